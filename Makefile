@@ -1,0 +1,35 @@
+# Two commands: `make demo` runs the main job on the embedded data set, `make test` the tests.
+PYTHON ?= python3
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+
+.PHONY: demo test setup check benchmark clean
+
+demo: setup
+	$(BIN)/python -m experiments.evaluate
+
+test: .venv/.test
+	$(BIN)/python -m pytest
+
+setup: .venv/.setup
+
+check: .venv/.check  ## style and types
+	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright
+
+benchmark: .venv/.benchmark
+	$(BIN)/python -m experiments.benchmark
+
+clean:
+	rm -rf .venv .pytest_cache .ruff_cache .hypothesis
+
+.venv/.setup: pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "mfvpr needs Python 3.11 or newer, $(PYTHON) is $$($(PYTHON) --version 2>&1); name another: make PYTHON=python3.12 demo"; exit 2; }
+	@echo "Installing mfvpr into .venv (once, about a minute) ..."
+	@$(PYTHON) -m venv .venv
+	@$(PIP) --editable .
+	@touch $@
+
+.venv/.test .venv/.check .venv/.benchmark: .venv/.%: .venv/.setup
+	@$(PIP) --editable '.[$*]'
+	@touch $@

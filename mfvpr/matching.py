@@ -1,0 +1,136 @@
+"""Features of two images -> Matches: mutual nearest neighbors, and filters of the matches found.
+
+The similarity matrix is the cost. It is formed once per pair, read four times while it is in cache (the maxima of its
+rows and columns, and the first place of each) and never stored for more than one chunk of candidates. `argmax` would
+read it the same number of times and take several times longer on XLA's CPU backend.
+"""
+
+from dataclasses import replace
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+
+from mfvpr.numerics import masked, safe_sqrt
+from mfvpr.types import Array, Features, Matches
+
+CrossCheck = Literal["mutual", "opencv_legacy", "none"]
+
+
+def match(features0: Features, features1: Features, *, cross_check: CrossCheck = "mutual") -> Matches:
+    """Nearest neighbors of one pair of images (paper, section IV-A).
+
+    Slot k of the result belongs to keypoint k of image 0 (K = N0); the first index wins a tie.
+
+    Args:
+        features0: query, keypoints `[N0, 2]`; padding may hold anything.
+        features1: candidate, keypoints `[N1, 2]`.
+        cross_check: `mutual` keeps i, j where each is the other's nearest. `opencv_legacy` is OpenCV's BFMatcher
+            before 2019: every candidate keypoint picks its nearest query keypoint, which keeps the closest of its
+            suitors. `none` keeps the nearest of every query keypoint. (facts A12: the paper says cross-check.)
+
+    Returns:
+        Matches with K = N0 slots.
+    """
+    similarity = _similarity(features0, features1)
+    nearest1, valid = _neighbors(similarity, cross_check)
+    valid &= features0.mask & jnp.any(features1.mask)
+    # The difference, not sqrt(2 - 2 cos): in float32 that would turn a distance of 0 into up to 3.5e-4.
+    difference = masked(features0.descriptors - features1.descriptors[nearest1], valid)
+    return Matches(
+        points0=features0.keypoints,
+        points1=features1.keypoints[nearest1],
+        distance=safe_sqrt(jnp.sum(difference * difference, axis=-1)),
+        scores0=features0.scores,
+        scores1=features1.scores[nearest1],
+        mask=valid,
+        image_size0=features0.image_size,
+        image_size1=features1.image_size,
+    )
+
+
+def match_candidates(
+    query: Features,
+    candidates: Features,
+    *,
+    cross_check: CrossCheck = "mutual",
+    chunk_size: int | None = None,
+) -> Matches:
+    """`match` of one query with C candidates.
+
+    Args:
+        query: keypoints `[N0, 2]`.
+        candidates: keypoints `[C, N1, 2]`.
+        cross_check: as in `match`.
+        chunk_size: candidates whose similarity matrices exist at the same time; by default 1 on a CPU, where the
+            matrix then stays in cache, and all of them elsewhere.
+
+    Returns:
+        Matches with leading axis C and K = N0 slots.
+    """
+    chunk_size = chunk_size or (1 if jax.default_backend() == "cpu" else len(candidates.mask))
+    one = lambda candidate: match(query, candidate, cross_check=cross_check)  # noqa: E731
+    return jax.lax.map(one, candidates, batch_size=None if chunk_size == 1 else chunk_size)
+
+
+def filter_matches(
+    matches: Matches, *, max_distance: float | Array | None = None, max_matches: int | None = None
+) -> Matches:
+    """The matches of one pair that are close enough, and of those the `max_matches` closest (facts A13).
+
+    Slots stay where they are, the mask shrinks; among equal distances the first slots are kept.
+    """
+    if max_distance is not None:
+        matches = replace(matches, mask=matches.mask & (matches.distance <= max_distance))
+    if max_matches is not None:
+        by_distance = jnp.argsort(masked(matches.distance, matches.mask, jnp.inf), stable=True)
+        place = jnp.zeros_like(by_distance).at[by_distance].set(jnp.arange(len(by_distance)))
+        matches = replace(matches, mask=matches.mask & (place < max_matches))
+    return matches
+
+
+def compact(matches: Matches, capacity: int) -> Matches:
+    """The real matches of one pair moved to the front, in their order, in `capacity` slots.
+
+    Everything after matching costs in proportion to K or to its square, so slots should be few. Matches beyond the
+    capacity are dropped: compare `matches.mask.sum()` with it.
+    """
+    slots = jnp.nonzero(matches.mask, size=capacity, fill_value=0)[0]
+    return Matches(
+        points0=matches.points0[slots],
+        points1=matches.points1[slots],
+        distance=matches.distance[slots],
+        scores0=matches.scores0[slots],
+        scores1=matches.scores1[slots],
+        mask=jnp.arange(capacity) < jnp.sum(matches.mask),
+        image_size0=matches.image_size0,
+        image_size1=matches.image_size1,
+    )
+
+
+def _similarity(features0: Features, features1: Features) -> Array:
+    """`[N0, N1]` dot products, -inf where either keypoint is padding (whose NaN reach only their row or column)."""
+    products = jnp.matmul(features0.descriptors, features1.descriptors.T, precision=jax.lax.Precision.HIGHEST)
+    return jnp.where(features0.mask[:, None] & features1.mask[None], products, -jnp.inf)
+
+
+def _first(hit: Array, axis: int) -> Array:
+    """First index of True along `axis`; 0 where there is none."""
+    size = hit.shape[axis]
+    index = jax.lax.broadcasted_iota(jnp.int32, hit.shape, axis)
+    first = jnp.min(jnp.where(hit, index, size), axis=axis)
+    return jnp.where(first == size, 0, first)
+
+
+def _neighbors(similarity: Array, cross_check: CrossCheck) -> tuple[Array, Array]:
+    """For each row its column `[N0]` int32, and whether the pair counts `[N0]` bool."""
+    rows = jnp.arange(similarity.shape[0], dtype=jnp.int32)
+    nearest1 = _first(similarity == jnp.max(similarity, axis=1, keepdims=True), axis=1)
+    if cross_check == "none":
+        return nearest1, jnp.ones(rows.shape, bool)
+    nearest0 = _first(similarity == jnp.max(similarity, axis=0, keepdims=True), axis=0)
+    if cross_check == "mutual":
+        return nearest1, nearest0[nearest1] == rows
+    suitors = jnp.where(nearest0[None] == rows[:, None], similarity, -jnp.inf)
+    best = jnp.max(suitors, axis=1)
+    return _first(suitors == best[:, None], axis=1), jnp.isfinite(best)

@@ -1,0 +1,65 @@
+"""The few array idioms that every room shares: masked reductions, safe roots, rounding up to a capacity."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.core import Tracer
+from jax.typing import ArrayLike
+
+
+def masked(values: Array, mask: Array, fill: ArrayLike = 0.0) -> Array:
+    """`values` where `mask`, `fill` elsewhere; a trailing axis of `values` that `mask` lacks is broadcast.
+
+    Padding may hold NaN: apply this before any arithmetic, or gradients turn NaN as well.
+    """
+    extra = values.ndim - mask.ndim
+    return jnp.where(mask.reshape(mask.shape + (1,) * extra), values, fill)
+
+
+def count(mask: Array) -> Array:
+    """Number of True entries along the last axis, float32."""
+    return jnp.sum(mask, axis=-1, dtype=jnp.float32)
+
+
+def masked_mean(values: Array, mask: Array, weights: Array | None = None) -> Array:
+    """(Weighted) mean over axis 0 of the real entries; 0 where there are none."""
+    weights = masked(jnp.ones(mask.shape) if weights is None else weights, mask)
+    total = jnp.sum(weights)
+    weighted = masked(values, mask) * weights.reshape(weights.shape + (1,) * (values.ndim - 1))
+    return jnp.sum(weighted, axis=0) / jnp.where(total == 0, 1.0, total)
+
+
+def masked_median(values: Array, mask: Array) -> Array:
+    """Median over axis 0 of the real entries (mean of the middle two when even); 0 where there are none."""
+    ordered = jnp.sort(masked(values, mask, jnp.inf), axis=0)
+    real = jnp.sum(mask)
+    middle = (ordered[jnp.maximum(real - 1, 0) // 2] + ordered[jnp.minimum(real // 2, len(mask) - 1)]) / 2
+    return jnp.where(real > 0, middle, 0.0)
+
+
+def safe_sqrt(squared: Array) -> Array:
+    """Square root of max(x, 0) whose gradient at 0 is 0 instead of infinite."""
+    positive = squared > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
+
+
+def round_up(size: int, multiple: int) -> int:
+    """The smallest multiple of `multiple` that is at least `size` (and at least one `multiple`)."""
+    return max(1, -(-size // multiple)) * multiple
+
+
+def pad_rows(rows: np.ndarray, capacity: int) -> np.ndarray:
+    """`rows` [n, ...] with zeros appended to [capacity, ...]; a host-side helper."""
+    if len(rows) > capacity:
+        raise ValueError(f"{len(rows)} rows do not fit a capacity of {capacity}")
+    padded = np.zeros((capacity, *rows.shape[1:]), rows.dtype)
+    padded[: len(rows)] = rows
+    return padded
+
+
+def is_concrete(tree: Any) -> bool:
+    """True where no leaf is traced, so that Python may look at the values."""
+    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))

@@ -1,0 +1,163 @@
+"""Histogram of shifts (paper, section III-A): the tallest bin of a Gaussian-voted histogram of points1 - points0.
+
+The two-dimensional Gaussian is a product of one along x and one along y, so all bins of a pair are one small matrix
+product, `votes_y [By, K] @ votes_x [Bx, K]^T`, instead of K x By x Bx exponentials. Lengths are pixels.
+"""
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mfvpr.numerics import is_concrete, round_up
+from mfvpr.scoring.shifts import match_shifts
+from mfvpr.types import Array, Matches
+from mfvpr.weighting import FeatureScoreWeight, Weight, match_weights
+
+TRACED_MAX_BINS = 64  # capacity where nobody set one and the values are traced: 10.5 px bins at 336 px
+_MEAN_SHIFT_STEPS = 30
+
+
+class ShiftHistogram(NamedTuple):
+    """Bin scores and where the bins are.
+
+    scores: `[By, Bx]`; -inf in bins beyond the range of shifts (present only where the capacity exceeds the bins).
+    centers_x: `[Bx]` px.  centers_y: `[By]` px.
+    """
+
+    scores: Array
+    centers_x: Array
+    centers_y: Array
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class HistogramOfShifts:
+    """s_ij = sum_k w_k exp(-((x_k - x_ij)^2 + (y_k - y_ij)^2) / (2 sigma^2)); the score is the maximum over bins.
+
+    Numbers are pytree leaves and may be traced or batched; `max_bins` and the choices are static. The score does not
+    change with the order of the matches, nor with a translation of all points of one image by a multiple of
+    `bin_size` while the peak stays in range.
+
+    Attributes:
+        bin_size: width of the square bins, px.
+        sigma: standard deviation of the vote, px; the paper's 22.5 is read as 1.5 bins (facts A1).
+        truncate: a match votes only for bins within this many sigmas along each axis (facts A4; the paper: all).
+        weight: match weight, FS by default as in the paper.
+        shift_range: (x, y): bins cover [-x, x] and [-y, y] px instead of all possible shifts (facts A2).
+        align: `min_edge` starts the first bin at the smallest possible shift; `zero_center` centers a bin on shift
+            0; `zero_edge` puts an edge there (facts A3).
+        sigma_is_variance: read `sigma` as the variance, px^2 (facts A1).
+        direction: shift of a match, candidate minus query point or the reverse (facts A5).
+        max_bins: capacity of bins per axis. By default as many as concrete values ask for, or 64 where they are
+            traced. A histogram that needs more than its capacity scores NaN, never a wrong number.
+    """
+
+    bin_size: float | Array = 15.0
+    sigma: float | Array = 22.5
+    truncate: float | Array = math.inf
+    weight: Weight = FeatureScoreWeight()
+    shift_range: tuple[float, float] | None = None
+    align: Literal["min_edge", "zero_center", "zero_edge"] = field(default="min_edge", metadata={"static": True})
+    sigma_is_variance: bool = field(default=False, metadata={"static": True})
+    direction: Literal["candidate_minus_query", "query_minus_candidate"] = field(
+        default="candidate_minus_query", metadata={"static": True}
+    )
+    max_bins: int | None = field(default=None, metadata={"static": True})
+
+    def __call__(self, matches: Matches) -> Array:
+        """Score of one pair, `[]` float32: the maximum over bins, 0 without matches."""
+        scores = self.histogram(matches).scores
+        return jnp.where(jnp.any(matches.mask), jnp.max(scores), 0.0)
+
+    def histogram(self, matches: Matches) -> ShiftHistogram:
+        """All bins of one pair with their centers."""
+        first, num_bins = self._lattice(matches.image_size0, matches.image_size1)
+        index = jnp.arange(self._capacity(matches), dtype=float)[:, None]
+        centers = first[None] + index * jnp.asarray(self.bin_size)  # [B, 2]
+        weights = match_weights(self.weight, matches)
+        shifts = self._shifts(matches)
+        votes_x = self._vote(centers[:, 0], shifts[:, 0])
+        votes_y = self._vote(centers[:, 1], shifts[:, 1]) * weights[None]
+        scores = jnp.matmul(votes_y, votes_x.T, precision=jax.lax.Precision.HIGHEST)
+        inside = index < num_bins[None]  # [B, 2]
+        scores = jnp.where(inside[:, 1:] & inside[None, :, 0], scores, -jnp.inf)
+        fits = jnp.all(num_bins <= len(index))
+        return ShiftHistogram(jnp.where(fits, scores, jnp.nan), centers[:, 0], centers[:, 1])
+
+    def dominant_shift(self, matches: Matches, *, refine: bool = False) -> Array:
+        """`[2]` (x, y) px: where the query's points lie in the candidate; (0, 0) without matches.
+
+        The center of the tallest bin, the first in row-major order on a tie. With `refine` the peak between bin
+        centers: the maximum of the same sum of Gaussians over all shifts, reached from that bin by mean shift
+        (Comaniciu & Meer, PAMI 2002).
+        """
+        histogram = self.histogram(matches)
+        row, column = jnp.unravel_index(jnp.argmax(histogram.scores), histogram.scores.shape)
+        shift = jnp.stack([histogram.centers_x[column], histogram.centers_y[row]])
+        if refine:
+            shift = self._climb(shift, self._shifts(matches), match_weights(self.weight, matches))
+        return jnp.where(jnp.any(matches.mask), shift, 0.0)
+
+    def with_capacity(self, image_size0: Array, image_size1: Array, *, multiple: int = 1) -> "HistogramOfShifts":
+        """This scorer with `max_bins` set to what its concrete values need, rounded up to a `multiple`.
+
+        `bin_size` and the sizes may be batched: the capacity serves all of them.
+        """
+        finest = replace(self, bin_size=np.min(self.bin_size))
+        _, num_bins = finest._lattice(image_size0, image_size1, np)
+        return replace(self, max_bins=round_up(int(np.max(num_bins)), multiple))
+
+    def _capacity(self, matches: Matches) -> int:
+        if self.max_bins is not None:
+            return self.max_bins
+        values = (self.bin_size, self.shift_range, matches.image_size0, matches.image_size1)
+        if not is_concrete(values):
+            return TRACED_MAX_BINS
+        return self.with_capacity(matches.image_size0, matches.image_size1).max_bins or TRACED_MAX_BINS
+
+    def _lattice(self, image_size0: Array, image_size1: Array, xp: Any = jnp) -> tuple[Array, Array]:
+        """Center of the first bin and number of bins, both `[..., 2]` along (x, y)."""
+        lower, upper = -xp.asarray(image_size0, dtype=float), xp.asarray(image_size1, dtype=float)
+        if self.direction == "query_minus_candidate":
+            lower, upper = -upper, -lower
+        if self.shift_range is not None:
+            upper = xp.asarray(self.shift_range, dtype=float)
+            lower = -upper
+        bin_size = xp.asarray(self.bin_size, dtype=float)[..., None]
+        slack = 1e-4  # of a bin: rounding must not add one that holds nothing
+        if self.align == "min_edge":
+            edge = lower
+        elif self.align == "zero_center":
+            edge = (xp.floor(lower / bin_size + 0.5 + slack) - 0.5) * bin_size
+        else:
+            edge = xp.floor(lower / bin_size + slack) * bin_size
+        return edge + bin_size / 2, xp.ceil((upper - edge) / bin_size - slack)
+
+    def _shifts(self, matches: Matches) -> Array:
+        shifts = match_shifts(matches)
+        return shifts if self.direction == "candidate_minus_query" else -shifts
+
+    def _deviation(self) -> Array:
+        sigma = jnp.asarray(self.sigma)
+        return jnp.sqrt(sigma) if self.sigma_is_variance else sigma
+
+    def _vote(self, centers: Array, shifts: Array) -> Array:
+        """`[B, K]` one-dimensional Gaussian votes."""
+        # Bins along rows: the exponentials then run along K, which is longer and contiguous (1.8x faster).
+        sigmas = (centers[:, None] - shifts[None]) / self._deviation()
+        return jnp.where(jnp.abs(sigmas) <= self.truncate, jnp.exp(-0.5 * sigmas**2), 0.0)
+
+    def _climb(self, start: Array, shifts: Array, weights: Array) -> Array:
+        """Fixed-point iteration to the mode of sum_k w_k exp(-|s - s_k|^2 / (2 sigma^2))."""
+
+        def step(_: int, shift: Array) -> Array:
+            distance = jnp.sum((shifts - shift[None]) ** 2, axis=-1)
+            pull = weights * jnp.exp(-0.5 * distance / self._deviation() ** 2)
+            total = jnp.sum(pull)
+            return jnp.where(total > 0, pull @ shifts / jnp.where(total > 0, total, 1.0), shift)
+
+        return jax.lax.fori_loop(0, _MEAN_SHIFT_STEPS, step, start)

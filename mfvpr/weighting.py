@@ -1,0 +1,47 @@
+"""Match weights (paper, section IV-B): values that map one pair's Matches to one weight per slot.
+
+What they return on padding is arbitrary; `match_weights` is the form that scorers use.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from mfvpr.numerics import masked
+from mfvpr.types import Array, Matches
+
+Weight = Callable[[Matches], Array]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class FeatureScoreWeight:
+    """FS-weight: w = scores0 + scores1, in units of the detector's scores."""
+
+    def __call__(self, matches: Matches) -> Array:
+        return matches.scores0 + matches.scores1
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class DescriptorDistanceWeight:
+    """DMF-weight: w = 2 - distance, in [0, 2]."""
+
+    def __call__(self, matches: Matches) -> Array:
+        return 2.0 - matches.distance
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class UnitWeight:
+    """w = 1: every match counts the same."""
+
+    def __call__(self, matches: Matches) -> Array:
+        return jnp.ones_like(matches.distance)
+
+
+def match_weights(weight: Weight, matches: Matches) -> Array:
+    """`[K]` weights, 0 on padding."""
+    return masked(weight(matches), matches.mask)

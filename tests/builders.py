@@ -1,0 +1,79 @@
+"""Random and hand-made Features and Matches for the tests, NumPy throughout."""
+
+import numpy as np
+
+from mfvpr import Features, Matches
+
+SIZE = 336
+
+
+def unit(array):
+    """Rows of unit length, float32."""
+    return (array / np.linalg.norm(array, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def make_features(rng, count, *, capacity=None, dimension=16, size=SIZE, garbage=np.nan):
+    """Features of one image with `count` real keypoints; the padding holds `garbage`."""
+    capacity = capacity or count
+
+    def padded(real):
+        rows = np.full((capacity, *real.shape[1:]), garbage, np.float32)
+        rows[:count] = real
+        return rows
+
+    return Features(
+        keypoints=padded(rng.uniform(0, size, (count, 2))),
+        descriptors=padded(unit(rng.normal(size=(count, dimension)))),
+        scores=padded(rng.uniform(0.1, 1, count)),
+        mask=np.arange(capacity) < count,
+        image_size=np.array([size, size], np.float32),
+    )
+
+
+def make_matches(points0, points1, *, distance=None, scores0=None, scores1=None, capacity=None, garbage=np.nan,
+                 size=(SIZE, SIZE)):  # fmt: skip
+    """Matches of one pair from real entries; the padding holds `garbage`."""
+    points0 = np.asarray(points0, np.float32).reshape(-1, 2)
+    points1 = np.asarray(points1, np.float32).reshape(-1, 2)
+    count = len(points0)
+    capacity = capacity or max(count, 1)
+
+    def padded(real, default=0.5):
+        real = np.full(count, default) if real is None else np.asarray(real)
+        rows = np.full((capacity, *real.shape[1:]), garbage, np.float32)
+        rows[:count] = real
+        return rows
+
+    return Matches(
+        points0=padded(points0),
+        points1=padded(points1),
+        distance=padded(distance),
+        scores0=padded(scores0),
+        scores1=padded(scores1),
+        mask=np.arange(capacity) < count,
+        image_size0=np.array(size, np.float32),
+        image_size1=np.array(size, np.float32),
+    )
+
+
+def random_matches(rng, count, *, capacity=None, garbage=np.nan):
+    """Half of the matches share a shift, half are random; coordinates are on a quarter-pixel grid, exact in float32."""
+    points0 = rng.integers(0, 4 * SIZE, (count, 2)) / 4
+    shift = rng.integers(-240, 240, 2) / 4
+    points1 = np.where(rng.random((count, 1)) < 0.5, points0 + shift, rng.integers(0, 4 * SIZE, (count, 2)) / 4)
+    return make_matches(
+        points0,
+        np.clip(points1, 0, SIZE - 0.25),
+        distance=rng.uniform(0, 2, count),
+        scores0=rng.uniform(0.1, 1, count),
+        scores1=rng.uniform(0.1, 1, count),
+        capacity=capacity,
+        garbage=garbage,
+    )
+
+
+def real(matches):
+    """(points0, points1, distance, scores0, scores1) of the real slots, float64."""
+    mask = np.asarray(matches.mask)
+    names = ("points0", "points1", "distance", "scores0", "scores1")
+    return tuple(np.asarray(getattr(matches, name), np.float64)[mask] for name in names)

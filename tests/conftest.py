@@ -1,0 +1,33 @@
+"""Strict arithmetic for every test: no silent rank promotion, warnings are errors (pyproject.toml)."""
+
+import jax
+import pytest
+from hypothesis import settings
+
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+settings.register_profile("mfvpr", deadline=None, derandomize=True, max_examples=60)
+settings.load_profile("mfvpr")
+
+
+class Compilations:
+    """How many programs XLA compiled since the last `reset`."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        jax.monitoring.register_event_duration_secs_listener(self._listen)
+
+    def _listen(self, event: str, _: float, **__: object) -> None:
+        self.count += event == "/jax/core/compile/backend_compile_duration"
+
+    def reset(self) -> None:
+        self.count = 0
+
+
+_compilations = Compilations()
+
+
+@pytest.fixture
+def compilations() -> Compilations:
+    _compilations.reset()
+    return _compilations

@@ -1,0 +1,108 @@
+"""Closed forms and invariances that need no oracle (facts.md, section 8)."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mfvpr import AggregatedScore, AnchorPoints, DescriptorDistanceWeight, HistogramOfShifts, UnitWeight
+from tests.builders import SIZE, make_matches, random_matches
+
+CENTER = -SIZE + 7.5 + 15 * 24  # the center of bin 24 along an axis: 31.5 px
+
+
+def grid_points(num_bins=15):
+    """One point in the middle of every anchor cell."""
+    middle = (np.arange(num_bins) + 0.5) * SIZE / num_bins
+    return np.stack(np.meshgrid(middle, middle), axis=-1).reshape(-1, 2)
+
+
+@pytest.mark.parametrize("count", [1, 2, 17])
+def test_coincident_matches_at_a_bin_center_score_their_weight(count):
+    points0 = np.full((count, 2), 100.0)
+    matches = make_matches(points0, points0 + CENTER, scores0=np.full(count, 0.75), scores1=np.full(count, 1.5))
+    assert HistogramOfShifts()(matches) == pytest.approx(2.25 * count, rel=1e-6)
+    np.testing.assert_allclose(HistogramOfShifts().dominant_shift(matches), [CENTER, CENTER])
+
+
+@pytest.mark.parametrize("size, bins", [(336, 45), (320, 43)])
+def test_number_of_bins_of_the_paper(size, bins):
+    matches = make_matches([[1, 1]], [[2, 2]], size=(size, size))
+    assert HistogramOfShifts().histogram(matches).scores.shape == (bins, bins)
+
+
+def test_translation_by_bins_moves_the_peak_and_keeps_the_score():
+    matches = random_matches(np.random.default_rng(0), 80)
+    matches = replace(matches, points0=matches.points0 / 4 + 100, points1=matches.points1 / 4 + 100)
+    moved = replace(matches, points1=matches.points1 + np.float32([45, -30]))
+    scorer = HistogramOfShifts()
+    np.testing.assert_allclose(scorer(moved), scorer(matches), rtol=1e-5)
+    np.testing.assert_allclose(scorer.dominant_shift(moved) - scorer.dominant_shift(matches), [45, -30])
+
+
+def test_tiny_sigma_is_the_hard_histogram_of_zhang():
+    rng = np.random.default_rng(1)
+    shifts = CENTER + 15 * rng.integers(-2, 3, (50, 2))
+    matches = make_matches(np.full((50, 2), 120.0), 120 + shifts)
+    _, counts = np.unique(shifts, axis=0, return_counts=True)
+    assert HistogramOfShifts(sigma=0.5, weight=UnitWeight())(matches) == pytest.approx(counts.max())
+
+
+def test_exchanged_images_mirror_the_histogram_when_a_bin_is_centered_on_zero():
+    matches = random_matches(np.random.default_rng(2), 60)
+    exchanged = replace(matches, points0=matches.points1, points1=matches.points0)
+    scorer = HistogramOfShifts(align="zero_center")
+    np.testing.assert_allclose(
+        scorer.histogram(exchanged).scores, scorer.histogram(matches).scores[::-1, ::-1], rtol=1e-4, atol=1e-5
+    )
+    reverse = replace(scorer, direction="query_minus_candidate")
+    np.testing.assert_allclose(reverse.dominant_shift(matches), -scorer.dominant_shift(matches), atol=1e-3)
+
+
+def test_a_histogram_beyond_its_capacity_is_nan_not_wrong():
+    matches = random_matches(np.random.default_rng(3), 30)
+    assert np.isnan(HistogramOfShifts(max_bins=44)(matches))
+    assert np.isfinite(HistogramOfShifts(max_bins=45)(matches))
+    tight, loose = HistogramOfShifts(max_bins=45), HistogramOfShifts(max_bins=80)
+    np.testing.assert_allclose(tight(matches), loose(matches), rtol=1e-6)
+
+
+@pytest.mark.parametrize("include_self", [True, False])
+def test_identical_images_give_the_full_window_to_every_anchor(include_self):
+    points = grid_points()
+    matches = make_matches(points, points)
+    row = np.arange(15)
+    reach = (abs(row[:, None] - row) <= 5).sum(1)  # cells of the 11-wide window inside the grid, along one axis
+    cells = reach[:, None] * reach - (not include_self)
+    assert AnchorPoints(include_self=include_self)(matches) == pytest.approx(3.0 * 1.0 * cells.sum(), rel=1e-6)
+
+
+def test_a_translation_by_whole_cells_keeps_the_anchor_score():
+    points = grid_points().reshape(15, 15, 2)[3:12, 3:12].reshape(-1, 2)
+    still, moved = make_matches(points, points), make_matches(points, points + 2 * SIZE / 15)
+    np.testing.assert_allclose(AnchorPoints()(moved), AnchorPoints()(still))
+
+
+def test_tolerance_one_counts_exact_agreements_as_ssm_vpr():
+    rng = np.random.default_rng(4)
+    points0 = grid_points()
+    target = rng.integers(0, 3, (225, 2)) + np.stack(np.divmod(np.arange(225), 15)[::-1], axis=-1)
+    matches = make_matches(points0, (np.clip(target, 0, 14) + 0.5) * SIZE / 15)
+    cell = np.stack(np.divmod(np.arange(225), 15), axis=-1)
+    displacement = np.clip(target, 0, 14)[:, ::-1] - cell
+    near = (abs(cell[:, None] - cell) <= 5).all(-1)
+    agreements = (near & (displacement[:, None] == displacement).all(-1)).sum()
+    assert float(AnchorPoints(tolerance=1.0, cell_weight="ones")(matches)) == agreements
+
+
+def test_equal_shifts_give_the_aggregated_score_its_maximum():
+    points0 = np.random.default_rng(5).uniform(0, 200, (40, 2)).round()
+    distance = np.linspace(0, 2, 40)
+    matches = make_matches(points0, points0 + [30, -7], distance=distance, size=(320, 240))
+    assert AggregatedScore()(matches) == pytest.approx((2 - distance).sum() * (320**2 + 240**2), rel=1e-5)
+
+
+def test_weights_of_the_paper():
+    matches = make_matches([[1, 1]], [[2, 2]], distance=[0.25], scores0=[3.0], scores1=[4.0])
+    assert HistogramOfShifts().weight(matches)[0] == 7.0
+    assert DescriptorDistanceWeight()(matches)[0] == 1.75

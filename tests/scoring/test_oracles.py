@@ -1,0 +1,144 @@
+"""Every scorer against its float64 loop, over random, empty, single, tied and duplicated matches."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mfvpr import (
+    AggregatedScore,
+    AnchorPoints,
+    DescriptorDistanceWeight,
+    FeatureScoreWeight,
+    HistogramOfShifts,
+    MatchCount,
+    UnitWeight,
+)
+from tests import oracles
+from tests.builders import SIZE, make_matches, random_matches, real
+
+WEIGHTS = {
+    "fs": (FeatureScoreWeight(), lambda d, s0, s1: oracles.fs_weight(s0, s1)),
+    "dmf": (DescriptorDistanceWeight(), lambda d, s0, s1: oracles.dmf_weight(d)),
+    "unit": (UnitWeight(), lambda d, s0, s1: np.ones(len(d))),
+}
+CLOSE = {"rtol": 2e-5, "atol": 1e-4}  # float32 sums of 60 terms; scores are of order 1 and more
+
+
+@st.composite
+def pairs(draw):
+    """Matches of one pair: empty, single, duplicated, tied or random, with weights exact in float32."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    matches = random_matches(rng, draw(st.sampled_from([0, 1, 2, 5, 20, 60])), capacity=64)
+    mask = matches.mask
+    if draw(st.booleans()):  # ties: few places, equal weights
+        for points in (matches.points0, matches.points1):
+            points[mask] = rng.integers(0, 4, (mask.sum(), 2)) * 84 + 42.0
+        for values in (matches.distance, matches.scores0, matches.scores1):
+            values[mask] = 0.5
+    if draw(st.booleans()):  # duplicates
+        matches.points0[mask] = matches.points0[0]
+        matches.points1[mask] = matches.points1[0]
+    return matches
+
+
+def oracle_inputs(matches, weight):
+    points0, points1, distance, scores0, scores1 = real(matches)
+    return points0, points1, WEIGHTS[weight][1](distance, scores0, scores1)
+
+
+@given(
+    pairs(),
+    st.sampled_from(list(WEIGHTS)),
+    st.sampled_from(["min_edge", "zero_center", "zero_edge"]),
+    st.sampled_from([(15.0, 22.5), (20.0, 8.0), (7.0, 30.0), (48.0, 5.0)]),
+    st.sampled_from([np.inf, 2.0]),
+    st.sampled_from([None, (100.0, 40.0)]),
+    st.booleans(),
+)
+def test_histogram(matches, weight, align, sizes, truncate, shift_range, variance):
+    bin_size, sigma = sizes
+    scorer = HistogramOfShifts(
+        bin_size=bin_size, sigma=sigma, truncate=truncate, align=align, shift_range=shift_range,
+        sigma_is_variance=variance, weight=WEIGHTS[weight][0],
+    )  # fmt: skip
+    points0, points1, weights = oracle_inputs(matches, weight)
+    expected, centers_x, centers_y = oracles.histogram_of_shifts(
+        points1 - points0, weights, (SIZE, SIZE), (SIZE, SIZE), bin_size=bin_size, sigma=sigma,
+        truncate=truncate * (1 + 1e-6), align=align, shift_range=shift_range, sigma_is_variance=variance,
+    )  # fmt: skip
+    got = scorer.histogram(matches)
+    rows, columns = expected.shape
+    np.testing.assert_allclose(got.centers_x[:columns], centers_x, atol=1e-3)
+    np.testing.assert_allclose(got.centers_y[:rows], centers_y, atol=1e-3)
+    np.testing.assert_allclose(got.scores[:rows, :columns], expected, **CLOSE)
+    assert (np.asarray(got.scores[rows:]) == -np.inf).all()
+    assert (np.asarray(got.scores[:, columns:]) == -np.inf).all()
+    np.testing.assert_allclose(scorer(matches), expected.max() if len(weights) else 0.0, **CLOSE)
+
+
+@given(
+    pairs(),
+    st.sampled_from(list(WEIGHTS)),
+    st.sampled_from([(10, 3.0), (9, 1.0), (2, 4.5), (15, 2.0)]),
+    st.sampled_from(["half_floor", "asymmetric", "odd_down", "radius"]),
+    st.sampled_from(["query", "candidate"]),
+    st.booleans(),
+    st.sampled_from(["winner_sum", "cell_sum", "ones"]),
+    st.sampled_from([15, 4]),
+)
+def test_anchor(matches, weight, parameters, window_mode, first, include_self, cell_weight, num_bins):
+    window, tolerance = parameters
+    options = {
+        "window": window, "tolerance": tolerance, "window_mode": window_mode, "first": first,
+        "include_self": include_self, "cell_weight": cell_weight, "num_bins": num_bins,
+    }  # fmt: skip
+    points0, points1, weights = oracle_inputs(matches, weight)
+    expected = oracles.anchor_points(points0, points1, weights, (SIZE, SIZE), (SIZE, SIZE), **options)
+    got = AnchorPoints(weight=WEIGHTS[weight][0], **options)(matches)
+    np.testing.assert_allclose(got, expected, **CLOSE)
+
+
+@given(pairs(), st.sampled_from(list(WEIGHTS)), st.sampled_from(["unweighted", "weighted", "median"]), st.booleans())
+def test_aggregate(matches, weight, mean, clamp):
+    points0, points1, weights = oracle_inputs(matches, weight)
+    expected = oracles.aggregated_score(points1 - points0, weights, (SIZE, SIZE), mean=mean, clamp=clamp)
+    got = AggregatedScore(weight=WEIGHTS[weight][0], mean=mean, clamp=clamp)(matches)
+    np.testing.assert_allclose(got, expected, rtol=2e-5)
+
+
+@given(pairs())
+def test_count(matches):
+    assert float(MatchCount()(matches)) == matches.mask.sum()
+
+
+@given(pairs(), st.sampled_from([(15.0, 22.5), (20.0, 8.0)]))
+def test_dominant_shift(matches, sizes):
+    bin_size, sigma = sizes
+    points0, points1, weights = oracle_inputs(matches, "fs")
+    scorer = HistogramOfShifts(bin_size=bin_size, sigma=sigma)
+    shift = np.asarray(scorer.dominant_shift(matches))
+    if not len(weights):
+        np.testing.assert_array_equal(shift, 0)
+        np.testing.assert_array_equal(scorer.dominant_shift(matches, refine=True), 0)
+        return
+    histogram, centers_x, centers_y = oracles.histogram_of_shifts(
+        points1 - points0, weights, (SIZE, SIZE), (SIZE, SIZE), bin_size=bin_size, sigma=sigma
+    )
+    column, row = np.argmin(abs(centers_x - shift[0])), np.argmin(abs(centers_y - shift[1]))
+    np.testing.assert_allclose([centers_x[column], centers_y[row]], shift, atol=1e-3)
+    np.testing.assert_allclose(histogram[row, column], histogram.max(), rtol=1e-5)  # rounding may choose among equals
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_refined_shift_is_the_mode_that_mean_shift_finds(seed):
+    rng = np.random.default_rng(seed)
+    points0 = rng.uniform(60, 270, (50, 2))
+    points1 = points0 + rng.uniform(-50, 50, 2) + rng.normal(0, 4, (50, 2))
+    matches = make_matches(points0, points1, scores0=rng.uniform(0.2, 1, 50), scores1=rng.uniform(0.2, 1, 50))
+    points0, points1, weights = oracle_inputs(matches, "fs")
+    scorer = HistogramOfShifts()
+    expected = oracles.refined_shift(points1 - points0, weights, 22.5, scorer.dominant_shift(matches))
+    np.testing.assert_allclose(scorer.dominant_shift(matches, refine=True), expected, atol=0.01)
+    density = lambda s: np.sum(weights * np.exp(-np.sum((points1 - points0 - s) ** 2, axis=1) / (2 * 22.5**2)))  # noqa: E731
+    assert density(np.asarray(scorer.dominant_shift(matches, refine=True))) >= scorer(matches)

@@ -1,0 +1,139 @@
+"""The matcher against the float64 loop: random, empty, single, tied and duplicated features."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mfvpr import Features, compact, filter_matches, match, match_candidates
+from tests import oracles
+from tests.builders import make_features, random_matches, unit
+
+MODES = ["mutual", "opencv_legacy", "none"]
+
+
+def found(matches):
+    """[(slot, points1, distance)] of the real slots."""
+    slots = np.flatnonzero(matches.mask)
+    return slots, np.asarray(matches.points1)[slots], np.asarray(matches.distance)[slots]
+
+
+@st.composite
+def feature_pairs(draw):
+    """Two images; with `ties` the descriptors are one-hot, so that equal similarities are exactly equal."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    counts = draw(st.tuples(*[st.sampled_from([0, 1, 2, 9, 30])] * 2))
+    pair = [make_features(rng, count, capacity=32) for count in counts]
+    if draw(st.booleans()):
+        for features in pair:
+            real = features.mask
+            features.descriptors[real] = np.eye(16, dtype=np.float32)[rng.integers(0, 4, real.sum())]
+    return pair
+
+
+@given(feature_pairs(), st.sampled_from(MODES))
+def test_agrees_with_the_oracle(pair, mode):
+    features0, features1 = pair
+    expected = oracles.nearest(features0.descriptors[features0.mask], features1.descriptors[features1.mask], mode)
+    slots, points1, distance = found(match(features0, features1, cross_check=mode))
+    assert list(slots) == [i for i, _, _ in expected]
+    np.testing.assert_array_equal(points1, [features1.keypoints[j] for _, j, _ in expected] or np.zeros((0, 2)))
+    np.testing.assert_allclose(distance, [d for _, _, d in expected], atol=1e-6)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_an_image_matched_with_itself_is_at_distance_zero(mode):
+    features = make_features(np.random.default_rng(0), 40, dimension=128)
+    slots, points1, distance = found(match(features, features, cross_check=mode))
+    assert len(slots) == 40
+    np.testing.assert_array_equal(points1, features.keypoints)
+    assert (distance == 0).all()
+
+
+def test_first_index_wins_on_both_sides():
+    rng = np.random.default_rng(1)
+    one = make_features(rng, 3)
+    one.descriptors[:] = one.descriptors[0]
+    slots, points1, _ = found(match(one, one))
+    assert list(slots) == [0]
+    np.testing.assert_array_equal(points1[0], one.keypoints[0])
+
+
+@pytest.mark.parametrize("chunk_size", [None, 1, 2, 3, 5, 50])
+def test_every_chunk_size_gives_the_loop(chunk_size):
+    rng = np.random.default_rng(2)
+    query = make_features(rng, 20, capacity=24)
+    candidates = [make_features(rng, count, capacity=30) for count in (30, 0, 7, 1, 22)]
+    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *candidates)
+    got = match_candidates(query, batch, chunk_size=chunk_size)
+    for row, candidate in enumerate(candidates):
+        alone = match(query, candidate)
+        np.testing.assert_array_equal(got.mask[row], alone.mask)
+        np.testing.assert_allclose(got.distance[row], alone.distance, atol=1e-6)
+        np.testing.assert_array_equal(got.points1[row][alone.mask], np.asarray(alone.points1)[alone.mask])
+
+
+def test_similarities_of_all_candidates_never_exist_at_once_on_a_cpu():
+    """The compiled program's temporary memory is one similarity matrix or two, not fifty."""
+    num, candidates = 256, 50
+    image = Features(
+        *(jax.ShapeDtypeStruct(s, d) for s, d in [((num, 2), "f4"), ((num, 64), "f4"), ((num,), "f4"), ((num,), bool)]),
+        jax.ShapeDtypeStruct((2,), "f4"),
+    )
+    batch = jax.tree.map(lambda s: jax.ShapeDtypeStruct((candidates, *s.shape), s.dtype), image)
+    compiled = jax.jit(match_candidates).lower(image, batch).compile()
+    assert compiled.memory_analysis().temp_size_in_bytes < 6 * num * num * 4
+
+
+def test_gradients_reach_the_descriptors_and_are_finite():
+    rng = np.random.default_rng(3)
+    features0, features1 = make_features(rng, 10, capacity=12), make_features(rng, 9, capacity=12)
+
+    def total(descriptors):
+        image = Features(features0.keypoints, descriptors, features0.scores, features0.mask, features0.image_size)
+        matches = match(image, features1)
+        return jnp.sum(jnp.where(matches.mask, matches.distance, 0.0))
+
+    gradient = jax.grad(total)(jnp.asarray(features0.descriptors))
+    assert np.isfinite(gradient).all()
+    assert np.abs(gradient).max() > 0
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([None, 0.7, 1.5]), st.sampled_from([None, 0, 1, 10, 99]))
+def test_filter_keeps_the_closest(seed, max_distance, max_matches):
+    matches = random_matches(np.random.default_rng(seed), 40, capacity=50)
+    distance = np.where(matches.mask, matches.distance, np.inf)
+    keep = distance <= (np.inf if max_distance is None else max_distance)
+    order = np.argsort(np.where(keep, distance, np.inf), kind="stable")
+    keep &= np.isin(np.arange(50), order[: 50 if max_matches is None else max_matches]) & matches.mask
+    got = filter_matches(matches, max_distance=max_distance, max_matches=max_matches)
+    np.testing.assert_array_equal(got.mask, keep)
+
+
+def test_compact_moves_real_matches_to_the_front_in_order():
+    matches = random_matches(np.random.default_rng(4), 60)
+    scattered = filter_matches(matches, max_distance=1.0)
+    kept = np.flatnonzero(scattered.mask)
+    for capacity in (len(kept), len(kept) + 5, 10):
+        tight = compact(scattered, capacity)
+        real = kept[:capacity]
+        assert tight.mask.sum() == len(real)
+        assert tight.points0.shape == (capacity, 2)
+        np.testing.assert_array_equal(tight.points1[: len(real)], matches.points1[real])
+        np.testing.assert_array_equal(tight.distance[: len(real)], matches.distance[real])
+
+
+def test_real_size_agrees_with_a_vectorised_check():
+    """700 x 700 x 512 non-negative descriptors, as D2-Net's, against float32 argmax."""
+    rng = np.random.default_rng(5)
+    one, two = (make_features(rng, 700, dimension=512) for _ in range(2))
+    descriptors = [unit(np.abs(f.descriptors)) for f in (one, two)]
+    one, two = (Features(f.keypoints, d, f.scores, f.mask, f.image_size) for f, d in zip((one, two), descriptors))  # noqa: B905
+    similarity = descriptors[0].astype(np.float64) @ descriptors[1].T.astype(np.float64)
+    mutual = similarity.argmax(0)[similarity.argmax(1)] == np.arange(700)
+    matches = match(one, two)
+    assert (np.asarray(matches.mask) == mutual).mean() > 0.998  # float32 rounding may flip a near-tie
+    agree = mutual & np.asarray(matches.mask)
+    np.testing.assert_array_equal(np.asarray(matches.points1)[agree], two.keypoints[similarity.argmax(1)][agree])

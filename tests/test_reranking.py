@@ -1,0 +1,108 @@
+"""Grids, fusion and ranking."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mfvpr import (
+    AggregatedScore,
+    AnchorPoints,
+    HistogramOfShifts,
+    balancing_c,
+    combine,
+    rank,
+    rerank,
+    score_candidates,
+    score_grid,
+)
+from tests import oracles
+from tests.builders import random_matches
+
+
+@pytest.fixture
+def matches():
+    rng = np.random.default_rng(0)
+    pairs = [random_matches(rng, count, capacity=40) for count in (40, 0, 12)]
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *pairs)
+
+
+def test_histogram_grid_equals_the_loop(matches):
+    sigmas, bin_sizes = [10.0, 22.5, 40.0], [8.0, 15.0]
+    got = score_grid(HistogramOfShifts(), matches, sigma=sigmas, bin_size=bin_sizes)
+    assert got.shape == (3, 2, 3)
+    for i, sigma in enumerate(sigmas):
+        for j, bin_size in enumerate(bin_sizes):
+            expected = score_candidates(HistogramOfShifts(sigma=sigma, bin_size=bin_size), matches)
+            np.testing.assert_allclose(got[i, j], expected, rtol=2e-6)
+
+
+def test_anchor_grid_equals_the_loop(matches):
+    got = score_grid(AnchorPoints(), matches, window=[2, 10], tolerance=[1.0, 3.0, 4.5])
+    expected = [
+        [score_candidates(AnchorPoints(window=w, tolerance=t), matches) for t in (1.0, 3.0, 4.5)] for w in (2, 10)
+    ]
+    np.testing.assert_allclose(got, expected, rtol=2e-6)
+
+
+def test_other_grid_values_cost_no_trace(matches):
+    traces = []
+
+    @jax.jit
+    def grid(sigma, bin_size):
+        traces.append(1)
+        return score_grid(HistogramOfShifts(max_bins=96), matches, sigma=sigma, bin_size=bin_size)
+
+    for shift in (0.0, 3.0):
+        grid(jnp.array([10.0, 20.0]) + shift, jnp.array([8.0]) + shift)
+    assert len(traces) == 1
+
+
+@pytest.mark.parametrize(
+    "scorer, axes, words",
+    [
+        (HistogramOfShifts(), {"sgma": [1.0]}, "sigma"),
+        (HistogramOfShifts(), {"max_bins": [1]}, "no numeric parameter"),
+        (HistogramOfShifts(), {"sigma": []}, "at least one value"),
+        (AnchorPoints(), {"weight": [1.0]}, "window, tolerance"),
+        (AggregatedScore(), {"sigma": [1.0]}, "no numeric parameter"),
+    ],
+)
+def test_wrong_axes_are_named(matches, scorer, axes, words):
+    with pytest.raises(ValueError, match=words):
+        score_grid(scorer, matches, **axes)
+
+
+@given(st.lists(st.sampled_from([0.0, 1.0, 2.5, -1.0, np.nan, np.inf, -np.inf]), min_size=1, max_size=12), st.data())
+def test_rank_is_stable_with_nan_and_masked_last(scores, data):
+    mask = data.draw(st.lists(st.booleans(), min_size=len(scores), max_size=len(scores)))
+    got = rank(jnp.array(scores, jnp.float32), jnp.array(mask))
+    assert got.dtype == jnp.int32
+    assert list(np.asarray(got)) == oracles.rank(scores, mask)
+
+
+def test_rank_takes_batches_and_defaults_to_no_mask():
+    scores = jnp.array([[1.0, 3.0, 2.0], [5.0, 5.0, 9.0]])
+    np.testing.assert_array_equal(rank(scores), [[1, 2, 0], [2, 0, 1]])
+    ranking = rerank(scores)
+    np.testing.assert_array_equal(ranking.order, rank(scores))
+    np.testing.assert_array_equal(ranking.scores, scores)
+
+
+def test_combined_score_spans_plain_to_filter_order():
+    rng = np.random.default_rng(1)
+    filter_scores, scores = jnp.array(rng.random(20), jnp.float32), jnp.array(rng.random(20), jnp.float32)
+    np.testing.assert_array_equal(rank(combine(filter_scores, scores, c=0.0)), rank(scores))
+    np.testing.assert_array_equal(rank(combine(filter_scores, scores)), rank(filter_scores))
+    np.testing.assert_allclose(combine(filter_scores, scores, c=3.0), oracles.combine(filter_scores, scores, 3.0), 1e-6)
+
+
+def test_balancing_c_equalizes_the_spread_of_real_candidates():
+    filter_scores = jnp.array([0.5, 0.7, 0.9, 77.0])
+    scores = jnp.array([10.0, 50.0, 30.0, np.nan])
+    mask = jnp.array([True, True, True, False])
+    c = balancing_c(filter_scores, scores, mask)
+    np.testing.assert_allclose(c * np.std(filter_scores[:3]), np.std(scores[:3]), rtol=1e-6)
+    assert balancing_c(jnp.ones(4), scores, mask) == 0.0

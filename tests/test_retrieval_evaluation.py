@@ -1,0 +1,77 @@
+"""Shortlists, positives and recall."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mfvpr import frame_positives, radius_positives, recall_at_k, retrieve
+from tests import oracles
+from tests.builders import unit
+
+
+def test_shortlist_is_the_exact_order():
+    rng = np.random.default_rng(0)
+    queries, database = unit(rng.normal(size=(5, 8))), unit(rng.normal(size=(30, 8)))
+    shortlist = retrieve(queries, database, num_candidates=7)
+    similarity = queries.astype(np.float64) @ database.T.astype(np.float64)
+    np.testing.assert_array_equal(shortlist.indices, np.argsort(-similarity, axis=1, kind="stable")[:, :7])
+    np.testing.assert_allclose(shortlist.scores, -np.sort(-similarity, axis=1)[:, :7], atol=1e-6)
+    assert shortlist.mask.all()
+
+
+def test_shortlist_deeper_than_the_database_ends_in_minus_one():
+    shortlist = retrieve(np.eye(2, dtype=np.float32), np.eye(2, dtype=np.float32), num_candidates=4)
+    np.testing.assert_array_equal(shortlist.indices, [[0, 1, -1, -1], [1, 0, -1, -1]])
+    np.testing.assert_array_equal(shortlist.mask.sum(1), [2, 2])
+
+
+def test_a_descriptor_that_is_not_finite_never_appears():
+    database = np.eye(3, dtype=np.float32)
+    database[1] = np.nan
+    queries = np.array([[0, 0, 1], [np.nan, 0, 0]], np.float32)
+    shortlist = retrieve(queries, database, num_candidates=3)
+    np.testing.assert_array_equal(shortlist.indices, [[2, 0, -1], [-1, -1, -1]])
+    masked = retrieve(queries[:1], database, num_candidates=3, mask=np.array([True, True, False]))
+    np.testing.assert_array_equal(masked.indices, [[0, -1, -1]])
+
+
+@given(st.lists(st.integers(-1, 9), min_size=1, max_size=8), st.integers(1, 10), st.integers(0, 5))
+def test_frame_positives(queries, num_database, tolerance):
+    got = frame_positives(np.array(queries), np.arange(num_database), tolerance=tolerance)
+    expected = oracles.frame_positives(queries, range(num_database), tolerance)
+    expected[np.array(queries) < 0] = False  # unknown place
+    np.testing.assert_array_equal(got, expected)
+
+
+def test_radius_is_inclusive_and_keeps_centimeters_at_utm_size():
+    database = np.array([[4_400_000.00, 500_000.00], [4_400_025.00, 500_000.00], [4_400_025.02, 500_000.00]])
+    np.testing.assert_array_equal(radius_positives(database[:1], database), [[True, True, False]])
+    rng = np.random.default_rng(1)
+    queries, places = rng.uniform(0, 100, (20, 2)), rng.uniform(0, 100, (30, 2))
+    expected = oracles.radius_positives(queries, places, 25.0)
+    np.testing.assert_array_equal(radius_positives(queries, places), expected)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 6))
+def test_recall(seed, depth):
+    rng = np.random.default_rng(seed)
+    order = np.stack([rng.permutation(9)[:depth] for _ in range(5)])
+    order[rng.random(order.shape) < 0.2] = -1
+    positives = rng.random((5, 9)) < 0.2
+    ks = [1, 2, 5, 100]
+    np.testing.assert_allclose(recall_at_k(order, positives, ks), oracles.recall_at_k(order, positives, ks))
+
+
+def test_a_query_without_positives_counts_as_a_failure():
+    positives = np.array([[True, False], [False, False]])
+    np.testing.assert_array_equal(recall_at_k(np.array([[0, 1], [0, 1]]), positives, [1, 2]), [0.5, 0.5])
+
+
+@pytest.mark.parametrize("depth, expected", [(1, 87.7), (2, 92.6)])
+def test_recall_is_k_over_n_as_the_paper_prints_it(depth, expected):
+    """Berlin A100 has 81 queries: every printed recall is a multiple of 1/81 (facts 1.4)."""
+    right = round(expected / 100 * 81)
+    positives = np.arange(81)[:, None] < right
+    order = np.zeros((81, depth), int)
+    assert round(100 * recall_at_k(order, positives, [depth])[0], 1) == expected
