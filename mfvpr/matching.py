@@ -5,8 +5,9 @@ rows and columns, and the first place of each) and never stored for more than on
 read it the same number of times and take several times longer on XLA's CPU backend.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -68,9 +69,34 @@ def match_candidates(
     Returns:
         Matches with leading axis C and K = N0 slots.
     """
-    chunk_size = chunk_size or (1 if jax.default_backend() == "cpu" else len(candidates.mask))
     one = lambda candidate: match(query, candidate, cross_check=cross_check)  # noqa: E731
-    return jax.lax.map(one, candidates, batch_size=None if chunk_size == 1 else chunk_size)
+    return _chunked_map(one, candidates, len(candidates.mask), chunk_size)
+
+
+def match_shortlist(
+    query: Features,
+    database: Features,
+    indices: Array,
+    *,
+    cross_check: CrossCheck = "mutual",
+    chunk_size: int | None = None,
+) -> Matches:
+    """`match` of one query with the rows `indices` `[C]` of a database `[M, N1, ...]`; -1 gives no matches.
+
+    The same as `match_candidates` of the rows gathered, without the copy of their descriptors.
+    """
+
+    def one(index: Array) -> Matches:
+        candidate = jax.tree.map(lambda field: field[jnp.maximum(index, 0)], database)
+        candidate = replace(candidate, mask=candidate.mask & (index >= 0))
+        return match(query, candidate, cross_check=cross_check)
+
+    return _chunked_map(one, indices, len(indices), chunk_size)
+
+
+def _chunked_map(function: Callable, items: Any, count: int, chunk_size: int | None) -> Matches:
+    chunk_size = chunk_size or (1 if jax.default_backend() == "cpu" else count)
+    return jax.lax.map(function, items, batch_size=None if chunk_size == 1 else chunk_size)
 
 
 def filter_matches(

@@ -1,0 +1,56 @@
+"""OpenCV SIFT as RootSIFT (Lowe, IJCV 2004; Arandjelovic & Zisserman, CVPR 2012): local features without a download."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from mfvpr.data.images import Interpolation
+from mfvpr.types import Features
+
+
+@dataclass(frozen=True)
+class Sift:
+    """RootSIFT of the gray image, 128 dimensions; scores are the detector's responses (of order 0.01 to 0.2).
+
+    Attributes:
+        image_size: (width, height) px.
+        interpolation: see `mfvpr.data.images.resize`.
+        max_keypoints: the strongest are kept.
+        contrast_threshold: OpenCV's; lower finds more in dark and foggy images.
+        clahe_clip: clip limit of local histogram equalization before detection; 0 turns it off.
+    """
+
+    image_size: tuple[int, int] = (336, 336)
+    interpolation: Interpolation = "pil_bilinear"
+    max_keypoints: int = 800
+    contrast_threshold: float = 0.02
+    clahe_clip: float = 3.0
+    batch_size: int = 8
+
+    def __call__(self, images: np.ndarray) -> list[Features]:
+        """Features of each image `[B, H, W, 3]` uint8 RGB."""
+        return [self._extract(image) for image in images]
+
+    def _extract(self, image: np.ndarray) -> Features:
+        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        if self.clahe_clip > 0:
+            gray = cv2.createCLAHE(self.clahe_clip, (8, 8)).apply(gray)
+        detector = cv2.SIFT_create(nfeatures=self.max_keypoints, contrastThreshold=self.contrast_threshold)
+        found, descriptors = detector.detectAndCompute(gray, None)
+        scores = np.array([keypoint.response for keypoint in found], np.float32)
+        strongest = np.argsort(-scores, kind="stable")[: self.max_keypoints]  # OpenCV keeps ties beyond the limit
+        keypoints = np.array([keypoint.pt for keypoint in found], np.float32).reshape(-1, 2)
+        descriptors = np.zeros((0, 128), np.float32) if descriptors is None else descriptors
+        return Features(
+            keypoints=keypoints[strongest],
+            descriptors=_root(descriptors[strongest]),
+            scores=scores[strongest],
+            mask=np.ones(len(strongest), bool),
+            image_size=np.array(gray.shape[::-1], np.float32),
+        )
+
+
+def _root(descriptors: np.ndarray) -> np.ndarray:
+    """RootSIFT: the square root of L1-normalized SIFT has unit Euclidean length."""
+    return np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12))
