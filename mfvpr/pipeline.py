@@ -187,9 +187,9 @@ def fuse(candidates: Shortlist, scores: np.ndarray, c: float | None) -> np.ndarr
     return np.asarray(_fuse(candidates.scores, scores, candidates.mask, c))
 
 
-def ranked_rows(candidates: Shortlist, scores: np.ndarray) -> np.ndarray:
-    """Database rows `[Q, C]`, best first, -1 = none."""
-    return np.take_along_axis(candidates.indices, np.asarray(_rank(scores, candidates.mask)), axis=1)
+def rank(candidates: Shortlist, scores: np.ndarray) -> np.ndarray:
+    """Positions `[Q, C]` into the shortlist, best first, those without a candidate last."""
+    return np.asarray(_rank(scores, candidates.mask))
 
 
 _retrieve = jax.jit(retrieval.retrieve, static_argnames="num_candidates")

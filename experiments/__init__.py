@@ -1,0 +1,1 @@
+"""The programs: settings -> plain values -> mfvpr.pipeline."""

@@ -1,0 +1,133 @@
+"""Checks every setting before any work, and before anything slow is imported.
+
+Hydra knows which settings exist and of which type the file had them; what a value means is known here.
+"""
+
+import math
+import numbers
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+
+class SettingsError(Exception):
+    """A setting that cannot be used; one line that names it, what was expected, and what was got."""
+
+
+class Rule(NamedTuple):
+    """What a setting must be, in code and in words."""
+
+    holds: Callable[[Any], bool]
+    expected: str
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _one_of(*choices: Any) -> Rule:
+    return Rule(lambda value: any(value is c or (value == c and type(value) is type(c)) for c in choices),
+                "one of " + ", ".join("null" if c is None else str(c).lower() if isinstance(c, bool) else str(c)
+                                      for c in choices))  # fmt: skip
+
+
+def _or(rule: Rule, *choices: Any) -> Rule:
+    other = _one_of(*choices)
+    words = other.expected.removeprefix("one of ")
+    return Rule(lambda value: rule.holds(value) or other.holds(value), f"{rule.expected}, or {words}")
+
+
+def _list_of(rule: Rule, length: int | None = None) -> Rule:
+    def holds(value: Any) -> bool:
+        return (
+            isinstance(value, list)
+            and (len(value) == length if length else bool(value))
+            and all(map(rule.holds, value))
+        )
+
+    return Rule(holds, f"a list of {length or 'one or more'}, each {rule.expected}")
+
+
+_POSITIVE = Rule(lambda value: _is_number(value) and value > 0, "a number above 0")
+_NOT_NEGATIVE = Rule(lambda value: _is_number(value) and value >= 0, "a number not below 0")
+_COUNT = Rule(lambda value: _is_count(value) and value > 0, "a whole number above 0")
+_INDEX = Rule(lambda value: _is_count(value) and value >= 0, "a whole number not below 0")
+_TEXT = Rule(lambda value: isinstance(value, str) and bool(value), "text")
+_FLAG = _one_of(True, False)
+_WEIGHT = _one_of("fs", "dmf", "unit")
+
+RULES: dict[str, Rule] = {
+    "name": _TEXT,
+    # data
+    "kind": _one_of("streets", "folder"),
+    "seed": _INDEX,
+    "cache": _TEXT,
+    "root": _TEXT,
+    "database": _TEXT,
+    "queries": _TEXT,
+    "ground_truth": _one_of("order", "index", "utm", "none"),
+    "index_file": _or(_TEXT, None),
+    # features and filter
+    "image_size": _list_of(_COUNT, 2),
+    "interpolation": _one_of("pil_bilinear", "pil_bicubic", "cv2_linear", "cv2_area"),
+    "max_keypoints": _COUNT,
+    "contrast_threshold": _POSITIVE,
+    "clahe_clip": _NOT_NEGATIVE,
+    "num_words": _COUNT,
+    "power": _POSITIVE,
+    "max_samples": _COUNT,
+    "candidates": _or(_COUNT, "all"),
+    # matching
+    "cross_check": _one_of("mutual", "opencv_legacy", "none"),
+    "max_distance": _or(_POSITIVE, None),
+    "max_matches": _or(_COUNT, None),
+    "chunk_size": _or(_COUNT, None),
+    # scores
+    "method": _one_of("count", "sum", "anchor", "histogram"),
+    "weight": _WEIGHT,
+    "mean": _one_of("unweighted", "weighted", "median"),
+    "clamp": _FLAG,
+    "num_bins": _COUNT,
+    "window": _POSITIVE,
+    "tolerance": _POSITIVE,
+    "window_mode": _one_of("half_floor", "asymmetric", "odd_down", "radius"),
+    "first": _one_of("query", "candidate"),
+    "include_self": _FLAG,
+    "cell_weight": _one_of("winner_sum", "cell_sum", "ones"),
+    "bin_size": _POSITIVE,
+    "sigma": _POSITIVE,
+    "truncate": _or(_POSITIVE, math.inf),
+    "shift_range": _or(_list_of(_POSITIVE, 2), None),
+    "align": _one_of("min_edge", "zero_center", "zero_edge"),
+    "sigma_is_variance": _FLAG,
+    "direction": _one_of("candidate_minus_query", "query_minus_candidate"),
+    "max_bins": _or(_COUNT, None),
+    "c": _or(_NOT_NEGATIVE, "auto"),
+    # report
+    "tolerances": _list_of(_INDEX),
+    "radius": _POSITIVE,
+    "ks": _list_of(_COUNT),
+    "on_bad_image": _one_of("fail", "skip"),
+    "figures": _INDEX,
+    "out": _or(_TEXT, None),
+}
+
+
+def check(settings: Mapping[str, Any]) -> None:
+    """Raise a SettingsError for the first value that its rule does not allow."""
+    for path, value in _leaves(settings, ""):
+        rule = RULES[path.rpartition(".")[2]]
+        if not rule.holds(value):
+            shown = "null" if value is None else value
+            raise SettingsError(f"{path}={shown}: expected {rule.expected}")
+
+
+def _leaves(settings: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
