@@ -50,7 +50,8 @@ def dataset(settings: dict[str, Any], progress: Callable[[int, int], None]) -> D
 def local_extractor(settings: dict[str, Any]) -> LocalExtractor:
     """What finds local features."""
     options = {name: value for name, value in settings.items() if name != "name"}
-    return Sift(**options | {"image_size": tuple(settings["image_size"])})
+    options["image_size"] = tuple(options["image_size"])
+    return Sift(**options)
 
 
 def global_extractor(settings: dict[str, Any], database: Sequence[Features]) -> GlobalExtractor:

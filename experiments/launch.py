@@ -5,13 +5,14 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
 import hydra
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from omegaconf.errors import OmegaConfBaseException
 
 from experiments.settings import SettingsError, check
 
@@ -22,19 +23,31 @@ def launch(program: Callable[[dict[str, Any]], None]) -> None:
     """`program(settings)` with the settings of conf/ and the command line, as plain and checked values."""
 
     def task(config: DictConfig) -> None:
-        settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-        check(settings)  # pyright: ignore[reportArgumentType]
-        program(settings)  # pyright: ignore[reportArgumentType]
+        with _one_line():  # in here, or Hydra adds lines of its own
+            for name in sorted(OmegaConf.missing_keys(config)):
+                raise SettingsError(_no_default(name))
+            settings: Any = OmegaConf.to_container(config, resolve=True)
+            check(settings)
+            program(settings)
 
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises instead of printing and exiting with 1
-    try:
+    with _one_line():
+        for argument in sys.argv[1:]:
+            if argument.startswith(("+", "~")):
+                raise SettingsError(f"{argument}: settings can be set, not added or removed; write name=value")
         hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(task)()
+
+
+@contextmanager
+def _one_line() -> Iterator[None]:
+    try:
+        yield
     except KeyboardInterrupt:
         print("interrupted; nothing half-written was left", file=sys.stderr)
         sys.exit(130)
-    except MissingMandatoryValue as error:
-        name = getattr(error, "full_key", None) or "a setting"
-        _refuse(f"{name}: this setting has no default; give {name}=VALUE")
+    except BrokenPipeError:  # whoever read our output has left: `| head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)
     except (HydraException, OmegaConfBaseException) as error:
         _refuse(_explain(error))
     except SettingsError as error:
@@ -54,30 +67,41 @@ def _refuse(reason: str) -> NoReturn:
 
 def _explain(error: Exception) -> str:
     """One line of a Hydra message, with the nearest setting where one is unknown."""
-    text = " ".join(str(error).split())
+    text = " ".join((str(error) or str(error.__cause__)).split())
+    text = text.partition(" Config search path")[0].partition(" See https")[0]
+    if missing := re.search(r"Missing mandatory value: ([\w.]+)", text):
+        return _no_default(missing[1])
     unknown = re.search(r"Could not override '([^']*)'", text) or re.search(r"Key '([^']*)' is not in struct", text)
-    if unknown:
-        wrong = unknown.group(1)
-        names = list(_setting_names())
-        nearest = difflib.get_close_matches(wrong, names, n=1, cutoff=0.4)
-        return f"{wrong}: unknown setting" + (f"; the nearest is {nearest[0]}" if nearest else "; see --help")
-    return text
+    if not unknown:
+        return text
+    wrong = unknown.group(1)
+    nearest = max(_setting_names(), key=lambda name: _likeness(wrong, name), default="")
+    return f"{wrong}: unknown setting" + (f"; the nearest is {nearest}" if nearest else "; see --help")
 
 
-def _setting_names() -> Iterator[str]:
+def _no_default(name: str) -> str:
+    return f"{name}: this setting has no default; give {name}=VALUE"
+
+
+def _likeness(wrong: str, name: str) -> tuple[float, float]:
+    """How alike two dotted names are: their last parts first, then all."""
+    pairs = ((wrong.rpartition(".")[2], name.rpartition(".")[2]), (wrong, name))
+    last, whole = (difflib.SequenceMatcher(None, *pair).ratio() for pair in pairs)
+    return last, whole
+
+
+def _setting_names() -> list[str]:
     """Every setting of the configuration that the command line's groups choose."""
     groups = [path.name for path in CONF.iterdir() if path.is_dir()]
     choices = [argument for argument in sys.argv[1:] if argument.partition("=")[0] in groups]
-    try:
-        with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-            config = hydra.compose("config", choices)
-    except HydraException:
-        return
-    pending = [("", config)]
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        config = hydra.compose("config", choices)
+    names, pending = [], [("", config)]
     while pending:
         prefix, node = pending.pop()
         for name in node:
+            names.append(f"{prefix}{name}")
             child = node._get_node(name)
-            yield f"{prefix}{name}"
             if isinstance(child, DictConfig) and not child._is_missing():
                 pending.append((f"{prefix}{name}.", child))
+    return names

@@ -248,11 +248,13 @@ def _figures(
     for query in build.track("figures")(shown, len(shown)):
         pair = dataset.queries.paths[query], dataset.database.paths[best[query]]
         images = [resize(read_image(path), extractor.image_size, extractor.interpolation) for path in pair]
+        matched = matches[query]
         position = int(np.flatnonzero(candidates.indices[query] == best[query])[0])
         histogram_figure(
             folder / "figures" / f"{verdicts[query].replace(' ', '_')}_{query:04d}.png",
-            *images,
-            jax.tree.map(lambda field: field[position], matches[query]),  # noqa: B023
+            images[0],
+            images[1],
+            jax.tree.map(lambda field: field[position], matched),  # noqa: B023
             scorer,
             title=f"{name}, {verdicts[query]}: {dataset.queries.names[query]} -> {dataset.database.names[best[query]]}",
         )

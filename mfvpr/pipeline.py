@@ -239,6 +239,8 @@ def _image_batches(
     track: Track,
 ) -> Iterator[tuple[list[int], np.ndarray]]:
     """(rows, images `[B, H, W, 3]`) of the readable images; the reasons of the others go into `bad`."""
+    if extractor.image_size is None:
+        raise ValueError(f"{type(extractor).__name__} reads no images")
     load = partial(_load, size=extractor.image_size, interpolation=extractor.interpolation)
 
     def readable() -> Iterator[tuple[int, np.ndarray]]:

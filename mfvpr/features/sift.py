@@ -17,15 +17,15 @@ class Sift:
         image_size: (width, height) px.
         interpolation: see `mfvpr.data.images.resize`.
         max_keypoints: the strongest are kept.
-        contrast_threshold: OpenCV's; lower finds more in dark and foggy images.
+        contrast_threshold: lower finds more in dark and foggy images.
         clahe_clip: clip limit of local histogram equalization before detection; 0 turns it off.
     """
 
     image_size: tuple[int, int] = (336, 336)
     interpolation: Interpolation = "pil_bilinear"
     max_keypoints: int = 800
-    contrast_threshold: float = 0.02
-    clahe_clip: float = 3.0
+    contrast_threshold: float = 0.04
+    clahe_clip: float = 0.0
     batch_size: int = 8
 
     def __call__(self, images: np.ndarray) -> list[Features]:
@@ -36,7 +36,7 @@ class Sift:
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         if self.clahe_clip > 0:
             gray = cv2.createCLAHE(self.clahe_clip, (8, 8)).apply(gray)
-        detector = cv2.SIFT_create(nfeatures=self.max_keypoints, contrastThreshold=self.contrast_threshold)
+        detector = cv2.SIFT_create(self.max_keypoints, contrastThreshold=self.contrast_threshold)  # pyright: ignore
         found, descriptors = detector.detectAndCompute(gray, None)
         scores = np.array([keypoint.response for keypoint in found], np.float32)
         strongest = np.argsort(-scores, kind="stable")[: self.max_keypoints]  # OpenCV keeps ties beyond the limit

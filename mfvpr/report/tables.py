@@ -8,10 +8,11 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Table:
-    """A header and rows of text; the first column is left-aligned, the others right."""
+    """A header and rows of text; the first `text_columns` are left-aligned, the numbers after them right."""
 
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
+    text_columns: int = 1
 
     def text(self) -> str:
         """For the terminal."""
@@ -21,7 +22,7 @@ class Table:
 
     def markdown(self) -> str:
         """GitHub's."""
-        rule = [":--", *["--:"] * (len(self.header) - 1)]
+        rule = [":--"] * self.text_columns + ["--:"] * (len(self.header) - self.text_columns)
         escaped = ([cell.replace("|", "\\|") for cell in row] for row in (self.header, rule, *self.rows))
         return "".join(f"| {' | '.join(row)} |\n" for row in escaped)
 
@@ -34,16 +35,16 @@ class Table:
     def latex(self) -> str:
         """A `tabular` for the booktabs package."""
         lines = [" & ".join(map(_latex_escaped, row)) + r" \\" for row in (self.header, *self.rows)]
-        columns = "l" + "r" * (len(self.header) - 1)
+        columns = "l" * self.text_columns + "r" * (len(self.header) - self.text_columns)
         body = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule", lines[0], r"\midrule", *lines[1:], r"\bottomrule"]
         return "\n".join([*body, r"\end{tabular}", ""])
 
     def _aligned(self, row: Sequence[str], widths: Sequence[int]) -> str:
-        first, *others = (
-            cell.rjust(width) if place else cell.ljust(width)
+        cells = (
+            cell.ljust(width) if place < self.text_columns else cell.rjust(width)
             for place, (cell, width) in enumerate(zip(row, widths, strict=True))
         )
-        return "  ".join([first, *others]).rstrip()
+        return "  ".join(cells).rstrip()
 
 
 def _latex_escaped(cell: str) -> str:

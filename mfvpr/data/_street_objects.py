@@ -1,0 +1,196 @@
+"""Flat drawings of what stands between the houses: ground, trees, lamps, signs, cars, and the sky behind all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mfvpr.data._street_textures import (
+    ACCENTS,
+    Color,
+    Image,
+    Rng,
+    Sheet,
+    Weather,
+    as_array,
+    blotches,
+    draw_glyphs,
+    pick,
+    tone,
+)
+
+
+def draw_ground(rng: Rng, half_width: float, length: float) -> Sheet:
+    """A strip of the street seen from above: y runs against the driving direction."""
+    sheet = Sheet(2 * half_width, length, (164, 158, 148), scale=24)
+    middle = half_width
+    for y in np.arange(0, length, 1.0):  # slabs of the sidewalk
+        sheet.rect(0, y, 2 * middle, 0.05, (136, 130, 122))
+    for x in np.arange(0, 2 * middle, 1.0):
+        sheet.rect(x, 0, 0.05, length, (136, 130, 122))
+    sheet.rect(middle - 4.4, 0, 8.8, length, (196, 192, 184))
+    sheet.rect(middle - 4.2, 0, 8.4, length, (98, 98, 102))
+    for _ in range(rng.integers(0, 3)):  # patches and manholes
+        x, y = rng.uniform((middle - 3.8, 0), (middle + 2, length - 2))
+        sheet.rect(x, y, rng.uniform(0.6, 1.8), rng.uniform(0.8, 2.0), tone((98, 98, 102), rng.uniform(0.75, 1.15)))
+        sheet.ellipse(middle + rng.uniform(-3, 3), y, 0.35, 0.35, (70, 68, 66))
+    for y in np.arange(0, length, 4.0):
+        sheet.rect(middle - 0.08, y, 0.16, 2.2, (222, 220, 210))
+    if rng.random() < 0.15:
+        for x in np.arange(-3.8, 3.8, 1.0):
+            sheet.rect(middle + x, length / 2 - 1.5, 0.5, 3.0, (226, 224, 216))
+    weather_ground(sheet, rng)
+    return sheet
+
+
+def weather_ground(sheet: Sheet, rng: Rng) -> None:
+    """Grain and stains on the strip, and snow that is thinner where wheels have passed."""
+    shape = sheet.day.shape[:2]
+    fade = np.sin(np.linspace(0, np.pi, shape[0]))[:, None]  # no stain may end at the edge of a strip
+    grain = 0.03 * rng.standard_normal(shape, np.float32)
+    sheet.shade((1 + grain + 0.05 * fade * blotches(rng, shape, 30))[..., None])
+    x = np.linspace(-sheet.width / 2, sheet.width / 2, shape[1])
+    ruts = sum(np.exp(-(((x - rut) / 0.24) ** 4)) for rut in (-2.7, -1.2, 1.2, 2.7))
+    sheet.extra[..., 3] = np.clip(235 - 110 * ruts + 18 * fade * blotches(rng, shape, 10), 0, 250)
+
+
+def draw_tree(rng: Rng, width: float, height: float) -> Sheet:
+    """A tree in leaf: trunk, branches and a round crown of many dabs."""
+    sheet = Sheet(width, height, None)
+    middle, bark = width / 2, (88, 68, 54)
+    sheet.line([(middle, height), (middle + 0.1, 0.45 * height)], 0.28, bark)
+    for x in rng.uniform(0.25, 0.75, 5) * width:
+        sheet.line([(middle, 0.62 * height), (x, 0.25 * height)], 0.1, bark)
+    leaf = tone((92, 132, 62), rng.uniform(0.8, 1.1))
+    for angle, radius in zip(rng.uniform(0, 2 * np.pi, 700), np.sqrt(rng.random(700)), strict=True):
+        x, y = middle + radius * 0.42 * width * np.cos(angle), 0.34 * height * (1 + 0.85 * radius * np.sin(angle))
+        light = 1.15 - 0.5 * y / (0.68 * height) + rng.uniform(-0.1, 0.1)
+        size = rng.uniform(0.07, 0.2)
+        sheet.ellipse(x, y, size, 0.8 * size, tone(leaf, light), snow=int(rng.uniform(120, 220) * min(1.0, light)))
+    return sheet
+
+
+def draw_shadow() -> Sheet:
+    """What a car or a tree darkens of the ground below it."""
+    sheet = Sheet(2.0, 2.0, None)
+    sheet.ellipse(1.0, 1.0, 1.0, 1.0, (66, 66, 70), snow=60)
+    return sheet
+
+
+def draw_lamp() -> Sheet:
+    """A street lamp."""
+    sheet = Sheet(1.0, 5.2, None)
+    sheet.rect(0.44, 0.6, 0.12, 4.6, (52, 58, 56))
+    sheet.rect(0.38, 4.3, 0.24, 0.9, (52, 58, 56))
+    sheet.polygon([(0.22, 0.1), (0.78, 0.1), (0.66, 0.75), (0.34, 0.75)], (226, 222, 204), (255, 236, 190))
+    sheet.polygon([(0.15, 0.14), (0.85, 0.14), (0.5, 0.0)], (52, 58, 56), snow=240)
+    return sheet
+
+
+def draw_sign(rng: Rng) -> Sheet:
+    """A traffic sign on its post: round, triangular or square."""
+    sheet = Sheet(0.9, 2.9, None)
+    sheet.rect(0.41, 0.4, 0.08, 2.5, (120, 122, 124))
+    kind = rng.integers(3)
+    if kind == 0:
+        sheet.ellipse(0.45, 0.45, 0.42, 0.42, (186, 40, 36))
+        sheet.ellipse(0.45, 0.45, 0.32, 0.32, (240, 238, 232))
+    elif kind == 1:
+        sheet.polygon([(0.0, 0.85), (0.9, 0.85), (0.45, 0.05)], (186, 40, 36))
+        sheet.polygon([(0.16, 0.76), (0.74, 0.76), (0.45, 0.25)], (240, 238, 232))
+    else:
+        sheet.rect(0.05, 0.05, 0.8, 0.8, (36, 78, 150))
+    draw_glyphs(sheet, rng, 0.3, 0.32, 0.4, 0.36, (30, 30, 34) if kind < 2 else (240, 238, 232))
+    return sheet
+
+
+def draw_hedge(rng: Rng, width: float, height: float) -> Sheet:
+    """A garden hedge."""
+    sheet = Sheet(width, height, None)
+    for x, y in rng.uniform((0.1, 0.15), (width - 0.1, height), (500, 2)):
+        light = 1.15 - 0.4 * y / height + rng.uniform(-0.2, 0.2)
+        sheet.ellipse(x, y, 0.17, 0.14, tone((80, 118, 60), light), snow=int(150 * light))
+    return sheet
+
+
+@dataclass(frozen=True)
+class Body:
+    """Shape of a car, in meters: heights of hood and roof; where the glass starts and the roof starts, per end."""
+
+    length: float
+    width: float
+    hood: float
+    roof: float
+    rear: tuple[float, float]
+    front: tuple[float, float]
+
+
+BODIES = (
+    Body(4.3, 1.75, 0.92, 1.45, (0.15, 0.7), (1.3, 2.1)),
+    Body(4.6, 1.8, 0.95, 1.42, (0.7, 1.3), (1.3, 2.1)),
+    Body(5.4, 2.0, 1.15, 2.5, (0.02, 0.06), (0.8, 1.5)),
+)
+
+
+def draw_car_side(rng: Rng, body: Body, paint: Color) -> Sheet:
+    """The car from its right side: it drives to the right."""
+    sheet = Sheet(body.length, body.roof, None)
+    length, waist = body.length, body.roof - body.hood
+    low, high = body.rear
+    nose, brow = length - body.front[0], length - body.front[1]
+    sheet.polygon([(low, waist), (high, 0), (brow, 0), (nose, waist)], tone(paint, 0.9), snow=90)
+    sheet.rect(0, waist, length, body.hood - 0.22, paint)
+    if body.roof < 2:
+        inner = [(low + 0.25, waist), (high + 0.08, 0.1), (brow - 0.05, 0.1), (nose - 0.2, waist)]
+        sheet.polygon(inner, (44, 54, 64))
+        sheet.rect(length * 0.48, 0.1, 0.08, waist, paint)
+    else:
+        draw_glyphs(sheet, rng, 0.5, 0.5, 2.6, 0.7, pick(rng, ACCENTS))
+        sheet.polygon([(brow - 1.0, 0.3), (brow, 0.3), (nose - 0.2, waist), (brow - 1.0, waist)], (44, 54, 64))
+    sheet.rect(0, body.roof - 0.4, length, 0.12, tone(paint, 0.6))
+    for x in (0.85, length - 0.85):
+        sheet.ellipse(x, body.roof - 0.33, 0.33, 0.33, (30, 30, 32))
+        sheet.ellipse(x, body.roof - 0.33, 0.18, 0.18, (170, 172, 176))
+    return sheet
+
+
+def draw_car_end(body: Body, paint: Color, lights: Color, glow: Color) -> Sheet:
+    """Rear or front below the glass, with its lights and plate."""
+    sheet = Sheet(body.width, body.hood - 0.2, tone(paint, 0.94))
+    sheet.rect(0, sheet.height - 0.22, body.width, 0.22, (48, 48, 52))
+    sheet.rect(body.width / 2 - 0.28, 0.32, 0.56, 0.14, (236, 232, 214))
+    for x in (0.08, body.width - 0.4):
+        sheet.rect(x, 0.12, 0.32, 0.18, lights, glow)
+    return sheet
+
+
+def draw_car_top(paint: Color) -> Sheet:
+    """Roof, hood and trunk."""
+    sheet = Sheet(1.0, 1.0, tone(paint, 1.1))
+    sheet.extra[..., 3] = 235
+    return sheet
+
+
+def draw_car_glass(body: Body, paint: Color) -> Sheet:
+    """The rear window or windshield with its frame."""
+    sheet = Sheet(body.width, body.roof - body.hood, paint)
+    sheet.rect(0.12, 0.08, body.width - 0.24, min(0.8, sheet.height - 0.12), (48, 58, 68))
+    return sheet
+
+
+def draw_backdrop(rng: Rng, weather: Weather) -> Image:
+    """Sky, clouds and a far skyline, directly in the colors of the weather; the horizon is the lower edge."""
+    rows, columns = shape = (256, 1024)
+    height = np.linspace(1, 0, rows, dtype=np.float32)[:, None, None]
+    zenith, horizon = as_array(weather.zenith), as_array(weather.horizon)
+    sky = np.broadcast_to(horizon + (zenith - horizon) * height**0.6, (rows, columns, 3)).copy()
+    cloud = sum(blotches(rng, shape, cell) * cell / 90 for cell in (90.0, 45.0, 20.0))
+    cover = np.clip(cloud * 0.7, 0, 1)[..., None] * np.clip(height * 4, 0, 1)
+    sky += cover * 0.7 * (as_array(tone(weather.horizon, 1.15)) - sky)
+    for layer, gain in ((0.16, 0.92), (0.10, 0.8)):
+        bumps = 0.35 * blotches(rng, (1, columns), 60) + 0.1 * blotches(rng, (1, columns), 8)
+        ridge = rows * (1 - layer * (1 + bumps))
+        hill = np.arange(rows)[:, None] > ridge
+        sky[hill] = as_array(tone(weather.horizon, gain)) * as_array((0.92, 1.0, 0.98))
+    return np.dstack([np.clip(sky, 0, 255).astype(np.uint8), np.full(shape, 255, np.uint8)])

@@ -1,0 +1,75 @@
+"""RootSIFT and VLAD."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mfvpr import InputError
+from mfvpr.features.sift import Sift
+from mfvpr.features.vlad import Vlad, fit_vlad
+from tests import oracles
+from tests.builders import make_features, unit
+
+
+@pytest.fixture
+def image():
+    noise = np.random.default_rng(0).integers(0, 256, (42, 42, 3), dtype=np.uint8)
+    return cv2.resize(noise, (336, 336), interpolation=cv2.INTER_CUBIC)
+
+
+def test_rootsift_is_opencvs_sift_with_the_square_root(image):
+    (features,) = Sift(max_keypoints=200)(image[None])
+    found, descriptors = cv2.SIFT_create(200).detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
+    by_place = {tuple(k.pt): (d, k.response) for k, d in zip(found, descriptors, strict=True)}
+    assert 100 < len(features.mask) <= 200
+    assert features.mask.all()
+    np.testing.assert_array_equal(features.image_size, [336, 336])
+    np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1, rtol=1e-5)
+    assert (np.diff(features.scores) <= 0).all()
+    places = [tuple(map(float, point)) for point in features.keypoints]
+    unique = [k for k, place in enumerate(places) if places.count(place) == 1]
+    assert len(unique) > 50
+    for k in unique:
+        descriptor, response = by_place[places[k]]
+        np.testing.assert_allclose(features.descriptors[k] ** 2, descriptor / descriptor.sum(), rtol=1e-4, atol=1e-7)
+        assert features.scores[k] == np.float32(response)
+
+
+def test_an_image_without_keypoints_gives_empty_features():
+    (features,) = Sift()(np.full((1, 336, 336, 3), 128, np.uint8))
+    assert features.keypoints.shape == (0, 2)
+    assert features.descriptors.shape == (0, 128)
+    assert features.scores.shape == (0,)
+
+
+def test_clahe_finds_more_in_the_dark(image):
+    dark = (image // 16)[None]
+    assert len(Sift(clahe_clip=3.0)(dark)[0].mask) > 1.2 * len(Sift()(dark)[0].mask)
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0, 1, 7, 40]), st.sampled_from([0.5, 1.0]))
+def test_vlad_agrees_with_the_oracle(seed, count, power):
+    rng = np.random.default_rng(seed)
+    centers = rng.normal(size=(5, 16)).astype(np.float32)
+    features = make_features(rng, count, capacity=44)
+    (got,) = Vlad(centers, power)(None, [features])
+    expected = oracles.vlad(features.descriptors[features.mask], centers, power)
+    np.testing.assert_allclose(got, expected, atol=2e-5)
+
+
+def test_vocabulary_is_reproducible_and_finds_clusters():
+    rng = np.random.default_rng(1)
+    true = unit(rng.normal(size=(4, 16)))
+    members = unit(np.repeat(true, 50, axis=0) + 0.01 * rng.normal(size=(200, 16)))
+    features = make_features(rng, 200)
+    features.descriptors[:] = members
+    one, two = (fit_vlad([features], num_words=4, seed=0) for _ in range(2))
+    np.testing.assert_array_equal(one.centers, two.centers)
+    assert (np.linalg.norm(one.centers[:, None] - true, axis=-1).min(axis=0) < 0.05).all()
+
+
+def test_fewer_features_than_words_is_the_users_to_mend():
+    with pytest.raises(InputError, match="num_words=64"):
+        fit_vlad([make_features(np.random.default_rng(2), 10)])
