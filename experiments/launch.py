@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import hydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from experiments.settings import SettingsError, check
 
+PATHS = {"database", "queries", "root", "index_file", "cache", "out"}
 CONF = Path(__file__).parent.parent / "conf"
 
 
@@ -35,7 +37,25 @@ def launch(program: Callable[[dict[str, Any]], None]) -> None:
         for argument in sys.argv[1:]:
             if argument.startswith(("+", "~")):
                 raise SettingsError(f"{argument}: settings can be set, not added or removed; write name=value")
+        sys.argv[1:] = map(_as_typed, sys.argv[1:])
         hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(task)()
+
+
+def _as_typed(argument: str) -> str:
+    """A setting quoted for Hydra where its grammar would not take the value as it was typed (paths, mostly)."""
+    name, equals, value = argument.partition("=")
+    is_path = name.rpartition(".")[2] in PATHS and value not in ("", "null") and value[0] not in "'\""
+    if not equals or argument.startswith("-") or not (is_path or _unparsable(argument)):
+        return argument
+    return f"{name}='{value.replace(chr(39), chr(92) + chr(39))}'"
+
+
+def _unparsable(argument: str) -> bool:
+    try:
+        OverridesParser.create().parse_override(argument)
+    except HydraException:
+        return True
+    return False
 
 
 @contextmanager

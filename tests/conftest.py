@@ -1,8 +1,12 @@
 """Strict arithmetic for every test: no silent rank promotion, warnings are errors (pyproject.toml)."""
 
+from pathlib import Path
+
 import jax
 import pytest
 from hypothesis import settings
+
+from mfvpr.data.streets import streets_folder
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -31,3 +35,9 @@ _compilations = Compilations()
 def compilations() -> Compilations:
     _compilations.reset()
     return _compilations
+
+
+@pytest.fixture(scope="session")
+def small_street(tmp_path_factory) -> Path:
+    """Ten frames of the drawn street: database/, queries/, ground_truth.csv."""
+    return streets_folder(tmp_path_factory.mktemp("cache"), num_frames=10, image_size=(320, 240))

@@ -17,14 +17,14 @@ class Sift:
         image_size: (width, height) px.
         interpolation: see `mfvpr.data.images.resize`.
         max_keypoints: the strongest are kept.
-        contrast_threshold: lower finds more in dark and foggy images.
+        contrast_threshold: OpenCV's; low, so that dark images reach `max_keypoints` as well.
         clahe_clip: clip limit of local histogram equalization before detection; 0 turns it off.
     """
 
     image_size: tuple[int, int] = (336, 336)
     interpolation: Interpolation = "pil_bilinear"
     max_keypoints: int = 800
-    contrast_threshold: float = 0.04
+    contrast_threshold: float = 0.01
     clahe_clip: float = 0.0
     batch_size: int = 8
 

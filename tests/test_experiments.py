@@ -1,0 +1,221 @@
+"""The programs as a user meets them: settings, mistakes, the demo's table, a run folder."""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import hydra
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+from PIL import Image
+
+from experiments import settings
+from experiments.launch import CONF
+from experiments.settings import SettingsError
+
+ROOT = Path(__file__).parent.parent
+
+
+def run(*arguments, cwd=ROOT, **environment):
+    return subprocess.run(
+        [sys.executable, "-m", "experiments.evaluate", *map(str, arguments)],
+        cwd=cwd, capture_output=True, text=True, timeout=280,
+        env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
+    )  # fmt: skip
+
+
+def composed(*overrides):
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        return OmegaConf.to_container(hydra.compose("config", list(overrides)), resolve=True)
+
+
+def folder(street, *more):
+    index = ("dataset.ground_truth=index", f"dataset.index_file={street}/ground_truth.csv")
+    return ("dataset=folder", f"dataset.database={street}/database", f"dataset.queries={street}/queries", *index, *more)
+
+
+QUICK = ("figures=1", "features.max_keypoints=100", "retrieval.num_words=8")
+CHOICES = [
+    (group.name, choice.stem)
+    for group in sorted(CONF.iterdir())
+    if group.is_dir()
+    for choice in sorted(group.glob("*"))
+]
+
+
+@pytest.mark.parametrize(("group", "choice"), CHOICES)
+def test_every_conf_composes_and_passes_its_own_checks(group, choice):
+    paths = {"folder": ["dataset.database=a", "dataset.queries=b"]}
+    needs = paths.get(choice, ["dataset.root=r"] if choice in ("grief_season", "corridor") else [])
+    settings.check(composed(f"{group}={choice}", *needs))
+
+
+def test_scorers_of_conf_are_the_papers():
+    from experiments import build
+    from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, MatchCount
+
+    expected = {
+        "count": MatchCount(),
+        "sum": AggregatedScore(),
+        "anchor": AnchorPoints(),
+        "histogram": HistogramOfShifts(),
+    }
+    assert build.scorers(composed()["scorer"]) == expected
+
+
+@pytest.mark.parametrize("value", [0, -1, float("nan"), float("inf"), "abc", None, True, [1]])
+@pytest.mark.parametrize("name", ["scorer.histogram.sigma", "scorer.histogram.bin_size", "scorer.anchor.tolerance"])
+def test_values_without_meaning_are_refused(name, value):
+    config = OmegaConf.create(composed())
+    OmegaConf.update(config, name, value)
+    with pytest.raises(SettingsError, match=f"{name}=.*expected a number above 0"):
+        settings.check(OmegaConf.to_container(config))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["scorer.sgma=3"], "scorer.sgma: unknown setting; the nearest is scorer.histogram.sigma"),
+        (["scorer=histogram", "scorer.sgma=3"], "the nearest is scorer.sigma"),
+        (["candidats=3"], "the nearest is candidates"),
+        (["scorer=histgram"], "Could not find 'scorer/histgram'"),
+        (["scorer=histogram", "scorer.sigma=nan"], "scorer.sigma=nan: expected a number above 0"),
+        (["candidates=0"], "candidates=0: expected a whole number above 0, or all"),
+        (["features.image_size=[336]"], "features.image_size=[336]: expected a list of 2"),
+        (["dataset=folder"], "dataset.database: this setting has no default; give dataset.database=VALUE"),
+        (["dataset=grief_season"], "dataset.root: this setting has no default"),
+        (["+new=1"], "+new=1: settings can be set, not added"),
+        (["dataset=folder", "dataset.database=nope", "dataset.queries=nope"], "nope: expected a folder of images"),
+        (["word"], "Error parsing override 'word'"),
+        (["scorer=histogram", "scorer.bin_size=[1,2"], "scorer.bin_size=[1,2: expected a number above 0"),
+        (["out=README.md"], "README.md: expected a new or empty run folder"),
+    ],
+)
+def test_mistakes_are_one_line_and_exit_code_2(arguments, words):
+    done = run(*arguments)
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert done.stdout == ""
+
+
+def test_bad_images_by_policy(small_street, tmp_path):
+    """Names with spaces, unicode and '@' in a parent folder; one image broken, one without keypoints."""
+    root = tmp_path / "a@b, c's" / "ü"
+    for name in ("database", "queries"):
+        (root / name).mkdir(parents=True)
+        for path in sorted((small_street / name).iterdir()):
+            (root / name / f"é {path.name}").write_bytes(path.read_bytes())
+    (root / "database" / "é 0003.png").write_bytes(b"")
+    Image.new("RGB", (30, 30)).save(root / "queries" / "é 0005.png")
+    arguments = ["dataset=folder", f"dataset.database={root}/database", f"dataset.queries={root}/queries", *QUICK,
+                 "candidates=99", f"out={tmp_path}/out"]  # fmt: skip
+
+    failed = run(*arguments)
+    assert failed.returncode == 2
+    assert "é 0003.png: expected an image file, got 0 bytes" in failed.stderr.splitlines()[-1]
+    assert "Traceback" not in failed.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a@b, c's"]
+
+    passed = run(*arguments, "on_bad_image=skip")
+    assert passed.returncode == 0, passed.stderr
+    assert "candidates=99: the database has 10 images" in passed.stderr
+    with (tmp_path / "out" / "skipped.csv").open() as file:
+        assert [(row["folder"], row["image"]) for row in csv.DictReader(file)] == [("database", "é 0003.png")]
+    with (tmp_path / "out" / "predictions.csv").open() as file:
+        rows = {row["query"]: row for row in csv.DictReader(file)}
+    assert len(rows) == 10
+    assert all("é 0003.png" not in list(row.values())[1:] for row in rows.values())
+    assert rows["é 0005.png"]["score_1"] == "0"
+
+    again = run(*arguments, "on_bad_image=skip")
+    assert again.returncode == 2
+    assert "expected a new or empty run folder" in again.stderr
+
+
+def test_rankings_without_ground_truth(small_street, tmp_path):
+    done = run(*folder(small_street, "dataset.ground_truth=none", "scorer=anchor", *QUICK, f"out={tmp_path}/out"))
+    assert done.returncode == 0, done.stderr
+    assert "no ground truth: rankings only" in done.stdout
+    rows = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert [row["system"] for row in rows] == ["filter", "anchor", "anchor + filter"]
+    assert all(row["recall_at"] == {} for row in rows)
+    assert (tmp_path / "out" / "figures").is_dir()
+
+
+def test_one_evaluation_compiles_at_most_six_programs(small_street, tmp_path, monkeypatch, compilations, capsys):
+    from experiments import run as program
+
+    monkeypatch.chdir(tmp_path)
+    common = folder(small_street, "figures=0", "features.max_keypoints=120", "retrieval.num_words=8", "candidates=7")
+    program.evaluate(composed(*common))
+    assert 1 <= compilations.count <= 6
+    compilations.reset()
+    others = ["scorer.histogram.sigma=9", "scorer.histogram.bin_size=14.5", "scorer.anchor.tolerance=2",
+              "scorer.anchor.window=6", "fusion.c=auto"]  # fmt: skip
+    program.evaluate(composed(*common, *others))
+    assert compilations.count == 0
+    assert len(list((tmp_path / "runs" / "folder").iterdir())) == 2
+
+
+@pytest.fixture(scope="session")
+def demo(tmp_path_factory):
+    """`make demo` after its installation, with an empty cache."""
+    root = tmp_path_factory.mktemp("demo")
+    done = run(cwd=root, MFVPR_CACHE=str(root / "cache"))
+    assert done.returncode == 0, done.stderr
+    (folder,) = (root / "runs" / "streets").iterdir()
+    return done, folder
+
+
+def test_demo_ranks_histogram_above_count_above_filter(demo):
+    _, folder = demo
+    rows = json.loads((folder / "results.json").read_text())
+    recall = {(row["system"], row["tolerance"]): row["recall_at"]["1"] for row in rows}
+    for tolerance in (1, 2, 5):
+        assert recall["histogram", tolerance] > recall["count", tolerance] > recall["filter", tolerance]
+
+
+def test_demo_prints_its_table_and_leaves_a_run_folder(demo):
+    done, folder = demo
+    systems = ["filter", "count", "sum", "anchor", "histogram", "histogram + filter"]
+    header, _, *lines = done.stdout[done.stdout.index("system") :].splitlines()[:8]
+    assert [line[:20].strip() for line in lines] == systems
+    assert header.split("  ")[0] == "system"
+    assert folder.name in done.stdout
+    for bar in ("drawing streets", "database features", "matching", "scores", "figures"):
+        assert bar in done.stderr
+
+    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert {"results.json", "table.md", "table.csv", "table.tex", "predictions.csv"} <= files
+    figures = [path for path in files if path.startswith("figures/")]
+    assert {name.split("/")[1].split("_")[0] for name in figures} == {"right", "wrong"}
+    for name in figures:
+        image = np.asarray(Image.open(folder / name).convert("L"))
+        assert image.shape[0] > 300
+        assert image.std() > 20
+    with (folder / "table.csv").open() as file:
+        assert [row[0] for row in csv.reader(file)] == ["system", *systems]
+    with (folder / "predictions.csv").open() as file:
+        first = next(csv.DictReader(file))
+    assert first["query"] == "0000.png"
+    scores = [float(first[f"score_{place}"]) for place in range(1, 51)]
+    assert scores == sorted(scores, reverse=True)
+
+
+def test_results_say_what_made_them(demo):
+    _, folder = demo
+    rows = json.loads((folder / "results.json").read_text())
+    assert len(rows) == 18
+    for row in rows:
+        assert set(row["recall_at"]) == {"1", "5", "10"}
+        assert (row["queries"], row["database"], row["candidates"]) == (100, 100, 50)
+        assert {"data", "features", "filter", "matching", "scores"} <= set(row["seconds"])
+        assert {"mfvpr", "jax", "numpy"} <= set(row["versions"])
+        assert len(row["data_fingerprint"]) == 16
+    histogram = next(row for row in rows if row["system"] == "histogram")
+    assert histogram["parameters"]["sigma"] == 22.5

@@ -1,0 +1,55 @@
+"""Imports run downwards only, and each foreign library stays in its room (the ground plan of the README)."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+# What each room may import of mfvpr. Rooms not named stand on everything.
+ALLOWED = {
+    "errors": set(),
+    "numerics": set(),
+    "types": set(),
+    "weighting": {"numerics", "types"},
+    "matching": {"numerics", "types"},
+    "scoring": {"numerics", "types", "weighting", "scoring"},
+    "retrieval": {"numerics", "types"},
+    "reranking": {"numerics", "types", "scoring"},
+    "evaluation": set(),
+    "data": {"errors", "evaluation", "types", "data"},
+    "features": {"errors", "types", "data", "features"},
+    "report": {"errors", "types", "weighting", "scoring", "data", "report"},
+}
+HOMES = {
+    "cv2": {"data", "features"},
+    "PIL": {"data"},
+    "matplotlib": {"report"},
+    "hydra": set(),
+    "omegaconf": set(),
+    "torch": set(),
+    "tqdm": set(),
+}
+MODULES = sorted((ROOT / "mfvpr").rglob("*.py"))
+
+
+def imports(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield from ([f"mfvpr.{alias.name}" for alias in node.names] if node.module == "mfvpr" else [node.module])
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_imports_run_downwards(path):
+    room = path.relative_to(ROOT / "mfvpr").parts[0].removesuffix(".py")
+    for name in imports(path):
+        top, _, rest = name.partition(".")
+        assert room in HOMES.get(top, {room}), f"{name} does not belong in {room}"
+        if top == "mfvpr" and room in ALLOWED:
+            assert rest.partition(".")[0] in ALLOWED[room], f"{room} must not import {name}"
+
+
+def test_there_is_something_to_check():
+    assert len(MODULES) > 20

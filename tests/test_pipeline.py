@@ -1,0 +1,167 @@
+"""The way over a data set, stage by stage, on a drawn street and on broken images."""
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+
+import mfvpr
+from mfvpr import pipeline
+from mfvpr.data.datasets import folder_dataset, image_folder
+from mfvpr.errors import InputError
+from mfvpr.features.sift import Sift
+from mfvpr.features.vlad import fit_vlad
+from tests import oracles
+from tests.builders import real
+
+SIFT = Sift(max_keypoints=400)
+
+
+@pytest.fixture(scope="module")
+def street(small_street):
+    return folder_dataset(small_street / "database", small_street / "queries")
+
+
+@pytest.fixture(scope="module")
+def features(street):
+    return pipeline.extract(street.database, SIFT), pipeline.extract(street.queries, SIFT)
+
+
+@pytest.fixture(scope="module")
+def candidates(street, features):
+    database, queries = features
+    vlad = fit_vlad([database[row] for row in range(len(database))], num_words=8)
+    described = [pipeline.describe(f, s, vlad) for f, s in ((street.queries, queries), (street.database, database))]
+    return pipeline.shortlist(*described, 6)
+
+
+@pytest.fixture(scope="module")
+def matches(features, candidates):
+    return pipeline.match(features[1], features[0], candidates)
+
+
+def test_matches_are_those_of_every_pair(features, candidates, matches):
+    database, queries = features
+    for query in (0, 7):
+        padded = matches[query]
+        assert padded.mask.shape == (6, matches.capacity)
+        for place, row in enumerate(candidates.indices[query]):
+            alone = mfvpr.match(queries[query], database[row])
+            pair = jax.tree.map(lambda field, place=place: field[place], padded)
+            for got, expected in zip(real(pair), real(alone), strict=True):
+                np.testing.assert_allclose(got, expected, atol=1e-6)
+
+
+def test_scores_are_those_of_the_oracle(candidates, matches):
+    scorers = {"histogram": mfvpr.HistogramOfShifts(), "anchor": mfvpr.AnchorPoints(), "sum": mfvpr.AggregatedScore()}
+    scores = pipeline.score(scorers, matches, candidates)
+    for place in range(6):
+        points0, points1, distance, s0, s1 = real(jax.tree.map(lambda field, p=place: field[p], matches[3]))
+        size, weights = (336, 336), s0 + s1
+        expected = {
+            "histogram": oracles.histogram_score(points1 - points0, weights, size, size),
+            "anchor": oracles.anchor_points(points0, points1, weights, size, size),
+            "sum": oracles.aggregated_score(points1 - points0, oracles.dmf_weight(distance), size),
+        }
+        for name, value in expected.items():
+            np.testing.assert_allclose(scores[name][3, place], value, rtol=1e-4)
+
+
+def test_the_street_is_recognized(street, candidates, matches):
+    scores = pipeline.score({"h": mfvpr.HistogramOfShifts()}, matches, candidates)["h"]
+    rows = np.take_along_axis(candidates.indices, pipeline.rank(candidates, scores), axis=1)
+    assert mfvpr.recall_at_k(rows, street.truth.positives(1), [1])[0] >= 0.8
+
+
+def test_fusion_with_a_constant_and_balanced(candidates, matches):
+    scores = pipeline.score({"count": mfvpr.MatchCount()}, matches, candidates)["count"]
+    np.testing.assert_allclose(pipeline.fuse(candidates, scores, 10.0), 10 * candidates.scores + scores, rtol=1e-5)
+    added = pipeline.fuse(candidates, scores, None) - scores
+    np.testing.assert_allclose(added.std(axis=1), scores.std(axis=1), rtol=1e-3)
+
+
+def test_capacity_of_matches_is_the_largest_pair(features, candidates, matches):
+    assert matches.capacity % 64 == 0
+    assert matches.counts.max() <= matches.capacity < matches.counts.max() + 64
+    few = pipeline.match(features[1], features[0], candidates, max_matches=10, max_distance=0.9)
+    assert few.counts.max() <= 10
+    assert few.capacity == 64
+
+
+@pytest.fixture
+def mixed(tmp_path, small_street):
+    """A good image, an empty one, a truncated one, one without keypoints."""
+    good = Image.open(small_street / "database" / "0000.png")
+    good.save(tmp_path / "0.png")
+    (tmp_path / "1.png").write_bytes(b"")
+    good.save(tmp_path / "2.jpg")
+    (tmp_path / "2.jpg").write_bytes((tmp_path / "2.jpg").read_bytes()[:900])
+    Image.new("RGB", (50, 40), (9, 9, 9)).save(tmp_path / "3.png")
+    good.save(tmp_path / "4.png")
+    return image_folder(tmp_path)
+
+
+def test_bad_images_fail_by_default_with_the_mend(mixed):
+    with pytest.raises(InputError, match=r"1\.png.*0 bytes.*on_bad_image=skip"):
+        pipeline.extract(mixed, SIFT)
+
+
+def test_skipped_images_are_listed_and_never_shortlisted(mixed):
+    found = pipeline.extract(mixed, SIFT, skip_bad=True)
+    assert sorted(found.bad) == [1, 2]
+    assert not found.features.mask[[1, 2, 3]].any()
+    descriptors = pipeline.describe(mixed, found, fit_vlad([found[0]], num_words=4))
+    candidates = pipeline.shortlist(descriptors, descriptors, 5)
+    np.testing.assert_array_equal(candidates.indices[0], [0, 4, 3, -1, -1])
+    np.testing.assert_array_equal(candidates.indices[1], [-1] * 5)
+    matches = pipeline.match(found, found, candidates)
+    scores = pipeline.score({"h": mfvpr.HistogramOfShifts(), "a": mfvpr.AnchorPoints()}, matches, candidates)
+    for values in scores.values():
+        assert values[0, 0] == values[0, 1] > 0
+        assert values[0, 2] == 0.0  # no keypoints, no matches
+        assert np.isnan(values[0, 3:]).all()
+        np.testing.assert_array_equal(pipeline.rank(candidates, values)[0], range(5))
+
+
+def test_only_bad_images_are_an_error_even_when_skipped(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"")
+    with pytest.raises(InputError, match=r"none of 1 images can be used; the first: .*a\.png"):
+        pipeline.extract(image_folder(tmp_path), SIFT, skip_bad=True)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_features_that_are_not_finite_are_named_and_rank_last(street, value):
+    class Broken:
+        image_size, interpolation, batch_size = SIFT.image_size, SIFT.interpolation, 3
+        calls = 0
+
+        def __call__(self, images):
+            found = SIFT(images)
+            if Broken.calls == 0:
+                found[1].descriptors[5, 3] = value
+            Broken.calls += 1
+            return found
+
+    found = pipeline.extract(street.database, Broken())
+    assert list(found.bad) == [1]
+    assert "0001.png" in found.bad[1]
+    descriptors = pipeline.describe(street.database, found, fit_vlad([found[0]], num_words=4))
+    candidates = pipeline.shortlist(descriptors, descriptors, 10)
+    assert (candidates.indices != 1).all()
+
+
+def test_numbers_cost_no_compilation_within_a_capacity(features, candidates, matches, compilations):
+    def scores(sigma, bin_size, window, tolerance):
+        scorers = {
+            "histogram": mfvpr.HistogramOfShifts(sigma=sigma, bin_size=bin_size),
+            "anchor": mfvpr.AnchorPoints(window=window, tolerance=tolerance),
+        }
+        return pipeline.score(scorers, matches, candidates)
+
+    first = scores(22.5, 15.0, 10, 3.0)  # 672 px in 45 bins: a capacity of 48
+    compilations.reset()
+    second = scores(10, 14.5, 4, 1)
+    assert compilations.count == 0
+    assert all((first[name] != second[name]).any() for name in first)
+    scores(10, 13.0, 4, 1)  # 52 bins: the next capacity, one program more
+    assert compilations.count == 1
