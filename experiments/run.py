@@ -81,7 +81,7 @@ def evaluate(settings: dict[str, Any]) -> None:
     shown = scorers.get("histogram", HistogramOfShifts())
     with runs.writing(folder) as new:
         _write(new, dataset, rows, table, systems, database, queries)
-        _figures(new, settings["figures"], dataset, extractor, systems, shown, matches, candidates)  # type: ignore[arg-type]
+        _figures(new, settings, dataset, extractor, systems, shown, matches, candidates)  # type: ignore[arg-type]
     print(f"\n{_heading(dataset, settings, candidates)}\n\n{table.text()}\nresults: {folder}")
 
 
@@ -163,8 +163,7 @@ def _result_rows(
     thresholds: list[tuple[dict[str, float], np.ndarray | None]] = [({}, None)]
     if dataset.truth:
         name = "tolerance" if dataset.truth.unit == "frames" else "radius"
-        values = settings["recall"]["tolerances"] if name == "tolerance" else [settings["recall"]["radius"]]
-        thresholds = [({name: value}, dataset.truth.positives(value)) for value in values]
+        thresholds = [({name: value}, dataset.truth.positives(value)) for value in _thresholds(settings, dataset)]
 
     def recall(rows: np.ndarray, positives: np.ndarray | None) -> dict[str, float]:
         if positives is None:
@@ -177,6 +176,12 @@ def _result_rows(
         for name, system in systems.items()
         for threshold, positives in thresholds
     ]  # fmt: skip
+
+
+def _thresholds(settings: dict[str, Any], dataset: Dataset) -> list[float]:
+    """What counts as right, in the unit of the ground truth."""
+    in_frames = dataset.truth is not None and dataset.truth.unit == "frames"
+    return settings["recall"]["tolerances"] if in_frames else [settings["recall"]["radius"]]
 
 
 def _table(rows: list[dict[str, Any]]) -> Table:
@@ -231,33 +236,42 @@ def _headline(systems: dict[str, System]) -> str:
 
 
 def _figures(
-    folder: Path, number: int, dataset: Dataset, extractor: LocalExtractor, systems: dict[str, System],
+    folder: Path, settings: dict[str, Any], dataset: Dataset, extractor: LocalExtractor, systems: dict[str, System],
     scorer: HistogramOfShifts, matches: MatchSet, candidates: Shortlist,
 ) -> None:  # fmt: skip
     """The paper's figure for a few queries, right and wrong ones, spread over the sequence."""
     name = _headline(systems)
     best = systems[name].rows[:, 0]
-    shown = _spread(np.flatnonzero(best >= 0), number)
-    verdicts = dict.fromkeys(shown, "ranked first")
-    if dataset.truth:
-        positives = dataset.truth.positives(25 if dataset.truth.unit == "m" else 2)
-        right = positives[np.arange(len(best)), np.maximum(best, 0)] & (best >= 0)
-        wrong = ~right & (best >= 0)
-        shown = [*_spread(np.flatnonzero(right), (number + 1) // 2), *_spread(np.flatnonzero(wrong), number // 2)]
-        verdicts = {query: "right" if right[query] else "wrong" for query in shown}
-    for query in build.track("figures")(shown, len(shown)):
-        pair = dataset.queries.paths[query], dataset.database.paths[best[query]]
-        images = [resize(read_image(path), extractor.image_size, extractor.interpolation) for path in pair]
-        matched = matches[query]
-        position = int(np.flatnonzero(candidates.indices[query] == best[query])[0])
+    verdicts = _shown(best, settings, dataset)
+    queries, database = dataset.queries, dataset.database
+    for query, verdict in build.track("figures")(verdicts.items(), len(verdicts)):
+        paths = queries.paths[query], database.paths[best[query]]
+        images = [resize(read_image(path), extractor.image_size, extractor.interpolation) for path in paths]
+        place = int(np.flatnonzero(candidates.indices[query] == best[query])[0])
         histogram_figure(
-            folder / "figures" / f"{verdicts[query].replace(' ', '_')}_{query:04d}.png",
+            folder / "figures" / f"{verdict.split()[0]}_{query:04d}.png",
             images[0],
             images[1],
-            jax.tree.map(lambda field: field[position], matched),  # noqa: B023
+            jax.tree.map(lambda field: field[place], matches[query]),  # noqa: B023
             scorer,
-            title=f"{name}, {verdicts[query]}: {dataset.queries.names[query]} -> {dataset.database.names[best[query]]}",
+            title=f"{name}, {verdict}: {queries.names[query]} -> {database.names[best[query]]}",
         )
+
+
+def _shown(best: np.ndarray, settings: dict[str, Any], dataset: Dataset) -> dict[int, str]:
+    """Queries that get a figure, with what became of them: half right, half wrong where that can be told."""
+    number, found = settings["figures"], best >= 0
+    if dataset.truth is None:
+        return dict.fromkeys(_spread(np.flatnonzero(found), number), "first")
+    threshold = _thresholds(settings, dataset)
+    positives = dataset.truth.positives(threshold[len(threshold) // 2])
+    right = positives[np.arange(len(best)), np.maximum(best, 0)] & found
+    shown = dict.fromkeys(_spread(np.flatnonzero(right), (number + 1) // 2), "right")
+    for query in _spread(np.flatnonzero(found & ~right), number // 2):
+        places = np.flatnonzero(positives[query])
+        true = dataset.database.names[places[len(places) // 2]] if len(places) else "not in the database"
+        shown[query] = f"wrong (truth: {true})"
+    return shown
 
 
 def _spread(items: np.ndarray, number: int) -> list[int]:

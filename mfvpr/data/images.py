@@ -32,13 +32,14 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-def read_image(path: Path) -> np.ndarray:
+def read_image(path: Path | str) -> np.ndarray:
     """`[H, W, 3]` uint8 RGB.
 
     Raises:
         InputError: not a regular file, empty, not an image, truncated, or over 64 megapixels (refused from the
             header, before anything is decoded).
     """
+    path = Path(path)
     _check_file(path)
     try:
         with Image.open(path) as image:

@@ -1,0 +1,79 @@
+"""The README is run, not believed."""
+
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from experiments.settings import RULES
+from tests.test_experiments import QUICK, ROOT, run
+
+README = (ROOT / "README.md").read_text()
+BLOCKS = re.findall(r"```(\w+)\n(.*?)```", README, flags=re.DOTALL)
+COMMANDS = [line for language, block in BLOCKS if language == "sh" for line in block.splitlines()]
+
+
+def test_commands_are_of_the_kinds_checked_here():
+    assert {line.split()[0] for line in COMMANDS} == {"make", "python", "."}
+
+
+@pytest.mark.parametrize("target", [line.split()[1] for line in COMMANDS if line.startswith("make")])
+def test_make_targets_exist(target):
+    done = subprocess.run(["make", "--dry-run", target], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("command", [line for line in COMMANDS if "experiments.evaluate" in line])
+def test_commands_run(command, small_street, tmp_path):
+    root = tmp_path / "root"
+    shutil.copytree(small_street, root)
+    shutil.copytree(root / "database", root / "ref")  # corridor's names
+    shutil.copytree(root / "queries", root / "query")
+    arguments = shlex.split(command.removeprefix("python -m experiments.evaluate"))
+    places = {"database": root / "database", "queries": root / "queries", "root": root}
+    folders = {f"dataset.{name}=DIR": f"dataset.{name}={path}" for name, path in places.items()}
+    arguments = [folders.get(argument, argument) for argument in arguments]
+    if not any(argument.startswith("dataset=") for argument in arguments):  # streets would take longer
+        arguments += ["dataset=folder", *list(folders.values())[:2]]
+    done = run(*arguments, *QUICK, cwd=tmp_path) if "--help" not in arguments else run("--help")
+    assert done.returncode == 0, done.stderr
+    assert "Settings" in done.stdout or "histogram" in done.stdout or "anchor" in done.stdout
+
+
+def test_benchmark_runs(tmp_path):
+    out = tmp_path / "benchmark.json"
+    done = subprocess.run(
+        [sys.executable, "-m", "experiments.benchmark", "--rounds", "1", "--out", out],
+        cwd=ROOT, capture_output=True, text=True, timeout=280,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    for step in ("matching", "matching + histogram", "histogram", "anchor", "sum"):
+        assert re.search(rf"^{re.escape(step)} +mfvpr", done.stdout, flags=re.MULTILINE)
+    assert out.is_file()
+
+
+@pytest.mark.parametrize("code", [block for language, block in BLOCKS if language == "python"])
+def test_library_example(code, small_street, tmp_path, monkeypatch, capsys):
+    assert len([line for line in code.splitlines() if line.strip() and "import" not in line]) <= 10
+    shutil.copy(small_street / "queries" / "0004.png", tmp_path / "query.jpg")
+    shutil.copy(small_street / "database" / "0004.png", tmp_path / "candidate.jpg")
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "README.md", "exec"), {})
+    printed = capsys.readouterr().out
+    for name in ("HistogramOfShifts", "AnchorPoints", "AggregatedScore", "candidate minus query"):
+        assert name in printed
+
+
+def test_settings_that_the_text_names_exist():
+    names = re.findall(r"`(?:[\w.]+\.)?(\w+)=[^`(]*`", README)
+    assert len(names) > 20
+    assert set(names) - {"sigma", "out"} <= RULES.keys()
+
+
+def test_readme_names_no_machine_path():
+    assert not re.search(r"/(work|tmp|root|home)/", README)
+    assert Path(ROOT / "LICENSE").read_text().startswith("MIT")
