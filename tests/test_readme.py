@@ -71,7 +71,7 @@ def test_library_example(code, small_street, tmp_path, monkeypatch, capsys):
 def test_settings_that_the_text_names_exist():
     names = re.findall(r"`(?:[\w.]+\.)?(\w+)=[^`(]*`", README)
     assert len(names) > 20
-    assert set(names) - {"sigma", "out"} <= RULES.keys()
+    assert set(names) <= RULES.keys()
 
 
 def test_readme_names_no_machine_path():
