@@ -12,9 +12,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-CANDIDATES, KEYPOINTS, DIMENSION, COMMON = 50, 700, 512, 300
-SIZE = 336
-BIN, SIGMA = 15.0, 22.5
 QUICK = 0.05  # seconds
 
 
@@ -60,6 +57,7 @@ def report(entries: list, seconds: list[list[float]], data: Any, arguments: argp
     import jax
     import numpy as np
 
+    from experiments.contestants import CANDIDATES, DIMENSION, KEYPOINTS
     from mfvpr.data.files import write_text
     from mfvpr.report.runs import versions
     from mfvpr.report.tables import Table

@@ -15,8 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import mfvpr
-from experiments.benchmark import BIN, CANDIDATES, COMMON, DIMENSION, KEYPOINTS, SIGMA, SIZE
 from mfvpr.types import Features, Matches
+
+CANDIDATES, KEYPOINTS, DIMENSION = 50, 700, 512
+COMMON = 300  # keypoints that a candidate shares with the query
+SIZE, BIN, SIGMA = 336, 15.0, 22.5  # px
 
 Entry = tuple[str, str, Callable[[], Any]]
 
