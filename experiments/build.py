@@ -1,12 +1,16 @@
 """Checked settings -> the library's values. Plain tables of names; nothing of a user's YAML is ever called."""
 
+import math
+import os
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
 import mfvpr
+from experiments.settings import SettingsError
 from mfvpr.data.datasets import Dataset, folder_dataset
 from mfvpr.data.streets import streets_folder
 from mfvpr.features import GlobalExtractor, LocalExtractor
@@ -21,7 +25,7 @@ WEIGHTS = {
     "dmf": mfvpr.DescriptorDistanceWeight(),
     "unit": mfvpr.UnitWeight(),
 }
-SCORERS: dict[str, Callable[..., Scorer]] = {
+SCORERS: dict[str, type] = {
     "count": mfvpr.MatchCount,
     "sum": mfvpr.AggregatedScore,
     "anchor": mfvpr.AnchorPoints,
@@ -29,21 +33,26 @@ SCORERS: dict[str, Callable[..., Scorer]] = {
 }
 
 
+def expanded(path: str) -> Path:
+    """A path with ~ resolved, where there is such a user."""
+    return Path(os.path.expanduser(path))
+
+
 def dataset(settings: dict[str, Any], progress: Callable[[int, int], None]) -> Dataset:
     """The data set; `streets` is drawn first where the cache does not have it."""
-    if settings["kind"] == "streets":
-        root = streets_folder(Path(settings["cache"]).expanduser(), seed=settings["seed"], progress=progress)
+    if "cache" in settings:
+        root = streets_folder(expanded(settings["cache"]), seed=settings["seed"], progress=progress)
         return folder_dataset(
             root / "database", root / "queries", name="streets", ground_truth="index",
             index_file=root / "ground_truth.csv",
         )  # fmt: skip
     index_file = settings["index_file"]
     return folder_dataset(
-        Path(settings["database"]).expanduser(),
-        Path(settings["queries"]).expanduser(),
+        expanded(settings["database"]),
+        expanded(settings["queries"]),
         name=settings["name"],
         ground_truth=settings["ground_truth"],
-        index_file=Path(index_file).expanduser() if index_file else None,
+        index_file=expanded(index_file) if index_file else None,
     )
 
 
@@ -62,6 +71,9 @@ def global_extractor(settings: dict[str, Any], database: Sequence[Features]) -> 
 def scorers(settings: dict[str, Any]) -> dict[str, Scorer]:
     """The chosen scorer, or all of a group, by name."""
     chosen = {settings["method"]: settings} if "method" in settings else settings
+    for name, values in chosen.items():
+        if values["method"] != name:
+            raise SettingsError(f"scorer.{name}.method={values['method']}: expected {name}; choose with scorer={name}")
     return {name: _scorer(values) for name, values in chosen.items()}
 
 
@@ -81,4 +93,12 @@ def _scorer(settings: dict[str, Any]) -> Scorer:
         options["weight"] = WEIGHTS[options["weight"]]
     if options.get("shift_range"):
         options["shift_range"] = tuple(map(float, options["shift_range"]))
-    return SCORERS[settings["method"]](**options)
+    if options.get("truncate", 0) is None:
+        options["truncate"] = math.inf
+    scorer = SCORERS[settings["method"]]
+    foreign = options.keys() - {field.name for field in fields(scorer)}
+    if foreign:
+        raise SettingsError(
+            f"scorer: {settings['method']} has no {', '.join(sorted(foreign))}; choose one scorer, or scorer=all"
+        )
+    return scorer(**options)

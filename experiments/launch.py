@@ -3,6 +3,7 @@
 import difflib
 import os
 import re
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -32,13 +33,30 @@ def launch(program: Callable[[dict[str, Any]], None]) -> None:
             check(settings)
             program(settings)
 
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # unwinds, so that temporary files go
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises instead of printing and exiting with 1
     with _one_line():
         for argument in sys.argv[1:]:
-            if argument.startswith(("+", "~")):
-                raise SettingsError(f"{argument}: settings can be set, not added or removed; write name=value")
+            _check_form(argument)
         sys.argv[1:] = map(_as_typed, sys.argv[1:])
         hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(task)()
+
+
+def _check_form(argument: str) -> None:
+    """Refuse what is no setting, in words of our own rather than of Hydra's grammar."""
+    name, equals, value = argument.partition("=")
+    if argument.startswith(("+", "~")):
+        raise SettingsError(f"{argument}: settings can be set, not added or removed; write name=value")
+    if argument.startswith("-"):
+        return
+    if not equals:
+        raise SettingsError(f"{argument}: expected name=value; put quotes around values with spaces")
+    choices = sorted(path.stem for path in (CONF / name).glob("*.yaml")) if name.isidentifier() else []
+    for choice in value.split(",") if choices else []:
+        if choice not in choices:
+            nearest = difflib.get_close_matches(choice, choices, n=1)
+            hint = f"; the nearest is {nearest[0]}" if nearest else ""
+            raise SettingsError(f"{argument}: expected one of {', '.join(choices)}{hint}")
 
 
 def _as_typed(argument: str) -> str:
@@ -47,7 +65,9 @@ def _as_typed(argument: str) -> str:
     is_path = name.rpartition(".")[2] in PATHS and value not in ("", "null") and value[0] not in "'\""
     if not equals or argument.startswith("-") or not (is_path or _unparsable(argument)):
         return argument
-    return f"{name}='{value.replace(chr(39), chr(92) + chr(39))}'"
+    for special in ("\\", "'", "${"):
+        value = value.replace(special, f"\\{special}")
+    return f"{name}='{value}'"
 
 
 def _unparsable(argument: str) -> bool:
@@ -63,7 +83,7 @@ def _one_line() -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        print("interrupted; nothing half-written was left", file=sys.stderr)
+        print("\ninterrupted; nothing half-written was left", file=sys.stderr)
         sys.exit(130)
     except BrokenPipeError:  # whoever read our output has left: `| head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -72,6 +92,8 @@ def _one_line() -> Iterator[None]:
         _refuse(_explain(error))
     except SettingsError as error:
         _refuse(str(error))
+    except OSError as error:
+        _refuse(f"{error.filename or 'input or output'}: {error.strerror or error}")
     except ValueError as error:
         from mfvpr.errors import InputError  # here, since it brings JAX along
 
@@ -81,7 +103,7 @@ def _one_line() -> Iterator[None]:
 
 
 def _refuse(reason: str) -> NoReturn:
-    print(f"error: {reason}", file=sys.stderr)
+    print("error:", *reason.splitlines(), file=sys.stderr)
     sys.exit(2)
 
 
@@ -95,8 +117,9 @@ def _explain(error: Exception) -> str:
     if not unknown:
         return text
     wrong = unknown.group(1)
-    nearest = max(_setting_names(), key=lambda name: _likeness(wrong, name), default="")
-    return f"{wrong}: unknown setting" + (f"; the nearest is {nearest}" if nearest else "; see --help")
+    nearest = max(_setting_names(), key=lambda name: _likeness(wrong, name))
+    alike = max(_likeness(wrong, nearest)) >= 0.6
+    return f"{wrong}: unknown setting; " + (f"the nearest is {nearest}" if alike else "see --help")
 
 
 def _no_default(name: str) -> str:

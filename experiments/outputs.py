@@ -13,7 +13,7 @@ from mfvpr.data.files import write_text
 from mfvpr.data.images import read_image, resize
 from mfvpr.evaluation import recall_at_k
 from mfvpr.features import LocalExtractor
-from mfvpr.pipeline import FeatureSet, MatchSet
+from mfvpr.pipeline import FeatureSet, MatchSet, explain
 from mfvpr.report import runs
 from mfvpr.report.figures import histogram_figure
 from mfvpr.report.tables import Table
@@ -53,7 +53,7 @@ class Outcome:
         if self.dataset.truth is None:
             return []
         recall = self.settings["recall"]
-        return recall["tolerances"] if self.dataset.truth.unit == "frames" else [recall["radius"]]
+        return sorted(set(recall["tolerances"])) if self.dataset.truth.unit == "frames" else [recall["radius"]]
 
     @property
     def headline(self) -> str:
@@ -77,7 +77,8 @@ def write(folder: Path, outcome: Outcome) -> Table:
     rows = result_rows(outcome)
     table = recall_table(rows)
     runs.write_results(folder, rows)
-    runs.write_table(folder, table)
+    if outcome.thresholds:
+        runs.write_table(folder, table)
     _write_predictions(folder, outcome)
     _write_skipped(folder, outcome)
     _write_figures(folder, outcome)
@@ -113,7 +114,7 @@ def result_rows(outcome: Outcome) -> list[dict[str, Any]]:
 
 def _recall(outcome: Outcome, positives: np.ndarray) -> dict[str, dict[str, float]]:
     """Recall@K by system and K."""
-    ks = outcome.settings["recall"]["ks"]
+    ks = sorted(set(outcome.settings["recall"]["ks"]))
 
     def of(rows: np.ndarray) -> dict[str, float]:
         return {str(k): round(float(value), 6) for k, value in zip(ks, recall_at_k(rows, positives, ks), strict=True)}
@@ -167,14 +168,15 @@ def _write_figures(folder: Path, outcome: Outcome) -> None:
     size, interpolation = outcome.extractor.image_size, outcome.extractor.interpolation
     best = outcome.systems[outcome.headline].rows[:, 0]
     shown = _shown(outcome, best)
-    for query, verdict in build.track("figures")(shown.items(), len(shown)):
+    for query, verdict in build.track("figures")(shown.items(), len(shown)) if shown else ():
         place = int(np.flatnonzero(outcome.candidates.indices[query] == best[query])[0])
+        pair = jax.tree.map(lambda field: field[place], outcome.matches[query])  # noqa: B023
         histogram_figure(
             folder / "figures" / f"{verdict.split()[0]}_{query:04d}.png",
             resize(read_image(queries.paths[query]), size, interpolation),
             resize(read_image(database.paths[best[query]]), size, interpolation),
-            jax.tree.map(lambda field: field[place], outcome.matches[query]),  # noqa: B023
-            scorer,
+            pair,
+            explain(scorer, pair),
             title=f"{outcome.headline}, {verdict}: {queries.names[query]} -> {database.names[best[query]]}",
         )
 
@@ -183,14 +185,13 @@ def _shown(outcome: Outcome, best: np.ndarray) -> dict[int, str]:
     """Queries that get a figure, with what became of them: half right, half wrong where that can be told."""
     number, found, truth = outcome.settings["figures"], best >= 0, outcome.dataset.truth
     if truth is None:
-        return dict.fromkeys(_spread(np.flatnonzero(found), number), "first")
+        return dict.fromkeys(_spread(np.flatnonzero(found), number), "best")
     positives = truth.positives(outcome.thresholds[len(outcome.thresholds) // 2])
     right = positives[np.arange(len(best)), np.maximum(best, 0)] & found
     shown = dict.fromkeys(_spread(np.flatnonzero(right), (number + 1) // 2), "right")
     for query in _spread(np.flatnonzero(found & ~right), number // 2):
-        places = np.flatnonzero(positives[query])
-        true = outcome.dataset.database.names[places[len(places) // 2]] if len(places) else "not in the database"
-        shown[query] = f"wrong (truth: {true})"
+        place = truth.place(query)
+        shown[query] = f"wrong (truth: {'nowhere' if place is None else outcome.dataset.database.names[place]})"
     return shown
 
 

@@ -35,9 +35,9 @@ class Stopwatch:
 
 def evaluate(settings: dict[str, Any]) -> None:
     """Images -> features -> shortlist and matches -> scores -> rankings -> recall, in a run folder."""
-    folder = Path(settings["out"]).expanduser() if settings["out"] else None
-    if folder:
-        runs.check_free(folder)
+    folder = build.expanded(settings["out"]) if settings["out"] else None
+    runs.check_free(folder or runs.new_run_folder(Path("runs"), settings["dataset"]["name"]))
+    scorers = build.scorers(settings["scorer"])
     watch = Stopwatch()
     with watch("data"):
         dataset = _dataset(settings["dataset"])
@@ -49,12 +49,11 @@ def evaluate(settings: dict[str, Any]) -> None:
             dataset.database, extractor, skip_bad=skip_bad, track=build.track("database features")
         )
         queries = pipeline.extract(dataset.queries, extractor, skip_bad=skip_bad, track=build.track("query features"))
-    _warn_of_bad(database, queries)
+    _warn(dataset, database, queries)
     with watch("filter"):
         candidates = _shortlist(settings, dataset, database, queries, skip_bad)
     with watch("matching"):
         matches = pipeline.match(queries, database, candidates, **settings["matching"], track=build.track("matching"))
-    scorers = build.scorers(settings["scorer"])
     with watch("scores"):
         systems = _systems(settings, scorers, matches, candidates)
 
@@ -64,7 +63,8 @@ def evaluate(settings: dict[str, Any]) -> None:
     folder = folder or runs.new_run_folder(Path("runs"), dataset.name)
     with runs.writing(folder) as new:
         table = outputs.write(new, outcome)
-    print(f"\n{outputs.heading(outcome)}\n\n{table.text()}\nresults: {folder}")
+    shown = f"{table.text()}\n" if outcome.thresholds else ""
+    print(f"\n{outputs.heading(outcome)}\n\n{shown}results: {folder}")
 
 
 def _dataset(settings: dict[str, Any]) -> Dataset:
@@ -82,9 +82,16 @@ def _dataset(settings: dict[str, Any]) -> Dataset:
             one.close()
 
 
-def _warn_of_bad(database: FeatureSet, queries: FeatureSet) -> None:
-    for reason in (*database.bad.values(), *queries.bad.values()):
-        print(f"warning: {reason}", file=sys.stderr)
+def _warn(dataset: Dataset, database: FeatureSet, queries: FeatureSet) -> None:
+    for found, images in ((database, dataset.database), (queries, dataset.queries)):
+        for reason in found.bad.values():
+            print(f"warning: {reason}", file=sys.stderr)
+        empty = [row for row in np.flatnonzero(~found.features.mask.any(axis=1)) if row not in found.bad]
+        if empty:
+            print(f"warning: {images.paths[empty[0]]}: no keypoints, so no matches ({len(empty)} such images of "
+                  f"{len(images)}); scores are 0", file=sys.stderr)  # fmt: skip
+    if dataset.truth is not None and all(dataset.truth.place(row) is None for row in range(len(dataset.queries))):
+        print("warning: the ground truth gives no query a place; every recall will be 0", file=sys.stderr)
 
 
 def _shortlist(
@@ -92,7 +99,10 @@ def _shortlist(
 ) -> Shortlist:
     asked, available = settings["candidates"], len(dataset.database)
     if asked != "all" and asked > available:
-        print(f"candidates={asked}: the database has {available} images; all of them are re-ranked", file=sys.stderr)
+        print(
+            f"note: candidates={asked}, but the database has {available} images; all of them are re-ranked",
+            file=sys.stderr,
+        )
     extractor = build.global_extractor(settings["retrieval"], [database[row] for row in range(len(database))])
     descriptors = [
         pipeline.describe(folder, features, extractor, skip_bad=skip_bad, track=build.track(f"{name} descriptors"))

@@ -5,6 +5,7 @@ Hydra knows which settings exist and of which type the file had them; what a val
 
 import math
 import numbers
+import re
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -51,18 +52,27 @@ def _list_of(rule: Rule, length: int | None = None) -> Rule:
     return Rule(holds, f"a list of {length or 'one or more'}, each {rule.expected}")
 
 
-_POSITIVE = Rule(lambda value: _is_number(value) and value > 0, "a number above 0")
-_NOT_NEGATIVE = Rule(lambda value: _is_number(value) and value >= 0, "a number not below 0")
-_COUNT = Rule(lambda value: _is_count(value) and value > 0, "a whole number above 0")
-_INDEX = Rule(lambda value: _is_count(value) and value >= 0, "a whole number not below 0")
+def _between(low: int, high: int) -> Rule:
+    return Rule(lambda value: _is_count(value) and low <= value <= high, f"a whole number from {low} to {high}")
+
+
+# Beyond these bounds float32 and int32 would fail, without a word.
+_POSITIVE = Rule(lambda value: _is_number(value) and 1e-6 <= value <= 1e12, "a number above 0 (1e-6 to 1e12)")
+_NOT_NEGATIVE = Rule(lambda value: _is_number(value) and 0 <= value <= 1e12, "a number not below 0 (at most 1e12)")
+_COUNT = Rule(lambda value: _is_count(value) and 0 < value <= 10**6, "a whole number above 0 (at most 1000000)")
+_INDEX = Rule(lambda value: _is_count(value) and 0 <= value <= 10**6, "a whole number not below 0 (at most 1000000)")
+_SIDE = _between(16, 4096)
 _TEXT = Rule(lambda value: isinstance(value, str) and bool(value), "text")
 _FLAG = _one_of(True, False)
 _WEIGHT = _one_of("fs", "dmf", "unit")
 
 RULES: dict[str, Rule] = {
-    "name": _TEXT,
+    "dataset.name": Rule(
+        lambda value: isinstance(value, str) and bool(re.fullmatch(r"[\w-][\w.-]*", value)), "letters, digits, - and _"
+    ),
+    "features.name": _one_of("sift"),
+    "retrieval.name": _one_of("vlad"),
     # data
-    "kind": _one_of("streets", "folder"),
     "seed": _INDEX,
     "cache": _TEXT,
     "root": _TEXT,
@@ -71,9 +81,9 @@ RULES: dict[str, Rule] = {
     "ground_truth": _one_of("order", "index", "utm", "none"),
     "index_file": _or(_TEXT, None),
     # features and filter
-    "image_size": _list_of(_COUNT, 2),
+    "image_size": _list_of(_SIDE, 2),
     "interpolation": _one_of("pil_bilinear", "pil_bicubic", "cv2_linear", "cv2_area"),
-    "max_keypoints": _COUNT,
+    "max_keypoints": _between(1, 20_000),
     "contrast_threshold": _POSITIVE,
     "clahe_clip": _NOT_NEGATIVE,
     "num_words": _COUNT,
@@ -90,7 +100,7 @@ RULES: dict[str, Rule] = {
     "weight": _WEIGHT,
     "mean": _one_of("unweighted", "weighted", "median"),
     "clamp": _FLAG,
-    "num_bins": _COUNT,
+    "num_bins": _between(1, 32),  # memory grows with the fourth power
     "window": _POSITIVE,
     "tolerance": _POSITIVE,
     "window_mode": _one_of("half_floor", "asymmetric", "odd_down", "radius"),
@@ -99,7 +109,7 @@ RULES: dict[str, Rule] = {
     "cell_weight": _one_of("winner_sum", "cell_sum", "ones"),
     "bin_size": _POSITIVE,
     "sigma": _POSITIVE,
-    "truncate": _or(_POSITIVE, math.inf),
+    "truncate": _or(_POSITIVE, None),
     "shift_range": _or(_list_of(_POSITIVE, 2), None),
     "align": _one_of("min_edge", "zero_center", "zero_edge"),
     "sigma_is_variance": _FLAG,
@@ -119,7 +129,10 @@ RULES: dict[str, Rule] = {
 def check(settings: Mapping[str, Any]) -> None:
     """Raise a SettingsError for the first value that its rule does not allow."""
     for path, value in _leaves(settings, ""):
-        rule = RULES[path.rpartition(".")[2]]
+        *_, group, name = f".{path}".split(".")
+        rule = RULES.get(f"{group}.{name}") or RULES.get(name)
+        if rule is None:
+            raise SettingsError(f"{path}={value}: this is a group of settings; set one of its members (see --help)")
         if not rule.holds(value):
             shown = "null" if value is None else value
             raise SettingsError(f"{path}={shown}: expected {rule.expected}")

@@ -14,7 +14,7 @@ def frame_positives(query_index: np.ndarray, database_index: np.ndarray, *, tole
         database_index: `[N]` frame number of each database image.
         tolerance: in frames.
     """
-    query_index, database_index = np.asarray(query_index), np.asarray(database_index)
+    query_index, database_index = np.asarray(query_index, np.int64), np.asarray(database_index, np.int64)
     near = np.abs(database_index[None, :] - query_index[:, None]) <= tolerance
     return near & (query_index >= 0)[:, None]
 
@@ -38,7 +38,7 @@ def recall_at_k(order: np.ndarray, positives: np.ndarray, ks: Sequence[int]) -> 
         ks: depths; beyond C all C candidates count.
     """
     order = np.asarray(order)
-    if len(order) == 0:
+    if order.size == 0 or np.size(positives) == 0:
         return np.zeros(len(ks))
     hits = np.take_along_axis(np.asarray(positives), np.maximum(order, 0), axis=1) & (order >= 0)
     return np.array([hits[:, :k].any(axis=1).mean() for k in ks])

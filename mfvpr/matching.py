@@ -7,7 +7,7 @@ read it the same number of times and take several times longer on XLA's CPU back
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -31,11 +31,12 @@ def match(features0: Features, features1: Features, *, cross_check: CrossCheck =
             suitors. `none` keeps the nearest of every query keypoint. (facts A12: the paper says cross-check.)
 
     Returns:
-        Matches with K = N0 slots.
+        Matches with K = N0 slots. A descriptor that is not finite matches nothing.
     """
-    similarity = _similarity(features0, features1)
-    nearest1, valid = _neighbors(similarity, cross_check)
-    valid &= features0.mask & jnp.any(features1.mask)
+    if cross_check not in get_args(CrossCheck):
+        raise ValueError(f"cross_check={cross_check!r}: expected one of {', '.join(get_args(CrossCheck))}")
+    features0, features1 = jax.tree.map(jnp.asarray, (features0, _at_least_one(features1)))
+    nearest1, valid = _neighbors(_similarity(features0, features1), cross_check)
     # The difference, not sqrt(2 - 2 cos): in float32 that would turn a distance of 0 into up to 3.5e-4.
     difference = masked(features0.descriptors - features1.descriptors[nearest1], valid)
     return Matches(
@@ -87,7 +88,7 @@ def match_shortlist(
     """
 
     def one(index: Array) -> Matches:
-        candidate = jax.tree.map(lambda field: field[jnp.maximum(index, 0)], database)
+        candidate = jax.tree.map(lambda field: jnp.asarray(field)[jnp.maximum(index, 0)], database)
         candidate = replace(candidate, mask=candidate.mask & (index >= 0))
         return match(query, candidate, cross_check=cross_check)
 
@@ -95,6 +96,8 @@ def match_shortlist(
 
 
 def _chunked_map(function: Callable, items: Any, count: int, chunk_size: int | None) -> Matches:
+    if chunk_size is not None and chunk_size < 1:
+        raise ValueError(f"chunk_size={chunk_size}: expected a whole number above 0")
     chunk_size = chunk_size or (1 if jax.default_backend() == "cpu" else count)
     return jax.lax.map(function, items, batch_size=None if chunk_size == 1 else chunk_size)
 
@@ -122,41 +125,60 @@ def compact(matches: Matches, capacity: int) -> Matches:
     capacity are dropped: compare `matches.mask.sum()` with it.
     """
     slots = jnp.nonzero(matches.mask, size=capacity, fill_value=0)[0]
+
+    def packed(values: Array) -> Array:
+        values = jnp.asarray(values)
+        return values[slots] if len(values) else jnp.zeros((capacity, *values.shape[1:]), values.dtype)
+
     return Matches(
-        points0=matches.points0[slots],
-        points1=matches.points1[slots],
-        distance=matches.distance[slots],
-        scores0=matches.scores0[slots],
-        scores1=matches.scores1[slots],
+        points0=packed(matches.points0),
+        points1=packed(matches.points1),
+        distance=packed(matches.distance),
+        scores0=packed(matches.scores0),
+        scores1=packed(matches.scores1),
         mask=jnp.arange(capacity) < jnp.sum(matches.mask),
         image_size0=matches.image_size0,
         image_size1=matches.image_size1,
     )
 
 
+def _at_least_one(features: Features) -> Features:
+    """An image without a single slot gets one of padding, so that there is something to index."""
+    if features.mask.shape[-1] > 0:
+        return features
+    per_keypoint = {
+        name: jnp.zeros((1, *getattr(features, name).shape[1:]), getattr(features, name).dtype)
+        for name in ("keypoints", "descriptors", "scores", "mask")
+    }
+    return replace(features, **per_keypoint)
+
+
 def _similarity(features0: Features, features1: Features) -> Array:
-    """`[N0, N1]` dot products, -inf where either keypoint is padding (whose NaN reach only their row or column)."""
+    """`[N0, N1]` dot products, -inf where either keypoint is padding or its descriptor is not finite."""
     products = jnp.matmul(features0.descriptors, features1.descriptors.T, precision=jax.lax.Precision.HIGHEST)
-    return jnp.where(features0.mask[:, None] & features1.mask[None], products, -jnp.inf)
+    real = features0.mask[:, None] & features1.mask[None] & jnp.isfinite(products)
+    return jnp.where(real, products, -jnp.inf)
 
 
 def _first(hit: Array, axis: int) -> Array:
     """First index of True along `axis`; 0 where there is none."""
     size = hit.shape[axis]
     index = jax.lax.broadcasted_iota(jnp.int32, hit.shape, axis)
-    first = jnp.min(jnp.where(hit, index, size), axis=axis)
+    first = jnp.min(jnp.where(hit, index, size), axis=axis, initial=size)
     return jnp.where(first == size, 0, first)
 
 
 def _neighbors(similarity: Array, cross_check: CrossCheck) -> tuple[Array, Array]:
     """For each row its column `[N0]` int32, and whether the pair counts `[N0]` bool."""
     rows = jnp.arange(similarity.shape[0], dtype=jnp.int32)
-    nearest1 = _first(similarity == jnp.max(similarity, axis=1, keepdims=True), axis=1)
+    best1 = jnp.max(similarity, axis=1, keepdims=True)
+    nearest1, some = _first(similarity == best1, axis=1), best1[:, 0] > -jnp.inf
     if cross_check == "none":
-        return nearest1, jnp.ones(rows.shape, bool)
-    nearest0 = _first(similarity == jnp.max(similarity, axis=0, keepdims=True), axis=0)
+        return nearest1, some
+    best0 = jnp.max(similarity, axis=0, keepdims=True, initial=-jnp.inf)
+    nearest0 = _first(similarity == best0, axis=0)
     if cross_check == "mutual":
-        return nearest1, nearest0[nearest1] == rows
+        return nearest1, some & (nearest0[nearest1] == rows)
     suitors = jnp.where(nearest0[None] == rows[:, None], similarity, -jnp.inf)
     best = jnp.max(suitors, axis=1)
     return _first(suitors == best[:, None], axis=1), jnp.isfinite(best)

@@ -11,12 +11,18 @@ from jax.typing import ArrayLike
 
 
 def masked(values: Array, mask: Array, fill: ArrayLike = 0.0) -> Array:
-    """`values` where `mask`, `fill` elsewhere; a trailing axis of `values` that `mask` lacks is broadcast.
+    """`values` where `mask`, `fill` elsewhere; trailing axes of `values` that `mask` lacks are broadcast.
 
     Padding may hold NaN: apply this before any arithmetic, or gradients turn NaN as well.
     """
     extra = values.ndim - mask.ndim
     return jnp.where(mask.reshape(mask.shape + (1,) * extra), values, fill)
+
+
+def as_float(values: ArrayLike) -> Array:
+    """`values` themselves where they are floating point, else in the default float type."""
+    values = jnp.asarray(values)
+    return values if jnp.issubdtype(values.dtype, jnp.floating) else values.astype(float)
 
 
 def count(mask: Array) -> Array:
@@ -26,7 +32,7 @@ def count(mask: Array) -> Array:
 
 def masked_mean(values: Array, mask: Array, weights: Array | None = None) -> Array:
     """(Weighted) mean over axis 0 of the real entries; 0 where there are none."""
-    weights = masked(jnp.ones(mask.shape) if weights is None else weights, mask)
+    weights = masked(jnp.ones(mask.shape, values.dtype) if weights is None else weights, mask)
     total = jnp.sum(weights)
     weighted = masked(values, mask) * weights.reshape(weights.shape + (1,) * (values.ndim - 1))
     return jnp.sum(weighted, axis=0) / jnp.where(total == 0, 1.0, total)
@@ -34,6 +40,8 @@ def masked_mean(values: Array, mask: Array, weights: Array | None = None) -> Arr
 
 def masked_median(values: Array, mask: Array) -> Array:
     """Median over axis 0 of the real entries (mean of the middle two when even); 0 where there are none."""
+    if len(mask) == 0:
+        return jnp.zeros(values.shape[1:], values.dtype)
     ordered = jnp.sort(masked(values, mask, jnp.inf), axis=0)
     real = jnp.sum(mask)
     middle = (ordered[jnp.maximum(real - 1, 0) // 2] + ordered[jnp.minimum(real // 2, len(mask) - 1)]) / 2

@@ -21,13 +21,15 @@ from mfvpr.errors import InputError
 from mfvpr.features import GlobalExtractor, LocalExtractor
 from mfvpr.matching import CrossCheck
 from mfvpr.numerics import pad_rows, round_up
-from mfvpr.scoring import HistogramOfShifts, Scorer
+from mfvpr.scoring import HistogramOfShifts, Scorer, ShiftHistogram
 from mfvpr.types import Array, Features, Matches, Shortlist
+from mfvpr.weighting import match_weights
 
 Item = TypeVar("Item")
 Track = Callable[[Iterable[Any], int], Iterable[Any]]
 
 DECODING_THREADS = 4
+MAX_BINS = 1024  # per axis: the histograms of 50 candidates then take 200 MB
 _PER_MATCH = ("points0", "points1", "distance", "scores0", "scores1")
 
 
@@ -182,6 +184,32 @@ def score(
     return {name: np.where(candidates.mask, values, np.nan) for name, values in scores.items()}
 
 
+@dataclass(frozen=True)
+class Explanation:
+    """What a histogram says of one pair, NumPy.
+
+    Attributes:
+        histogram: all bins `[B, B]` (-inf beyond the range of shifts) with their centers, px.
+        score: the tallest bin.
+        shift: `[2]` its center (x, y), px.
+        peak: `[2]` the refined peak between bin centers, px.
+        weights: `[K]` of the matches.
+        agrees: `[K]` whether a match's shift lies within two standard deviations of the peak along both axes.
+    """
+
+    histogram: ShiftHistogram
+    score: Array
+    shift: Array
+    peak: Array
+    weights: Array
+    agrees: Array
+
+
+def explain(scorer: HistogramOfShifts, matches: Matches) -> Explanation:
+    """The parts of one pair's score, for figures and for steering; one program for all pairs."""
+    return Explanation(*jax.tree.map(np.asarray, _explain(_prepare(scorer, matches), matches)))
+
+
 def fuse(candidates: Shortlist, scores: np.ndarray, c: float | None) -> np.ndarray:
     """Combined scores `[Q, C]` of filter and re-ranking; `c` None balances their spread per query."""
     return np.asarray(_fuse(candidates.scores, scores, candidates.mask, c))
@@ -224,10 +252,26 @@ def _fuse(filter_scores: Array, scores: Array, mask: Array, c: Array | None) -> 
     return reranking.combine(filter_scores, scores, c=c)
 
 
+@jax.jit
+def _explain(scorer: HistogramOfShifts, matches: Matches) -> tuple[Any, ...]:
+    shift, peak = scorer.dominant_shift(matches), scorer.dominant_shift(matches, refine=True)
+    weights = match_weights(scorer.weight, matches)
+    return scorer.histogram(matches), scorer(matches), shift, peak, weights, scorer.agrees(matches, peak)
+
+
 def _prepare(scorer: Any, matches: Matches) -> Any:
     """A scorer whose numbers are float32 arrays (one type, one program) and whose histogram has a capacity."""
-    if isinstance(scorer, HistogramOfShifts) and scorer.max_bins is None:
-        scorer = scorer.with_capacity(matches.image_size0, matches.image_size1, multiple=16)
+    if isinstance(scorer, HistogramOfShifts):
+        needed = scorer.with_capacity(matches.image_size0, matches.image_size1, multiple=16)
+        if (needed.max_bins or 0) > MAX_BINS:
+            raise InputError(
+                f"bin_size={scorer.bin_size}: expected at most {MAX_BINS} bins per axis, these images need "
+                f"{needed.max_bins}; use larger bins"
+            )
+        if scorer.max_bins is None:
+            scorer = needed
+        elif (exact := scorer.with_capacity(matches.image_size0, matches.image_size1).max_bins or 0) > scorer.max_bins:
+            raise InputError(f"max_bins={scorer.max_bins}: expected at least {exact}, which these images need")
     return jax.tree.map(np.float32, scorer)
 
 

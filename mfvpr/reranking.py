@@ -35,6 +35,8 @@ def score_grid(scorer: Any, matches: Matches, **axes: Sequence[float] | Array) -
     Raises:
         ValueError: an axis is empty, not one-dimensional, or names no numeric parameter of the scorer.
     """
+    if not axes:
+        raise ValueError("score_grid: expected at least one axis, such as sigma=[10.0, 22.5]")
     values = [_axis(scorer, name, axis) for name, axis in axes.items()]
     lengths = [len(axis) for axis in values]
     points = [point.reshape(-1) for point in jnp.meshgrid(*values, indexing="ij")]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
-from mfvpr.numerics import masked
+from mfvpr.numerics import as_float, masked
 from mfvpr.types import Array, Matches
 
 Weight = Callable[[Matches], Array]
@@ -44,4 +44,4 @@ class UnitWeight:
 
 def match_weights(weight: Weight, matches: Matches) -> Array:
     """`[K]` weights, 0 on padding."""
-    return masked(weight(matches), matches.mask)
+    return masked(as_float(weight(matches)), matches.mask)

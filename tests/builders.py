@@ -31,7 +31,7 @@ def make_features(rng, count, *, capacity=None, dimension=16, size=SIZE, garbage
 
 
 def make_matches(points0, points1, *, distance=None, scores0=None, scores1=None, capacity=None, garbage=np.nan,
-                 size=(SIZE, SIZE)):  # fmt: skip
+                 sizes=((SIZE, SIZE), (SIZE, SIZE))):  # fmt: skip
     """Matches of one pair from real entries; the padding holds `garbage`."""
     points0 = np.asarray(points0, np.float32).reshape(-1, 2)
     points1 = np.asarray(points1, np.float32).reshape(-1, 2)
@@ -51,24 +51,25 @@ def make_matches(points0, points1, *, distance=None, scores0=None, scores1=None,
         scores0=padded(scores0),
         scores1=padded(scores1),
         mask=np.arange(capacity) < count,
-        image_size0=np.array(size, np.float32),
-        image_size1=np.array(size, np.float32),
+        image_size0=np.array(sizes[0], np.float32),
+        image_size1=np.array(sizes[1], np.float32),
     )
 
 
-def random_matches(rng, count, *, capacity=None, garbage=np.nan):
+def random_matches(rng, count, *, capacity=None, garbage=np.nan, sizes=((SIZE, SIZE), (SIZE, SIZE))):
     """Half of the matches share a shift, half are random; coordinates are on a quarter-pixel grid, exact in float32."""
-    points0 = rng.integers(0, 4 * SIZE, (count, 2)) / 4
+    points0, anywhere = (rng.integers(0, 4 * np.array(size), (count, 2)) / 4 for size in sizes)
     shift = rng.integers(-240, 240, 2) / 4
-    points1 = np.where(rng.random((count, 1)) < 0.5, points0 + shift, rng.integers(0, 4 * SIZE, (count, 2)) / 4)
+    points1 = np.where(rng.random((count, 1)) < 0.5, points0 + shift, anywhere)
     return make_matches(
         points0,
-        np.clip(points1, 0, SIZE - 0.25),
+        np.clip(points1, 0, np.array(sizes[1]) - 0.25),
         distance=rng.uniform(0, 2, count),
         scores0=rng.uniform(0.1, 1, count),
         scores1=rng.uniform(0.1, 1, count),
         capacity=capacity,
         garbage=garbage,
+        sizes=sizes,
     )
 
 

@@ -3,8 +3,10 @@
 import csv
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import hydra
@@ -82,16 +84,29 @@ def test_values_without_meaning_are_refused(name, value):
         (["scorer.sgma=3"], "scorer.sgma: unknown setting; the nearest is scorer.histogram.sigma"),
         (["scorer=histogram", "scorer.sgma=3"], "the nearest is scorer.sigma"),
         (["candidats=3"], "the nearest is candidates"),
-        (["scorer=histgram"], "Could not find 'scorer/histgram'"),
+        (
+            ["scorer=histgram"],
+            "scorer=histgram: expected one of all, anchor, count, histogram, sum; the nearest is histogram",
+        ),
         (["scorer=histogram", "scorer.sigma=nan"], "scorer.sigma=nan: expected a number above 0"),
-        (["candidates=0"], "candidates=0: expected a whole number above 0, or all"),
+        (["candidates=0"], "candidates=0: expected a whole number above 0 (at most 1000000), or all"),
         (["features.image_size=[336]"], "features.image_size=[336]: expected a list of 2"),
         (["dataset=folder"], "dataset.database: this setting has no default; give dataset.database=VALUE"),
         (["dataset=grief_season"], "dataset.root: this setting has no default"),
         (["+new=1"], "+new=1: settings can be set, not added"),
         (["dataset=folder", "dataset.database=nope", "dataset.queries=nope"], "nope: expected a folder of images"),
-        (["word"], "Error parsing override 'word'"),
+        (["word"], "word: expected name=value"),
+        (["scorer=[count,sum]"], "expected one of all"),
+        (["features=null"], "features=null: expected one of sift"),
+        (["scorer.count.method=histogram"], "scorer.count.method=histogram: expected count"),
         (["scorer=histogram", "scorer.bin_size=[1,2"], "scorer.bin_size=[1,2: expected a number above 0"),
+        (["scorer.histogram=3"], "scorer.histogram=3: this is a group of settings"),
+        (["features.name=superpoint"], "features.name=superpoint: expected one of sift"),
+        (["dataset.name=../up"], "dataset.name=../up: expected letters"),
+        (["scorer=histogram", "scorer.method=sum"], "scorer: sum has no"),
+        (["hydra.foo=1"], "hydra.foo: unknown setting; see --help"),
+        (["scorer.histogram.sigma=1e-46"], "expected a number above 0 (1e-6 to 1e12)"),
+        (["out=README.md/x"], "cannot be written to"),
         (["out=README.md"], "README.md: expected a new or empty run folder"),
     ],
 )
@@ -123,7 +138,7 @@ def test_bad_images_by_policy(small_street, tmp_path):
 
     passed = run(*arguments, "on_bad_image=skip")
     assert passed.returncode == 0, passed.stderr
-    assert "candidates=99: the database has 10 images" in passed.stderr
+    assert "candidates=99, but the database has 10 images" in passed.stderr
     with (tmp_path / "out" / "skipped.csv").open() as file:
         assert [(row["folder"], row["image"]) for row in csv.DictReader(file)] == [("database", "é 0003.png")]
     with (tmp_path / "out" / "predictions.csv").open() as file:
@@ -138,7 +153,16 @@ def test_bad_images_by_policy(small_street, tmp_path):
 
 
 def test_rankings_without_ground_truth(small_street, tmp_path):
-    done = run(*folder(small_street, "dataset.ground_truth=none", "scorer=anchor", *QUICK, f"out={tmp_path}/out"))
+    done = run(
+        *folder(
+            small_street,
+            "dataset.ground_truth=none",
+            "dataset.index_file=null",
+            "scorer=anchor",
+            *QUICK,
+            f"out={tmp_path}/out",
+        )
+    )
     assert done.returncode == 0, done.stderr
     assert "no ground truth: rankings only" in done.stdout
     rows = json.loads((tmp_path / "out" / "results.json").read_text())
@@ -147,11 +171,34 @@ def test_rankings_without_ground_truth(small_street, tmp_path):
     assert (tmp_path / "out" / "figures").is_dir()
 
 
+@pytest.mark.parametrize("after", [1.5, 2.5])
+def test_ctrl_c_leaves_nothing_and_the_next_run_works(small_street, tmp_path, after):
+    command = [sys.executable, "-m", "experiments.evaluate", *folder(small_street, "figures=9", f"out={tmp_path}/out")]
+    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    time.sleep(after)
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130, stderr
+    assert "\ninterrupted; nothing half-written was left\n" in stderr
+    assert "Traceback" not in stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bins_that_do_not_fit_are_refused(small_street):
+    for setting, words in (
+        ("scorer.max_bins=3", "at least 45"),
+        ("scorer.bin_size=0.01", "at most 1024 bins per axis"),
+    ):
+        done = run(*folder(small_street, "scorer=histogram", *QUICK, setting))
+        assert done.returncode == 2
+        assert words in done.stderr.splitlines()[-1]
+
+
 def test_one_evaluation_compiles_at_most_six_programs(small_street, tmp_path, monkeypatch, compilations, capsys):
     from experiments import run as program
 
     monkeypatch.chdir(tmp_path)
-    common = folder(small_street, "figures=0", "features.max_keypoints=120", "retrieval.num_words=8", "candidates=7")
+    common = folder(small_street, "figures=4", "features.max_keypoints=120", "retrieval.num_words=8", "candidates=7")
     program.evaluate(composed(*common))
     assert 1 <= compilations.count <= 6
     compilations.reset()
@@ -209,7 +256,8 @@ def test_demo_prints_its_table_and_leaves_a_run_folder(demo):
 
 def test_results_say_what_made_them(demo):
     _, folder = demo
-    rows = json.loads((folder / "results.json").read_text())
+    text = (folder / "results.json").read_text()
+    rows = json.loads(text, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
     assert len(rows) == 18
     for row in rows:
         assert set(row["recall_at"]) == {"1", "5", "10"}

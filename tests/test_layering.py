@@ -19,7 +19,7 @@ ALLOWED = {
     "evaluation": set(),
     "data": {"errors", "evaluation", "types", "data"},
     "features": {"errors", "types", "data", "features"},
-    "report": {"errors", "types", "weighting", "scoring", "data", "report"},
+    "report": {"errors", "types", "data", "pipeline", "report"},
 }
 HOMES = {
     "cv2": {"data", "features"},

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import Features, compact, filter_matches, match, match_candidates
+from mfvpr.matching import match_shortlist
 from tests import oracles
 from tests.builders import make_features, random_matches, unit
 
@@ -123,6 +124,53 @@ def test_compact_moves_real_matches_to_the_front_in_order():
         assert tight.points0.shape == (capacity, 2)
         np.testing.assert_array_equal(tight.points1[: len(real)], matches.points1[real])
         np.testing.assert_array_equal(tight.distance[: len(real)], matches.distance[real])
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("counts", [(0, 0), (0, 5), (5, 0)])
+def test_images_without_a_single_slot(mode, counts):
+    features0, features1 = (make_features(np.random.default_rng(6), count) for count in counts)
+    batch = jax.tree.map(lambda leaf: np.stack([leaf, leaf]), features1)
+    for matches in (
+        match(features0, features1, cross_check=mode),
+        match_candidates(features0, batch, cross_check=mode),
+        match_shortlist(features0, batch, jnp.array([1, -1]), cross_check=mode),
+    ):
+        assert matches.mask.shape[-1] == counts[0]
+        assert not matches.mask.any()
+    assert compact(match(features0, features1), 4).mask.shape == (4,)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_broken_descriptor_costs_its_own_matches_only(mode, value):
+    rng = np.random.default_rng(7)
+    features0, features1 = make_features(rng, 12), make_features(rng, 10)
+    whole = match(features0, features1, cross_check=mode)
+    features1.descriptors[4, 2] = value
+    features0.descriptors[3, 0] = value
+    slots, points1, _ = found(match(features0, features1, cross_check=mode))
+    rest0, rest1 = np.delete(features0.descriptors, 3, axis=0), np.delete(features1.descriptors, 4, axis=0)
+    expected = oracles.nearest(rest0, rest1, mode)
+    assert list(slots) == [i + (i >= 3) for i, _, _ in expected]
+    np.testing.assert_array_equal(points1, [features1.keypoints[j + (j >= 4)] for _, j, _ in expected])
+    assert whole.mask.sum() >= len(slots)
+
+
+def test_numpy_features_may_stand_in_a_compiled_closure():
+    rng = np.random.default_rng(8)
+    features0, features1 = make_features(rng, 6), make_features(rng, 7)
+    expected = match(features0, features1)
+    got = jax.jit(lambda query: compact(match(query, features1), 6))(features0)
+    assert got.mask.sum() == expected.mask.sum()
+
+
+def test_options_without_meaning_are_refused():
+    features = make_features(np.random.default_rng(9), 3)
+    with pytest.raises(ValueError, match="expected one of mutual"):
+        match(features, features, cross_check="mutal")
+    with pytest.raises(ValueError, match="chunk_size=0"):
+        match_candidates(features, jax.tree.map(lambda leaf: leaf[None], features), chunk_size=0)
 
 
 def test_real_size_agrees_with_a_vectorised_check():

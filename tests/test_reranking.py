@@ -65,6 +65,7 @@ def test_other_grid_values_cost_no_trace(matches):
     [
         (HistogramOfShifts(), {"sgma": [1.0]}, "sigma"),
         (HistogramOfShifts(), {"max_bins": [1]}, "no numeric parameter"),
+        (HistogramOfShifts(), {}, "at least one axis"),
         (HistogramOfShifts(), {"sigma": []}, "at least one value"),
         (AnchorPoints(), {"weight": [1.0]}, "window, tolerance"),
         (AggregatedScore(), {"sigma": [1.0]}, "no numeric parameter"),

@@ -75,3 +75,13 @@ def test_recall_is_k_over_n_as_the_paper_prints_it(depth, expected):
     positives = np.arange(81)[:, None] < right
     order = np.zeros((81, depth), int)
     assert round(100 * recall_at_k(order, positives, [depth])[0], 1) == expected
+
+
+def test_unsigned_frame_numbers_do_not_wrap():
+    got = frame_positives(np.array([5], np.uint8), np.arange(10, dtype=np.uint8), tolerance=2)
+    np.testing.assert_array_equal(np.flatnonzero(got[0]), [3, 4, 5, 6, 7])
+
+
+def test_no_database_and_no_queries_recall_nothing():
+    np.testing.assert_array_equal(recall_at_k(np.full((2, 1), -1), np.zeros((2, 0), bool), [1, 5]), [0, 0])
+    np.testing.assert_array_equal(recall_at_k(np.zeros((0, 3), int), np.zeros((0, 4), bool), [1]), [0])

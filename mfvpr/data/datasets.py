@@ -44,10 +44,16 @@ def image_folder(root: Path) -> ImageFolder:
         InputError: no such folder, or no images in it.
     """
     if not root.is_dir():
-        raise InputError(f"{root}: expected a folder of images, got {'a file' if root.exists() else 'nothing'}")
-    names = [path.relative_to(root).as_posix() for path in root.rglob("*") if path.suffix.lower() in SUFFIXES]
+        raise InputError(
+            f"{root}: expected a folder of images, got {'a file' if root.exists() else 'nothing'}; check the path"
+        )
+    names = [
+        path.relative_to(root).as_posix()
+        for path in root.rglob("*")
+        if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+    ]
     if not names:
-        raise InputError(f"{root}: expected images ({', '.join(sorted(SUFFIXES))}), found none")
+        raise InputError(f"{root}: expected images ({', '.join(sorted(SUFFIXES))}), found none; check the path")
     return ImageFolder(root, tuple(sorted(names, key=_natural)))
 
 
@@ -72,11 +78,13 @@ def fingerprint(folders: Sequence[ImageFolder]) -> str:
     digest = hashlib.sha256()
     for folder in folders:
         for name, content in zip(folder.names, ordered_map(_content_digest, folder.paths, workers=2), strict=True):
-            digest.update(f"{len(name.encode())}:{name}".encode() + content)
+            digest.update(name.encode("utf-8", "surrogateescape") + b"\0" + content)
     return digest.hexdigest()[:16]
 
 
 def _truth(database: ImageFolder, queries: ImageFolder, kind: str, index_file: Path | None) -> Truth | None:
+    if index_file is not None and kind != "index":
+        raise InputError(f"{index_file}: given as index file, but dataset.ground_truth={kind}; set it to index")
     if kind == "order":
         return truth_by_order(len(queries), len(database))
     if kind == "index":
@@ -87,10 +95,13 @@ def _truth(database: ImageFolder, queries: ImageFolder, kind: str, index_file: P
 
 
 def _content_digest(path: Path) -> bytes:
-    if not path.is_file():
-        return b"no regular file"
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").digest()
+    try:
+        if path.is_file():
+            with path.open("rb") as file:
+                return hashlib.file_digest(file, "sha256").digest()
+    except OSError:
+        pass  # whoever reads the image will tell
+    return b"unreadable"
 
 
 def _natural(name: str) -> tuple[list[tuple[int, int, str]], str]:

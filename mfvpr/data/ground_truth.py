@@ -34,6 +34,10 @@ class FrameTruth:
             positives |= frame_positives(index, np.arange(self.num_database), tolerance=int(threshold))
         return positives
 
+    def place(self, query: int) -> int | None:
+        """The database row that shows the query's place best, None if there is none."""
+        return self.rows[query][0] if self.rows[query] else None
+
 
 @dataclass(frozen=True)
 class RadiusTruth:
@@ -46,6 +50,10 @@ class RadiusTruth:
     def positives(self, threshold: float) -> np.ndarray:
         """`[Q, N]` bool for a radius in meters, inclusive."""
         return radius_positives(self.query_xy, self.database_xy, radius=threshold)
+
+    def place(self, query: int) -> int | None:
+        """The database row nearest to the query."""
+        return int(np.argmin(np.linalg.norm(self.database_xy - self.query_xy[query], axis=1)))
 
 
 Truth = FrameTruth | RadiusTruth
@@ -78,7 +86,8 @@ def truth_from_file(path: Path, query_names: Sequence[str], database_names: Sequ
     * `.json`: VPR-Bench's `[[query, [database, ...]], ...]`.
     """
     if not path.is_file():
-        raise InputError(f"{path}: expected an index file (.csv, .npz or .json), found none; set dataset.index_file")
+        found = "a folder" if path.is_dir() else "nothing"
+        raise InputError(f"{path}: expected an index file (.csv, .npz or .json), got {found}; set dataset.index_file")
     readers = {".csv": _csv_pairs, ".npz": _npz_pairs, ".json": _json_pairs}
     if path.suffix.lower() not in readers:
         raise InputError(f"{path}: expected an index file named .csv, .npz or .json, got {path.suffix or 'no suffix'}")
@@ -87,6 +96,8 @@ def truth_from_file(path: Path, query_names: Sequence[str], database_names: Sequ
     except InputError:
         raise
     except Exception as error:  # a parser on a foreign file
+        if "allow_pickle" in str(error):
+            error = ValueError("it holds Python objects, which are never loaded")
         raise InputError(f"{path}: cannot be read as {path.suffix} ({error}); see README, Your own images") from None
     if isinstance(found, RadiusTruth):
         _same_count(path, "query positions (utmQ)", len(found.query_xy), len(query_names))
@@ -127,14 +138,27 @@ def _csv_pairs(path: Path) -> list[tuple[str, str]]:
 def _npz_pairs(path: Path) -> list[tuple[Any, Any]] | RadiusTruth:
     with np.load(path, allow_pickle=False) as arrays:
         if {"utmQ", "utmDb"} <= set(arrays):
-            return RadiusTruth(arrays["utmQ"].astype(np.float64), arrays["utmDb"].astype(np.float64))
+            positions = [arrays[name].astype(np.float64) for name in ("utmQ", "utmDb")]
+            for name, xy in zip(("utmQ", "utmDb"), positions, strict=True):
+                if xy.ndim != 2 or xy.shape[1] != 2 or not np.isfinite(xy).all():
+                    raise InputError(
+                        f"{path}: {name}: expected finite positions [n, 2] in meters, got shape {xy.shape}"
+                    )
+            return RadiusTruth(*positions)
         if {"query", "database"} <= set(arrays):
+            if arrays["query"].shape != arrays["database"].shape or arrays["query"].ndim != 1:
+                raise InputError(f"{path}: expected query and database of one length, got "
+                                 f"{arrays['query'].shape} and {arrays['database'].shape}")  # fmt: skip
             return list(zip(arrays["query"].tolist(), arrays["database"].tolist(), strict=True))
         raise InputError(f"{path}: expected arrays query and database, or utmQ and utmDb; got {', '.join(arrays)}")
 
 
 def _json_pairs(path: Path) -> list[tuple[Any, Any]]:
     entries = json.loads(path.read_text(encoding="utf-8"))
+    if not isinstance(entries, list) or not all(
+        isinstance(entry, list) and len(entry) == 2 and isinstance(entry[1], list) for entry in entries
+    ):
+        raise InputError(f"{path}: expected [[query, [database, ...]], ...] as in VPR-Bench")
     return [(query, place) for query, places in entries for place in (places or [""])]
 
 

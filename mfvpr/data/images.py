@@ -27,6 +27,7 @@ _CV2 = {"cv2_linear": cv2.INTER_LINEAR, "cv2_area": cv2.INTER_AREA}
 
 # Pillow warns from 89 megapixels on; `read_image` refuses earlier, with the file's name.
 warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
+warnings.filterwarnings("ignore", message="Palette images with Transparency")
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -1,5 +1,6 @@
 """The paper's histogram figure: both images with their matches beside the histogram of shifts, its peak marked."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -7,14 +8,15 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
 
 from mfvpr.data.files import replacing
-from mfvpr.scoring import HistogramOfShifts
+from mfvpr.pipeline import Explanation
 from mfvpr.types import Matches
-from mfvpr.weighting import match_weights
 
-_AGREES, _DIFFERS = "#3ddc84", "#ff5a5f"
+_AGREES, _DIFFERS = "#2fa8ff", "#ff9a1f"  # told apart by color-blind people as well
+_GAP = 12  # px between the two images
 
 
 def histogram_figure(
@@ -22,7 +24,7 @@ def histogram_figure(
     query_image: np.ndarray,
     candidate_image: np.ndarray,
     matches: Matches,
-    scorer: HistogramOfShifts,
+    explanation: Explanation,
     *,
     title: str,
     max_lines: int = 30,
@@ -33,66 +35,66 @@ def histogram_figure(
         path: image file to write.
         query_image: `[H, W, 3]` uint8, at the size that the points refer to.
         candidate_image: likewise.
-        matches: of this pair, `[K, ...]`.
-        scorer: whose histogram is shown.
+        matches: of this pair, `[K, ...]`, NumPy.
+        explanation: of these matches, see `mfvpr.pipeline.explain`.
         title: above everything.
-        max_lines: matches drawn, the heaviest (the paper shows 30). Green ones lie within two sigmas of the peak.
+        max_lines: matches drawn, the heaviest (the paper shows 30); blue where they agree with the peak.
     """
     figure = Figure(figsize=(12, 4.6), layout="constrained")
     FigureCanvasAgg(figure)
     pair, heat = figure.subplots(1, 2, width_ratios=(2, 1.15))
-    figure.suptitle(title, fontsize=11)
-    peak = np.asarray(scorer.dominant_shift(matches, refine=True))
-    _draw_pair(pair, query_image, candidate_image, matches, scorer, peak, max_lines)
-    image = _draw_histogram(heat, matches, scorer, peak)
+    figure.suptitle(title, fontsize=11, parse_math=False)  # a file's name may hold a $
+    _draw_pair(pair, query_image, candidate_image, matches, explanation, max_lines)
+    image = _draw_histogram(heat, explanation)
     figure.colorbar(image, ax=heat, label="bin score", shrink=0.85)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    with replacing(path) as temporary, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing")  # names in scripts that the font lacks
+        figure.savefig(temporary, dpi=110, bbox_inches="tight", pad_inches=0.15)
 
 
 def _draw_pair(
-    axes: Axes, query: np.ndarray, candidate: np.ndarray, matches: Matches, scorer: HistogramOfShifts,
-    peak: np.ndarray, max_lines: int,
-) -> None:  # fmt: skip
-    gap = 12
-    height = max(len(query), len(candidate))
-    canvas = np.full((height, query.shape[1] + gap + candidate.shape[1], 3), 255, np.uint8)
+    axes: Axes, query: np.ndarray, candidate: np.ndarray, matches: Matches, explanation: Explanation, max_lines: int
+) -> None:
+    offset = query.shape[1] + _GAP
+    canvas = np.full((max(len(query), len(candidate)), offset + candidate.shape[1], 3), 255, np.uint8)
     canvas[: len(query), : query.shape[1]] = query
-    canvas[: len(candidate), query.shape[1] + gap :] = candidate
+    canvas[: len(candidate), offset:] = candidate
     axes.imshow(canvas)
     axes.set_axis_off()
 
-    weights = np.asarray(match_weights(scorer.weight, matches))
-    heaviest = np.argsort(-weights, kind="stable")[: min(max_lines, int(np.sum(matches.mask)))]
-    start = np.asarray(matches.points0)[heaviest]
-    end = np.asarray(matches.points1)[heaviest]
-    sign = 1 if scorer.direction == "candidate_minus_query" else -1
-    reach = 2 * np.sqrt(scorer.sigma) if scorer.sigma_is_variance else 2 * scorer.sigma
-    agrees = np.linalg.norm(sign * (end - start) - peak, axis=1) <= reach
-    offset = np.array([query.shape[1] + gap, 0])
-    colors = np.where(agrees, _AGREES, _DIFFERS)
-    lines = np.stack([start, end + offset], axis=1)
+    count = int(matches.mask.sum())
+    heaviest = np.argsort(-np.where(matches.mask, explanation.weights, -np.inf), kind="stable")[: min(max_lines, count)]
+    start, end = matches.points0[heaviest], matches.points1[heaviest] + [offset, 0]
+    colors = np.where(explanation.agrees[heaviest], _AGREES, _DIFFERS)
+    lines = np.stack([start, end], axis=1)
     axes.add_collection(LineCollection(list(lines), colors=colors, linewidths=0.8, alpha=0.9))
-    for points in (start, end + offset):
+    for points in (start, end):
         axes.scatter(points[:, 0], points[:, 1], s=7, c=colors, linewidths=0)
     axes.set_title(
-        f"query | candidate: {len(heaviest)} heaviest of {int(np.sum(matches.mask))} matches, "
-        f"{agrees.sum()} agree with the peak",
+        f"query | candidate: the {len(heaviest)} heaviest of {count} matches, blue where the shift agrees with the "
+        f"peak ({explanation.agrees[heaviest].sum()} of these, {explanation.agrees.sum()} of all)",
         fontsize=9,
     )
 
 
-def _draw_histogram(axes: Axes, matches: Matches, scorer: HistogramOfShifts, peak: np.ndarray):
-    scores, centers_x, centers_y = map(np.asarray, scorer.histogram(matches))
-    real_y, real_x = (scores > -np.inf).any(axis=1), (scores > -np.inf).any(axis=0)
-    scores, centers_x, centers_y = scores[real_y][:, real_x], centers_x[real_x], centers_y[real_y]
-    half = float(scorer.bin_size) / 2
+def _draw_histogram(axes: Axes, explanation: Explanation) -> AxesImage:
+    scores, centers_x, centers_y = explanation.histogram
+    inside = scores > -np.inf
+    rows, columns = inside.any(axis=1), inside.any(axis=0)
+    scores, centers_x, centers_y = scores[rows][:, columns], centers_x[columns], centers_y[rows]
+    width = float(explanation.histogram.centers_x[1] - explanation.histogram.centers_x[0])
+    half = width / 2
     extent = (centers_x[0] - half, centers_x[-1] + half, centers_y[-1] + half, centers_y[0] - half)
-    image = axes.imshow(scores, extent=extent, cmap="magma", interpolation="nearest", vmin=0)
-    x, y = np.asarray(scorer.dominant_shift(matches))
-    axes.add_patch(Rectangle((x - half, y - half), 2 * half, 2 * half, fill=False, edgecolor="cyan", linewidth=1.4))
-    axes.plot(*peak, marker="+", color="cyan", markersize=8)
-    axes.set_xlabel("shift x, px")
+    top = max(float(explanation.score), 1e-9)
+    image = axes.imshow(scores, extent=extent, cmap="magma", interpolation="nearest", vmin=0, vmax=top)
+    axes.set_xlabel("shift x, px (candidate minus query; square: tallest bin, cross: refined peak)", fontsize=8)
     axes.set_ylabel("shift y, px")
-    axes.set_title(f"score {float(scorer(matches)):.4g}, shift ({peak[0]:.1f}, {peak[1]:.1f}) px", fontsize=9)
+    if explanation.score <= 0:
+        axes.set_title("histogram of shifts: no votes", fontsize=9)
+        return image
+    corner = explanation.shift - half
+    axes.add_patch(Rectangle((corner[0], corner[1]), width, width, fill=False, edgecolor="cyan", linewidth=1.4))
+    axes.plot(*explanation.peak, marker="+", color="cyan", markersize=8)
+    words = "histogram of shifts: score {:.4g}, peak at ({:.1f}, {:.1f}) px"
+    axes.set_title(words.format(explanation.score, *explanation.peak), fontsize=9)
     return image

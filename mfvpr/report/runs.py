@@ -33,11 +33,16 @@ def new_run_folder(root: Path, name: str) -> Path:
 
 def check_free(folder: Path) -> None:
     """Refuse a run folder that already holds something, or cannot be made."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    if os.path.lexists(folder) and (folder.is_symlink() or not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: expected a new or empty run folder; name another with out=DIR, or remove it")
     parent = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
-    if not os.access(parent, os.W_OK):
-        raise InputError(f"{folder}: {parent} cannot be written to; name another run folder with out=DIR")
+    try:
+        with tempfile.TemporaryDirectory(dir=parent):
+            pass
+    except OSError as error:
+        raise InputError(
+            f"{folder}: {parent} cannot be written to ({error.strerror}); name another run folder with out=DIR"
+        ) from None
 
 
 @contextmanager
@@ -64,7 +69,7 @@ def versions() -> dict[str, str]:
 
 def write_results(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """`results.json`: one row per system and tolerance."""
-    write_text(folder / "results.json", json.dumps(rows, indent=1, ensure_ascii=False) + "\n")
+    write_text(folder / "results.json", json.dumps(rows, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
 def write_table(folder: Path, table: Table) -> None:

@@ -1,12 +1,12 @@
 """Aggregated score (paper, section III-C): every match counts, less so the further its shift is from the mean."""
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
 
-from mfvpr.numerics import masked_mean, masked_median
+from mfvpr.numerics import as_float, masked, masked_mean, masked_median
+from mfvpr.scoring.choices import check_choices, choice
 from mfvpr.scoring.shifts import match_shifts
 from mfvpr.types import Array, Matches
 from mfvpr.weighting import DescriptorDistanceWeight, Weight, match_weights
@@ -24,17 +24,20 @@ class AggregatedScore:
     """
 
     weight: Weight = DescriptorDistanceWeight()
-    mean: Literal["unweighted", "weighted", "median"] = field(default="unweighted", metadata={"static": True})
+    mean: str = choice("unweighted", "weighted", "median")
     clamp: bool = field(default=False, metadata={"static": True})
+
+    def __post_init__(self) -> None:
+        check_choices(self)
 
     def __call__(self, matches: Matches) -> Array:
         """Score of one pair, `[]` float32."""
         weights = match_weights(self.weight, matches)
         shifts = match_shifts(matches)
         center = self._center(shifts, weights, matches.mask)
-        closeness = matches.image_size0[None] - jnp.abs(shifts - center[None])
+        closeness = as_float(matches.image_size0)[None] - jnp.abs(shifts - center[None])
         closeness = jnp.maximum(closeness, 0.0) if self.clamp else closeness
-        return jnp.sum(weights * jnp.sum(closeness**2, axis=-1))
+        return jnp.sum(weights * jnp.sum(masked(closeness, matches.mask) ** 2, axis=-1))
 
     def _center(self, shifts: Array, weights: Array, mask: Array) -> Array:
         if self.mean == "median":

@@ -6,12 +6,12 @@ paper's ||((i, j) - (k, l)) - (m_ij - m_kl)|| is the distance of two displacemen
 """
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
 
-from mfvpr.numerics import masked, safe_sqrt
+from mfvpr.numerics import as_float, masked, safe_sqrt
+from mfvpr.scoring.choices import check_choices, choice
 from mfvpr.types import Array, Matches
 from mfvpr.weighting import FeatureScoreWeight, Weight, match_weights
 
@@ -25,10 +25,10 @@ class AnchorPoints:
     tolerance 1 and unit cell weights it counts exact agreements, as SSM-VPR does.
 
     Attributes:
+        num_bins: cells per side (facts A14); memory grows with its fourth power.
         window: width of the square window around an anchor, cells.
         tolerance: largest distance of two displacements that still counts, cells.
         weight: match weight, FS by default as in the paper.
-        num_bins: cells per side (facts A14).
         window_mode: `half_floor` is window // 2 to each side (10 -> 11 x 11); `asymmetric` exactly window cells
             (10 -> -5 ... +4); `odd_down` the next odd number below (10 -> 9 x 9); `radius` window to each side (A18).
         first: image whose cells are the anchors, `query` or `candidate` (facts A16).
@@ -36,16 +36,17 @@ class AnchorPoints:
         cell_weight: w_a is the winner's summed weight, the whole cell's, or 1 (facts A17).
     """
 
-    window: float | Array = 10
+    num_bins: int = field(default=15, metadata={"static": True})
+    window: float | Array = 10.0
     tolerance: float | Array = 3.0
     weight: Weight = FeatureScoreWeight()
-    num_bins: int = field(default=15, metadata={"static": True})
-    window_mode: Literal["half_floor", "asymmetric", "odd_down", "radius"] = field(
-        default="half_floor", metadata={"static": True}
-    )
-    first: Literal["query", "candidate"] = field(default="query", metadata={"static": True})
+    window_mode: str = choice("half_floor", "asymmetric", "odd_down", "radius")
+    first: str = choice("query", "candidate")
     include_self: bool = field(default=True, metadata={"static": True})
-    cell_weight: Literal["winner_sum", "cell_sum", "ones"] = field(default="winner_sum", metadata={"static": True})
+    cell_weight: str = choice("winner_sum", "cell_sum", "ones")
+
+    def __post_init__(self) -> None:
+        check_choices(self)
 
     def __call__(self, matches: Matches) -> Array:
         """Score of one pair, `[]` float32."""
@@ -65,27 +66,27 @@ class AnchorPoints:
         anchor, target = (cell0, cell1) if self.first == "query" else (cell1, cell0)
 
         vote = anchor * num_cells + target
-        votes = jnp.zeros(num_cells**2).at[vote].add(weights)
+        votes = jnp.zeros(num_cells**2, weights.dtype).at[vote].add(weights)
         strength = jax.lax.stop_gradient(votes[vote])  # [K]; which cell wins has no gradient, its weight below has
         member = jnp.where(matches.mask, anchor, num_cells)  # out of range: padding is dropped
-        best = jnp.full(num_cells, -jnp.inf).at[member].max(strength, mode="drop")
+        best = jnp.full(num_cells, -jnp.inf, weights.dtype).at[member].max(strength, mode="drop")
         contender = jnp.where(strength == best[anchor], target, num_cells)
-        winner = jnp.full(num_cells, num_cells).at[member].min(contender, mode="drop")
+        winner = jnp.full(num_cells, num_cells, jnp.int32).at[member].min(contender, mode="drop")
 
-        cells = jnp.arange(num_cells)
+        cells = jnp.arange(num_cells, dtype=jnp.int32)
         occupied = winner < num_cells
         winner = jnp.where(occupied, winner, cells)
         rows, columns = winner // self.num_bins - cells // self.num_bins, winner % self.num_bins - cells % self.num_bins
         cell_weights = {
             "winner_sum": lambda: votes[cells * num_cells + winner],
             "cell_sum": lambda: jnp.sum(votes.reshape(num_cells, num_cells), axis=1),
-            "ones": lambda: jnp.ones(num_cells),
+            "ones": lambda: jnp.ones(num_cells, weights.dtype),
         }[self.cell_weight]()
-        return rows.astype(float), columns.astype(float), occupied, cell_weights
+        return rows.astype(weights.dtype), columns.astype(weights.dtype), occupied, cell_weights
 
     def _cell(self, points: Array, image_size: Array, mask: Array) -> Array:
         """`[K]` int32 row-major cell of each point; points outside belong to the border (facts A15)."""
-        position = jnp.floor(masked(points, mask) * self.num_bins / image_size[None])
+        position = jnp.floor(masked(as_float(points), mask) * self.num_bins / as_float(image_size)[None])
         column, row = jnp.clip(position, 0, self.num_bins - 1).astype(jnp.int32).T
         return row * self.num_bins + column
 

@@ -6,13 +6,14 @@ product, `votes_y [By, K] @ votes_x [Bx, K]^T`, instead of K x By x Bx exponenti
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mfvpr.numerics import is_concrete, round_up
+from mfvpr.scoring.choices import check_choices, choice
 from mfvpr.scoring.shifts import match_shifts
 from mfvpr.types import Array, Matches
 from mfvpr.weighting import FeatureScoreWeight, Weight, match_weights
@@ -45,28 +46,30 @@ class HistogramOfShifts:
     Attributes:
         bin_size: width of the square bins, px.
         sigma: standard deviation of the vote, px; the paper's 22.5 is read as 1.5 bins (facts A1).
-        truncate: a match votes only for bins within this many sigmas along each axis (facts A4; the paper: all).
         weight: match weight, FS by default as in the paper.
+        truncate: a match votes only for bins within this many sigmas along each axis (facts A4; the paper: all).
         shift_range: (x, y): bins cover [-x, x] and [-y, y] px instead of all possible shifts (facts A2).
         align: `min_edge` starts the first bin at the smallest possible shift; `zero_center` centers a bin on shift
             0; `zero_edge` puts an edge there (facts A3).
         sigma_is_variance: read `sigma` as the variance, px^2 (facts A1).
         direction: shift of a match, candidate minus query point or the reverse (facts A5).
         max_bins: capacity of bins per axis. By default as many as concrete values ask for, or 64 where they are
-            traced. A histogram that needs more than its capacity scores NaN, never a wrong number.
+            traced. A histogram that needs more than its capacity scores NaN, never a wrong number: set `max_bins`
+            before `jit` for larger images or finer bins (`with_capacity` does).
     """
 
     bin_size: float | Array = 15.0
     sigma: float | Array = 22.5
-    truncate: float | Array = math.inf
     weight: Weight = FeatureScoreWeight()
+    truncate: float | Array = math.inf
     shift_range: tuple[float, float] | None = None
-    align: Literal["min_edge", "zero_center", "zero_edge"] = field(default="min_edge", metadata={"static": True})
+    align: str = choice("min_edge", "zero_center", "zero_edge")
     sigma_is_variance: bool = field(default=False, metadata={"static": True})
-    direction: Literal["candidate_minus_query", "query_minus_candidate"] = field(
-        default="candidate_minus_query", metadata={"static": True}
-    )
+    direction: str = choice("candidate_minus_query", "query_minus_candidate")
     max_bins: int | None = field(default=None, metadata={"static": True})
+
+    def __post_init__(self) -> None:
+        check_choices(self)
 
     def __call__(self, matches: Matches) -> Array:
         """Score of one pair, `[]` float32: the maximum over bins, 0 without matches."""
@@ -81,34 +84,47 @@ class HistogramOfShifts:
         return ShiftHistogram(scores, centers[:, 0], centers[:, 1])
 
     def dominant_shift(self, matches: Matches, *, refine: bool = False) -> Array:
-        """`[2]` (x, y) px: where the query's points lie in the candidate; (0, 0) without matches.
+        """`[2]` (x, y) px: where the query's points lie in the candidate; (0, 0) where nothing votes.
 
         The center of the tallest bin, the first in row-major order on a tie. With `refine` the peak between bin
         centers: the maximum of the same sum of Gaussians over all shifts, reached from that bin by mean shift
         (Comaniciu & Meer, PAMI 2002).
         """
-        histogram = self.histogram(matches)
-        row, column = jnp.unravel_index(jnp.argmax(histogram.scores), histogram.scores.shape)
-        shift = jnp.stack([histogram.centers_x[column], histogram.centers_y[row]])
+        scores, centers, inside, fits = self._vote(matches)
+        scores = jnp.where(inside, scores, -jnp.inf)
+        row, column = jnp.unravel_index(jnp.argmax(scores), scores.shape)
+        shift = jnp.stack([centers[column, 0], centers[row, 1]])
         if refine:
             shift = self._climb(shift, self._shifts(matches), match_weights(self.weight, matches))
-        return jnp.where(jnp.any(matches.mask), shift, 0.0)
+        return jnp.where(jnp.max(scores) > 0, jnp.where(fits, shift, jnp.nan), 0.0)
+
+    def agrees(self, matches: Matches, shift: Array) -> Array:
+        """`[K]` bool: real matches whose shift lies within two standard deviations of `shift` `[2]` along both axes."""
+        shifts = self._shifts(matches)
+        near = jnp.all(jnp.abs(shifts - shift[None]) <= 2 * self._deviation(shifts.dtype), axis=-1)
+        return near & matches.mask
 
     def with_capacity(self, image_size0: Array, image_size1: Array, *, multiple: int = 1) -> "HistogramOfShifts":
         """This scorer with `max_bins` set to what its concrete values need, rounded up to a `multiple`.
 
         `bin_size` and the sizes may be batched: the capacity serves all of them.
+
+        Raises:
+            ValueError: `bin_size` is not above 0.
         """
         finest = replace(self, bin_size=np.min(self.bin_size))
-        _, num_bins = finest._lattice(image_size0, image_size1, np)
-        return replace(self, max_bins=round_up(int(np.max(num_bins)), multiple))
+        if not finest.bin_size > 0:
+            raise ValueError(f"HistogramOfShifts(bin_size={finest.bin_size}): expected a number above 0")
+        _, num_bins = finest._lattice(image_size0, image_size1, float, np)
+        needed = np.max(num_bins, where=np.isfinite(num_bins), initial=1)  # padding pairs may have any size
+        return replace(self, max_bins=round_up(int(needed), multiple))
 
     def _vote(self, matches: Matches) -> tuple[Array, Array, Array, Array]:
         """Scores `[B, B]` (y, x), centers `[B, 2]`, which bins are in range `[B, B]`, whether all bins fit `[]`."""
-        first, num_bins = self._lattice(matches.image_size0, matches.image_size1)
-        index = jnp.arange(self._capacity(matches), dtype=float)[:, None]
-        centers = first[None] + index * jnp.asarray(self.bin_size)
         shifts = self._shifts(matches)
+        first, num_bins = self._lattice(matches.image_size0, matches.image_size1, shifts.dtype, jnp)
+        index = jnp.arange(self._capacity(matches), dtype=shifts.dtype)[:, None]
+        centers = first[None] + index * jnp.asarray(self.bin_size, dtype=shifts.dtype)
         votes_x = self._gaussian(centers[:, 0], shifts[:, 0])
         votes_y = self._gaussian(centers[:, 1], shifts[:, 1]) * match_weights(self.weight, matches)[None]
         scores = jnp.matmul(votes_y, votes_x.T, precision=jax.lax.Precision.HIGHEST)
@@ -121,17 +137,17 @@ class HistogramOfShifts:
         values = (self.bin_size, self.shift_range, matches.image_size0, matches.image_size1)
         if not is_concrete(values):
             return TRACED_MAX_BINS
-        return self.with_capacity(matches.image_size0, matches.image_size1).max_bins or TRACED_MAX_BINS
+        return cast(int, self.with_capacity(matches.image_size0, matches.image_size1).max_bins)
 
-    def _lattice(self, image_size0: Array, image_size1: Array, xp: Any = jnp) -> tuple[Array, Array]:
-        """Center of the first bin and number of bins, both `[..., 2]` along (x, y)."""
-        lower, upper = -xp.asarray(image_size0, dtype=float), xp.asarray(image_size1, dtype=float)
+    def _lattice(self, image_size0: Array, image_size1: Array, dtype: Any, xp: Any) -> tuple[Array, Array]:
+        """Center of the first bin and number of bins, both `[..., 2]` along (x, y); in NumPy or JAX (`xp`)."""
+        lower, upper = -xp.asarray(image_size0, dtype=dtype), xp.asarray(image_size1, dtype=dtype)
         if self.direction == "query_minus_candidate":
             lower, upper = -upper, -lower
         if self.shift_range is not None:
-            upper = xp.asarray(self.shift_range, dtype=float)
+            upper = xp.asarray(self.shift_range, dtype=dtype)
             lower = -upper
-        bin_size = xp.asarray(self.bin_size, dtype=float)[..., None]
+        bin_size = xp.asarray(self.bin_size, dtype=dtype)[..., None]
         slack = 1e-4  # of a bin: rounding must not add one that holds nothing
         if self.align == "min_edge":
             edge = lower
@@ -145,22 +161,23 @@ class HistogramOfShifts:
         shifts = match_shifts(matches)
         return shifts if self.direction == "candidate_minus_query" else -shifts
 
-    def _deviation(self) -> Array:
-        sigma = jnp.asarray(self.sigma)
+    def _deviation(self, dtype: Any) -> Array:
+        sigma = jnp.asarray(self.sigma, dtype=dtype)
+        sigma = jnp.where(sigma > 0, sigma, jnp.nan)  # no width, no score
         return jnp.sqrt(sigma) if self.sigma_is_variance else sigma
 
     def _gaussian(self, centers: Array, shifts: Array) -> Array:
         """`[B, K]` one-dimensional Gaussian votes."""
         # Bins along rows: the exponentials then run along K, which is longer and contiguous (1.8x faster).
-        sigmas = (centers[:, None] - shifts[None]) / self._deviation()
-        return jnp.where(jnp.abs(sigmas) <= self.truncate, jnp.exp(-0.5 * sigmas**2), 0.0)
+        sigmas = (centers[:, None] - shifts[None]) / self._deviation(shifts.dtype)
+        return jnp.where(jnp.abs(sigmas) > self.truncate, 0.0, jnp.exp(-0.5 * sigmas**2))
 
     def _climb(self, start: Array, shifts: Array, weights: Array) -> Array:
         """Fixed-point iteration to the mode of sum_k w_k exp(-|s - s_k|^2 / (2 sigma^2))."""
 
         def step(_: int, shift: Array) -> Array:
             distance = jnp.sum((shifts - shift[None]) ** 2, axis=-1)
-            pull = weights * jnp.exp(-0.5 * distance / self._deviation() ** 2)
+            pull = weights * jnp.exp(-0.5 * distance / self._deviation(shifts.dtype) ** 2)
             total = jnp.sum(pull)
             return jnp.where(total > 0, pull @ shifts / jnp.where(total > 0, total, 1.0), shift)
 

@@ -25,6 +25,7 @@ def folders(tmp_path):
 
 
 def test_names_are_relative_in_natural_order_and_kept_apart(tmp_path):
+    fill(tmp_path, ["._img10.png", "sub/.hidden.jpg"])
     names = ["img10.png", "img2.png", "sub/img2.png", "a b/ü@1.png", "IMG3.JPG", "img02.png"]
     fill(tmp_path, names)
     (tmp_path / "notes.txt").write_text("no image")
@@ -87,7 +88,7 @@ def bad_npz(path):
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("missing.csv", None, "found none"),
+        ("missing.csv", None, "got nothing"),
         ("gt.txt", "x", "named .csv, .npz or .json"),
         ("gt.csv", "", "no header"),
         ("gt.csv", "a,b\n0,0\n", "got a,b"),
@@ -101,7 +102,16 @@ def bad_npz(path):
         ("gt.csv", "query,database\n0,0\nzz.png,0\n", "got 'zz.png'"),
         ("gt.json", "[[0", "cannot be read as .json"),
         ("gt.npz", "no archive", "cannot be read as .npz"),
-        ("gt.npz", bad_npz, "allow_pickle=False"),
+        ("gt.npz", bad_npz, "Python objects, which are never loaded"),
+        ("gt.json", '{"00": 1, "11": 1}', "expected [[query, [database, ...]], ...]"),
+        ("gt.json", '[[0, "12"], [1, "0"]]', "expected [[query, [database, ...]], ...]"),
+        (
+            "gt.npz",
+            lambda p: np.savez(p, utmQ=np.full((2, 2), np.nan), utmDb=np.zeros((3, 2))),
+            "utmQ: expected finite",
+        ),
+        ("gt.npz", lambda p: np.savez(p, utmQ=np.zeros(()), utmDb=np.zeros((3, 2))), "utmQ: expected finite"),
+        ("gt.npz", lambda p: np.savez(p, query=np.arange(2), database=np.arange(3)), "of one length"),
         ("gt.npz", lambda p: np.savez(p, other=np.zeros(2)), "got other"),
         ("gt.npz", lambda p: np.savez(p, utmQ=np.zeros((5, 2)), utmDb=np.zeros((3, 2))), "expected 2 query positions"),
     ],

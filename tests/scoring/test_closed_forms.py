@@ -27,7 +27,7 @@ def test_coincident_matches_at_a_bin_center_score_their_weight(count):
 
 @pytest.mark.parametrize("size, bins", [(336, 45), (320, 43)])
 def test_number_of_bins_of_the_paper(size, bins):
-    matches = make_matches([[1, 1]], [[2, 2]], size=(size, size))
+    matches = make_matches([[1, 1]], [[2, 2]], sizes=((size, size), (size, size)))
     assert HistogramOfShifts().histogram(matches).scores.shape == (bins, bins)
 
 
@@ -62,6 +62,8 @@ def test_exchanged_images_mirror_the_histogram_when_a_bin_is_centered_on_zero():
 def test_a_histogram_beyond_its_capacity_is_nan_not_wrong():
     matches = random_matches(np.random.default_rng(3), 30)
     assert np.isnan(HistogramOfShifts(max_bins=44)(matches))
+    assert np.isnan(HistogramOfShifts(max_bins=44).dominant_shift(matches)).all()
+    assert np.isnan(HistogramOfShifts(max_bins=44).dominant_shift(matches, refine=True)).all()
     assert np.isfinite(HistogramOfShifts(max_bins=45)(matches))
     tight, loose = HistogramOfShifts(max_bins=45), HistogramOfShifts(max_bins=80)
     np.testing.assert_allclose(tight(matches), loose(matches), rtol=1e-6)
@@ -98,7 +100,7 @@ def test_tolerance_one_counts_exact_agreements_as_ssm_vpr():
 def test_equal_shifts_give_the_aggregated_score_its_maximum():
     points0 = np.random.default_rng(5).uniform(0, 200, (40, 2)).round()
     distance = np.linspace(0, 2, 40)
-    matches = make_matches(points0, points0 + [30, -7], distance=distance, size=(320, 240))
+    matches = make_matches(points0, points0 + [30, -7], distance=distance, sizes=((320, 240), (320, 240)))
     assert AggregatedScore()(matches) == pytest.approx((2 - distance).sum() * (320**2 + 240**2), rel=1e-5)
 
 
@@ -106,3 +108,16 @@ def test_weights_of_the_paper():
     matches = make_matches([[1, 1]], [[2, 2]], distance=[0.25], scores0=[3.0], scores1=[4.0])
     assert HistogramOfShifts().weight(matches)[0] == 7.0
     assert DescriptorDistanceWeight()(matches)[0] == 1.75
+
+
+def test_numbers_without_meaning_give_no_number():
+    matches = random_matches(np.random.default_rng(6), 30)
+    assert np.isnan(HistogramOfShifts(sigma=0.0)(matches))
+    assert np.isnan(HistogramOfShifts(sigma=-5.0)(matches))
+    with pytest.raises(ValueError, match="bin_size=-5"):
+        HistogramOfShifts(bin_size=-5.0)(matches)
+
+
+def test_a_histogram_without_votes_has_no_shift():
+    matches = make_matches([[10, 10]], [[50, 20]], scores0=[0.0], scores1=[0.0])
+    np.testing.assert_array_equal(HistogramOfShifts().dominant_shift(matches), 0)

@@ -29,7 +29,8 @@ CLOSE = {"rtol": 2e-5, "atol": 1e-4}  # float32 sums of 60 terms; scores are of 
 def pairs(draw):
     """Matches of one pair: empty, single, duplicated, tied or random, with weights exact in float32."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    matches = random_matches(rng, draw(st.sampled_from([0, 1, 2, 5, 20, 60])), capacity=64)
+    sizes = draw(st.sampled_from([((SIZE, SIZE), (SIZE, SIZE)), ((480, 320), (336, 400)), ((336, 400), (352, 338))]))
+    matches = random_matches(rng, draw(st.sampled_from([0, 1, 2, 5, 20, 60])), capacity=64, sizes=sizes)
     mask = matches.mask
     if draw(st.booleans()):  # ties: few places, equal weights
         for points in (matches.points0, matches.points1):
@@ -51,20 +52,23 @@ def oracle_inputs(matches, weight):
     pairs(),
     st.sampled_from(list(WEIGHTS)),
     st.sampled_from(["min_edge", "zero_center", "zero_edge"]),
-    st.sampled_from([(15.0, 22.5), (20.0, 8.0), (7.0, 30.0), (48.0, 5.0)]),
+    st.sampled_from([(15.0, 22.5), (20.0, 8.0), (11.0, 30.0), (48.0, 5.0)]),
     st.sampled_from([np.inf, 2.0]),
     st.sampled_from([None, (100.0, 40.0)]),
     st.booleans(),
+    st.sampled_from(["candidate_minus_query", "query_minus_candidate"]),
 )
-def test_histogram(matches, weight, align, sizes, truncate, shift_range, variance):
-    bin_size, sigma = sizes
+def test_histogram(matches, weight, align, parameters, truncate, shift_range, variance, direction):
+    bin_size, sigma = parameters
     scorer = HistogramOfShifts(
         bin_size=bin_size, sigma=sigma, truncate=truncate, align=align, shift_range=shift_range,
-        sigma_is_variance=variance, weight=WEIGHTS[weight][0],
+        sigma_is_variance=variance, direction=direction, weight=WEIGHTS[weight][0],
     )  # fmt: skip
     points0, points1, weights = oracle_inputs(matches, weight)
+    ends = [(points0, matches.image_size0), (points1, matches.image_size1)]
+    (start, size0), (end, size1) = ends if direction == "candidate_minus_query" else ends[::-1]
     expected, centers_x, centers_y = oracles.histogram_of_shifts(
-        points1 - points0, weights, (SIZE, SIZE), (SIZE, SIZE), bin_size=bin_size, sigma=sigma,
+        end - start, weights, size0, size1, bin_size=bin_size, sigma=sigma,
         truncate=truncate * (1 + 1e-6), align=align, shift_range=shift_range, sigma_is_variance=variance,
     )  # fmt: skip
     got = scorer.histogram(matches)
@@ -94,7 +98,7 @@ def test_anchor(matches, weight, parameters, window_mode, first, include_self, c
         "include_self": include_self, "cell_weight": cell_weight, "num_bins": num_bins,
     }  # fmt: skip
     points0, points1, weights = oracle_inputs(matches, weight)
-    expected = oracles.anchor_points(points0, points1, weights, (SIZE, SIZE), (SIZE, SIZE), **options)
+    expected = oracles.anchor_points(points0, points1, weights, matches.image_size0, matches.image_size1, **options)
     got = AnchorPoints(weight=WEIGHTS[weight][0], **options)(matches)
     np.testing.assert_allclose(got, expected, **CLOSE)
 
@@ -102,7 +106,7 @@ def test_anchor(matches, weight, parameters, window_mode, first, include_self, c
 @given(pairs(), st.sampled_from(list(WEIGHTS)), st.sampled_from(["unweighted", "weighted", "median"]), st.booleans())
 def test_aggregate(matches, weight, mean, clamp):
     points0, points1, weights = oracle_inputs(matches, weight)
-    expected = oracles.aggregated_score(points1 - points0, weights, (SIZE, SIZE), mean=mean, clamp=clamp)
+    expected = oracles.aggregated_score(points1 - points0, weights, matches.image_size0, mean=mean, clamp=clamp)
     got = AggregatedScore(weight=WEIGHTS[weight][0], mean=mean, clamp=clamp)(matches)
     np.testing.assert_allclose(got, expected, rtol=2e-5)
 
@@ -123,7 +127,7 @@ def test_dominant_shift(matches, sizes):
         np.testing.assert_array_equal(scorer.dominant_shift(matches, refine=True), 0)
         return
     histogram, centers_x, centers_y = oracles.histogram_of_shifts(
-        points1 - points0, weights, (SIZE, SIZE), (SIZE, SIZE), bin_size=bin_size, sigma=sigma
+        points1 - points0, weights, matches.image_size0, matches.image_size1, bin_size=bin_size, sigma=sigma
     )
     column, row = np.argmin(abs(centers_x - shift[0])), np.argmin(abs(centers_y - shift[1]))
     np.testing.assert_allclose([centers_x[column], centers_y[row]], shift, atol=1e-3)
