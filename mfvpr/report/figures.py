@@ -71,8 +71,8 @@ def _draw_pair(
     for points in (start, end):
         axes.scatter(points[:, 0], points[:, 1], s=7, c=colors, linewidths=0)
     axes.set_title(
-        f"query | candidate: the {len(heaviest)} heaviest of {count} matches, blue where the shift agrees with the "
-        f"peak ({explanation.agrees[heaviest].sum()} of these, {explanation.agrees.sum()} of all)",
+        f"query | candidate: {len(heaviest)} heaviest of {count} matches; blue agree with the peak "
+        f"({explanation.agrees[heaviest].sum()}; of all {explanation.agrees.sum()})",
         fontsize=9,
     )
 
