@@ -117,16 +117,16 @@ def _systems(settings: dict[str, Any], scorers: dict, matches: MatchSet, candida
     group = settings["scorer"]
     parameters = {name: group if "method" in group else group[name] for name in scorers}
     combined = "histogram" if "histogram" in scorers else next(iter(scorers))
-    c = settings["fusion"]["c"]
+    c, euclidean = settings["fusion"]["c"], settings["fusion"]["filter_score"] == "negative_euclidean"
     found = {"filter": ("none", {}, candidates.scores)}
     found |= {name: (name, parameters[name], scores[name]) for name in scorers}
-    fused = pipeline.fuse(candidates, scores[combined], None if c == "auto" else c)
-    found[f"{combined} + filter"] = (combined, parameters[combined] | {"c": c}, fused)
-    return {name: _system(candidates, *values) for name, values in found.items()}
+    fused = pipeline.fuse(candidates, scores[combined], None if c == "auto" else c, euclidean=euclidean)
+    found[f"{combined} + filter"] = (combined, parameters[combined] | settings["fusion"], fused)
+    return {name: _system(candidates, settings["ties"], *values) for name, values in found.items()}
 
 
-def _system(candidates: Shortlist, scorer: str, parameters: dict[str, Any], scores: np.ndarray) -> System:
-    order = pipeline.rank(candidates, scores)
+def _system(candidates: Shortlist, ties: Any, scorer: str, parameters: dict[str, Any], scores: np.ndarray) -> System:
+    order = pipeline.rank(candidates, scores, ties=ties)
     return System(
         scorer=scorer,
         parameters=parameters,

@@ -86,7 +86,7 @@ RULES: dict[str, Rule] = {
     "max_keypoints": _between(1, 20_000),
     "contrast_threshold": _POSITIVE,
     "clahe_clip": _NOT_NEGATIVE,
-    "num_words": _COUNT,
+    "num_words": _between(1, 4096),
     "power": _POSITIVE,
     "max_samples": _COUNT,
     "candidates": _or(_COUNT, "all"),
@@ -115,6 +115,8 @@ RULES: dict[str, Rule] = {
     "sigma_is_variance": _FLAG,
     "direction": _one_of("candidate_minus_query", "query_minus_candidate"),
     "max_bins": _or(_COUNT, None),
+    "filter_score": _one_of("cosine", "negative_euclidean"),
+    "ties": _one_of("filter", "index"),
     "c": _or(_NOT_NEGATIVE, "auto"),
     # report
     "tolerances": _list_of(_INDEX),

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import jax
 import numpy as np
@@ -210,14 +210,26 @@ def explain(scorer: HistogramOfShifts, matches: Matches) -> Explanation:
     return Explanation(*jax.tree.map(np.asarray, _explain(_prepare(scorer, matches), matches)))
 
 
-def fuse(candidates: Shortlist, scores: np.ndarray, c: float | None) -> np.ndarray:
-    """Combined scores `[Q, C]` of filter and re-ranking; `c` None balances their spread per query."""
-    return np.asarray(_fuse(candidates.scores, scores, candidates.mask, c))
+def fuse(candidates: Shortlist, scores: np.ndarray, c: float | None, *, euclidean: bool = False) -> np.ndarray:
+    """Combined scores `[Q, C]` of filter and re-ranking.
+
+    Args:
+        candidates: the filter's, with their cosine similarities.
+        scores: `[Q, C]` of the re-ranking.
+        c: weight of the filter; None balances the spread of both per query.
+        euclidean: the filter's score is minus the Euclidean distance of the unit descriptors instead (facts A28).
+    """
+    cosine = candidates.scores
+    filter_scores = -np.sqrt(np.maximum(2 - 2 * cosine, 0)) if euclidean else cosine
+    return np.asarray(_fuse(filter_scores, scores, candidates.mask, c))
 
 
-def rank(candidates: Shortlist, scores: np.ndarray) -> np.ndarray:
-    """Positions `[Q, C]` into the shortlist, best first, those without a candidate last."""
-    return np.asarray(_rank(scores, candidates.mask))
+def rank(candidates: Shortlist, scores: np.ndarray, *, ties: Literal["filter", "index"] = "filter") -> np.ndarray:
+    """Positions `[Q, C]` into the shortlist, best first, those without a candidate last.
+
+    Equal scores keep the filter's order, or go by database index (facts A29).
+    """
+    return np.asarray(_rank(scores, candidates.mask, tie_break=candidates.indices if ties == "index" else None))
 
 
 _retrieve = jax.jit(retrieval.retrieve, static_argnames="num_candidates")

@@ -69,15 +69,17 @@ def balancing_c(filter_scores: Array, rerank_scores: Array, mask: Array) -> Arra
     return jnp.where((filter_spread > 0) & jnp.isfinite(c), c, 0.0)
 
 
-def rank(scores: Array, mask: Array | None = None) -> Array:
+def rank(scores: Array, mask: Array | None = None, *, tie_break: Array | None = None) -> Array:
     """Positions `[..., C]` int32 in descending order of `scores` `[..., C]`.
 
-    Stable: ties keep the given order, which is the filter's (facts A29). NaN comes after every number, masked last.
+    Stable: ties keep the given order, which is the filter's, or go by ascending `tie_break` `[..., C]`, such as the
+    database index (facts A29). NaN comes after every number, masked last.
     """
     present = jnp.ones(scores.shape, bool) if mask is None else mask
     number = present & ~jnp.isnan(scores)
     group = jnp.where(present, jnp.where(number, 0, 1), 2)
-    return jnp.lexsort((-masked(scores, number), group), axis=-1).astype(jnp.int32)
+    keys = (-masked(scores, number), group) if tie_break is None else (tie_break, -masked(scores, number), group)
+    return jnp.lexsort(keys, axis=-1).astype(jnp.int32)
 
 
 def rerank(scores: Array, mask: Array | None = None) -> Ranking:

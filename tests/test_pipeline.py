@@ -76,6 +76,11 @@ def test_the_street_is_recognized(street, candidates, matches):
 def test_fusion_with_a_constant_and_balanced(candidates, matches):
     scores = pipeline.score({"count": mfvpr.MatchCount()}, matches, candidates)["count"]
     np.testing.assert_allclose(pipeline.fuse(candidates, scores, 10.0), 10 * candidates.scores + scores, rtol=1e-5)
+    distance = np.sqrt(2 - 2 * candidates.scores)
+    euclidean = pipeline.fuse(candidates, scores, 10.0, euclidean=True)
+    np.testing.assert_allclose(euclidean, scores - 10 * distance, rtol=1e-5)
+    by_index = np.take_along_axis(candidates.indices, pipeline.rank(candidates, 0 * scores, ties="index"), axis=1)
+    np.testing.assert_array_equal(by_index, np.sort(candidates.indices, axis=1))
     added = pipeline.fuse(candidates, scores, None) - scores
     np.testing.assert_allclose(added.std(axis=1), scores.std(axis=1), rtol=1e-3)
 

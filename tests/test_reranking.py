@@ -92,6 +92,13 @@ def test_rank_takes_batches_and_defaults_to_no_mask():
     np.testing.assert_array_equal(ranking.scores, scores)
 
 
+def test_ties_may_go_by_index_instead():
+    scores = jnp.array([[1.0, 2.0, 2.0, np.nan, 1.0]])
+    index = jnp.array([[7, 9, 3, 1, 5]])
+    np.testing.assert_array_equal(rank(scores), [[1, 2, 0, 4, 3]])
+    np.testing.assert_array_equal(rank(scores, tie_break=index), [[2, 1, 4, 0, 3]])
+
+
 def test_combined_score_spans_plain_to_filter_order():
     rng = np.random.default_rng(1)
     filter_scores, scores = jnp.array(rng.random(20), jnp.float32), jnp.array(rng.random(20), jnp.float32)

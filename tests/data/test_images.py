@@ -42,7 +42,7 @@ def _broken(path, photo):
 
 
 def _bomb(path):
-    Image.new("1", (MAX_PIXELS // 8000 + 1, 8000)).save(path)
+    Image.new("1", (MAX_PIXELS // 8000 + 1, 8000)).save(path, format="PNG")  # quick to write, whatever its name says
 
 
 BAD = {
@@ -64,8 +64,6 @@ BAD = {
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 @pytest.mark.parametrize("kind", BAD)
 def test_broken_files_are_named_in_one_line(tmp_path, photo, kind, suffix):
-    if kind == "too large" and suffix == ".jpg":
-        pytest.skip("a one-bit image of 64 megapixels is quick to write as PNG only")
     make, words = BAD[kind]
     path = tmp_path / f"bad{suffix}"
     make(path, photo)
