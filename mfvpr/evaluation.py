@@ -7,7 +7,7 @@ from scipy.spatial import KDTree
 
 
 def frame_positives(query_index: np.ndarray, database_index: np.ndarray, *, tolerance: int) -> np.ndarray:
-    """`[Q, N]` bool: |database_index - query_index| <= tolerance, inclusive (facts A30).
+    """`[Q, N]` bool: |database_index - query_index| <= tolerance, inclusive.
 
     Args:
         query_index: `[Q]` frame number of each query's true place; negative = unknown, no positives.

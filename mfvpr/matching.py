@@ -28,7 +28,7 @@ def match(features0: Features, features1: Features, *, cross_check: CrossCheck =
         features1: candidate, keypoints `[N1, 2]`.
         cross_check: `mutual` keeps i, j where each is the other's nearest. `opencv_legacy` is OpenCV's BFMatcher
             before 2019: every candidate keypoint picks its nearest query keypoint, which keeps the closest of its
-            suitors. `none` keeps the nearest of every query keypoint. (facts A12: the paper says cross-check.)
+            suitors. `none` keeps the nearest of every query keypoint. (The paper says cross-check.)
 
     Returns:
         Matches with K = N0 slots. A descriptor that is not finite matches nothing.
@@ -105,7 +105,7 @@ def _chunked_map(function: Callable, items: Any, count: int, chunk_size: int | N
 def filter_matches(
     matches: Matches, *, max_distance: float | Array | None = None, max_matches: int | None = None
 ) -> Matches:
-    """The matches of one pair that are close enough, and of those the `max_matches` closest (facts A13).
+    """The matches of one pair that are close enough, and of those the `max_matches` closest.
 
     Slots stay where they are, the mask shrinks; among equal distances the first slots are kept.
     """

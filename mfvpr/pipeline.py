@@ -217,7 +217,7 @@ def fuse(candidates: Shortlist, scores: np.ndarray, c: float | None, *, euclidea
         candidates: the filter's, with their cosine similarities.
         scores: `[Q, C]` of the re-ranking.
         c: weight of the filter; None balances the spread of both per query.
-        euclidean: the filter's score is minus the Euclidean distance of the unit descriptors instead (facts A28).
+        euclidean: the filter's score is minus the Euclidean distance of the unit descriptors instead.
     """
     cosine = candidates.scores
     filter_scores = -np.sqrt(np.maximum(2 - 2 * cosine, 0)) if euclidean else cosine
@@ -227,7 +227,7 @@ def fuse(candidates: Shortlist, scores: np.ndarray, c: float | None, *, euclidea
 def rank(candidates: Shortlist, scores: np.ndarray, *, ties: Literal["filter", "index"] = "filter") -> np.ndarray:
     """Positions `[Q, C]` into the shortlist, best first, those without a candidate last.
 
-    Equal scores keep the filter's order, or go by database index (facts A29).
+    Equal scores keep the filter's order, or go by database index.
     """
     return np.asarray(_rank(scores, candidates.mask, tie_break=candidates.indices if ties == "index" else None))
 

@@ -57,7 +57,7 @@ def combine(filter_scores: Array, rerank_scores: Array, *, c: float | Array = 1e
 def balancing_c(filter_scores: Array, rerank_scores: Array, mask: Array) -> Array:
     """The `c` `[]` that gives both scores the same spread over one query's candidates `[C]`.
 
-    Not from the paper, whose c is a constant by hand (facts A28); it serves detectors whose scores have other units.
+    Not from the paper, whose c is a constant by hand; it serves detectors whose scores have other units.
     """
 
     def spread(scores: Array) -> Array:
@@ -73,7 +73,7 @@ def rank(scores: Array, mask: Array | None = None, *, tie_break: Array | None = 
     """Positions `[..., C]` int32 in descending order of `scores` `[..., C]`.
 
     Stable: ties keep the given order, which is the filter's, or go by ascending `tie_break` `[..., C]`, such as the
-    database index (facts A29). NaN comes after every number, masked last.
+    database index. NaN comes after every number, masked last.
     """
     present = jnp.ones(scores.shape, bool) if mask is None else mask
     number = present & ~jnp.isnan(scores)

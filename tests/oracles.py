@@ -2,8 +2,8 @@
 
 Nothing here imports mfvpr or JAX, so that a test against this file is a test against the paper. Equations are
 numbered as in the paper, "On Model-Free Re-ranking for Visual Place Recognition with Deep Learned Local
-Features": 1 is the histogram of shifts, 2 anchor points, 3 the aggregated score, 4 the combined one. A1..A30
-are its ambiguities.
+Features": 1 is the histogram of shifts, 2 anchor points, 3 the aggregated score, 4 the combined one. Where its
+text is ambiguous, the options are those of the README's table.
 
 All inputs are real entries only (no padding). Points and shifts are (x, y) in pixels, sizes (width, height);
 a shift is the candidate's point minus the query's point. Sums whose equality decides a tie use `math.fsum`,
@@ -42,7 +42,7 @@ def _first_argmax(values):
 
 
 def nearest(descriptors0, descriptors1, crosscheck="mutual"):
-    """Nearest neighbors with cross-check, first index wins ties: [(i, j, distance)] sorted by i (A12)."""
+    """Nearest neighbors with cross-check, first index wins ties: [(i, j, distance)] sorted by i."""
     rows0, rows1 = _rows(descriptors0), _rows(descriptors1)
     if crosscheck not in ("mutual", "opencv_legacy", "none"):
         raise ValueError(f"unknown crosscheck: {crosscheck}")
@@ -70,12 +70,12 @@ def nearest(descriptors0, descriptors1, crosscheck="mutual"):
 
 
 def fs_weight(scores0, scores1):
-    """FS-weight, w = s1 + s2 (A8)."""
+    """FS-weight, w = s1 + s2."""
     return np.array([a + b for a, b in zip(_values(scores0), _values(scores1), strict=True)], np.float64)
 
 
 def dmf_weight(distance):
-    """DMF-weight, w = 2 - d (A9)."""
+    """DMF-weight, w = 2 - d."""
     return np.array([2.0 - d for d in _values(distance)], np.float64)
 
 
@@ -83,7 +83,7 @@ def dmf_weight(distance):
 
 
 def _bin_centers(lower, upper, bin_size, align):
-    """Centers of the fewest bins that cover [lower, upper], at least one (A3)."""
+    """Centers of the fewest bins that cover [lower, upper], at least one."""
     if align == "min_edge":
         count = math.ceil((upper - lower) / bin_size)
         return [lower + bin_size / 2 + index * bin_size for index in range(max(count, 1))]
@@ -111,7 +111,7 @@ def histogram_of_shifts(
     truncate=math.inf,
     shift_range=None,
 ):
-    """Bin scores [By, Bx], centers_x [Bx], centers_y [By] (paper eq. 1; A1 sigma, A2 range, A3 bins, A4)."""
+    """Bin scores [By, Bx], centers_x [Bx], centers_y [By] (paper eq. 1)."""
     shifts, weights = _rows(shifts, 2), _values(weights)
     bin_size = float(bin_size)
     sigma = math.sqrt(sigma) if sigma_is_variance else float(sigma)
@@ -139,7 +139,7 @@ def histogram_of_shifts(
 
 
 def histogram_score(shifts, weights, size0, size1, **options):
-    """Largest bin score (paper, text below eq. 1), 0 without matches (A29)."""
+    """Largest bin score (paper, text below eq. 1), 0 without matches."""
     if len(shifts) == 0:
         return 0.0
     histogram, _, _ = histogram_of_shifts(shifts, weights, size0, size1, **options)
@@ -147,7 +147,7 @@ def histogram_score(shifts, weights, size0, size1, **options):
 
 
 def dominant_shift(shifts, weights, size0, size1, **options):
-    """Center (x, y) of the largest bin, first in row-major order on ties; (0, 0) without matches (A5)."""
+    """Center (x, y) of the largest bin, first in row-major order on ties; (0, 0) without matches."""
     if len(shifts) == 0:
         return 0.0, 0.0
     histogram, centers_x, centers_y = histogram_of_shifts(shifts, weights, size0, size1, **options)
@@ -179,14 +179,14 @@ def refined_shift(shifts, weights, sigma, start):
 
 
 def _cell(point, size, num_bins):
-    """Grid cell (row, column) of a point, clipped to the grid (A14, A15)."""
+    """Grid cell (row, column) of a point, clipped to the grid."""
     column = math.floor(point[0] * num_bins / float(size[0]))
     row = math.floor(point[1] * num_bins / float(size[1]))
     return min(max(row, 0), num_bins - 1), min(max(column, 0), num_bins - 1)
 
 
 def _window_offsets(window, window_mode):
-    """Offsets of the square window along one axis (A18)."""
+    """Offsets of the square window along one axis."""
     if window_mode == "half_floor":
         return range(-(window // 2), window // 2 + 1)
     if window_mode == "asymmetric":  # exactly `window` cells: 10 -> -5..4, 9 -> -4..4
@@ -200,7 +200,7 @@ def _window_offsets(window, window_mode):
 
 
 def anchor_cells(points0, points1, weights, size0, size1, *, num_bins=15):
-    """Matrix of matches {cell: (winning target cell, its summed weight, total weight)} (A16, A17)."""
+    """Matrix of matches {cell: (winning target cell, its summed weight, total weight)}."""
     groups = {}
     for point0, point1, weight in zip(_rows(points0, 2), _rows(points1, 2), _values(weights), strict=True):
         targets = groups.setdefault(_cell(point0, size0, num_bins), {})
@@ -231,7 +231,7 @@ def anchor_points(
     include_self=True,
     cell_weight="winner_sum",
 ):
-    """Sum of the anchor scores over all cells with a match (paper eq. 2; A14-A19)."""
+    """Sum of the anchor scores over all cells with a match (paper eq. 2)."""
     if first not in ("query", "candidate"):
         raise ValueError(f"unknown first: {first}")
     if cell_weight not in ("winner_sum", "cell_sum", "ones"):
@@ -268,7 +268,7 @@ def _median(values):
 
 
 def aggregated_score(shifts, weights, size, *, mean="unweighted", clamp=False):
-    """Aggregated score (paper eq. 3; A25 mean, A26 clamp, A27 size), 0 without matches (A29)."""
+    """Aggregated score (paper eq. 3), 0 without matches."""
     shifts, weights = _rows(shifts, 2), _values(weights)
     if mean not in ("unweighted", "weighted", "median"):
         raise ValueError(f"unknown mean: {mean}")
@@ -305,13 +305,13 @@ def match_count(n):
 
 
 def combine(filter_scores, rerank_scores, c):
-    """s = c * s_f + s_r (paper eq. 4; A28)."""
+    """s = c * s_f + s_r (paper eq. 4)."""
     pairs = zip(_values(filter_scores), _values(rerank_scores), strict=True)
     return np.array([float(c) * s_f + s_r for s_f, s_r in pairs], np.float64)
 
 
 def rank(scores, mask=None):
-    """Positions by descending score: NaN after all numbers, masked last, ties keep the given order (A29)."""
+    """Positions by descending score: NaN after all numbers, masked last, ties keep the given order."""
     scores = _values(scores)
     mask = [True] * len(scores) if mask is None else [bool(m) for m in mask]
     numbers = [p for p, score in enumerate(scores) if mask[p] and not math.isnan(score)]
@@ -330,7 +330,7 @@ def rank(scores, mask=None):
 
 
 def frame_positives(query_index, database_index, tolerance):
-    """|query frame - database frame| <= tolerance, inclusive, [Q, N] (A30)."""
+    """|query frame - database frame| <= tolerance, inclusive, [Q, N]."""
     positives = np.zeros((len(query_index), len(database_index)), bool)
     for q, query in enumerate(_values(query_index)):
         for d, reference in enumerate(_values(database_index)):

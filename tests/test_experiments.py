@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import hydra
@@ -171,11 +170,15 @@ def test_rankings_without_ground_truth(small_street, tmp_path):
     assert (tmp_path / "out" / "figures").is_dir()
 
 
-@pytest.mark.parametrize("after", [1.5, 2.5])
-def test_ctrl_c_leaves_nothing_and_the_next_run_works(small_street, tmp_path, after):
-    command = [sys.executable, "-m", "experiments.evaluate", *folder(small_street, "figures=9", f"out={tmp_path}/out")]
+@pytest.mark.parametrize("stage", ["database features", "matching", "figures"])
+def test_ctrl_c_leaves_nothing(small_street, tmp_path, stage):
+    command = [sys.executable, "-m", "experiments.evaluate", *folder(small_street, "figures=10", f"out={tmp_path}/out")]
     process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
-    time.sleep(after)
+    seen = ""
+    while stage not in seen:
+        character = process.stderr.read(1)
+        assert character, f"ended before {stage}: {seen}"
+        seen += character
     process.send_signal(signal.SIGINT)
     _, stderr = process.communicate(timeout=60)
     assert process.returncode == 130, stderr

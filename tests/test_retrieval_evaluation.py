@@ -70,7 +70,7 @@ def test_a_query_without_positives_counts_as_a_failure():
 
 @pytest.mark.parametrize("depth, expected", [(1, 87.7), (2, 92.6)])
 def test_recall_is_k_over_n_as_the_paper_prints_it(depth, expected):
-    """Berlin A100 has 81 queries: every printed recall is a multiple of 1/81 (facts 1.4)."""
+    """Berlin A100 has 81 queries: every printed recall is a multiple of 1/81."""
     right = round(expected / 100 * 81)
     positives = np.arange(81)[:, None] < right
     order = np.zeros((81, depth), int)

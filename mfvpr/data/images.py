@@ -59,7 +59,7 @@ def read_image(path: Path | str) -> np.ndarray:
 
 
 def resize(image: np.ndarray, size: tuple[int, int], interpolation: Interpolation = "pil_bilinear") -> np.ndarray:
-    """`image` squashed to `size` (width, height), no crop, aspect not kept (facts A7). Half-pixel centers."""
+    """`image` squashed to `size` (width, height), no crop, aspect not kept. Half-pixel centers."""
     if interpolation in _PIL:
         return np.asarray(Image.fromarray(image).resize(size, _PIL[interpolation]))
     return np.asarray(cv2.resize(image, size, interpolation=_CV2[interpolation]))

@@ -19,8 +19,8 @@ class AggregatedScore:
 
     Attributes:
         weight: match weight, DMF by default as in the paper.
-        mean: center of the shifts: `unweighted` mean (as printed), `weighted` mean or `median` (facts A25).
-        clamp: let a shift further from the center than the image is wide count 0 instead of growing again (facts A26).
+        mean: center of the shifts: `unweighted` mean (as printed), `weighted` mean or `median`.
+        clamp: let a shift further from the center than the image is wide count 0 instead of growing again.
     """
 
     weight: Weight = DescriptorDistanceWeight()

@@ -25,15 +25,15 @@ class AnchorPoints:
     tolerance 1 and unit cell weights it counts exact agreements, as SSM-VPR does.
 
     Attributes:
-        num_bins: cells per side (facts A14); memory grows with its fourth power.
+        num_bins: cells per side; memory grows with its fourth power.
         window: width of the square window around an anchor, cells.
         tolerance: largest distance of two displacements that still counts, cells.
         weight: match weight, FS by default as in the paper.
         window_mode: `half_floor` is window // 2 to each side (10 -> 11 x 11); `asymmetric` exactly window cells
-            (10 -> -5 ... +4); `odd_down` the next odd number below (10 -> 9 x 9); `radius` window to each side (A18).
-        first: image whose cells are the anchors, `query` or `candidate` (facts A16).
-        include_self: an anchor counts itself (facts A19).
-        cell_weight: w_a is the winner's summed weight, the whole cell's, or 1 (facts A17).
+            (10 -> -5 ... +4); `odd_down` the next odd number below (10 -> 9 x 9); `radius` window to each side.
+        first: image whose cells are the anchors, `query` or `candidate`.
+        include_self: an anchor counts itself.
+        cell_weight: w_a is the winner's summed weight, the whole cell's, or 1.
     """
 
     num_bins: int = field(default=15, metadata={"static": True})
@@ -85,7 +85,7 @@ class AnchorPoints:
         return rows.astype(weights.dtype), columns.astype(weights.dtype), occupied, cell_weights
 
     def _cell(self, points: Array, image_size: Array, mask: Array) -> Array:
-        """`[K]` int32 row-major cell of each point; points outside belong to the border (facts A15)."""
+        """`[K]` int32 row-major cell of each point; points outside belong to the border."""
         position = jnp.floor(masked(as_float(points), mask) * self.num_bins / as_float(image_size)[None])
         column, row = jnp.clip(position, 0, self.num_bins - 1).astype(jnp.int32).T
         return row * self.num_bins + column

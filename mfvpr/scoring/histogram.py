@@ -45,14 +45,14 @@ class HistogramOfShifts:
 
     Attributes:
         bin_size: width of the square bins, px.
-        sigma: standard deviation of the vote, px; the paper's 22.5 is read as 1.5 bins (facts A1).
+        sigma: standard deviation of the vote, px; the paper's 22.5 is read as 1.5 bins.
         weight: match weight, FS by default as in the paper.
-        truncate: a match votes only for bins within this many sigmas along each axis (facts A4; the paper: all).
-        shift_range: (x, y): bins cover [-x, x] and [-y, y] px instead of all possible shifts (facts A2).
+        truncate: a match votes only for bins within this many sigmas along each axis (the paper: for all).
+        shift_range: (x, y): bins cover [-x, x] and [-y, y] px instead of all possible shifts.
         align: `min_edge` starts the first bin at the smallest possible shift; `zero_center` centers a bin on shift
-            0; `zero_edge` puts an edge there (facts A3).
-        sigma_is_variance: read `sigma` as the variance, px^2 (facts A1).
-        direction: shift of a match, candidate minus query point or the reverse (facts A5).
+            0; `zero_edge` puts an edge there.
+        sigma_is_variance: read `sigma` as the variance, px^2.
+        direction: shift of a match, candidate minus query point or the reverse.
         max_bins: capacity of bins per axis. By default as many as concrete values ask for, or 64 where they are
             traced. A histogram that needs more than its capacity scores NaN, never a wrong number: set `max_bins`
             before `jit` for larger images or finer bins (`with_capacity` does).

@@ -1,4 +1,4 @@
-"""Closed forms and invariances that need no oracle (facts.md, section 8)."""
+"""Closed forms and invariances that need no oracle."""
 
 from dataclasses import replace
 
