@@ -177,9 +177,8 @@ def score(
     """
     first = match_set.matches[0]
     prepared = {name: _prepare(scorer, first) for name, scorer in scorers.items()}
-    rows = [
-        _score(prepared, match_set[query]) for query in track(range(len(match_set.matches)), len(match_set.matches))
-    ]
+    queries = range(len(match_set.matches))
+    rows = [_score(prepared, match_set[query]) for query in track(queries, len(queries))]
     scores = {name: np.array([row[name] for row in rows]) for name in scorers}
     return {name: np.where(candidates.mask, values, np.nan) for name, values in scores.items()}
 
@@ -274,16 +273,16 @@ def _explain(scorer: HistogramOfShifts, matches: Matches) -> tuple[Any, ...]:
 def _prepare(scorer: Any, matches: Matches) -> Any:
     """A scorer whose numbers are float32 arrays (one type, one program) and whose histogram has a capacity."""
     if isinstance(scorer, HistogramOfShifts):
-        needed = scorer.with_capacity(matches.image_size0, matches.image_size1, multiple=16)
-        if (needed.max_bins or 0) > MAX_BINS:
+        needed = scorer.with_capacity(matches.image_size0, matches.image_size1).max_bins or 1
+        if needed > MAX_BINS:
             raise InputError(
-                f"bin_size={scorer.bin_size}: expected at most {MAX_BINS} bins per axis, these images need "
-                f"{needed.max_bins}; use larger bins"
+                f"bin_size={scorer.bin_size}: expected at most {MAX_BINS} bins per axis, these images need {needed}; "
+                "use larger bins"
             )
         if scorer.max_bins is None:
-            scorer = needed
-        elif (exact := scorer.with_capacity(matches.image_size0, matches.image_size1).max_bins or 0) > scorer.max_bins:
-            raise InputError(f"max_bins={scorer.max_bins}: expected at least {exact}, which these images need")
+            scorer = replace(scorer, max_bins=round_up(needed, 16))
+        elif scorer.max_bins < needed:
+            raise InputError(f"max_bins={scorer.max_bins}: expected at least {needed}, which these images need")
     return jax.tree.map(np.float32, scorer)
 
 

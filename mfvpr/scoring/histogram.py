@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mfvpr.numerics import is_concrete, round_up
+from mfvpr.numerics import is_concrete
 from mfvpr.scoring.choices import check_choices, choice
 from mfvpr.scoring.shifts import match_shifts
 from mfvpr.types import Array, Matches
@@ -104,8 +104,8 @@ class HistogramOfShifts:
         near = jnp.all(jnp.abs(shifts - shift[None]) <= 2 * self._deviation(shifts.dtype), axis=-1)
         return near & matches.mask
 
-    def with_capacity(self, image_size0: Array, image_size1: Array, *, multiple: int = 1) -> "HistogramOfShifts":
-        """This scorer with `max_bins` set to what its concrete values need, rounded up to a `multiple`.
+    def with_capacity(self, image_size0: Array, image_size1: Array) -> "HistogramOfShifts":
+        """This scorer with `max_bins` set to what its concrete values need.
 
         `bin_size` and the sizes may be batched: the capacity serves all of them.
 
@@ -117,7 +117,7 @@ class HistogramOfShifts:
             raise ValueError(f"HistogramOfShifts(bin_size={finest.bin_size}): expected a number above 0")
         _, num_bins = finest._lattice(image_size0, image_size1, float, np)
         needed = np.max(num_bins, where=np.isfinite(num_bins), initial=1)  # padding pairs may have any size
-        return replace(self, max_bins=round_up(int(needed), multiple))
+        return replace(self, max_bins=int(needed))
 
     def _vote(self, matches: Matches) -> tuple[Array, Array, Array, Array]:
         """Scores `[B, B]` (y, x), centers `[B, 2]`, which bins are in range `[B, B]`, whether all bins fit `[]`."""
