@@ -57,15 +57,40 @@ def dataset(settings: dict[str, Any], progress: Callable[[int, int], None]) -> D
 
 
 def local_extractor(settings: dict[str, Any]) -> LocalExtractor:
-    """What finds local features."""
-    options = {name: value for name, value in settings.items() if name != "name"}
+    """What finds local features; networks with their converted weights."""
+    name, options = settings["name"], {name: value for name, value in settings.items() if name != "name"}
     options["image_size"] = tuple(options["image_size"])
-    return Sift(**options)
+    if name == "sift":
+        if options["interpolation"] == "torch_bilinear":
+            raise SettingsError("features.interpolation=torch_bilinear: gives fractions, but SIFT takes whole numbers")
+        return Sift(**_only(options, Sift, "features=sift"))
+    from mfvpr.features.aliked import AlikedFeatures  # here, since Flax takes half a second
+    from mfvpr.features.d2net import D2NetFeatures
+
+    extractor = {"aliked": AlikedFeatures, "d2net": D2NetFeatures}[name]
+    weights = options.pop("weights", None)
+    return extractor(_network("features", name, weights), **_only(options, extractor, f"features={name}"))
 
 
 def global_extractor(settings: dict[str, Any], database: Sequence[Features]) -> GlobalExtractor:
     """What describes whole images; VLAD learns its vocabulary from the database's features."""
-    return fit_vlad(database, **{name: value for name, value in settings.items() if name != "name"})
+    options = {name: value for name, value in settings.items() if name != "name"}
+    if settings["name"] == "vlad":
+        return fit_vlad(database, **options)
+    from mfvpr.features.mixvpr import MixVprDescriptor
+
+    return MixVprDescriptor(_network("retrieval", "mixvpr", options.pop("weights")), **options)
+
+
+def _network(group: str, name: str, weights: str | None) -> Any:
+    """The network with its weights, converted before."""
+    from mfvpr.weights.files import load_model
+    from mfvpr.weights.registry import REGISTRY, entry_of
+
+    if weights is None or entry_of(weights).network != name:
+        expected = ", ".join(entry.name for entry in REGISTRY.values() if entry.network == name)
+        raise SettingsError(f"{group}.weights={weights}: expected weights of {name}: one of {expected}")
+    return load_model(weights)
 
 
 def scorers(settings: dict[str, Any]) -> dict[str, Scorer]:
@@ -96,9 +121,12 @@ def _scorer(settings: dict[str, Any]) -> Scorer:
     if options.get("truncate", 0) is None:
         options["truncate"] = math.inf
     scorer = SCORERS[settings["method"]]
-    foreign = options.keys() - {field.name for field in fields(scorer)}
+    return scorer(**_only(options, scorer, f"scorer={settings['method']}"))
+
+
+def _only(options: dict[str, Any], made: type, choice: str) -> dict[str, Any]:
+    """The options, which `made` must all know: a mixture of two choices has others."""
+    foreign = options.keys() - {field.name for field in fields(made)}
     if foreign:
-        raise SettingsError(
-            f"scorer: {settings['method']} has no {', '.join(sorted(foreign))}; choose one scorer, or scorer=all"
-        )
-    return scorer(**options)
+        raise SettingsError(f"{choice} has no setting {', '.join(sorted(foreign))}; see --help")
+    return options

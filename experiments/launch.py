@@ -3,12 +3,11 @@
 import difflib
 import os
 import re
-import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import hydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -16,9 +15,10 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from experiments.errors import one_line, unwind_on_sigterm
 from experiments.settings import SettingsError, check
 
-PATHS = {"database", "queries", "root", "index_file", "cache", "out"}
+PATHS = {"database", "queries", "root", "index_file", "cache", "store", "out"}
 CONF = Path(__file__).parent.parent / "conf"
 
 
@@ -26,16 +26,16 @@ def launch(program: Callable[[dict[str, Any]], None]) -> None:
     """`program(settings)` with the settings of conf/ and the command line, as plain and checked values."""
 
     def task(config: DictConfig) -> None:
-        with _one_line():  # in here, or Hydra adds lines of its own
+        with one_line(), _our_words():  # in here, or Hydra adds lines of its own
             for name in sorted(OmegaConf.missing_keys(config)):
                 raise SettingsError(_no_default(name))
             settings: Any = OmegaConf.to_container(config, resolve=True)
             check(settings)
             program(settings)
 
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # unwinds, so that temporary files go
+    unwind_on_sigterm()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises instead of printing and exiting with 1
-    with _one_line():
+    with one_line(), _our_words():
         for argument in sys.argv[1:]:
             _check_form(argument)
         sys.argv[1:] = map(_as_typed, sys.argv[1:])
@@ -79,32 +79,12 @@ def _unparsable(argument: str) -> bool:
 
 
 @contextmanager
-def _one_line() -> Iterator[None]:
+def _our_words() -> Iterator[None]:
+    """Hydra's errors as ours."""
     try:
         yield
-    except KeyboardInterrupt:
-        print("\ninterrupted; nothing half-written was left", file=sys.stderr)
-        sys.exit(130)
-    except BrokenPipeError:  # whoever read our output has left: `| head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(141)
     except (HydraException, OmegaConfBaseException) as error:
-        _refuse(_explain(error))
-    except SettingsError as error:
-        _refuse(str(error))
-    except OSError as error:
-        _refuse(f"{error.filename or 'input or output'}: {error.strerror or error}")
-    except ValueError as error:
-        from mfvpr.errors import InputError  # here, since it brings JAX along
-
-        if not isinstance(error, InputError):
-            raise
-        _refuse(str(error))
-
-
-def _refuse(reason: str) -> NoReturn:
-    print("error:", *reason.splitlines(), file=sys.stderr)
-    sys.exit(2)
+        raise SettingsError(_explain(error)) from error
 
 
 def _explain(error: Exception) -> str:

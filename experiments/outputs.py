@@ -45,7 +45,7 @@ class Outcome:
     scorers: dict[str, Scorer]
     systems: dict[str, System]
     seconds: dict[str, float]
-    fingerprint: str
+    fingerprint: dict[str, str]  # of the images
 
     @property
     def thresholds(self) -> list[float]:
@@ -58,6 +58,8 @@ class Outcome:
     @property
     def headline(self) -> str:
         """The system of predictions.csv and of the figures: the histogram, else the scorer that was asked for."""
+        if self.settings["final"] == "combined":
+            return next(name for name in self.systems if name.endswith(" + filter"))
         return "histogram" if "histogram" in self.systems else list(self.systems)[1]
 
 

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from experiments import build, outputs
+from experiments import build, outputs, stores
 from experiments.outputs import Outcome, System
 from mfvpr import pipeline
-from mfvpr.data.datasets import Dataset, fingerprint
+from mfvpr.data.datasets import Dataset, ImageFolder, fingerprint
+from mfvpr.features import LocalExtractor
 from mfvpr.pipeline import FeatureSet, MatchSet
 from mfvpr.report import runs
 from mfvpr.types import Shortlist
@@ -41,17 +42,14 @@ def evaluate(settings: dict[str, Any]) -> None:
     watch = Stopwatch()
     with watch("data"):
         dataset = _dataset(settings["dataset"])
-        data = fingerprint([dataset.database, dataset.queries])
-    skip_bad = settings["on_bad_image"] == "skip"
+        sides = {"database": dataset.database, "query": dataset.queries}
+        data = {side: fingerprint(folder) for side, folder in sides.items()}
     extractor = build.local_extractor(settings["features"])
     with watch("features"):
-        database = pipeline.extract(
-            dataset.database, extractor, skip_bad=skip_bad, track=build.track("database features")
-        )
-        queries = pipeline.extract(dataset.queries, extractor, skip_bad=skip_bad, track=build.track("query features"))
+        database, queries = (_features(settings, extractor, side, sides[side], data[side]) for side in sides)
     _warn(dataset, database, queries)
     with watch("filter"):
-        candidates = _shortlist(settings, dataset, database, queries, skip_bad)
+        candidates = _shortlist(settings, sides, data, {"database": database, "query": queries})
     with watch("matching"):
         matches = pipeline.match(queries, database, candidates, **settings["matching"], track=build.track("matching"))
     with watch("scores"):
@@ -94,21 +92,38 @@ def _warn(dataset: Dataset, database: FeatureSet, queries: FeatureSet) -> None:
         print("warning: the ground truth gives no query a place; every recall will be 0", file=sys.stderr)
 
 
+def _features(
+    settings: dict[str, Any], extractor: LocalExtractor, side: str, folder: ImageFolder, images: str
+) -> FeatureSet:
+    chosen, label = settings["features"], f"{side} features"
+    name = f"{settings['dataset']['name']} {side} {chosen['name']}"
+    with stores.opened(settings["store"], name, folder, extractor, chosen, images) as store:
+        skip_bad = settings["on_bad_image"] == "skip"
+        return pipeline.extract(folder, extractor, store=store, skip_bad=skip_bad, track=build.track(label))
+
+
 def _shortlist(
-    settings: dict[str, Any], dataset: Dataset, database: FeatureSet, queries: FeatureSet, skip_bad: bool
+    settings: dict[str, Any], sides: dict[str, ImageFolder], images: dict[str, str], features: dict[str, FeatureSet]
 ) -> Shortlist:
-    asked, available = settings["candidates"], len(dataset.database)
+    asked, available = settings["candidates"], len(sides["database"])
     if asked != "all" and asked > available:
         print(
             f"note: candidates={asked}, but the database has {available} images; all of them are re-ranked",
             file=sys.stderr,
         )
-    extractor = build.global_extractor(settings["retrieval"], [database[row] for row in range(len(database))])
-    descriptors = [
-        pipeline.describe(folder, features, extractor, skip_bad=skip_bad, track=build.track(f"{name} descriptors"))
-        for name, folder, features in (("database", dataset.database, database), ("query", dataset.queries, queries))
-    ]
-    return pipeline.shortlist(descriptors[1], descriptors[0], available if asked == "all" else min(asked, available))
+    chosen, database = settings["retrieval"], features["database"]
+    extractor = build.global_extractor(chosen, [database[row] for row in range(len(database))])
+    root = settings["store"] if extractor.image_size is not None else None  # VLAD takes no time
+    skip_bad, descriptors = settings["on_bad_image"] == "skip", {}
+    for side, folder in sides.items():
+        name = f"{settings['dataset']['name']} {side} {chosen['name']}"
+        with stores.opened(root, name, folder, extractor, chosen, images[side]) as store:
+            descriptors[side] = pipeline.describe(
+                folder, features[side], extractor, store=store, skip_bad=skip_bad,
+                track=build.track(f"{side} descriptors"),
+            )  # fmt: skip
+    wanted = available if asked == "all" else min(asked, available)
+    return pipeline.shortlist(descriptors["query"], descriptors["database"], wanted)
 
 
 def _systems(settings: dict[str, Any], scorers: dict, matches: MatchSet, candidates: Shortlist) -> dict[str, System]:

@@ -70,8 +70,8 @@ RULES: dict[str, Rule] = {
     "dataset.name": Rule(
         lambda value: isinstance(value, str) and bool(re.fullmatch(r"[\w-][\w.-]*", value)), "letters, digits, - and _"
     ),
-    "features.name": _one_of("sift"),
-    "retrieval.name": _one_of("vlad"),
+    "features.name": _one_of("sift", "d2net", "aliked"),
+    "retrieval.name": _one_of("vlad", "mixvpr"),
     # data
     "seed": _INDEX,
     "cache": _TEXT,
@@ -82,8 +82,15 @@ RULES: dict[str, Rule] = {
     "index_file": _or(_TEXT, None),
     # features and filter
     "image_size": _list_of(_SIDE, 2),
-    "interpolation": _one_of("pil_bilinear", "pil_bicubic", "cv2_linear", "cv2_area"),
-    "max_keypoints": _between(1, 20_000),
+    "interpolation": _one_of(
+        "pil_bilinear", "pil_bicubic", "cv2_linear", "cv2_area", "torch_bilinear", "torch_bicubic"
+    ),
+    "weights": _TEXT,
+    "preprocessing": _one_of("caffe", "torch"),
+    "multiscale": _FLAG,
+    "threshold": _NOT_NEGATIVE,
+    "max_keypoints": _or(_between(1, 20_000), None),
+    "batch_size": _between(1, 256),
     "contrast_threshold": _POSITIVE,
     "clahe_clip": _NOT_NEGATIVE,
     "num_words": _between(1, 4096),
@@ -118,10 +125,12 @@ RULES: dict[str, Rule] = {
     "filter_score": _one_of("cosine", "negative_euclidean"),
     "ties": _one_of("filter", "index"),
     "c": _or(_NOT_NEGATIVE, "auto"),
+    "final": _one_of("score", "combined"),
     # report
     "tolerances": _list_of(_INDEX),
     "radius": _POSITIVE,
     "ks": _list_of(_COUNT),
+    "store": _or(_TEXT, None),
     "on_bad_image": _one_of("fail", "skip"),
     "figures": _INDEX,
     "out": _or(_TEXT, None),

@@ -4,7 +4,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jax.core import Tracer
 from jax.typing import ArrayLike
@@ -57,15 +56,6 @@ def safe_sqrt(squared: Array) -> Array:
 def round_up(size: int, multiple: int) -> int:
     """The smallest multiple of `multiple` that is at least `size` (and at least one `multiple`)."""
     return max(1, -(-size // multiple)) * multiple
-
-
-def pad_rows(rows: np.ndarray, capacity: int) -> np.ndarray:
-    """`rows` [n, ...] with zeros appended to [capacity, ...]; a host-side helper."""
-    if len(rows) > capacity:
-        raise ValueError(f"{len(rows)} rows do not fit a capacity of {capacity}")
-    padded = np.zeros((capacity, *rows.shape[1:]), rows.dtype)
-    padded[: len(rows)] = rows
-    return padded
 
 
 def is_concrete(tree: Any) -> bool:

@@ -1,61 +1,31 @@
-"""The whole way over a data set: extract, describe, shortlist, match, score, rank.
+"""The whole way over a data set: extract and describe (`mfvpr.extraction`), shortlist, match, score, rank.
 
 Files and threads stay on the host; each computation is one compiled program per shape, called for every query. Here is
 where `jit` lives. `track` wraps the iterable of a stage: a progress bar, or nothing.
 """
 
-import itertools
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import jax
 import numpy as np
 
 from mfvpr import matching, reranking, retrieval
-from mfvpr.data.datasets import ImageFolder
-from mfvpr.data.images import Interpolation, ordered_map, read_image, resize
 from mfvpr.errors import InputError
-from mfvpr.features import GlobalExtractor, LocalExtractor
+from mfvpr.extraction import FeatureSet, Track, describe, extract, untracked
 from mfvpr.matching import CrossCheck
-from mfvpr.numerics import pad_rows, round_up
+from mfvpr.numerics import round_up
 from mfvpr.scoring import HistogramOfShifts, Scorer, ShiftHistogram
 from mfvpr.types import Array, Features, Matches, Shortlist
 from mfvpr.weighting import match_weights
 
-Item = TypeVar("Item")
-Track = Callable[[Iterable[Any], int], Iterable[Any]]
+__all__ = ["Explanation", "FeatureSet", "MatchSet", "Track", "describe", "explain", "extract", "fuse", "match", "rank",
+           "score", "shortlist", "untracked"]  # fmt: skip
 
-DECODING_THREADS = 4
 MAX_BINS = 1024  # per axis: the histograms of 50 candidates then take 200 MB
 _PER_MATCH = ("points0", "points1", "distance", "scores0", "scores1")
-
-
-def untracked(items: Iterable[Item], total: int) -> Iterable[Item]:
-    """No progress bar."""
-    return items
-
-
-@dataclass(frozen=True)
-class FeatureSet:
-    """Local features of all images of a folder.
-
-    Attributes:
-        features: `[M, N, ...]`, padded, NumPy.
-        bad: reason by row, for images that gave no usable features; their masks are all False.
-    """
-
-    features: Features
-    bad: Mapping[int, str]
-
-    def __len__(self) -> int:
-        return len(self.features.mask)
-
-    def __getitem__(self, row: int) -> Features:
-        """Features `[N, ...]` of one image."""
-        return jax.tree.map(lambda field: field[row], self.features)
 
 
 @dataclass(frozen=True)
@@ -83,60 +53,6 @@ class MatchSet:
             return slots
 
         return replace(flat, mask=mask, **{name: padded(getattr(flat, name)) for name in _PER_MATCH})
-
-
-def extract(
-    folder: ImageFolder, extractor: LocalExtractor, *, skip_bad: bool = False, track: Track = untracked
-) -> FeatureSet:
-    """Local features of every image; decoding runs on threads meanwhile.
-
-    Args:
-        folder: the images.
-        extractor: what turns images into Features.
-        skip_bad: list unreadable images in `bad` and go on, instead of raising. An image whose features are not
-            finite is always listed.
-        track: progress.
-
-    Raises:
-        InputError: an image cannot be read (unless `skip_bad`), or none can.
-    """
-    found: dict[int, Features] = {}
-    bad: dict[int, str] = {}
-    for rows, images in _image_batches(folder, extractor, skip_bad, bad, track):
-        for row, features in zip(rows, extractor(images), strict=True):
-            if all(np.isfinite(getattr(features, field.name)).all() for field in fields(features)):
-                found[row] = features
-            else:
-                bad[row] = f"{folder.paths[row]}: features are not finite (NaN or infinite); the image ranks last"
-    if not found:
-        raise InputError(f"{folder.root}: none of {len(folder)} images can be used; the first: {bad[min(bad)]}")
-    return FeatureSet(_stack(found, len(folder)), bad)
-
-
-def describe(
-    folder: ImageFolder,
-    feature_set: FeatureSet,
-    extractor: GlobalExtractor,
-    *,
-    skip_bad: bool = False,
-    track: Track = untracked,
-) -> np.ndarray:
-    """Global descriptors `[M, D]` float32 of every image; NaN for bad ones, which no shortlist contains."""
-    batches: Iterable[tuple[Sequence[int], np.ndarray | None]]
-    if extractor.image_size is None:
-        batches = ((rows, None) for rows in _batches(track(range(len(folder)), len(folder)), extractor.batch_size))
-    else:
-        batches = _image_batches(folder, extractor, skip_bad, dict(feature_set.bad), track)
-    descriptors = None
-    for rows, images in batches:
-        batch = extractor(images, [feature_set[row] for row in rows])
-        if descriptors is None:
-            descriptors = np.full((len(folder), batch.shape[1]), np.nan, np.float32)
-        descriptors[list(rows)] = batch
-    if descriptors is None:
-        raise InputError(f"{folder.root}: none of {len(folder)} images can be described")
-    descriptors[list(feature_set.bad)] = np.nan
-    return descriptors
 
 
 def shortlist(query_descriptors: np.ndarray, database_descriptors: np.ndarray, num_candidates: int) -> Shortlist:
@@ -284,57 +200,3 @@ def _prepare(scorer: Any, matches: Matches) -> Any:
         elif scorer.max_bins < needed:
             raise InputError(f"max_bins={scorer.max_bins}: expected at least {needed}, which these images need")
     return jax.tree.map(np.float32, scorer)
-
-
-def _image_batches(
-    folder: ImageFolder,
-    extractor: LocalExtractor | GlobalExtractor,
-    skip_bad: bool,
-    bad: dict[int, str],
-    track: Track,
-) -> Iterator[tuple[list[int], np.ndarray]]:
-    """(rows, images `[B, H, W, 3]`) of the readable images; the reasons of the others go into `bad`."""
-    if extractor.image_size is None:
-        raise ValueError(f"{type(extractor).__name__} reads no images")
-    load = partial(_load, size=extractor.image_size, interpolation=extractor.interpolation)
-
-    def readable() -> Iterator[tuple[int, np.ndarray]]:
-        for row, image in enumerate(track(ordered_map(load, folder.paths, workers=DECODING_THREADS), len(folder))):
-            if isinstance(image, InputError):
-                if not skip_bad:
-                    raise InputError(f"{image} (or set on_bad_image=skip)")
-                bad[row] = str(image)
-            else:
-                yield row, image
-
-    for batch in _batches(readable(), extractor.batch_size):
-        rows, images = zip(*batch, strict=True)
-        yield list(rows), np.stack(images)
-
-
-def _load(path: Path, *, size: tuple[int, int], interpolation: Interpolation) -> np.ndarray | InputError:
-    try:
-        return resize(read_image(path), size, interpolation)
-    except InputError as error:
-        return error
-
-
-def _batches(items: Iterable[Item], size: int) -> Iterator[list[Item]]:
-    iterator = iter(items)
-    while batch := list(itertools.islice(iterator, size)):
-        yield batch
-
-
-def _stack(found: Mapping[int, Features], num_images: int) -> Features:
-    """Padded features of all rows; those not found are empty."""
-    sample = next(iter(found.values()))
-    empty = jax.tree.map(lambda field: field[:0], replace(sample, image_size=None))
-    empty = replace(empty, image_size=sample.image_size)
-    rows = [found.get(row, empty) for row in range(num_images)]
-    capacity = round_up(max(len(features.mask) for features in rows), 32)
-
-    def padded(name: str) -> np.ndarray:
-        return np.stack([pad_rows(getattr(features, name), capacity) for features in rows])
-
-    per_keypoint = {name: padded(name) for name in ("keypoints", "descriptors", "scores", "mask")}
-    return Features(**per_keypoint, image_size=np.stack([features.image_size for features in rows]))

@@ -1,5 +1,6 @@
 """Strict arithmetic for every test: no silent rank promotion, warnings are errors (pyproject.toml)."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -35,6 +36,14 @@ _compilations = Compilations()
 def compilations() -> Compilations:
     _compilations.reset()
     return _compilations
+
+
+@pytest.fixture(scope="session", autouse=True)
+def cache(tmp_path_factory) -> Iterator[None]:
+    """Nothing of the user's cache is read or written."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MFVPR_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
 
 
 @pytest.fixture(scope="session")

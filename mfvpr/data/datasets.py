@@ -2,7 +2,6 @@
 
 import hashlib
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -73,12 +72,11 @@ def folder_dataset(
     return Dataset(name, database_folder, query_folder, _truth(database_folder, query_folder, ground_truth, index_file))
 
 
-def fingerprint(folders: Sequence[ImageFolder]) -> str:
+def fingerprint(folder: ImageFolder) -> str:
     """SHA-256 over names and contents of all images, in order; the first 16 hexadecimal digits."""
     digest = hashlib.sha256()
-    for folder in folders:
-        for name, content in zip(folder.names, ordered_map(_content_digest, folder.paths, workers=2), strict=True):
-            digest.update(name.encode("utf-8", "surrogateescape") + b"\0" + content)
+    for name, content in zip(folder.names, ordered_map(_content_digest, folder.paths, workers=2), strict=True):
+        digest.update(name.encode("utf-8", "surrogateescape") + b"\0" + content)
     return digest.hexdigest()[:16]
 
 

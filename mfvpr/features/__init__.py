@@ -31,6 +31,16 @@ class LocalExtractor(Protocol):
         """Images per call."""
         ...
 
+    @property
+    def dimension(self) -> int:
+        """D of the descriptors."""
+        ...
+
+    @property
+    def typical_count(self) -> int:
+        """Features that an image has, roughly: for forecasts of disk space."""
+        ...
+
     def __call__(self, images: np.ndarray) -> list[Features]: ...
 
 
@@ -50,6 +60,16 @@ class GlobalExtractor(Protocol):
     @property
     def batch_size(self) -> int:
         """Images per call."""
+        ...
+
+    @property
+    def dimension(self) -> int:
+        """D of the descriptors."""
+        ...
+
+    @property
+    def typical_count(self) -> int:
+        """1: descriptors of an image."""
         ...
 
     def __call__(self, images: np.ndarray | None, features: Sequence[Features]) -> np.ndarray: ...

@@ -16,17 +16,27 @@ class Sift:
     Attributes:
         image_size: (width, height) px.
         interpolation: see `mfvpr.data.images.resize`.
-        max_keypoints: the strongest are kept.
+        max_keypoints: the strongest are kept; None = all.
         contrast_threshold: OpenCV's; low, so that dark images reach `max_keypoints` as well.
         clahe_clip: clip limit of local histogram equalization before detection; 0 turns it off.
     """
 
     image_size: tuple[int, int] = (336, 336)
     interpolation: Interpolation = "pil_bilinear"
-    max_keypoints: int = 800
+    max_keypoints: int | None = 800
     contrast_threshold: float = 0.01
     clahe_clip: float = 0.0
     batch_size: int = 8
+
+    @property
+    def dimension(self) -> int:
+        """128."""
+        return 128
+
+    @property
+    def typical_count(self) -> int:
+        """What textured images reach: `max_keypoints`, or one keypoint in 100 px."""
+        return self.max_keypoints or self.image_size[0] * self.image_size[1] // 100
 
     def __call__(self, images: np.ndarray) -> list[Features]:
         """Features of each image `[B, H, W, 3]` uint8 RGB."""
@@ -36,7 +46,7 @@ class Sift:
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         if self.clahe_clip > 0:
             gray = cv2.createCLAHE(self.clahe_clip, (8, 8)).apply(gray)
-        detector = cv2.SIFT_create(self.max_keypoints, contrastThreshold=self.contrast_threshold)  # pyright: ignore
+        detector = cv2.SIFT_create(self.max_keypoints or 0, contrastThreshold=self.contrast_threshold)  # pyright: ignore
         found, descriptors = detector.detectAndCompute(gray, None)
         scores = np.array([keypoint.response for keypoint in found], np.float32)
         strongest = np.argsort(-scores, kind="stable")[: self.max_keypoints]  # OpenCV keeps ties beyond the limit

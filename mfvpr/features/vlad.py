@@ -25,6 +25,12 @@ class Vlad:
     image_size: None = None  # reads features, no pixels
     interpolation: Interpolation = "pil_bilinear"
     batch_size: int = 64
+    typical_count: int = 1
+
+    @property
+    def dimension(self) -> int:
+        """Words x dimension of the local descriptors."""
+        return self.centers.size
 
     def __call__(self, images: np.ndarray | None, features: Sequence[Features]) -> np.ndarray:
         """`[B, M * D]` float32 descriptors of unit length; zero where an image has no features."""

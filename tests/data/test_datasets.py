@@ -152,12 +152,12 @@ def test_missing_and_empty_folders(tmp_path):
 
 def test_fingerprint_follows_names_contents_and_order(tmp_path):
     one, two = fill(tmp_path / "1", ["a.png", "b.png"]), fill(tmp_path / "2", ["a.png", "b.png"])
-    same = fingerprint([image_folder(one)]), fingerprint([image_folder(two)])
+    same = fingerprint(image_folder(one)), fingerprint(image_folder(two))
     assert same[0] == same[1]
     (two / "b.png").rename(two / "c.png")
-    assert fingerprint([image_folder(two)]) != same[0]
+    assert fingerprint(image_folder(two)) != same[0]
     (one / "b.png").write_bytes(b"other")
-    assert fingerprint([image_folder(one)]) != same[0]
+    assert fingerprint(image_folder(one)) != same[0]
 
 
 def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):

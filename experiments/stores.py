@@ -1,0 +1,80 @@
+"""Features on disk: which store belongs to a run, what it will take, and what it took."""
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from experiments import build
+from mfvpr.data.datasets import ImageFolder
+from mfvpr.data.feature_store import FeatureStore, forecast_bytes, open_store, require_space
+from mfvpr.data.store_manifest import store_path
+from mfvpr.features import GlobalExtractor, LocalExtractor
+from mfvpr.report.runs import versions
+
+MB = 2**20  # as the paper's table counts
+PAPER_FEATURE = 2064  # bytes of one feature of D2-Net there: float32 descriptor, keypoint and score
+
+
+@contextmanager
+def opened(
+    root: str | None,
+    name: str,
+    folder: ImageFolder,
+    extractor: LocalExtractor | GlobalExtractor,
+    settings: dict[str, Any],
+    images: str,
+) -> Iterator[FeatureStore | None]:
+    """The store of a folder's features by this extractor, announced and accounted for; None where `root` is None.
+
+    Args:
+        root: folder of all stores.
+        name: what is stored, for people.
+        folder: the images.
+        extractor: what makes the features.
+        settings: of the extractor; with the weights and the images they are what the store is keyed by.
+        images: fingerprint of the images.
+    """
+    if root is None:
+        yield None
+        return
+    recipe = _recipe(settings, images)
+    with open_store(store_path(build.expanded(root), name, recipe), recipe, num_images=len(folder)) as store:
+        missing = len(folder) - int(store.done.sum())
+        if missing:
+            needed = forecast_bytes(missing, extractor.typical_count, extractor.dimension)
+            require_space(store.folder, needed)
+            _tell(
+                f"{name}: {missing} of {len(folder)} images to do, about {extractor.typical_count} features of "
+                f"{extractor.dimension} dimensions each: about {needed / MB:.1f} MB in {store.folder}"
+            )
+        else:
+            _tell(f"{name}: all {len(folder)} images from {store.folder}")
+        yield store
+        if missing:
+            _tell(_account(name, store, settings))
+
+
+def _recipe(settings: dict[str, Any], images: str) -> dict[str, Any]:
+    """All that changes features; how many images go through a network at once does not."""
+    recipe = {key: value for key, value in settings.items() if key != "batch_size"}
+    if "weights" in recipe:
+        from mfvpr.weights.files import fingerprint
+
+        recipe["weights_sha256"] = fingerprint(recipe["weights"])
+    used = {name: version for name, version in versions().items() if name in ("mfvpr", "opencv-python-headless")}
+    return {"extractor": recipe, "images": images, "versions": used}
+
+
+def _account(name: str, store: FeatureStore, settings: dict[str, Any]) -> str:
+    size, features = store.size_bytes, int(store.counts.clip(0).sum())
+    images = max(int(store.done.sum()), 1)
+    text = f"{name}: {size / MB:.1f} MB, {size / images / MB:.2f} MB and {features / images:.0f} features an image"
+    if settings["name"] != "d2net":
+        return text
+    paper = features * PAPER_FEATURE
+    return f"{text}; as the paper stores them {paper / MB:.1f} MB (there 304 MB for 220 images): {size / paper:.2f}x"
+
+
+def _tell(text: str) -> None:
+    print(text, file=sys.stderr)

@@ -1,0 +1,119 @@
+"""Features of a folder through a store: extracted once, whatever happens in between."""
+
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mfvpr import pipeline
+from mfvpr.data.datasets import image_folder
+from mfvpr.data.feature_store import open_store
+from mfvpr.features.sift import Sift
+
+SIFT = Sift(max_keypoints=60, batch_size=3)
+
+
+class Counted:
+    """SIFT that counts its images, and is killed after some."""
+
+    image_size, interpolation, batch_size = SIFT.image_size, SIFT.interpolation, SIFT.batch_size
+    dimension, typical_count = SIFT.dimension, SIFT.typical_count
+
+    def __init__(self, limit=100):
+        self.seen, self.limit = 0, limit
+
+    def __call__(self, images):
+        if self.seen + len(images) > self.limit:
+            raise KeyboardInterrupt
+        self.seen += len(images)
+        return SIFT(images)
+
+
+class Mean:
+    """A global descriptor: the mean color, of unit length."""
+
+    image_size, interpolation, batch_size, dimension, typical_count = (16, 16), "pil_bilinear", 4, 3, 1
+
+    def __init__(self):
+        self.seen = 0
+
+    def __call__(self, images, features):
+        self.seen += len(images)
+        mean = images.mean((1, 2)).astype(np.float32) + 1
+        return mean / np.linalg.norm(mean, axis=1, keepdims=True)
+
+
+@pytest.fixture(scope="module")
+def folder(small_street):
+    return image_folder(small_street / "database")
+
+
+@pytest.fixture
+def opened(tmp_path):
+    @contextmanager
+    def opened(folder, name="store"):
+        with open_store(tmp_path / name, {"name": name}, num_images=len(folder)) as store:
+            yield store
+
+    return opened
+
+
+def test_a_store_gives_what_was_extracted_and_is_read_ever_after(folder, opened):
+    plain = pipeline.extract(folder, SIFT)
+    extractor, found = Counted(), []
+    for _ in range(2):
+        with opened(folder) as store:
+            found.append(pipeline.extract(folder, extractor, store=store))
+    assert extractor.seen == len(folder)
+    first, again = (one.features for one in found)
+    for name in ("keypoints", "descriptors", "scores", "mask", "image_size"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
+        exact = name != "descriptors"
+        np.testing.assert_allclose(getattr(first, name), getattr(plain.features, name), atol=0 if exact else 2e-4)
+
+
+def test_an_interrupted_extraction_goes_on_where_it_was(folder, opened):
+    interrupted, resumed = Counted(limit=7), Counted()
+    with pytest.raises(KeyboardInterrupt), opened(folder) as store:
+        pipeline.extract(folder, interrupted, store=store)
+    with opened(folder) as store:
+        assert store.done.sum() == interrupted.seen == 6
+        found = pipeline.extract(folder, resumed, store=store)
+    assert resumed.seen == len(folder) - 6
+    with opened(folder, "uninterrupted") as store:
+        expected = pipeline.extract(folder, SIFT, store=store)
+    np.testing.assert_array_equal(found.features.descriptors, expected.features.descriptors)
+
+
+def test_bad_images_are_tried_again(tmp_path, opened):
+    for name in "abc":
+        Image.effect_noise((64, 64), 80).convert("RGB").save(tmp_path / f"{name}.png")
+    good = (tmp_path / "b.png").read_bytes()
+    (tmp_path / "b.png").write_bytes(b"")
+    folder = image_folder(tmp_path)
+    with opened(folder) as store:
+        assert list(pipeline.extract(folder, SIFT, store=store, skip_bad=True).bad) == [1]
+    (tmp_path / "b.png").write_bytes(good)
+    with opened(folder) as store:
+        found = pipeline.extract(folder, SIFT, store=store, skip_bad=True)
+    assert found.bad == {}
+    assert found.features.mask.any(axis=1).all()
+
+
+def test_global_descriptors_are_stored_as_well(tmp_path, opened):
+    for name, color in (("a", (200, 10, 10)), ("b", (10, 200, 10)), ("d", (10, 10, 200))):
+        Image.new("RGB", (30, 20), color).save(tmp_path / f"{name}.png")
+    (tmp_path / "c.png").write_bytes(b"")
+    folder, mean = image_folder(tmp_path), Mean()
+    features = pipeline.extract(folder, SIFT, skip_bad=True)
+    plain = pipeline.describe(folder, features, mean, skip_bad=True)
+    found = []
+    for _ in range(2):
+        with opened(folder) as store:
+            found.append(pipeline.describe(folder, features, mean, store=store, skip_bad=True))
+    assert mean.seen == 3 + 3
+    np.testing.assert_array_equal(found[0], found[1])
+    np.testing.assert_allclose(found[0], plain, atol=3e-4)
+    assert np.isnan(plain[2]).all()
+    np.testing.assert_allclose(np.linalg.norm(plain[[0, 1, 3]], axis=1), 1, rtol=1e-5)
