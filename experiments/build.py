@@ -65,6 +65,7 @@ def local_extractor(settings: dict[str, Any]) -> LocalExtractor:
             raise SettingsError("features.interpolation=torch_bilinear: gives fractions, but SIFT takes whole numbers")
         return Sift(**_only(options, Sift, "features=sift"))
     from mfvpr.features.aliked import AlikedFeatures  # here, since Flax takes half a second
+
     from mfvpr.features.d2net import D2NetFeatures
 
     extractor = {"aliked": AlikedFeatures, "d2net": D2NetFeatures}[name]
@@ -72,14 +73,15 @@ def local_extractor(settings: dict[str, Any]) -> LocalExtractor:
     return extractor(_network("features", name, weights), **_only(options, extractor, f"features={name}"))
 
 
-def global_extractor(settings: dict[str, Any], database: Sequence[Features]) -> GlobalExtractor:
-    """What describes whole images; VLAD learns its vocabulary from the database's features."""
+def global_extractor(settings: dict[str, Any]) -> Callable[[Sequence[Features]], GlobalExtractor]:
+    """What describes whole images, once the database's features are there, of which VLAD learns its vocabulary."""
     options = {name: value for name, value in settings.items() if name != "name"}
     if settings["name"] == "vlad":
-        return fit_vlad(database, **options)
+        return lambda database: fit_vlad(database, **options)
     from mfvpr.features.mixvpr import MixVprDescriptor
 
-    return MixVprDescriptor(_network("retrieval", "mixvpr", options.pop("weights")), **options)
+    extractor = MixVprDescriptor(_network("retrieval", "mixvpr", options.pop("weights")), **options)
+    return lambda database: extractor
 
 
 def _network(group: str, name: str, weights: str | None) -> Any:

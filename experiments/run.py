@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,10 +15,10 @@ from experiments import build, outputs, stores
 from experiments.outputs import Outcome, System
 from mfvpr import pipeline
 from mfvpr.data.datasets import Dataset, ImageFolder, fingerprint
-from mfvpr.features import LocalExtractor
+from mfvpr.features import GlobalExtractor, LocalExtractor
 from mfvpr.pipeline import FeatureSet, MatchSet
 from mfvpr.report import runs
-from mfvpr.types import Shortlist
+from mfvpr.types import Features, Shortlist
 
 
 @dataclass
@@ -39,17 +39,18 @@ def evaluate(settings: dict[str, Any]) -> None:
     folder = build.expanded(settings["out"]) if settings["out"] else None
     runs.check_free(folder or runs.new_run_folder(Path("runs"), settings["dataset"]["name"]))
     scorers = build.scorers(settings["scorer"])
+    extractor = build.local_extractor(settings["features"])
+    describer = build.global_extractor(settings["retrieval"])
     watch = Stopwatch()
     with watch("data"):
         dataset = _dataset(settings["dataset"])
         sides = {"database": dataset.database, "query": dataset.queries}
         data = {side: fingerprint(folder) for side, folder in sides.items()}
-    extractor = build.local_extractor(settings["features"])
     with watch("features"):
         database, queries = (_features(settings, extractor, side, sides[side], data[side]) for side in sides)
     _warn(dataset, database, queries)
     with watch("filter"):
-        candidates = _shortlist(settings, sides, data, {"database": database, "query": queries})
+        candidates = _shortlist(settings, describer, sides, data, {"database": database, "query": queries})
     with watch("matching"):
         matches = pipeline.match(queries, database, candidates, **settings["matching"], track=build.track("matching"))
     with watch("scores"):
@@ -103,7 +104,11 @@ def _features(
 
 
 def _shortlist(
-    settings: dict[str, Any], sides: dict[str, ImageFolder], images: dict[str, str], features: dict[str, FeatureSet]
+    settings: dict[str, Any],
+    describer: Callable[[Sequence[Features]], GlobalExtractor],
+    sides: dict[str, ImageFolder],
+    images: dict[str, str],
+    features: dict[str, FeatureSet],
 ) -> Shortlist:
     asked, available = settings["candidates"], len(sides["database"])
     if asked != "all" and asked > available:
@@ -112,7 +117,7 @@ def _shortlist(
             file=sys.stderr,
         )
     chosen, database = settings["retrieval"], features["database"]
-    extractor = build.global_extractor(chosen, [database[row] for row in range(len(database))])
+    extractor = describer([database[row] for row in range(len(database))])
     root = settings["store"] if extractor.image_size is not None else None  # VLAD takes no time
     skip_bad, descriptors = settings["on_bad_image"] == "skip", {}
     for side, folder in sides.items():

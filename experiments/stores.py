@@ -12,7 +12,7 @@ from mfvpr.data.store_manifest import store_path
 from mfvpr.features import GlobalExtractor, LocalExtractor
 from mfvpr.report.runs import versions
 
-MB = 2**20  # as the paper's table counts
+MB = 1e6
 PAPER_FEATURE = 2064  # bytes of one feature of D2-Net there: float32 descriptor, keypoint and score
 
 
@@ -73,7 +73,7 @@ def _account(name: str, store: FeatureStore, settings: dict[str, Any]) -> str:
     if settings["name"] != "d2net":
         return text
     paper = features * PAPER_FEATURE
-    return f"{text}; as the paper stores them {paper / MB:.1f} MB (there 304 MB for 220 images): {size / paper:.2f}x"
+    return f"{text}; as the paper stores them, in float32, {paper / MB:.1f} MB: {size / paper:.2f}x"
 
 
 def _tell(text: str) -> None:

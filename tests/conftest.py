@@ -8,6 +8,11 @@ import pytest
 from hypothesis import settings
 
 from mfvpr.data.streets import streets_folder
+from mfvpr.weights.conversion import convert
+from mfvpr.weights.files import save
+from mfvpr.weights.networks import blueprint, network_of
+from mfvpr.weights.registry import entry_of
+from tests import checkpoints
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -44,6 +49,19 @@ def cache(tmp_path_factory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MFVPR_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture(scope="session")
+def weights(tmp_path_factory) -> Path:
+    """A folder of installed weights: random ones, but ALIKED's real ones where they are at hand."""
+    root = tmp_path_factory.mktemp("weights")
+    for name, tensors in checkpoints.at_hand():
+        entry, source = entry_of(name), root / f"{name}.source"
+        source.write_text("not published")
+        plan = blueprint(entry)
+        arrays = convert(tensors, network_of(entry).table, plan.shapes)
+        save(name, arrays, source, parameters=plan.parameters, folder=root)
+    return root
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,203 @@
+"""Published weights: list them, download, convert, verify. `python -m experiments.weights --help`."""
+
+import argparse
+import shlex
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+from experiments.errors import one_line, refuse, unwind_on_sigterm
+
+if TYPE_CHECKING:
+    from mfvpr.weights.registry import Entry
+
+# Functions import what they need: --help and wrong usage need not wait for JAX.
+CONVERT = "python -m experiments.weights convert"
+_CHUNK = 1 << 18
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        refuse(f"{message}; see python -m experiments.weights --help")
+
+
+def main() -> None:
+    """Run the command line's command."""
+    unwind_on_sigterm()
+    with one_line():
+        arguments = vars(_parser().parse_args())
+        arguments.pop("run")(**arguments)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="python -m experiments.weights", description="Weights live in MFVPR_WEIGHTS, by default "
+                     "~/.cache/mfvpr/weights. None come with the package; each has its own license.")  # fmt: skip
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    command = commands.add_parser("list", help="all known weights, their licenses, and whether they are installed")
+    command.set_defaults(run=list_weights)
+    command = commands.add_parser("convert", help="install an official checkpoint (needs torch)")
+    command.add_argument("file", metavar="FILE", type=Path, help="a checkpoint under its official name")
+    command.add_argument("--as", dest="name", metavar="NAME", help="what FILE is, where it has another name")
+    command.set_defaults(run=convert)
+    command = commands.add_parser("verify", help="check what is installed, byte by byte")
+    command.add_argument("names", metavar="NAME", nargs="*", help="by default all that are there")
+    command.set_defaults(run=verify)
+    command = commands.add_parser("download", help="fetch an official checkpoint whose hash is published")
+    command.add_argument("name", metavar="NAME")
+    command.set_defaults(run=download)
+    return parser
+
+
+def list_weights() -> None:
+    """Print a table of the registry."""
+    from mfvpr.report.tables import Table
+    from mfvpr.weights.files import is_installed
+    from mfvpr.weights.networks import NETWORKS
+    from mfvpr.weights.registry import REGISTRY
+
+    header = ["name", "network", "official file", "license of code", "of weights", "installed", "MB"]
+    rows = []
+    for entry in REGISTRY.values():
+        installed = ("yes" if is_installed(entry) else "no") if entry.name in NETWORKS else "no network yet"
+        size = f"{entry.size / 1e6:.1f}" if entry.size else "-"
+        licenses = (entry.code_license, entry.weights_license)
+        rows.append([entry.name, entry.network, entry.file, *licenses, installed, size])
+    print(Table(header, rows, text_columns=6).text(), end="")
+
+
+def convert(file: Path, name: str | None) -> None:
+    """Install an official checkpoint."""
+    from mfvpr.weights.files import install, read_manifest
+
+    entry = _recognized(file, name)
+    path = install(file, entry.name)
+    print(f"{path}: {entry.name}, {read_manifest(entry.name).parameters:,} parameters")
+
+
+def verify(names: Iterable[str]) -> None:
+    """Check runtime files against their manifests, and downloaded checkpoints against the published hashes."""
+    from mfvpr.errors import InputError
+    from mfvpr.weights.files import weights_folder
+    from mfvpr.weights.registry import REGISTRY, entry_of
+
+    there = [entry for entry in REGISTRY.values() if _runtime_present(entry) or _original_present(entry)]
+    entries = [entry_of(name) for name in names] or there
+    if not entries:
+        print(f"nothing is installed in {weights_folder()}")
+    bad = 0
+    for entry in entries:
+        try:
+            print(f"{entry.name}: {_verified(entry)}")
+        except InputError as error:
+            print(f"{entry.name}: BAD, {str(error).removeprefix(f'{entry.name}: ')}")
+            bad += 1
+    if bad:
+        refuse(f"{bad} of {len(entries)} could not be verified")
+
+
+def download(name: str) -> None:
+    """Fetch an official checkpoint into the weights folder; it gets its name once its hash is right."""
+    from mfvpr.errors import InputError
+    from mfvpr.weights.files import file_sha256, weights_folder
+    from mfvpr.weights.networks import NETWORKS
+    from mfvpr.weights.registry import entry_of
+
+    entry = entry_of(name)
+    if entry.sha256 is None:
+        raise InputError(f"{name}: no hash is published, so it cannot be fetched safely; get {entry.file} from "
+                         f"{entry.source}, then: {CONVERT} {shlex.quote(entry.file)}")  # fmt: skip
+    target = weights_folder() / entry.file
+    size = f"{entry.size:,} bytes" if entry.size else "size not published"
+    print(f"{entry.file}: {entry.source}, {size}, {entry.license}", flush=True)
+    if target.is_file() and file_sha256(target) == entry.sha256:
+        print(f"{target}: is there already, with the published hash")
+    else:
+        _fetch(entry, target)
+        print(f"{target}: downloaded, with the published hash")
+    if name in NETWORKS:
+        print(f"to install it: {CONVERT} {shlex.quote(str(target))}")
+
+
+def _fetch(entry: "Entry", target: Path) -> None:
+    import hashlib
+    from http.client import HTTPException
+    from urllib.request import urlopen
+
+    from tqdm import tqdm
+
+    from mfvpr.data.files import replacing
+    from mfvpr.errors import InputError
+    from mfvpr.weights.files import check_sha256
+
+    digest = hashlib.sha256()
+    try:
+        with (
+            replacing(target) as temporary,
+            urlopen(entry.source, timeout=30) as response,
+            temporary.open("wb") as file,
+            tqdm(total=entry.size, unit="B", unit_scale=True, desc=entry.file) as bar,
+        ):
+            while chunk := response.read(_CHUNK):
+                digest.update(chunk)
+                bar.update(file.write(chunk))
+                if entry.size and bar.n > entry.size:
+                    break  # the hash will tell
+            file.flush()
+            check_sha256(digest.hexdigest(), entry, entry.source)
+    except (OSError, HTTPException) as error:
+        reason = getattr(error, "reason", None) or error
+        raise InputError(f"{entry.source}: could not be downloaded to {target.parent}: {reason}") from error
+
+
+def _recognized(file: Path, name: str | None) -> "Entry":
+    from mfvpr.errors import InputError
+    from mfvpr.weights.registry import REGISTRY, entry_of
+
+    if name is not None:
+        return entry_of(name)
+    for entry in REGISTRY.values():
+        if entry.file == file.name:
+            return entry
+    raise InputError(f"{file}: no official file name; say what it is with --as NAME, one of {', '.join(REGISTRY)}")
+
+
+def _runtime_present(entry: "Entry") -> bool:
+    from mfvpr.weights.files import weights_folder
+
+    return any((weights_folder() / f"{entry.name}{suffix}").exists() for suffix in (".safetensors", ".json"))
+
+
+def _original_present(entry: "Entry") -> bool:
+    from mfvpr.weights.files import weights_folder
+
+    return entry.sha256 is not None and (weights_folder() / entry.file).exists()
+
+
+def _verified(entry: "Entry") -> str:
+    """What was found good.
+
+    Raises:
+        InputError: what is not.
+    """
+    from mfvpr.errors import InputError
+    from mfvpr.weights.files import check_published, load_model, read_manifest, weights_folder
+    from mfvpr.weights.networks import NETWORKS
+
+    good = []
+    original = weights_folder() / entry.file
+    if _original_present(entry):
+        check_published(original, entry)
+        good.append(f"{entry.file} has the published hash")
+    if entry.name in NETWORKS and (not good or _runtime_present(entry)):
+        load_model(entry.name)
+        parameters = read_manifest(entry.name).parameters
+        if parameters != entry.parameters:
+            raise InputError(f"expected {entry.parameters:,} parameters, got {parameters:,}")
+        good.append(f"{parameters:,} parameters as converted")
+    if not good:
+        raise InputError(f"{original}: not there; fetch it: python -m experiments.weights download {entry.name}")
+    return "good, " + ", ".join(good)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,70 @@
+"""Values of maps between their pixels, bilinear: at any position, or on a finer grid. Pixels lie at integers."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+
+class Neighbors(NamedTuple):
+    """For each of n positions on a line the pixels before and after it, and how far between the two it is."""
+
+    lower: np.ndarray  # [n] int
+    upper: np.ndarray  # [n] int
+    part: np.ndarray  # [n] in [0, 1], from lower to upper
+
+
+def sample(dense: Array, points: Array) -> Array:
+    """A map `[H, W, C]` at positions `[..., 2]` (x, y) px -> `[..., C]`.
+
+    Outside of the map are zeros: each of the four pixels around a position counts by itself, so that values fade out
+    within one pixel of the border (as `grid_sample` with corners aligned has it, and deformable convolutions).
+    """
+    height, width, channels = dense.shape
+    flat = dense.reshape(height * width, channels)  # one index is faster than two
+    total = jnp.zeros((*points.shape[:-1], channels), dense.dtype)
+    for y, x, weight in around(points, height, width):
+        total += weight[..., None] * flat.at[y * width + x].get(mode="promise_in_bounds")
+    return total
+
+
+def around(points: Array, height: int, width: int) -> Iterator[tuple[Array, Array, Array]]:
+    """The four pixels around positions `[..., 2]` (x, y) px: y, x, weight. Those outside are moved in, and weigh 0."""
+    low = jnp.floor(points)
+    part, pixel = points - low, low.astype(int)
+    for down in (0, 1):
+        for right in (0, 1):
+            x, y = pixel[..., 0] + right, pixel[..., 1] + down
+            across = part[..., 0] if right else 1 - part[..., 0]
+            along = part[..., 1] if down else 1 - part[..., 1]
+            inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
+            yield jnp.clip(y, 0, height - 1), jnp.clip(x, 0, width - 1), jnp.where(inside, across * along, 0)
+
+
+def upsample(dense: Array, factor: int) -> Array:
+    """Maps `[..., h, w, C]` -> `[..., factor * h, factor * w, C]`, the centers of the corner pixels aligned."""
+    if factor == 1:
+        return dense
+    for axis in (-3, -2):
+        dense = between(dense, neighbors(dense.shape[axis], factor * dense.shape[axis]), axis)
+    return dense
+
+
+def neighbors(size: int, count: int, window: slice = slice(None)) -> Neighbors:
+    """Where `count` positions lie among `size` pixels, first on first and last on last; of these the window's."""
+    step = np.float32((size - 1) / max(count - 1, 1))
+    position = step * np.arange(count, dtype=np.float32)[window]  # rounded as torch rounds it
+    lower = np.minimum(position.astype(int), size - 1)
+    return Neighbors(lower, np.minimum(lower + 1, size - 1), position - lower.astype(np.float32))
+
+
+def between(dense: Array, places: Neighbors, axis: int) -> Array:
+    """`dense` at these places along one axis.
+
+    Fetching two neighbors is several times faster than a product with the matrix of the interpolation, which is zero
+    almost everywhere.
+    """
+    part = jnp.expand_dims(places.part, [other for other in range(dense.ndim) if other != axis % dense.ndim])
+    return (1 - part) * jnp.take(dense, places.lower, axis) + part * jnp.take(dense, places.upper, axis)

@@ -1,0 +1,134 @@
+"""Which network each published file fills, and how."""
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from mfvpr.errors import InputError
+from mfvpr.weights.conversion import Rule, Table, convert
+from mfvpr.weights.registry import Entry
+from mfvpr.weights.tables import ALIKED, D2NET, MIXVPR
+
+if TYPE_CHECKING:
+    from flax import nnx
+
+_OURS = Table((Rule("(.*)", r"\1"),))  # runtime files have our own paths
+
+
+class Network(NamedTuple):
+    """A network of the package: what makes it, and how its published checkpoints are laid out."""
+
+    builder: Callable[[], Callable[..., "nnx.Module"]]  # imports the model, and returns what takes `rngs`
+    table: Table
+
+
+def _d2net() -> Callable[..., "nnx.Module"]:
+    from mfvpr.models.d2net import D2Net
+
+    return D2Net
+
+
+def _mixvpr(out_channels: int, out_rows: int) -> Callable[..., "nnx.Module"]:
+    from mfvpr.models.mixvpr import MixVPR
+
+    return partial(MixVPR, out_channels=out_channels, out_rows=out_rows)
+
+
+def _aliked(variant: str) -> Callable[..., "nnx.Module"]:
+    from mfvpr.models.aliked import Aliked
+
+    return partial(Aliked, variant)
+
+
+_ALIKED = ("aliked-t16", "aliked-n16", "aliked-n16rot", "aliked-n32")
+
+# By the registry's names. Entries that are not here have no network in this version.
+NETWORKS: dict[str, Network] = {
+    **{name: Network(_d2net, D2NET) for name in ("d2_tf", "d2_ots", "d2_tf_no_phototourism")},
+    "mixvpr_4096": Network(partial(_mixvpr, 1024, 4), MIXVPR),
+    "mixvpr_512": Network(partial(_mixvpr, 256, 2), MIXVPR),
+    "mixvpr_128": Network(partial(_mixvpr, 64, 2), MIXVPR),
+    **{name: Network(partial(_aliked, name), ALIKED) for name in _ALIKED},
+}
+
+
+@dataclass(frozen=True)
+class Blueprint:
+    """A network without values: nothing was computed to make it."""
+
+    shapes: Mapping[str, tuple[int, ...]]  # by dotted path; parameters and running statistics
+    parameters: int  # without running statistics
+    _graph: Any
+    _state: Any
+
+    def filled(self, arrays: Mapping[str, np.ndarray]) -> "nnx.Module":
+        """The network with these values, in evaluation mode.
+
+        Raises:
+            InputError: a path is missing or unknown, or a shape differs.
+        """
+        import jax
+        from flax import nnx
+
+        arrays = convert(arrays, _OURS, self.shapes)
+        state = jax.tree.map(lambda leaf: leaf, self._state)  # a copy, since the next line changes it
+        nnx.replace_by_pure_dict(state, _nested({path: jax.numpy.asarray(array) for path, array in arrays.items()}))
+        module = nnx.merge(self._graph, state)
+        module.eval()
+        return module
+
+
+def network_of(entry: Entry) -> Network:
+    """How the entry's network is built and converted.
+
+    Raises:
+        InputError: it is not part of this version.
+    """
+    if entry.name not in NETWORKS:
+        raise InputError(
+            f"{entry.name}: the network {entry.network} is not part of this version; its files are listed and verified"
+        )
+    return NETWORKS[entry.name]
+
+
+def blueprint(entry: Entry) -> Blueprint:
+    """The shapes of the entry's network.
+
+    Raises:
+        InputError: it is not part of this version.
+    """
+    network = network_of(entry)
+    import jax
+    from flax import nnx
+
+    build = network.builder()  # before tracing, or constants of the model's module would be traced
+    with jax.numpy_dtype_promotion("standard"):  # Flax's initializers mix types
+        module = nnx.eval_shape(lambda: build(rngs=nnx.Rngs(0)))
+    graph, state = nnx.split(module)
+    shapes = {path: leaf.shape for path, leaf in _leaves(nnx.to_pure_dict(state), "")}
+    trained = _leaves(nnx.to_pure_dict(nnx.state(module, nnx.Param)), "")
+    return Blueprint(shapes, sum(math.prod(leaf.shape) for _, leaf in trained), graph, state)
+
+
+def _leaves(tree: Mapping[Any, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _nested(flat: Mapping[str, Any]) -> dict[Any, Any]:
+    """Of dotted paths; digits are places of a list."""
+    tree: dict[Any, Any] = {}
+    for path, value in flat.items():
+        *parents, last = (int(part) if part.isdigit() else part for part in path.split("."))
+        node = tree
+        for part in parents:
+            node = node.setdefault(part, {})
+        node[last] = value
+    return tree

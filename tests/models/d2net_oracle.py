@@ -1,0 +1,127 @@
+"""D2-Net's detection from the paper and its published settings: float64, explicit loops, no JAX."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Found(NamedTuple):
+    """A keypoint of one map."""
+
+    channel: int
+    row: int
+    column: int
+    x: float  # px
+    y: float
+    score: float
+    descriptor: np.ndarray  # [C]
+
+
+def detected(dense: np.ndarray) -> list[tuple[int, int, int]]:
+    """(channel, row, column) that pass the three tests, in this order, of a map `[h, w, C]`."""
+    height, width, channels = dense.shape
+    found = []
+    for channel in range(channels):
+        for row in range(height):
+            for column in range(width):
+                value = dense[row, column, channel]
+                rows = slice(max(row - 1, 0), row + 2)
+                columns = slice(max(column - 1, 0), column + 2)
+                strongest = value == dense[row, column].max()
+                if (
+                    strongest
+                    and value == dense[rows, columns, channel].max()
+                    and not _is_edge(dense, channel, row, column)
+                ):
+                    found.append((channel, row, column))
+    return found
+
+
+def keypoints(dense: np.ndarray, banned: np.ndarray | None = None) -> list[Found]:
+    """What is detected where nothing is `banned` `[h, w]`, moved to the maximum of a parabola."""
+    height, width, _ = dense.shape
+    found = []
+    for channel, row, column in detected(dense):
+        if banned is not None and banned[row, column]:
+            continue
+        ii, jj, ij, i, j = _derivatives(dense, channel, row, column)
+        down, right = np.linalg.solve([[ii, ij], [ij, jj]], [-i, -j])
+        if abs(down) >= 0.5 or abs(right) >= 0.5:
+            continue
+        at_row, at_column = row + down, column + right
+        if min(at_row, at_column) < 0 or math.ceil(at_row) >= height or math.ceil(at_column) >= width:
+            continue
+        descriptor = _bilinear(dense, at_row, at_column)
+        descriptor = descriptor / max(np.linalg.norm(descriptor), 1e-12)
+        score = dense[row, column, channel]
+        found.append(Found(channel, row, column, 4 * at_column + 1.5, 4 * at_row + 1.5, score, descriptor))
+    return found
+
+
+def pyramid(maps: list[np.ndarray]) -> list[list[Found]]:
+    """Keypoints of each scale's map, the smallest first, px of that scale's image; scores divided by 1, 2, ..."""
+    found: list[list[Found]] = []
+    previous = banned = None
+    for level, dense in enumerate(maps, start=1):
+        height, width, _ = dense.shape
+        if previous is not None:
+            dense = dense + _enlarged(previous, height, width)
+        if banned is not None:
+            tall, wide = banned.shape
+            banned = np.array(
+                [
+                    [banned[row * tall // height, column * wide // width] for column in range(width)]
+                    for row in range(height)
+                ]
+            )
+        ours = keypoints(dense, banned)
+        now = np.zeros((height, width), bool) if banned is None else banned.copy()
+        for _, row, column in detected(dense):
+            now[row, column] = True
+        found.append([one._replace(score=one.score / level) for one in ours])
+        banned, previous = now, dense if ours else None
+    return found
+
+
+def _value(dense: np.ndarray, channel: int, row: int, column: int) -> float:
+    height, width, _ = dense.shape
+    return dense[row, column, channel] if 0 <= row < height and 0 <= column < width else 0.0
+
+
+def _derivatives(dense: np.ndarray, channel: int, row: int, column: int) -> tuple[float, float, float, float, float]:
+    """Second derivatives ii, jj, ij and first derivatives i, j (rows, columns); zeros outside."""
+
+    def at(down: int, right: int) -> float:
+        return _value(dense, channel, row + down, column + right)
+
+    ii = at(-1, 0) - 2 * at(0, 0) + at(1, 0)
+    jj = at(0, -1) - 2 * at(0, 0) + at(0, 1)
+    ij = (at(-1, -1) - at(-1, 1) - at(1, -1) + at(1, 1)) / 4
+    return ii, jj, ij, (at(1, 0) - at(-1, 0)) / 2, (at(0, 1) - at(0, -1)) / 2
+
+
+def _is_edge(dense: np.ndarray, channel: int, row: int, column: int) -> bool:
+    ii, jj, ij, _, _ = _derivatives(dense, channel, row, column)
+    det = ii * jj - ij * ij
+    return det <= 0 or (ii + jj) ** 2 / det > (5 + 1) ** 2 / 5
+
+
+def _bilinear(dense: np.ndarray, row: float, column: float) -> np.ndarray:
+    top, left = math.floor(row), math.floor(column)
+    bottom, right = math.ceil(row), math.ceil(column)
+    down, across = row - top, column - left
+    upper = (1 - across) * dense[top, left] + across * dense[top, right]
+    lower = (1 - across) * dense[bottom, left] + across * dense[bottom, right]
+    return (1 - down) * upper + down * lower
+
+
+def _enlarged(dense: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Bilinear; the corners stay the corners."""
+    tall, wide, channels = dense.shape
+    result = np.zeros((height, width, channels))
+    for row in range(height):
+        for column in range(width):
+            at_row, at_column = row * (tall - 1) / (height - 1), column * (wide - 1) / (width - 1)
+            result[row, column] = _bilinear(dense, min(at_row, tall - 1), min(at_column, wide - 1))
+    return result

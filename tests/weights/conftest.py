@@ -1,0 +1,76 @@
+"""A small network with one of everything, registered beside the published ones; runtime files go to a test's folder."""
+
+from types import ModuleType
+
+import numpy as np
+import pytest
+from flax import nnx
+
+from mfvpr.weights import networks, registry
+from mfvpr.weights.conversion import Layout, Rule, Table
+
+
+class Tiny(nnx.Module):
+    def __init__(self, rngs: nnx.Rngs) -> None:
+        self.conv = nnx.Conv(3, 4, (3, 3), rngs=rngs)
+        self.bn = nnx.BatchNorm(4, rngs=rngs)
+        self.mix = nnx.List([nnx.Linear(4, 5, rngs=rngs), nnx.Linear(5, 2, rngs=rngs)])
+
+    def __call__(self, x):
+        x = self.bn(self.conv(x))
+        for layer in self.mix:
+            x = layer(x)
+        return x
+
+
+_NORM = {"weight": "scale", "bias": "bias", "running_mean": "mean", "running_var": "var"}
+TABLE = Table(
+    (
+        Rule(r"net\.conv\.weight", "conv.kernel", Layout.CONV),
+        Rule(r"net\.conv\.bias", "conv.bias"),
+        *(Rule(rf"net\.bn\.{theirs}", f"bn.{ours}") for theirs, ours in _NORM.items()),
+        Rule(r"net\.mix\.(\d)\.weight", r"mix.\1.kernel", Layout.LINEAR),
+        Rule(r"net\.mix\.(\d)\.bias", r"mix.\1.bias"),
+    ),
+    ignored=(r".*\.num_batches_tracked",),
+)
+SOURCE_SHAPES = {
+    "net.conv.weight": (4, 3, 3, 3), "net.conv.bias": (4,),
+    "net.bn.weight": (4,), "net.bn.bias": (4,), "net.bn.running_mean": (4,), "net.bn.running_var": (4,),
+    "net.bn.num_batches_tracked": (),
+    "net.mix.0.weight": (5, 4), "net.mix.0.bias": (5,), "net.mix.1.weight": (2, 5), "net.mix.1.bias": (2,),
+}  # fmt: skip
+SHAPES = {
+    "conv.kernel": (3, 3, 3, 4), "conv.bias": (4,), "bn.scale": (4,), "bn.bias": (4,), "bn.mean": (4,), "bn.var": (4,),
+    "mix.0.kernel": (4, 5), "mix.0.bias": (5,), "mix.1.kernel": (5, 2), "mix.1.bias": (2,),
+}  # fmt: skip
+PARAMETERS = 157
+
+
+def tiny_entry(name: str = "tiny", **changes: object) -> registry.Entry:
+    values = {
+        "name": name, "network": "tiny", "file": f"{name}.pth", "source": f"https://example.org/{name}.pth",
+        "size": None, "sha256": None, "code_license": "MIT", "weights_license": "none stated", "cite": "-",
+        "parameters": PARAMETERS,
+    }  # fmt: skip
+    return registry.Entry(**(values | changes))
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Where `tiny` is installed, once it is."""
+    monkeypatch.setenv("MFVPR_WEIGHTS", str(tmp_path / "weights"))
+    monkeypatch.setitem(registry.REGISTRY, "tiny", tiny_entry())
+    monkeypatch.setitem(networks.NETWORKS, "tiny", networks.Network(lambda: Tiny, TABLE))
+    return tmp_path / "weights"
+
+
+@pytest.fixture
+def arrays():
+    rng = np.random.default_rng(0)
+    return {path: rng.uniform(0.5, 1, shape).astype(np.float32) for path, shape in SHAPES.items()}
+
+
+@pytest.fixture
+def torch() -> ModuleType:
+    return pytest.importorskip("torch", reason="torch, of the extra `convert`, is not installed")

@@ -1,0 +1,226 @@
+"""Runtime files: what was saved comes back byte for byte, or is refused by name and with the mend."""
+
+import hashlib
+import json
+import struct
+
+import numpy as np
+import pytest
+from safetensors.numpy import save as serialized
+
+from mfvpr.errors import InputError
+from mfvpr.weights import files
+from mfvpr.weights.files import fingerprint, install, load, load_model, save, weights_folder
+from mfvpr.weights.registry import REGISTRY
+from tests.checkpoints import random_checkpoint
+from tests.weights.conftest import PARAMETERS, SOURCE_SHAPES, tiny_entry
+
+
+@pytest.fixture
+def installed(folder, arrays, tmp_path):
+    (tmp_path / "tiny.pth").write_bytes(b"the source")
+    return save("tiny", arrays, tmp_path / "tiny.pth", parameters=PARAMETERS)
+
+
+def refused(words, name="tiny"):
+    with pytest.raises(InputError) as caught:
+        load(name)
+    message = str(caught.value)
+    assert words in message
+    assert "python -m experiments.weights convert tiny.pth" in message
+    assert "\n" not in message
+
+
+def test_round_trip(installed, folder, arrays):
+    assert installed == folder / "tiny.safetensors"
+    found = load("tiny")
+    assert found.keys() == arrays.keys()
+    for path, array in arrays.items():
+        np.testing.assert_array_equal(found[path], array)
+        assert found[path].dtype == np.float32
+    assert sorted(path.name for path in folder.iterdir()) == ["tiny.json", "tiny.safetensors"]
+
+
+def test_manifest(installed, tmp_path):
+    content = installed.read_bytes()
+    sha256 = hashlib.sha256(content).hexdigest()
+    assert json.loads(installed.with_suffix(".json").read_text()) == {
+        "name": "tiny", "sha256": sha256, "size": len(content), "parameters": PARAMETERS, "source_file": "tiny.pth",
+        "source_sha256": hashlib.sha256(b"the source").hexdigest(), "format": 1,
+    }  # fmt: skip
+    assert fingerprint("tiny") == sha256
+
+
+def test_saving_twice_makes_the_same_bytes(installed, arrays, tmp_path):
+    before = installed.read_bytes()
+    save("tiny", dict(reversed(arrays.items())), tmp_path / "tiny.pth", parameters=PARAMETERS)
+    assert installed.read_bytes() == before
+
+
+def test_model(installed, arrays):
+    model = load_model("tiny")
+    np.testing.assert_array_equal(model.conv.kernel[...], arrays["conv.kernel"])
+    np.testing.assert_array_equal(model.mix[1].bias[...], arrays["mix.1.bias"])
+    np.testing.assert_array_equal(model.bn.var[...], arrays["bn.var"])
+    image = np.random.default_rng(0).standard_normal((1, 6, 6, 3)).astype(np.float32)
+    once, again = model(image), model(image)
+    np.testing.assert_array_equal(once, again)  # evaluation mode: no statistics are gathered
+    assert once.shape == (1, 6, 6, 2)
+
+
+def test_arrays_of_another_network_are_refused(installed, arrays, tmp_path):
+    arrays["conv.extra"] = arrays.pop("conv.bias")
+    arrays["mix.0.kernel"] = arrays["mix.0.kernel"].T
+    save("tiny", arrays, tmp_path / "tiny.pth", parameters=PARAMETERS)
+    with pytest.raises(InputError, match=r"tiny\.safetensors: 3 of the network's keys do not fit: ") as caught:
+        load_model("tiny")
+    assert all(name in str(caught.value) for name in ("conv.extra", "mix.0.kernel", "conv.bias", "write it again"))
+
+
+@pytest.mark.parametrize("place", [0.02, 0.5, 0.999])
+def test_a_flipped_bit_is_refused(installed, place):
+    content = bytearray(installed.read_bytes())
+    content[int(place * len(content))] ^= 1
+    installed.write_bytes(content)
+    refused("the file has changed since it was written (sha256 differs)")
+
+
+def test_truncated(installed):
+    installed.write_bytes(installed.read_bytes()[:-1])
+    refused(f"expected {installed.stat().st_size + 1} bytes, got {installed.stat().st_size}")
+
+
+def test_without_manifest(installed):
+    installed.with_suffix(".json").unlink()
+    refused("there is no manifest, so the file was never finished")
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"name": "tiny"}', '{"format": 1, "more": 2}', "\x00\x01"])
+def test_damaged_manifest(installed, text):
+    installed.with_suffix(".json").write_text(text)
+    refused("expected a manifest of format 1")
+
+
+def test_manifest_of_another(installed):
+    manifest = installed.with_suffix(".json")
+    values = json.loads(manifest.read_text())
+    manifest.write_text(json.dumps(values | {"parameters": "many"}))
+    refused("expected a manifest of format 1")
+    manifest.write_text(json.dumps(values | {"name": "d2_tf"}))
+    refused("expected the manifest of tiny, got that of d2_tf")
+    manifest.write_text(json.dumps(values | {"format": 2}))
+    refused("expected a manifest of format 1, got 2")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        struct.pack("<Q", 2**62) + b"{}",
+        struct.pack("<Q", 2**27) + b"{" + b" " * 1000,
+        struct.pack("<Q", 2) + b"{}" + b"more",
+        b"",
+        serialized({"a": np.zeros(3)})[:-4],
+        struct.pack("<Q", 60) + b'{"a":{"dtype":"BF16","shape":[2],"data_offsets":[0,4]}}'.ljust(60) + bytes(4),
+    ],
+    ids=["endless header", "huge header", "uncovered", "empty", "short", "bfloat16"],
+)
+def test_what_is_no_safetensors_file_is_refused_even_with_its_hash(installed, content):
+    installed.write_bytes(content)
+    manifest = installed.with_suffix(".json")
+    values = json.loads(manifest.read_text())
+    values |= {"size": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+    manifest.write_text(json.dumps(values))
+    with pytest.raises(InputError) as caught:
+        load_model("tiny")
+    assert str(caught.value).startswith(f"{installed}: ")
+
+
+def test_a_crash_between_file_and_manifest_leaves_nothing_that_looks_complete(folder, arrays, tmp_path, monkeypatch):
+    (tmp_path / "tiny.pth").write_bytes(b"the source")
+
+    def crash(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(files, "write_text", crash)
+        with pytest.raises(KeyboardInterrupt):
+            save("tiny", arrays, tmp_path / "tiny.pth", parameters=PARAMETERS)
+    refused("there is no manifest")
+    save("tiny", arrays, tmp_path / "tiny.pth", parameters=PARAMETERS)
+    with monkeypatch.context() as patch:
+        patch.setattr(files, "write_text", crash)
+        with pytest.raises(KeyboardInterrupt):
+            save("tiny", arrays | {"conv.bias": np.ones(4, np.float32)}, tmp_path / "tiny.pth", parameters=PARAMETERS)
+    refused("the file has changed since it was written")
+
+
+def test_not_installed_is_told_with_file_place_license_and_command(folder):
+    refused("tiny: not installed in")
+    refused("get tiny.pth from https://example.org/tiny.pth (code MIT, weights none stated), then: python -m")
+    with pytest.raises(InputError, match=r"convert 'resnet50_MixVPR_512_channels\(256\)_rows\(2\)\.ckpt'$"):
+        load("mixvpr_512")
+    with pytest.raises(InputError, match="not installed"):
+        fingerprint("tiny")
+
+
+@pytest.mark.parametrize("name", ["../tiny", "", "/etc/passwd", "unknown"])
+def test_unknown_names(folder, name):
+    with pytest.raises(InputError, match="no weights of this name"):
+        load(name)
+
+
+def test_values_that_are_not_finite_are_not_saved(folder, arrays, tmp_path):
+    arrays["conv.bias"][1] = np.nan
+    with pytest.raises(InputError, match=r"NaN or infinity in conv\.bias"):
+        save("tiny", arrays, tmp_path / "tiny.pth", parameters=PARAMETERS)
+    assert not folder.exists()
+
+
+def test_folder(monkeypatch):
+    monkeypatch.setenv("MFVPR_WEIGHTS", "~/w")
+    assert weights_folder().is_absolute()
+    assert weights_folder().name == "w"
+    monkeypatch.setenv("MFVPR_WEIGHTS", "")
+    assert weights_folder().parts[-3:] == (".cache", "mfvpr", "weights")
+
+
+class TestInstall:
+    """A checkpoint -> the runtime file."""
+
+    @pytest.fixture
+    def checkpoint(self, folder, tmp_path, monkeypatch):
+        """Reading is another test's matter."""
+        tensors = random_checkpoint(SOURCE_SHAPES)
+        monkeypatch.setattr(files, "read_checkpoint", lambda _: tensors)
+        path = tmp_path / "tiny.pth"
+        path.write_bytes(b"the source")
+        return path, tensors
+
+    def test_whole_way(self, checkpoint):
+        path, tensors = checkpoint
+        before = path.read_bytes()
+        install(path, "tiny")
+        np.testing.assert_array_equal(load_model("tiny").mix[0].kernel[...], tensors["net.mix.0.weight"].T)
+        assert path.read_bytes() == before
+
+    def test_keys_that_do_not_fit(self, checkpoint, folder):
+        path, tensors = checkpoint
+        tensors["net.conv.bis"] = tensors.pop("net.conv.bias")
+        with pytest.raises(
+            InputError, match=r"tiny\.pth: 2 of .*net\.conv\.bis.*conv\.bias; use the official tiny\.pth"
+        ):
+            install(path, "tiny")
+        assert not folder.exists()
+
+    def test_wrong_hash(self, checkpoint, folder, monkeypatch):
+        path, _ = checkpoint
+        monkeypatch.setitem(REGISTRY, "tiny", tiny_entry(sha256="0" * 64))
+        with pytest.raises(InputError, match=r"tiny\.pth: expected the sha256 of tiny, 0{12}\.\.\., got [0-9a-f]{12}"):
+            install(path, "tiny")
+        sha256 = hashlib.sha256(b"the source").hexdigest()
+        monkeypatch.setitem(REGISTRY, "other", tiny_entry("other", sha256=sha256))
+        with pytest.raises(InputError, match="got that of other"):
+            install(path, "tiny")
+        assert not folder.exists()
+        monkeypatch.setitem(REGISTRY, "tiny", tiny_entry(sha256=sha256))
+        assert install(path, "tiny").is_file()

@@ -1,0 +1,322 @@
+"""`python -m experiments.weights` as a user types it."""
+
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+
+from experiments.weights import main
+from mfvpr.weights.files import load_model, save
+from mfvpr.weights.registry import REGISTRY
+from tests.checkpoints import ALIKED, d2net_shapes, random_checkpoint
+from tests.weights.conftest import PARAMETERS, SOURCE_SHAPES, tiny_entry
+
+ROOT = Path(__file__).parent.parent.parent
+CONTENT = os.urandom(1 << 20)
+SHA256 = hashlib.sha256(CONTENT).hexdigest()
+
+
+@pytest.fixture
+def program(folder, monkeypatch, capfd):
+    """Runs the command line in this process: exit code, stdout, stderr."""
+    handler = signal.getsignal(signal.SIGTERM)
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["weights", *map(str, arguments)])
+        code = 0
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code or 0
+        return code, *capfd.readouterr()
+
+    yield run
+    signal.signal(signal.SIGTERM, handler)
+
+
+@pytest.fixture
+def refused(program):
+    def run(words, *arguments):
+        code, stdout, stderr = program(*arguments)
+        assert (code, stdout) == (2, "")
+        assert stderr.startswith("error: ")
+        assert stderr.count("\n") == 1
+        assert words in stderr
+
+    return run
+
+
+@pytest.fixture
+def tiny_checkpoint(torch, tmp_path):
+    path = tmp_path / "tiny.pth"
+    tensors = {key: torch.from_numpy(array) for key, array in random_checkpoint(SOURCE_SHAPES).items()}
+    torch.save({"model": tensors}, path)
+    return path
+
+
+def test_help_and_wrong_usage_do_not_wait_for_jax():
+    code = """
+import sys
+from experiments.weights import main
+try:
+    main()
+except SystemExit:
+    print(sorted({"jax", "flax", "numpy", "torch", "hydra", "mfvpr"} & set(sys.modules)))
+"""
+    done = subprocess.run([sys.executable, "-c", code, "--help"], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.stderr == ""
+    *text, loaded = done.stdout.splitlines()
+    assert loaded == "[]"
+    assert all(any(command in line for line in text) for command in ("list", "convert", "verify", "download"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "arguments are required: COMMAND"),
+        (["lst"], "invalid choice: 'lst'"),
+        (["convert"], "arguments are required: FILE"),
+        (["list", "3"], "unrecognized arguments: 3"),
+        (["convert", "some.pth"], "some.pth: no official file name; say what it is with --as NAME, one of d2_tf"),
+        (["convert", "some.pth", "--as", "d2_tff"], "d2_tff: no weights of this name; the nearest is d2_tf"),
+        (["convert", "nowhere/d2_tf.pth"], "nowhere/d2_tf.pth: expected a checkpoint file, got: No such file"),
+        (
+            ["convert", "nowhere/aliked-n16.pth"],
+            "nowhere/aliked-n16.pth: expected a checkpoint file, got: No such file",
+        ),
+        (["convert", "pitts_WPCA512.pth.tar"], "the network patchnetvlad is not part of this version"),
+        (["verify", "d2"], "d2: no weights of this name; expected one of d2_tf, "),
+        (
+            ["download", "d2_tf"],
+            "d2_tf: no hash is published, so it cannot be fetched safely; get d2_tf.pth from https",
+        ),
+    ],
+)
+def test_mistakes_are_one_line_and_exit_code_2(refused, folder, arguments, words):
+    refused(words, *arguments)
+    assert not folder.exists()
+
+
+def test_list(program, folder):
+    code, stdout, stderr = program("list")
+    assert (code, stderr) == (0, "")
+    lines = {line.split()[0]: line for line in stdout.splitlines()[2:]}
+    assert lines.keys() == REGISTRY.keys()
+    assert "BSD-3-Clause-Clear  none stated" in lines["d2_tf"]
+    assert lines["aliked-n16"].split()[-2:] == ["no", "2.7"]
+    assert "no network yet" in lines["patchnetvlad_pitts_512"]
+
+
+def test_convert_list_verify(program, folder, tiny_checkpoint):
+    assert program("verify") == (0, f"nothing is installed in {folder}\n", "")
+    code, stdout, stderr = program("convert", tiny_checkpoint)
+    assert (code, stderr) == (0, "")
+    assert stdout == f"{folder}/tiny.safetensors: tiny, {PARAMETERS} parameters\n"
+    assert program("list")[1].splitlines()[-1].split()[-2:] == ["yes", "-"]
+    for arguments in ([], ["tiny"]):
+        assert program("verify", *arguments) == (0, f"tiny: good, {PARAMETERS} parameters as converted\n", "")
+
+
+def test_convert_under_another_name(program, refused, folder, tiny_checkpoint):
+    other = tiny_checkpoint.rename(tiny_checkpoint.with_name("it's (1).pth"))
+    refused("it's (1).pth: no official file name", "convert", other)
+    refused("expected the sha256 of aliked-t16", "convert", other, "--as", "aliked-t16")
+    assert not folder.exists()
+    assert program("convert", other, "--as", "tiny")[0] == 0
+
+
+def test_verify_tells_each_bad_file(program, folder, arrays, tmp_path, monkeypatch):
+    (tmp_path / "tiny.pth").write_bytes(b"the source")
+    save("tiny", arrays, tmp_path / "tiny.pth", parameters=PARAMETERS)
+    assert program("verify", "tiny")[0] == 0
+    monkeypatch.setitem(REGISTRY, "tiny", tiny_entry(parameters=1))
+    code, stdout, _ = program("verify")
+    assert (code, stdout) == (2, f"tiny: BAD, expected 1 parameters, got {PARAMETERS}\n")
+    path = folder / "tiny.safetensors"
+    content = bytearray(path.read_bytes())
+    content[-1] ^= 4
+    path.write_bytes(content)
+    code, stdout, stderr = program("verify", "tiny", "d2_tf", "patchnetvlad_pitts_128")
+    assert code == 2
+    assert stderr == "error: 3 of 3 could not be verified\n"
+    bad, missing, original = stdout.splitlines()
+    assert bad.startswith(f"tiny: BAD, {path}: the file has changed since it was written")
+    assert missing.startswith("d2_tf: BAD, not installed in")
+    assert original.startswith(f"patchnetvlad_pitts_128: BAD, {folder}/pitts_WPCA128.pth.tar: not there; fetch it: ")
+    path.with_suffix(".json").unlink()
+    assert "there is no manifest" in program("verify")[1]
+
+
+def test_what_has_no_network_is_verified_by_its_published_hash(program, folder, monkeypatch):
+    name, file = "patchnetvlad_pitts_128", "pitts_WPCA128.pth.tar"
+    folder.mkdir()
+    (folder / file).write_bytes(b"other")
+    code, stdout, _ = program("verify")
+    assert code == 2
+    assert f"{name}: BAD, {folder / file}: expected the sha256 of {name}, 74bb0e0113c0..., got " in stdout
+    monkeypatch.setitem(REGISTRY, name, tiny_entry(name, file=file, sha256=hashlib.sha256(b"other").hexdigest()))
+    assert program("verify") == (0, f"{name}: good, {file} has the published hash\n", "")
+
+
+def test_ctrl_c_while_converting_leaves_nothing(program, folder, tiny_checkpoint, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("mfvpr.weights.files.write_text", interrupted)
+    code, stdout, stderr = program("convert", tiny_checkpoint)
+    assert (code, stdout) == (130, "")
+    assert "interrupted; nothing half-written was left" in stderr
+    assert program("verify")[0] == 2
+
+
+class Site(BaseHTTPRequestHandler):
+    """Serves one file, a longer one, a shorter one, and one that never ends."""
+
+    def do_GET(self):
+        if self.path not in ("/good", "/long", "/short", "/slow"):
+            return self.send_error(404)
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(CONTENT)))
+        self.end_headers()
+        if self.path == "/long":
+            self.wfile.write(CONTENT[:-4] + b"else")
+        elif self.path == "/slow":
+            self.wfile.write(CONTENT[: 1 << 19])
+            self.wfile.flush()
+            threading.Event().wait(20)
+        else:
+            self.wfile.write(CONTENT if self.path == "/good" else CONTENT[: 1 << 18])
+
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture
+def site(folder, monkeypatch):
+    """Registers `tiny` with an address of a local server."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Site)
+    server.daemon_threads = True
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+    thread.start()
+    monkeypatch.setenv("no_proxy", "*")
+
+    def publish(page):
+        source = f"http://127.0.0.1:{server.server_port}/{page}"
+        monkeypatch.setitem(REGISTRY, "tiny", tiny_entry(source=source, sha256=SHA256, size=len(CONTENT)))
+        return source
+
+    yield publish
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+def test_download(program, folder, site):
+    source = site("good")
+    code, stdout, stderr = program("download", "tiny")
+    assert code == 0, stderr
+    target = folder / "tiny.pth"
+    assert stdout.splitlines() == [
+        f"tiny.pth: {source}, {len(CONTENT):,} bytes, code MIT, weights none stated",
+        f"{target}: downloaded, with the published hash",
+        f"to install it: python -m experiments.weights convert {target}",
+    ]
+    assert "100%" in stderr
+    assert target.read_bytes() == CONTENT
+    site("nowhere")
+    code, stdout, _ = program("download", "tiny")
+    assert code == 0
+    assert "is there already, with the published hash" in stdout
+    target.write_bytes(b"damaged")
+    site("good")
+    assert program("download", "tiny")[0] == 0
+    assert target.read_bytes() == CONTENT
+
+
+@pytest.mark.parametrize(
+    ("page", "words"),
+    [
+        ("nowhere", "could not be downloaded to"),
+        ("long", f"expected the sha256 of tiny, {SHA256[:12]}..., got "),
+        ("short", "tiny"),
+    ],
+)
+def test_download_that_fails_leaves_nothing(program, folder, site, page, words):
+    source = site(page)
+    code, stdout, stderr = program("download", "tiny")
+    assert code == 2
+    assert stdout.startswith(f"tiny.pth: {source}")
+    assert stderr.splitlines()[-1].startswith(f"error: {source}: ")
+    assert words in stderr.splitlines()[-1]
+    assert "Traceback" not in stderr
+    assert list(folder.iterdir()) == []
+
+
+def test_download_without_network(program, folder, monkeypatch):
+    monkeypatch.setenv("no_proxy", "*")
+    monkeypatch.setitem(REGISTRY, "tiny", tiny_entry(source="http://127.0.0.1:9/x", sha256=SHA256))
+    code, _, stderr = program("download", "tiny")
+    assert code == 2
+    assert stderr.startswith("error: http://127.0.0.1:9/x: could not be downloaded to")
+    assert stderr.count("\n") == 1
+    assert list(folder.iterdir()) == []
+
+
+def test_ctrl_c_while_downloading_leaves_nothing(folder, site):
+    code = f"""
+import dataclasses
+from experiments.weights import main
+from mfvpr.weights.registry import REGISTRY
+entry = REGISTRY["aliked-t16"]
+REGISTRY["aliked-t16"] = dataclasses.replace(entry, source={site("slow")!r}, size={len(CONTENT)})
+main()
+"""
+    process = subprocess.Popen([sys.executable, "-c", code, "download", "aliked-t16"], cwd=ROOT, text=True,
+                               stdout=subprocess.PIPE, stderr=subprocess.PIPE)  # fmt: skip
+    deadline = time.monotonic() + 60
+    while not (folder.is_dir() and any(path.stat().st_size for path in folder.iterdir())):  # until it is amid the file
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=20)
+    assert process.returncode == 130, stderr
+    assert "interrupted; nothing half-written was left" in stderr
+    assert list(folder.iterdir()) == []
+
+
+def run(*arguments, **environment):
+    return subprocess.run([sys.executable, "-m", "experiments.weights", *map(str, arguments)], cwd=ROOT, text=True,
+                          capture_output=True, timeout=120, env=os.environ | environment)  # fmt: skip
+
+
+@pytest.mark.skipif(not ALIKED.is_dir(), reason="no ../shared/weights: weights do not ship with the project")
+def test_real_weights_from_checkpoint_to_network(torch, tmp_path):
+    place = {"MFVPR_WEIGHTS": str(tmp_path)}
+    done = run("convert", ALIKED / "aliked-n16.pth", **place)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == f"{tmp_path}/aliked-n16.safetensors: aliked-n16, 677,356 parameters\n"
+    done = run("verify", **place)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "aliked-n16: good, 677,356 parameters as converted\n", "")
+    wrong = run("convert", ALIKED / "aliked-n16.pth", "--as", "aliked-n16rot", **place)
+    assert wrong.returncode == 2
+    assert "got that of aliked-n16\n" in wrong.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["aliked-n16.json", "aliked-n16.safetensors"]
+
+
+def test_d2net_from_checkpoint_to_network(torch, program, tmp_path):
+    path = tmp_path / "d2_tf.pth"
+    arrays = random_checkpoint(d2net_shapes())
+    torch.save({"model": {key: torch.from_numpy(array) for key, array in arrays.items()}}, path)
+    code, stdout, _ = program("convert", path)
+    assert code == 0
+    assert stdout.endswith("d2_tf, 7,635,264 parameters\n")
+    kernel = load_model("d2_tf").vgg.conv4_3.kernel[...]
+    assert (kernel == arrays["dense_feature_extraction.model.21.weight"].transpose(2, 3, 1, 0)).all()
