@@ -78,8 +78,11 @@ def global_extractor(settings: dict[str, Any]) -> Callable[[Sequence[Features]],
     options = {name: value for name, value in settings.items() if name != "name"}
     if settings["name"] == "vlad":
         return lambda database: fit_vlad(database, **options)
-    from mfvpr.features.mixvpr import MixVprDescriptor
+    from mfvpr.features.mixvpr import IMAGE_SIZE, MixVprDescriptor
 
+    size = options.pop("image_size")
+    if tuple(size) != IMAGE_SIZE:
+        raise SettingsError(f"retrieval.image_size={size}: MixVPR takes {list(IMAGE_SIZE)} only, as its weights do")
     extractor = MixVprDescriptor(_network("retrieval", "mixvpr", options.pop("weights")), **options)
     return lambda database: extractor
 

@@ -1,4 +1,4 @@
-"""Image files -> RGB arrays `[H, W, 3]` uint8 of a stated size (width, height) in pixels.
+"""Image files -> RGB arrays `[H, W, 3]` of a stated size (width, height) in pixels.
 
 Decoding and the default resampling are Pillow's, which the published networks were fed with.
 """
@@ -21,8 +21,12 @@ from mfvpr.errors import InputError
 MAX_PIXELS = 64_000_000
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
 
-Interpolation = Literal["pil_bilinear", "pil_bicubic", "cv2_linear", "cv2_area"]
-_PIL = {"pil_bilinear": Image.Resampling.BILINEAR, "pil_bicubic": Image.Resampling.BICUBIC}
+Interpolation = Literal["pil_bilinear", "pil_bicubic", "cv2_linear", "cv2_area", "torch_bicubic", "torch_bilinear"]
+_PIL = {
+    "pil_bilinear": Image.Resampling.BILINEAR,
+    "pil_bicubic": Image.Resampling.BICUBIC,
+    "torch_bicubic": Image.Resampling.BICUBIC,  # torch's is a port of it
+}
 _CV2 = {"cv2_linear": cv2.INTER_LINEAR, "cv2_area": cv2.INTER_AREA}
 
 # Pillow warns from 89 megapixels on; `read_image` refuses earlier, with the file's name.
@@ -59,7 +63,19 @@ def read_image(path: Path | str) -> np.ndarray:
 
 
 def resize(image: np.ndarray, size: tuple[int, int], interpolation: Interpolation = "pil_bilinear") -> np.ndarray:
-    """`image` squashed to `size` (width, height), no crop, aspect not kept. Half-pixel centers."""
+    """`image` `[H, W, 3]` uint8 squashed to `size` (width, height), no crop, aspect not kept. Half-pixel centers.
+
+    | interpolation | as | result |
+    | :-- | :-- | :-- |
+    | `pil_bilinear`, `pil_bicubic` | Pillow, antialiased | uint8 |
+    | `cv2_linear`, `cv2_area` | OpenCV; `cv2_linear` is not antialiased | uint8 |
+    | `torch_bicubic` | torch's antialiasing of uint8: Pillow's, but for a level or two in 1 % of the values | uint8 |
+    | `torch_bilinear` | torch's antialiasing of floats, not rounded | float32, 0 .. 255 |
+
+    Networks take both types; SIFT refuses floats.
+    """
+    if interpolation == "torch_bilinear":
+        return _resized_in_float(image, size)
     if interpolation in _PIL:
         return np.asarray(Image.fromarray(image).resize(size, _PIL[interpolation]))
     return np.asarray(cv2.resize(image, size, interpolation=_CV2[interpolation]))
@@ -84,6 +100,12 @@ def ordered_map(function: Callable[[Item], Result], items: Iterable[Item], *, wo
         finally:
             for future in waiting:
                 future.cancel()
+
+
+def _resized_in_float(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Bilinear, antialiased, `[H, W, 3]` float32: Pillow's kernel is torch's, and its float images are not rounded."""
+    channels = (Image.fromarray(channel) for channel in np.moveaxis(image.astype(np.float32), -1, 0))
+    return np.stack([np.asarray(channel.resize(size, Image.Resampling.BILINEAR)) for channel in channels], axis=-1)
 
 
 def _check_file(path: Path) -> None:

@@ -141,7 +141,7 @@ class Aliked(nnx.Module):
 
         def of_one(levels: list[Array], scores: Array) -> tuple[Detections, Array]:
             found = detect(scores, threshold, capacity)
-            return found, self.desc_head(field(levels, *_inside(images)), found.keypoints)
+            return found, self.desc_head(field(levels, *_inside(images)), found.keypoints, found.count)
 
         return jax.vmap(of_one)(levels, scores)
 

@@ -11,6 +11,7 @@ from jax import Array
 from mfvpr.models.sampling import Neighbors, around, between, neighbors
 
 _EPSILON = 1e-12  # of normalizations, where a vector is zero
+_CHUNK = 256  # keypoints described at a time
 
 
 class Level(NamedTuple):
@@ -90,10 +91,27 @@ class DescriptorHead(nnx.Module):
         self.agg_weights = nnx.Param(init(rngs.params(), (positions, dimension, dimension)))
         self.precision = precision
 
-    def __call__(self, features: Field, keypoints: Array) -> Array:
-        """`[N, D]` of unit length, at keypoints `[N, 2]` (x, y) px.
+    def __call__(self, features: Field, keypoints: Array, count: Array | int) -> Array:
+        """`[N, D]` of unit length, at the first `count` of keypoints `[N, 2]` (x, y) px; anything at the others.
 
-        One of the places after the other, for all keypoints, so that intermediate values stay in the caches.
+        Chunk by chunk, so that slots which are not used cost nothing.
+        """
+        slots, dimension = len(keypoints), self.agg_weights.shape[-1]
+        keypoints = jnp.pad(keypoints, ((0, -slots % _CHUNK), (0, 0)))
+
+        def describe(chunk: Array, descriptors: Array) -> Array:
+            start = chunk * _CHUNK
+            described = self._described(features, jax.lax.dynamic_slice_in_dim(keypoints, start, _CHUNK))
+            return jax.lax.dynamic_update_slice_in_dim(descriptors, described, start, axis=0)
+
+        chunks = -(-jnp.minimum(count, slots) // _CHUNK)
+        start = jnp.zeros((len(keypoints), dimension), keypoints.dtype)
+        return jax.lax.fori_loop(0, chunks, describe, start)[:slots]
+
+    def _described(self, features: Field, keypoints: Array) -> Array:
+        """Descriptors of all keypoints `[N, 2]`.
+
+        One place after the other, for all keypoints, so that intermediate values stay in the caches.
         """
 
         def add(total: Array, place: tuple[Array, Array]) -> tuple[Array, None]:

@@ -62,10 +62,7 @@ def _spread(values: Array) -> Array:
 
 
 def _refined(score_map: Array, row: Array, column: Array) -> Array:
-    """`[N, 2]` (x, y) px: the mean position around each peak, weighted by a softmax of the scores.
-
-    There and back through [-1, 1], as the original goes, since the descriptor truncates what this rounds.
-    """
+    """`[N, 2]` (x, y) px: the mean position around each peak, weighted by a softmax of the scores."""
     height, width = score_map.shape
     reach = jnp.arange(2 * RADIUS + 1)
     padded = jnp.pad(score_map, RADIUS)
@@ -74,5 +71,15 @@ def _refined(score_map: Array, row: Array, column: Array) -> Array:
     total = jnp.sum(weights, axis=(1, 2))
     x = column + jnp.sum(weights * (reach - RADIUS)[None, None, :], axis=(1, 2)) / total
     y = row + jnp.sum(weights * (reach - RADIUS)[None, :, None], axis=(1, 2)) / total
-    last = jnp.array([width - 1, height - 1], score_map.dtype)[None]
-    return (((jnp.stack([x, y], axis=-1) / last * 2 - 1) / 2) + 0.5) * last
+    return jnp.stack([_there_and_back(x, width, total), _there_and_back(y, height, total)], axis=-1)
+
+
+def _there_and_back(position: Array, size: int, total: Array) -> Array:
+    """Through [-1, 1], as the original goes, to the last bit.
+
+    Whole numbers may come out a little smaller, and the descriptor truncates. XLA would multiply by the reciprocal of a
+    number that all positions share, which rounds otherwise, so each has its own: `total` is 1 or more, which XLA does
+    not know.
+    """
+    last = jnp.where(total > 0, jnp.asarray(size - 1, position.dtype), 1)
+    return ((position / last * 2 - 1) / 2 + 0.5) * last

@@ -15,7 +15,7 @@ import numpy as np
 from flax import nnx
 from jax import Array
 
-from mfvpr.models.layers import IMAGENET_DEVIATION, IMAGENET_MEAN
+from mfvpr.models.imagenet import DEVIATION, MEAN
 from mfvpr.models.vgg import Vgg16
 
 Preprocessing = Literal["caffe", "torch"]
@@ -86,7 +86,7 @@ def preprocess(images: Array, preprocessing: Preprocessing = "caffe") -> Array:
 # Scale, mean and deviation, in the network's order of the channels.
 _STATISTICS = {
     "caffe": (1.0, np.array([103.939, 116.779, 123.68]), np.ones(3)),
-    "torch": (255.0, np.array(IMAGENET_MEAN), np.array(IMAGENET_DEVIATION)),
+    "torch": (255.0, np.array(MEAN), np.array(DEVIATION)),
 }
 
 

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 from flax import nnx
 from jax import Array
 
+from mfvpr.models.imagenet import DEVIATION, MEAN
 from mfvpr.models.resnet import ResNet50
 
 IMAGE_SIZE = (320, 320)  # px, width and height, to which the mixers' weights belong
 _CHANNELS, _POSITIONS = 1024, 20 * 20  # of the backbone's maps
-_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet's, of RGB in 0 .. 1
 _NORM_EPSILON = 1e-5  # the published weights'; Flax's default of 1e-6 changes descriptors where maps are faint
 _LENGTH_EPSILON = 1e-12
 
@@ -72,17 +72,18 @@ class MixVPR(nnx.Module):
     def _projected(self, maps: Array) -> Array:
         """Channel projection, then row projection: `[B, 1024, positions]` -> `[B, channels, rows]`.
 
-        Both are linear and act on different axes, so the rows, of which few remain, may be projected first: 1/5 of the
+        Both are linear and act on different axes, so the rows, of which few remain, may be projected first: 1/6 of the
         mixers' and projections' time less. The channels' bias is then summed over the rows' kernel.
         """
-        kernel, bias = self.row_proj.kernel[...], self.channel_proj.bias[...]
-        rows = jnp.matmul(maps, kernel, precision=self.precision).swapaxes(1, 2)  # [B, rows, 1024]
-        projected = jnp.matmul(rows, self.channel_proj.kernel[...], precision=self.precision)
-        projected += (jnp.outer(kernel.sum(0), bias) + self.row_proj.bias[...][:, None])[None]
+        channels, rows = self.channel_proj, self.row_proj
+        kernel = rows.kernel[...]
+        bias = jnp.outer(kernel.sum(0), channels.bias[...]) + rows.bias[...][:, None]  # pyright: ignore  (never None)
+        narrow = jnp.matmul(maps, kernel, precision=self.precision).swapaxes(1, 2)  # [B, rows, 1024]
+        projected = jnp.matmul(narrow, channels.kernel[...], precision=self.precision) + bias[None]
         return projected.swapaxes(1, 2)
 
 
 def preprocess(images: Array) -> Array:
     """`[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32 -> what the network takes, float32."""
-    mean, deviation = (jnp.array(values, jnp.float32)[None, None, None] for values in (_MEAN, _DEVIATION))
+    mean, deviation = (jnp.array(values, jnp.float32)[None, None, None] for values in (MEAN, DEVIATION))
     return (images.astype(jnp.float32) / 255 - mean) / deviation

@@ -78,7 +78,8 @@ class ResNet50(nnx.Module):
     def __call__(self, images: Array) -> Array:
         """`[B, H, W, 3]` float32 -> `[B, h, w, C]`."""
         x = nnx.relu(self.bn1(self.conv1(images)))
-        x = nnx.max_pool(x, (3, 3), strides=(2, 2), padding=((1, 1), (1, 1)))  # with minus infinity around
+        around = ((1, 1), (1, 1))  # one pixel of minus infinity; Flax's annotation knows names only
+        x = nnx.max_pool(x, (3, 3), strides=(2, 2), padding=around)  # pyright: ignore[reportArgumentType]
         for name in self.layers:
             for block in getattr(self, name):
                 x = block(x)

@@ -11,6 +11,7 @@ from PIL import Image
 
 from mfvpr import InputError
 from mfvpr.data.images import MAX_PIXELS, ordered_map, read_image, resize
+from tests.golden import make_resize
 
 
 @pytest.fixture
@@ -85,6 +86,23 @@ def test_resize_is_the_librarys_own(photo, size):
         resize(photo, size, "cv2_area"), cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
     )
     assert resize(photo, size, "cv2_linear").shape == (size[1], size[0], 3)
+
+
+@pytest.mark.parametrize(("interpolation", "tolerance"), [("torch_bicubic", 1), ("torch_bilinear", 1e-3)])
+def test_resize_is_torchs(interpolation, tolerance):
+    golden = np.load(make_resize.GOLDEN)[interpolation]
+    resized = resize(make_resize.image(), make_resize.SIZE, interpolation)
+    assert resized.dtype == golden.dtype
+    difference = np.abs(resized.astype(float) - golden)
+    assert difference.max() <= tolerance
+    assert np.count_nonzero(difference >= 1) < 0.02 * golden.size
+
+
+def test_resize_without_rounding_keeps_order_and_range(photo):
+    exact, rounded = resize(photo, (20, 10), "torch_bilinear"), resize(photo, (20, 10), "pil_bilinear")
+    assert exact.shape == rounded.shape
+    assert np.abs(exact - rounded).max() <= 1  # Pillow rounds between the axes as well
+    np.testing.assert_array_equal(resize(photo, (60, 40), "torch_bilinear"), photo)
 
 
 def test_ordered_map_keeps_order_and_never_runs_far_ahead():

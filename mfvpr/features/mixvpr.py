@@ -1,0 +1,63 @@
+"""MixVPR's global descriptors (Ali-bey et al., WACV 2023), 4096, 512 or 128 dimensions: the paper's filter."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import jax
+import numpy as np
+
+from mfvpr.data.images import Interpolation
+from mfvpr.features.network import compiled, in_batches
+from mfvpr.models.mixvpr import IMAGE_SIZE, MixVPR, preprocess
+from mfvpr.types import Features
+
+
+@dataclass(frozen=True)
+class MixVprDescriptor:
+    """What the public code extracts.
+
+    Attributes:
+        model: the network with its weights.
+        interpolation: see `mfvpr.data.images.resize`. "pil_bicubic" is the authors' demonstration's, "pil_bilinear"
+            their training's, "torch_bicubic" OpenVPRLab's, "torch_bilinear" VPR-methods-evaluation's.
+        batch_size: images per call.
+    """
+
+    model: MixVPR
+    interpolation: Interpolation = "pil_bicubic"
+    batch_size: int = 8
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(320, 320), the only one the weights are for."""
+        return IMAGE_SIZE
+
+    @property
+    def dimension(self) -> int:
+        """4096, 512 or 128 with published weights."""
+        return self.model.dimension
+
+    @property
+    def typical_count(self) -> int:
+        """1: descriptors of an image."""
+        return 1
+
+    def __call__(self, images: np.ndarray | None, features: Sequence[Features]) -> np.ndarray:
+        """`[B, D]` float32 descriptors of unit length, of images `[B, 320, 320, 3]` RGB, 0 .. 255, uint8 or float32.
+
+        Raises:
+            ValueError: no images, or of another size.
+        """
+        if images is None:
+            raise ValueError("MixVPR describes images, but got none")
+        return np.stack(in_batches(self._program, images, self.batch_size))
+
+    @cached_property
+    def _program(self) -> Callable[..., Any]:
+        return compiled(self.model, _describe)
+
+
+def _describe(model: MixVPR, images: jax.Array) -> jax.Array:
+    return model(preprocess(images))

@@ -1,0 +1,79 @@
+"""Makes mixvpr.npz: what the public code computes with random weights. `python -m tests.golden.make_mixvpr CLONE`
+
+CLONE is a clone of https://github.com/amaralibey/MixVPR, whose aggregator is run, on top of a ResNet-50 in plain torch;
+both in float64, so that the file holds no rounding errors but its own. The tests read it without either.
+"""
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from tests.checkpoints import mixvpr_shapes, random_checkpoint
+
+GOLDEN = Path(__file__).parent / "mixvpr.npz"
+SIZES = ((1024, 4), (256, 2), (64, 2))  # channels and rows of the published networks
+SAMPLES = 1000
+
+
+def images() -> np.ndarray:
+    """`[2, 320, 320, 3]` uint8: stripes, circles and steps, by integer arithmetic alone."""
+    row, column, channel = np.indices((320, 320, 3))
+    circles = (row - 90) ** 2 + (column - 200) ** 2
+    first = circles // (150 + 60 * channel) + 40 * ((row // 32 + column // 24) % 3)
+    second = row * column // (70 + 11 * channel) + 5 * (row % 7) + 90 * (circles < 4900)
+    return (np.stack([first, second]) % 256).astype(np.uint8)
+
+
+def faint_maps() -> np.ndarray:
+    """`[1, 20, 20, 1024]` float32: maps of so little contrast that the epsilon of a normalization shows."""
+    row, column, channel = np.indices((20, 20, 1024))
+    return ((row * (channel % 13 + 1) + column * (channel % 7 + 2)) % 17).astype(np.float32)[None] / 8192
+
+
+def samples(values: np.ndarray) -> np.ndarray:
+    """Values at `SAMPLES` places."""
+    return values.reshape(-1)[np.random.default_rng(0).choice(values.size, SAMPLES, replace=False)]
+
+
+def main(clone: str) -> None:
+    import torch
+
+    golden = {}
+    with torch.inference_mode():
+        for channels, rows in SIZES:
+            checkpoint = random_checkpoint(mixvpr_shapes(channels, rows))
+            golden |= _computed(clone, channels, rows, {key: torch.tensor(array) for key, array in checkpoint.items()})
+    np.savez_compressed(GOLDEN, **{name: array.astype(np.float32) for name, array in golden.items()})
+
+
+def _computed(clone: str, channels: int, rows: int, checkpoint: Mapping) -> dict[str, np.ndarray]:
+    import torch
+
+    from experiments.torch_networks import MixVPR
+
+    sys.path.insert(0, clone)
+    from models.aggregators.mixvpr import MixVPR as Aggregator
+
+    network = MixVPR()
+    network.aggregator = Aggregator(
+        in_channels=1024, in_h=20, in_w=20, out_channels=channels, mix_depth=4, out_rows=rows
+    )
+    network.load_state_dict(checkpoint)
+    network.double().eval()
+    maps = network.backbone["model"](network.prepared(torch.from_numpy(images()).double()))
+    faint = torch.from_numpy(faint_maps()).double().permute(0, 3, 1, 2)
+    width = channels * rows
+    golden = {f"{width}/descriptors": network.aggregator(maps), f"{width}/faint": network.aggregator(faint)}
+    if channels == SIZES[0][0]:
+        mixed = maps.flatten(2)
+        golden |= {"backbone": samples(maps.permute(0, 2, 3, 1).numpy()), "backbone/means": maps.mean((2, 3))}
+        for place, mixer in enumerate(network.aggregator.mix):
+            mixed = mixer(mixed)
+            golden[f"mixer{place}"] = samples(mixed.numpy())
+    return {name: np.asarray(array) for name, array in golden.items()}
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,99 @@
+"""The main job with networks: systems, stores and mistakes. D2-Net and MixVPR have random weights here."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests import checkpoints
+
+ROOT = Path(__file__).parent.parent
+
+
+def evaluate(*arguments, **environment):
+    return subprocess.run(
+        [sys.executable, "-m", "experiments.evaluate", *map(str, arguments)],
+        cwd=ROOT, capture_output=True, text=True, timeout=280, env=os.environ | environment,
+    )  # fmt: skip
+
+
+def system(name, street, out, *more):
+    folders = f"dataset.database={street}/database", f"dataset.queries={street}/queries"
+    return (f"system={name}", "dataset=folder", *folders, "candidates=10", "features.image_size=[160,160]",
+            "figures=2", f"out={out}", *more)  # fmt: skip
+
+
+def test_the_papers_system_runs_and_is_read_from_its_stores_ever_after(weights, small_street, tmp_path):
+    environment = {"MFVPR_WEIGHTS": str(weights), "MFVPR_CACHE": str(tmp_path / "cache")}
+    first = evaluate(*system("mix_hist_comb_10", small_street, tmp_path / "first"), **environment)
+    assert first.returncode == 0, first.stderr
+    stores = sorted(path.name.rpartition("-")[0] for path in (tmp_path / "cache" / "features").iterdir())
+    assert stores == [f"folder_{side}_{name}" for side in ("database", "query") for name in ("d2net", "mixvpr")]
+    assert "10 of 10 images to do, about 163 features of 512 dimensions each" in first.stderr
+    assert "as the paper stores them" in first.stderr
+    rows = json.loads((tmp_path / "first" / "results.json").read_text())
+    assert list(dict.fromkeys(row["system"] for row in rows)) == ["filter", "histogram", "histogram + filter"]
+    assert rows[0]["features"]["weights"] == "d2_tf"
+    assert rows[-1]["parameters"]["c"] == 1e6
+    predictions = [(tmp_path / "first" / name).read_text()
+                   for name in ("predictions.csv", "predictions/histogram_filter.csv")]  # fmt: skip
+    assert predictions[0] == predictions[1]
+
+    again = evaluate(*system("mix_hist_comb_10", small_street, tmp_path / "again"), **environment)
+    assert again.stderr.count("all 10 images from") == 4
+    for name in ("filter", "histogram", "histogram_filter"):
+        one, two = (tmp_path / out / "predictions" / f"{name}.csv" for out in ("first", "again"))
+        assert one.read_text() == two.read_text()
+
+
+@pytest.mark.skipif(not checkpoints.ALIKED.is_dir(), reason="no ../shared/weights: ALIKED's are not shipped")
+def test_aliked_recognizes_the_street(weights, small_street, tmp_path):
+    done = evaluate(*system("mix_hist_aliked_50", small_street, tmp_path / "out", "features.image_size=[320,320]"),
+                    MFVPR_WEIGHTS=str(weights))  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "out" / "results.json").read_text())
+    (recall,) = (row["recall_at"]["1"] for row in rows if (row["system"], row.get("tolerance")) == ("histogram", 1))
+    assert recall >= 0.8
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["features=d2net"], "d2_tf: not installed in NOWHERE; get d2_tf.pth from https://"),
+        (["features=aliked"], "python -m experiments.weights convert aliked-n16.pth"),
+        (["retrieval=mixvpr"], "weights none stated"),
+        (["features=d2net", "features.weights=mixvpr_512"], "features.weights=mixvpr_512: expected weights of d2net"),
+        (["retrieval=mixvpr", "retrieval.image_size=[224,224]"], "MixVPR takes [320, 320] only"),
+        (["features=aliked", "features.weights=alikd-n16"], "the nearest is aliked-n16"),
+        (["features=aliked", "features.clahe_clip=2"], "features.clahe_clip: unknown setting"),
+        (["system=mix_hist_20"], "system=mix_hist_20: expected one of mix_hist_10, mix_hist_50"),
+        (["features.interpolation=torch_bilinear"], "SIFT takes whole numbers"),
+        (["features=d2net", "features.preprocessing=vgg"], "expected one of caffe, torch"),
+    ],
+)
+def test_mistakes_are_one_line(arguments, words, tmp_path):
+    done = evaluate(*arguments, "dataset=folder", f"dataset.database={ROOT}", "dataset.queries=x",
+                    MFVPR_WEIGHTS=str(tmp_path / "none"))  # fmt: skip
+    assert done.returncode == 2
+    assert words.replace("NOWHERE", str(tmp_path / "none")) in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_store_that_is_a_file_is_refused(small_street):
+    done = evaluate("dataset=folder", f"dataset.database={small_street}/database", "store=README.md",
+                    f"dataset.queries={small_street}/queries")  # fmt: skip
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: ")
+    assert "README.md" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_sizes_that_networks_cannot_take_are_refused_with_those_they_can(weights):
+    done = evaluate("features=d2net", "features.multiscale=true", "features.image_size=[16,100]",
+                    MFVPR_WEIGHTS=str(weights))  # fmt: skip
+    assert done.returncode == 2
+    assert "expected images of 24 x 24 px or more, got 16 x 100" in done.stderr
+    assert done.stderr.count("\n") == 1
