@@ -64,8 +64,8 @@ def local_extractor(settings: dict[str, Any]) -> LocalExtractor:
         if options["interpolation"] == "torch_bilinear":
             raise SettingsError("features.interpolation=torch_bilinear: gives fractions, but SIFT takes whole numbers")
         return Sift(**_only(options, Sift, "features=sift"))
-    from mfvpr.features.aliked import AlikedFeatures  # here, since Flax takes half a second
-
+    # Here, since Flax takes half a second.
+    from mfvpr.features.aliked import AlikedFeatures
     from mfvpr.features.d2net import D2NetFeatures
 
     extractor = {"aliked": AlikedFeatures, "d2net": D2NetFeatures}[name]

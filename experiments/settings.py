@@ -82,9 +82,7 @@ RULES: dict[str, Rule] = {
     "index_file": _or(_TEXT, None),
     # features and filter
     "image_size": _list_of(_SIDE, 2),
-    "interpolation": _one_of(
-        "pil_bilinear", "pil_bicubic", "cv2_linear", "cv2_area", "torch_bilinear", "torch_bicubic"
-    ),
+    "interpolation": _one_of("pil_bilinear", "pil_bicubic", "cv2_linear", "cv2_area", "torch_bilinear"),
     "weights": _TEXT,
     "preprocessing": _one_of("caffe", "torch"),
     "multiscale": _FLAG,

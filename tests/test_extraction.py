@@ -8,8 +8,9 @@ from PIL import Image
 
 from mfvpr import pipeline
 from mfvpr.data.datasets import image_folder
-from mfvpr.data.feature_store import open_store
+from mfvpr.data.feature_store import forecast_bytes, open_store
 from mfvpr.features.sift import Sift
+from mfvpr.types import Features
 
 SIFT = Sift(max_keypoints=60, batch_size=3)
 
@@ -117,3 +118,25 @@ def test_global_descriptors_are_stored_as_well(tmp_path, opened):
     np.testing.assert_allclose(found[0], plain, atol=3e-4)
     assert np.isnan(plain[2]).all()
     np.testing.assert_allclose(np.linalg.norm(plain[[0, 1, 3]], axis=1), 1, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("images", "features", "paper", "readme"), [(220, 686, 304, 157), (1415, 681, 1942, 1006)])
+def test_the_papers_databases_take_about_half(images, features, paper, readme):
+    ours = (forecast_bytes(images, features, 512) + forecast_bytes(images, 1, 4096)) / 2**20
+    assert ours <= 0.55 * paper
+    assert round(ours) == readme
+
+
+def test_a_forecast_is_not_exceeded(folder, opened):
+    """Random descriptors, which compress worst."""
+    rng = np.random.default_rng(0)
+    with opened(folder) as store:
+        for row in range(len(folder)):
+            descriptors = rng.normal(size=(700, 512)).astype(np.float32)
+            descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+            points, scores = rng.uniform(0, 336, (700, 2)).astype(np.float32), rng.uniform(size=700).astype(np.float32)
+            size = np.full(2, 336, np.float32)
+            store.write({row: Features(points, descriptors, scores, np.ones(700, bool), size)})
+        forecast = forecast_bytes(len(folder), 700, 512)
+        assert 0.8 * forecast < store.size_bytes <= forecast + 100_000  # folders and what describes the arrays
+        assert store.size_bytes <= 0.55 * 2064 * 700 * len(folder)

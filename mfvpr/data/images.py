@@ -21,12 +21,8 @@ from mfvpr.errors import InputError
 MAX_PIXELS = 64_000_000
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
 
-Interpolation = Literal["pil_bilinear", "pil_bicubic", "cv2_linear", "cv2_area", "torch_bicubic", "torch_bilinear"]
-_PIL = {
-    "pil_bilinear": Image.Resampling.BILINEAR,
-    "pil_bicubic": Image.Resampling.BICUBIC,
-    "torch_bicubic": Image.Resampling.BICUBIC,  # torch's is a port of it
-}
+Interpolation = Literal["pil_bilinear", "pil_bicubic", "cv2_linear", "cv2_area", "torch_bilinear"]
+_PIL = {"pil_bilinear": Image.Resampling.BILINEAR, "pil_bicubic": Image.Resampling.BICUBIC}
 _CV2 = {"cv2_linear": cv2.INTER_LINEAR, "cv2_area": cv2.INTER_AREA}
 
 # Pillow warns from 89 megapixels on; `read_image` refuses earlier, with the file's name.
@@ -67,9 +63,8 @@ def resize(image: np.ndarray, size: tuple[int, int], interpolation: Interpolatio
 
     | interpolation | as | result |
     | :-- | :-- | :-- |
-    | `pil_bilinear`, `pil_bicubic` | Pillow, antialiased | uint8 |
+    | `pil_bilinear`, `pil_bicubic` | Pillow, antialiased; torch's of uint8, but for a level in 1 % of values | uint8 |
     | `cv2_linear`, `cv2_area` | OpenCV; `cv2_linear` is not antialiased | uint8 |
-    | `torch_bicubic` | torch's antialiasing of uint8: Pillow's, but for a level or two in 1 % of the values | uint8 |
     | `torch_bilinear` | torch's antialiasing of floats, not rounded | float32, 0 .. 255 |
 
     Networks take both types; SIFT refuses floats.

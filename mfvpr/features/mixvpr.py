@@ -20,8 +20,8 @@ class MixVprDescriptor:
 
     Attributes:
         model: the network with its weights.
-        interpolation: see `mfvpr.data.images.resize`. "pil_bicubic" is the authors' demonstration's, "pil_bilinear"
-            their training's, "torch_bicubic" OpenVPRLab's, "torch_bilinear" VPR-methods-evaluation's.
+        interpolation: see `mfvpr.data.images.resize`. "pil_bicubic" is that of the authors' demonstration and of
+            OpenVPRLab, "pil_bilinear" their training's, "torch_bilinear" VPR-methods-evaluation's.
         batch_size: images per call.
     """
 

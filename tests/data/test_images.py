@@ -88,7 +88,7 @@ def test_resize_is_the_librarys_own(photo, size):
     assert resize(photo, size, "cv2_linear").shape == (size[1], size[0], 3)
 
 
-@pytest.mark.parametrize(("interpolation", "tolerance"), [("torch_bicubic", 1), ("torch_bilinear", 1e-3)])
+@pytest.mark.parametrize(("interpolation", "tolerance"), [("pil_bicubic", 1), ("torch_bilinear", 1e-3)])
 def test_resize_is_torchs(interpolation, tolerance):
     golden = np.load(make_resize.GOLDEN)[interpolation]
     resized = resize(make_resize.image(), make_resize.SIZE, interpolation)
@@ -124,3 +124,21 @@ def test_ordered_map_keeps_order_and_never_runs_far_ahead():
 def test_ordered_map_passes_errors_on():
     with pytest.raises(ZeroDivisionError):
         list(ordered_map(lambda x: 1 / x, [1, 0, 2], workers=2))
+
+
+def test_orientation_tags_are_left_alone_as_by_pillow(tmp_path, photo):
+    exif = Image.Exif()
+    exif[0x0112] = 6  # to be shown rotated by 90 degrees
+    Image.fromarray(photo).save(tmp_path / "a.png", exif=exif)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png"), photo)
+
+
+def test_16_bits_are_what_pillow_makes_of_them(tmp_path):
+    deep = np.array([[0, 100, 255, 256, 40_000]], np.uint16)
+    Image.fromarray(deep).save(tmp_path / "a.png")
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png")[..., 0], [[0, 100, 255, 255, 255]])
+
+
+def test_an_image_of_one_pixel_fills_any_size(tmp_path):
+    Image.new("RGB", (1, 1), (10, 20, 30)).save(tmp_path / "a.png")
+    np.testing.assert_array_equal(resize(read_image(tmp_path / "a.png"), (8, 4)), np.full((4, 8, 3), (10, 20, 30)))

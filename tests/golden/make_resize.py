@@ -21,7 +21,7 @@ def main() -> None:
     batch = torch.from_numpy(image()).permute(2, 0, 1)[None]
     bicubic = interpolate(batch, SIZE[::-1], mode="bicubic", antialias=True)
     bilinear = interpolate(batch.float(), SIZE[::-1], mode="bilinear", antialias=True)
-    golden = {"torch_bicubic": bicubic, "torch_bilinear": bilinear}
+    golden = {"pil_bicubic": bicubic, "torch_bilinear": bilinear}
     np.savez_compressed(GOLDEN, **{name: result[0].permute(1, 2, 0).numpy() for name, result in golden.items()})
 
 
