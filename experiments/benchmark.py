@@ -1,6 +1,7 @@
-"""Times matching and scoring of one query with 50 candidates against the peers of the field, in one run.
+"""Times mfvpr against the peers of the field, in one run.
 
-Everything is warm; the contestants take turns, round by round, so that a noisy machine disturbs all alike.
+`scores` are matching and scoring of one query with 50 candidates, `networks` are D2-Net, MixVPR and ALIKED. Everything
+is warm; the contestants take turns, round by round, so that a noisy machine disturbs all alike.
 """
 
 import argparse
@@ -10,7 +11,10 @@ import platform
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from experiments.contestants import Lineup
 
 QUICK = 0.05  # seconds
 
@@ -18,28 +22,32 @@ QUICK = 0.05  # seconds
 def main() -> None:
     """Print the table and write it as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=15, help="timed calls of each contestant (default 15)")
-    parser.add_argument("--out", type=Path, default=Path("runs/benchmark.json"), help="JSON file to write")
+    parser.add_argument("what", nargs="?", choices=("scores", "networks"), default="scores", help="default: scores")
+    parser.add_argument("--rounds", type=int, help="timed calls of each contestant (default 15; of networks 5)")
+    parser.add_argument("--out", type=Path, help="JSON file to write (default runs/benchmark_WHAT.json)")
     arguments = parser.parse_args()
 
-    from experiments import contestants  # here, so that --help need not wait for JAX
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # leaves torch its part of a GPU
+    if arguments.what == "scores":  # here, so that --help need not wait for JAX
+        from experiments.contestants import lineup
+    else:
+        from experiments.network_contestants import lineup
 
-    data = contestants.make_data()
-    entries = [entry for make in contestants.ALL for entry in make(data)]
-    seconds = take_turns([run for _, _, run in entries], arguments.rounds)
-    report(entries, seconds, data, arguments)
+    contest = lineup()
+    rounds = arguments.rounds or contest.rounds
+    seconds, results = take_turns([run for _, _, run in contest.entries], rounds)
+    report(contest, seconds, results, arguments.out or Path(f"runs/benchmark_{arguments.what}.json"))
 
 
-def take_turns(runs: list[Callable[[], Any]], rounds: int) -> list[list[float]]:
-    """Seconds of every call, after one that compiles and warms up.
+def take_turns(runs: list[Callable[[], Any]], rounds: int) -> tuple[list[list[float]], list[Any]]:
+    """Seconds of every call, after one that compiles and warms up; and what that one returned.
 
     A contestant of a few milliseconds first gets untimed calls in each of its turns: others have just emptied the
     caches, and their idle threads may still be spinning.
     """
     from tqdm import tqdm
 
-    for run in tqdm(runs, desc="warm-up", unit=""):
-        run()
+    results = [run() for run in tqdm(runs, desc="warm-up", unit="")]
     seconds: list[list[float]] = [[] for _ in runs]
     for _ in tqdm(range(rounds), desc="rounds", unit=""):
         for run, taken in zip(runs, seconds, strict=True):
@@ -49,21 +57,21 @@ def take_turns(runs: list[Callable[[], Any]], rounds: int) -> list[list[float]]:
             start = time.perf_counter()
             run()
             taken.append(time.perf_counter() - start)
-    return seconds
+    return seconds, results
 
 
-def report(entries: list, seconds: list[list[float]], data: Any, arguments: argparse.Namespace) -> None:
+def report(contest: "Lineup", seconds: list[list[float]], results: list[Any], out: Path) -> None:
     """One table: medians, quartiles, and how many times as long as mfvpr each contestant takes."""
     import jax
     import numpy as np
 
-    from experiments.contestants import CANDIDATES, DIMENSION, KEYPOINTS
     from mfvpr.data.files import write_text
     from mfvpr.report.runs import versions
     from mfvpr.report.tables import Table
 
+    names = [(step, name) for step, name, _ in contest.entries]
     found = []
-    for (step, name, _), taken in zip(entries, seconds, strict=True):
+    for (step, name), taken in zip(names, seconds, strict=True):
         low, middle, high = (1e3 * float(q) for q in np.quantile(taken, (0.25, 0.5, 0.75)))
         found.append({"step": step, "name": name, "median_ms": middle, "quartiles_ms": [low, high]})
     ours = {entry["step"]: entry["median_ms"] for entry in found if entry["name"] == "mfvpr"}
@@ -74,18 +82,11 @@ def report(entries: list, seconds: list[list[float]], data: Any, arguments: argp
         for entry in found
     ]  # fmt: skip
     table = Table(["step", "who", "median, ms", "quartiles, ms", "/ mfvpr"], lines, text_columns=2)
-    setting = {
-        "candidates": CANDIDATES, "keypoints": KEYPOINTS, "dimension": DIMENSION,
-        "matches_per_pair": float(np.asarray(data.matches.mask).sum(1).mean()),
-        "machine": {"device": jax.devices()[0].device_kind, "cores": os.cpu_count(), "processor": platform.machine()},
-        "versions": versions(), "rounds": arguments.rounds,
-    }  # fmt: skip
-    write_text(arguments.out, json.dumps(setting | {"results": found}, indent=1) + "\n")
-    print(
-        f"\n1 query x {CANDIDATES} candidates, {KEYPOINTS} features of {DIMENSION} dimensions, "
-        f"{setting['matches_per_pair']:.0f} matches a pair; {setting['machine']}\n\n{table.text()}\n"
-        f"anchor / histogram: {ours['anchor'] / ours['histogram']:.2f}\nresults: {arguments.out}"
-    )
+    remarks = list(contest.remarks(dict(zip(names, seconds, strict=True)), dict(zip(names, results, strict=True))))
+    machine = {"device": jax.devices()[0].device_kind, "cores": os.cpu_count(), "processor": platform.machine()}
+    setting = contest.setting | {"machine": machine, "versions": versions(), "rounds": len(seconds[0])}
+    write_text(out, json.dumps(setting | {"remarks": remarks, "results": found}, indent=1) + "\n")
+    print(f"\n{contest.title}; {machine}\n", table.text(), *remarks, f"results: {out}", sep="\n")
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 Each maker returns (step, name, function) triples, none where its library is not installed.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
@@ -22,6 +22,19 @@ COMMON = 300  # keypoints that a candidate shares with the query
 SIZE, BIN, SIGMA = 336, 15.0, 22.5  # px
 
 Entry = tuple[str, str, Callable[[], Any]]
+
+
+@dataclass(frozen=True)
+class Lineup:
+    """Those who are timed together."""
+
+    title: str
+    setting: dict[str, Any]  # for the JSON file
+    entries: list[Entry]
+    rounds: int  # unless asked for others
+    # What the table does not say, from seconds and results by (step, name).
+    remarks: Callable[[Mapping[tuple[str, str], list[float]], Mapping[tuple[str, str], Any]], Iterable[str]]
+
 
 MATCHING, HISTOGRAM, ANCHOR, SUM = "matching", "histogram", "anchor", "sum"
 BOTH = "matching + histogram"
@@ -42,6 +55,27 @@ class Data:
         m = self.matches
         shifts, weights = np.asarray(m.points1) - np.asarray(m.points0), np.asarray(m.scores0) + np.asarray(m.scores1)
         return [(shifts[k][mask], weights[k][mask]) for k, mask in enumerate(np.asarray(m.mask))]
+
+
+def lineup() -> Lineup:
+    """Everyone, on one query and its candidates."""
+    data = make_data()
+    matches = float(np.asarray(data.matches.mask).sum(1).mean())
+    sizes = f"1 query x {CANDIDATES} candidates, {KEYPOINTS} features of {DIMENSION} dimensions"
+    return Lineup(
+        title=f"{sizes}, {matches:.0f} matches a pair",
+        setting={
+            "candidates": CANDIDATES, "keypoints": KEYPOINTS, "dimension": DIMENSION, "matches_per_pair": matches,
+        },
+        entries=[entry for make in ALL for entry in make(data)],
+        rounds=15,
+        remarks=_remarks,
+    )  # fmt: skip
+
+
+def _remarks(seconds: Mapping[tuple[str, str], list[float]], results: Mapping[tuple[str, str], Any]) -> list[str]:
+    anchor, histogram = (np.median(seconds[step, "mfvpr"]) for step in (ANCHOR, HISTOGRAM))
+    return [f"anchor / histogram: {anchor / histogram:.2f}"]
 
 
 def make_data(seed: int = 0) -> Data:

@@ -67,7 +67,8 @@ class AlikedFeatures:
             InputError: the images do not have the size asked for.
         """
         if images.shape[1:3] != self.image_size[::-1]:
-            raise InputError(f"ALIKED: expected images of {self.image_size} px, got {images.shape[2:0:-1]}")
+            (width, height), (rows, columns) = self.image_size, images.shape[1:3]
+            raise InputError(f"ALIKED: expected images of {width} x {height} px, got {columns} x {rows}")
         usual = min(self._limit, math.ceil(math.prod(self.image_size) / _PIXELS_PER_SLOT))
         found = in_batches(self._program(usual), images, self.batch_size)
         crowded = [row for row, (detections, _) in enumerate(found) if detections.count > usual]

@@ -58,7 +58,7 @@ class DeformableConv(nnx.Module):
         moves = jnp.clip(self.offset(x), -limit, limit).reshape(*x.shape[:3], 9, 2)[..., ::-1]  # stored as (y, x)
         pixels = jnp.stack(jnp.meshgrid(jnp.arange(width), jnp.arange(height)), axis=-1)  # [h, w, 2] (x, y)
         shifts = jnp.stack(jnp.meshgrid(jnp.arange(-1, 2), jnp.arange(-1, 2)), axis=-1).reshape(9, 1, 1, 1, 2)
-        points = pixels[None, None] + shifts + jnp.moveaxis(moves, 3, 0)  # [9, B, h, w, 2]
+        points = (pixels[None, None] + shifts).astype(x.dtype) + jnp.moveaxis(moves, 3, 0)  # [9, B, h, w, 2]
 
         def add(total: Array, tap: tuple[Array, Array]) -> tuple[Array, None]:
             points, kernel = tap

@@ -69,8 +69,9 @@ def _refined(score_map: Array, row: Array, column: Array) -> Array:
     patches = padded[row[:, None, None] + reach[None, :, None], column[:, None, None] + reach[None, None, :]]
     weights = jnp.exp((patches - jnp.max(patches, axis=(1, 2), keepdims=True)) / _TEMPERATURE)
     total = jnp.sum(weights, axis=(1, 2))
-    x = column + jnp.sum(weights * (reach - RADIUS)[None, None, :], axis=(1, 2)) / total
-    y = row + jnp.sum(weights * (reach - RADIUS)[None, :, None], axis=(1, 2)) / total
+    away = (reach - RADIUS).astype(weights.dtype)
+    x = column.astype(weights.dtype) + jnp.sum(weights * away[None, None, :], axis=(1, 2)) / total
+    y = row.astype(weights.dtype) + jnp.sum(weights * away[None, :, None], axis=(1, 2)) / total
     return jnp.stack([_there_and_back(x, width, total), _there_and_back(y, height, total)], axis=-1)
 
 

@@ -1,0 +1,215 @@
+"""The networks in the benchmark: mfvpr's, and the same in torch, with the same weights and images."""
+
+import math
+import re
+import tempfile
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from copy import deepcopy
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+
+from experiments.contestants import Entry, Lineup
+from mfvpr.data.images import read_image, resize
+from mfvpr.data.streets import draw_streets
+from mfvpr.features.aliked import AlikedFeatures
+from mfvpr.features.d2net import D2NetFeatures
+from mfvpr.features.mixvpr import MixVprDescriptor
+from mfvpr.features.network import compiled
+from mfvpr.models.d2net import extract, preprocess
+from mfvpr.weights.conversion import Table
+from mfvpr.weights.files import is_installed, load
+from mfvpr.weights.networks import blueprint, network_of
+from mfvpr.weights.registry import entry_of
+
+if TYPE_CHECKING:
+    import torch
+
+BATCHES = (1, 8)
+D2NET_SIZE, MIXVPR_SIZE, ALIKED_SIZE = 336, 320, 320  # px
+D2NET, MIXVPR, ALIKED = "d2_tf", "mixvpr_4096", ("aliked-n16", "aliked-n32")
+MAP, ON_DEVICE, FEATURES = "D2-Net dense map", "D2-Net features, left on the device", "D2-Net features"
+THRESHOLD = 0.1  # of the detection score: the paper's
+PAPER = "paper, RTX 2080 Ti: features 0.03 s (D2-Net at 320), matching and score of 50 candidates 0.07 s"
+
+
+def lineup() -> Lineup:
+    """Everyone, on images of the drawn street."""
+    images = make_images(D2NET_SIZE)
+    entries = [*of_d2net(images), *of_mixvpr(_resized(images, MIXVPR_SIZE))]
+    for name in ALIKED:
+        entries += of_aliked(name, _resized(images, ALIKED_SIZE))
+    sizes = f"D2-Net at {D2NET_SIZE} px, MixVPR at {MIXVPR_SIZE} px, ALIKED at {ALIKED_SIZE} px"
+    published = [name for name in (D2NET, MIXVPR, *ALIKED) if is_installed(entry_of(name))]
+    weights = f"published weights of {', '.join(published)}, others random" if published else "random weights"
+    return Lineup(
+        title=f"images of the drawn street, {sizes}, {weights}",
+        setting={"batches": BATCHES, "sizes": sizes, "weights": weights},
+        entries=entries,
+        rounds=5,
+        remarks=remarks,
+    )
+
+
+def make_images(size: int) -> np.ndarray:
+    """`[max(BATCHES), size, size, 3]` uint8 RGB: a street by day, at night and in snow."""
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary) / "street"
+        draw_streets(folder, num_frames=math.ceil(max(BATCHES) / 2), image_size=(size, size))
+        return np.stack([read_image(path) for path in sorted(folder.rglob("*.png"))[: max(BATCHES)]])
+
+
+def make_network(name: str) -> tuple[Any, dict[str, np.ndarray]]:
+    """mfvpr's, and its arrays by path: the published ones where they are installed, otherwise random."""
+    entry = entry_of(name)
+    plan = blueprint(entry)
+    arrays = load(name) if is_installed(entry) else {path: _random(path, shape) for path, shape in plan.shapes.items()}
+    return plan.filled(arrays), arrays
+
+
+def _random(path: str, shape: tuple[int, ...]) -> np.ndarray:
+    """Kernels keep the variance through a ReLU (He et al., 2015); depends on path and shape alone."""
+    normal = np.random.default_rng(zlib.crc32(path.encode())).standard_normal(shape, np.float32)
+    if path.endswith(".var"):
+        return 1 + 0.5 * np.tanh(normal)
+    if path.endswith((".bias", ".mean")):
+        return 0.05 * normal
+    if path.endswith(".scale"):
+        return 1 + 0.1 * normal
+    return normal * np.float32(math.sqrt(2 / math.prod(shape[:-1])))
+
+
+def of_d2net(images: np.ndarray) -> list[Entry]:
+    """The dense map, and keypoints from host to host; of mfvpr also those that stay on the device."""
+    model, arrays = make_network(D2NET)
+    dense = compiled(model, lambda model, batch: model(preprocess(batch)))
+    on_device = compiled(model, partial(extract, share=0.3))
+    entries: list[Entry] = []
+    for count in BATCHES:
+        batch = images[:count]
+        features = D2NetFeatures(model, image_size=images.shape[2:0:-1], batch_size=count)
+        entries += [
+            (f"{MAP}, batch {count}", "mfvpr", partial(_on_device, dense, batch)),
+            (f"{ON_DEVICE}, batch {count}", "mfvpr", partial(_on_device, on_device, batch)),
+            (f"{FEATURES}, batch {count}", "mfvpr", partial(features, batch)),
+        ]
+    if find_spec("torch") is None:
+        return entries
+    from experiments.torch_networks import D2Net
+
+    module = load_torch(D2Net(), arrays, network_of(entry_of(D2NET)).table)
+    entries += of_torch(MAP, module, images)
+    return entries + of_torch(FEATURES, module, images, D2Net.extract)
+
+
+def of_mixvpr(images: np.ndarray) -> list[Entry]:
+    """Descriptors on the host."""
+    model, arrays = make_network(MIXVPR)
+    step = "MixVPR descriptor"
+    entries: list[Entry] = []
+    for count in BATCHES:
+        describe = MixVprDescriptor(model, batch_size=count)
+        entries.append((f"{step}, batch {count}", "mfvpr", partial(describe, images[:count], ())))
+    if find_spec("torch") is None:
+        return entries
+    from experiments.torch_networks import MixVPR
+
+    module = load_torch(MixVPR(), arrays, network_of(entry_of(MIXVPR)).table)
+    return entries + of_torch(step, module, images, lambda model, batch: model(batch).cpu().numpy())
+
+
+def of_aliked(name: str, images: np.ndarray) -> list[Entry]:
+    """Keypoints from host to host."""
+    model, arrays = make_network(name)
+    step = f"{name} features"
+    entries: list[Entry] = []
+    for count in BATCHES:
+        features = AlikedFeatures(model, image_size=images.shape[2:0:-1], threshold=THRESHOLD, batch_size=count)
+        entries.append((f"{step}, batch {count}", "mfvpr", partial(features, images[:count])))
+    if find_spec("torch") is None:
+        return entries
+    from experiments.torch_aliked import Aliked
+
+    module = load_torch(Aliked(name, THRESHOLD), arrays, network_of(entry_of(name)).table)
+    return entries + of_torch(step, module, images, Aliked.extract, note=" (deformable convolution in Python)")
+
+
+def _resized(images: np.ndarray, size: int) -> np.ndarray:
+    return np.stack([resize(image, (size, size)) for image in images])
+
+
+def _on_device(program: Callable[[Any], Any], batch: np.ndarray) -> Any:
+    """One by one on a CPU, as the extractors do it."""
+    size = 1 if jax.default_backend() == "cpu" else len(batch)
+    return jax.block_until_ready([program(batch[start : start + size]) for start in range(0, len(batch), size)])
+
+
+def load_torch(module: Any, arrays: Mapping[str, np.ndarray], table: Table) -> Any:
+    """The torch network with our arrays under the published keys, conversion backwards; ready for inference."""
+    import torch
+
+    state = module.state_dict()
+    for key in state:
+        for rule in table.rules:
+            if match := re.fullmatch(rule.source, key):
+                array, axes = arrays[match.expand(rule.target)], rule.layout.value
+                state[key] = torch.from_numpy(np.array(array if axes is None else array.transpose(np.argsort(axes))))
+    module.load_state_dict(state)
+    return module.eval()
+
+
+def of_torch(step: str, module: Any, images: np.ndarray, method: Callable | None = None, note: str = "") -> list[Entry]:
+    """In both memory layouts; on a CPU one by one as well, as mfvpr does it. As precise as mfvpr on a GPU."""
+    import torch
+
+    torch.backends.cudnn.allow_tf32 = False
+    torch.backends.cudnn.benchmark = True
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    default, channels_last = (
+        partial(_in_torch, deepcopy(module).to(device, memory_format=layout), method or type(module).forward, layout)
+        for layout in (torch.contiguous_format, torch.channels_last)
+    )
+    entries: list[Entry] = []
+    for count in BATCHES:
+        batch, where = images[:count], f"{step}, batch {count}"
+        entries.append((where, f"torch{note}", partial(default, batch)))
+        entries.append((where, f"torch, channels last{note}", partial(channels_last, batch)))
+        if count > 1 and device == "cpu":
+            one_by_one = partial(_each, channels_last, np.split(batch, count))
+            entries.append((where, f"torch, channels last, one by one{note}", one_by_one))
+    return entries
+
+
+def _in_torch(model: Any, method: Callable, layout: "torch.memory_format", batch: np.ndarray) -> Any:
+    import torch
+
+    with torch.inference_mode():
+        on_device = torch.from_numpy(batch).to(next(model.parameters()).device)
+        result = method(model, model.prepared(on_device).contiguous(memory_format=layout))
+        if on_device.is_cuda:
+            torch.cuda.synchronize()
+        return result
+
+
+def _each(run: Callable[[np.ndarray], Any], batches: list[np.ndarray]) -> list[Any]:
+    return [one for batch in batches for one in run(batch)]
+
+
+def remarks(seconds: Mapping[tuple[str, str], list[float]], results: Mapping[tuple[str, str], Any]) -> Iterator[str]:
+    """What the medians do not say: the share of D2-Net's detection, and how many keypoints each side finds."""
+    for count in BATCHES:
+        pairs = zip(*(seconds[f"{step}, batch {count}", "mfvpr"] for step in (ON_DEVICE, MAP)), strict=True)
+        share = np.median([full / dense - 1 for full, dense in pairs])
+        yield f"D2-Net, batch {count}: detection adds {100 * share:.1f} % to the dense map"
+    counts: dict[str, list[str]] = {}
+    for (step, name), result in results.items():
+        if hasattr(result[0], "keypoints"):
+            mean = np.mean([len(one.keypoints) for one in result])
+            counts.setdefault(step, []).append(f"{name} {mean:.1f}")
+    yield from (f"{step}: keypoints per image: {'; '.join(found)}" for step, found in counts.items())
+    yield PAPER

@@ -1,0 +1,183 @@
+"""Makes aliked.npz: what the public code finds. `python -m tests.golden.make_aliked CLONE WEIGHTS IMAGES`
+
+CLONE is a clone of https://github.com/Shiaoming/ALIKED, WEIGHTS the folder of its files, IMAGES that of grief_season;
+torch is needed as well. The tests read the file without. What the public code uses of torchvision and of its own
+compiled operator is written out here.
+"""
+
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import NamedTuple
+
+import numpy as np
+
+from mfvpr.data.images import read_image, resize
+from tests.checkpoints import random_checkpoint, read_zip
+from tests.golden.make_d2net import projections, samples, texture
+
+GOLDEN = Path(__file__).parent / "aliked.npz"
+WIDTHS = {"aliked-t16": (8, 16, 32, 64)}  # of the others 16, 32, 64, 128; the last is the descriptor's too
+POSITIONS = {"aliked-n32": 32}  # of the others 16
+
+
+class Case(NamedTuple):
+    """A network, an image below IMAGES, and how it is processed; without an image, texture and random weights."""
+
+    variant: str
+    width: int
+    height: int
+    image: str | None
+    threshold: float = 0.1
+    max_keypoints: int = 5000
+
+    def __str__(self) -> str:
+        image = self.image.replace("/", "-").removesuffix(".jpg") if self.image else "texture"
+        return f"{self.variant}-{self.width}x{self.height}-{image}-{self.threshold}-{self.max_keypoints}"
+
+
+REAL = (
+    Case("aliked-n16", 320, 320, "database/image0000.jpg"),
+    Case("aliked-n16rot", 320, 320, "queries/image0033.jpg"),
+    Case("aliked-n16", 336, 336, "queries/image0066.jpg"),
+    Case("aliked-n16rot", 336, 336, "database/image0099.jpg"),
+    Case("aliked-n32", 224, 224, "database/image0050.jpg", 0.1, 300),
+    Case("aliked-n32", 224, 224, "queries/image0050.jpg", 0.99, 300),  # none is above: the mean, and too many
+    Case("aliked-t16", 300, 200, "queries/image0012.jpg"),
+    Case("aliked-t16", 300, 200, "database/image0012.jpg"),
+)
+DRAWN = Case("aliked-t16", 300, 200, None, 0.99)
+
+
+def shapes(variant: str) -> dict[str, tuple[int, ...]]:
+    """The tensors of a checkpoint."""
+    widths, positions = WIDTHS.get(variant, (16, 32, 64, 128)), POSITIONS.get(variant, 16)
+    dimension = widths[-1]
+    found: dict[str, tuple[int, ...]] = {}
+    for block, (inputs, outputs) in enumerate(zip((3, *widths), widths, strict=False), start=1):
+        for place, channels in ((1, inputs), (2, outputs)):
+            conv = f"block{block}.conv{place}"
+            if block > 2:
+                found |= {f"{conv}.offset_conv.weight": (18, channels, 3, 3), f"{conv}.offset_conv.bias": (18,)}
+                conv += ".regular_conv"
+            found[f"{conv}.weight"] = (outputs, channels, 3, 3)
+            names = ("weight", "bias", "running_mean", "running_var")
+            found |= {f"block{block}.bn{place}.{name}": (outputs,) for name in names}
+            found[f"block{block}.bn{place}.num_batches_tracked"] = ()
+        if block > 1:
+            found[f"block{block}.downsample.weight"] = (outputs, inputs, 1, 1)
+            found[f"block{block}.downsample.bias"] = (outputs,)
+        found[f"conv{block}.weight"] = (dimension // 4, outputs, 1, 1)
+    for place, size in {0: (8, dimension, 1, 1), 2: (4, 8, 3, 3), 4: (4, 4, 3, 3), 6: (1, 4, 3, 3)}.items():
+        found[f"score_head.{place}.weight"] = size
+    head = "desc_head.offset_conv"
+    found |= {f"{head}.0.weight": (2 * positions, dimension, 3, 3), f"{head}.0.bias": (2 * positions,)}
+    found |= {f"{head}.2.weight": (2 * positions, 2 * positions, 1, 1), f"{head}.2.bias": (2 * positions,)}
+    return found | {
+        "desc_head.sf_conv.weight": (dimension, dimension, 1, 1),
+        "desc_head.agg_weights": (positions, dimension, dimension),
+    }
+
+
+def checkpoint(case: Case, weights: Path) -> dict[str, np.ndarray]:
+    """The case's weights, by the public names."""
+    return read_zip(weights / f"{case.variant}.pth") if case.image else random_checkpoint(shapes(case.variant))
+
+
+def picture(case: Case, images: Path) -> np.ndarray:
+    """The case's image, `[height, width, 3]` uint8."""
+    if case.image is None:
+        return texture(case.width, case.height)
+    return resize(read_image(images / case.image), (case.width, case.height))
+
+
+def _deformable(input, offset, weight, bias=None, padding=None, mask=None):
+    """torchvision's `deform_conv2d`, 3 x 3 with stride 1 and one pixel of padding."""
+    import torch
+
+    batch, channels, height, width = input.shape
+    offset = offset.unflatten(1, (9, 2))
+    tap = torch.arange(9).view(1, 9, 1, 1)
+    y = torch.arange(height).view(1, 1, -1, 1) + tap // 3 - 1 + offset[:, :, 0]
+    x = torch.arange(width).view(1, 1, 1, -1) + tap % 3 - 1 + offset[:, :, 1]
+    sampled = torch.zeros(batch, channels, 9 * height * width)
+    for row in (y.floor(), y.floor() + 1):
+        for column in (x.floor(), x.floor() + 1):
+            inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+            share = (1 - (y - row).abs()) * (1 - (x - column).abs()) * inside
+            place = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
+            place = place.long().flatten(1)[:, None].expand(-1, channels, -1)
+            sampled += input.flatten(2).gather(2, place) * share.flatten(1)[:, None]
+    taps = sampled.unflatten(2, (9, -1)).flatten(1, 2)
+    return (weight.flatten(1) @ taps).unflatten(2, (height, width))
+
+
+class _Patches:
+    """The compiled operator: neighborhoods of pixels, zeros outside."""
+
+    @staticmethod
+    def apply(features, points, size):
+        import torch
+        import torch.nn.functional as F
+
+        reach = torch.arange(size)
+        padded = F.pad(features, (size // 2,) * 4)
+        rows, columns = points[:, 1, None] + reach, points[:, 0, None] + reach
+        return padded[:, rows[:, :, None], columns[:, None]].transpose(0, 1)
+
+
+def _stubs() -> None:
+    """Makes importable what the public code imports."""
+    import torch
+    from torch import nn
+
+    def module(name: str, **contents: object) -> ModuleType:
+        sys.modules[name] = made = ModuleType(name)
+        made.__dict__.update(contents)
+        return made
+
+    def conv(inputs: int, outputs: int, size: int) -> nn.Module:
+        return nn.Conv2d(inputs, outputs, size, padding=size // 2, bias=False)
+
+    resnet = module("torchvision.models.resnet", conv1x1=lambda *widths: conv(*widths, 1),
+                    conv3x3=lambda *widths: conv(*widths, 3))  # fmt: skip
+    models = module("torchvision.models", resnet=resnet)
+    module("torchvision", ops=module("torchvision.ops", deform_conv2d=_deformable), models=models)
+    module(
+        "torchvision.transforms", ToTensor=lambda: lambda image: torch.from_numpy(image.copy()).permute(2, 0, 1) / 255
+    )
+    module("custom_ops", get_patches=_Patches)
+    torch.cuda.synchronize = lambda *_: None
+
+
+def main(clone: str, weights: str, images: str) -> None:
+    sys.path.insert(0, clone)
+    _stubs()
+    import torch
+    from nets.aliked import ALIKED
+
+    golden = {}
+    for case in (*REAL, DRAWN):
+        network = ALIKED(
+            case.variant, "cpu", scores_th=case.threshold, n_limit=case.max_keypoints, load_pretrained=False
+        )
+        values = checkpoint(case, Path(weights))
+        network.load_state_dict({name: torch.from_numpy(np.array(tensor)) for name, tensor in values.items()})
+        network.eval()
+        image = picture(case, Path(images))
+        found = network.run(image)
+        with torch.no_grad():
+            dense, _ = network.extract_dense_map(torch.from_numpy(image.copy()).permute(2, 0, 1)[None] / 255)
+        golden |= {
+            f"{case}/features": samples(dense[0].permute(1, 2, 0).numpy()),
+            f"{case}/score_map": samples(found["score_map"][..., None]),
+            f"{case}/keypoints": found["keypoints"],
+            f"{case}/scores": found["scores"],
+            f"{case}/projections": projections(found["descriptors"]),
+        }
+        print(f"{case}: {len(found['scores'])} keypoints")
+    np.savez_compressed(GOLDEN, **golden)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

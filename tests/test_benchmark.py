@@ -1,0 +1,95 @@
+"""The networks of the benchmark do the same on both sides, so that equals are compared."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments import benchmark
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def contest(tmp_path_factory):
+    """Small images and random weights; everyone's results after one round."""
+    torch = pytest.importorskip("torch", reason="torch is what the networks are compared with")
+    from experiments import network_contestants
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # several wait for each other when other processes take their cores
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MFVPR_WEIGHTS", str(tmp_path_factory.mktemp("weights")))
+        small = {"BATCHES": (2,), "D2NET_SIZE": 96, "ALIKED_SIZE": 96, "ALIKED": ("aliked-n16",)}
+        for name, value in small.items():
+            patch.setattr(network_contestants, name, value)
+        lineup = network_contestants.lineup()
+        seconds, results = benchmark.take_turns([run for _, _, run in lineup.entries], rounds=1)
+        out = tmp_path_factory.mktemp("benchmark") / "networks.json"
+        benchmark.report(lineup, seconds, results, out)
+    torch.set_num_threads(threads)
+    by_step = {}
+    for (step, name, _), result in zip(lineup.entries, results, strict=True):
+        by_step.setdefault(step, {})[name] = result
+    return by_step, json.loads(out.read_text())
+
+
+def peers(results):
+    """mfvpr's result, and each peer's."""
+    others = dict(results)
+    ours = others.pop("mfvpr")
+    assert len(others) == 3  # two memory layouts, and one by one
+    return ours, others.values()
+
+
+@pytest.mark.parametrize("step", ["D2-Net", "aliked-n16"])
+def test_keypoints_are_the_same(contest, step):
+    ours, others = peers(contest[0][f"{step} features, batch 2"])
+    assert len(ours) == 2
+    for theirs in others:
+        for one, other in zip(ours, theirs, strict=True):
+            assert len(one.keypoints) > 10
+            assert abs(len(one.keypoints) - len(other.keypoints)) <= 0.02 * len(one.keypoints)
+            distance = np.linalg.norm(one.keypoints[:, None] - other.keypoints, axis=2)
+            nearest = distance.argmin(1)
+            same = distance.min(1) < 0.05  # px; rounding moves a few maxima
+            assert same.mean() >= 0.98
+            found = other.descriptors[nearest][same], other.scores[nearest][same]
+            np.testing.assert_allclose(one.descriptors[same], found[0], atol=2e-3)
+            np.testing.assert_allclose(one.scores[same], found[1], rtol=1e-3, atol=1e-4)
+
+
+def test_dense_maps_are_the_same(contest):
+    ours, others = peers(contest[0]["D2-Net dense map, batch 2"])
+    ours = np.concatenate([np.asarray(one) for one in ours]).transpose(0, 3, 1, 2)
+    for theirs in others:
+        np.testing.assert_allclose(ours, np.stack([np.asarray(one) for one in theirs]), atol=1e-4 * ours.max())
+
+
+def test_descriptors_are_the_same(contest):
+    ours, others = peers(contest[0]["MixVPR descriptor, batch 2"])
+    for theirs in others:
+        np.testing.assert_allclose(ours, theirs, atol=1e-5)
+
+
+def test_report_has_everyone(contest):
+    by_step, written = contest
+    names = {(entry["step"], entry["name"]) for entry in written["results"]}
+    assert names == {(step, name) for step, results in by_step.items() for name in results}
+    assert all(entry["median_ms"] > 0 for entry in written["results"])
+    remarks = "\n".join(written["remarks"])
+    for wanted in ("detection adds", "aliked-n16 features, batch 2: keypoints per image: mfvpr", "RTX 2080 Ti"):
+        assert wanted in remarks
+
+
+def test_help_needs_no_jax():
+    done = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "experiments.benchmark", "--help"],
+        cwd=ROOT, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 0
+    assert "networks" in done.stdout
+    assert " jax\n" not in done.stderr
