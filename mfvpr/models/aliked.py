@@ -168,10 +168,9 @@ def _conv(inputs: int, outputs: int, size: int = 3, *, precision: str, rngs: nnx
 
 
 def _narrow(conv: nnx.Conv, x: Array) -> Array:
-    """`conv(x)`, 3 x 3 from few channels to few: `_TOGETHER` pixels of a row become one, with as many channels in all.
+    """`conv(x)`, 3 x 3 from few channels to few: `_TOGETHER` pixels of a row become one of many channels.
 
-    That is no work at all, a wider kernel, many zeros in which cost nothing, and half of the time on a CPU, whose
-    convolutions are vectorized over channels.
+    The kernel grows with them, by zeros too. A CPU, which works on many channels at once, takes half of the time.
     """
     batch, height, width, inputs = x.shape
     block, source, target = np.indices((3, _TOGETHER, _TOGETHER))

@@ -24,7 +24,7 @@ class Level(NamedTuple):
 class Field(NamedTuple):
     """Features `[H, W, D]` of unit length, which are computed where they are asked for.
 
-    Descriptors look at half of the pixels at most, and all features of 320 x 320 px take 52 MB.
+    Descriptors look at about half of the pixels, and the features of 320 x 320 px take 52 MB.
     """
 
     levels: tuple[Level, ...]
