@@ -59,7 +59,7 @@ def _torch() -> ModuleType:
     try:
         import torch
     except ImportError as error:
-        raise InputError('converting checkpoints needs torch: pip install "mfvpr[convert]"') from error
+        raise InputError("converting checkpoints needs PyTorch, and nothing else does: pip install torch") from error
     return torch
 
 

@@ -154,7 +154,7 @@ def test_without_torch_the_mend_is_told(tmp_path):
         [sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60
     )
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == 'error: converting checkpoints needs torch: pip install "mfvpr[convert]"\n'
+    assert done.stderr == "error: converting checkpoints needs PyTorch, and nothing else does: pip install torch\n"
     assert not (tmp_path / "weights").exists()
 
 
