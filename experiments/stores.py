@@ -62,8 +62,8 @@ def _recipe(settings: dict[str, Any], images: str) -> dict[str, Any]:
         from mfvpr.weights.files import fingerprint
 
         recipe["weights_sha256"] = fingerprint(recipe["weights"])
-    used = {name: version for name, version in versions().items() if name in ("mfvpr", "opencv-python-headless")}
-    return {"extractor": recipe, "images": images, "versions": used}
+    decoders = {name: versions()[name] for name in ("mfvpr", "opencv-python-headless", "pillow")}
+    return {"extractor": recipe, "images": images, "versions": decoders}
 
 
 def _account(name: str, store: FeatureStore, settings: dict[str, Any]) -> str:

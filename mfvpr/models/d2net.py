@@ -16,6 +16,7 @@ from flax import nnx
 from jax import Array
 
 from mfvpr.models.imagenet import DEVIATION, MEAN
+from mfvpr.models.sampling import between, neighbors
 from mfvpr.models.vgg import Vgg16
 
 Preprocessing = Literal["caffe", "torch"]
@@ -236,13 +237,7 @@ def _interpolated(dense: Array, position: Array) -> Array:
 def _stretched(values: Array, size: int, *, axis: int) -> Array:
     """Linear interpolation along an axis, so that its ends stay the ends."""
     length = values.shape[axis]
-    if size == length:
-        return values
-    position = np.arange(size, dtype=np.float32) * (np.float32(length - 1) / np.float32(max(size - 1, 1)))
-    low = np.floor(position).astype(int)
-    after = (position - low.astype(np.float32)).reshape([-1 if one == axis else 1 for one in range(values.ndim)])
-    high = np.minimum(low + 1, length - 1)
-    return jnp.take(values, low, axis) * (1 - after) + jnp.take(values, high, axis) * after
+    return values if size == length else between(values, neighbors(length, size), axis)
 
 
 def _nearest(length: int, size: int) -> np.ndarray:
