@@ -47,6 +47,9 @@ class Matches:
         mask: `[..., K]` bool.
         image_size0: `[..., 2]` (width, height) of the query, px.
         image_size1: `[..., 2]` (width, height) of the candidate, px.
+        ratio: `[..., K]` distance to the nearest descriptor of the candidate over that to the second nearest, in
+            [0, 1]; None where nobody asked for it.
+        confidence: `[..., K]` in [0, 1], how surely a match is one: it counts so much of its weight. None = 1.
     """
 
     points0: Array  # [..., K, 2]
@@ -57,6 +60,8 @@ class Matches:
     mask: Array  # [..., K]
     image_size0: Array  # [..., 2]
     image_size1: Array  # [..., 2]
+    ratio: Array | None = None  # [..., K]
+    confidence: Array | None = None  # [..., K]
 
 
 @jax.tree_util.register_dataclass

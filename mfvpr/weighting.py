@@ -43,5 +43,6 @@ class UnitWeight:
 
 
 def match_weights(weight: Weight, matches: Matches) -> Array:
-    """`[K]` weights, 0 on padding."""
-    return masked(as_float(weight(matches)), matches.mask)
+    """`[K]` weights times the matches' confidence, 0 on padding."""
+    weights = as_float(weight(matches))
+    return masked(weights if matches.confidence is None else weights * matches.confidence, matches.mask)
