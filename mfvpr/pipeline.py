@@ -4,7 +4,8 @@ Files and threads stay on the host; each computation is one compiled program per
 where `jit` lives. `track` wraps the iterable of a stage: a progress bar, or nothing.
 """
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
@@ -13,6 +14,7 @@ import jax
 import numpy as np
 
 from mfvpr import matching, reranking, retrieval
+from mfvpr.data.match_store import MatchStore, QueryMatches
 from mfvpr.errors import InputError
 from mfvpr.extraction import FeatureSet, Track, describe, extract, untracked
 from mfvpr.matching import CrossCheck
@@ -22,10 +24,11 @@ from mfvpr.types import Array, Features, Matches, Shortlist
 from mfvpr.weighting import match_weights
 
 __all__ = ["Explanation", "FeatureSet", "MatchSet", "Track", "describe", "explain", "extract", "fuse", "match", "rank",
-           "score", "shortlist", "untracked"]  # fmt: skip
+           "score", "shortlist", "stored_matches", "untracked"]  # fmt: skip
 
 MAX_BINS = 1024  # per axis: the histograms of 50 candidates then take 200 MB
-_PER_MATCH = ("points0", "points1", "distance", "scores0", "scores1")
+STORE_BATCH = 8  # queries whose matches may be lost when a run is killed
+_PER_MATCH = ("points0", "points1", "distance", "scores0", "scores1", "ratio")
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,8 @@ class MatchSet:
     """Matches of every query with its candidates, without padding.
 
     Attributes:
-        matches: per query, the real matches of all candidates one after the other; image sizes `[C, 2]`.
+        matches: per query, the real matches `[n, ...]` of all candidates one after the other; `image_size0` `[2]`,
+            `image_size1` `[C, 2]`.
         counts: `[Q, C]` matches of each candidate.
         capacity: slots that hold every pair's matches.
     """
@@ -52,7 +56,9 @@ class MatchSet:
             slots[mask] = values
             return slots
 
-        return replace(flat, mask=mask, **{name: padded(getattr(flat, name)) for name in _PER_MATCH})
+        slots = {name: padded(values) for name, values in per_match(flat).items()}
+        sizes = np.broadcast_to(flat.image_size0, flat.image_size1.shape)
+        return replace(flat, mask=mask, image_size0=sizes, **slots)
 
 
 def shortlist(query_descriptors: np.ndarray, database_descriptors: np.ndarray, num_candidates: int) -> Shortlist:
@@ -69,19 +75,59 @@ def match(
     max_distance: float | None = None,
     max_matches: int | None = None,
     chunk_size: int | None = None,
+    store: MatchStore | None = None,
     track: Track = untracked,
 ) -> MatchSet:
-    """Matches of every query with its candidates; options as in `mfvpr.matching`."""
-    device_database = jax.device_put(database.features)
+    """Matches of every query with its candidates.
+
+    Args:
+        queries: Q images.
+        database: M images.
+        candidates: `[Q, C]` rows of the database.
+        cross_check: as `max_distance`, `max_matches` and `chunk_size` in `mfvpr.matching`.
+        max_distance: see there.
+        max_matches: see there.
+        chunk_size: see there.
+        store: of these features, candidates and options. Only queries that it lacks are matched, with the ratio of
+            their distances; some at a time are on disk before the next are begun; and what comes back was read from it.
+        track: progress.
+
+    Raises:
+        InputError: the store cannot be used, or is of other candidates.
+    """
     options = {"cross_check": cross_check, "max_matches": max_matches, "chunk_size": chunk_size}
-    flat, counts = [], []
-    for row in track(range(len(queries)), len(queries)):
-        found = _match(queries[row], device_database, candidates.indices[row], max_distance, **options)
-        found = jax.tree.map(np.asarray, found)
-        counts.append(found.mask.sum(axis=1))
-        flat.append(replace(found, **{name: getattr(found, name)[found.mask] for name in _PER_MATCH}))
-    counts = np.array(counts)
-    return MatchSet(flat, counts, round_up(int(counts.max(initial=0)), 64))
+    if store is None:
+        rows = track(range(len(queries)), len(queries))
+        return _match_set([one for _, one in _matched(queries, database, candidates, rows, max_distance, **options)])
+    if missing := np.flatnonzero(~store.done).tolist():
+        rows = track(missing, len(missing))
+        found = _matched(queries, database, candidates, rows, max_distance, with_ratio=True, **options)
+        while batch := dict(itertools.islice(found, STORE_BATCH)):
+            store.write(batch)
+    match_set, stored = stored_matches(store)
+    if not np.array_equal(stored.indices, candidates.indices):
+        raise InputError(
+            f"{store.folder}: expected matches of these candidates, got those of another shortlist; choose another "
+            "path, or delete this folder"
+        )
+    return match_set
+
+
+def stored_matches(store: MatchStore) -> tuple[MatchSet, Shortlist]:
+    """All that a complete store holds, NumPy: the features are not needed any more.
+
+    Raises:
+        InputError: matches of some queries are missing or damaged.
+    """
+    if not store.done.all():
+        raise InputError(
+            f"{store.folder}: expected the matches of all {len(store.done)} queries, got {store.done.sum()}; finish "
+            "the matching first"
+        )
+    found = [one for _, one in store.read()]
+    indices = np.array([one.indices for one in found], np.int32).reshape(-1, store.num_candidates)
+    scores = np.array([one.filter_scores for one in found], np.float32).reshape(indices.shape)
+    return _match_set(found), Shortlist(indices=indices, scores=scores, mask=indices >= 0)
 
 
 def score(
@@ -134,9 +180,13 @@ def fuse(candidates: Shortlist, scores: np.ndarray, c: float | None, *, euclidea
         c: weight of the filter; None balances the spread of both per query.
         euclidean: the filter's score is minus the Euclidean distance of the unit descriptors instead.
     """
+    return np.asarray(_fuse(filter_scores(candidates, euclidean=euclidean), scores, candidates.mask, c))
+
+
+def filter_scores(candidates: Shortlist, *, euclidean: bool = False) -> np.ndarray:
+    """The filter's part of a combined score `[Q, C]`: cosine similarity, or minus the Euclidean distance."""
     cosine = candidates.scores
-    filter_scores = -np.sqrt(np.maximum(2 - 2 * cosine, 0)) if euclidean else cosine
-    return np.asarray(_fuse(filter_scores, scores, candidates.mask, c))
+    return -np.sqrt(np.maximum(2 - 2 * cosine, 0)) if euclidean else cosine
 
 
 def rank(candidates: Shortlist, scores: np.ndarray, *, ties: Literal["filter", "index"] = "filter") -> np.ndarray:
@@ -147,11 +197,42 @@ def rank(candidates: Shortlist, scores: np.ndarray, *, ties: Literal["filter", "
     return np.asarray(_rank(scores, candidates.mask, tie_break=candidates.indices if ties == "index" else None))
 
 
+def _matched(
+    queries: FeatureSet,
+    database: FeatureSet,
+    candidates: Shortlist,
+    rows: Iterable[int],
+    max_distance: float | None,
+    **options: Any,
+) -> Iterator[tuple[int, QueryMatches]]:
+    """(row, all of that query), one after the other, NumPy."""
+    device_database = jax.device_put(database.features)
+    for row in rows:
+        found = _match(queries[row], device_database, candidates.indices[row], max_distance, **options)
+        found = jax.tree.map(np.asarray, found)
+        counts = found.mask.sum(axis=1, dtype=np.int32)
+        entries = {name: values[found.mask] for name, values in per_match(found).items()}
+        real, size0 = np.ones(counts.sum(), bool), queries.features.image_size[row]
+        flat = replace(found, mask=real, image_size0=size0, **entries)
+        yield row, QueryMatches(flat, counts, candidates.indices[row], candidates.scores[row])
+
+
+def _match_set(found: Sequence[QueryMatches]) -> MatchSet:
+    counts = np.array([one.counts for one in found])
+    return MatchSet([one.matches for one in found], counts, round_up(int(counts.max(initial=0)), 64))
+
+
+def per_match(matches: Matches) -> dict[str, np.ndarray]:
+    """The fields with a value for every match; the ratio only where there is one."""
+    return {name: values for name in _PER_MATCH if (values := getattr(matches, name)) is not None}
+
+
 _retrieve = jax.jit(retrieval.retrieve, static_argnames="num_candidates")
 _rank = jax.jit(reranking.rank)
+_fuse = jax.jit(reranking.fuse)
 
 
-@partial(jax.jit, static_argnames=("cross_check", "max_matches", "chunk_size"))
+@partial(jax.jit, static_argnames=("cross_check", "max_matches", "chunk_size", "with_ratio"))
 def _match(
     query: Features,
     database: Features,
@@ -161,8 +242,11 @@ def _match(
     cross_check: CrossCheck,
     max_matches: int | None,
     chunk_size: int | None,
+    with_ratio: bool = False,
 ) -> Matches:
-    found = matching.match_shortlist(query, database, indices, cross_check=cross_check, chunk_size=chunk_size)
+    found = matching.match_shortlist(
+        query, database, indices, cross_check=cross_check, chunk_size=chunk_size, with_ratio=with_ratio
+    )
     keep = partial(matching.filter_matches, max_distance=max_distance, max_matches=max_matches)
     return jax.vmap(keep)(found)
 
@@ -170,13 +254,6 @@ def _match(
 @jax.jit
 def _score(scorers: dict[str, Scorer], matches: Matches) -> dict[str, Array]:
     return {name: reranking.score_candidates(scorer, matches) for name, scorer in scorers.items()}
-
-
-@jax.jit
-def _fuse(filter_scores: Array, scores: Array, mask: Array, c: Array | None) -> Array:
-    if c is None:
-        c = jax.vmap(reranking.balancing_c)(filter_scores, scores, mask)[:, None]
-    return reranking.combine(filter_scores, scores, c=c)
 
 
 @jax.jit

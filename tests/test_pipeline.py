@@ -1,5 +1,8 @@
 """The way over a data set, stage by stage, on a drawn street and on broken images."""
 
+from contextlib import contextmanager
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
@@ -8,6 +11,7 @@ from PIL import Image
 import mfvpr
 from mfvpr import pipeline
 from mfvpr.data.datasets import folder_dataset, image_folder
+from mfvpr.data.match_store import open_match_store
 from mfvpr.errors import InputError
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import fit_vlad
@@ -93,6 +97,93 @@ def test_capacity_of_matches_is_the_largest_pair(features, candidates, matches):
     assert few.capacity == 64
 
 
+PER_MATCH = ("points0", "points1", "distance", "scores0", "scores1")
+
+
+@pytest.fixture
+def opened(tmp_path):
+    @contextmanager
+    def opened(num_queries=10, num_candidates=6, name="store"):
+        sizes = {"num_queries": num_queries, "num_candidates": num_candidates}
+        with open_match_store(tmp_path / name, {"name": "street"}, **sizes) as store:
+            yield store
+
+    return opened
+
+
+class Counted:
+    """A function that counts its calls; a limit stands for a kill."""
+
+    def __init__(self, function):
+        self.function, self.count, self.limit = function, 0, None
+
+    def __call__(self, *args, **options):
+        if self.count == self.limit:
+            raise KeyboardInterrupt
+        self.count += 1
+        return self.function(*args, **options)
+
+
+@pytest.fixture
+def matched(monkeypatch):
+    """Counts the queries that are matched."""
+    counted = Counted(pipeline._match)
+    monkeypatch.setattr(pipeline, "_match", counted)
+    return counted
+
+
+def assert_same_matches(got, expected, names=(*PER_MATCH, "ratio")):
+    np.testing.assert_array_equal(got.counts, expected.counts)
+    assert got.capacity == expected.capacity
+    for query in range(len(expected.counts)):
+        for name in (*names, "mask", "image_size0", "image_size1"):
+            np.testing.assert_array_equal(getattr(got[query], name), getattr(expected[query], name))
+
+
+def test_a_store_gives_what_was_matched_and_is_read_ever_after(features, candidates, matches, opened, matched):
+    with opened() as store:
+        first = pipeline.match(features[1], features[0], candidates, store=store)
+    with opened() as store:
+        again = pipeline.match(features[1], features[0], candidates, store=store)
+        alone, stored = pipeline.stored_matches(store)
+    assert matched.count == 10
+    assert_same_matches(first, matches, PER_MATCH)
+    assert matches[0].ratio is None
+    assert ((first[0].ratio > 0) == first[0].mask).all()
+    for later in (again, alone):
+        assert_same_matches(later, first)
+    for name in ("indices", "scores", "mask"):
+        np.testing.assert_array_equal(getattr(stored, name), getattr(candidates, name))
+    scorers = {"h": mfvpr.HistogramOfShifts(), "a": mfvpr.AnchorPoints(), "s": mfvpr.AggregatedScore()}
+    fresh, swept = (pipeline.score(scorers, one, candidates) for one in (matches, alone))
+    for name in scorers:
+        np.testing.assert_array_equal(fresh[name], swept[name])
+
+
+def test_an_interrupted_matching_goes_on_where_it_was(features, candidates, opened, matched, compilations):
+    matched.limit = 9
+    with opened() as store, pytest.raises(KeyboardInterrupt):
+        pipeline.match(features[1], features[0], candidates, store=store)
+    matched.limit = None
+    with opened() as store:
+        assert store.done.tolist() == [True] * pipeline.STORE_BATCH + [False] * 2
+        with pytest.raises(InputError, match=r"store: expected the matches of all 10 queries, got 8; finish"):
+            pipeline.stored_matches(store)
+        resumed = pipeline.match(features[1], features[0], candidates, store=store)
+    assert matched.count == 9 + 2
+    assert compilations.count <= 1
+    with opened(name="uninterrupted") as store:
+        assert_same_matches(resumed, pipeline.match(features[1], features[0], candidates, store=store))
+
+
+def test_matches_of_another_shortlist_are_told(features, candidates, opened):
+    with opened() as store:
+        pipeline.match(features[1], features[0], candidates, store=store)
+        other = replace(candidates, indices=candidates.indices[:, ::-1])
+        with pytest.raises(InputError, match=r"store: expected matches of these candidates, .* delete this folder"):
+            pipeline.match(features[1], features[0], other, store=store)
+
+
 @pytest.fixture
 def mixed(tmp_path, small_street):
     """A good image, an empty one, a truncated one, one without keypoints."""
@@ -111,7 +202,7 @@ def test_bad_images_fail_by_default_with_the_mend(mixed):
         pipeline.extract(mixed, SIFT)
 
 
-def test_skipped_images_are_listed_and_never_shortlisted(mixed):
+def test_skipped_images_are_listed_and_never_shortlisted(mixed, opened):
     found = pipeline.extract(mixed, SIFT, skip_bad=True)
     assert sorted(found.bad) == [1, 2]
     assert not found.features.mask[[1, 2, 3]].any()
@@ -120,6 +211,9 @@ def test_skipped_images_are_listed_and_never_shortlisted(mixed):
     np.testing.assert_array_equal(candidates.indices[0], [0, 4, 3, -1, -1])
     np.testing.assert_array_equal(candidates.indices[1], [-1] * 5)
     matches = pipeline.match(found, found, candidates)
+    with opened(5, 5) as store:
+        assert_same_matches(pipeline.match(found, found, candidates, store=store), matches, PER_MATCH)
+        np.testing.assert_array_equal(pipeline.stored_matches(store)[1].mask, candidates.mask)
     scores = pipeline.score({"h": mfvpr.HistogramOfShifts(), "a": mfvpr.AnchorPoints()}, matches, candidates)
     for values in scores.values():
         assert values[0, 0] == values[0, 1] > 0

@@ -1,12 +1,12 @@
-"""How a feature store lies on disk: its arrays, its lock, and what goes wrong there, each told in one line."""
+"""How a store of rows lies on disk: its arrays, its lock, and what goes wrong there, each told in one line."""
 
 import errno
 import fcntl
-import json
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,58 +15,64 @@ import tensorstore as ts
 
 from mfvpr.errors import InputError
 
-CHUNK_ROWS = 1024  # features; one chunk of descriptors is 1 MB at D = 512
-MAX_FEATURES = 2**20  # of one image; absent chunks cost nothing
 _DAMAGE = ("DATA_LOSS", "NOT_FOUND", "FAILED_PRECONDITION", "OUT_OF_RANGE", "INVALID_ARGUMENT")
+BYTES = {"name": "bytes", "configuration": {"endian": "little"}}
+ZSTD = {"name": "zstd", "configuration": {"level": 1}}
 
 
-def open_arrays(folder: Path, num_images: int, dimension: int, context: ts.Context) -> dict[str, ts.TensorStore]:
-    """The arrays, made where they are not there. Reading what was never written is an error, but for `count`."""
-    rows, chunk = (num_images, MAX_FEATURES), (1, CHUNK_ROWS)
-    layout = {
-        "descriptors": ("float16", (*rows, dimension), (*chunk, dimension)),
-        "keypoints": ("float32", (*rows, 2), (*chunk, 2)),
-        "scores": ("float32", rows, chunk),
-        "image_size": ("float32", (num_images, 2), (1, 2)),
-        "count": ("int32", (num_images,), (1,)),
-    }
+@dataclass(frozen=True)
+class Column:
+    """One array of a store; all of a row's are written before the row is done.
+
+    Attributes:
+        dtype: of its values; where rows have entries, floating point.
+        shape: of a row's value; with `chunk`, of one entry.
+        chunk: entries in a chunk, where rows have any number of entries; None = one value a row.
+        capacity: the most entries of a row; chunks that are absent cost nothing.
+        codecs: Zarr's, of chunks `[1, chunk, *shape]`; a checksum is added.
+    """
+
+    dtype: str
+    shape: tuple[int, ...] = ()
+    chunk: int | None = None
+    capacity: int = 2**20
+    codecs: tuple[Mapping[str, Any], ...] = (BYTES, ZSTD)
+
+
+def open_arrays(
+    folder: Path, num_rows: int, columns: Mapping[str, Column], context: ts.Context
+) -> dict[str, ts.TensorStore]:
+    """The arrays of `columns` and `count`, made where they are not there.
+
+    Reading what was never written is an error, but for `count`.
+    """
     arrays = {}
-    for name, (dtype, shape, chunk_shape) in layout.items():
+    for name, column in {**columns, "count": Column("int32")}.items():
         spec = {
             "driver": "zarr3",
             "kvstore": {"driver": "file", "path": str(folder / name)},
-            "metadata": _metadata(dtype, shape, chunk_shape),
+            "metadata": _metadata(column, num_rows),
             "fill_missing_data_reads": name == "count",
+            "store_data_equal_to_fill_value": name != "count",  # a chunk that is not there was never written
         }
         arrays[name] = ts.open(spec, context=context, open=True, create=True).result()
     return arrays
 
 
-def _metadata(dtype: str, shape: Sequence[int], chunk_shape: Sequence[int]) -> dict[str, Any]:
+def _metadata(column: Column, num_rows: int) -> dict[str, Any]:
+    entries, chunk = ((), ()) if column.chunk is None else ((column.capacity,), (column.chunk,))
     return {
-        "shape": shape,
-        "data_type": dtype,
-        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": chunk_shape}},
-        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "."}},  # no folder per image
-        "fill_value": -1 if dtype == "int32" else "NaN",  # which no feature is: a chunk of features is always written
-        "codecs": [
-            {"name": "bytes", "configuration": {"endian": "little"}},
-            {"name": "zstd", "configuration": {"level": 1}},
-            {"name": "crc32c"},
-        ],
+        "shape": (num_rows, *entries, *column.shape),
+        "data_type": column.dtype,
+        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": (1, *chunk, *column.shape)}},
+        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "."}},  # no folder per row
+        "fill_value": -1 if column.dtype == "int32" else "NaN",
+        "codecs": [*column.codecs, {"name": "crc32c"}],
     }
 
 
-def stored_dimension(folder: Path) -> int:
-    path = folder / "descriptors" / "zarr.json"
-    try:
-        return int(json.loads(path.read_bytes())["shape"][2])
-    except (ValueError, KeyError, IndexError, TypeError):
-        raise InputError(f"{path}: damaged; delete {folder} and run again") from None
-
-
 def read_counts(array: ts.TensorStore) -> np.ndarray:
-    """`[M]` int32; images whose count is damaged are not done."""
+    """`[M]` int32; rows whose count is damaged are not done."""
     try:
         return np.array(array.read().result())
     except ValueError as error:
@@ -90,12 +96,12 @@ def commit(writes: Sequence[ts.WriteFutures]) -> None:
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path, content: str) -> Iterator[None]:
     """Hold the store's lock, which ends with the process, however that ends."""
-    with told(folder):
+    with told(folder, content):
         handle = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o644)
     try:
-        with told(folder):
+        with told(folder, content):
             _take(handle, folder)
         with suppress(OSError):  # a full disk; the lock holds without its owner's name
             os.ftruncate(handle, 0)
@@ -117,8 +123,14 @@ def _take(handle: int, folder: Path) -> None:
 
 
 @contextmanager
-def told(folder: Path, needed: int = 10**6) -> Iterator[None]:
-    """What the file system or tensorstore raise, as one line. `needed`: bytes that what is under way takes."""
+def told(folder: Path, content: str, needed: int = 10**6) -> Iterator[None]:
+    """What the file system or tensorstore raise, as one line.
+
+    Args:
+        folder: the store's.
+        content: what it holds.
+        needed: bytes that what is under way takes.
+    """
     try:
         yield
     except InputError:
@@ -129,7 +141,7 @@ def told(folder: Path, needed: int = 10**6) -> Iterator[None]:
         elif is_damage(error):
             message = f"{folder}: damaged ({reason(error)}); delete this folder and run again"
         else:
-            message = f"{folder}: cannot hold features ({reason(error)}); check the path, its permissions and its disk"
+            message = f"{folder}: cannot hold {content} ({reason(error)}); check the path, its permissions and its disk"
         raise InputError(message) from None
 
 

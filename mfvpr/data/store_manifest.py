@@ -1,4 +1,4 @@
-"""What the features of a store were made from, in plain text beside them: never mixed, never reused by mistake.
+"""What the rows of a store were made from, in plain text beside them: never mixed, never reused by mistake.
 
 The manifest is the `zarr.json` of the store's Zarr group, in its attributes. It is written before anything else and
 compared, ingredient by ingredient, whenever the store is opened.
@@ -10,29 +10,55 @@ import json
 import os
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from mfvpr.data.files import replacing
 from mfvpr.errors import InputError
 
-FORMAT = "mfvpr feature store 1"
 MANIFEST = "zarr.json"
 _ABSENT = object()
 
 
-def recipe_fingerprint(recipe: Mapping[str, Any]) -> str:
+@dataclass(frozen=True)
+class Kind:
+    """What a store holds, in the words of its manifest and of its messages.
+
+    Attributes:
+        store: what it is called.
+        content: what a row is made of.
+        rows: what a row belongs to.
+        remake: what the next run does with a row that is not done.
+    """
+
+    store: str
+    content: str
+    rows: str
+    remake: str
+
+    @property
+    def format(self) -> str:
+        """Of the arrays on disk, with its version."""
+        return f"mfvpr {self.store} 1"
+
+
+FEATURES = Kind("feature store", "features", "images", "extracts")
+MATCHES = Kind("match store", "matches", "queries", "matches")
+
+
+def recipe_fingerprint(recipe: Mapping[str, Any], kind: Kind = FEATURES) -> str:
     """SHA-256 over the store's format and the recipe (JSON values only); the first 16 hexadecimal digits."""
-    text = json.dumps({"format": FORMAT, "recipe": recipe}, sort_keys=True, allow_nan=False)
+    text = json.dumps({"format": kind.format, "recipe": recipe}, sort_keys=True, allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def store_path(root: Path, name: str, recipe: Mapping[str, Any]) -> Path:
+def store_path(root: Path, name: str, recipe: Mapping[str, Any], kind: Kind = FEATURES) -> Path:
     """`<root>/<name>-<fingerprint>`; characters of `name` that do not belong in a file name become `_`."""
-    return root / f"{re.sub(r'[^A-Za-z0-9._-]', '_', name)[:100]}-{recipe_fingerprint(recipe)}"
+    return root / f"{re.sub(r'[^A-Za-z0-9._-]', '_', name)[:100]}-{recipe_fingerprint(recipe, kind)}"
 
 
-def check_owned(folder: Path) -> None:
+def check_owned(folder: Path, kind: Kind) -> None:
     """Refuse to make a store of anything but a new or empty folder, or what an interrupted start left.
 
     Raises:
@@ -40,34 +66,40 @@ def check_owned(folder: Path) -> None:
         OSError: it cannot be read.
     """
     if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: expected a folder of features, got a file; choose another path")
+        raise InputError(f"{folder}: expected a folder of {kind.content}, got a file; choose another path")
     if folder.is_dir() and not (folder / MANIFEST).exists():
         foreign = sorted(path.name for path in folder.iterdir() if path.name != "lock" and not _is_leftover(path))
         if foreign:
             raise InputError(
-                f"{folder}: expected a folder of features, got one without {MANIFEST} that holds {_short(foreign[0])}; "
-                "choose another path"
+                f"{folder}: expected a folder of {kind.content}, got one without {MANIFEST} that holds "
+                f"{_short(foreign[0])}; choose another path"
             )
 
 
-def settle_manifest(folder: Path, recipe: Mapping[str, Any], num_images: int) -> None:
+def settle_manifest(folder: Path, kind: Kind, recipe: Mapping[str, Any], sizes: Mapping[str, int]) -> None:
     """Write the manifest, or compare it with the one that is there. Whoever calls holds the store's lock.
+
+    Args:
+        folder: the store's.
+        kind: what it holds.
+        recipe: what that is made from.
+        sizes: lengths of its axes by name, which the manifest tells as well.
 
     Raises:
         InputError: the store was made from something else, or its manifest cannot be understood.
         OSError: it cannot be read or written.
     """
-    content = {"format": FORMAT, "num_images": num_images, "recipe": recipe}
-    expected = json.loads(json.dumps({**content, "fingerprint": recipe_fingerprint(recipe)}))  # tuples become lists
+    content = {"format": kind.format, **sizes, "recipe": recipe, "fingerprint": recipe_fingerprint(recipe, kind)}
+    expected = json.loads(json.dumps(content))  # tuples become lists
     path = folder / MANIFEST
     if not path.exists():
         for leftover in filter(_is_leftover, folder.iterdir()):
             leftover.unlink()
         _write(path, expected)
-    found = _read(path)
+    found = _read(path, kind)
     if difference := _difference(found, expected):
         raise InputError(
-            f"{path}: these features were made with {difference}; choose another path, or delete this folder"
+            f"{path}: these {kind.content} were made with {difference}; choose another path, or delete this folder"
         )
 
 
@@ -84,12 +116,12 @@ def _write(path: Path, manifest: Mapping[str, Any]) -> None:
         os.fsync(file.fileno())  # what comes later is on disk when it is written; so must this be
 
 
-def _read(path: Path) -> Any:
+def _read(path: Path, kind: Kind) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))["attributes"]["mfvpr"]
     except (ValueError, KeyError, TypeError):
         raise InputError(
-            f"{path}: expected the manifest of a feature store, got something else; choose another path, or delete "
+            f"{path}: expected the manifest of a {kind.store}, got something else; choose another path, or delete "
             "this folder"
         ) from None
 

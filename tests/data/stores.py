@@ -1,15 +1,20 @@
-"""Small feature stores, for tests."""
+"""Small stores of features and of matches, for tests."""
 
 import hashlib
+import shutil
 import subprocess
 import sys
-from dataclasses import fields
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from mfvpr import Features
+from mfvpr import Features, Matches
 from mfvpr.data.feature_store import open_store
+from mfvpr.data.match_store import QueryMatches, open_match_store
 from tests.builders import make_features
 
 ROOT = Path(__file__).parents[2]
@@ -18,7 +23,9 @@ RECIPE = {
     "extractor": {"name": "d2net", "max_keypoints": 800, "image_size": (336, 336), "sigma": 1.6},
     "images": [{"name": f"{row}.png", "sha256": f"{row:064x}"} for row in range(3)],
 }
+MATCH_RECIPE = {"features": "0123", "shortlist": {"name": "mixvpr", "candidates": 4}, "cross_check": "mutual"}
 ARRAYS = ("descriptors", "keypoints", "scores", "image_size", "count")
+MATCH_ARRAYS = ("query", "candidate", "shortlist", "filter_scores", "sizes", "count")
 
 
 def features_of(row: int, count: int = 40, dimension: int = 16) -> Features:
@@ -30,18 +37,75 @@ def assert_same(got: Features, expected: Features) -> None:
         np.testing.assert_array_equal(getattr(got, part.name), getattr(expected, part.name))
 
 
-def fill(folder: Path, num_images: int = 3, batch: int = 2) -> list[int]:
+def matches_of(row: int, counts: tuple[int, ...] = (30, 0, 25, 5)) -> QueryMatches:
+    """Matches of one query with so many matches of each candidate; no candidate where there are none."""
+    rng, total = np.random.default_rng(row), sum(counts)
+    numbers = lambda *shape: rng.uniform(0, 336, shape).astype(np.float32)  # noqa: E731
+    flat = Matches(
+        points0=numbers(total, 2),
+        points1=numbers(total, 2),
+        distance=numbers(total),
+        scores0=numbers(total),
+        scores1=numbers(total),
+        mask=np.ones(total, bool),
+        image_size0=numbers(2),
+        image_size1=numbers(len(counts), 2),
+        ratio=numbers(total),
+    )
+    indices = np.where(np.array(counts) > 0, rng.permutation(len(counts)), -1).astype(np.int32)
+    return QueryMatches(flat, np.array(counts, np.int32), indices, numbers(len(counts)))
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A kind of store, for tests of what all kinds have in common."""
+
+    open: Callable[[Path, int], AbstractContextManager[Any]]
+    row_of: Callable[..., Any]
+    arrays: tuple[str, ...]
+
+
+FEATURES = Subject(lambda folder, rows: open_store(folder, RECIPE, num_images=rows), features_of, ARRAYS)
+MATCHES = Subject(
+    lambda folder, rows: open_match_store(folder, MATCH_RECIPE, num_queries=rows, num_candidates=4),
+    matches_of,
+    MATCH_ARRAYS,
+)
+
+
+def fill(folder: Path, num_rows: int = 3, batch: int = 2, subject: Subject = FEATURES) -> list[int]:
     """Do what is not done; the rows that were not."""
-    with open_store(folder, RECIPE, num_images=num_images) as store:
+    with subject.open(folder, num_rows) as store:
         todo = np.flatnonzero(~store.done).tolist()
         for start in range(0, len(todo), batch):
-            store.write({row: features_of(row) for row in todo[start : start + batch]})
+            store.write({row: subject.row_of(row) for row in todo[start : start + batch]})
     return todo
 
 
-def read_all(folder: Path, num_images: int = 3) -> dict[int, Features]:
-    with open_store(folder, RECIPE, num_images=num_images) as store:
+def read_all(folder: Path, num_rows: int = 3, subject: Subject = FEATURES) -> dict[int, Any]:
+    with subject.open(folder, num_rows) as store:
         return dict(store.read())
+
+
+def chunk_of(folder: Path, name: str, row: int = 1) -> Path:
+    [path] = (folder / name).glob(f"c.{row}*")
+    return path
+
+
+def flip(path: Path, position: int) -> None:
+    content = bytearray(path.read_bytes())
+    content[position] ^= 1 << position % 8
+    path.write_bytes(content)
+
+
+DAMAGE: dict[str, Callable[[Path], Any]] = {
+    "missing": Path.unlink,
+    "empty": lambda path: path.write_bytes(b""),
+    "short": lambda path: path.write_bytes(path.read_bytes()[:-3]),
+    "long": lambda path: path.write_bytes(path.read_bytes() + b"abc"),
+    "flipped": lambda path: flip(path, path.stat().st_size // 2),
+    "swapped": lambda path: shutil.copy(path.parent.parent / "count" / "zarr.json", path),
+}
 
 
 def digests(folder: Path) -> dict[str, str]:

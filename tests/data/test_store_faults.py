@@ -1,4 +1,4 @@
-"""The feature store when processes are killed, files are damaged and disks are full."""
+"""Stores when processes are killed, files are damaged and disks are full."""
 
 import json
 import os
@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,23 @@ import pytest
 
 from mfvpr import InputError
 from mfvpr.data.feature_store import forecast_bytes, open_store
-from tests.data.stores import ARRAYS, RECIPE, ROOT, digests, features_of, fill, read_all, run_here
+from tests.data.stores import (
+    ARRAYS,
+    DAMAGE,
+    FEATURES,
+    MATCHES,
+    RECIPE,
+    ROOT,
+    Subject,
+    chunk_of,
+    digests,
+    features_of,
+    fill,
+    flip,
+    matches_of,
+    read_all,
+    run_here,
+)
 
 # Two processes
 
@@ -56,34 +73,13 @@ def test_the_lock_holds_within_a_process_and_ends_with_an_error(tmp_path):
 # Damage
 
 
-def _chunk(folder: Path, name: str, row: int = 1) -> Path:
-    [path] = (folder / name).glob(f"c.{row}*")
-    return path
-
-
-def _flip(path: Path, position: int) -> None:
-    content = bytearray(path.read_bytes())
-    content[position] ^= 1 << position % 8
-    path.write_bytes(content)
-
-
-DAMAGE = {
-    "missing": Path.unlink,
-    "empty": lambda path: path.write_bytes(b""),
-    "short": lambda path: path.write_bytes(path.read_bytes()[:-3]),
-    "long": lambda path: path.write_bytes(path.read_bytes() + b"abc"),
-    "flipped": lambda path: _flip(path, path.stat().st_size // 2),
-    "swapped": lambda path: shutil.copy(path.parent.parent / "image_size" / "zarr.json", path),
-}
-
-
 @pytest.mark.parametrize("damage", DAMAGE)
 @pytest.mark.parametrize("name", ARRAYS)
 def test_a_damaged_image_is_told_and_extracted_anew(tmp_path, name, damage):
     folder = tmp_path / "s"
     fill(folder)
     before = digests(folder)
-    DAMAGE[damage](_chunk(folder, name))
+    DAMAGE[damage](chunk_of(folder, name))
     if name != "count":  # without its count an image is not done, and that is that
         with open_store(folder, RECIPE, num_images=3) as store:
             assert store.done.all()
@@ -103,14 +99,14 @@ def test_every_flipped_bit_is_noticed(tmp_path, name):
     folder = tmp_path / "s"
     with open_store(folder, RECIPE, num_images=1) as store:
         store.write({0: features_of(0, 3, 4)})
-    path = _chunk(folder, name, 0)
+    path = chunk_of(folder, name, 0)
     whole = path.read_bytes()
-    flag = _chunk(folder, "count", 0)
+    flag = chunk_of(folder, "count", 0)
     counted = flag.read_bytes()
     for position in range(len(whole)):
         flag.write_bytes(counted)
         path.write_bytes(whole)
-        _flip(path, position)
+        flip(path, position)
         with open_store(folder, RECIPE, num_images=1) as store:
             assert store.done.all() == (name != "count")
             if name != "count":
@@ -143,27 +139,31 @@ def test_a_missing_array_is_made_again(tmp_path, name):
 
 # Kill -9
 
-NUM_IMAGES = 60
+NUM_ROWS = 60
+LARGER: dict[str, Subject] = {
+    "features": replace(FEATURES, row_of=lambda row: features_of(row, 200, 64)),
+    "matches": replace(MATCHES, row_of=lambda row: matches_of(row, (300, 0, 1, 200))),
+}
 
 
-def _extract(folder: Path, log: Path, ready: int) -> None:
+def _make(subject: Subject, folder: Path, log: Path, ready: int) -> None:
     """A child process: do what is not done, noting each row, and saying so before the first is written."""
-    with open_store(folder, RECIPE, num_images=NUM_IMAGES) as store:
+    with subject.open(folder, NUM_ROWS) as store:
         todo = np.flatnonzero(~store.done).tolist()
         for start in range(0, len(todo), 4):
-            batch = {row: features_of(row, 200, 64) for row in todo[start : start + 4]}
+            batch = {row: subject.row_of(row) for row in todo[start : start + 4]}
             with log.open("a") as file:
                 file.writelines(f"{row}\n" for row in batch)
             os.write(ready, b".")
             store.write(batch)
 
 
-def _child(folder: Path, log: Path, delay: float | None, *, from_first_write: bool) -> int:
+def _child(subject: Subject, folder: Path, log: Path, delay: float | None, *, from_first_write: bool) -> int:
     """Exit status of a child that is killed after `delay` s; None = not at all."""
     reading, writing = os.pipe()
     if (pid := os.fork()) == 0:
         os.close(reading)
-        _extract(folder, log, writing)
+        _make(subject, folder, log, writing)
         os._exit(0)
     os.close(writing)
     if delay is not None:
@@ -180,37 +180,38 @@ def _rows(folder: Path, name: str) -> set[int]:
     return {int(path.name.split(".")[1]) for path in folder.glob(f"{name}/c.*") if not path.name.endswith("__lock")}
 
 
-def kill_rounds(root: str, rounds: int) -> None:
-    """Kill `rounds` extractions at random times, finish them all, and print what happened.
+def kill_rounds(root: str, kind: str, rounds: int) -> None:
+    """Kill `rounds` processes at random times, finish their work, and print what happened.
 
     Forks before tensorstore starts its threads, which saves a second of imports per round.
     """
-    rng = np.random.default_rng(0)
+    rng, subject = np.random.default_rng(0), LARGER[kind]
     told = {"killed": 0, "torn": 0, "twice": 0, "failed": 0, "stores": 0, "different": 0}
-    _child(Path(root, "whole"), Path(root, "log"), None, from_first_write=False)
+    _child(subject, Path(root, "whole"), Path(root, "log"), None, from_first_write=False)
     expected = digests(Path(root, "whole"))
     while told["killed"] < rounds:
         folder, told["stores"] = Path(root, str(told["stores"])), told["stores"] + 1
-        while len(_rows(folder, "count")) < NUM_IMAGES:
+        while len(_rows(folder, "count")) < NUM_ROWS:
             done, log = _rows(folder, "count"), Path(root, "log")
             log.write_text("")
             finish = told["killed"] == rounds
             early = rng.random() < 0.3  # while the store is made or opened
             delay = None if finish else rng.uniform(0, 0.02 if early else 0.03)
-            status = _child(folder, log, delay, from_first_write=not early)
+            status = _child(subject, folder, log, delay, from_first_write=not early)
             told["killed"] += status == signal.SIGKILL
             told["failed"] += status not in (0, signal.SIGKILL)
             told["twice"] += len(done.intersection(map(int, log.read_text().split())))
             leftovers = any(folder.rglob("*__lock")) or any(folder.glob(".zarr-*"))
-            told["torn"] += leftovers or any(_rows(folder, name) != _rows(folder, "count") for name in ARRAYS)
+            told["torn"] += leftovers or any(_rows(folder, name) != _rows(folder, "count") for name in subject.arrays)
         told["different"] += digests(folder) | {"lock": ""} != expected | {"lock": ""}
     print(json.dumps(told))
 
 
-def test_killed_extractions_end_in_the_same_files(tmp_path):
-    told = json.loads(run_here(f"kill_rounds({str(tmp_path)!r}, 50)"))
-    assert told["killed"] == 50
-    assert told["torn"] >= 20  # kills in the middle of writing, as the files show
+@pytest.mark.parametrize(("kind", "rounds", "torn"), [("features", 50, 20), ("matches", 30, 10)])
+def test_killed_processes_end_in_the_same_files(tmp_path, kind, rounds, torn):
+    told = json.loads(run_here(f"kill_rounds({str(tmp_path)!r}, {kind!r}, {rounds})"))
+    assert told["killed"] == rounds
+    assert told["torn"] >= torn  # kills in the middle of writing, as the files show
     assert (told["failed"], told["twice"], told["different"]) == (0, 0, 0)
 
 
