@@ -22,24 +22,24 @@ PATHS = {"database", "queries", "root", "index_file", "cache", "store", "out"}
 CONF = Path(__file__).parent.parent / "conf"
 
 
-def launch(program: Callable[[dict[str, Any]], None]) -> None:
-    """`program(settings)` with the settings of conf/ and the command line, as plain and checked values."""
+def launch(program: Callable[[dict[str, Any]], None], config: str = "config") -> None:
+    """`program(settings)` with the settings of conf/`config`.yaml and the command line, as plain and checked values."""
 
-    def task(config: DictConfig) -> None:
-        with one_line(), _our_words():  # in here, or Hydra adds lines of its own
-            for name in sorted(OmegaConf.missing_keys(config)):
+    def task(found: DictConfig) -> None:
+        with one_line(), _our_words(config):  # in here, or Hydra adds lines of its own
+            for name in sorted(OmegaConf.missing_keys(found)):
                 raise SettingsError(_no_default(name))
-            settings: Any = OmegaConf.to_container(config, resolve=True)
+            settings: Any = OmegaConf.to_container(found, resolve=True)
             check(settings)
             program(settings)
 
     unwind_on_sigterm()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises instead of printing and exiting with 1
-    with one_line(), _our_words():
+    with one_line(), _our_words(config):
         for argument in sys.argv[1:]:
             _check_form(argument)
         sys.argv[1:] = map(_as_typed, sys.argv[1:])
-        hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(task)()
+        hydra.main(version_base="1.3", config_path=str(CONF), config_name=config)(task)()
 
 
 def _check_form(argument: str) -> None:
@@ -79,15 +79,15 @@ def _unparsable(argument: str) -> bool:
 
 
 @contextmanager
-def _our_words() -> Iterator[None]:
+def _our_words(config: str) -> Iterator[None]:
     """Hydra's errors as ours."""
     try:
         yield
     except (HydraException, OmegaConfBaseException) as error:
-        raise SettingsError(_explain(error)) from error
+        raise SettingsError(_explain(error, config)) from error
 
 
-def _explain(error: Exception) -> str:
+def _explain(error: Exception, config: str) -> str:
     """One line of a Hydra message, with the nearest setting where one is unknown."""
     text = " ".join((str(error) or str(error.__cause__)).split())
     text = text.partition(" Config search path")[0].partition(" See https")[0]
@@ -97,7 +97,7 @@ def _explain(error: Exception) -> str:
     if not unknown:
         return text
     wrong = unknown.group(1)
-    nearest = max(_setting_names(), key=lambda name: _likeness(wrong, name))
+    nearest = max(_setting_names(config), key=lambda name: _likeness(wrong, name))
     alike = max(_likeness(wrong, nearest)) >= 0.6
     return f"{wrong}: unknown setting; " + (f"the nearest is {nearest}" if alike else "see --help")
 
@@ -113,13 +113,12 @@ def _likeness(wrong: str, name: str) -> tuple[float, float]:
     return last, whole
 
 
-def _setting_names() -> list[str]:
+def _setting_names(config: str) -> list[str]:
     """Every setting of the configuration that the command line's groups choose."""
     groups = [path.name for path in CONF.iterdir() if path.is_dir()]
     choices = [argument for argument in sys.argv[1:] if argument.partition("=")[0] in groups]
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        config = hydra.compose("config", choices)
-    names, pending = [], [("", config)]
+        names, pending = [], [("", hydra.compose(config, choices))]
     while pending:
         prefix, node = pending.pop()
         for name in node:

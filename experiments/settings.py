@@ -66,6 +66,11 @@ _TEXT = Rule(lambda value: isinstance(value, str) and bool(value), "text")
 _FLAG = _one_of(True, False)
 _WEIGHT = _one_of("fs", "dmf", "unit")
 
+
+def _axis(rule: Rule) -> Rule:
+    return _or(_list_of(rule), None)
+
+
 RULES: dict[str, Rule] = {
     "dataset.name": Rule(
         lambda value: isinstance(value, str) and bool(re.fullmatch(r"[\w-][\w.-]*", value)), "letters, digits, - and _"
@@ -132,6 +137,14 @@ RULES: dict[str, Rule] = {
     "on_bad_image": _one_of("fail", "skip"),
     "figures": _INDEX,
     "out": _or(_TEXT, None),
+    # sweeps
+    "temperature": _or(_POSITIVE, None),
+    "search": _one_of("grid", "optuna"),
+    "trials": _between(1, 100_000),
+    "split": _one_of(None, "first_half", "second_half", "both"),
+    "resamples": _between(100, 1_000_000),
+    "chunk.settings": _or(_COUNT, None),
+    "chunk.queries": _or(_COUNT, None),
 }
 
 
@@ -140,6 +153,7 @@ def check(settings: Mapping[str, Any]) -> None:
     for path, value in _leaves(settings, ""):
         *_, group, name = f".{path}".split(".")
         rule = RULES.get(f"{group}.{name}") or RULES.get(name)
+        rule = _axis(rule) if group == "grid" and rule else rule
         if rule is None:
             raise SettingsError(f"{path}={value}: this is a group of settings; set one of its members (see --help)")
         if not rule.holds(value):

@@ -1,14 +1,17 @@
-"""Features on disk: which store belongs to a run, what it will take, and what it took."""
+"""Features and matches on disk: which store belongs to a run, what it will take, and what it took."""
 
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from experiments import build
+from mfvpr.data import feature_store, match_store
 from mfvpr.data.datasets import ImageFolder
-from mfvpr.data.feature_store import FeatureStore, forecast_bytes, open_store, require_space
-from mfvpr.data.store_manifest import store_path
+from mfvpr.data.feature_store import FeatureStore, open_store, require_space
+from mfvpr.data.match_store import MatchStore, open_match_store
+from mfvpr.data.store_manifest import MATCHES, store_path
 from mfvpr.features import GlobalExtractor, LocalExtractor
 from mfvpr.report.runs import versions
 
@@ -38,11 +41,11 @@ def opened(
     if root is None:
         yield None
         return
-    recipe = _recipe(settings, images)
+    recipe = features_recipe(settings, images)
     with open_store(store_path(build.expanded(root), name, recipe), recipe, num_images=len(folder)) as store:
         missing = len(folder) - int(store.done.sum())
         if missing:
-            needed = forecast_bytes(missing, extractor.typical_count, extractor.dimension)
+            needed = feature_store.forecast_bytes(missing, extractor.typical_count, extractor.dimension)
             require_space(store.folder, needed)
             _tell(
                 f"{name}: {missing} of {len(folder)} images to do, about {extractor.typical_count} features of "
@@ -55,7 +58,39 @@ def opened(
             _tell(_account(name, store, settings))
 
 
-def _recipe(settings: dict[str, Any], images: str) -> dict[str, Any]:
+@contextmanager
+def opened_matches(
+    root: str, name: str, recipe: dict[str, Any], num_queries: int, num_candidates: int, typical_matches: int
+) -> Iterator[MatchStore]:
+    """The store of a run's matches, announced.
+
+    Args:
+        root: folder of all stores.
+        name: whose matches, for people.
+        recipe: what they are made from, see `matches_recipe`.
+        num_queries: Q.
+        num_candidates: C.
+        typical_matches: of a pair, about.
+    """
+    path = matches_path(root, name, recipe)
+    with open_match_store(path, recipe, num_queries=num_queries, num_candidates=num_candidates) as store:
+        missing = num_queries - int(store.done.sum())
+        if missing:
+            needed = match_store.forecast_bytes(missing, num_candidates, typical_matches)
+            require_space(store.folder, needed)
+            _tell(f"{name}: {missing} of {num_queries} queries to match with {num_candidates} candidates: about "
+                  f"{needed / MB:.1f} MB in {store.folder}")  # fmt: skip
+        else:
+            _tell(f"{name}: all {num_queries} queries from {store.folder}")
+        yield store
+
+
+def matches_path(root: str, name: str, recipe: dict[str, Any]) -> Path:
+    """Where a run's matches are kept."""
+    return store_path(build.expanded(root), name, recipe, MATCHES)
+
+
+def features_recipe(settings: dict[str, Any], images: str) -> dict[str, Any]:
     """All that changes features; how many images go through a network at once does not."""
     recipe = {key: value for key, value in settings.items() if key != "batch_size"}
     if "weights" in recipe:
@@ -64,6 +99,18 @@ def _recipe(settings: dict[str, Any], images: str) -> dict[str, Any]:
         recipe["weights_sha256"] = fingerprint(recipe["weights"])
     decoders = {name: versions()[name] for name in ("mfvpr", "opencv-python-headless", "pillow")}
     return {"extractor": recipe, "images": images, "versions": decoders}
+
+
+def matches_recipe(settings: dict[str, Any], images: dict[str, str], num_candidates: int) -> dict[str, Any]:
+    """All that changes a shortlist and its matches: features and descriptors of both sides, and the matching."""
+    matching = {key: value for key, value in settings["matching"].items() if key != "chunk_size"}
+    return {
+        side: {
+            "features": features_recipe(settings["features"], fingerprint),
+            "descriptors": features_recipe(settings["retrieval"], fingerprint),
+        }
+        for side, fingerprint in images.items()
+    } | {"candidates": num_candidates, "matching": matching, "on_bad_image": settings["on_bad_image"]}
 
 
 def _account(name: str, store: FeatureStore, settings: dict[str, Any]) -> str:

@@ -7,7 +7,7 @@ rankings become recall. The names below are the core of that sentence, on arrays
 
 from mfvpr.errors import InputError
 from mfvpr.evaluation import frame_positives, radius_positives, recall_at_k
-from mfvpr.matching import compact, filter_matches, match, match_candidates
+from mfvpr.matching import compact, filter_matches, match, match_candidates, soft_match
 from mfvpr.reranking import balancing_c, combine, rank, rerank, score_candidates, score_grid
 from mfvpr.retrieval import retrieve
 from mfvpr.scoring import AggregatedScore, AnchorPoints, HistogramOfShifts, MatchCount, ShiftHistogram
@@ -44,4 +44,5 @@ __all__ = [
     "retrieve",
     "score_candidates",
     "score_grid",
+    "soft_match",
 ]

@@ -1,4 +1,4 @@
-"""Features of two images -> Matches: mutual nearest neighbors, and filters of the matches found.
+"""Features of two images -> Matches: nearest neighbors, hard or soft, and filters of the matches found.
 
 The similarity matrix is the cost. It is formed once per pair, read four times while it is in cache (the maxima of its
 rows and columns, and the first place of each) and never stored for more than one chunk of candidates. `argmax` would
@@ -12,13 +12,16 @@ from typing import Any, Literal, get_args
 import jax
 import jax.numpy as jnp
 
-from mfvpr.numerics import masked, safe_sqrt
+from mfvpr.numerics import as_float, masked, safe_sqrt
 from mfvpr.types import Array, Features, Matches
 
 CrossCheck = Literal["mutual", "opencv_legacy", "none"]
+_PER_MATCH = ("points0", "points1", "distance", "scores0", "scores1", "ratio", "confidence")
 
 
-def match(features0: Features, features1: Features, *, cross_check: CrossCheck = "mutual") -> Matches:
+def match(
+    features0: Features, features1: Features, *, cross_check: CrossCheck = "mutual", with_ratio: bool = False
+) -> Matches:
     """Nearest neighbors of one pair of images (paper, section IV-A).
 
     Slot k of the result belongs to keypoint k of image 0 (K = N0); the first index wins a tie.
@@ -29,6 +32,9 @@ def match(features0: Features, features1: Features, *, cross_check: CrossCheck =
         cross_check: `mutual` keeps i, j where each is the other's nearest. `opencv_legacy` is OpenCV's BFMatcher
             before 2019: every candidate keypoint picks its nearest query keypoint, which keeps the closest of its
             suitors. `none` keeps the nearest of every query keypoint. (The paper says cross-check.)
+        with_ratio: also give the ratio of the distances to the nearest and the second nearest descriptor of the
+            candidate, matched or not (Lowe, IJCV 2004): 1 where both are 0 or there is no second. It costs another
+            pass over the similarities.
 
     Returns:
         Matches with K = N0 slots. A descriptor that is not finite matches nothing.
@@ -36,18 +42,53 @@ def match(features0: Features, features1: Features, *, cross_check: CrossCheck =
     if cross_check not in get_args(CrossCheck):
         raise ValueError(f"cross_check={cross_check!r}: expected one of {', '.join(get_args(CrossCheck))}")
     features0, features1 = jax.tree.map(jnp.asarray, (features0, _at_least_one(features1)))
-    nearest1, valid = _neighbors(_similarity(features0, features1), cross_check)
-    # The difference, not sqrt(2 - 2 cos): in float32 that would turn a distance of 0 into up to 3.5e-4.
-    difference = masked(features0.descriptors - features1.descriptors[nearest1], valid)
+    similarity = _similarity(features0, features1)
+    nearest1, valid = _neighbors(similarity, cross_check)
     return Matches(
         points0=features0.keypoints,
         points1=features1.keypoints[nearest1],
-        distance=safe_sqrt(jnp.sum(difference * difference, axis=-1)),
+        distance=_distance(features0, features1, nearest1, valid),
         scores0=features0.scores,
         scores1=features1.scores[nearest1],
         mask=valid,
         image_size0=features0.image_size,
         image_size1=features1.image_size,
+        ratio=_ratio(features0, features1, similarity) if with_ratio else None,
+    )
+
+
+def soft_match(features0: Features, features1: Features, *, temperature: float | Array) -> Matches:
+    """`match` of one pair made smooth: a dual softmax over the similarities s_ij (Rocco et al., NeurIPS 2018).
+
+    With R the softmax of s / T over the candidate's keypoints j and C that over the query's i, slot i goes to the
+    means of points, scores and squared distances 2 - 2 s_ij under R, with confidence sum_j R_ij C_ij. As T -> 0 that is
+    `match`: the neighbor, with confidence 1 where it is mutual and 0 elsewhere.
+
+    Args:
+        features0: query, keypoints `[N0, 2]`; padding may hold anything.
+        features1: candidate, keypoints `[N1, 2]`.
+        temperature: T, in units of the similarity, which lies in [-1, 1]; not above 0 gives NaN.
+
+    Returns:
+        Matches with K = N0 slots, real where the query has a keypoint with a finite descriptor and the candidate any.
+    """
+    features0, features1 = jax.tree.map(jnp.asarray, (features0, _at_least_one(features1)))
+    real0, real1 = (f.mask & jnp.all(jnp.isfinite(f.descriptors), axis=-1) for f in (features0, features1))
+    similarity = _products(masked(features0.descriptors, real0), masked(features1.descriptors, real1))
+    temperature = jnp.asarray(temperature, dtype=similarity.dtype)
+    logits = similarity / jnp.where(temperature > 0, temperature, jnp.nan)
+    real = real0[:, None] & real1[None]
+    rows, columns = (_softmax(logits, real, axis) for axis in (1, 0))
+    return Matches(
+        points0=features0.keypoints,
+        points1=_products(rows, masked(as_float(features1.keypoints), real1).T),
+        distance=safe_sqrt(2 - 2 * jnp.sum(rows * similarity, axis=1)),
+        scores0=features0.scores,
+        scores1=jnp.sum(rows * masked(as_float(features1.scores), real1)[None], axis=1),
+        mask=jnp.any(real, axis=1),
+        image_size0=features0.image_size,
+        image_size1=features1.image_size,
+        confidence=jnp.minimum(jnp.sum(rows * columns, axis=1), 1.0),  # rounding may exceed 1
     )
 
 
@@ -56,6 +97,7 @@ def match_candidates(
     candidates: Features,
     *,
     cross_check: CrossCheck = "mutual",
+    with_ratio: bool = False,
     chunk_size: int | None = None,
 ) -> Matches:
     """`match` of one query with C candidates.
@@ -64,13 +106,14 @@ def match_candidates(
         query: keypoints `[N0, 2]`.
         candidates: keypoints `[C, N1, 2]`.
         cross_check: as in `match`.
+        with_ratio: as in `match`.
         chunk_size: candidates whose similarity matrices exist at the same time; by default 1 on a CPU, where the
             matrix then stays in cache, and all of them elsewhere.
 
     Returns:
         Matches with leading axis C and K = N0 slots.
     """
-    one = lambda candidate: match(query, candidate, cross_check=cross_check)  # noqa: E731
+    one = lambda candidate: match(query, candidate, cross_check=cross_check, with_ratio=with_ratio)  # noqa: E731
     return _chunked_map(one, candidates, len(candidates.mask), chunk_size)
 
 
@@ -80,6 +123,7 @@ def match_shortlist(
     indices: Array,
     *,
     cross_check: CrossCheck = "mutual",
+    with_ratio: bool = False,
     chunk_size: int | None = None,
 ) -> Matches:
     """`match` of one query with the rows `indices` `[C]` of a database `[M, N1, ...]`; -1 gives no matches.
@@ -90,7 +134,7 @@ def match_shortlist(
     def one(index: Array) -> Matches:
         candidate = jax.tree.map(lambda field: jnp.asarray(field)[jnp.maximum(index, 0)], database)
         candidate = replace(candidate, mask=candidate.mask & (index >= 0))
-        return match(query, candidate, cross_check=cross_check)
+        return match(query, candidate, cross_check=cross_check, with_ratio=with_ratio)
 
     return _chunked_map(one, indices, len(indices), chunk_size)
 
@@ -130,16 +174,8 @@ def compact(matches: Matches, capacity: int) -> Matches:
         values = jnp.asarray(values)
         return values[slots] if len(values) else jnp.zeros((capacity, *values.shape[1:]), values.dtype)
 
-    return Matches(
-        points0=packed(matches.points0),
-        points1=packed(matches.points1),
-        distance=packed(matches.distance),
-        scores0=packed(matches.scores0),
-        scores1=packed(matches.scores1),
-        mask=jnp.arange(capacity) < jnp.sum(matches.mask),
-        image_size0=matches.image_size0,
-        image_size1=matches.image_size1,
-    )
+    per_match = jax.tree.map(packed, {name: getattr(matches, name) for name in _PER_MATCH})
+    return replace(matches, mask=jnp.arange(capacity) < jnp.sum(matches.mask), **per_match)
 
 
 def _at_least_one(features: Features) -> Features:
@@ -155,9 +191,37 @@ def _at_least_one(features: Features) -> Features:
 
 def _similarity(features0: Features, features1: Features) -> Array:
     """`[N0, N1]` dot products, -inf where either keypoint is padding or its descriptor is not finite."""
-    products = jnp.matmul(features0.descriptors, features1.descriptors.T, precision=jax.lax.Precision.HIGHEST)
+    products = _products(features0.descriptors, features1.descriptors)
     real = features0.mask[:, None] & features1.mask[None] & jnp.isfinite(products)
     return jnp.where(real, products, -jnp.inf)
+
+
+def _products(rows0: Array, rows1: Array) -> Array:
+    """Dot products of all rows of both, in full precision on every device."""
+    return jnp.matmul(rows0, rows1.T, precision=jax.lax.Precision.HIGHEST)
+
+
+def _softmax(logits: Array, real: Array, axis: int) -> Array:
+    """Softmax over the real entries along `axis`; 0 elsewhere, also where none is real."""
+    lowest = jnp.finfo(logits.dtype).min  # not -inf, whose softmax over nothing real is NaN, and so is its gradient
+    return masked(jax.nn.softmax(jnp.where(real, logits, lowest), axis=axis), real)
+
+
+def _distance(features0: Features, features1: Features, index1: Array, real: Array) -> Array:
+    """`[N0]` distances to the candidate's descriptors `index1`; 0 where not `real`."""
+    # The difference, not sqrt(2 - 2 cos): in float32 that would turn a distance of 0 into up to 3.5e-4.
+    difference = masked(features0.descriptors - features1.descriptors[index1], real)
+    return safe_sqrt(jnp.sum(difference * difference, axis=-1))
+
+
+def _ratio(features0: Features, features1: Features, similarity: Array) -> Array:
+    """`[N0]` distance to the nearest descriptor over that to the second nearest; 1 where there is no second."""
+    nearest, _ = _neighbors(similarity, "none")
+    columns = jnp.arange(similarity.shape[1], dtype=jnp.int32)
+    second, some = _neighbors(jnp.where(columns[None] == nearest[:, None], -jnp.inf, similarity), "none")
+    closest, next_closest = (_distance(features0, features1, index, some) for index in (nearest, second))
+    apart = some & (closest < next_closest)  # not where both are 0, nor where rounding swaps two of one distance
+    return jnp.where(apart, closest / jnp.where(apart, next_closest, 1.0), 1.0)
 
 
 def _first(hit: Array, axis: int) -> Array:

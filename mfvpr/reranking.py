@@ -4,49 +4,141 @@ Scorers know one pair; here is where `vmap` (over candidates) and `lax.map` (ove
 """
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mfvpr.numerics import is_concrete, masked
+from mfvpr.matching import filter_matches
+from mfvpr.numerics import is_concrete, masked, round_up
 from mfvpr.scoring import HistogramOfShifts, Scorer
 from mfvpr.types import Array, Matches, Ranking
+from mfvpr.weighting import ChosenWeight, Weight, match_weights
+
+WEIGHTINGS = ("weight", "max_distance")  # what only changes how much a match counts
+BIN_STEP = 8  # capacities of histograms are multiples of it
 
 
 def score_candidates(scorer: Scorer, matches: Matches) -> Array:
     """Scores `[C]` of matches `[C, K, ...]`."""
-    return jax.vmap(_fit(scorer, matches))(matches)
+    return jax.vmap(_fit(scorer, matches.image_size0, matches.image_size1))(matches)
 
 
-def score_grid(scorer: Any, matches: Matches, **axes: Sequence[float] | Array) -> Array:
+def score_settings(
+    scorer: Any, matches: Matches, settings: Mapping[str, Array], weightings: Mapping[str, Array]
+) -> Array:
+    """Scores `[G, W, C]` of matches `[C, K, ...]` by one scorer with every pair of G settings and W weightings.
+
+    One after the other, since all at once would leave the cache; one traced computation, so that other values cost no
+    compilation.
+
+    Args:
+        scorer: the scorer whose other parameters stay; a histogram with a capacity that serves every `bin_size`.
+        matches: `[C, K, ...]`.
+        settings: `[G]` values of the scorer's numeric parameters; none: G = 1.
+        weightings: `[W]` values of what only says how much a match counts, which is cheap to vary: `max_distance`
+            (matches further apart do not count) and `weight` (an option of the scorer's `ChosenWeight`); none: W = 1.
+    """
+
+    def one(setting: dict[str, Array]) -> Array:
+        chosen = replace(scorer, **setting)
+        return jax.vmap(partial(_score_weightings, chosen, weightings=weightings), out_axes=-1)(matches)
+
+    return _map(one, settings)
+
+
+def _score_weightings(scorer: Any, matches: Matches, weightings: Mapping[str, Array]) -> Array:
+    """Scores `[W]` of one pair."""
+
+    def weighted(weighting: dict[str, Array]) -> tuple[Any, Matches]:
+        near = filter_matches(matches, max_distance=weighting.get("max_distance"))
+        if "weight" not in weighting:
+            return scorer, near
+        return replace(scorer, weight=replace(scorer.weight, index=weighting["weight"])), near
+
+    def weights(weighting: dict[str, Array]) -> Array:
+        chosen, near = weighted(weighting)
+        return match_weights(chosen.weight, near)
+
+    def score(weighting: dict[str, Array]) -> Array:
+        chosen, near = weighted(weighting)
+        return chosen(near)
+
+    if isinstance(scorer, HistogramOfShifts):  # its Gaussians are the same for all weightings
+        return scorer.reweighted(matches, _map(weights, weightings))
+    return _map(score, weightings)
+
+
+def _map(function: Callable[[dict[str, Array]], Array], values: Mapping[str, Array]) -> Array:
+    """`function` of every row of `values`, one at a time; of no values, once."""
+    return jax.lax.map(function, dict(values)) if values else function({})[None]
+
+
+def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> Array:
     """Scores of every combination of parameter values, `[len(axis1), len(axis2), ..., C]`.
 
-    The grid is one traced computation: other values cost no compilation, other lengths do.
+    The grid is one traced computation for each capacity of bins that its values ask for, so that fine bins do not
+    slow coarse ones down: other values cost no compilation within them, other lengths do.
 
     Args:
         scorer: the scorer whose other parameters stay.
         matches: `[C, K, ...]`.
-        **axes: values of the scorer's numeric parameters, e.g. `sigma=[10., 22.5], bin_size=[10., 15.]`.
+        **axes: values of the scorer's numeric parameters, e.g. `sigma=[10., 22.5], bin_size=[10., 15.]`; of
+            `max_distance`, beyond which matches do not count; and of `weight`, e.g. `weight=[UnitWeight(), ...]`.
 
     Raises:
         ValueError: an axis is empty, not one-dimensional, or names no numeric parameter of the scorer.
     """
     if not axes:
         raise ValueError("score_grid: expected at least one axis, such as sigma=[10.0, 22.5]")
-    values = [_axis(scorer, name, axis) for name, axis in axes.items()]
-    lengths = [len(axis) for axis in values]
-    points = [point.reshape(-1) for point in jnp.meshgrid(*values, indexing="ij")]
-    settings = dict(zip(axes, points, strict=True))
-    scorer = _fit(replace(scorer, **settings), matches)
+    if weights := _weights(scorer, axes):
+        scorer, axes["weight"] = replace(scorer, weight=ChosenWeight(weights, 0)), np.arange(len(weights))
+    values = {name: _axis(scorer, name, axis) for name, axis in axes.items()}
+    inner = [name for name in values if name in WEIGHTINGS]
+    outer = [name for name in values if name not in WEIGHTINGS]
+    settings, weightings = _product(values, outer), _product(values, inner)
+    rows = int(np.prod([len(values[name]) for name in outer]))
+    parts = by_capacity(scorer, settings, rows, matches.image_size0, matches.image_size1)
+    scores = [
+        score_settings(fitted, matches, {name: axis[part] for name, axis in settings.items()}, weightings)
+        for fitted, part in parts
+    ]
+    order = np.argsort(np.concatenate([part for _, part in parts]))
+    names = outer + inner
+    found = jnp.concatenate(scores)[order].reshape(*(len(values[name]) for name in names), -1)
+    return jnp.moveaxis(found, range(len(names)), [list(axes).index(name) for name in names])
 
-    def one(setting: dict[str, Array]) -> Array:
-        return score_candidates(replace(scorer, **setting), matches)
 
-    return jax.lax.map(one, settings).reshape(*lengths, -1)
+def _product(values: Mapping[str, Array], names: Sequence[str]) -> dict[str, Array]:
+    """Every combination of some axes' values, by axis."""
+    points = jnp.meshgrid(*(values[name] for name in names), indexing="ij")
+    return {name: point.reshape(-1) for name, point in zip(names, points, strict=True)}
+
+
+def by_capacity(
+    scorer: Any, settings: Mapping[str, Array], num_settings: int, image_size0: Array, image_size1: Array
+) -> list[tuple[Any, np.ndarray]]:
+    """The scorer in each of the capacities that settings `[G]` ask for, with the rows of those settings.
+
+    One that needs none, has its own, or is traced, serves all. Capacities are multiples of 8 bins: few programs,
+    and little padding.
+    """
+    bin_sizes = settings.get("bin_size")
+    every = np.arange(num_settings)
+    if bin_sizes is None or not isinstance(scorer, HistogramOfShifts) or scorer.max_bins is not None:
+        return [(_fit(scorer, image_size0, image_size1), every)]
+    if not is_concrete((bin_sizes, scorer.shift_range, image_size0, image_size1)):
+        return [(scorer, every)]
+    needed = {
+        value: replace(scorer, bin_size=value).with_capacity(image_size0, image_size1).max_bins
+        for value in np.unique(bin_sizes)
+    }
+    capacities = np.array([round_up(needed[value] or 1, BIN_STEP) for value in np.asarray(bin_sizes)])
+    return [(replace(scorer, max_bins=int(c)), np.flatnonzero(capacities == c)) for c in np.unique(capacities)]
 
 
 def combine(filter_scores: Array, rerank_scores: Array, *, c: float | Array = 1e6) -> Array:
@@ -69,6 +161,13 @@ def balancing_c(filter_scores: Array, rerank_scores: Array, mask: Array) -> Arra
     return jnp.where((filter_spread > 0) & jnp.isfinite(c), c, 0.0)
 
 
+def fuse(filter_scores: Array, scores: Array, mask: Array, c: float | Array | None) -> Array:
+    """Combined scores `[Q, C]` of several queries; `c` None balances the spread of both scores per query."""
+    if c is None:
+        c = jax.vmap(balancing_c)(filter_scores, scores, mask)[:, None]
+    return combine(filter_scores, scores, c=c)
+
+
 def rank(scores: Array, mask: Array | None = None, *, tie_break: Array | None = None) -> Array:
     """Positions `[..., C]` int32 in descending order of `scores` `[..., C]`.
 
@@ -87,24 +186,34 @@ def rerank(scores: Array, mask: Array | None = None) -> Ranking:
     return Ranking(order=rank(scores, mask), scores=scores)
 
 
-def _fit(scorer: Any, matches: Matches) -> Any:
+def _fit(scorer: Any, image_size0: Array, image_size1: Array) -> Any:
     """A histogram without a capacity gets the one that concrete values ask for, before vmap hides them."""
     if not isinstance(scorer, HistogramOfShifts) or scorer.max_bins is not None:
         return scorer
-    sizes = matches.image_size0, matches.image_size1
+    sizes = image_size0, image_size1
     return scorer.with_capacity(*sizes) if is_concrete((scorer, sizes)) else scorer
+
+
+def _weights(scorer: Any, axes: Mapping[str, Any]) -> tuple[Weight, ...]:
+    """The axis of weights, where there is one."""
+    if "weight" not in axes or not hasattr(scorer, "weight"):
+        return ()
+    if not all(map(callable, axes["weight"])):
+        raise ValueError(f"grid axis weight: expected weights such as UnitWeight(), got {list(axes['weight'])}")
+    return tuple(axes["weight"])
 
 
 def _axis(scorer: Any, name: str, axis: Sequence[float] | Array) -> Array:
     """One checked axis of a grid, float `[n]`."""
     numeric = [f.name for f in fields(scorer) if not f.metadata.get("static") and _is_number(getattr(scorer, f.name))]
+    numeric += ["max_distance", "weight"] if hasattr(scorer, "weight") else ["max_distance"]
     if name not in numeric:
         nearest = difflib.get_close_matches(name, numeric, n=1) or numeric
         raise ValueError(
             f"{type(scorer).__name__} has no numeric parameter {name!r}; expected one of {', '.join(numeric)}"
             + (f" (nearest: {nearest[0]})" if numeric else "")
         )
-    values = jnp.asarray(axis, dtype=float)
+    values = jnp.asarray(axis, dtype=int if name == "weight" else float)
     if values.ndim != 1 or values.size == 0:
         raise ValueError(f"grid axis {name}: expected at least one value in one dimension, got shape {values.shape}")
     return values

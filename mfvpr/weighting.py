@@ -42,7 +42,25 @@ class UnitWeight:
         return jnp.ones_like(matches.distance)
 
 
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class ChosenWeight:
+    """One of several weights, by its number: so the kind of weight may be traced and batched like a parameter."""
+
+    options: tuple[Weight, ...]
+    index: int | Array
+
+    def __call__(self, matches: Matches) -> Array:
+        return jnp.stack([as_float(weight(matches)) for weight in self.options])[self.index]
+
+
 def match_weights(weight: Weight, matches: Matches) -> Array:
     """`[K]` weights times the matches' confidence, 0 on padding."""
-    weights = as_float(weight(matches))
-    return masked(weights if matches.confidence is None else weights * matches.confidence, matches.mask)
+    weights = masked(as_float(weight(matches)), matches.mask)
+    return weights if matches.confidence is None else weights * match_confidence(matches)
+
+
+def match_confidence(matches: Matches) -> Array:
+    """`[K]` the matches' confidence, 1 where nobody gave one, 0 on padding; a match of confidence 0 is none."""
+    confidence = jnp.ones_like(matches.distance) if matches.confidence is None else matches.confidence
+    return masked(as_float(confidence), matches.mask)

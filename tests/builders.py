@@ -1,5 +1,9 @@
-"""Random and hand-made Features and Matches for the tests, NumPy throughout."""
+"""Random and hand-made Features and Matches for the tests, NumPy but where said."""
 
+from dataclasses import fields, replace
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mfvpr import Features, Matches
@@ -30,8 +34,8 @@ def make_features(rng, count, *, capacity=None, dimension=16, size=SIZE, garbage
     )
 
 
-def make_matches(points0, points1, *, distance=None, scores0=None, scores1=None, capacity=None, garbage=np.nan,
-                 sizes=((SIZE, SIZE), (SIZE, SIZE))):  # fmt: skip
+def make_matches(points0, points1, *, distance=None, scores0=None, scores1=None, ratio=None, confidence=None,
+                 capacity=None, garbage=np.nan, sizes=((SIZE, SIZE), (SIZE, SIZE))):  # fmt: skip
     """Matches of one pair from real entries; the padding holds `garbage`."""
     points0 = np.asarray(points0, np.float32).reshape(-1, 2)
     points1 = np.asarray(points1, np.float32).reshape(-1, 2)
@@ -53,11 +57,16 @@ def make_matches(points0, points1, *, distance=None, scores0=None, scores1=None,
         mask=np.arange(capacity) < count,
         image_size0=np.array(sizes[0], np.float32),
         image_size1=np.array(sizes[1], np.float32),
+        ratio=None if ratio is None else padded(ratio),
+        confidence=None if confidence is None else padded(confidence),
     )
 
 
 def random_matches(rng, count, *, capacity=None, garbage=np.nan, sizes=((SIZE, SIZE), (SIZE, SIZE))):
-    """Half of the matches share a shift, half are random; coordinates are on a quarter-pixel grid, exact in float32."""
+    """Half of the matches share a shift, half are random; coordinates are on a quarter-pixel grid, exact in float32.
+
+    Half are sure, a quarter of confidence 0.
+    """
     points0, anywhere = (rng.integers(0, 4 * np.array(size), (count, 2)) / 4 for size in sizes)
     shift = rng.integers(-240, 240, 2) / 4
     points1 = np.where(rng.random((count, 1)) < 0.5, points0 + shift, anywhere)
@@ -67,6 +76,8 @@ def random_matches(rng, count, *, capacity=None, garbage=np.nan, sizes=((SIZE, S
         distance=rng.uniform(0, 2, count),
         scores0=rng.uniform(0.1, 1, count),
         scores1=rng.uniform(0.1, 1, count),
+        ratio=rng.uniform(0, 1, count),
+        confidence=np.clip(rng.uniform(-1, 3, count), 0, 1),
         capacity=capacity,
         garbage=garbage,
         sizes=sizes,
@@ -78,3 +89,15 @@ def real(matches):
     mask = np.asarray(matches.mask)
     names = ("points0", "points1", "distance", "scores0", "scores1")
     return tuple(np.asarray(getattr(matches, name), np.float64)[mask] for name in names)
+
+
+def per_match(matches, function):
+    """`function` of every field that has a row per match, and of no other."""
+    rows = {f.name: getattr(matches, f.name) for f in fields(matches) if "size" not in f.name}
+    return replace(matches, **jax.tree.map(function, rows))
+
+
+def double(tree):
+    """Every floating point leaf, and Python number, as float64 of JAX: only below `jax.enable_x64(True)`."""
+    wide = lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf  # noqa: E731
+    return jax.tree.map(lambda leaf: wide(jnp.asarray(leaf)), tree)

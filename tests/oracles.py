@@ -267,9 +267,10 @@ def _median(values):
     return ordered[half] if len(ordered) % 2 == 1 else (ordered[half - 1] + ordered[half]) / 2
 
 
-def aggregated_score(shifts, weights, size, *, mean="unweighted", clamp=False):
-    """Aggregated score (paper eq. 3), 0 without matches."""
+def aggregated_score(shifts, weights, size, *, mean="unweighted", clamp=False, confidence=None):
+    """Aggregated score (paper eq. 3), 0 without matches. The unweighted mean counts the confidence."""
     shifts, weights = _rows(shifts, 2), _values(weights)
+    confidence = [1.0] * len(shifts) if confidence is None else _values(confidence)
     if mean not in ("unweighted", "weighted", "median"):
         raise ValueError(f"unknown mean: {mean}")
     total = math.fsum(weights)
@@ -280,7 +281,7 @@ def aggregated_score(shifts, weights, size, *, mean="unweighted", clamp=False):
     for axis in range(2):
         values = [shift[axis] for shift in shifts]
         if mean == "unweighted":
-            center.append(math.fsum(values) / len(values))
+            center.append(math.fsum(c * v for c, v in zip(confidence, values, strict=True)) / math.fsum(confidence))
         elif mean == "weighted":
             center.append(math.fsum(w * v for w, v in zip(weights, values, strict=True)) / total)
         else:

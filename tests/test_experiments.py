@@ -21,17 +21,17 @@ from experiments.settings import SettingsError
 ROOT = Path(__file__).parent.parent
 
 
-def run(*arguments, cwd=ROOT, **environment):
+def run(*arguments, program="evaluate", cwd=ROOT, **environment):
     return subprocess.run(
-        [sys.executable, "-m", "experiments.evaluate", *map(str, arguments)],
+        [sys.executable, "-m", f"experiments.{program}", *map(str, arguments)],
         cwd=cwd, capture_output=True, text=True, timeout=280,
         env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
     )  # fmt: skip
 
 
-def composed(*overrides):
+def composed(*overrides, config="config"):
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        return OmegaConf.to_container(hydra.compose("config", list(overrides)), resolve=True)
+        return OmegaConf.to_container(hydra.compose(config, list(overrides)), resolve=True)
 
 
 def folder(street, *more):
@@ -52,7 +52,8 @@ CHOICES = [
 def test_every_conf_composes_and_passes_its_own_checks(group, choice):
     paths = {"folder": ["dataset.database=a", "dataset.queries=b"]}
     needs = paths.get(choice, ["dataset.root=r"] if choice in ("grief_season", "corridor") else [])
-    settings.check(composed(f"{group}={choice}", *needs))
+    config = "sweep" if group == "experiment" else "config"
+    settings.check(composed(f"{group}={choice}", *needs, config=config))
 
 
 def test_scorers_of_conf_are_the_papers():

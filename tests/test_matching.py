@@ -13,6 +13,11 @@ from tests import oracles
 from tests.builders import make_features, random_matches, unit
 
 MODES = ["mutual", "opencv_legacy", "none"]
+# Compiled as a whole, not operation by operation: seconds, where every test has its own shapes.
+match_once = jax.jit(match, static_argnames="cross_check")
+match_candidates_once = jax.jit(match_candidates, static_argnames=("cross_check", "chunk_size"))
+match_shortlist_once = jax.jit(match_shortlist, static_argnames="cross_check")
+compact_once = jax.jit(compact, static_argnames="capacity")
 
 
 def found(matches):
@@ -38,7 +43,7 @@ def feature_pairs(draw):
 def test_agrees_with_the_oracle(pair, mode):
     features0, features1 = pair
     expected = oracles.nearest(features0.descriptors[features0.mask], features1.descriptors[features1.mask], mode)
-    slots, points1, distance = found(match(features0, features1, cross_check=mode))
+    slots, points1, distance = found(match_once(features0, features1, cross_check=mode))
     assert list(slots) == [i for i, _, _ in expected]
     np.testing.assert_array_equal(points1, [features1.keypoints[j] for _, j, _ in expected] or np.zeros((0, 2)))
     np.testing.assert_allclose(distance, [d for _, _, d in expected], atol=1e-6)
@@ -47,7 +52,7 @@ def test_agrees_with_the_oracle(pair, mode):
 @pytest.mark.parametrize("mode", MODES)
 def test_an_image_matched_with_itself_is_at_distance_zero(mode):
     features = make_features(np.random.default_rng(0), 40, dimension=128)
-    slots, points1, distance = found(match(features, features, cross_check=mode))
+    slots, points1, distance = found(match_once(features, features, cross_check=mode))
     assert len(slots) == 40
     np.testing.assert_array_equal(points1, features.keypoints)
     assert (distance == 0).all()
@@ -57,7 +62,7 @@ def test_first_index_wins_on_both_sides():
     rng = np.random.default_rng(1)
     one = make_features(rng, 3)
     one.descriptors[:] = one.descriptors[0]
-    slots, points1, _ = found(match(one, one))
+    slots, points1, _ = found(match_once(one, one))
     assert list(slots) == [0]
     np.testing.assert_array_equal(points1[0], one.keypoints[0])
 
@@ -68,9 +73,9 @@ def test_every_chunk_size_gives_the_loop(chunk_size):
     query = make_features(rng, 20, capacity=24)
     candidates = [make_features(rng, count, capacity=30) for count in (30, 0, 7, 1, 22)]
     batch = jax.tree.map(lambda *leaves: np.stack(leaves), *candidates)
-    got = match_candidates(query, batch, chunk_size=chunk_size)
+    got = match_candidates_once(query, batch, chunk_size=chunk_size)
     for row, candidate in enumerate(candidates):
-        alone = match(query, candidate)
+        alone = match_once(query, candidate)
         np.testing.assert_array_equal(got.mask[row], alone.mask)
         np.testing.assert_allclose(got.distance[row], alone.distance, atol=1e-6)
         np.testing.assert_array_equal(got.points1[row][alone.mask], np.asarray(alone.points1)[alone.mask])
@@ -97,7 +102,7 @@ def test_gradients_reach_the_descriptors_and_are_finite():
         matches = match(image, features1)
         return jnp.sum(jnp.where(matches.mask, matches.distance, 0.0))
 
-    gradient = jax.grad(total)(jnp.asarray(features0.descriptors))
+    gradient = jax.jit(jax.grad(total))(jnp.asarray(features0.descriptors))
     assert np.isfinite(gradient).all()
     assert np.abs(gradient).max() > 0
 
@@ -118,12 +123,13 @@ def test_compact_moves_real_matches_to_the_front_in_order():
     scattered = filter_matches(matches, max_distance=1.0)
     kept = np.flatnonzero(scattered.mask)
     for capacity in (len(kept), len(kept) + 5, 10):
-        tight = compact(scattered, capacity)
+        tight = compact_once(scattered, capacity)
         real = kept[:capacity]
         assert tight.mask.sum() == len(real)
         assert tight.points0.shape == (capacity, 2)
         np.testing.assert_array_equal(tight.points1[: len(real)], matches.points1[real])
-        np.testing.assert_array_equal(tight.distance[: len(real)], matches.distance[real])
+        for name in ("distance", "ratio", "confidence"):
+            np.testing.assert_array_equal(getattr(tight, name)[: len(real)], getattr(matches, name)[real])
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -132,13 +138,13 @@ def test_images_without_a_single_slot(mode, counts):
     features0, features1 = (make_features(np.random.default_rng(6), count) for count in counts)
     batch = jax.tree.map(lambda leaf: np.stack([leaf, leaf]), features1)
     for matches in (
-        match(features0, features1, cross_check=mode),
-        match_candidates(features0, batch, cross_check=mode),
-        match_shortlist(features0, batch, jnp.array([1, -1]), cross_check=mode),
+        match_once(features0, features1, cross_check=mode),
+        match_candidates_once(features0, batch, cross_check=mode),
+        match_shortlist_once(features0, batch, jnp.array([1, -1]), cross_check=mode),
     ):
         assert matches.mask.shape[-1] == counts[0]
         assert not matches.mask.any()
-    assert compact(match(features0, features1), 4).mask.shape == (4,)
+    assert compact_once(match_once(features0, features1), 4).mask.shape == (4,)
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -146,10 +152,10 @@ def test_images_without_a_single_slot(mode, counts):
 def test_a_broken_descriptor_costs_its_own_matches_only(mode, value):
     rng = np.random.default_rng(7)
     features0, features1 = make_features(rng, 12), make_features(rng, 10)
-    whole = match(features0, features1, cross_check=mode)
+    whole = match_once(features0, features1, cross_check=mode)
     features1.descriptors[4, 2] = value
     features0.descriptors[3, 0] = value
-    slots, points1, _ = found(match(features0, features1, cross_check=mode))
+    slots, points1, _ = found(match_once(features0, features1, cross_check=mode))
     rest0, rest1 = np.delete(features0.descriptors, 3, axis=0), np.delete(features1.descriptors, 4, axis=0)
     expected = oracles.nearest(rest0, rest1, mode)
     assert list(slots) == [i + (i >= 3) for i, _, _ in expected]
@@ -160,7 +166,7 @@ def test_a_broken_descriptor_costs_its_own_matches_only(mode, value):
 def test_numpy_features_may_stand_in_a_compiled_closure():
     rng = np.random.default_rng(8)
     features0, features1 = make_features(rng, 6), make_features(rng, 7)
-    expected = match(features0, features1)
+    expected = match_once(features0, features1)
     got = jax.jit(lambda query: compact(match(query, features1), 6))(features0)
     assert got.mask.sum() == expected.mask.sum()
 
@@ -181,7 +187,7 @@ def test_real_size_agrees_with_a_vectorised_check():
     one, two = (Features(f.keypoints, d, f.scores, f.mask, f.image_size) for f, d in zip((one, two), descriptors))  # noqa: B905
     similarity = descriptors[0].astype(np.float64) @ descriptors[1].T.astype(np.float64)
     mutual = similarity.argmax(0)[similarity.argmax(1)] == np.arange(700)
-    matches = match(one, two)
+    matches = match_once(one, two)
     assert (np.asarray(matches.mask) == mutual).mean() > 0.998  # float32 rounding may flip a near-tie
     agree = mutual & np.asarray(matches.mask)
     np.testing.assert_array_equal(np.asarray(matches.points1)[agree], two.keypoints[similarity.argmax(1)][agree])

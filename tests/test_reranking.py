@@ -1,5 +1,7 @@
 """Grids, fusion and ranking."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,14 +12,20 @@ from hypothesis import strategies as st
 from mfvpr import (
     AggregatedScore,
     AnchorPoints,
+    DescriptorDistanceWeight,
+    FeatureScoreWeight,
     HistogramOfShifts,
+    MatchCount,
+    UnitWeight,
     balancing_c,
     combine,
+    filter_matches,
     rank,
     rerank,
     score_candidates,
     score_grid,
 )
+from mfvpr.reranking import by_capacity
 from tests import oracles
 from tests.builders import random_matches
 
@@ -47,6 +55,27 @@ def test_anchor_grid_equals_the_loop(matches):
     np.testing.assert_allclose(got, expected, rtol=2e-6)
 
 
+def test_kinds_of_weights_and_distances_are_axes_too(matches):
+    weights = [FeatureScoreWeight(), DescriptorDistanceWeight(), UnitWeight()]
+    got = score_grid(AggregatedScore(), matches, max_distance=[0.7, 1.5], weight=weights)
+    for i, limit in enumerate((0.7, 1.5)):
+        near = jax.vmap(partial(filter_matches, max_distance=limit))(matches)
+        for j, weight in enumerate(weights):
+            expected = score_candidates(AggregatedScore(weight=weight), near)
+            np.testing.assert_allclose(got[i, j], expected, rtol=2e-6)
+
+
+def test_fine_bins_do_not_tax_coarse_ones(matches):
+    """One program per capacity, each no larger than its bins ask for."""
+    sizes = matches.image_size0, matches.image_size1
+    groups = by_capacity(HistogramOfShifts(), {"bin_size": np.array([6.0, 14.0, 15.0])}, 3, *sizes)
+    needed = [HistogramOfShifts(bin_size=size).with_capacity(*sizes).max_bins for size in (6.0, 14.0, 15.0)]
+    assert [list(rows) for _, rows in groups] == [[1, 2], [0]]
+    for scorer, rows in groups:
+        worst = max(needed[row] for row in rows)
+        assert worst <= scorer.max_bins < worst + 8
+
+
 def test_other_grid_values_cost_no_trace(matches):
     traces = []
 
@@ -67,7 +96,9 @@ def test_other_grid_values_cost_no_trace(matches):
         (HistogramOfShifts(), {"max_bins": [1]}, "no numeric parameter"),
         (HistogramOfShifts(), {}, "at least one axis"),
         (HistogramOfShifts(), {"sigma": []}, "at least one value"),
-        (AnchorPoints(), {"weight": [1.0]}, "window, tolerance"),
+        (AnchorPoints(), {"sigma": [1.0]}, "window, tolerance"),
+        (AnchorPoints(), {"weight": [1.0]}, "expected weights such as UnitWeight"),
+        (MatchCount(), {"weight": [UnitWeight()]}, "no numeric parameter 'weight'; expected one of max_distance"),
         (AggregatedScore(), {"sigma": [1.0]}, "no numeric parameter"),
     ],
 )

@@ -5,11 +5,12 @@ from dataclasses import dataclass, field
 import jax
 import jax.numpy as jnp
 
-from mfvpr.numerics import as_float, masked, masked_mean, masked_median
+from mfvpr.numerics import masked, masked_mean, masked_median, safe_sqrt
 from mfvpr.scoring.choices import check_choices, choice
-from mfvpr.scoring.shifts import match_shifts
+from mfvpr.scoring.positive import positive
+from mfvpr.scoring.shifts import image_sizes, match_shifts
 from mfvpr.types import Array, Matches
-from mfvpr.weighting import DescriptorDistanceWeight, Weight, match_weights
+from mfvpr.weighting import DescriptorDistanceWeight, Weight, match_confidence, match_weights
 
 
 @jax.tree_util.register_dataclass
@@ -19,13 +20,17 @@ class AggregatedScore:
 
     Attributes:
         weight: match weight, DMF by default as in the paper.
-        mean: center of the shifts: `unweighted` mean (as printed), `weighted` mean or `median`.
+        mean: center of the shifts: `unweighted` mean (as printed), `weighted` mean or `median`. A mean counts every
+            match with its confidence.
         clamp: let a shift further from the center than the image is wide count 0 instead of growing again.
+        temperature: px; T > 0 makes |x| a hyperbola, sqrt(x^2 + T^2) - T, and the clamp T log(1 + e^(z / T)), so that
+            the score is smooth in the points but for the median's. None is the paper's; not above 0 scores NaN.
     """
 
     weight: Weight = DescriptorDistanceWeight()
     mean: str = choice("unweighted", "weighted", "median")
     clamp: bool = field(default=False, metadata={"static": True})
+    temperature: float | Array | None = None
 
     def __post_init__(self) -> None:
         check_choices(self)
@@ -34,12 +39,19 @@ class AggregatedScore:
         """Score of one pair, `[]` float32."""
         weights = match_weights(self.weight, matches)
         shifts = match_shifts(matches)
-        center = self._center(shifts, weights, matches.mask)
-        closeness = as_float(matches.image_size0)[None] - jnp.abs(shifts - center[None])
-        closeness = jnp.maximum(closeness, 0.0) if self.clamp else closeness
+        confidence = match_confidence(matches)
+        if self.mean == "median":
+            center = masked_median(shifts, confidence > 0)
+        else:
+            center = masked_mean(shifts, matches.mask, weights if self.mean == "weighted" else confidence)
+        closeness = self._closeness(shifts - center[None], image_sizes(matches)[0][None])
         return jnp.sum(weights * jnp.sum(masked(closeness, matches.mask) ** 2, axis=-1))
 
-    def _center(self, shifts: Array, weights: Array, mask: Array) -> Array:
-        if self.mean == "median":
-            return masked_median(shifts, mask)
-        return masked_mean(shifts, mask, weights if self.mean == "weighted" else None)
+    def _closeness(self, offsets: Array, size: Array) -> Array:
+        """`[K, 2]` how much closer to the center than the image is wide and high, px."""
+        if self.temperature is None:
+            closeness = size - jnp.abs(offsets)
+            return jnp.maximum(closeness, 0.0) if self.clamp else closeness
+        temperature = positive(self.temperature, offsets.dtype)
+        closeness = size - (safe_sqrt(offsets**2 + temperature**2) - temperature)
+        return temperature * jax.nn.softplus(closeness / temperature) if self.clamp else closeness

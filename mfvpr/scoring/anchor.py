@@ -12,8 +12,12 @@ import jax.numpy as jnp
 
 from mfvpr.numerics import as_float, masked, safe_sqrt
 from mfvpr.scoring.choices import check_choices, choice
+from mfvpr.scoring.positive import positive
+from mfvpr.scoring.shifts import image_sizes
 from mfvpr.types import Array, Matches
-from mfvpr.weighting import FeatureScoreWeight, Weight, match_weights
+from mfvpr.weighting import FeatureScoreWeight, Weight, match_confidence, match_weights
+
+_LEAST_SHARE = 1e-12  # of the winner's votes, below which a target has none: keeps the logarithm's gradient finite
 
 
 @jax.tree_util.register_dataclass
@@ -34,6 +38,13 @@ class AnchorPoints:
         first: image whose cells are the anchors, `query` or `candidate`.
         include_self: an anchor counts itself.
         cell_weight: w_a is the winner's summed weight, the whole cell's, or 1.
+        temperature: without unit; T > 0 scores the soft form below. None is the paper's; not above 0 scores NaN.
+
+    The soft form, smooth in points and weights: a point at u, in cells, belongs to cell c along an axis in proportion
+    to e^(-(u - c - 1/2)^2 / T), so that V = A0^T diag(w) A1 are the votes of anchors for targets. An anchor's match is
+    the mean target position, weighted by V^(1/T), and w_a the mean V of the same weights: T -> 0 is the winner, T = 1
+    the mean of all votes. A cell with n matches is occupied to n^2 / (n^2 + T), counts so much in the window, and weighs
+    so much where w_a is 1. Weights must not be negative. The window moves in whole cells: its gradient is 0.
     """
 
     num_bins: int = field(default=15, metadata={"static": True})
@@ -44,31 +55,31 @@ class AnchorPoints:
     first: str = choice("query", "candidate")
     include_self: bool = field(default=True, metadata={"static": True})
     cell_weight: str = choice("winner_sum", "cell_sum", "ones")
+    temperature: float | Array | None = None
 
     def __post_init__(self) -> None:
         check_choices(self)
 
     def __call__(self, matches: Matches) -> Array:
         """Score of one pair, `[]` float32."""
-        rows, columns, occupied, weights = self._displacements(matches)
+        cells = self._cells if self.temperature is None else self._soft_cells
+        rows, columns, occupancy, weights = cells(matches)
         # Two [cells, cells] planes, not one array with a trailing axis of 2, which costs nine times as much on a CPU.
         distance = safe_sqrt((rows[:, None] - rows[None]) ** 2 + (columns[:, None] - columns[None]) ** 2)
-        support = jnp.maximum(self.tolerance - distance, 0.0)
-        support = jnp.sum(masked(support, self._neighbors() & occupied[None]), axis=1)
-        return jnp.sum(masked(weights * support, occupied))
+        support = masked(jnp.maximum(self.tolerance - distance, 0.0), self._neighbors()) * occupancy[None]
+        return jnp.sum(weights * jnp.sum(support, axis=1))
 
-    def _displacements(self, matches: Matches) -> tuple[Array, Array, Array, Array]:
-        """Per cell of the first image, all `[cells]`: displacement in rows and in columns, has a match, weight."""
+    def _cells(self, matches: Matches) -> tuple[Array, Array, Array, Array]:
+        """Per cell of the first image, all `[cells]`: displacement in rows and in columns, occupancy, weight."""
         num_cells = self.num_bins**2
         weights = match_weights(self.weight, matches)
-        cell0 = self._cell(matches.points0, matches.image_size0, matches.mask)
-        cell1 = self._cell(matches.points1, matches.image_size1, matches.mask)
-        anchor, target = (cell0, cell1) if self.first == "query" else (cell1, cell0)
+        anchor, target = (self._cell(position) for position in self._positions(matches))
 
         vote = anchor * num_cells + target
         votes = jnp.zeros(num_cells**2, weights.dtype).at[vote].add(weights)
         strength = jax.lax.stop_gradient(votes[vote])  # [K]; which cell wins has no gradient, its weight below has
-        member = jnp.where(matches.mask, anchor, num_cells)  # out of range: padding is dropped
+        real = match_confidence(matches) > 0
+        member = jnp.where(real, anchor, num_cells)  # out of range: what is no match is dropped
         best = jnp.full(num_cells, -jnp.inf, weights.dtype).at[member].max(strength, mode="drop")
         contender = jnp.where(strength == best[anchor], target, num_cells)
         winner = jnp.full(num_cells, num_cells, jnp.int32).at[member].min(contender, mode="drop")
@@ -82,13 +93,49 @@ class AnchorPoints:
             "cell_sum": lambda: jnp.sum(votes.reshape(num_cells, num_cells), axis=1),
             "ones": lambda: jnp.ones(num_cells, weights.dtype),
         }[self.cell_weight]()
-        return rows.astype(weights.dtype), columns.astype(weights.dtype), occupied, cell_weights
+        rows, columns, occupancy = (values.astype(weights.dtype) for values in (rows, columns, occupied))
+        return rows, columns, occupancy, masked(cell_weights, occupied)
 
-    def _cell(self, points: Array, image_size: Array, mask: Array) -> Array:
-        """`[K]` int32 row-major cell of each point; points outside belong to the border."""
-        position = jnp.floor(masked(as_float(points), mask) * self.num_bins / as_float(image_size)[None])
-        column, row = jnp.clip(position, 0, self.num_bins - 1).astype(jnp.int32).T
+    def _soft_cells(self, matches: Matches) -> tuple[Array, Array, Array, Array]:
+        """As `_cells`, smooth in points and weights."""
+        weights = match_weights(self.weight, matches)
+        temperature = positive(self.temperature, weights.dtype)
+        anchor, target = (self._membership(position, temperature) for position in self._positions(matches))
+        votes = jnp.matmul((anchor * weights[:, None]).T, target, precision=jax.lax.Precision.HIGHEST)
+        count = jnp.sum(anchor * match_confidence(matches)[:, None], axis=0)
+        occupancy = count**2 / (count**2 + temperature)
+
+        most = jax.lax.stop_gradient(jnp.max(votes, axis=1, keepdims=True))  # a common factor, which drops out
+        share = votes / jnp.maximum(most, jnp.finfo(votes.dtype).tiny ** 0.5)
+        chosen = jax.nn.softmax(jnp.log(jnp.maximum(share, _LEAST_SHARE)) / temperature, axis=1)
+
+        row, column = jnp.divmod(jnp.arange(self.num_bins**2, dtype=votes.dtype), self.num_bins)
+        rows, columns = (jnp.sum(chosen * index[None], axis=1) - index for index in (row, column))
+        cell_weights = {
+            "winner_sum": lambda: jnp.sum(chosen * votes, axis=1),
+            "cell_sum": lambda: jnp.sum(votes, axis=1),
+            "ones": lambda: occupancy,
+        }[self.cell_weight]()
+        return rows, columns, occupancy, cell_weights
+
+    def _positions(self, matches: Matches) -> tuple[Array, Array]:
+        """`[K, 2]` (x, y) of all points of the anchors' image and of the other, in cells; 0 on padding."""
+        size0, size1 = image_sizes(matches)
+        query = masked(as_float(matches.points0), matches.mask) * self.num_bins / size0[None]
+        candidate = masked(as_float(matches.points1), matches.mask) * self.num_bins / size1[None]
+        return (query, candidate) if self.first == "query" else (candidate, query)
+
+    def _cell(self, position: Array) -> Array:
+        """`[K]` int32 row-major cell of each position; those outside belong to the border."""
+        column, row = jnp.clip(jnp.floor(position), 0, self.num_bins - 1).astype(jnp.int32).T
         return row * self.num_bins + column
+
+    def _membership(self, position: Array, temperature: Array) -> Array:
+        """`[K, cells]` how far each position belongs to each cell, row-major, sums to 1."""
+        centers = jnp.arange(self.num_bins, dtype=position.dtype) + 0.5
+        distance = jnp.clip(position, 0, self.num_bins)[:, :, None] - centers[None, None]
+        along = jax.nn.softmax(-(distance**2) / temperature, axis=-1)  # [K, (x, y), bins]
+        return (along[:, 1, :, None] * along[:, 0, None, :]).reshape(len(position), self.num_bins**2)
 
     def _neighbors(self) -> Array:
         """`[cells, cells]` True where the second cell lies in the window around the first."""

@@ -3,16 +3,20 @@
 from dataclasses import dataclass
 
 import jax
+import jax.numpy as jnp
 
-from mfvpr.numerics import count
 from mfvpr.types import Array, Matches
+from mfvpr.weighting import match_confidence
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class MatchCount:
-    """Number of mutual matches."""
+    """Number of matches, each counted with its confidence.
+
+    Soft matches make it soft: its temperature is that of `mfvpr.soft_match`.
+    """
 
     def __call__(self, matches: Matches) -> Array:
         """Score of one pair, `[]` float32."""
-        return count(matches.mask)
+        return jnp.sum(match_confidence(matches))

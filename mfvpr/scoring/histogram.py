@@ -12,9 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mfvpr.numerics import is_concrete
+from mfvpr.numerics import is_concrete, masked
 from mfvpr.scoring.choices import check_choices, choice
-from mfvpr.scoring.shifts import match_shifts
+from mfvpr.scoring.positive import positive
+from mfvpr.scoring.shifts import image_sizes, match_shifts
 from mfvpr.types import Array, Matches
 from mfvpr.weighting import FeatureScoreWeight, Weight, match_weights
 
@@ -56,6 +57,8 @@ class HistogramOfShifts:
         max_bins: capacity of bins per axis. By default as many as concrete values ask for, or 64 where they are
             traced. A histogram that needs more than its capacity scores NaN, never a wrong number: set `max_bins`
             before `jit` for larger images or finer bins (`with_capacity` does).
+        temperature: in units of the score; T > 0 scores T log(mean over bins of e^(s_ij / T)), at most the maximum
+            and smooth in everything but the number of bins. None is the paper's maximum; not above 0 scores NaN.
     """
 
     bin_size: float | Array = 15.0
@@ -67,15 +70,31 @@ class HistogramOfShifts:
     sigma_is_variance: bool = field(default=False, metadata={"static": True})
     direction: str = choice("candidate_minus_query", "query_minus_candidate")
     max_bins: int | None = field(default=None, metadata={"static": True})
+    temperature: float | Array | None = None
 
     def __post_init__(self) -> None:
         check_choices(self)
 
     def __call__(self, matches: Matches) -> Array:
-        """Score of one pair, `[]` float32: the maximum over bins, 0 without matches."""
-        scores, _, inside, fits = self._vote(matches)
-        score = jnp.max(scores, where=inside, initial=-jnp.inf)
-        return jnp.where(jnp.any(matches.mask), jnp.where(fits, score, jnp.nan), 0.0)
+        """Score of one pair, `[]` float32: the (smooth) maximum over bins, 0 without matches."""
+        return self.reweighted(matches, match_weights(self.weight, matches)[None])[0]
+
+    def reweighted(self, matches: Matches, weights: Array) -> Array:
+        """Scores `[W]` of one pair by several weights `[W, K]` of its matches (0 on padding).
+
+        The Gaussians, which do not depend on them, are evaluated once.
+        """
+        votes_x, votes_y, _, inside, fits = self._votes(matches)
+
+        def score(weights: Array) -> Array:
+            scores = _bins(votes_x, votes_y, weights)
+            largest = jnp.max(scores, where=inside, initial=-jnp.inf)
+            if self.temperature is None:
+                return largest
+            return _smooth_max(scores, inside, largest, positive(self.temperature, scores.dtype))
+
+        found = score(weights[0])[None] if len(weights) == 1 else jax.lax.map(score, weights)
+        return jnp.where(jnp.any(matches.mask), jnp.where(fits, found, jnp.nan), 0.0)
 
     def histogram(self, matches: Matches) -> ShiftHistogram:
         """All bins of one pair with their centers."""
@@ -121,15 +140,18 @@ class HistogramOfShifts:
 
     def _vote(self, matches: Matches) -> tuple[Array, Array, Array, Array]:
         """Scores `[B, B]` (y, x), centers `[B, 2]`, which bins are in range `[B, B]`, whether all bins fit `[]`."""
+        votes_x, votes_y, *lattice = self._votes(matches)
+        return _bins(votes_x, votes_y, match_weights(self.weight, matches)), *lattice
+
+    def _votes(self, matches: Matches) -> tuple[Array, Array, Array, Array, Array]:
+        """Votes `[B, K]` along x and along y, without weights; centers, bins in range and whether they fit."""
         shifts = self._shifts(matches)
-        first, num_bins = self._lattice(matches.image_size0, matches.image_size1, shifts.dtype, jnp)
+        first, num_bins = self._lattice(*image_sizes(matches), shifts.dtype, jnp)
         index = jnp.arange(self._capacity(matches), dtype=shifts.dtype)[:, None]
         centers = first[None] + index * jnp.asarray(self.bin_size, dtype=shifts.dtype)
-        votes_x = self._gaussian(centers[:, 0], shifts[:, 0])
-        votes_y = self._gaussian(centers[:, 1], shifts[:, 1]) * match_weights(self.weight, matches)[None]
-        scores = jnp.matmul(votes_y, votes_x.T, precision=jax.lax.Precision.HIGHEST)
         inside = index < num_bins[None]  # [B, 2]
-        return scores, centers, inside[:, 1:] & inside[None, :, 0], jnp.all(num_bins <= len(index))
+        votes = (self._gaussian(centers[:, axis], shifts[:, axis]) for axis in (0, 1))
+        return *votes, centers, inside[:, 1:] & inside[None, :, 0], jnp.all(num_bins <= len(index))
 
     def _capacity(self, matches: Matches) -> int:
         if self.max_bins is not None:
@@ -162,8 +184,7 @@ class HistogramOfShifts:
         return shifts if self.direction == "candidate_minus_query" else -shifts
 
     def _deviation(self, dtype: Any) -> Array:
-        sigma = jnp.asarray(self.sigma, dtype=dtype)
-        sigma = jnp.where(sigma > 0, sigma, jnp.nan)  # no width, no score
+        sigma = positive(self.sigma, dtype)
         return jnp.sqrt(sigma) if self.sigma_is_variance else sigma
 
     def _gaussian(self, centers: Array, shifts: Array) -> Array:
@@ -182,3 +203,16 @@ class HistogramOfShifts:
             return jnp.where(total > 0, pull @ shifts / jnp.where(total > 0, total, 1.0), shift)
 
         return jax.lax.fori_loop(0, _MEAN_SHIFT_STEPS, step, start)
+
+
+def _bins(votes_x: Array, votes_y: Array, weights: Array) -> Array:
+    """`[B, B]` (y, x) sums of the weighted votes `[B, K]`."""
+    return jnp.matmul(votes_y * weights[None], votes_x.T, precision=jax.lax.Precision.HIGHEST)
+
+
+def _smooth_max(values: Array, mask: Array, largest: Array, temperature: Array) -> Array:
+    """T log(mean of e^(v / T)) of the values where `mask`, whose maximum is `largest`."""
+    # Relative to the maximum nothing overflows or cancels; its own gradient would be 0, since it drops out.
+    largest = jax.lax.stop_gradient(largest)
+    below = (masked(values, mask, largest) - largest) / temperature
+    return largest + temperature * jnp.log(jnp.mean(jnp.exp(below), where=mask))

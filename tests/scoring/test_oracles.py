@@ -1,5 +1,7 @@
 """Every scorer against its float64 loop, over random, empty, single, tied and duplicated matches."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -22,6 +24,7 @@ WEIGHTS = {
     "dmf": (DescriptorDistanceWeight(), lambda d, s0, s1: oracles.dmf_weight(d)),
     "unit": (UnitWeight(), lambda d, s0, s1: np.ones(len(d))),
 }
+CAPACITY = 81  # bins along an axis that all examples need: one shape of arrays for all of them
 CLOSE = {"rtol": 2e-5, "atol": 1e-4}  # float32 sums of 60 terms; scores are of order 1 and more
 
 
@@ -40,12 +43,20 @@ def pairs(draw):
     if draw(st.booleans()):  # duplicates
         matches.points0[mask] = matches.points0[0]
         matches.points1[mask] = matches.points1[0]
-    return matches
+    return matches if draw(st.booleans()) else replace(matches, confidence=None)
+
+
+def certainty(matches):
+    """Confidence of the real matches."""
+    return np.ones(matches.mask.sum()) if matches.confidence is None else matches.confidence[matches.mask].astype(float)
 
 
 def oracle_inputs(matches, weight):
+    """Points and weights of the matches with any confidence: one of confidence 0 is none."""
     points0, points1, distance, scores0, scores1 = real(matches)
-    return points0, points1, WEIGHTS[weight][1](distance, scores0, scores1)
+    confidence = certainty(matches)
+    some = confidence > 0
+    return points0[some], points1[some], (WEIGHTS[weight][1](distance, scores0, scores1) * confidence)[some]
 
 
 @given(
@@ -62,7 +73,7 @@ def test_histogram(matches, weight, align, parameters, truncate, shift_range, va
     bin_size, sigma = parameters
     scorer = HistogramOfShifts(
         bin_size=bin_size, sigma=sigma, truncate=truncate, align=align, shift_range=shift_range,
-        sigma_is_variance=variance, direction=direction, weight=WEIGHTS[weight][0],
+        sigma_is_variance=variance, direction=direction, weight=WEIGHTS[weight][0], max_bins=CAPACITY,
     )  # fmt: skip
     points0, points1, weights = oracle_inputs(matches, weight)
     ends = [(points0, matches.image_size0), (points1, matches.image_size1)]
@@ -73,6 +84,7 @@ def test_histogram(matches, weight, align, parameters, truncate, shift_range, va
     )  # fmt: skip
     got = scorer.histogram(matches)
     rows, columns = expected.shape
+    assert scorer.with_capacity(matches.image_size0, matches.image_size1).max_bins == max(rows, columns)
     np.testing.assert_allclose(got.centers_x[:columns], centers_x, atol=1e-3)
     np.testing.assert_allclose(got.centers_y[:rows], centers_y, atol=1e-3)
     np.testing.assert_allclose(got.scores[:rows, :columns], expected, **CLOSE)
@@ -106,21 +118,24 @@ def test_anchor(matches, weight, parameters, window_mode, first, include_self, c
 @given(pairs(), st.sampled_from(list(WEIGHTS)), st.sampled_from(["unweighted", "weighted", "median"]), st.booleans())
 def test_aggregate(matches, weight, mean, clamp):
     points0, points1, weights = oracle_inputs(matches, weight)
-    expected = oracles.aggregated_score(points1 - points0, weights, matches.image_size0, mean=mean, clamp=clamp)
+    confidence = certainty(matches)
+    expected = oracles.aggregated_score(
+        points1 - points0, weights, matches.image_size0, mean=mean, clamp=clamp, confidence=confidence[confidence > 0]
+    )
     got = AggregatedScore(weight=WEIGHTS[weight][0], mean=mean, clamp=clamp)(matches)
     np.testing.assert_allclose(got, expected, rtol=2e-5)
 
 
 @given(pairs())
 def test_count(matches):
-    assert float(MatchCount()(matches)) == matches.mask.sum()
+    np.testing.assert_allclose(MatchCount()(matches), certainty(matches).sum(), rtol=1e-6)
 
 
 @given(pairs(), st.sampled_from([(15.0, 22.5), (20.0, 8.0)]))
 def test_dominant_shift(matches, sizes):
     bin_size, sigma = sizes
     points0, points1, weights = oracle_inputs(matches, "fs")
-    scorer = HistogramOfShifts(bin_size=bin_size, sigma=sigma)
+    scorer = HistogramOfShifts(bin_size=bin_size, sigma=sigma, max_bins=CAPACITY)
     shift = np.asarray(scorer.dominant_shift(matches))
     if not len(weights):
         np.testing.assert_array_equal(shift, 0)

@@ -1,0 +1,100 @@
+"""The stages of a sweep: matches, all settings on all queries, the best, and what it is worth on other queries."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments import build, prepare, stores, sweep_outputs
+from experiments.axes import BYTES_PER_SETTING, Axes, as_setting, axes, require_memory, scorer
+from experiments.judging import Judge, judge
+from mfvpr import sweeping
+from mfvpr.data.store_manifest import recipe_fingerprint
+from mfvpr.pipeline import MatchSet
+from mfvpr.report import runs
+from mfvpr.types import Shortlist
+
+
+def sweep(settings: dict[str, Any]) -> None:
+    """Matches -> rows of every setting's ranking -> the best setting -> table, heat maps, files."""
+    folder = build.expanded(settings["out"]) if settings["out"] else None
+    runs.check_free(folder or runs.new_run_folder(Path("runs"), settings["dataset"]["name"]))
+    varied = axes(settings)
+    if settings["search"] == "grid":
+        require_memory(f"grid: {varied.size:,} settings", varied.size * BYTES_PER_SETTING,
+                       "use fewer values, or search=optuna")  # fmt: skip
+    else:
+        from experiments import optuna_search
+
+        optuna_search.require()
+    tools = prepare.extractors(settings)
+    watch = prepare.Stopwatch()
+    with watch("data"):
+        images = prepare.images(settings)
+    judgment = judge(settings, images.dataset)
+    matches, candidates = prepare.matched(settings, tools, images, watch)
+    judgment = judgment.of(candidates)
+    kept = _kept(settings, images, candidates)
+    with watch("sweep"):
+        written, rows = _search(settings, varied, judgment, matches, candidates, kept)
+    found = sweep_outputs.Found(settings, images, varied, judgment, written, rows, watch.seconds)
+    folder = folder or runs.new_run_folder(Path("runs"), images.dataset.name)
+    with runs.writing(folder) as new:
+        text = sweep_outputs.write(new, found)
+    print(f"\n{text}\nresults: {folder}")
+    if kept is not None:
+        shutil.rmtree(kept, ignore_errors=True)
+
+
+def _search(
+    settings: dict[str, Any], varied: Axes, judgment: Judge, matches: MatchSet, candidates: Shortlist, kept: Path | None
+) -> tuple[list[dict[str, Any]], np.ndarray]:
+    """Settings as written, and the rows `[V, S, Q, depth]` of their rankings."""
+
+    def rows_of(written: list[dict[str, Any]], label: str) -> np.ndarray:
+        return sweeping.sweep(
+            scorer(settings), list(map(as_setting, written)), matches, candidates,
+            views=judgment.views, depth=max(settings["recall"]["ks"]), by_index=settings["ties"] == "index",
+            euclidean=settings["fusion"]["filter_score"] == "negative_euclidean",
+            settings_per_block=settings["chunk"]["settings"], queries_per_block=settings["chunk"]["queries"],
+            folder=kept, track=build.track(label),
+        )  # fmt: skip
+
+    own = dict(varied.own)
+    if settings["search"] == "grid":
+        written = varied.grid()
+        written += [] if own in written else [own]
+        _require_memory(settings, judgment, matches, len(written))
+        return written, rows_of(written, "sweep")
+    from experiments import optuna_search
+
+    return optuna_search.search(settings, varied, judgment, rows_of)
+
+
+def _require_memory(settings: dict[str, Any], judgment: Judge, matches: MatchSet, num_settings: int) -> None:
+    queries, num_candidates = matches.counts.shape
+    depth = max(settings["recall"]["ks"])
+    require_memory(
+        f"grid: rankings of {queries:,} queries by {num_settings:,} settings",
+        sweeping.result_bytes(len(judgment.views), num_settings, queries, depth),
+        "use fewer values, smaller recall.ks, or search=optuna",
+    )
+    chunk = settings["chunk"]
+    if chunk["settings"] or chunk["queries"]:
+        lines, columns = min(chunk["settings"] or 64, num_settings), min(chunk["queries"] or 1, queries)
+        require_memory(
+            f"chunk: {lines:,} settings x {columns:,} queries",
+            sweeping.block_bytes(matches, num_candidates, lines, columns),
+            "use a smaller chunk.settings or chunk.queries, or leave them null",
+        )
+
+
+def _kept(settings: dict[str, Any], images: prepare.Images, candidates: Shortlist) -> Path | None:
+    """Where an interrupted sweep goes on: finished blocks on these matches, by this version."""
+    if settings["store"] is None:
+        return None
+    recipe = stores.matches_recipe(settings, images.fingerprints, candidates.mask.shape[1])
+    versions = {name: runs.versions()[name] for name in ("mfvpr", "jax", "numpy")}
+    name = recipe_fingerprint({"matches": recipe, "versions": versions})
+    return build.expanded(settings["store"]) / f"{settings['dataset']['name']}_sweep-{name}"

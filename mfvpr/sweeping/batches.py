@@ -1,0 +1,66 @@
+"""Matches of all pairs of some queries -> batches of pairs with about as many matches: little padding, few shapes."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from mfvpr.numerics import round_up
+from mfvpr.pipeline import MatchSet, per_match
+from mfvpr.types import Matches
+
+BATCH_SLOTS = 2**14  # matches of a batch of pairs: its votes stay in cache
+PAIRS_STEP = 8
+BYTES_PER_SLOT = 33
+
+
+def slots(counts: np.ndarray) -> np.ndarray:
+    """Slots for pairs with so many matches: multiples of 32, beyond 512 at most an eighth too many.
+
+    A pair's slots depend on the pair alone, or its score would change with the company it is in.
+    """
+    step = 2.0 ** np.maximum(np.ceil(np.log2(np.maximum(counts, 1))) - 4, 5)
+    return (np.maximum(np.ceil(counts / step), 1) * step).astype(int)
+
+
+def batches(match_set: MatchSet, queries: range) -> Iterator[tuple[np.ndarray, Matches]]:
+    """All pairs that have matches.
+
+    Returns:
+        (places `[n]` in the flattened `[queries, C]`, Matches `[P, K, ...]` of P >= n pairs; padding has no matches).
+    """
+    counts = match_set.counts[queries.start : queries.stop].reshape(-1)
+    starts = np.cumsum(counts) - counts
+    flat, sizes0, sizes1 = _flattened(match_set, queries)
+    sizes = slots(counts)
+    for size in np.unique(sizes[counts > 0]):
+        places = np.flatnonzero((sizes == size) & (counts > 0))
+        pairs = round_up(BATCH_SLOTS // int(size), PAIRS_STEP)
+        for start in range(0, len(places), pairs):
+            part = places[start : start + pairs]
+            mask = np.zeros((pairs, size), bool)
+            mask[: len(part)] = np.arange(size)[None] < counts[part][:, None]
+            source = (starts[part][:, None] + np.arange(size)[None])[mask[: len(part)]]
+            fields = {name: np.zeros((*mask.shape, *values.shape[1:]), values.dtype) for name, values in flat.items()}
+            for name, values in flat.items():
+                fields[name][mask] = values[source]
+            padded = np.concatenate([part, np.repeat(part[-1:], pairs - len(part))])  # padding has image sizes as well
+            yield part, Matches(**fields, mask=mask, image_size0=sizes0[padded], image_size1=sizes1[padded])
+
+
+def image_sizes(match_set: MatchSet) -> tuple[np.ndarray, np.ndarray]:
+    """All combinations of sizes of query and database images, `[n, 2]` each."""
+    sizes0, sizes1 = (
+        np.unique(np.concatenate([np.reshape(getattr(one, name), (-1, 2)) for one in match_set.matches]), axis=0)
+        for name in ("image_size0", "image_size1")
+    )
+    return np.repeat(sizes0, len(sizes1), 0), np.tile(sizes1, (len(sizes0), 1))
+
+
+def _flattened(match_set: MatchSet, queries: range) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+    """All matches of some queries one after the other, by field, and both image sizes of every pair."""
+    found = [match_set.matches[query] for query in queries]
+    parts = [per_match(one) for one in found]
+    flat = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    shape = (match_set.counts.shape[1], 2)
+    sizes0 = np.concatenate([np.broadcast_to(one.image_size0, shape) for one in found])
+    return flat, sizes0, np.concatenate([np.broadcast_to(one.image_size1, shape) for one in found])

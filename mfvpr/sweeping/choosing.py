@@ -1,0 +1,71 @@
+"""Which setting is the best, on which queries that may be decided, and on which it may be reported."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+
+class Half(NamedTuple):
+    """A path cut in two: what is chosen or learned on one part, and reported on the other.
+
+    tune: `[t]` query rows to choose on.  report: `[r]` query rows to report on.
+    allowed: `[N]` bool, database rows that may be looked at while choosing.
+    """
+
+    tune: np.ndarray
+    report: np.ndarray
+    allowed: np.ndarray
+
+
+def halves(positives: np.ndarray) -> tuple[Half, Half]:
+    """The queries in two contiguous blocks, either of which is reported on once.
+
+    While choosing, nothing of the reported places is seen: database rows that are right for a reported query are not
+    allowed, and queries for which such a row is right are left out (they are neighbors across the cut).
+
+    Args:
+        positives: `[Q, N]` bool, what is right within the widest tolerance.
+    """
+    blocks = np.split(np.arange(len(positives)), [len(positives) // 2])
+    return _half(positives, blocks[0], blocks[1]), _half(positives, blocks[1], blocks[0])
+
+
+def _half(positives: np.ndarray, tune: np.ndarray, report: np.ndarray) -> Half:
+    allowed = np.logical_not(positives[report].any(axis=0))
+    return Half(tune[~(positives[tune] & ~allowed[None]).any(axis=1)], report, allowed)
+
+
+def hits(rows: np.ndarray, positives: np.ndarray, k: int = 1) -> np.ndarray:
+    """`[..., Q]` bool, whether one of the first k `rows` `[..., Q, depth]` is right; -1 never is."""
+    rows = rows[..., :k]
+    query = np.arange(len(positives)).reshape(-1, 1)
+    return np.any(positives[query, np.maximum(rows, 0)] & (rows >= 0), axis=-1)
+
+
+def neighbors(axes: Mapping[str, Sequence[Any]], setting: int) -> list[int]:
+    """Numbers of the settings of a grid that are one step along one axis away from a setting."""
+    shape = tuple(map(len, axes.values()))
+    place = np.array(np.unravel_index(setting, shape))
+    found = []
+    for axis, length in enumerate(shape):
+        for step in (-1, 1):
+            if 0 <= place[axis] + step < length:
+                other = place.copy()
+                other[axis] += step
+                found.append(int(np.ravel_multi_index(tuple(other), shape)))
+    return found
+
+
+def best_setting(recall: np.ndarray, axes: Mapping[str, Sequence[Any]] | None = None) -> int:
+    """The number of the setting with the highest `recall` `[S]`.
+
+    Among equals, the one whose neighbors in the grid have the highest recall on average (it depends least on luck),
+    and the first of those.
+    """
+    equal = np.flatnonzero(recall == recall.max())
+    if axes is None:
+        return int(equal[0])
+    around = [np.mean(recall[neighbors(axes, int(setting))] if neighbors(axes, int(setting)) else recall[setting])
+              for setting in equal]  # fmt: skip
+    return int(equal[int(np.argmax(around))])

@@ -1,0 +1,205 @@
+"""Every setting of a sweep on every query: scores, rankings, and of those the first few rows.
+
+Settings are batch axes of one compiled call. Matches are scored pair by pair, whatever query they belong to. Work goes
+block by block (some settings, some queries), which bounds the memory and is where an interrupted sweep goes on.
+"""
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from mfvpr import reranking
+from mfvpr.data.files import replacing
+from mfvpr.pipeline import MatchSet, Track, filter_scores, untracked
+from mfvpr.sweeping.batches import BYTES_PER_SLOT, batches, image_sizes, slots
+from mfvpr.sweeping.settings import FUSION, Group, Setting, distinct, groups
+from mfvpr.types import Array, Matches, Shortlist
+
+SETTINGS_PER_BLOCK = 64
+BLOCK_BYTES = 2**28
+_ALONE = "alone"  # the c of a score that is not fused
+
+
+@dataclass(frozen=True)
+class Work:
+    """What `sweep` was asked for, and a part of the queries.
+
+    Attributes:
+        match_set: of all queries.
+        queries: the part.
+        candidates: of the part, `[q, C]`.
+        views: V times the candidates `[q, C]` bool that are ranked.
+        depth: rows kept of each ranking.
+        by_index: equal scores go by database row.
+        euclidean: what the filter's scores are.
+    """
+
+    match_set: MatchSet
+    queries: range
+    candidates: Shortlist
+    views: Sequence[np.ndarray]
+    depth: int
+    by_index: bool
+    euclidean: bool
+
+    def parts(self, size: int) -> Iterator["Work"]:
+        """The same for at most `size` queries at a time."""
+        for start in range(0, len(self.queries), size):
+            part = slice(start, start + size)
+            candidates = jax.tree.map(lambda values: values[part], self.candidates)  # noqa: B023
+            views = [view[part] & candidates.mask for view in self.views]
+            yield replace(self, queries=self.queries[part], candidates=candidates, views=views)
+
+
+def sweep(
+    scorer: Any, settings: Sequence[Setting], match_set: MatchSet, candidates: Shortlist, *,
+    views: Sequence[np.ndarray] | None = None, depth: int = 10, by_index: bool = False, euclidean: bool = False,
+    settings_per_block: int | None = None, queries_per_block: int | None = None,
+    folder: Path | None = None, track: Track = untracked,
+) -> np.ndarray:  # fmt: skip
+    """The first rows of every query's ranking by every setting.
+
+    Args:
+        scorer: whose other parameters stay.
+        settings: S times values by name, the same names in each: fields of the scorer (numbers are batch axes, what
+            is static costs a program for each value), `weight` (a Weight), `max_distance` of matches, and `c` of the
+            fusion with the filter (None = balanced). Without `c` the score alone ranks.
+        match_set: matches of Q queries with C candidates.
+        candidates: their shortlist.
+        views: V times the candidates `[Q, C]` bool that are ranked; by default one, all of the shortlist.
+        depth: how many rows of a ranking are kept.
+        by_index: equal scores go by database row, not by the filter.
+        euclidean: as in `pipeline.fuse`.
+        settings_per_block: by default 64. The result does not depend on it, nor on the next.
+        queries_per_block: by default what 256 MB hold.
+        folder: where finished blocks are kept, to be read instead of being computed again; None = nowhere.
+        track: progress over blocks.
+
+    Returns:
+        `[V, S, Q, depth]` int32 database rows, best first, -1 where there is none.
+    """
+    num_queries, num_candidates = candidates.mask.shape
+    views = [candidates.mask] if views is None else views
+    scored, places = distinct(settings)
+    per_block = min(settings_per_block or SETTINGS_PER_BLOCK, len(scored))
+    queries = queries_per_block or queries_that_fit(match_set, num_candidates, per_block)
+    work = Work(match_set, range(num_queries), candidates, views, depth, by_index, euclidean)
+    blocks = [one for group in groups(scorer, scored, image_sizes(match_set)) for one in group.blocks(per_block)]
+    found = np.full((len(views), len(settings), num_queries, depth), -1, np.int32)
+    steps = ((part, block) for part in work.parts(queries) for block in blocks)
+    held: dict[range, list[tuple[np.ndarray, Matches]]] = {}
+    for part, block in track(steps, len(blocks) * -(-num_queries // queries)):
+        if part.queries not in held:  # the batches of one part at a time, and only if some block needs them
+            held = {part.queries: []}
+        wanted = [place for row in dict.fromkeys(block.rows.reshape(-1).tolist()) for place in places[row]]
+        cs = [settings[place].get(FUSION, _ALONE) for place in wanted]
+        shares = [len(places[row]) for row in dict.fromkeys(block.rows.reshape(-1).tolist())]
+        rows = _kept(folder, part, block, cs, lambda: _rows(part, block, held[part.queries], cs, shares))  # noqa: B023
+        found[:, wanted, part.queries.start : part.queries.stop] = rows
+    return found
+
+
+def result_bytes(num_views: int, num_settings: int, num_queries: int, depth: int) -> int:
+    """Bytes that `sweep` returns."""
+    return 4 * num_views * num_settings * num_queries * depth
+
+
+def block_bytes(match_set: MatchSet, num_candidates: int, num_settings: int, num_queries: int) -> int:
+    """Bytes that a block of `sweep` takes, about: its padded matches, its scores and their rankings."""
+    padded = np.sort(slots(match_set.counts).sum(1))[::-1][:num_queries].sum()
+    return int(2 * BYTES_PER_SLOT * padded) + 12 * num_settings * num_queries * num_candidates
+
+
+def queries_that_fit(match_set: MatchSet, num_candidates: int, num_settings: int) -> int:
+    """Queries of a block of so many settings that BLOCK_BYTES hold, at least one."""
+    one = block_bytes(match_set, num_candidates, num_settings, 1)
+    return max(1, min(len(match_set.matches), BLOCK_BYTES // max(one, 1)))
+
+
+def _rows(
+    part: Work, block: Group, held: list[tuple[np.ndarray, Matches]], cs: Sequence[Any], shares: Sequence[int]
+) -> np.ndarray:
+    """`[V, W, q, depth]`: the block's distinct settings, each as often as it has values of c."""
+    if not held:
+        held.extend(batches(part.match_set, part.queries))
+    scores = _scores(block, held, part.candidates.mask.shape)
+    _, first = np.unique(block.rows, return_index=True)
+    scores = np.repeat(scores.reshape(-1, *part.candidates.mask.shape)[np.sort(first)], shares, axis=0)
+    return np.stack([_first_rows(part, scores, cs, view) for view in part.views])
+
+
+_score_settings = jax.jit(reranking.score_settings)
+
+
+def _scores(block: Group, held: Sequence[tuple[np.ndarray, Matches]], shape: tuple[int, int]) -> np.ndarray:
+    """`[G, W, q, C]`; a pair without matches scores 0."""
+    scores = np.zeros((*block.rows.shape, shape[0] * shape[1]), np.float32)
+    for places, matches in held:
+        found = _score_settings(block.scorer, matches, block.settings, block.weightings)
+        scores[:, :, places] = np.asarray(found)[:, :, : len(places)]
+    return scores.reshape(*block.rows.shape, *shape)
+
+
+def _first_rows(part: Work, scores: np.ndarray, cs: Sequence[Any], view: np.ndarray) -> np.ndarray:
+    """`[W, q, depth]` database rows by scores `[W, q, C]`, each fused with its own c."""
+    indices, of_filter = part.candidates.indices, filter_scores(part.candidates, euclidean=part.euclidean)
+    rows = np.full((*scores.shape[:2], part.depth), -1, np.int32)
+    kinds = np.array(["alone" if c == _ALONE else "balanced" if c is None else "given" for c in cs])
+    for kind in np.unique(kinds):
+        members = np.flatnonzero(kinds == kind)
+        c = np.array([cs[int(member)] for member in members], np.float32) if kind == "given" else None
+        tie_break = indices if part.by_index else None
+        order = np.asarray(_orders(of_filter, scores[members], c, view, tie_break, fused=kind != "alone"))
+        order = order[..., : part.depth]
+        ranked = np.where(np.take_along_axis(view[None], order, -1), np.take_along_axis(indices[None], order, -1), -1)
+        rows[members, :, : ranked.shape[-1]] = ranked
+    return rows
+
+
+@partial(jax.jit, static_argnames="fused")
+def _orders(
+    of_filter: Array, scores: Array, c: Array | None, view: Array, tie_break: Array | None, *, fused: bool
+) -> Array:
+    """`[W, q, C]` positions into the shortlist, best first, one ranking of all queries at a time."""
+
+    def one(scores_c: tuple[Array, Array | None]) -> Array:
+        scores, c = scores_c
+        return reranking.rank(
+            reranking.fuse(of_filter, scores, view, c) if fused else scores, view, tie_break=tie_break
+        )
+
+    return jax.lax.map(one, (scores, c))
+
+
+def _kept(folder: Path | None, part: Work, block: Group, cs: Sequence[Any], compute: Any) -> np.ndarray:
+    """A block's rows, from its file where that is there and whole; else computed and written."""
+    if folder is None:
+        return compute()
+    path = folder / f"{_fingerprint(part, block, cs)}.npy"
+    if path.exists():
+        try:
+            rows = np.load(path, allow_pickle=False)
+            if rows.dtype == np.int32 and rows.shape == (len(part.views), len(cs), len(part.queries), part.depth):
+                return rows
+        except (OSError, ValueError, EOFError):
+            pass  # damaged: computed again
+    rows = compute()
+    with replacing(path) as temporary:
+        np.save(temporary, rows)
+    return rows
+
+
+def _fingerprint(part: Work, block: Group, cs: Sequence[Any]) -> str:
+    """All that a block's rows depend on, but for the matches and the shortlist."""
+    leaves, structure = jax.tree.flatten((block.scorer, dict(block.settings), dict(block.weightings), list(part.views)))
+    options = part.queries, part.depth, part.by_index, part.euclidean, [repr(c) for c in cs]
+    digest = hashlib.sha256(repr((structure, options, block.rows.tolist())).encode())
+    for leaf in leaves:
+        digest.update(np.asarray(leaf).tobytes() + b";")
+    return digest.hexdigest()[:24]

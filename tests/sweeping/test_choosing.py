@@ -1,0 +1,49 @@
+"""Which setting, on which queries: explicit small cases."""
+
+import numpy as np
+import pytest
+
+from mfvpr import frame_positives
+from mfvpr.sweeping import best_setting, halves, hits, neighbors
+
+
+@pytest.mark.parametrize("tolerance", [0, 1, 3])
+def test_halves_never_share_a_place(tolerance):
+    places = np.arange(20)
+    positives = frame_positives(places, places, tolerance=tolerance)
+    for half in halves(positives):
+        near = {place for query in half.report for place in range(query - tolerance, query + tolerance + 1)}
+        assert set(np.flatnonzero(~half.allowed)) == near & set(range(20))
+        assert all(set(np.flatnonzero(positives[query])) & near == set() for query in half.tune)
+        assert list(half.report) == list(range(half.report[0], half.report[-1] + 1))
+    reported = np.concatenate([half.report for half in halves(positives)])
+    assert sorted(reported) == list(range(20))
+    first, second = halves(positives)
+    assert len(first.tune) == len(second.tune) == 10 - 2 * tolerance
+
+
+def test_queries_without_a_place_may_be_tuned_on():
+    positives = frame_positives(np.array([0, -1, 8, 9]), np.arange(10), tolerance=1)
+    first, _ = halves(positives)
+    assert list(first.tune) == [0, 1]
+
+
+def test_hits_look_at_the_first_k_and_never_at_nothing():
+    positives = np.array([[True, False, False], [False, False, True]])
+    rows = np.array([[[1, 0], [0, 2]], [[-1, -1], [2, -1]]])  # [settings, queries, depth]
+    np.testing.assert_array_equal(hits(rows, positives), [[False, False], [False, True]])
+    np.testing.assert_array_equal(hits(rows, positives, k=2), [[True, True], [False, True]])
+
+
+def test_neighbors_are_one_step_along_one_axis():
+    axes = {"sigma": [1, 2, 3], "weight": ["fs", "dmf"]}  # numbers: 0 1 / 2 3 / 4 5
+    assert neighbors(axes, 2) == [0, 4, 3]
+    assert neighbors(axes, 5) == [3, 4]
+    assert neighbors({"sigma": [1]}, 0) == []
+
+
+def test_equals_are_told_apart_by_their_neighbors():
+    axes = {"sigma": [1, 2, 3, 4, 5]}
+    assert best_setting(np.array([0.9, 0.1, 0.8, 0.9, 0.8]), axes) == 3
+    assert best_setting(np.array([0.9, 0.1, 0.8, 0.9, 0.8])) == 0
+    assert best_setting(np.array([0.2, 0.1, 0.8, 0.4, 0.7]), axes) == 2

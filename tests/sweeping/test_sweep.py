@@ -1,0 +1,177 @@
+"""Sweeps against one evaluation after the other."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+import mfvpr
+from mfvpr import pipeline, sweeping
+from mfvpr.pipeline import MatchSet
+from mfvpr.sweeping.batches import slots
+from mfvpr.types import Shortlist
+from tests.builders import random_matches
+
+FS, DMF = mfvpr.FeatureScoreWeight(), mfvpr.DescriptorDistanceWeight()
+QUERIES, CANDIDATES, DATABASE = 7, 5, 9
+
+
+def make_set():
+    """Few to many matches a pair, some pairs without, and a shortlist that ends early for one query."""
+    rng = np.random.default_rng(4)
+    flat, counts = [], []
+    for _ in range(QUERIES):
+        pairs = [random_matches(rng, count) for count in rng.permutation([0, 3, 20, 33, 70])]
+        counts.append([int(pair.mask.sum()) for pair in pairs])
+        joined = {
+            name: np.concatenate([getattr(pair, name)[pair.mask] for pair in pairs])
+            for name in ("points0", "points1", "distance", "scores0", "scores1", "mask")
+        }
+        sizes = np.stack([pair.image_size1 for pair in pairs])
+        none = {"ratio": None, "confidence": None}
+        flat.append(replace(pairs[0], **joined, **none, image_size0=pairs[0].image_size0, image_size1=sizes))
+    indices = np.stack([rng.permutation(DATABASE)[:CANDIDATES] for _ in range(QUERIES)]).astype(np.int32)
+    indices[2, 3:] = -1
+    scores = np.sort(rng.random((QUERIES, CANDIDATES)).astype(np.float32))[:, ::-1]
+    counts = np.array(counts)
+    return MatchSet(flat, counts, 96), Shortlist(indices, scores, indices >= 0)
+
+
+@pytest.fixture(scope="module")
+def data():
+    return make_set()
+
+
+_score = jax.jit(mfvpr.score_candidates)
+
+
+def one_by_one(scorer, setting, match_set, candidates, view=None, **options):
+    """Rows of one setting, by the functions that an evaluation calls."""
+    setting = dict(setting)
+    limit, fused, c = setting.pop("max_distance", np.inf), "c" in setting, setting.pop("c", None)
+    scorer = replace(scorer, **setting)
+    scorer = pipeline._prepare(scorer, match_set.matches[0])
+    scores = []
+    for query in range(QUERIES):
+        padded = match_set[query]
+        scores.append(_score(scorer, replace(padded, mask=padded.mask & (padded.distance <= limit))))
+    view = candidates.mask if view is None else view
+    seen = replace(candidates, mask=candidates.mask & view)
+    scores = np.array(scores, np.float32)
+    scores = pipeline.fuse(seen, scores, c) if fused else scores
+    order = pipeline.rank(seen, scores, **options)
+    return np.where(np.take_along_axis(seen.mask, order, 1), np.take_along_axis(candidates.indices, order, 1), -1)
+
+
+CASES = [
+    (mfvpr.HistogramOfShifts(), {"sigma": [9.0, 22.5], "bin_size": [8.0, 15.0, 16.0], "weight": [FS, DMF]}),
+    (mfvpr.HistogramOfShifts(), {"max_distance": [0.8, 2.0], "align": ["min_edge", "zero_edge"], "c": [None, 0.5, 0]}),
+    (mfvpr.HistogramOfShifts(bin_size=20.0), {"temperature": [None, 0.5], "c": [0.0]}),
+    (mfvpr.AnchorPoints(), {"num_bins": [6, 8], "window": [4, 6], "tolerance": [1, 2.5], "weight": [DMF, FS]}),
+    (mfvpr.AggregatedScore(), {"weight": [FS, DMF], "max_distance": [1.0, 2.0], "mean": ["unweighted", "median"]}),
+    (mfvpr.MatchCount(), {"max_distance": [0.5, 1.0, 1.5]}),
+]
+
+
+@pytest.mark.parametrize(("scorer", "axes"), CASES, ids=lambda value: type(value).__name__)
+def test_sweep_is_one_evaluation_per_setting(data, scorer, axes):
+    settings = sweeping.grid(axes)
+    got = sweeping.sweep(scorer, settings, *data, depth=CANDIDATES)
+    assert got.shape == (1, len(settings), QUERIES, CANDIDATES)
+    for rows, setting in zip(got[0], settings, strict=True):
+        np.testing.assert_array_equal(rows, one_by_one(scorer, setting, *data), err_msg=str(setting))
+
+
+def test_settings_need_not_be_a_grid(data):
+    scorer = mfvpr.HistogramOfShifts()
+    settings = [
+        {"sigma": 9.0, "max_distance": 2.0, "weight": FS},
+        {"sigma": 30.0, "max_distance": 0.9, "weight": DMF},
+        {"sigma": 14.0, "max_distance": 2.0, "weight": DMF},
+    ]
+    got = sweeping.sweep(scorer, settings, *data, depth=2)
+    for rows, setting in zip(got[0], settings, strict=True):
+        np.testing.assert_array_equal(rows, one_by_one(scorer, setting, *data)[:, :2])
+
+
+@pytest.mark.parametrize("settings_per_block", [1, 5, 100])
+@pytest.mark.parametrize("queries_per_block", [1, 4, 100])
+def test_chunks_change_nothing(data, settings_per_block, queries_per_block):
+    settings = sweeping.grid(CASES[0][1] | {"c": [None, 1.0]})
+    got = sweeping.sweep(
+        CASES[0][0], settings, *data,
+        settings_per_block=settings_per_block, queries_per_block=queries_per_block,
+    )  # fmt: skip
+    np.testing.assert_array_equal(got, sweeping.sweep(CASES[0][0], settings, *data))
+
+
+def test_views_hide_candidates_and_ties_may_go_by_index(data):
+    _, candidates = data
+    view = np.random.default_rng(1).random(candidates.mask.shape) < 0.6
+    settings = [{"max_distance": limit, "c": c} for limit in (0.05, 2.0) for c in (None, 0.0)]  # 0.05: mostly ties
+    got = sweeping.sweep(mfvpr.MatchCount(), settings, *data, views=[candidates.mask, view], by_index=True)
+    for seen, rows in zip((candidates.mask, view), got, strict=True):
+        for found, setting in zip(rows, settings, strict=True):
+            expected = one_by_one(mfvpr.MatchCount(), setting, *data, view=seen, ties="index")
+            np.testing.assert_array_equal(found[:, :CANDIDATES], expected)
+            assert (found[:, CANDIDATES:] == -1).all()
+
+
+def test_finished_blocks_are_read_and_damaged_ones_computed_again(data, tmp_path, monkeypatch):
+    scorer, settings = mfvpr.HistogramOfShifts(), sweeping.grid({"sigma": [9.0, 12.0, 20.0], "c": [None, 0.5]})
+    expected = sweeping.sweep(scorer, settings, *data)
+
+    class Stopped(Exception):
+        pass
+
+    def stops(steps, total):
+        for number, step in enumerate(steps):
+            if number == 4:
+                raise Stopped
+            yield step
+
+    chunks = {"settings_per_block": 1, "queries_per_block": 3, "folder": tmp_path}
+    with pytest.raises(Stopped):
+        sweeping.sweep(scorer, settings, *data, track=stops, **chunks)
+    kept = sorted(tmp_path.iterdir())
+    assert len(kept) == 4
+    kept[0].write_bytes(kept[0].read_bytes()[:-5])
+    kept[1].write_bytes(b"")
+    computed = []
+    module = sweeping.sweep.__globals__
+    scores = module["_scores"]
+    monkeypatch.setitem(module, "_scores", lambda *inputs: computed.append(1) or scores(*inputs))
+    np.testing.assert_array_equal(sweeping.sweep(scorer, settings, *data, **chunks), expected)
+    assert len(computed) == 9 - 4 + 2
+    np.testing.assert_array_equal(sweeping.sweep(scorer, settings, *data, **chunks), expected)
+    assert len(computed) == 9 - 4 + 2
+    other = [{**setting, "sigma": setting["sigma"] + 1} for setting in settings]
+    sweeping.sweep(scorer, other, *data, **chunks)
+    assert len(computed) == 9 - 4 + 2 + 9
+
+
+def test_one_program_per_shape_and_capacity(data, compilations):
+    match_set, _ = data
+    shapes = len(np.unique(slots(match_set.counts[match_set.counts > 0])))
+    axes = {"sigma": [9.0, 22.5, 30.0], "bin_size": [8.0, 14.9, 15.0], "max_distance": [0.8, 2.0]}
+    sweeping.sweep(mfvpr.HistogramOfShifts(), sweeping.grid(axes), *data)
+    compilations.reset()
+    axes = {"sigma": [7.0, 21.5, 33.0], "bin_size": [8.1, 14.8, 15.1], "max_distance": [0.7, 1.0]}
+    sweeping.sweep(mfvpr.HistogramOfShifts(), sweeping.grid(axes), *data)
+    assert compilations.count == 0
+    sweeping.sweep(mfvpr.HistogramOfShifts(), sweeping.grid(axes | {"bin_size": [6.0, 12.0, 12.1]}), *data)
+    assert 1 <= compilations.count <= 2 * shapes  # two capacities
+
+
+@pytest.mark.parametrize("count", [1, 31, 32, 33, 64, 65, 255, 257, 300, 511, 513, 800, 2000])
+def test_slots_hold_every_match_with_little_padding(count):
+    size = int(slots(np.array([count]))[0])
+    assert count <= size <= max(count + 31, 1.13 * count)
+
+
+def test_memory_is_told_beforehand(data):
+    match_set, _ = data
+    assert sweeping.result_bytes(2, 10, 7, 3) == np.zeros((2, 10, 7, 3), np.int32).nbytes
+    one = sweeping.block_bytes(match_set, CANDIDATES, 10, 1)
+    assert one < sweeping.block_bytes(match_set, CANDIDATES, 20, 1) < sweeping.block_bytes(match_set, CANDIDATES, 20, 7)
