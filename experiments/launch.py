@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 from experiments.errors import one_line, unwind_on_sigterm
 from experiments.settings import SettingsError, check
 
-PATHS = {"database", "queries", "root", "index_file", "cache", "store", "out"}
+PATHS = {"database", "queries", "root", "index_file", "cache", "store", "out", "checkpoints"}
 CONF = Path(__file__).parent.parent / "conf"
 
 

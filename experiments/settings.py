@@ -143,6 +143,15 @@ RULES: dict[str, Rule] = {
     "trials": _between(1, 100_000),
     "split": _one_of(None, "first_half", "second_half", "both"),
     "resamples": _between(100, 1_000_000),
+    # learning
+    "loss": _one_of("cross_entropy", "recall", "average_precision"),
+    "steps": _COUNT,
+    "every": _COUNT,
+    "patience": _COUNT,
+    "batch": _between(1, 1024),
+    "learning_rate": _POSITIVE,
+    "hidden": _between(1, 1024),
+    "checkpoints": _or(_TEXT, None),
     "chunk.settings": _or(_COUNT, None),
     "chunk.queries": _or(_COUNT, None),
 }

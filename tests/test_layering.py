@@ -15,13 +15,24 @@ ALLOWED = {
     "matching": {"numerics", "types"},
     "scoring": {"numerics", "types", "weighting", "scoring"},
     "retrieval": {"numerics", "types"},
-    "reranking": {"numerics", "types", "scoring"},
+    "reranking": {"matching", "numerics", "types", "scoring", "weighting"},
+    "learning": {
+        "errors",
+        "numerics",
+        "types",
+        "weighting",
+        "matching",
+        "scoring",
+        "reranking",
+        "learning",
+    },
     "evaluation": set(),
     "data": {"errors", "evaluation", "types", "data"},
     "models": {"errors", "numerics", "types", "models"},
     "weights": {"errors", "data", "models", "weights"},
     "features": {"errors", "types", "numerics", "data", "models", "features"},
     "extraction": {"errors", "types", "numerics", "data", "features"},
+    "statistics": set(),
     "report": {"errors", "types", "data", "pipeline", "report"},
 }
 HOMES = {
@@ -35,6 +46,8 @@ HOMES = {
     "tensorstore": {"data"},
     "safetensors": {"weights"},
     "tqdm": set(),
+    "optax": {"learning"},
+    "orbax": {"learning"},
 }
 MODULES = sorted((ROOT / "mfvpr").rglob("*.py"))
 

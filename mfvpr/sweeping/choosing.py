@@ -27,11 +27,12 @@ def halves(positives: np.ndarray) -> tuple[Half, Half]:
     Args:
         positives: `[Q, N]` bool, what is right within the widest tolerance.
     """
-    blocks = np.split(np.arange(len(positives)), [len(positives) // 2])
-    return _half(positives, blocks[0], blocks[1]), _half(positives, blocks[1], blocks[0])
+    first, second = np.split(np.arange(len(positives)), [len(positives) // 2])
+    return separated(positives, first, second), separated(positives, second, first)
 
 
-def _half(positives: np.ndarray, tune: np.ndarray, report: np.ndarray) -> Half:
+def separated(positives: np.ndarray, tune: np.ndarray, report: np.ndarray) -> Half:
+    """Query rows to choose on and to report on, without those that share a place; see `halves`."""
     allowed = np.logical_not(positives[report].any(axis=0))
     return Half(tune[~(positives[tune] & ~allowed[None]).any(axis=1)], report, allowed)
 

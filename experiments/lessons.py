@@ -1,0 +1,273 @@
+"""The stages of learning: what is learned on one half of the path, beside what is set by hand, on the other half."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import optax
+
+import mfvpr
+from experiments import axes, build, learn_outputs, prepare, stores
+from experiments.judging import Judge, judge
+from experiments.models import LOSSES, NUMBERS, Lesson, Model, model
+from experiments.settings import SettingsError
+from mfvpr import pipeline, sweeping
+from mfvpr.data.store_manifest import recipe_fingerprint
+from mfvpr.learning.match_weight import LearnedWeight
+from mfvpr.learning.training import Fit, fit
+from mfvpr.numerics import round_up
+from mfvpr.pipeline import MatchSet
+from mfvpr.report import runs
+from mfvpr.sweeping import Half
+from mfvpr.types import Matches, Shortlist
+
+VALIDATION = 0.25  # of the queries to learn on, the end of their block
+
+
+@dataclass(frozen=True)
+class School:
+    """One half of the path to learn on.
+
+    Attributes:
+        settings: all.
+        matches: of all queries.
+        candidates: of all queries.
+        judge: what is right.
+        half: where to choose and where to report.
+        learning: `[t]` queries of the losses.
+        validating: `[v]` queries that stop the learning.
+        seen: `[Q, C]` bool, candidates that learning may look at.
+        name: of the half.
+    """
+
+    settings: dict[str, Any]
+    matches: MatchSet
+    candidates: Shortlist
+    judge: Judge
+    half: Half
+    learning: np.ndarray
+    validating: np.ndarray
+    seen: np.ndarray
+    name: str
+
+    def part(self, queries: np.ndarray) -> tuple[MatchSet, Shortlist]:
+        """Matches and candidates of some queries."""
+        chosen = [self.matches.matches[query] for query in queries]
+        part = MatchSet(chosen, self.matches.counts[queries], self.matches.capacity)
+        return part, jax.tree.map(lambda values: values[queries], self.candidates)
+
+    @property
+    def right(self) -> np.ndarray:
+        """`[Q, C]` bool, candidates that are right within the threshold that decides."""
+        return self._positive(self.judge.positives[self.judge.main])
+
+    @property
+    def usable(self) -> np.ndarray:
+        """`[Q, C]` bool, candidates of the losses: seen, and not right by the widest threshold alone."""
+        return self.seen & ~(self._positive(self.judge.positives[-1]) & ~self.right)
+
+    def _positive(self, positives: np.ndarray) -> np.ndarray:
+        indices = np.maximum(self.candidates.indices, 0)
+        return np.take_along_axis(positives, indices, axis=1) & self.candidates.mask
+
+    @property
+    def width(self) -> int:
+        """Candidates that hold every query's usable ones."""
+        return round_up(int(self.usable[self.half.tune].sum(axis=1).max()), 8)
+
+    def lesson(self, queries: np.ndarray, size: int) -> Lesson:
+        """Some queries, padded to `size`; padding has no candidates."""
+        padded = np.concatenate([queries, np.repeat(queries[-1:], size - len(queries))])
+        places = np.argsort(~self.usable[padded], axis=1, kind="stable")[:, : self.width]
+        take = partial(np.take_along_axis, indices=places, axis=1)
+        mask = take(self.usable[padded]) & (np.arange(size) < len(queries))[:, None]
+        matches = [jax.tree.map(lambda values: values[order], self.matches[query])  # noqa: B023
+                   for query, order in zip(padded, places, strict=True)]  # fmt: skip
+        stacked: Matches = jax.tree.map(lambda *values: np.stack(values), *matches)
+        return Lesson(stacked, take(self.candidates.scores[padded]), take(self.right[padded]), mask)
+
+
+def learn(settings: dict[str, Any]) -> None:
+    """Matches -> learned, searched and hand-set scores on the half that none of them saw -> table, figures, files."""
+    folder = build.expanded(settings["out"]) if settings["out"] else None
+    runs.check_free(folder or runs.new_run_folder(Path("runs"), settings["dataset"]["name"]))
+    varied = axes.axes(settings)
+    if varied.method not in NUMBERS:
+        raise SettingsError(f"scorer={varied.method}: it has nothing to learn; expected one of {', '.join(NUMBERS)}")
+    if settings["split"] is None:
+        raise SettingsError("split=null: what is learned is never reported on the same queries; expected first_half, "
+                            "second_half or both")  # fmt: skip
+    tools = prepare.extractors(settings)
+    watch = prepare.Stopwatch()
+    with watch("data"):
+        images = prepare.images(settings)
+    judgment = judge(settings, images.dataset)
+    matches, candidates = prepare.matched(settings, tools, images, watch)
+    checkpoints = _checkpoints(settings, images, candidates)
+    results = []
+    with watch("learning"):
+        for school in _schools(settings, matches, candidates, judgment):
+            results.append(list(_lessons(school, varied, checkpoints)))
+    outcome = learn_outputs.Outcome(settings, images, judgment, matches, candidates, results, watch.seconds)
+    folder = folder or runs.new_run_folder(Path("runs"), images.dataset.name)
+    with runs.writing(folder) as new:
+        text = learn_outputs.write(new, outcome)
+    print(f"\n{text}\nresults: {folder}")
+
+
+def _schools(settings: dict[str, Any], matches: MatchSet, candidates: Shortlist, judgment: Judge) -> Iterator[School]:
+    names = ["first_half", "second_half"] if settings["split"] == "both" else [settings["split"]]
+    for name, half in zip(names, judgment.halves, strict=True):
+        cut = len(half.tune) - round(VALIDATION * len(half.tune))
+        apart = sweeping.separated(judgment.positives[-1], half.tune[:cut], half.tune[cut:])
+        seen = candidates.mask & half.allowed[np.maximum(candidates.indices, 0)]
+        school = School(settings, matches, candidates, judgment, half, apart.tune, apart.report, seen, name)
+        teaches = np.asarray((school.right & school.usable).any(axis=1))
+        school = replace(
+            school, learning=apart.tune[teaches[apart.tune]], validating=apart.report[teaches[apart.report]]
+        )
+        if not len(school.learning) or not len(school.validating):
+            raise SettingsError(
+                f"split={name}: expected queries to learn on and to validate with, got {len(school.learning)} and "
+                f"{len(school.validating)}; use more queries or candidates"
+            )
+        yield school
+
+
+def _lessons(
+    school: School, varied: axes.Axes, checkpoints: Callable[[str, str], Any]
+) -> Iterator["learn_outputs.Result"]:
+    """Every row of the table, on the queries of the half that is reported on."""
+    settings, own = school.settings, axes.scorer(school.settings)
+    c = settings["fusion"]["c"]
+    yield _reported(school, "paper", own, None)
+    yield _reported(school, "paper + filter", own, "auto" if c == "auto" else float(c))
+    spread = _spread(school, own)
+    for fused in (False, True):
+        scorer, chosen_c, written = _searched(school, varied, spread, fused=fused)
+        name = "grid search" + " + filter" * fused
+        yield replace(_reported(school, name, scorer, chosen_c if fused else None), values=written)
+    for learned_weight in (False, True):
+        for fused in (False, True):
+            name = ("match weights" if learned_weight else "gradient") + " + filter" * fused
+            start = _start(school, name, varied.method, own, fused=fused, learned_weight=learned_weight)
+            fitted = _fit(school, start, *checkpoints(school.name, name))
+            final = start.c_of(fitted.parameters)
+            found = _reported(school, name, start.scorer_of(fitted.parameters), None if final is None else float(final))
+            yield replace(found, values=_values(start, fitted), fitted=fitted)
+
+
+def _start(school: School, name: str, method: str, own: Any, *, fused: bool, learned_weight: bool) -> Model:
+    weight = None
+    if learned_weight:
+        own = replace(own, weight=mfvpr.UnitWeight())  # what a learned weight starts as
+        seed = jax.random.key(school.settings["seed"])
+        sample = school.lesson(school.learning[: school.settings["batch"]], school.settings["batch"])
+        weight = LearnedWeight.create(seed, sample.matches, school.settings["hidden"])
+    spread = _spread(school, own)
+    sizes = school.matches[0].image_size0, school.matches[0].image_size1
+    scorer = own.with_capacity(*sizes) if isinstance(own, mfvpr.HistogramOfShifts) else own
+    scorer = jax.tree.map(np.float32, scorer)
+    start = 0.3 * _balance(school, spread) if fused else None
+    return model(name, method, scorer, spread, fused=start, weight=weight)
+
+
+def _fit(school: School, start: Model, folder: Path | None, recipe: dict[str, Any]) -> Fit:
+    settings, size = school.settings, school.settings["batch"]
+    objective = start.objective(LOSSES[settings["loss"]])
+    validated = jax.jit(objective)
+    parts = [school.validating[place : place + size] for place in range(0, len(school.validating), size)]
+    lessons = [school.lesson(part, size) for part in parts]
+
+    def batches(step: int) -> Lesson:
+        """Every query once before any comes again, in an order that the step alone decides."""
+        per_epoch = -(-len(school.learning) // size)
+        epoch, place = divmod(step, per_epoch)
+        order = np.random.default_rng([settings["seed"], epoch]).permutation(school.learning)
+        return school.lesson(order[place * size : (place + 1) * size], size)
+
+    def validate(parameters: Any) -> float:
+        found = [float(validated(parameters, lesson)) * len(part) for lesson, part in zip(lessons, parts, strict=True)]
+        return sum(found) / len(school.validating)
+
+    return fit(
+        start.start, objective, batches, optimizer=optax.adam(settings["learning_rate"]), steps=settings["steps"],
+        validate=validate, every=settings["every"], patience=settings["patience"], folder=folder, recipe=recipe,
+        track=build.track(f"{school.name}: {start.name}"),
+    )  # fmt: skip
+
+
+def _reported(school: School, name: str, scorer: Any, c: float | str | None) -> "learn_outputs.Result":
+    """A scorer on the half that is reported on, with all candidates; `c` None = not fused."""
+    matches, candidates = school.part(school.half.report)
+    scores = pipeline.score({"it": scorer}, matches, candidates)["it"]
+    if c is not None:
+        scores = pipeline.fuse(candidates, scores, None if isinstance(c, str) else c)
+    order = pipeline.rank(candidates, scores)
+    rows = np.take_along_axis(np.where(candidates.mask, candidates.indices, -1), order, axis=1)
+    hits = np.stack([sweeping.hits(rows, right[school.half.report]) for right in school.judge.positives])
+    return learn_outputs.Result(school.name, name, hits, {}, None)
+
+
+def _searched(school: School, varied: axes.Axes, spread: float, *, fused: bool) -> tuple[Any, Any, dict[str, Any]]:
+    """The best setting of the grid on the half to choose on: its scorer, its c, and its values as written."""
+    values = {name: axis for name, axis in varied.values.items() if name != "c" or fused}
+    balance = _balance(school, spread)
+    written = sweeping.grid(values)
+    settings = [axes.as_setting(one) for one in written]
+    if fused:
+        settings = [{**one, "c": None if one["c"] is None else one["c"] * balance} for one in settings]
+    matches, candidates = school.part(school.half.tune)
+    rows = sweeping.sweep(
+        axes.scorer(school.settings), settings, matches, candidates, views=[school.seen[school.half.tune]], depth=1,
+        track=build.track(f"{school.name}: grid" + " + filter" * fused),
+    )  # fmt: skip
+    right = school.judge.positives[school.judge.main][school.half.tune]
+    best = sweeping.best_setting(sweeping.hits(rows[0], right).mean(axis=-1), values)
+    chosen = dict(settings[best])
+    c = chosen.pop("c", None)
+    own: Any = axes.scorer(school.settings)
+    return replace(own, **chosen), "auto" if c is None else c, written[best]
+
+
+def _spread(school: School, scorer: Any) -> float:
+    """Standard deviation of the scores that learning may see."""
+    matches, candidates = school.part(school.learning)
+    scores = pipeline.score({"it": scorer}, matches, candidates)["it"]
+    return float(np.std(scores[school.seen[school.learning]])) or 1.0
+
+
+def _balance(school: School, spread: float) -> float:
+    """The c that gives the filter's scores the same spread."""
+    deviation = float(np.std(school.candidates.scores[school.learning][school.seen[school.learning]]))
+    return spread / deviation if deviation else 0.0
+
+
+def _values(start: Model, fitted: Fit) -> dict[str, Any]:
+    numbers = start.scorer_of(fitted.parameters)
+    names = fitted.parameters["numbers"]
+    values: dict[str, Any] = {name: float(getattr(numbers, name)) for name in names}
+    c = start.c_of(fitted.parameters)
+    return values if c is None else values | {"c": float(c)}
+
+
+def _checkpoints(
+    settings: dict[str, Any], images: prepare.Images, candidates: Shortlist
+) -> Callable[[str, str], tuple[Path | None, dict[str, Any]]]:
+    """Where the training of a half's model is kept, and what identifies it."""
+    data = stores.matches_recipe(settings, images.fingerprints, candidates.mask.shape[1])
+    names = ("scorer", "loss", "every", "patience", "batch", "learning_rate", "hidden", "seed")
+    recipe = {"matches": data, "tolerances": settings["recall"]} | {name: settings[name] for name in names}
+    recipe["versions"] = {name: runs.versions()[name] for name in ("mfvpr", "jax", "numpy")}
+    root = settings["checkpoints"] or settings["store"]
+    own = "" if settings["checkpoints"] else f"{settings['dataset']['name']}_learning-{recipe_fingerprint(recipe)}"
+
+    def of(half: str, name: str) -> tuple[Path | None, dict[str, Any]]:
+        place = f"{half}-{name}".replace(" ", "_").replace("_+_", "_")
+        return (build.expanded(root) / own / place if root else None), recipe | {"half": half, "model": name}
+
+    return of

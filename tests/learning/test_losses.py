@@ -1,0 +1,176 @@
+"""Losses of a ranking against explicit loops in float64, their limits, and their gradients."""
+
+import math
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from jax.test_util import check_grads
+
+from mfvpr import rank, recall_at_k
+from mfvpr.learning.losses import cross_entropy, mean_loss, smooth_average_precision, smooth_recall_at_1
+
+CANDIDATES = 6
+LOSSES = {
+    "cross_entropy": cross_entropy,
+    "recall": partial(smooth_recall_at_1, temperature=0.7),
+    "precision": partial(smooth_average_precision, temperature=0.7),
+}
+losses = pytest.mark.parametrize("name", LOSSES)
+COMPILED = {name: jax.jit(jax.value_and_grad(loss)) for name, loss in LOSSES.items()}
+
+
+def softmax(scores):
+    powers = [math.exp(score - max(scores)) for score in scores]
+    return [power / sum(powers) for power in powers]
+
+
+def oracle(name, scores, positives, mask, temperature=0.7):
+    """The loss with loops over the real candidates."""
+    real = [i for i in range(len(scores)) if mask[i]]
+    scores, right = [float(scores[i]) for i in real], [bool(positives[i]) for i in real]
+    if not any(right):
+        return 0.0
+    if name == "cross_entropy":
+        return -math.log(sum(p for p, is_right in zip(softmax(scores), right, strict=True) if is_right))
+    if name == "recall":
+        scaled = softmax([score / temperature for score in scores])
+        return 1 - sum(p for p, is_right in zip(scaled, right, strict=True) if is_right)
+    precisions = []
+    for i in range(len(scores)):
+        if not right[i]:
+            continue
+        ahead = [1 / (1 + math.exp((scores[i] - scores[j]) / temperature)) for j in range(len(scores))]
+        others = [j for j in range(len(scores)) if j != i]
+        among = 1 + sum(ahead[j] for j in others if right[j])
+        precisions.append(among / (1 + sum(ahead[j] for j in others)))
+    return 1 - sum(precisions) / len(precisions)
+
+
+def average_precision(scores, positives):
+    """The exact one: mean over positives of the share of positives down to their place."""
+    found, precisions = 0, []
+    for place, i in enumerate(sorted(range(len(scores)), key=lambda i: -scores[i]), start=1):
+        if positives[i]:
+            found += 1
+            precisions.append(found / place)
+    return sum(precisions) / len(precisions)
+
+
+def random_queries(seed, queries=200, candidates=CANDIDATES):
+    """Scores without ties, NaN on padding; some queries without positives, some without candidates."""
+    rng = np.random.default_rng(seed)
+    mask = rng.random((queries, candidates)) < 0.8
+    positives = rng.random((queries, candidates)) < 0.3  # on padding as well
+    mask[:5] = False
+    positives[5:10] = False
+    scores = rng.permuted(np.tile(np.arange(candidates, dtype=np.float32), (queries, 1)), axis=1)
+    return np.where(mask, scores, np.nan).astype(np.float32), positives, mask
+
+
+def distances(loss, exact, *queries):
+    """Of the mean loss from the exact one, for falling temperatures."""
+    smooth = jax.jit(lambda temperature: mean_loss(partial(loss, temperature=temperature), *queries))
+    return [abs(float(smooth(temperature)) - exact) for temperature in (1.0, 0.3, 0.1, 0.03)]
+
+
+@losses
+@given(
+    scores=st.lists(st.floats(-20, 20, width=32), min_size=CANDIDATES, max_size=CANDIDATES),
+    positives=st.lists(st.booleans(), min_size=CANDIDATES, max_size=CANDIDATES),
+    mask=st.lists(st.booleans(), min_size=CANDIDATES, max_size=CANDIDATES),
+    garbage=st.sampled_from([math.nan, math.inf, -1e30, 0.0]),
+)
+def test_loss_equals_the_loops_and_padding_never_matters(name, scores, positives, mask, garbage):
+    positives, mask = np.array(positives), np.array(mask)
+    padded = np.where(mask, scores, garbage).astype(np.float32)
+    loss, gradient = COMPILED[name](padded, positives, mask)
+    np.testing.assert_allclose(loss, oracle(name, scores, positives, mask), rtol=2e-5, atol=2e-6)
+    assert np.all(np.isfinite(gradient))
+    assert np.all(np.asarray(gradient)[~mask] == 0)
+    if not np.any(positives & mask):
+        assert loss == 0
+        assert np.all(gradient == 0)
+
+
+@losses
+def test_gradient_equals_finite_differences(name):
+    rng = np.random.default_rng(0)
+    positives, mask = np.array([0, 1, 0, 1, 0, 1], bool), np.array([1, 1, 1, 1, 0, 0], bool)
+    with jax.enable_x64(True):
+        scores = jnp.asarray(np.where(mask, rng.normal(size=6), 0.0))
+        loss = jax.jit(lambda scores: LOSSES[name](scores, positives, mask))
+        check_grads(loss, (scores,), order=1, modes=["rev"])
+
+
+@pytest.mark.parametrize("loss", [smooth_recall_at_1, smooth_average_precision])
+def test_temperature_has_a_gradient_and_must_be_above_0(loss):
+    query = np.array([0.3, 0.1, -0.4, 0.9]), np.array([0, 1, 0, 1], bool), np.ones(4, bool)
+    with jax.enable_x64(True):
+        compiled = jax.jit(lambda temperature: loss(*query, temperature))
+        check_grads(compiled, (jnp.asarray(0.4),), order=1, modes=["rev"])
+        assert jnp.all(jnp.isnan(jax.vmap(compiled)(jnp.array([0.0, -1.0]))))
+
+
+def test_recall_loss_tends_to_one_minus_recall():
+    scores, positives, mask = random_queries(1)
+    some = np.any(positives & mask, axis=1)
+    order = np.asarray(rank(jnp.asarray(scores), jnp.asarray(mask)))
+    order = np.where(np.take_along_axis(mask, order, axis=1), order, -1)
+    exact = 1 - recall_at_k(order[some], positives[some], [1])[0]
+    assert 0.2 < exact < 0.8
+    errors = distances(smooth_recall_at_1, exact, scores, positives, mask)
+    assert errors == sorted(errors, reverse=True)
+    assert errors[-1] < 1e-6
+
+
+def test_precision_loss_tends_to_one_minus_average_precision():
+    scores, positives, mask = random_queries(2)
+    some = np.any(positives & mask, axis=1)
+    rows = zip(scores[some], positives[some], mask[some], strict=True)
+    exact = 1 - np.mean([average_precision(s[m].tolist(), p[m].tolist()) for s, p, m in rows])
+    errors = distances(smooth_average_precision, exact, scores, positives, mask)
+    assert errors == sorted(errors, reverse=True)
+    assert errors[-1] < 1e-6
+
+
+@losses
+def test_mean_is_over_the_queries_that_teach(name):
+    scores, positives, mask = random_queries(3, queries=30)
+    expected = [oracle(name, *row) for row in zip(scores, positives, mask, strict=True) if np.any(row[1] & row[2])]
+    assert 0 < len(expected) < 25
+    mean = jax.jit(partial(mean_loss, LOSSES[name]))
+    np.testing.assert_allclose(mean(scores, positives, mask), np.mean(expected), rtol=1e-5)
+    positives[10:] = False
+    assert mean(scores, positives, mask) == 0
+
+
+def test_closed_forms():
+    entropy, recall, precision = (jax.jit(LOSSES[name]) for name in LOSSES)
+    real, first, equal = np.ones(3, bool), np.array([True, False, False]), np.zeros(3, np.float32)
+    np.testing.assert_allclose(entropy(equal, first, real), math.log(3), rtol=1e-6)
+    np.testing.assert_allclose(entropy(equal, ~first, real), math.log(1.5), rtol=1e-6)
+    assert entropy(equal, real, real) == 0
+    np.testing.assert_allclose(recall(equal, first, real), 2 / 3, rtol=1e-6)
+    np.testing.assert_allclose(precision(equal, first, real), 0.5, rtol=1e-6)
+    # Scores in the thousands, as histograms have them, neither overflow nor lose the small loss.
+    np.testing.assert_allclose(entropy(np.float32([5010, 5000, 4000]), first, real), 4.5399e-05, rtol=4e-3)
+    assert entropy(np.float32([-3e5, 3e5, 0]), first, real) == 6e5
+
+
+@losses
+def test_what_teaches_nothing_may_have_any_score(name):
+    nothing_right = np.array([np.nan, np.inf, 1e30, -np.inf, 2, 1], np.float32), np.zeros(6, bool), np.ones(6, bool)
+    loss, gradient = COMPILED[name](*nothing_right)
+    assert loss == 0
+    assert np.all(gradient == 0)
+
+
+@losses
+def test_no_candidate_slots_at_all(name):
+    nothing = np.zeros(0, np.float32), np.zeros(0, bool), np.zeros(0, bool)
+    assert LOSSES[name](*nothing) == 0

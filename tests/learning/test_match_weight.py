@@ -1,0 +1,175 @@
+"""The learned match weight: its start, its inputs, its values against loops, its gradients."""
+
+import math
+from dataclasses import fields, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from mfvpr import AggregatedScore, HistogramOfShifts, Matches, UnitWeight, score_candidates
+from mfvpr.learning.match_weight import FEATURE_NAMES, LearnedWeight
+from mfvpr.weighting import match_weights
+from tests.builders import make_matches, random_matches
+
+SIZES = ((320, 240), (400, 300))
+KEY = jax.random.key(0)
+
+
+def pairs(seed=0, counts=(40, 25, 0), capacity=50):
+    """Several pairs, the last without a match; NaN on padding."""
+    rng = np.random.default_rng(seed)
+    made = [random_matches(rng, count, capacity=capacity, sizes=SIZES) for count in counts]
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *made)
+
+
+scores = jax.jit(score_candidates)
+weigh = jax.jit(LearnedWeight.__call__)
+
+
+def trained(seed=1, hidden=5):
+    """A weight that is far from its start."""
+    start = LearnedWeight.create(KEY, pairs(), hidden)
+    rng = np.random.default_rng(seed)
+    learned = {
+        name: np.float32(rng.normal(size=getattr(start, name).shape))
+        for name in ("hidden", "hidden_bias", "output", "output_bias")
+    }
+    return replace(start, **learned)
+
+
+def raw_oracle(matches, k):
+    """The inputs of one match before they are standardized, float64, in the order of FEATURE_NAMES."""
+    values = [matches.scores0[k], matches.scores1[k], matches.distance[k], matches.ratio[k]]
+    for points, size in ((matches.points0, matches.image_size0), (matches.points1, matches.image_size1)):
+        values += [(float(points[k][axis]) - float(size[axis]) / 2) / (float(size[axis]) / 2) for axis in (0, 1)]
+    return [float(value) for value in values]
+
+
+def oracle(weight, matches, k):
+    raw = raw_oracle(matches, k)
+    inputs = [(raw[f] - float(weight.center[f])) / float(weight.scale[f]) for f in range(len(raw))]
+    total = float(weight.output_bias)
+    for unit in range(len(weight.output)):
+        drive = sum(inputs[f] * float(weight.hidden[f, unit]) for f in range(len(raw)))
+        total += float(weight.output[unit]) * math.tanh(drive + float(weight.hidden_bias[unit]))
+    return math.log1p(math.exp(total))
+
+
+def test_starts_as_the_unit_weight_in_a_scorer():
+    matches = pairs()
+    weight = LearnedWeight.create(KEY, matches)
+    for scorer in (HistogramOfShifts(max_bins=64), AggregatedScore()):
+        learned = scores(replace(scorer, weight=weight), matches)
+        np.testing.assert_allclose(learned, scores(replace(scorer, weight=UnitWeight()), matches), rtol=1e-6)
+
+
+def test_statistics_are_those_of_the_real_matches():
+    matches = pairs()
+    weight = LearnedWeight.create(KEY, matches)
+    real = [
+        raw_oracle(jax.tree.map(lambda leaf: leaf[pair], matches), k)  # noqa: B023
+        for pair, k in np.argwhere(matches.mask)
+    ]
+    assert len(real) == 65
+    np.testing.assert_allclose(weight.center, np.mean(real, axis=0), atol=1e-6)
+    np.testing.assert_allclose(weight.scale, np.std(real, axis=0), rtol=1e-5)
+    assert weight.center.shape == (len(FEATURE_NAMES),)
+
+
+def test_whole_pairs_of_padding_may_hold_anything():
+    matches = pairs()
+    garbage = {f.name: getattr(matches, f.name).copy() for f in fields(matches)}
+    for name, values in garbage.items():
+        values[2] = False if name == "mask" else np.nan
+    expected, got = LearnedWeight.create(KEY, matches), LearnedWeight.create(KEY, replace(matches, **garbage))
+    jax.tree.map(np.testing.assert_array_equal, got, expected)
+
+    @jax.jit
+    def total(weight, padding):
+        return jnp.sum(match_weights(weight, padding))
+
+    value, gradient = jax.value_and_grad(total)(trained(), Matches(**{n: values[2] for n, values in garbage.items()}))
+    assert value == 0
+    assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(gradient))
+
+
+def test_a_constant_input_and_no_match_at_all_divide_by_1():
+    constant = make_matches([(10, 20), (30, 40)], [(1, 2), (3, 5)], scores0=[0.1, 0.1], ratio=[0.3, 0.9])
+    weight = LearnedWeight.create(KEY, constant)
+    assert weight.scale[FEATURE_NAMES.index("scores0")] == 1
+    assert weight.scale[FEATURE_NAMES.index("ratio")] == pytest.approx(0.3)
+    nothing = LearnedWeight.create(KEY, make_matches([], [], ratio=[], capacity=3))
+    assert np.all(nothing.center == 0)
+    assert np.all(nothing.scale == 1)
+
+
+def test_values_equal_the_loops():
+    matches, weight = jax.tree.map(lambda leaf: leaf[0], pairs(2)), trained()
+    expected = [oracle(weight, matches, k) for k in range(40)]
+    assert np.ptp(expected) > 0.5
+    np.testing.assert_allclose(weigh(weight, matches)[:40], expected, rtol=2e-5)
+    assert np.all(np.isfinite(weigh(weight, matches)))
+
+
+def test_inputs_are_standardized():
+    matches = pairs(3, counts=(50, 50))
+    weight = LearnedWeight.create(KEY, matches)
+    inputs = np.concatenate(jax.jit(jax.vmap(weight.inputs))(matches))
+    np.testing.assert_allclose(inputs.mean(axis=0), 0, atol=1e-5)
+    np.testing.assert_allclose(inputs.std(axis=0), 1, rtol=1e-4)
+
+
+def test_order_of_matches_moves_along():
+    matches, weight = jax.tree.map(lambda leaf: leaf[0], pairs(4)), trained()
+    order = np.random.default_rng(5).permutation(len(matches.mask))
+    moved = replace(
+        matches, **{f.name: getattr(matches, f.name)[order] for f in fields(matches) if "size" not in f.name}
+    )
+    np.testing.assert_allclose(weigh(weight, moved), weigh(weight, matches)[order], rtol=1e-6)
+
+
+@pytest.mark.parametrize("bias", [-1e4, -90.0, 1e4])
+def test_always_above_0_and_finite(bias):
+    weights = weigh(replace(trained(), output_bias=np.float32(bias)), jax.tree.map(lambda leaf: leaf[0], pairs()))
+    assert np.all(weights > 0)
+    assert np.all(np.isfinite(weights))
+
+
+def test_gradients_are_finite_and_statistics_have_none():
+    matches, weight = pairs(), trained()
+
+    @jax.jit
+    def total(weight, points0, distance):
+        return jnp.sum(score_candidates(HistogramOfShifts(weight=weight, max_bins=64),
+                                        replace(matches, points0=points0, distance=distance)))  # fmt: skip
+
+    learned, points0, distance = jax.grad(total, argnums=(0, 1, 2))(weight, matches.points0, matches.distance)
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves((learned, points0, distance)))
+    assert np.all(learned.center == 0)
+    assert np.all(learned.scale == 0)
+    assert all(np.any(leaf != 0) for leaf in (learned.hidden, learned.hidden_bias, learned.output, points0, distance))
+    assert np.all(np.asarray(distance)[~matches.mask] == 0)
+
+
+def test_gradients_equal_finite_differences():
+    with jax.enable_x64(True):
+        double = lambda leaf: jnp.asarray(leaf, dtype=float) if leaf.dtype == np.float32 else leaf  # noqa: E731
+        matches = jax.tree.map(double, random_matches(np.random.default_rng(6), 7, sizes=SIZES))
+        weight = jax.tree.map(double, trained())
+        free = {name: getattr(weight, name) for name in ("hidden", "hidden_bias", "output", "output_bias")}
+
+        @jax.jit
+        def total(free, points1, ratio):
+            return jnp.sum(replace(weight, **free)(replace(matches, points1=points1, ratio=ratio)) ** 2)
+
+        check_grads(total, (free, matches.points1, matches.ratio), order=1, modes=["rev"])
+
+
+def test_matches_without_a_ratio_are_refused_with_the_mend():
+    matches = make_matches([(1, 2)], [(3, 4)])
+    for call in (trained(), trained().inputs, lambda matches: LearnedWeight.create(KEY, matches)):
+        with pytest.raises(ValueError, match="match them with_ratio=True"):
+            call(matches)
