@@ -1,7 +1,8 @@
 """Times mfvpr against the peers of the field, in one run.
 
-`scores` are matching and scoring of one query with 50 candidates, `networks` are D2-Net, MixVPR and ALIKED. Everything
-is warm; the contestants take turns, round by round, so that a noisy machine disturbs all alike.
+`scores` are matching and scoring of one query with 50 candidates, `sweeps` grids of a score's parameters on cached
+matches, `networks` are D2-Net, MixVPR and ALIKED. Everything is warm; the contestants take turns, round by round, so
+that a noisy machine disturbs all alike.
 """
 
 import argparse
@@ -22,14 +23,20 @@ QUICK = 0.05  # seconds
 def main() -> None:
     """Print the table and write it as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", nargs="?", choices=("scores", "networks"), default="scores", help="default: scores")
-    parser.add_argument("--rounds", type=int, help="timed calls of each contestant (default 15; of networks 5)")
+    parser.add_argument(
+        "what", nargs="?", choices=("scores", "sweeps", "networks"), default="scores", help="default: scores"
+    )
+    parser.add_argument(
+        "--rounds", type=int, help="timed calls of each contestant (default 15; of sweeps 7, of networks 5)"
+    )
     parser.add_argument("--out", type=Path, help="JSON file to write (default runs/benchmark_WHAT.json)")
     arguments = parser.parse_args()
 
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # leaves torch its part of a GPU
     if arguments.what == "scores":  # here, so that --help need not wait for JAX
         from experiments.contestants import lineup
+    elif arguments.what == "sweeps":
+        from experiments.sweep_contestants import lineup
     else:
         from experiments.network_contestants import lineup
 

@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args
 import jax
 import jax.numpy as jnp
 
-from mfvpr.numerics import as_float, masked, safe_sqrt
+from mfvpr.numerics import as_float, masked, positive, safe_sqrt
 from mfvpr.types import Array, Features, Matches
 
 CrossCheck = Literal["mutual", "opencv_legacy", "none"]
@@ -75,8 +75,7 @@ def soft_match(features0: Features, features1: Features, *, temperature: float |
     features0, features1 = jax.tree.map(jnp.asarray, (features0, _at_least_one(features1)))
     real0, real1 = (f.mask & jnp.all(jnp.isfinite(f.descriptors), axis=-1) for f in (features0, features1))
     similarity = _products(masked(features0.descriptors, real0), masked(features1.descriptors, real1))
-    temperature = jnp.asarray(temperature, dtype=similarity.dtype)
-    logits = similarity / jnp.where(temperature > 0, temperature, jnp.nan)
+    logits = similarity / positive(temperature, similarity.dtype)
     real = real0[:, None] & real1[None]
     rows, columns = (_softmax(logits, real, axis) for axis in (1, 0))
     return Matches(

@@ -24,9 +24,10 @@ def as_float(values: ArrayLike) -> Array:
     return values if jnp.issubdtype(values.dtype, jnp.floating) else values.astype(float)
 
 
-def count(mask: Array) -> Array:
-    """Number of True entries along the last axis, float32."""
-    return jnp.sum(mask, axis=-1, dtype=jnp.float32)
+def positive(value: ArrayLike, dtype: Any) -> Array:
+    """A width or a temperature where it is above 0, NaN elsewhere: without one there is no score."""
+    value = jnp.asarray(value, dtype=dtype)
+    return jnp.where(value > 0, value, jnp.nan)
 
 
 def masked_mean(values: Array, mask: Array, weights: Array | None = None) -> Array:

@@ -28,6 +28,7 @@ def score_candidates(scorer: Scorer, matches: Matches) -> Array:
     return jax.vmap(_fit(scorer, matches.image_size0, matches.image_size1))(matches)
 
 
+@jax.jit  # here, or every call of score_grid would compile its loop again
 def score_settings(
     scorer: Any, matches: Matches, settings: Mapping[str, Array], weightings: Mapping[str, Array]
 ) -> Array:
@@ -205,7 +206,11 @@ def _weights(scorer: Any, axes: Mapping[str, Any]) -> tuple[Weight, ...]:
 
 def _axis(scorer: Any, name: str, axis: Sequence[float] | Array) -> Array:
     """One checked axis of a grid, float `[n]`."""
-    numeric = [f.name for f in fields(scorer) if not f.metadata.get("static") and _is_number(getattr(scorer, f.name))]
+    numeric = [
+        f.name
+        for f in fields(scorer)
+        if not f.metadata.get("static") and (f.name == "temperature" or _is_number(getattr(scorer, f.name)))
+    ]
     numeric += ["max_distance", "weight"] if hasattr(scorer, "weight") else ["max_distance"]
     if name not in numeric:
         nearest = difflib.get_close_matches(name, numeric, n=1) or numeric

@@ -65,6 +65,12 @@ def test_kinds_of_weights_and_distances_are_axes_too(matches):
             np.testing.assert_allclose(got[i, j], expected, rtol=2e-6)
 
 
+def test_temperature_is_an_axis_of_a_hard_scorer(matches):
+    got = score_grid(AnchorPoints(), matches, temperature=[0.1, 0.5])
+    expected = [score_candidates(AnchorPoints(temperature=t), matches) for t in (0.1, 0.5)]
+    np.testing.assert_allclose(got, expected, rtol=2e-6)
+
+
 def test_fine_bins_do_not_tax_coarse_ones(matches):
     """One program per capacity, each no larger than its bins ask for."""
     sizes = matches.image_size0, matches.image_size1

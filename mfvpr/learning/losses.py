@@ -9,8 +9,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from mfvpr.numerics import as_float, masked, masked_mean
-from mfvpr.scoring.positive import positive
+from mfvpr.numerics import as_float, masked, masked_mean, positive
 from mfvpr.types import Array
 
 Loss = Callable[[Array, Array, Array], Array]

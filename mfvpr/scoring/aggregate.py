@@ -5,9 +5,8 @@ from dataclasses import dataclass, field
 import jax
 import jax.numpy as jnp
 
-from mfvpr.numerics import masked, masked_mean, masked_median, safe_sqrt
+from mfvpr.numerics import masked, masked_mean, masked_median, positive, safe_sqrt
 from mfvpr.scoring.choices import check_choices, choice
-from mfvpr.scoring.positive import positive
 from mfvpr.scoring.shifts import image_sizes, match_shifts
 from mfvpr.types import Array, Matches
 from mfvpr.weighting import DescriptorDistanceWeight, Weight, match_confidence, match_weights

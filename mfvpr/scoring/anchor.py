@@ -10,9 +10,8 @@ from dataclasses import dataclass, field
 import jax
 import jax.numpy as jnp
 
-from mfvpr.numerics import as_float, masked, safe_sqrt
+from mfvpr.numerics import as_float, masked, positive, safe_sqrt
 from mfvpr.scoring.choices import check_choices, choice
-from mfvpr.scoring.positive import positive
 from mfvpr.scoring.shifts import image_sizes
 from mfvpr.types import Array, Matches
 from mfvpr.weighting import FeatureScoreWeight, Weight, match_confidence, match_weights
@@ -42,9 +41,10 @@ class AnchorPoints:
 
     The soft form, smooth in points and weights: a point at u, in cells, belongs to cell c along an axis in proportion
     to e^(-(u - c - 1/2)^2 / T), so that V = A0^T diag(w) A1 are the votes of anchors for targets. An anchor's match is
-    the mean target position, weighted by V^(1/T), and w_a the mean V of the same weights: T -> 0 is the winner, T = 1
-    the mean of all votes. A cell with n matches is occupied to n^2 / (n^2 + T), counts so much in the window, and weighs
-    so much where w_a is 1. Weights must not be negative. The window moves in whole cells: its gradient is 0.
+    the mean target position, weighted by V^(1/T), and its winner's summed weight the mean of V, weighted likewise:
+    T -> 0 is the winner, T = 1 the mean of all votes. A cell with n matches is occupied to n^2 / (n^2 + T), which it
+    counts in the window, and weighs where w_a is 1. Weights must not be negative. The window moves in whole cells: its
+    gradient is 0.
     """
 
     num_bins: int = field(default=15, metadata={"static": True})

@@ -12,9 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mfvpr.numerics import is_concrete, masked
+from mfvpr.numerics import is_concrete, masked, positive
 from mfvpr.scoring.choices import check_choices, choice
-from mfvpr.scoring.positive import positive
 from mfvpr.scoring.shifts import image_sizes, match_shifts
 from mfvpr.types import Array, Matches
 from mfvpr.weighting import FeatureScoreWeight, Weight, match_weights

@@ -134,14 +134,11 @@ def _rows(
     return np.stack([_first_rows(part, scores, cs, view) for view in part.views])
 
 
-_score_settings = jax.jit(reranking.score_settings)
-
-
 def _scores(block: Group, held: Sequence[tuple[np.ndarray, Matches]], shape: tuple[int, int]) -> np.ndarray:
     """`[G, W, q, C]`; a pair without matches scores 0."""
     scores = np.zeros((*block.rows.shape, shape[0] * shape[1]), np.float32)
     for places, matches in held:
-        found = _score_settings(block.scorer, matches, block.settings, block.weightings)
+        found = reranking.score_settings(block.scorer, matches, block.settings, block.weightings)
         scores[:, :, places] = np.asarray(found)[:, :, : len(places)]
     return scores.reshape(*block.rows.shape, *shape)
 

@@ -2,12 +2,15 @@
 
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 
 from mfvpr import AggregatedScore, AnchorPoints, DescriptorDistanceWeight, HistogramOfShifts, UnitWeight
 from tests.builders import SIZE, make_matches, random_matches
 
+score = jax.jit(lambda scorer, matches: scorer(matches))
+dominant_shift = jax.jit(HistogramOfShifts.dominant_shift, static_argnames="refine")
 CENTER = -SIZE + 7.5 + 15 * 24  # the center of bin 24 along an axis: 31.5 px
 
 
@@ -61,12 +64,12 @@ def test_exchanged_images_mirror_the_histogram_when_a_bin_is_centered_on_zero():
 
 def test_a_histogram_beyond_its_capacity_is_nan_not_wrong():
     matches = random_matches(np.random.default_rng(3), 30)
-    assert np.isnan(HistogramOfShifts(max_bins=44)(matches))
-    assert np.isnan(HistogramOfShifts(max_bins=44).dominant_shift(matches)).all()
-    assert np.isnan(HistogramOfShifts(max_bins=44).dominant_shift(matches, refine=True)).all()
-    assert np.isfinite(HistogramOfShifts(max_bins=45)(matches))
-    tight, loose = HistogramOfShifts(max_bins=45), HistogramOfShifts(max_bins=80)
-    np.testing.assert_allclose(tight(matches), loose(matches), rtol=1e-6)
+    small, tight, loose = (HistogramOfShifts(max_bins=bins) for bins in (44, 45, 80))
+    assert np.isnan(score(small, matches))
+    assert np.isnan(dominant_shift(small, matches)).all()
+    assert np.isnan(dominant_shift(small, matches, refine=True)).all()
+    assert np.isfinite(score(tight, matches))
+    np.testing.assert_allclose(score(tight, matches), score(loose, matches), rtol=1e-6)
 
 
 @pytest.mark.parametrize("include_self", [True, False])

@@ -1,0 +1,190 @@
+"""The soft form of every scorer: against its float64 loop, between its bounds, and hard in the limit."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mfvpr import (
+    AggregatedScore,
+    AnchorPoints,
+    HistogramOfShifts,
+    MatchCount,
+    UnitWeight,
+    match,
+    score_grid,
+    soft_match,
+)
+from tests import soft_oracles
+from tests.builders import SIZE, double, make_features, make_matches, random_matches, real
+
+HISTOGRAMS = [
+    HistogramOfShifts(bin_size=24.0, max_bins=30),
+    HistogramOfShifts(bin_size=24.0, sigma=400.0, sigma_is_variance=True, truncate=2.0, weight=UnitWeight()),
+    HistogramOfShifts(bin_size=24.0, align="zero_center", shift_range=(100.0, 50.0)),
+    HistogramOfShifts(bin_size=24.0, align="zero_edge", direction="query_minus_candidate"),
+]
+ANCHORS = [
+    AnchorPoints(5, 4, 2.5),
+    AnchorPoints(5, 3, 2.0, window_mode="asymmetric", first="candidate", cell_weight="cell_sum", include_self=False),
+    AnchorPoints(5, 4, 1.5, window_mode="odd_down", cell_weight="ones", weight=UnitWeight()),
+    AnchorPoints(5, 1, 4.0, window_mode="radius", first="candidate", include_self=False),
+]
+SUMS = [
+    AggregatedScore(),
+    AggregatedScore(clamp=True),
+    AggregatedScore(mean="weighted", clamp=True),
+    AggregatedScore(mean="median", clamp=True),
+]
+score = jax.jit(lambda scorer, matches: scorer(matches))
+histogram = jax.jit(HistogramOfShifts.histogram)
+
+
+def named(scorers):
+    return pytest.mark.parametrize("scorer", scorers, ids=lambda scorer: type(scorer).__name__)
+
+
+def distinct_matches(rng, count, num_bins=5):
+    """Matches without ties: points well inside cells, half of them in the same, and weights that differ."""
+    cells0, anywhere = rng.integers(0, num_bins, (2, count, 2))
+    cells1 = np.where(rng.random((count, 1)) < 0.5, cells0, anywhere)
+    points0, points1 = ((cells + rng.uniform(0.2, 0.8, (count, 2))) * SIZE / num_bins for cells in (cells0, cells1))
+    weights = {name: rng.uniform(0.1, 1, count) for name in ("distance", "scores0", "scores1", "confidence")}
+    return make_matches(points0, points1, capacity=count + 5, **weights)
+
+
+def oracle_inputs(scorer, matches):
+    points0, points1, distance, scores0, scores1 = real(matches)
+    confidence = matches.confidence[matches.mask].astype(float)
+    weights = {
+        "FeatureScoreWeight": scores0 + scores1,
+        "DescriptorDistanceWeight": 2 - distance,
+        "UnitWeight": np.ones(len(distance)),
+    }[type(scorer.weight).__name__]
+    return points0, points1, weights * confidence, confidence
+
+
+def draws(scorers, temperatures):
+    rng = st.integers(0, 2**32 - 1).map(np.random.default_rng)
+    matches = st.builds(lambda r, count: random_matches(r, count, capacity=16), rng, st.sampled_from([0, 1, 2, 16]))
+    return given(matches, st.sampled_from(scorers), st.sampled_from(temperatures))
+
+
+@draws(HISTOGRAMS, [0.01, 0.3, 10.0])
+@settings(max_examples=40)
+def test_histogram_agrees_with_the_loop(matches, scorer, temperature):
+    points0, points1, weights, _ = oracle_inputs(scorer, matches)
+    names = ("bin_size", "sigma", "sigma_is_variance", "truncate", "align", "shift_range")
+    options = {name: getattr(scorer, name) for name in names}
+    (start, size0), (end, size1) = (points0, matches.image_size0), (points1, matches.image_size1)
+    if scorer.direction == "query_minus_candidate":
+        (start, size0), (end, size1) = (end, size1), (start, size0)
+    expected = soft_oracles.histogram_score(end - start, weights, size0, size1, temperature=temperature, **options)
+    got = score(replace(scorer, temperature=temperature), matches)
+    np.testing.assert_allclose(got, expected, rtol=2e-5, atol=2e-6 * (1 + temperature))
+
+
+@draws(ANCHORS, [0.02, 0.3, 1.0, 3.0])
+@settings(max_examples=40)
+def test_anchor_agrees_with_the_loop(matches, scorer, temperature):
+    names = ("num_bins", "window", "tolerance", "window_mode", "first", "include_self", "cell_weight")
+    options = {name: getattr(scorer, name) for name in names}
+    sizes = matches.image_size0, matches.image_size1
+    expected = soft_oracles.anchor_points(*oracle_inputs(scorer, matches), *sizes, temperature=temperature, **options)
+    got = score(replace(scorer, temperature=temperature), matches)
+    np.testing.assert_allclose(got, expected, rtol=2e-4, atol=1e-4)
+
+
+@draws([scorer for scorer in SUMS if scorer.mean != "median"], [0.5, 20.0, 300.0])
+@settings(max_examples=40)
+def test_aggregate_agrees_with_the_loop(matches, scorer, temperature):
+    points0, points1, weights, confidence = oracle_inputs(scorer, matches)
+    if confidence.sum() == 0:
+        weights = confidence = np.zeros(0)
+        points0 = points1 = np.zeros((0, 2))
+    expected = soft_oracles.aggregated_score(
+        points1 - points0, weights, confidence, matches.image_size0,
+        temperature=temperature, mean=scorer.mean, clamp=scorer.clamp,
+    )  # fmt: skip
+    np.testing.assert_allclose(score(replace(scorer, temperature=temperature), matches), expected, rtol=2e-5)
+
+
+@draws(HISTOGRAMS, [1e-30, 1e-3, 0.5, 1e3])
+@settings(max_examples=40)
+def test_the_smooth_maximum_lies_below_the_maximum_by_at_most_t_log_n(matches, scorer, temperature):
+    bins = int((histogram(scorer, matches).scores > -np.inf).sum())
+    hard, soft = score(scorer, matches), score(replace(scorer, temperature=temperature), matches)
+    slack = 1e-6 * (1 + abs(hard)) + 1e-6 * temperature
+    assert hard - temperature * np.log(bins) - slack <= soft <= hard + slack
+    if not matches.mask.any():
+        assert soft == 0.0
+
+
+@named(HISTOGRAMS + ANCHORS + SUMS)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_soft_becomes_hard(scorer, seed):
+    """In double precision, where the error is not rounding; hard and soft are two programs, one for all T."""
+    with jax.enable_x64(True):
+        matches = double(distinct_matches(np.random.default_rng(seed), 25))
+        hard = score(scorer, matches)
+        cool = [score(replace(scorer, temperature=t), matches) for t in (3e-2, 1e-3, 3e-5, 1e-6)]
+    errors = np.abs(np.array(cool) / np.array(hard) - 1)
+    assert (np.diff(errors) < 0).all()
+    assert errors[-1] < 1e-4
+
+
+@pytest.mark.parametrize("confidence", [None, 1.0])
+def test_a_hard_match_of_confidence_zero_is_no_match(confidence):
+    matches = random_matches(np.random.default_rng(3), 40)
+    gone = matches.confidence < 0.5
+    zero = replace(matches, confidence=np.where(gone, 0, 1).astype(np.float32))
+    without = replace(matches, mask=~gone, confidence=confidence and np.full(40, confidence, np.float32))
+    for scorer in (HISTOGRAMS[0], ANCHORS[1], SUMS[0], SUMS[3], MatchCount()):
+        np.testing.assert_allclose(score(scorer, zero), score(scorer, without), rtol=1e-6)
+
+
+def test_soft_matching_and_soft_scores_together_become_the_paper():
+    rng = np.random.default_rng(4)
+    pair = make_features(rng, 20, capacity=22), make_features(rng, 25, capacity=26)
+    with jax.enable_x64(True):
+        pair = double(pair)
+        hard = score(AggregatedScore(clamp=True), jax.jit(match)(*pair))
+        soft = score(AggregatedScore(clamp=True, temperature=1e-6), jax.jit(soft_match)(*pair, temperature=1e-7))
+    np.testing.assert_allclose(soft, hard, rtol=1e-6)
+
+
+@named([HISTOGRAMS[0], ANCHORS[0], SUMS[1]])
+def test_a_temperature_not_above_zero_gives_no_number(scorer):
+    matches = random_matches(np.random.default_rng(5), 16)
+    for temperature in (0.0, -1.0):
+        assert np.isnan(score(replace(scorer, temperature=temperature), matches))
+
+
+@named([HISTOGRAMS[0], ANCHORS[0], SUMS[1]])
+def test_a_grid_of_temperatures_equals_the_loop(scorer):
+    batch = jax.tree.map(lambda leaf: leaf[None], random_matches(np.random.default_rng(6), 16))
+    temperatures = [0.1, 0.3, 1.0]
+    grid = score_grid(replace(scorer, temperature=1), batch, temperature=temperatures)
+    pair = jax.tree.map(lambda leaf: leaf[0], batch)
+    loop = [score(replace(scorer, temperature=t), pair) for t in temperatures]
+    np.testing.assert_allclose(grid[:, 0], loop, rtol=1e-5)
+
+
+def test_identical_points_and_one_cell_have_closed_forms():
+    """n equal matches at a cell's center, T -> 0 but for the occupancy: one cell, which supports itself."""
+    matches = make_matches(np.full((3, 2), SIZE / 2), np.full((3, 2), SIZE / 2), scores0=[1, 2, 3], scores1=[0, 1, 2])
+    soft = AnchorPoints(3, temperature=0.01)
+    assert score(soft, matches) == pytest.approx(9 * 3.0 * 9 / 9.01, rel=1e-5)
+    assert score(replace(soft, cell_weight="ones"), matches) == pytest.approx(3.0 * (9 / 9.01) ** 2, rel=1e-5)
+    still = float(score(AggregatedScore(temperature=50.0), matches))
+    assert still == pytest.approx(6 * 2 * SIZE**2 * 0.75, rel=1e-6)
+
+
+@named([HISTOGRAMS[0], ANCHORS[0], SUMS[1], MatchCount()])
+def test_half_the_confidence_is_half_the_score(scorer):
+    matches = random_matches(np.random.default_rng(8), 30)
+    sure, unsure = (replace(matches, confidence=np.full(30, c, np.float32)) for c in (1.0, 0.5))
+    np.testing.assert_allclose(score(scorer, unsure), 0.5 * score(scorer, sure), rtol=1e-6)

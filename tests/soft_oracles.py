@@ -1,0 +1,120 @@
+"""The soft forms of scores and of matching: NumPy float64, explicit loops, from their definitions and nothing else.
+
+As in `tests.oracles`, nothing here imports mfvpr or JAX, and all inputs are real entries only.
+"""
+
+import math
+
+import numpy as np
+
+from tests.oracles import _rows, _values, _window_offsets, histogram_of_shifts
+
+
+def _log_mean_exp(values):
+    largest = max(values)
+    return largest + math.log(math.fsum(math.exp(value - largest) for value in values) / len(values))
+
+
+def _softmax(values):
+    largest = max(values)
+    powers = [math.exp(value - largest) for value in values]
+    total = math.fsum(powers)
+    return [power / total for power in powers]
+
+
+def histogram_score(shifts, weights, size0, size1, *, temperature, **options):
+    """T log(mean of exp(s / T)) over all bins s, 0 without matches."""
+    if len(shifts) == 0:
+        return 0.0
+    bins, _, _ = histogram_of_shifts(shifts, weights, size0, size1, **options)
+    return temperature * _log_mean_exp([score / temperature for score in _values(bins)])
+
+
+def _memberships(points, size, num_bins, temperature):
+    """For each point {cell (row, column): how far it belongs to it}."""
+    members = []
+    for point in _rows(points, 2):
+        position = [min(max(point[axis] * num_bins / float(size[axis]), 0.0), num_bins) for axis in range(2)]
+        along_x, along_y = (_softmax([-((u - c - 0.5) ** 2) / temperature for c in range(num_bins)]) for u in position)
+        members.append({(r, c): along_y[r] * along_x[c] for r in range(num_bins) for c in range(num_bins)})
+    return members
+
+
+def anchor_points(points0, points1, weights, confidence, size0, size1, *, temperature, num_bins, window, tolerance,
+                  window_mode="half_floor", first="query", include_self=True, cell_weight="winner_sum"):  # fmt: skip
+    """Every anchor's mean target under V^(1/T), supported by the occupied cells of its window."""
+    anchors, targets = (
+        _memberships(points, size, num_bins, temperature) for points, size in ((points0, size0), (points1, size1))
+    )
+    if first == "candidate":
+        anchors, targets = targets, anchors
+    weights, confidence = _values(weights), _values(confidence)
+    cells = [(r, c) for r in range(num_bins) for c in range(num_bins)]
+    displacement, occupancy, cell_weights = {}, {}, {}
+    for a in cells:
+        number = math.fsum(sure * anchor[a] for sure, anchor in zip(confidence, anchors, strict=True))
+        occupancy[a] = number**2 / (number**2 + temperature)
+        matches = list(zip(weights, anchors, targets, strict=True))
+        votes = {t: math.fsum(w * anchor[a] * target[t] for w, anchor, target in matches) for t in cells}
+        most = max(votes.values())
+        share = {t: (votes[t] / most) ** (1 / temperature) if most > 0 else 1.0 for t in cells}
+        total = math.fsum(share.values())
+        mean = [math.fsum(share[t] * t[axis] for t in cells) / total for axis in range(2)]
+        displacement[a] = mean[0] - a[0], mean[1] - a[1]
+        winner_sum = math.fsum(share[t] * votes[t] for t in cells) / total
+        cell_weights[a] = {"winner_sum": winner_sum, "cell_sum": math.fsum(votes.values()), "ones": occupancy[a]}
+
+    score = 0.0
+    for a in cells:
+        for row_offset in _window_offsets(window, window_mode):
+            for column_offset in _window_offsets(window, window_mode):
+                b = a[0] + row_offset, a[1] + column_offset
+                if b in occupancy and (b != a or include_self):
+                    support = max(tolerance - math.dist(displacement[a], displacement[b]), 0.0)
+                    score += cell_weights[a][cell_weight] * support * occupancy[b]
+    return score
+
+
+def aggregated_score(shifts, weights, confidence, size, *, temperature, mean, clamp):
+    """The aggregated score with a hyperbola for |x| and a softplus for the clamp."""
+    shifts, weights = _rows(shifts, 2), _values(weights)
+    if not shifts:
+        return 0.0
+    counts = weights if mean == "weighted" else _values(confidence)
+    score = 0.0
+    for axis in range(2):
+        center = math.fsum(c * s[axis] for c, s in zip(counts, shifts, strict=True)) / math.fsum(counts)
+        for shift, weight in zip(shifts, weights, strict=True):
+            closeness = float(size[axis]) - (math.hypot(shift[axis] - center, temperature) - temperature)
+            if clamp:  # T log(1 + exp(z / T)), which overflows as it stands
+                gap = math.log1p(math.exp(-abs(closeness) / temperature))
+                closeness = max(closeness, 0.0) + temperature * gap
+            score += weight * closeness**2
+    return score
+
+
+def soft_matches(descriptors0, descriptors1, keypoints1, scores1, temperature):
+    """One row (x, y, score, distance, confidence) per query keypoint."""
+    rows0, rows1 = _rows(descriptors0), _rows(descriptors1)
+    if not rows0:
+        return np.zeros((0, 5))
+    cosine = [[math.fsum(a * b for a, b in zip(one, two, strict=True)) for two in rows1] for one in rows0]
+    by_row = [_softmax([value / temperature for value in row]) for row in cosine]
+    by_column = [_softmax([row[j] / temperature for row in cosine]) for j in range(len(rows1))]
+    found = []
+    for i, chances in enumerate(by_row):
+        mean = lambda values, chances=chances: math.fsum(p * v for p, v in zip(chances, values, strict=True))  # noqa: E731
+        squared = mean([2 - 2 * value for value in cosine[i]])
+        confidence = math.fsum(p * by_column[j][i] for j, p in enumerate(chances))
+        columns = [mean([float(point[axis]) for point in keypoints1]) for axis in range(2)]
+        found.append([*columns, mean(_values(scores1)), math.sqrt(max(squared, 0.0)), confidence])
+    return np.array(found)
+
+
+def ratios(descriptors0, descriptors1):
+    """Distance to the nearest descriptor over that to the second nearest; 1 where there is none, or both are 0."""
+    found = []
+    for one in _rows(descriptors0):
+        distances = sorted(math.dist(one, two) for two in _rows(descriptors1))
+        found.append(distances[0] / distances[1] if len(distances) > 1 and distances[1] > 0 else 1.0)
+    return np.array(found)
