@@ -24,7 +24,7 @@ def as_float(values: ArrayLike) -> Array:
     return values if jnp.issubdtype(values.dtype, jnp.floating) else values.astype(float)
 
 
-def positive(value: ArrayLike, dtype: Any) -> Array:
+def positive(value: ArrayLike | None, dtype: Any) -> Array:
     """A width or a temperature where it is above 0, NaN elsewhere: without one there is no score."""
     value = jnp.asarray(value, dtype=dtype)
     return jnp.where(value > 0, value, jnp.nan)

@@ -1,5 +1,6 @@
 """Strict arithmetic for every test: no silent rank promotion, warnings are errors (pyproject.toml)."""
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,6 +17,15 @@ from tests import checkpoints
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+# Compiled programs are shared by this process, those it starts, and the next run.
+COMPILED = Path(__file__).parent.parent / ".pytest_cache" / "xla"
+for name, value in (
+    ("jax_compilation_cache_dir", str(COMPILED)),
+    ("jax_persistent_cache_min_compile_time_secs", 0.0),
+    ("jax_persistent_cache_min_entry_size_bytes", -1),
+):
+    jax.config.update(name, value)
+    os.environ[name.upper()] = str(value)
 settings.register_profile("mfvpr", deadline=None, derandomize=True, max_examples=60)
 settings.load_profile("mfvpr")
 
