@@ -10,16 +10,22 @@ from mfvpr.types import Matches
 
 BATCH_SLOTS = 2**14  # matches of a batch of pairs: its votes stay in cache
 PAIRS_STEP = 8
+SLOTS_STEP = 32
+QUANTILES = (0.25, 0.5, 0.75, 0.95, 1.0)
 BYTES_PER_SLOT = 33
 
 
-def slots(counts: np.ndarray) -> np.ndarray:
-    """Slots for pairs with so many matches: multiples of 32, beyond 512 at most an eighth too many.
+def slots(match_set: MatchSet) -> np.ndarray:
+    """`[Q, C]` slots of the batch that each pair belongs to: few sizes, each a shape to compile, of little padding.
 
-    A pair's slots depend on the pair alone, or its score would change with the company it is in.
+    The sizes are quantiles over all pairs that have matches, so that neither a pair's company nor the part of the
+    queries that is worked on changes its score.
     """
-    step = 2.0 ** np.maximum(np.ceil(np.log2(np.maximum(counts, 1))) - 4, 5)
-    return (np.maximum(np.ceil(counts / step), 1) * step).astype(int)
+    some = match_set.counts[match_set.counts > 0]
+    if not some.size:
+        return np.full(match_set.counts.shape, SLOTS_STEP)
+    sizes = np.ceil(np.quantile(some, QUANTILES) / SLOTS_STEP).astype(int) * SLOTS_STEP
+    return sizes[np.searchsorted(sizes, match_set.counts)]
 
 
 def batches(match_set: MatchSet, queries: range) -> Iterator[tuple[np.ndarray, Matches]]:
@@ -31,7 +37,7 @@ def batches(match_set: MatchSet, queries: range) -> Iterator[tuple[np.ndarray, M
     counts = match_set.counts[queries.start : queries.stop].reshape(-1)
     starts = np.cumsum(counts) - counts
     flat, sizes0, sizes1 = _flattened(match_set, queries)
-    sizes = slots(counts)
+    sizes = slots(match_set)[queries.start : queries.stop].reshape(-1)
     for size in np.unique(sizes[counts > 0]):
         places = np.flatnonzero((sizes == size) & (counts > 0))
         pairs = round_up(BATCH_SLOTS // int(size), PAIRS_STEP)

@@ -5,6 +5,8 @@ block by block (some settings, some queries), which bounds the memory and is whe
 """
 
 import hashlib
+import itertools
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,6 +18,7 @@ import numpy as np
 
 from mfvpr import reranking
 from mfvpr.data.files import replacing
+from mfvpr.data.images import ordered_map
 from mfvpr.pipeline import MatchSet, Track, filter_scores, untracked
 from mfvpr.sweeping.batches import BYTES_PER_SLOT, batches, image_sizes, slots
 from mfvpr.sweeping.settings import FUSION, Group, Setting, distinct, groups
@@ -112,7 +115,7 @@ def result_bytes(num_views: int, num_settings: int, num_queries: int, depth: int
 
 def block_bytes(match_set: MatchSet, num_candidates: int, num_settings: int, num_queries: int) -> int:
     """Bytes that a block of `sweep` takes, about: its padded matches, its scores and their rankings."""
-    padded = np.sort(slots(match_set.counts).sum(1))[::-1][:num_queries].sum()
+    padded = np.sort(slots(match_set).sum(1))[::-1][:num_queries].sum()
     return int(2 * BYTES_PER_SLOT * padded) + 12 * num_settings * num_queries * num_candidates
 
 
@@ -137,9 +140,22 @@ def _rows(
 def _scores(block: Group, held: Sequence[tuple[np.ndarray, Matches]], shape: tuple[int, int]) -> np.ndarray:
     """`[G, W, q, C]`; a pair without matches scores 0."""
     scores = np.zeros((*block.rows.shape, shape[0] * shape[1]), np.float32)
-    for places, matches in held:
-        found = reranking.score_settings(block.scorer, matches, block.settings, block.weightings)
-        scores[:, :, places] = np.asarray(found)[:, :, : len(places)]
+
+    def score(batch: tuple[np.ndarray, Matches]) -> np.ndarray:
+        return np.asarray(reranking.score_settings(block.scorer, batch[1], block.settings, block.weightings))
+
+    # Products this small keep one core busy: as many batches at a time as there are cores; but first one of each shape
+    # alone, which compiles.
+    first = {matches.mask.shape: number for number, (_, matches) in reversed(list(enumerate(held)))}
+    order = sorted(range(len(held)), key=lambda number: number not in first.values())
+    alone, together = order[: len(first)], order[len(first) :]
+    found = itertools.chain(
+        (score(held[number]) for number in alone),
+        ordered_map(score, [held[number] for number in together], workers=os.cpu_count() or 1),
+    )
+    for number, values in zip(order, found, strict=True):
+        places, _ = held[number]
+        scores[:, :, places] = values[:, :, : len(places)]
     return scores.reshape(*block.rows.shape, *shape)
 
 
