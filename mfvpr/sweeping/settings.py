@@ -86,13 +86,14 @@ def groups(scorer: Any, settings: Sequence[Setting], image_sizes: tuple[np.ndarr
 
 
 def _products(settings: Sequence[Setting], members: Sequence[int]) -> list[np.ndarray]:
-    """The members as products `[G, W]` of settings and weightings: one if they are one, else one per weighting."""
-    lines = [rows for _, rows in _grouped(settings, members, lambda name, _: name not in WEIGHTINGS)]
-    columns = [rows for _, rows in _grouped(settings, members, lambda name, _: name in WEIGHTINGS)]
-    if len(lines) * len(columns) == len(members) and len(set(map(len, lines))) == 1:
-        order = {row: place for place, column in enumerate(columns) for row in column}
-        return [np.array([sorted(line, key=order.__getitem__) for line in lines])]
-    return [np.array(column)[:, None] for column in columns]
+    """The members as products `[G, W]` of settings and weightings: those with the same weightings are one."""
+    columns = _grouped(settings, members, lambda name, _: name in WEIGHTINGS)
+    column = {row: place for place, (_, rows) in enumerate(columns) for row in rows}
+    found: dict[tuple[int, ...], list[list[int]]] = {}
+    for _, line in _grouped(settings, members, lambda name, _: name not in WEIGHTINGS):
+        line = sorted(line, key=column.__getitem__)
+        found.setdefault(tuple(column[row] for row in line), []).append(line)
+    return [np.array(lines) for lines in found.values()]
 
 
 def _grouped(

@@ -9,7 +9,8 @@ import pytest
 import mfvpr
 from mfvpr import pipeline, sweeping
 from mfvpr.pipeline import MatchSet
-from mfvpr.sweeping.batches import slots
+from mfvpr.sweeping.batches import image_sizes, slots
+from mfvpr.sweeping.settings import groups
 from mfvpr.types import Shortlist
 from tests.builders import random_matches
 
@@ -81,6 +82,18 @@ def test_sweep_is_one_evaluation_per_setting(data, scorer, axes):
     assert got.shape == (1, len(settings), QUERIES, CANDIDATES)
     for rows, setting in zip(got[0], settings, strict=True):
         np.testing.assert_array_equal(rows, one_by_one(scorer, setting, *data), err_msg=str(setting))
+
+
+def test_one_setting_beside_a_grid_leaves_it_whole(data):
+    """The grid's weightings still share their Gaussians."""
+    scorer = mfvpr.HistogramOfShifts()
+    settings = sweeping.grid({"sigma": [9.0, 20.0, 30.0], "weight": [FS, DMF], "max_distance": [0.8, 2.0]})
+    settings.insert(3, {"sigma": 9.0, "weight": FS, "max_distance": 1.1})
+    found = list(groups(scorer, settings, image_sizes(data[0])))
+    assert sorted(group.rows.shape for group in found) == [(1, 5), (2, 4)]
+    assert sorted(row for group in found for row in group.rows.reshape(-1)) == list(range(13))
+    for rows, setting in zip(sweeping.sweep(scorer, settings, *data)[0], settings, strict=True):
+        np.testing.assert_array_equal(rows[:, :CANDIDATES], one_by_one(scorer, setting, *data))
 
 
 def test_settings_need_not_be_a_grid(data):
