@@ -5,13 +5,16 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from jax.test_util import check_grads
 
-from mfvpr import match
+from mfvpr import MatchCount, match, soft_match
+from mfvpr.learning.losses import cross_entropy, mean_loss
 from mfvpr.learning.projection import Projection
+from mfvpr.learning.training import fit
 from tests.builders import make_features, unit
 
 
@@ -91,3 +94,37 @@ def test_gradients_are_finite_for_zeros_and_padding():
 def test_impossible_dimensions_are_refused(dimension):
     with pytest.raises(ValueError, match="expected 1 to 12"):
         Projection.principal(random_descriptors(8), dimension)
+
+
+def test_a_projection_is_learned_through_soft_matching():
+    """Half of the dimensions are noise, and stronger: principal axes keep the noise, gradients find the signal."""
+    rng = np.random.default_rng(0)
+    count, signal = 12, rng.normal(size=(5, 12, 3))
+
+    def image(place):
+        noisy = signal[place] + 0.1 * rng.normal(size=(count, 3))
+        values = np.concatenate([noisy, 1.5 * rng.normal(size=(count, 3))], axis=1)
+        values /= np.linalg.norm(values, axis=1, keepdims=True)
+        return replace(make_features(rng, count, dimension=6), descriptors=values.astype(np.float32))
+
+    queries, database = ([image(place) for place in range(5)] for _ in range(2))
+    queries, database = (jax.tree.map(lambda *leaves: np.stack(leaves), *images) for images in (queries, database))
+    start = Projection.principal(database.descriptors.reshape(-1, 6), 3)
+
+    def scores(projection):
+        def one(query, candidate):
+            return MatchCount()(soft_match(projection(query), projection(candidate), temperature=0.1))
+
+        return jax.vmap(lambda query: jax.vmap(lambda candidate: one(query, candidate))(database))(queries)
+
+    right = np.eye(5, dtype=bool)
+
+    def objective(projection, _):
+        return mean_loss(cross_entropy, scores(projection), right, np.ones_like(right))
+
+    fitted = fit(start, objective, lambda step: 0, optimizer=optax.adam(0.1), steps=80, every=80)
+    found = [jax.jit(scores)(projection) for projection in (start, fitted.parameters)]
+    losses = [mean_loss(cross_entropy, one, right, np.ones_like(right)) for one in found]
+    recall = [np.mean(np.argmax(one, axis=1) == np.arange(5)) for one in found]
+    assert losses[1] < 0.5 * losses[0]
+    assert recall[1] == 1.0 > recall[0]
