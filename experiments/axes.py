@@ -2,8 +2,10 @@
 
 import math
 import os
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +13,9 @@ import numpy as np
 from experiments import build
 from experiments.settings import SettingsError
 from mfvpr import sweeping
-from mfvpr.scoring import Scorer
+from mfvpr.pipeline import MAX_BINS, MatchSet
+from mfvpr.scoring import HistogramOfShifts, Scorer
+from mfvpr.sweeping.batches import image_sizes
 
 OF_MATCHES = ("max_distance", "c")  # what is no parameter of a scorer
 BYTES_PER_SETTING = 2000  # of Python's own, about
@@ -91,10 +95,38 @@ def scorer(settings: dict[str, Any]) -> Scorer:
 
 def require_memory(what: str, needed: int, mend: str) -> None:
     """Refuse what would not fit, before it is begun."""
-    free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    free = _free_memory()
     if needed > 0.8 * free:
         raise SettingsError(
             f"{what} would take about {needed / _MB:,.0f} MB of memory, {free / _MB:,.0f} MB are free; {mend}"
+        )
+
+
+def _free_memory() -> int:
+    """Bytes that a program may still take, those of cached files included; all of them where the system is silent."""
+    try:
+        return 1024 * int(re.findall(r"MemAvailable: *(\d+)", Path("/proc/meminfo").read_text())[0])
+    except (OSError, IndexError):
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
+def require_bins(settings: dict[str, Any], varied: Axes, matches: MatchSet) -> None:
+    """Refuse histograms that an evaluation refuses: too many bins, or more than `scorer.max_bins`."""
+    own = scorer(settings)
+    if not isinstance(own, HistogramOfShifts):
+        return
+    finest = min(varied.values.get("bin_size", [own.bin_size]))
+    needed = max(
+        replace(own, bin_size=finest, align=align).with_capacity(*image_sizes(matches)).max_bins or 1
+        for align in varied.values.get("align", [own.align])
+    )
+    if needed > MAX_BINS:
+        raise SettingsError(
+            f"bin_size={finest}: expected at most {MAX_BINS} bins per axis, these images need {needed}; use larger bins"
+        )
+    if own.max_bins is not None and own.max_bins < needed:
+        raise SettingsError(
+            f"scorer.max_bins={own.max_bins}: expected null, or at least {needed}, which bin_size={finest} needs here"
         )
 
 

@@ -3,22 +3,29 @@
 import difflib
 import os
 import re
+import signal
 import sys
+import threading
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from experiments.errors import one_line, unwind_on_sigterm
 from experiments.settings import SettingsError, check
 
-PATHS = {"database", "queries", "root", "index_file", "cache", "store", "out", "checkpoints"}
+PATHS = {"dataset.database", "dataset.queries", "dataset.root", "dataset.index_file", "dataset.cache"}
+PATHS |= {"store", "out", "checkpoints"}
+MULTIRUN = ("-m", "--multirun")
 CONF = Path(__file__).parent.parent / "conf"
 
 
@@ -26,20 +33,48 @@ def launch(program: Callable[[dict[str, Any]], None], config: str = "config") ->
     """`program(settings)` with the settings of conf/`config`.yaml and the command line, as plain and checked values."""
 
     def task(found: DictConfig) -> None:
-        with one_line(), _our_words(config):  # in here, or Hydra adds lines of its own
+        many = HydraConfig.get().mode == RunMode.MULTIRUN
+        with _one_of_many() if many else one_line(), _our_words(config):  # in here, or Hydra adds lines of its own
             for name in sorted(OmegaConf.missing_keys(found)):
                 raise SettingsError(_no_default(name))
             settings: Any = OmegaConf.to_container(found, resolve=True)
             check(settings)
-            program(settings)
+            program(settings | {"multirun": many})
 
     unwind_on_sigterm()
+    sys.unraisablehook = _keep_interrupt
+    warnings.filterwarnings("ignore", "A worker stopped")  # joblib renews one that has grown; no job is lost
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises instead of printing and exiting with 1
     with one_line(), _our_words(config):
         for argument in sys.argv[1:]:
             _check_form(argument)
-        sys.argv[1:] = map(_as_typed, sys.argv[1:])
+        many = sorted({*MULTIRUN} & {*sys.argv})  # first, or Hydra takes no settings after it
+        settings = [argument for argument in sys.argv[1:] if argument not in MULTIRUN]
+        sys.argv[1:] = many[:1] + [_as_typed(argument, several=bool(many)) for argument in settings]
         hydra.main(version_base="1.3", config_path=str(CONF), config_name=config)(task)()
+
+
+def _keep_interrupt(lost: "sys.UnraisableHookArgs") -> None:
+    """Send Ctrl-C again where nobody could catch it, as in JAX's callback of the garbage collector."""
+    if issubclass(lost.exc_type, KeyboardInterrupt):
+        threading.Timer(0.01, signal.raise_signal, [signal.SIGINT]).start()
+    else:
+        sys.__unraisablehook__(lost)
+
+
+@contextmanager
+def _one_of_many() -> Iterator[None]:
+    """A job of a multirun: what is wrong with it is told at once, and again by Hydra when the others are done."""
+    job = HydraConfig.get()
+    chosen = [override for override in job.overrides.task if override.partition("=")[0] not in PATHS]
+    print(f"job {job.job.num}: {' '.join(chosen)}", file=sys.stderr)
+    try:
+        with one_line():
+            yield
+    except SystemExit as left:
+        if not isinstance(left.__context__, Exception) or left.code != 2:
+            raise  # interrupted: no other job is begun
+        raise left.__context__ from None
 
 
 def _check_form(argument: str) -> None:
@@ -59,15 +94,19 @@ def _check_form(argument: str) -> None:
             raise SettingsError(f"{argument}: expected one of {', '.join(choices)}{hint}")
 
 
-def _as_typed(argument: str) -> str:
-    """A setting quoted for Hydra where its grammar would not take the value as it was typed (paths, mostly)."""
+def _as_typed(argument: str, several: bool) -> str:
+    """A setting quoted for Hydra where its grammar would not take the value as it was typed (paths, mostly).
+
+    Where `several`, in a multirun, paths stand between commas.
+    """
     name, equals, value = argument.partition("=")
-    is_path = name.rpartition(".")[2] in PATHS and value not in ("", "null") and value[0] not in "'\""
+    is_path = name in PATHS and value not in ("", "null") and value[0] not in "'\""
     if not equals or argument.startswith("-") or not (is_path or _unparsable(argument)):
         return argument
     for special in ("\\", "'", "${"):
         value = value.replace(special, f"\\{special}")
-    return f"{name}='{value}'"
+    values = value.split(",") if several and is_path else [value]
+    return f"{name}=" + ",".join(f"'{one}'" for one in values)
 
 
 def _unparsable(argument: str) -> bool:

@@ -119,7 +119,7 @@ def _remarks(outcome: Outcome) -> Iterator[str]:
 
 def _results(outcome: Outcome) -> dict[str, Any]:
     judge, settings = outcome.judge, outcome.settings
-    left_out = ("dataset", "store", "out", "checkpoints", "chunk")
+    left_out = ("dataset", "store", "out", "checkpoints", "multirun")
     labels = [f"{threshold:g}" for threshold in judge.thresholds]
     rows = [
         {

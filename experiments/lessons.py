@@ -1,5 +1,6 @@
 """The stages of learning: what is learned on one half of the path, beside what is set by hand, on the other half."""
 
+import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -95,9 +96,10 @@ def learn(settings: dict[str, Any]) -> None:
     """Matches -> learned, searched and hand-set scores on the half that none of them saw -> table, figures, files."""
     folder = build.expanded(settings["out"]) if settings["out"] else None
     runs.check_free(folder or runs.new_run_folder(Path("runs"), settings["dataset"]["name"]))
+    method = settings["scorer"].get("method", "all")
+    if method not in NUMBERS:
+        raise SettingsError(f"scorer={method}: expected one to learn, of {', '.join(NUMBERS)}")
     varied = axes.axes(settings)
-    if varied.method not in NUMBERS:
-        raise SettingsError(f"scorer={varied.method}: it has nothing to learn; expected one of {', '.join(NUMBERS)}")
     if settings["split"] is None:
         raise SettingsError("split=null: what is learned is never reported on the same queries; expected first_half, "
                             "second_half or both")  # fmt: skip
@@ -107,13 +109,16 @@ def learn(settings: dict[str, Any]) -> None:
         images = prepare.images(settings)
     judgment = judge(settings, images.dataset)
     matches, candidates = prepare.matched(settings, tools, images, watch)
-    checkpoints = _checkpoints(settings, images, candidates)
+    axes.require_bins(settings, varied, matches)
+    euclidean = settings["fusion"]["filter_score"] == "negative_euclidean"
+    candidates = replace(candidates, scores=pipeline.filter_scores(candidates, euclidean=euclidean))
+    checkpoints = _checkpoints(settings, images, candidates, judgment)
     results = []
     with watch("learning"):
         for school in _schools(settings, matches, candidates, judgment):
             results.append(list(_lessons(school, varied, checkpoints)))
     outcome = learn_outputs.Outcome(settings, images, judgment, matches, candidates, results, watch.seconds)
-    folder = folder or runs.new_run_folder(Path("runs"), images.dataset.name)
+    folder = folder or runs.claimed_run_folder(Path("runs"), images.dataset.name)
     with runs.writing(folder) as new:
         text = learn_outputs.write(new, outcome)
     print(f"\n{text}\nresults: {folder}")
@@ -207,7 +212,7 @@ def _reported(school: School, name: str, scorer: Any, c: float | str | None) -> 
     scores = pipeline.score({"it": scorer}, matches, candidates)["it"]
     if c is not None:
         scores = pipeline.fuse(candidates, scores, None if isinstance(c, str) else c)
-    order = pipeline.rank(candidates, scores)
+    order = pipeline.rank(candidates, scores, ties=school.settings["ties"])
     rows = np.take_along_axis(np.where(candidates.mask, candidates.indices, -1), order, axis=1)
     hits = np.stack([sweeping.hits(rows, right[school.half.report]) for right in school.judge.positives])
     return learn_outputs.Result(school.name, name, hits, {}, None)
@@ -224,7 +229,7 @@ def _searched(school: School, varied: axes.Axes, spread: float, *, fused: bool) 
     matches, candidates = school.part(school.half.tune)
     rows = sweeping.sweep(
         axes.scorer(school.settings), settings, matches, candidates, views=[school.seen[school.half.tune]], depth=1,
-        track=build.track(f"{school.name}: grid" + " + filter" * fused),
+        by_index=school.settings["ties"] == "index", track=build.track(f"{school.name}: grid" + " + filter" * fused),
     )  # fmt: skip
     right = school.judge.positives[school.judge.main][school.half.tune]
     best = sweeping.best_setting(sweeping.hits(rows[0], right).mean(axis=-1), values)
@@ -256,12 +261,14 @@ def _values(start: Model, fitted: Fit) -> dict[str, Any]:
 
 
 def _checkpoints(
-    settings: dict[str, Any], images: prepare.Images, candidates: Shortlist
+    settings: dict[str, Any], images: prepare.Images, candidates: Shortlist, judgment: Judge
 ) -> Callable[[str, str], tuple[Path | None, dict[str, Any]]]:
     """Where the training of a half's model is kept, and what identifies it."""
     data = stores.matches_recipe(settings, images.fingerprints, candidates.mask.shape[1])
     names = ("scorer", "loss", "every", "patience", "batch", "learning_rate", "hidden", "seed")
     recipe = {"matches": data, "tolerances": settings["recall"]} | {name: settings[name] for name in names}
+    recipe["filter_score"] = settings["fusion"]["filter_score"]
+    recipe["positives"] = hashlib.sha256(np.stack(judgment.positives).tobytes()).hexdigest()[:16]
     recipe["versions"] = {name: runs.versions()[name] for name in ("mfvpr", "jax", "numpy")}
     root = settings["checkpoints"] or settings["store"]
     own = "" if settings["checkpoints"] else f"{settings['dataset']['name']}_learning-{recipe_fingerprint(recipe)}"

@@ -96,7 +96,8 @@ def matched(settings: dict[str, Any], tools: Extractors, found: Images, watch: S
     name, recipe = matches_name(settings), stores.matches_recipe(settings, found.fingerprints, num_candidates)
     typical = tools.local.typical_count // 3  # of mutual nearest neighbors
     queries = len(found.dataset.queries)
-    with stores.opened_matches(settings["store"], name, recipe, queries, num_candidates, typical) as store:
+    sizes = queries, num_candidates, typical
+    with stores.opened_matches(settings["store"], name, recipe, *sizes, wait=_is_one_of_many(settings)) as store:
         if not store.done.all():
             made = extracted(settings, tools, found, watch)
             with watch("matching"):
@@ -115,6 +116,11 @@ def match(settings: dict[str, Any], made: Extracted, **options: Any) -> MatchSet
     return pipeline.match(
         made.queries, made.database, made.candidates, **settings["matching"], **options, track=build.track("matching")
     )
+
+
+def _is_one_of_many(settings: dict[str, Any]) -> bool:
+    """A job of a multirun, whose others may be making the same features; see `launch`."""
+    return settings.get("multirun", False)
 
 
 def _num_candidates(settings: dict[str, Any], found: Images) -> int:
@@ -154,7 +160,8 @@ def _features(
 ) -> FeatureSet:
     chosen, label = settings["features"], f"{side} features"
     name = f"{settings['dataset']['name']} {side} {chosen['name']}"
-    with stores.opened(settings["store"], name, folder, extractor, chosen, images) as store:
+    wait = _is_one_of_many(settings)
+    with stores.opened(settings["store"], name, folder, extractor, chosen, images, wait=wait) as store:
         skip_bad = settings["on_bad_image"] == "skip"
         return pipeline.extract(folder, extractor, store=store, skip_bad=skip_bad, track=build.track(label))
 
@@ -174,10 +181,10 @@ def _shortlist(
     chosen, database = settings["retrieval"], features["database"]
     extractor = describer([database[row] for row in range(len(database))])
     root = settings["store"] if extractor.image_size is not None else None  # VLAD takes no time
-    skip_bad, descriptors = settings["on_bad_image"] == "skip", {}
+    skip_bad, wait, descriptors = settings["on_bad_image"] == "skip", _is_one_of_many(settings), {}
     for side, folder in found.sides.items():
         name = f"{settings['dataset']['name']} {side} {chosen['name']}"
-        with stores.opened(root, name, folder, extractor, chosen, found.fingerprints[side]) as store:
+        with stores.opened(root, name, folder, extractor, chosen, found.fingerprints[side], wait=wait) as store:
             descriptors[side] = pipeline.describe(
                 folder, features[side], extractor, store=store, skip_bad=skip_bad,
                 track=build.track(f"{side} descriptors"),

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from experiments import build, prepare, stores, sweep_outputs
-from experiments.axes import BYTES_PER_SETTING, Axes, as_setting, axes, require_memory, scorer
+from experiments.axes import BYTES_PER_SETTING, Axes, as_setting, axes, require_bins, require_memory, scorer
 from experiments.judging import Judge, judge
 from mfvpr import sweeping
 from mfvpr.data.store_manifest import recipe_fingerprint
@@ -34,12 +34,13 @@ def sweep(settings: dict[str, Any]) -> None:
         images = prepare.images(settings)
     judgment = judge(settings, images.dataset)
     matches, candidates = prepare.matched(settings, tools, images, watch)
+    require_bins(settings, varied, matches)
     judgment = judgment.of(candidates)
     kept = _kept(settings, images, candidates)
     with watch("sweep"):
         written, rows = _search(settings, varied, judgment, matches, candidates, kept)
     found = sweep_outputs.Found(settings, images, varied, judgment, written, rows, watch.seconds)
-    folder = folder or runs.new_run_folder(Path("runs"), images.dataset.name)
+    folder = folder or runs.claimed_run_folder(Path("runs"), images.dataset.name)
     with runs.writing(folder) as new:
         text = sweep_outputs.write(new, found)
     print(f"\n{text}\nresults: {folder}")
@@ -91,10 +92,12 @@ def _require_memory(settings: dict[str, Any], judgment: Judge, matches: MatchSet
 
 
 def _kept(settings: dict[str, Any], images: prepare.Images, candidates: Shortlist) -> Path | None:
-    """Where an interrupted sweep goes on: finished blocks on these matches, by this version."""
+    """Where an interrupted sweep goes on: its finished blocks on these matches, by this version."""
     if settings["store"] is None:
         return None
     recipe = stores.matches_recipe(settings, images.fingerprints, candidates.mask.shape[1])
+    names = ("scorer", "grid", "search", "trials", "seed", "split", "recall", "ties", "fusion")
+    own = {name: settings[name] for name in names}  # or another sweep that ends would take away what this one needs
     versions = {name: runs.versions()[name] for name in ("mfvpr", "jax", "numpy")}
-    name = recipe_fingerprint({"matches": recipe, "versions": versions})
+    name = recipe_fingerprint({"matches": recipe, "sweep": own, "versions": versions})
     return build.expanded(settings["store"]) / f"{settings['dataset']['name']}_sweep-{name}"

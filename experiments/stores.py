@@ -27,6 +27,8 @@ def opened(
     extractor: LocalExtractor | GlobalExtractor,
     settings: dict[str, Any],
     images: str,
+    *,
+    wait: bool,
 ) -> Iterator[FeatureStore | None]:
     """The store of a folder's features by this extractor, announced and accounted for; None where `root` is None.
 
@@ -37,12 +39,14 @@ def opened(
         extractor: what makes the features.
         settings: of the extractor; with the weights and the images they are what the store is keyed by.
         images: fingerprint of the images.
+        wait: for another process that has the store open, instead of refusing it.
     """
     if root is None:
         yield None
         return
-    recipe = features_recipe(settings, images)
-    with open_store(store_path(build.expanded(root), name, recipe), recipe, num_images=len(folder)) as store:
+    recipe, waiting = features_recipe(settings, images), _tell if wait else None
+    path = store_path(build.expanded(root), name, recipe)
+    with open_store(path, recipe, num_images=len(folder), waiting=waiting) as store:
         missing = len(folder) - int(store.done.sum())
         if missing:
             needed = feature_store.forecast_bytes(missing, extractor.typical_count, extractor.dimension)
@@ -60,7 +64,14 @@ def opened(
 
 @contextmanager
 def opened_matches(
-    root: str, name: str, recipe: dict[str, Any], num_queries: int, num_candidates: int, typical_matches: int
+    root: str,
+    name: str,
+    recipe: dict[str, Any],
+    num_queries: int,
+    num_candidates: int,
+    typical_matches: int,
+    *,
+    wait: bool,
 ) -> Iterator[MatchStore]:
     """The store of a run's matches, announced.
 
@@ -71,9 +82,11 @@ def opened_matches(
         num_queries: Q.
         num_candidates: C.
         typical_matches: of a pair, about.
+        wait: for another process that has the store open, instead of refusing it.
     """
-    path = matches_path(root, name, recipe)
-    with open_match_store(path, recipe, num_queries=num_queries, num_candidates=num_candidates) as store:
+    path, waiting = matches_path(root, name, recipe), _tell if wait else None
+    sizes = {"num_queries": num_queries, "num_candidates": num_candidates}
+    with open_match_store(path, recipe, **sizes, waiting=waiting) as store:
         missing = num_queries - int(store.done.sum())
         if missing:
             needed = match_store.forecast_bytes(missing, num_candidates, typical_matches)

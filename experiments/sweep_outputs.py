@@ -89,10 +89,11 @@ def _table(found: Found, numbers: Any) -> Table:
 def _summary(found: Found) -> Iterator[str]:
     judge, dataset = found.judge, found.images.dataset
     main = judge.thresholds[judge.main]
+    features, num_candidates = found.settings["features"], judge.views[0].shape[1]
     yield (
-        f"{dataset.name}: {len(dataset.queries)} queries, {len(dataset.database)} database images, "
-        f"{found.rows.shape[1]} settings of the {found.axes.method} score, {found.settings['features']['name']} "
-        f"features; recall in %\n"
+        f"{dataset.name}: {len(dataset.queries)} queries, {num_candidates} candidates of {len(dataset.database)} "
+        f"database images, {found.rows.shape[1]} settings of the {found.axes.method} score, {features['name']} "
+        f"features at {features['image_size'][0]} x {features['image_size'][1]} px; recall in %\n"
     )
     order = np.argsort(-found.recall[:, judge.main], kind="stable")
     shown_rows = list(dict.fromkeys([*order[:TOP].tolist(), found.own]))

@@ -4,7 +4,7 @@ import errno
 import fcntl
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -96,13 +96,19 @@ def commit(writes: Sequence[ts.WriteFutures]) -> None:
 
 
 @contextmanager
-def locked(folder: Path, content: str) -> Iterator[None]:
-    """Hold the store's lock, which ends with the process, however that ends."""
+def locked(folder: Path, content: str, waiting: Callable[[str], None] | None = None) -> Iterator[None]:
+    """Hold the store's lock, which ends with the process, however that ends.
+
+    Args:
+        folder: the store's.
+        content: what it holds.
+        waiting: is told, in one line, whom this waits for; None = refuse a store that is in use.
+    """
     with told(folder, content):
         handle = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o644)
     try:
         with told(folder, content):
-            _take(handle, folder)
+            _take(handle, folder, waiting)
         with suppress(OSError):  # a full disk; the lock holds without its owner's name
             os.ftruncate(handle, 0)
             os.write(handle, str(os.getpid()).encode())
@@ -114,12 +120,15 @@ def locked(folder: Path, content: str) -> Iterator[None]:
         os.close(handle)
 
 
-def _take(handle: int, folder: Path) -> None:
+def _take(handle: int, folder: Path, waiting: Callable[[str], None] | None) -> None:
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        holder = os.read(handle, 20).decode(errors="replace") or "unknown"
-        raise InputError(f"{folder}: in use by process {holder}; wait until it ends, or stop it") from None
+        holder = os.pread(handle, 20, 0).decode(errors="replace") or "unknown"
+        if waiting is None:
+            raise InputError(f"{folder}: in use by process {holder}; wait until it ends, or stop it") from None
+        waiting(f"{folder}: in use by process {holder}; waiting until it is free")
+        fcntl.flock(handle, fcntl.LOCK_EX)
 
 
 @contextmanager

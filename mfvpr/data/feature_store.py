@@ -11,7 +11,7 @@ of one image; `count` `[M]` are the features of each.
 """
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -107,19 +107,22 @@ class FeatureStore:
 
 
 @contextmanager
-def open_store(folder: Path, recipe: Mapping[str, Any], *, num_images: int) -> Iterator[FeatureStore]:
+def open_store(
+    folder: Path, recipe: Mapping[str, Any], *, num_images: int, waiting: Callable[[str], None] | None = None
+) -> Iterator[FeatureStore]:
     """The store in `folder`, made if it is not there; no other process can open it meanwhile.
 
     Args:
         folder: see `store_manifest.store_path`.
         recipe: what the features are made from (JSON values only): weights, settings, images. Kept in plain text.
         num_images: M.
+        waiting: is told, in one line, which process this waits for; None = refuse a store that is in use.
 
     Raises:
         InputError: made from something else, in use, damaged beyond what the next run mends by itself, no store at
             all, or the folder cannot be written.
     """
-    with open_rows(folder, FEATURES, recipe, {"num_images": num_images}) as rows:
+    with open_rows(folder, FEATURES, recipe, {"num_images": num_images}, waiting) as rows:
         with told(rows.folder, FEATURES.content):
             if (rows.folder / "descriptors" / "zarr.json").exists():
                 rows.resume(_columns(_stored_dimension(rows.folder)))

@@ -15,7 +15,7 @@ sees where whole points follow each other in one large chunk; all else is noise 
 of the bytes brings together.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -128,7 +128,12 @@ class MatchStore:
 
 @contextmanager
 def open_match_store(
-    folder: Path, recipe: Mapping[str, Any], *, num_queries: int, num_candidates: int
+    folder: Path,
+    recipe: Mapping[str, Any],
+    *,
+    num_queries: int,
+    num_candidates: int,
+    waiting: Callable[[str], None] | None = None,
 ) -> Iterator[MatchStore]:
     """The store in `folder`, made if it is not there; no other process can open it meanwhile.
 
@@ -137,13 +142,14 @@ def open_match_store(
         recipe: what the matches are made from (JSON values only): features, shortlist, settings. Kept in plain text.
         num_queries: Q.
         num_candidates: C.
+        waiting: is told, in one line, which process this waits for; None = refuse a store that is in use.
 
     Raises:
         InputError: made from something else, in use, damaged beyond what the next run mends by itself, no store at
             all, or the folder cannot be written.
     """
     sizes = {"num_queries": num_queries, "num_candidates": num_candidates}
-    with open_rows(folder, MATCHES, recipe, sizes) as rows:
+    with open_rows(folder, MATCHES, recipe, sizes, waiting) as rows:
         rows.resume(_columns(num_candidates))
         yield MatchStore(num_candidates, rows)
 

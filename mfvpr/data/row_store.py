@@ -11,7 +11,7 @@ goes on.
 import itertools
 import math
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -164,7 +164,13 @@ class RowStore:
 
 
 @contextmanager
-def open_rows(folder: Path, kind: Kind, recipe: Mapping[str, Any], sizes: Mapping[str, int]) -> Iterator[RowStore]:
+def open_rows(
+    folder: Path,
+    kind: Kind,
+    recipe: Mapping[str, Any],
+    sizes: Mapping[str, int],
+    waiting: Callable[[str], None] | None = None,
+) -> Iterator[RowStore]:
     """The store in `folder`, made if it is not there; no other process can open it meanwhile. No row is done yet.
 
     Args:
@@ -172,6 +178,7 @@ def open_rows(folder: Path, kind: Kind, recipe: Mapping[str, Any], sizes: Mappin
         kind: what it holds.
         recipe: what the rows are made from (JSON values only). Kept in plain text.
         sizes: lengths of axes by name, first that of the rows.
+        waiting: is told, in one line, which process this waits for; None = refuse a store that is in use.
 
     Raises:
         InputError: made from something else, in use, no store at all, or the folder cannot be written.
@@ -181,7 +188,7 @@ def open_rows(folder: Path, kind: Kind, recipe: Mapping[str, Any], sizes: Mappin
         str(folder).encode()  # tensorstore takes no path that is not Unicode
         check_owned(folder, kind)
         folder.mkdir(parents=True, exist_ok=True)
-    with locked(folder, kind.content):
+    with locked(folder, kind.content, waiting):
         with told(folder, kind.content):
             settle_manifest(folder, kind, recipe, sizes)
         counts = np.full(next(iter(sizes.values())), -1, np.int32)

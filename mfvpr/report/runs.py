@@ -6,8 +6,9 @@ import platform
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,15 @@ def new_run_folder(root: Path, name: str) -> Path:
     return folder
 
 
+def claimed_run_folder(root: Path, name: str) -> Path:
+    """A `new_run_folder`, made empty at once, so that no run that ends in the same second takes it; for `writing`."""
+    while True:
+        folder = new_run_folder(root, name)
+        with suppress(FileExistsError):  # another run was faster
+            folder.mkdir(parents=True)
+            return folder
+
+
 def check_free(folder: Path) -> None:
     """Refuse a run folder that already holds something, or cannot be made."""
     if os.path.lexists(folder) and (folder.is_symlink() or not folder.is_dir() or any(folder.iterdir())):
@@ -47,17 +57,22 @@ def check_free(folder: Path) -> None:
 
 @contextmanager
 def writing(folder: Path) -> Iterator[Path]:
-    """A temporary folder beside `folder` that takes its name when the block ends without an error."""
+    """A temporary folder beside `folder` that takes its name when the block ends without an error; else both go."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
     try:
         yield temporary
         temporary.chmod(0o755)
         os.replace(temporary, folder)  # an empty folder of that name is replaced
+    except BaseException:
+        with suppress(OSError):  # not there, or not empty
+            folder.rmdir()
+        raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
+@cache
 def versions() -> dict[str, str]:
     """Versions of what computed the results."""
     return {

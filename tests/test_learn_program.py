@@ -1,0 +1,251 @@
+"""experiments.learn as its users meet it: what it learns from, what it reports, its checkpoints, and mistakes."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from experiments import lessons, search
+from experiments import run as evaluation
+from mfvpr.learning import checkpoints
+from mfvpr.learning.training import Fit, Record
+from tests.programs import QUERIES, results, shared, small, snapshot, typed
+from tests.test_experiments import composed
+
+SUM = ("scorer=sum", "grid.sigma=null", "grid.bin_size=null")
+SHORT = (*SUM, "split=first_half", "steps=4", "every=2", "batch=4", "learning_rate=0.05")
+ROWS = ["paper", "paper + filter", "grid search", "grid search + filter", "gradient", "gradient + filter",
+        "match weights", "match weights + filter"]  # fmt: skip
+WIDEST = 1  # frames
+
+
+@pytest.fixture(scope="session")
+def root(tmp_path_factory):
+    return shared(tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
+def learn(root):
+    """Learns into a folder, in this process; what results.json holds comes back."""
+
+    def call(out, *overrides):
+        lessons.learn(composed(*small(root), f"out={out}", *overrides, config="learn"))
+        return results(out)
+
+    return call
+
+
+@pytest.fixture(scope="session")
+def learned(learn, tmp_path_factory):
+    out = tmp_path_factory.mktemp("learned") / "out"
+    return out, learn(out, *SHORT)
+
+
+@pytest.fixture
+def untrained(monkeypatch):
+    """No training: the start is what was learned. What was asked of the training is kept."""
+    asked = []
+
+    def start(parameters, objective, batches, **options):
+        asked.append(options)
+        for step in range(options["steps"]):
+            batches(step)
+        return Fit(parameters, 0, (Record(0, None, 1.0),), "nothing was learned")
+
+    monkeypatch.setattr(lessons, "fit", start)
+    return asked
+
+
+def test_eight_rows_in_every_file(learned):
+    out, found = learned
+    assert [row["score"] for row in found["rows"]] == ROWS
+    with (out / "table.csv").open() as file:
+        header, *lines = csv.reader(file)
+    assert header == ["score", "R@1 ±0", "R@1 ±1", "95 % at ±1", "against paper", "p"]
+    assert [line[0] for line in lines] == ROWS
+    for line, row in zip(lines, found["rows"], strict=True):
+        assert [float(cell) for cell in line[1:3]] == [round(100 * value, 1) for value in row["recall_at_1"].values()]
+        for tolerance, (low, high) in row["interval"].items():
+            assert 0 <= low <= row["recall_at_1"][tolerance] <= high <= 1
+    assert all(name in (out / "summary.txt").read_text() for name in ROWS)
+    trained = [row["halves"]["first_half"] for row in found["rows"][4:]]
+    for one in trained:
+        assert [record[0] for record in one["history"]] == [0, 2, 4]
+        assert one["steps"] in (0, 2, 4)
+        assert one["values"]["temperature"] > 0
+    assert [sorted(one["values"]) for one in trained] == 2 * [["temperature"], ["c", "temperature"]]
+    assert any(one["steps"] > 0 for one in trained)
+
+
+def test_pictures_and_weights(learned):
+    out, _ = learned
+    for name in ("curves", "weights"):
+        picture = np.asarray(Image.open(out / "figures" / f"{name}.png").convert("L"))
+        assert min(picture.shape) > 200
+        assert picture.std() > 10
+    for name in ("first_half_match_weights", "first_half_match_weights_filter"):
+        with np.load(out / "weights" / f"{name}.npz", allow_pickle=False) as weight:
+            assert weight["hidden"].shape == (8, 16)
+            assert all(np.isfinite(array).all() for array in weight.values())
+
+
+def test_hand_set_and_searched_rows_are_those_of_a_sweep(root, learned, tmp_path):
+    grid = ("scorer=sum", "split=first_half", "grid.weight=[fs,dmf,unit]")
+    search.sweep(composed(*small(root), *grid, f"out={tmp_path}/out", config="sweep"))
+    swept = results(tmp_path / "out")
+    rows = {row["score"]: row for row in learned[1]["rows"]}
+    assert [rows["grid search"]["halves"]["first_half"]["values"]] == swept["chosen"]
+    for line in swept["report"]:
+        for row, name in (("paper", "own"), ("grid search", "chosen")):
+            assert rows[row]["recall_at_1"][f"{line['threshold']}"] == pytest.approx(line[name]["recall"])
+
+
+def test_nothing_that_is_reported_on_was_seen(learn, untrained, tmp_path, monkeypatch):
+    """Of both halves: neither the reported queries and places nor their neighbors, while learning or validating."""
+    seen, lesson = [], lessons.School.lesson
+
+    def watched(school, queries, size):
+        seen.append((school, queries))
+        return lesson(school, queries, size)
+
+    monkeypatch.setattr(lessons.School, "lesson", watched)
+    found = learn(tmp_path / "out", *SUM, "split=both", "steps=6", "batch=2")
+    reported = dict(zip(("first_half", "second_half"), found["queries"]["reported"], strict=True))
+    assert sorted(query for half in reported.values() for query in half) == list(range(QUERIES))
+    for chosen_on, (half, others) in zip(found["queries"]["chosen_on"], reported.items(), strict=True):
+        assert len(chosen_on) >= 8
+        assert min(abs(one - other) for one in chosen_on for other in others) > 2 * WIDEST
+        taught = {int(query) for school, queries in seen if school.name == half for query in queries}
+        assert len(taught) >= 5
+        assert taught <= set(chosen_on)
+    for school, queries in seen:
+        places = {int(place) for query in queries for place in school.candidates.indices[query][school.usable[query]]}
+        assert min(abs(place - other) for place in places for other in reported[school.name]) > WIDEST
+        assert min(abs(one - other) for one in school.learning for other in school.validating) > 2 * WIDEST
+        assert {*queries} <= {*school.learning} or {*queries} <= {*school.validating}
+
+
+@pytest.mark.parametrize("changes", [(), ("fusion.filter_score=negative_euclidean", "ties=index")])
+def test_the_papers_rows_are_an_evaluation(root, learn, untrained, tmp_path, changes):
+    changes = ("scorer=sum", "fusion.c=30", *changes)
+    rows = {row["score"]: row for row in learn(tmp_path / "out", *SUM, *changes, "steps=1")["rows"]}
+    evaluation.evaluate(composed(*small(root), *changes, "figures=0", f"out={tmp_path}/evaluated"))
+    expected = json.loads((tmp_path / "evaluated" / "results.json").read_text())
+    names = {"sum": "paper", "sum + filter": "paper + filter"}
+    for row in expected:
+        if row["system"] in names:
+            found = rows[names[row["system"]]]["recall_at_1"][f"{row['tolerance']}"]
+            assert found == pytest.approx(row["recall_at"]["1"], abs=1e-6)
+
+
+def test_an_interrupted_learning_goes_on_to_the_same_end(root, learn, learned, tmp_path, monkeypatch):
+    """Interrupted in the middle of the second training."""
+    saved, save = [], checkpoints.save
+
+    def interrupted(folder, step, *rest):
+        saved.append((folder.name, step))
+        if len(saved) == 4:
+            raise KeyboardInterrupt
+        save(folder, step, *rest)
+
+    monkeypatch.setattr(checkpoints, "save", interrupted)
+    again = (*SHORT, f"checkpoints={tmp_path}/kept")
+    with pytest.raises(KeyboardInterrupt):
+        learn(tmp_path / "out", *again)
+    assert [path.name for path in tmp_path.iterdir()] == ["kept"]
+    assert learn(tmp_path / "out", *again) == learned[1]
+    assert saved[:4] == [(f"first_half-gradient{more}", step) for more in ("", "_filter") for step in (2, 4)]
+    assert saved[4:6] == [("first_half-gradient_filter", 4), ("first_half-match_weights", 2)]
+
+
+def test_what_is_trained_already_is_not_trained_again(learn, learned, tmp_path, monkeypatch):
+    monkeypatch.setattr(checkpoints, "save", lambda *_: pytest.fail("trained again"))
+    assert learn(tmp_path / "out", *SHORT) == learned[1]
+
+
+def test_a_checkpoint_of_another_model_is_refused(root, learned, tmp_path, monkeypatch, capsys):
+    [kept] = [path.parent for path in root.glob("store/folder_learning-*/first_half-gradient/4")]
+    before = snapshot(root)
+    for change, words in (
+        ("learning_rate=0.5", "learning_rate=0.05, expected 0.5"),
+        ("recall.tolerances=[1]", "positives="),
+        ("loss=recall", 'loss="cross_entropy", expected "recall"'),
+    ):
+        arguments = (*small(root), *SHORT, change, f"checkpoints={kept.parent}", f"out={tmp_path}/out")
+        code, stdout, stderr = typed(monkeypatch, capsys, "learn", *arguments)
+        assert (code, stdout) == (2, "")
+        last = stderr.splitlines()[-1]
+        assert last.startswith(f"error: {kept}: this checkpoint is of ")
+        assert words in last
+        assert "choose another folder, or delete this one" in last
+        assert list(tmp_path.iterdir()) == []
+    assert snapshot(root) == before
+
+
+def test_whatever_changes_the_result_changes_the_checkpoint(root, untrained, tmp_path, monkeypatch):
+    """Else one training would go on with what another one left."""
+    monkeypatch.setattr(lessons.learn_outputs, "write", lambda *_: "")
+    shifted = tmp_path / "shifted.csv"
+    shifted.write_text("query,database\n" + "".join(f"{row},{(row + 1) % QUERIES}\n" for row in range(QUERIES)))
+    changes = ["seed=0", "seed=1", "hidden=4", "batch=3", "learning_rate=0.5", "loss=recall", "candidates=7", "every=1",
+               "fusion.filter_score=negative_euclidean", f"dataset.index_file={shifted}"]  # fmt: skip
+    for change in changes:
+        fixed = (*SUM, "grid.c=[1]", "split=second_half", "steps=1", f"out={tmp_path}/out")
+        lessons.learn(composed(*small(root), *fixed, change, config="learn"))
+        (tmp_path / "out").rmdir()
+    assert len({asked["folder"] for asked in untrained}) == 4 * len(changes)
+    assert len({json.dumps(asked["recipe"]) for asked in untrained}) == 4 * len(changes)
+
+
+@pytest.mark.parametrize(
+    ("rate", "step", "kept"), [(20, 4, "the last good checkpoint is {}/4;"), (1e12, 1, "there is no checkpoint yet;")]
+)
+def test_a_loss_that_turns_infinite_is_told(root, tmp_path, monkeypatch, capsys, rate, step, kept):
+    place = tmp_path / "kept"
+    few = ("grid.sigma=[10]", "grid.bin_size=null", "grid.weight=null", "grid.c=[0,1]")
+    absurd = (f"learning_rate={rate}", "every=1", f"checkpoints={place}", f"out={tmp_path}/out")
+    code, stdout, stderr = typed(monkeypatch, capsys, "learn", *small(root), *few, *absurd)
+    assert (code, stdout) == (2, "")
+    last = stderr.splitlines()[-1]
+    assert last.startswith(f"error: step {step}: ")
+    assert " is not finite at numbers.sigma=" in last
+    assert kept.format(place / "first_half-gradient") in last
+    assert last.endswith("lower the learning rate")
+    assert "Traceback" not in stderr
+    assert not (tmp_path / "out").exists()
+    assert sorted(path.name for path in place.glob("*/*")) == (["3", "4"] if step == 4 else [])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["split=null"], "split=null: what is learned is never reported on the same queries"),
+        (["scorer=count"], "scorer=count: expected one to learn, of histogram, anchor, sum"),
+        (["scorer=all"], "scorer=all: expected one to learn"),
+        (["scorer=anchor"], "grid.sigma: scorer=anchor has no such parameter"),
+        (["loss=hinge"], "loss=hinge: expected one of cross_entropy, recall, average_precision"),
+        (["steps=0"], "steps=0: expected a whole number above 0"),
+        (["learning_rate=nan"], "learning_rate=nan: expected a number above 0"),
+        (["learning_rat=1"], "the nearest is learning_rate"),
+        (["grid.sigma=[]"], "grid.sigma=[]: expected a list of one or more"),
+        (["dataset.ground_truth=none", "dataset.index_file=null"], "choosing settings needs a ground truth"),
+        (["recall.tolerances=[30]"], "split=both: no query of one half has a place far enough"),
+    ],
+)
+def test_mistakes_are_one_line_and_exit_code_2(root, tmp_path, monkeypatch, capsys, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    code, stdout, stderr = typed(monkeypatch, capsys, "learn", *small(root), *arguments)
+    assert (code, stdout) == (2, "")
+    assert words in stderr
+    assert stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_too_few_queries_are_refused(root, tmp_path, monkeypatch, capsys):
+    few = ("recall.tolerances=[0,3]", *SUM, f"out={tmp_path}/out")
+    code, stdout, stderr = typed(monkeypatch, capsys, "learn", *small(root), *few)
+    assert (code, stdout) == (2, "")
+    assert "split=first_half: expected queries to learn on and to validate with, got" in stderr.splitlines()[-1]
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,143 @@
+"""Hydra's multirun: many jobs, one after the other or at the same time."""
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from datetime import datetime
+from types import SimpleNamespace
+
+import pytest
+
+from experiments import prepare, stores
+from mfvpr.data import match_store
+from mfvpr.report import runs
+from tests.programs import CANDIDATES, QUERIES, results, shared, small, typed
+from tests.test_experiments import ROOT, composed
+
+SIGMA = "grid.sigma=[10]"
+
+
+@pytest.fixture(scope="session")
+def root(tmp_path_factory):
+    return shared(tmp_path_factory)
+
+
+def test_a_multirun_makes_one_run_folder_per_job(root, tmp_path, monkeypatch, capsys):
+    """A job that fails stops no other, and comes up again at the end."""
+    monkeypatch.chdir(tmp_path)
+    jobs = ("experiment=weight", "scorer=sum,histogram", "candidates=8,0")
+    code, stdout, stderr = typed(monkeypatch, capsys, "sweep", *small(root), "-m", *jobs)
+    assert code == 2
+    folders = sorted((tmp_path / "runs" / "folder").iterdir())
+    assert [f"results: {path.relative_to(tmp_path)}" in stdout for path in folders] == [True, True]
+    assert {results(path)["scorer"]["method"] for path in folders} == {"sum", "histogram"}
+    line = "error: candidates=0: expected a whole number above 0 (at most 1000000), or all"
+    assert stderr.splitlines().count(line) == 3
+    assert stderr.splitlines()[-1] == line
+    assert "Traceback" not in stderr
+    assert [number for number in range(4) if f"job {number}: " in stderr] == [0, 1, 2, 3]
+
+
+def test_weights_of_every_score_are_one_command(root, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    arguments = ("-m", *small(root), "experiment=weight", "grid.weight=[fs,unit]")
+    code, stdout, _ = typed(monkeypatch, capsys, "sweep", *arguments)
+    assert code == 0
+    assert [f"settings of the {name} score" in stdout for name in ("sum", "anchor", "histogram")] == [True] * 3
+
+
+def test_paths_stand_between_commas_in_a_multirun(root, tmp_path, monkeypatch, capsys):
+    outs = f"{tmp_path}/a b,{tmp_path}/it's"
+    monkeypatch.chdir(tmp_path)
+    code, _, stderr = typed(monkeypatch, capsys, "sweep", "-m", *small(root), SIGMA, f"out={outs}")
+    assert code == 0, stderr
+    assert results(tmp_path / "a b") == results(tmp_path / "it's")
+
+
+def test_a_job_waits_for_the_matches_of_another_and_a_single_run_does_not(root, tmp_path, monkeypatch, capsys):
+    overrides = *small(root), SIGMA
+    settings = composed(*overrides, config="sweep")
+    recipe = stores.matches_recipe(settings, prepare.images(settings).fingerprints, CANDIDATES)
+    path = stores.matches_path(settings["store"], prepare.matches_name(settings), recipe)
+    taken, told = threading.Event(), threading.Event()
+
+    def another():
+        with match_store.open_match_store(path, recipe, num_queries=QUERIES, num_candidates=CANDIDATES):
+            taken.set()
+            told.wait(timeout=60)
+
+    other, tell = threading.Thread(target=another), stores._tell
+    monkeypatch.setattr(stores, "_tell", lambda text: (tell(text), "waiting until" in text and told.set()))
+    other.start()
+    assert taken.wait(timeout=60)
+    code, _, stderr = typed(monkeypatch, capsys, "sweep", *overrides, f"out={tmp_path}/single")
+    assert (code, told.is_set()) == (2, False)
+    assert stderr == f"error: {path}: in use by process {os.getpid()}; wait until it ends, or stop it\n"
+    monkeypatch.chdir(tmp_path)
+    code, _, stderr = typed(monkeypatch, capsys, "sweep", "-m", *overrides, f"out={tmp_path}/job")
+    other.join(timeout=60)
+    assert code == 0, stderr
+    assert f"{path}: in use by process {os.getpid()}; waiting until it is free\n" in stderr
+    assert {place.name for place in tmp_path.iterdir()} == {"runs", "job"}
+
+
+def test_jobs_in_several_processes(root, tmp_path):
+    jobs = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "candidates=4,8", f"store={tmp_path}/store", SIGMA)
+    done = subprocess.run(
+        [sys.executable, "-m", "experiments.sweep", "-m", *small(root), *jobs],
+        cwd=tmp_path, capture_output=True, text=True, timeout=200, env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("results: runs/folder/") == 2
+    assert {results(path)["candidates"] for path in (tmp_path / "runs" / "folder").iterdir()} == {4, 8}
+    assert "error" not in done.stderr
+
+
+def test_who_waits_for_a_store_says_so_and_gets_it(tmp_path):
+    told, got = [], []
+
+    def another():
+        with match_store.open_match_store(
+            tmp_path / "s", {}, num_queries=1, num_candidates=2, waiting=told.append
+        ) as store:
+            got.append(store.done.tolist())
+
+    other = threading.Thread(target=another)
+    with match_store.open_match_store(tmp_path / "s", {}, num_queries=1, num_candidates=2):
+        other.start()
+        while not told and other.is_alive():
+            time.sleep(0.01)
+        assert not got
+    other.join(timeout=30)
+    assert told == [f"{tmp_path}/s: in use by process {os.getpid()}; waiting until it is free"]
+    assert got == [[False]]
+
+
+def test_run_folders_of_one_second_differ(tmp_path, monkeypatch):
+    monkeypatch.setattr(runs, "datetime", SimpleNamespace(now=lambda: datetime(2030, 1, 2, 3, 4, 5)))
+    claimed, start = [], threading.Barrier(8)
+
+    def claim():
+        start.wait()
+        claimed.append(runs.claimed_run_folder(tmp_path, "street").name)
+
+    threads = [threading.Thread(target=claim) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(timeout=30)
+    names = [f"2030-01-02_03-04-05{suffix}" for suffix in ("", *(f"-{number}" for number in range(2, 9)))]
+    assert sorted(claimed) == names
+
+
+def test_a_claimed_run_folder_goes_when_the_run_fails(tmp_path):
+    def interrupted():
+        with runs.writing(runs.claimed_run_folder(tmp_path, "street")) as new:
+            (new / "half").write_text("written")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert list((tmp_path / "street").iterdir()) == []

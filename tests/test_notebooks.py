@@ -1,0 +1,84 @@
+"""The notebooks are run, not believed; what is in the repository is their text alone."""
+
+import asyncio
+import os
+import re
+import sys
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+from mfvpr.data.streets import streets_folder
+from tests.test_layering import imports
+
+FOLDER = Path(__file__).parent.parent / "notebooks"
+PATHS = sorted(FOLDER.glob("*.ipynb"))
+LIBRARIES = {"mfvpr", "numpy", "jax", "matplotlib", "optax"}
+
+
+def code(notebook):
+    return [cell for cell in notebook.cells if cell.cell_type == "code"]
+
+
+@pytest.fixture(scope="module")
+def executed(tmp_path_factory):
+    """All notebooks, or what stopped them, after their execution side by side in an empty folder, and that folder."""
+    streets_folder(Path(os.environ["MFVPR_CACHE"]), num_frames=40)  # or each of them would draw it at the same time
+    folder = tmp_path_factory.mktemp("notebooks")
+    notebooks = [nbformat.read(path, as_version=4) for path in PATHS]
+
+    async def execute():
+        clients = (NotebookClient(one, timeout=200, resources={"metadata": {"path": folder}}) for one in notebooks)
+        return await asyncio.gather(*(client.async_execute() for client in clients), return_exceptions=True)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("IPYTHONDIR", str(tmp_path_factory.mktemp("ipython")))  # nothing of the user's is read or written
+        patch.delenv("MPLBACKEND", raising=False)  # pictures inline, wherever the tests run
+        results = asyncio.run(execute())
+    return dict(zip(PATHS, results, strict=True)), folder
+
+
+def test_there_are_three():
+    assert [path.name[0] for path in PATHS] == ["1", "2", "3"]
+
+
+@pytest.mark.parametrize("path", PATHS, ids=lambda path: path.stem)
+def test_only_the_text_is_kept(path):
+    notebook = nbformat.read(path, as_version=nbformat.NO_CONVERT)
+    nbformat.validate(notebook)
+    assert set(notebook.metadata) == {"kernelspec"}
+    assert notebook.metadata.kernelspec.name == "python3"
+    for cell in notebook.cells:
+        assert not cell.metadata
+        assert re.fullmatch(r"[a-z]+(-[a-z]+)*", cell.id)  # by hand: random ones would change with every save
+    for cell in code(notebook):
+        assert cell.outputs == []
+        assert cell.execution_count is None
+    assert not re.search(r"/(work|tmp|root|home)/", path.read_text())
+
+
+@pytest.mark.parametrize("path", PATHS, ids=lambda path: path.stem)
+def test_cells_are_short_and_need_the_library_alone(path, tmp_path):
+    cells = code(nbformat.read(path, as_version=4))
+    for cell in cells:
+        assert len([line for line in cell.source.splitlines() if line.strip()]) <= 12, cell.id
+    script = tmp_path / "cells.py"
+    script.write_text("\n".join(cell.source for cell in cells))
+    assert {name.partition(".")[0] for name in imports(script)} <= LIBRARIES | sys.stdlib_module_names
+
+
+@pytest.mark.parametrize("path", PATHS, ids=lambda path: path.stem)
+def test_they_run_and_show_pictures(path, executed):
+    result = executed[0][path]
+    assert not isinstance(result, BaseException), result
+    cells = code(result)
+    assert all(cell.execution_count for cell in cells)
+    outputs = [output for cell in cells for output in cell.outputs]
+    assert sum("image/png" in output.get("data", {}) for output in outputs) >= 3
+
+
+def test_they_leave_no_files(executed):
+    assert not list(executed[1].iterdir())
+    assert {path.suffix for path in FOLDER.iterdir()} == {".ipynb"}

@@ -1,0 +1,340 @@
+"""experiments.sweep as its users meet it: its numbers, its files, mistakes, and interruptions."""
+
+import csv
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from experiments import axes, launch, prepare, search, stores
+from experiments import run as evaluation
+from mfvpr.data import match_store
+from tests.programs import CANDIDATES, QUERIES, results, shared, small, snapshot, typed
+from tests.test_experiments import ROOT, composed
+
+SWEEP = sys.modules["mfvpr.sweeping.sweep"]
+
+
+@pytest.fixture(scope="session")
+def root(tmp_path_factory):
+    return shared(tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
+def sweep(root):
+    """Sweeps into a folder, in this process; what results.json holds comes back."""
+
+    def call(out, *overrides):
+        search.sweep(composed(*small(root), f"out={out}", *overrides, config="sweep"))
+        return results(out)
+
+    return call
+
+
+GRID = ("grid.sigma=[10,22.5]", "grid.weight=[fs,unit]", "grid.c=[0,2]", "fusion.c=2")
+
+
+@pytest.fixture(scope="session")
+def swept(sweep, tmp_path_factory):
+    """The sweep that fills the store."""
+    out = tmp_path_factory.mktemp("swept") / "out"
+    return out, sweep(out, *GRID)
+
+
+def recall_of(found, **parameters):
+    [entry] = [entry for entry in found["settings"] if entry["parameters"] == parameters]
+    return entry["recall_at"]
+
+
+# --- one sweep ---------------------------------------------------------------------------------------------------
+
+
+def evaluated(root, out, **changes):
+    """Recall at ks by system and tolerance."""
+    overrides = [f"{name}={value}" for name, value in changes.items()]
+    evaluation.evaluate(composed(*small(root), "figures=0", f"out={out}", *overrides))
+    rows = json.loads((out / "results.json").read_text())
+    return {(row["system"], f"{row['tolerance']}"): row["recall_at"] for row in rows}
+
+
+@pytest.mark.parametrize(("sigma", "weight"), [(10, "unit"), (22.5, "fs")])
+def test_a_sweep_is_one_evaluation_per_setting(root, swept, tmp_path, sigma, weight):
+    own = {"scorer.sigma": sigma, "scorer.weight": weight, "fusion.c": 2}
+    expected = evaluated(root, tmp_path / "out", scorer="histogram", **own)
+    for system, c in (("histogram", 0), ("histogram + filter", 2)):
+        for tolerance, found in recall_of(swept[1], sigma=sigma, weight=weight, c=c).items():
+            assert found == pytest.approx(expected[system, tolerance], abs=1e-6)
+
+
+def test_every_file_tells_the_same(swept):
+    out, found = swept
+    with (out / "table.csv").open() as file:
+        header, *lines = csv.reader(file)
+    assert header == ["sigma", "weight", "c", "R@1 ±0", "R@1 ±1", "R@5 ±1"]
+    assert len(lines) == len(found["settings"]) == 8
+    for line, entry in zip(lines, found["settings"], strict=True):
+        assert line[:3] == [f"{value}" for value in entry["parameters"].values()]
+        recall = entry["recall_at"]
+        expected = [recall["0"]["1"], recall["1"]["1"], recall["1"]["5"]]
+        np.testing.assert_allclose([float(cell) / 100 for cell in line[3:]], expected, atol=6e-4)
+    for name in ("table.md", "table.tex"):
+        assert (out / name).read_text().count("22.5") >= 4
+    assert {"mfvpr", "jax", "numpy"} <= set(found["versions"])
+    assert set(map(len, found["data_fingerprint"].values())) == {16}
+    assert (found["unit"], found["thresholds"], found["ks"]) == ("frames", [0, 1], [1, 5])
+
+
+def test_the_best_setting_is_chosen_and_told(swept):
+    out, found = swept
+    main = {tuple(entry["parameters"].values()): entry["recall_at"]["1"]["1"] for entry in found["settings"]}
+    [chosen] = found["chosen"]
+    assert main[tuple(chosen.values())] == max(main.values()) > min(main.values())
+    assert found["own"] == {"sigma": 22.5, "weight": "fs", "c": 2}
+    for line in found["report"]:
+        tolerance = f"{line['threshold']}"
+        for name, setting in (("chosen", chosen), ("own", found["own"])):
+            assert line[name]["recall"] == pytest.approx(recall_of(found, **setting)[tolerance]["1"], abs=1e-6)
+            low, high = line[name]["interval"]
+            assert 0 <= low <= line[name]["recall"] <= high <= 1
+        test = line["mcnemar"]
+        gain = QUERIES * (line["chosen"]["recall"] - line["own"]["recall"])
+        assert test["only_first"] - test["only_second"] == pytest.approx(gain)
+    text = (out / "summary.txt").read_text()
+    assert "The best, and its neighbors in the grid:" in text
+    assert f"chosen: sigma = {chosen['sigma']:g}, weight = {chosen['weight']}, c = {chosen['c']}" in text
+    assert f"24 queries, {CANDIDATES} candidates of 24 database images" in text
+    assert "this flatters" in text
+
+
+def test_heat_maps_are_pictures(swept):
+    figures = swept[0] / "figures"
+    assert {path.name for path in figures.iterdir()} == {"sigma_weight.png", "sigma_c.png", "weight_c.png"}
+    for path in figures.iterdir():
+        picture = np.asarray(Image.open(path).convert("RGB"))
+        assert min(picture.shape[:2]) > 200
+        assert picture.std() > 30
+        assert np.any(np.all(np.abs(picture.astype(int) - (232, 72, 44)) < 8, axis=-1))  # the best is framed
+
+
+def test_split_reports_every_query_once_by_what_it_did_not_choose(sweep, swept, tmp_path):
+    parts = ("first_half", "second_half", "both")
+    found = {part: sweep(tmp_path / part, *GRID[:2], "grid.c=null", f"split={part}") for part in parts}
+    first, second, both = (found[part]["report"] for part in parts)
+    assert [found[part]["report"][0]["queries"] for part in parts] == [12, 12, 24]
+    assert found["both"]["chosen"] == found["first_half"]["chosen"] + found["second_half"]["chosen"]
+    for one, other, joined in zip(first, second, both, strict=True):
+        for name in ("chosen", "own"):
+            assert joined[name]["recall"] == pytest.approx((one[name]["recall"] + other[name]["recall"]) / 2)
+            assert joined[name]["interval"][0] < joined[name]["interval"][1]
+        for name in ("only_first", "only_second"):
+            assert joined["mcnemar"][name] == one["mcnemar"][name] + other["mcnemar"][name]
+    assert "reported on the 12 of the other" in (tmp_path / "both" / "summary.txt").read_text()
+
+
+def test_no_features_are_read_where_the_matches_are_stored(sweep, swept, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(prepare, "extracted", lambda *_: pytest.fail("features were read"))
+    sweep(tmp_path / "out", *GRID)
+    stderr = capsys.readouterr().err
+    assert "folder sift matches: all 24 queries from" in stderr
+    assert "features" not in stderr
+
+
+@pytest.mark.parametrize("chunk", [(1, 24), (3, 5)])
+def test_chunks_change_nothing(sweep, swept, tmp_path, chunk):
+    found = sweep(tmp_path / "out", *GRID, f"chunk.settings={chunk[0]}", f"chunk.queries={chunk[1]}")
+    assert found == swept[1]
+
+
+def test_without_a_store(root, sweep, tmp_path):
+    """Descriptors are not rounded to float16 then, so that other candidates are possible."""
+    expected = evaluated(root, tmp_path / "evaluated", scorer="histogram", **{"scorer.sigma": 10, "store": "null"})
+    found = sweep(tmp_path / "swept", "store=null", "grid.sigma=[10]")
+    for tolerance, recall in recall_of(found, sigma=10).items():
+        assert recall == pytest.approx(expected["histogram", tolerance], abs=1e-6)
+
+
+def test_other_scores_and_their_axes(sweep, swept, tmp_path):
+    sizes = sweep(tmp_path / "anchor", "scorer=anchor", "scorer.num_bins=8", "grid.num_bins=[5,8]")
+    assert len({json.dumps(entry["recall_at"]) for entry in sizes["settings"]}) == 2
+    soft = sweep(tmp_path / "soft", "grid.temperature=[null,1e-6,100]")["settings"]
+    hard, nearly, washed_out = (entry["recall_at"] for entry in soft)
+    assert hard == nearly != washed_out
+    assert "none" in (tmp_path / "soft" / "table.csv").read_text()
+
+
+@pytest.mark.parametrize(
+    ("experiment", "changes", "count"),
+    [
+        ("histogram", ("grid.sigma=[10,15]", "grid.bin_size=[15]"), 3),
+        ("anchor", ("scorer.num_bins=8", "grid.num_bins=[8]", "grid.window=[4,6]", "grid.tolerance=[2,3]"), 5),
+        ("combined", ("grid.c=[0,1,auto]",), 3),
+    ],
+)
+def test_experiments_of_conf_run(sweep, swept, tmp_path, experiment, changes, count):
+    found = sweep(tmp_path / "out", f"experiment={experiment}", *changes)
+    assert len(found["settings"]) == count
+    assert (tmp_path / "out" / "figures").is_dir()
+
+
+def test_optuna_finds_the_same_with_the_same_seed(sweep, swept, tmp_path):
+    def find(name, seed):
+        space = ("search=optuna", "trials=5", "grid.sigma=[5,30]", "grid.weight=[fs,unit]")
+        return sweep(tmp_path / name, *space, f"seed={seed}")
+
+    first, again, other = find("first", 1), find("again", 1), find("other", 2)
+    assert first == again
+    tried = [entry["parameters"] for entry in first["settings"]]
+    assert tried[0] == first["own"] == {"sigma": 22.5, "weight": "fs"}
+    assert len(tried) == 6
+    assert all(5 <= one["sigma"] <= 30 and one["weight"] in ("fs", "unit") for one in tried)
+    assert tried != [entry["parameters"] for entry in other["settings"]]
+
+
+# --- mistakes and interruptions ----------------------------------------------------------------------------------
+
+SIGMA = "grid.sigma=[10]"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "grid: expected at least one axis"),
+        (["grid.sigma=[]"], "grid.sigma=[]: expected a list of one or more"),
+        (["grid.sgma=[1]"], "grid.sgma: unknown setting; the nearest is grid.sigma"),
+        (["grid.window=[3]"], "grid.window: scorer=histogram has no such parameter; it has sigma, bin_size"),
+        (["grid.sigma=[10,nan]"], "grid.sigma=[10, nan]: expected a list of one or more, each a number above 0"),
+        (["grid.sigma=[-1]"], "grid.sigma=[-1]: expected"),
+        (["grid.sigma=3"], "grid.sigma=3: expected a list"),
+        (["grid.align=[middle]"], "each one of min_edge, zero_center, zero_edge"),
+        (["grid.c=[automatic]"], "grid.c=['automatic']: expected"),
+        (["scorer=anchor", "grid.num_bins=[33]"], "each a whole number from 1 to 32"),
+        (["grid.sigma=[10,10]"], "grid.sigma=[10, 10]: expected different values"),
+        (["scorer=all", SIGMA], "scorer=all: a sweep takes one scorer at a time"),
+        (["scorer=count", SIGMA], "grid.sigma: scorer=count has no such parameter; it has max_distance, c"),
+        ([SIGMA, "dataset.ground_truth=none", "dataset.index_file=null"], "choosing settings needs a ground truth"),
+        ([SIGMA, "search=random"], "search=random: expected one of grid, optuna"),
+        ([SIGMA, "split=half"], "split=half: expected one of null, first_half, second_half, both"),
+        ([SIGMA, "chunk.settings=0"], "chunk.settings=0: expected a whole number above 0"),
+        ([SIGMA, "recall.tolerances=[30]", "split=both"], "no query of one half has a place far enough"),
+        ([SIGMA, "experiment=histogam"], "the nearest is histogram"),
+        ([SIGMA, "features=sift,aliked"], "add --multirun"),
+    ],
+)
+def test_mistakes_are_one_line_and_exit_code_2(root, tmp_path, monkeypatch, capsys, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    code, stdout, stderr = typed(monkeypatch, capsys, "sweep", *small(root), *arguments)
+    assert (code, stdout) == (2, "")
+    assert words in stderr
+    assert stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["grid.bin_size=[15,0.01]"], "bin_size=0.01: expected at most 1024 bins per axis, these images need 32000"),
+        ([SIGMA, "scorer.max_bins=3"], "scorer.max_bins=3: expected null, or at least 22"),
+        (["search=optuna", "grid.bin_size=[0.1,5]"], "bin_size=0.1: expected at most 1024 bins"),
+    ],
+)
+def test_bins_that_do_not_fit_are_refused(root, swept, tmp_path, monkeypatch, capsys, arguments, words):
+    code, stdout, stderr = typed(monkeypatch, capsys, "sweep", *small(root), *arguments, f"out={tmp_path}/out")
+    assert (code, stdout) == (2, "")
+    assert f"error: {words}" in stderr.splitlines()[-1]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_does_not_fit_in_memory_is_refused_with_its_size(root, swept, tmp_path, monkeypatch, capsys):
+    def refused(free, *arguments):
+        monkeypatch.setattr(axes, "_free_memory", lambda: free)
+        code, _, stderr = typed(monkeypatch, capsys, "sweep", *small(root), *arguments, f"out={tmp_path}/out")
+        assert (code, list(tmp_path.iterdir())) == (2, [])
+        return stderr.splitlines()[-1]
+
+    many = f"grid.sigma={list(range(1, 101))}", f"grid.bin_size={list(range(5, 105))}"
+    assert "10,000 settings would take about 20 MB of memory, 10 MB are free; use fewer" in refused(10**7, *many)
+    few = f"grid.sigma={list(range(1, 101))}", "recall.ks=[1000]"
+    line = refused(10**6, *few)
+    assert "rankings of 24 queries by 101 settings would take about 10 MB of memory, 1 MB are free" in line
+    line = refused(2 * 10**5, SIGMA, "chunk.queries=24")
+    assert "chunk: 2 settings x 24 queries would take about" in line
+    assert "use a smaller chunk.settings or chunk.queries" in line
+
+
+def test_free_memory_is_told_by_any_system(monkeypatch):
+    assert axes._free_memory() > 10**7
+    monkeypatch.setattr(Path, "read_text", lambda _: "something else")
+    assert axes._free_memory() > 10**7
+
+
+@pytest.mark.parametrize("change", ["candidates=7", "retrieval.num_words=9", "features.max_keypoints=61"])
+def test_matches_of_something_else_are_refused(root, swept, tmp_path, monkeypatch, capsys, change):
+    """A store that was moved to where another one belongs."""
+
+    def place(*changes):
+        settings = composed(*small(root), *changes, config="sweep")
+        images = prepare.images(settings)
+        recipe = stores.matches_recipe(settings, images.fingerprints, settings["candidates"])
+        return stores.matches_path(settings["store"], prepare.matches_name(settings), recipe)
+
+    own, foreign = place(f"store={tmp_path}/store"), place(change)
+    with match_store.open_match_store(own, {"other": 1}, num_queries=24, num_candidates=8):
+        pass
+    own.parent.joinpath(foreign.name).symlink_to(own)
+    before = snapshot(tmp_path)
+    code, stdout, stderr = typed(monkeypatch, capsys, "sweep", *small(root), change, SIGMA, f"store={tmp_path}/store",
+                                 f"out={tmp_path}/out")  # fmt: skip
+    assert (code, stdout) == (2, "")
+    assert "these matches were made with" in stderr
+    assert stderr.count("\n") == 1
+    assert snapshot(tmp_path) == before
+
+
+def test_results_are_not_overwritten(root, swept, monkeypatch, capsys):
+    before = snapshot(swept[0])
+    code, stdout, stderr = typed(monkeypatch, capsys, "sweep", *small(root), SIGMA, f"out={swept[0]}")
+    assert (code, stdout) == (2, "")
+    assert "expected a new or empty run folder" in stderr
+    assert stderr.count("\n") == 1
+    assert snapshot(swept[0]) == before
+
+
+def test_ctrl_c_keeps_what_is_finished_and_the_next_run_does_the_rest(root, sweep, swept, tmp_path, monkeypatch):
+    """Finished blocks are kept, and go when the whole sweep is done."""
+    grid = ("grid.sigma=[5,10,15,20,22.5,30]", "chunk.settings=1", "chunk.queries=1")
+    arguments = [*small(root), *grid, f"out={tmp_path}/out"]
+    command = [sys.executable, "-m", "experiments.sweep", *arguments]
+    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    kept = root / "store"
+    while len(done := list(kept.glob("folder_sweep-*/[!.]*.npy"))) < 5:
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130, stderr
+    assert "\ninterrupted; nothing half-written was left, and what was finished is kept\n" in stderr
+    assert "Traceback" not in stderr
+    assert list(tmp_path.iterdir()) == []
+
+    done, computed = list(kept.glob("folder_sweep-*/[!.]*.npy")), []
+    assert 5 <= len(done) < 6 * QUERIES
+    sweep(tmp_path / "other", SIGMA)  # takes nothing of another sweep away
+    scores = SWEEP._scores
+    monkeypatch.setattr(SWEEP, "_scores", lambda *block: computed.append(1) or scores(*block))
+    resumed = sweep(tmp_path / "out", *grid)
+    assert len(computed) == 6 * QUERIES - len(done)
+    assert not list(kept.glob("folder_sweep-*"))
+    assert resumed == sweep(tmp_path / "again", *grid[:1])
+
+
+def test_a_lost_ctrl_c_comes_again():
+    """What is raised in a callback of the garbage collector, nobody can catch."""
+    with pytest.raises(KeyboardInterrupt):
+        launch._keep_interrupt(SimpleNamespace(exc_type=KeyboardInterrupt)) or time.sleep(20)
