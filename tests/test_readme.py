@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from experiments.launch import CONF
-from experiments.settings import RULES
+from experiments.settings import RULES, check
 from tests import checkpoints
-from tests.test_experiments import QUICK, ROOT, run
+from tests.test_experiments import QUICK, ROOT, composed, run
 
 README = (ROOT / "README.md").read_text()
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", README, flags=re.DOTALL)
@@ -50,6 +50,18 @@ def test_commands_run(command, small_street, weights, tmp_path):
     assert "Settings" in done.stdout or "histogram" in done.stdout or "anchor" in done.stdout
 
 
+@pytest.mark.parametrize("program", ["sweep", "learn"])
+def test_commands_of_sweeps_and_learning_are_settings(program):
+    """They run in the tests of these programs, on less."""
+    commands = [shlex.split(line) for line in COMMANDS if f"experiments.{program}" in line]
+    assert len(commands) >= 2
+    for _, _, _, *arguments in commands:
+        chosen = [one.replace("=DIR", "=root") for one in arguments if one != "-m" and not one.startswith("hydra/")]
+        if "-m" in arguments:  # the first of several values
+            chosen = [re.sub(r"=(\[[^]]*\]|[^,\[]*),.*", r"=\1", one) for one in chosen]
+        check(composed(*chosen, config=program))
+
+
 def test_benchmark_runs(tmp_path):
     out = tmp_path / "benchmark.json"
     done = subprocess.run(
@@ -78,7 +90,7 @@ def test_settings_that_the_text_names_exist():
     names = re.findall(r"`(?:[\w.]+\.)?(\w+)=[^`(]*`", README)
     assert len(names) > 20
     groups = {path.name for path in CONF.iterdir() if path.is_dir()}
-    assert set(names) <= RULES.keys() | groups
+    assert set(names) <= {rule.rpartition(".")[2] for rule in RULES} | groups
 
 
 def test_readme_names_no_machine_path():

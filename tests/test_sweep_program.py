@@ -153,9 +153,10 @@ def test_chunks_change_nothing(sweep, swept, tmp_path, chunk):
 
 
 def test_without_a_store(root, sweep, tmp_path):
-    """Descriptors are not rounded to float16 then, so that other candidates are possible."""
-    expected = evaluated(root, tmp_path / "evaluated", scorer="histogram", **{"scorer.sigma": 10, "store": "null"})
-    found = sweep(tmp_path / "swept", "store=null", "grid.sigma=[10]")
+    """Nor with many ties, by another rule: most pairs have no matches."""
+    common = {"store": "null", "matching.max_distance": 0.3, "ties": "index"}
+    expected = evaluated(root, tmp_path / "evaluated", scorer="histogram", **common, **{"scorer.sigma": 10})
+    found = sweep(tmp_path / "swept", "grid.sigma=[10]", *(f"{name}={value}" for name, value in common.items()))
     for tolerance, recall in recall_of(found, sigma=10).items():
         assert recall == pytest.approx(expected["histogram", tolerance], abs=1e-6)
 
