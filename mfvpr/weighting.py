@@ -1,6 +1,9 @@
 """Match weights (paper, section IV-B): values that map one pair's Matches to one weight per slot.
 
 What they return on padding is arbitrary; `match_weights` is the form that scorers use.
+
+A weight without numbers is registered as static: to `jit`, pytrees of different classes without leaves look alike
+(jaxlib 0.10), and one weight's program would now and then be used for another.
 """
 
 from collections.abc import Callable
@@ -15,7 +18,7 @@ from mfvpr.types import Array, Matches
 Weight = Callable[[Matches], Array]
 
 
-@jax.tree_util.register_dataclass
+@jax.tree_util.register_static
 @dataclass(frozen=True)
 class FeatureScoreWeight:
     """FS-weight: w = scores0 + scores1, in units of the detector's scores."""
@@ -24,7 +27,7 @@ class FeatureScoreWeight:
         return matches.scores0 + matches.scores1
 
 
-@jax.tree_util.register_dataclass
+@jax.tree_util.register_static
 @dataclass(frozen=True)
 class DescriptorDistanceWeight:
     """DMF-weight: w = 2 - distance, in [0, 2]."""
@@ -33,7 +36,7 @@ class DescriptorDistanceWeight:
         return 2.0 - matches.distance
 
 
-@jax.tree_util.register_dataclass
+@jax.tree_util.register_static
 @dataclass(frozen=True)
 class UnitWeight:
     """w = 1: every match counts the same."""

@@ -26,6 +26,7 @@ from mfvpr import (
     score_grid,
 )
 from mfvpr.reranking import by_capacity
+from mfvpr.weighting import ChosenWeight
 from tests import oracles
 from tests.builders import random_matches
 
@@ -63,6 +64,17 @@ def test_kinds_of_weights_and_distances_are_axes_too(matches):
         for j, weight in enumerate(weights):
             expected = score_candidates(AggregatedScore(weight=weight), near)
             np.testing.assert_allclose(got[i, j], expected, rtol=2e-6)
+
+
+def test_no_program_is_mistaken_for_that_of_another_weight():
+    """Pytrees that `jit` cannot tell apart share a program now and then, by the luck of their hashes."""
+    weights = [FeatureScoreWeight(), DescriptorDistanceWeight(), UnitWeight()]
+    made = [HistogramOfShifts, AnchorPoints, AggregatedScore]
+    values = [MatchCount(), *weights, *(scorer(weight=weight) for scorer in made for weight in weights)]
+    values += [ChosenWeight((first, second), 0) for first in weights for second in weights]
+    structures = [jax.tree.structure(value) for value in values]
+    for place, one in enumerate(structures):
+        assert [other == one for other in structures].index(True) == place
 
 
 def test_temperature_is_an_axis_of_a_hard_scorer(matches):

@@ -9,7 +9,7 @@ from mfvpr.types import Array, Matches
 from mfvpr.weighting import match_confidence
 
 
-@jax.tree_util.register_dataclass
+@jax.tree_util.register_static  # no numbers; see weighting
 @dataclass(frozen=True)
 class MatchCount:
     """Number of matches, each counted with its confidence.
