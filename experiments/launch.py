@@ -57,7 +57,8 @@ def launch(program: Callable[[dict[str, Any]], None], config: str = "config") ->
 def _keep_interrupt(lost: "sys.UnraisableHookArgs") -> None:
     """Send Ctrl-C again where nobody could catch it, as in JAX's callback of the garbage collector."""
     if issubclass(lost.exc_type, KeyboardInterrupt):
-        threading.Timer(0.01, signal.raise_signal, [signal.SIGINT]).start()
+        main = threading.main_thread().ident
+        threading.Timer(0.01, signal.pthread_kill, [main, signal.SIGINT]).start()
     else:
         sys.__unraisablehook__(lost)
 
