@@ -32,7 +32,7 @@ def evaluate(settings: dict[str, Any]) -> None:
         settings, images.dataset, made.extractor, made.database, made.queries, made.candidates, matches, scorers,
         systems, watch.seconds, images.fingerprints,
     )  # fmt: skip
-    folder = folder or runs.new_run_folder(Path("runs"), images.dataset.name)
+    folder = folder or runs.claimed_run_folder(Path("runs"), images.dataset.name)
     with runs.writing(folder) as new:
         table = outputs.write(new, outcome)
     shown = f"{table.text()}\n" if outcome.thresholds else ""
