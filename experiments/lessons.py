@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -61,12 +61,12 @@ class School:
         part = MatchSet(chosen, self.matches.counts[queries], self.matches.capacity)
         return part, jax.tree.map(lambda values: values[queries], self.candidates)
 
-    @property
+    @cached_property
     def right(self) -> np.ndarray:
         """`[Q, C]` bool, candidates that are right within the threshold that decides."""
         return self._positive(self.judge.positives[self.judge.main])
 
-    @property
+    @cached_property
     def usable(self) -> np.ndarray:
         """`[Q, C]` bool, candidates of the losses: seen, and not right by the widest threshold alone."""
         return self.seen & ~(self._positive(self.judge.positives[-1]) & ~self.right)
@@ -75,7 +75,7 @@ class School:
         indices = np.maximum(self.candidates.indices, 0)
         return np.take_along_axis(positives, indices, axis=1) & self.candidates.mask
 
-    @property
+    @cached_property
     def width(self) -> int:
         """Candidates that hold every query's usable ones."""
         return round_up(int(self.usable[self.half.tune].sum(axis=1).max()), 8)

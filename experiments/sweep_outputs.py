@@ -2,7 +2,7 @@
 
 import itertools
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -70,15 +70,14 @@ def write(folder: Path, found: Found) -> str:
     return text
 
 
-def _table(found: Found, numbers: Any) -> Table:
+def _table(found: Found, numbers: Sequence[int]) -> Table:
     """Recall at 1 of some settings by all queries, and at the other ks by the main threshold."""
     judge, names = found.judge, list(found.axes.values)
     ks = sorted(set(found.settings["recall"]["ks"]))
     header = [judge.label(ks[0], threshold) for threshold in judge.thresholds]
     header += [judge.label(k, judge.thresholds[judge.main]) for k in ks[1:]]
-    numbers = list(numbers)
-    columns = [*judge.recall(found.rows[0][numbers], ks[0]).T]
-    columns += [judge.recall(found.rows[0][numbers], k)[:, judge.main] for k in ks[1:]]
+    columns = [*judge.recall(found.rows[0][list(numbers)], ks[0]).T]
+    columns += [judge.recall(found.rows[0][list(numbers)], k)[:, judge.main] for k in ks[1:]]
     lines = [
         [*(shown(found.written[number][name]) for name in names), *(f"{100 * column[place]:.1f}" for column in columns)]
         for place, number in enumerate(numbers)
@@ -95,10 +94,10 @@ def _summary(found: Found) -> Iterator[str]:
         f"database images, {found.rows.shape[1]} settings of the {found.axes.method} score, {features['name']} "
         f"features at {features['image_size'][0]} x {features['image_size'][1]} px; recall in %\n"
     )
-    order = np.argsort(-found.recall[:, judge.main], kind="stable")
-    shown_rows = list(dict.fromkeys([*order[:TOP].tolist(), found.own]))
-    yield f"Best settings by {judge.label(1, main)}, all queries; last: the scorer's own values."
-    yield _table(found, shown_rows).text()
+    best = np.argsort(-found.recall[:, judge.main], kind="stable")[:TOP].tolist()
+    beside = "" if found.own in best else "; last: the scorer's own values"
+    yield f"Best settings by {judge.label(1, main)}, all queries{beside}."
+    yield _table(found, list(dict.fromkeys([*best, found.own]))).text()
     if found.is_grid and not judge.halves:
         best = found.chosen[0]
         around = sweeping.neighbors(found.axes.values, best)

@@ -7,7 +7,7 @@ block by block (some settings, some queries), which bounds the memory and is whe
 import hashlib
 import itertools
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -100,9 +100,9 @@ def sweep(
     for part, block in track(steps, len(blocks) * -(-num_queries // queries)):
         if part.queries not in held:  # the batches of one part at a time, and only if some block needs them
             held = {part.queries: []}
-        wanted = [place for row in dict.fromkeys(block.rows.reshape(-1).tolist()) for place in places[row]]
+        sharing = [places[row] for row in dict.fromkeys(block.rows.reshape(-1).tolist())]
+        wanted, shares = list(itertools.chain.from_iterable(sharing)), list(map(len, sharing))
         cs = [settings[place].get(FUSION, _ALONE) for place in wanted]
-        shares = [len(places[row]) for row in dict.fromkeys(block.rows.reshape(-1).tolist())]
         rows = _kept(folder, part, block, cs, lambda: _rows(part, block, held[part.queries], cs, shares))  # noqa: B023
         found[:, wanted, part.queries.start : part.queries.stop] = rows
     return found
@@ -190,7 +190,9 @@ def _orders(
     return jax.lax.map(one, (scores, c))
 
 
-def _kept(folder: Path | None, part: Work, block: Group, cs: Sequence[Any], compute: Any) -> np.ndarray:
+def _kept(
+    folder: Path | None, part: Work, block: Group, cs: Sequence[Any], compute: Callable[[], np.ndarray]
+) -> np.ndarray:
     """A block's rows, from its file where that is there and whole; else computed and written."""
     if folder is None:
         return compute()
