@@ -62,7 +62,8 @@ def axes(settings: dict[str, Any]) -> Axes:
         if len(set(map(str, axis))) < len(axis):
             raise SettingsError(f"grid.{name}={axis}: expected different values")
     if not values:
-        raise SettingsError("grid: expected at least one axis, such as 'grid.sigma=[10,22.5]'; see --help")
+        raise SettingsError("grid: expected at least one axis, such as 'grid.sigma=[10,22.5]', or an experiment=; see "
+                            "--help")  # fmt: skip
     own = {name: _own(settings, name) for name in values}
     return Axes(method, values, own)
 

@@ -2,6 +2,7 @@
 
 import math
 import os
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -113,8 +114,25 @@ def track(label: str) -> Track:
 
 
 def bar(label: str, total: int, items: Iterable[Any] | None = None) -> tqdm:
-    """The one look of all progress bars."""
-    return tqdm(items, total=total, desc=f"{label:<20}", unit="", dynamic_ncols=True)
+    """The one look of all progress bars; none where there is nothing to do."""
+    shown = tqdm if sys.stderr.isatty() else _Lines
+    return shown(items, total=total, desc=f"{label:<20}", unit="", dynamic_ncols=True, disable=total == 0)
+
+
+class _Lines(tqdm):
+    """Progress without a terminal, in a file or a log: a line per 10 %."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        self._tenths = -1
+        super().__init__(*arguments, mininterval=0, miniters=1, leave=False, **options)
+
+    def display(self, msg: str | None = None, pos: int | None = None) -> None:
+        """What tqdm calls wherever a bar would be drawn."""
+        tenths = 10 * self.n // self.total
+        if tenths > self._tenths:
+            self._tenths = tenths
+            print(f"{self.desc} {10 * tenths:3d} %  {self.n} of {self.total}  {self.format_dict['elapsed']:.0f} s",
+                  file=sys.stderr)  # fmt: skip
 
 
 def _scorer(settings: dict[str, Any]) -> Scorer:

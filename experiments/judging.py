@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments import truth
 from experiments.settings import SettingsError
 from mfvpr import sweeping
 from mfvpr.data.datasets import Dataset
@@ -48,7 +49,7 @@ class Judge:
 
     def label(self, k: int, threshold: float) -> str:
         """R@K and what counts, for tables."""
-        return f"R@{k} ±{threshold:g}" if self.unit == "frames" else f"R@{k} {threshold:g} m"
+        return truth.label(k, threshold, self.unit)
 
     def recall(self, rows: np.ndarray, k: int = 1) -> np.ndarray:
         """`[S, thresholds]` recall at k of all queries, of rows `[S, Q, depth]`."""
@@ -81,14 +82,12 @@ class Judge:
 
 def judge(settings: dict[str, Any], dataset: Dataset) -> Judge:
     """Before matching: what is wrong with the ground truth is told early."""
-    truth = dataset.truth
-    if truth is None:
+    if dataset.truth is None:
         raise SettingsError(
             "dataset.ground_truth=none: choosing settings needs a ground truth; set order, index or utm"
         )
-    recall = settings["recall"]
-    thresholds = sorted(set(recall["tolerances"])) if truth.unit == "frames" else [recall["radius"]]
-    positives = [truth.positives(threshold) for threshold in thresholds]
+    thresholds = truth.thresholds(settings, dataset.truth)
+    positives = [dataset.truth.positives(threshold) for threshold in thresholds]
     both = dict(zip(("first_half", "second_half"), sweeping.halves(positives[-1]), strict=True))
     split = settings["split"]
     halves = list(both.values()) if split == "both" else [both[split]] if split else []
@@ -96,4 +95,4 @@ def judge(settings: dict[str, Any], dataset: Dataset) -> Judge:
         if not len(half.tune) or not positives[-1][half.tune].any():
             raise SettingsError(f"split={split}: no query of one half has a place far enough from the other half; "
                                 "use more queries, smaller tolerances, or split=null")  # fmt: skip
-    return Judge(thresholds, truth.unit, positives, halves, [], settings["resamples"], settings["seed"])
+    return Judge(thresholds, dataset.truth.unit, positives, halves, [], settings["resamples"], settings["seed"])

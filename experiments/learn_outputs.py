@@ -1,18 +1,20 @@
 """What learning leaves: the table side by side, the learned values, and how the trainings went."""
 
-import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
+from experiments import truth
 from experiments.axes import shown
 from experiments.judging import Judge
 from experiments.prepare import Images
+from experiments.run_folder import Figure
 from mfvpr.data.files import replacing, write_text
 from mfvpr.learning.match_weight import FEATURE_NAMES, LearnedWeight
 from mfvpr.learning.training import Fit
@@ -63,20 +65,36 @@ class Outcome:
             yield found[0].name, np.concatenate([one.hits for one in found], axis=1), found
 
 
-def write(folder: Path, outcome: Outcome) -> str:
-    """All files of the run folder; the text for the terminal comes back."""
-    table = _table(outcome)
-    runs.write_table(folder, table)
-    write_text(folder / "results.json", json.dumps(_results(outcome), indent=1, ensure_ascii=False) + "\n")
-    fitted = {f"{one.half}: {one.name}": one.fitted for half in outcome.results for one in half if one.fitted}
-    curves_figure(folder / "figures" / "curves.png", {name: one.history for name, one in fitted.items()})
-    weights = {name: one.parameters["weight"] for name, one in fitted.items() if "weight" in one.parameters}
-    for name, weight in weights.items():
+def text(outcome: Outcome) -> str:
+    """For the terminal."""
+    return "\n".join([_heading(outcome), "", _table(outcome).text(), *_remarks(outcome)])
+
+
+def write(folder: Path, outcome: Outcome) -> None:
+    """All files of the run folder but the figures."""
+    runs.write_table(folder, _table(outcome), _heading(outcome))
+    runs.write_json(folder / "results.json", _results(outcome))
+    for name, weight in _weights(outcome).items():
         _write_weight(folder / "weights" / f"{re.sub(r'[^a-z]+', '_', name)}.npz", weight)
-    _weights_figure(folder / "figures" / "weights.png", outcome, weights)
-    text = "\n".join([_heading(outcome), "", table.text(), *_remarks(outcome)])
-    write_text(folder / "summary.txt", text + "\n")
-    return text
+    write_text(folder / "summary.txt", text(outcome) + "\n")
+
+
+def figures(outcome: Outcome) -> list[Figure]:
+    """How the trainings went, and what the learned weights look at."""
+    histories = {name: one.history for name, one in _fitted(outcome).items()}
+    return [
+        ("curves.png", partial(curves_figure, histories=histories)),
+        ("weights.png", partial(_weights_figure, outcome=outcome, weights=_weights(outcome))),
+    ]
+
+
+def _fitted(outcome: Outcome) -> dict[str, Fit]:
+    return {f"{one.half}: {one.name}": one.fitted for half in outcome.results for one in half if one.fitted}
+
+
+def _weights(outcome: Outcome) -> dict[str, LearnedWeight]:
+    fitted = _fitted(outcome)
+    return {name: one.parameters["weight"] for name, one in fitted.items() if "weight" in one.parameters}
 
 
 def _heading(outcome: Outcome) -> str:
@@ -85,7 +103,7 @@ def _heading(outcome: Outcome) -> str:
     return (
         f"{dataset.name}: {outcome.settings['scorer']['method']} score, {outcome.settings['features']['name']} "
         f"features; each of {reported} queries is reported on by what was learned on the other half of the path; "
-        "recall in %"
+        f"{truth.in_words(outcome.settings, dataset)}"
     )
 
 
@@ -119,7 +137,7 @@ def _remarks(outcome: Outcome) -> Iterator[str]:
 
 def _results(outcome: Outcome) -> dict[str, Any]:
     judge, settings = outcome.judge, outcome.settings
-    left_out = ("dataset", "store", "out", "checkpoints", "multirun")
+    left_out = ("dataset", "store", "out", "checkpoints", "multirun", "command")
     labels = [f"{threshold:g}" for threshold in judge.thresholds]
     rows = [
         {
@@ -131,7 +149,8 @@ def _results(outcome: Outcome) -> dict[str, Any]:
         for name, hits, found in outcome.rows()
     ]
     return {
-        "dataset": outcome.images.dataset.name, "data_fingerprint": outcome.images.fingerprints,
+        "dataset": outcome.images.dataset.name, "ground_truth": truth.described(settings, outcome.images.dataset),
+        "data_fingerprint": outcome.images.fingerprints,
         "unit": judge.unit, "thresholds": list(judge.thresholds),
         "queries": {"reported": [half.report.tolist() for half in judge.halves],
                     "chosen_on": [half.tune.tolist() for half in judge.halves]},

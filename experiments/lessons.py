@@ -12,7 +12,7 @@ import numpy as np
 import optax
 
 import mfvpr
-from experiments import axes, build, learn_outputs, prepare, stores
+from experiments import axes, build, learn_outputs, prepare, run_folder, stores, truth
 from experiments.judging import Judge, judge
 from experiments.models import LOSSES, NUMBERS, Lesson, Model, model
 from experiments.settings import SettingsError
@@ -94,8 +94,15 @@ class School:
 
 def learn(settings: dict[str, Any]) -> None:
     """Matches -> learned, searched and hand-set scores on the half that none of them saw -> table, figures, files."""
-    folder = build.expanded(settings["out"]) if settings["out"] else None
-    runs.check_free(folder or runs.new_run_folder(Path("runs"), settings["dataset"]["name"]))
+    with run_folder.claimed(settings) as folder:
+        outcome = _outcome(settings)
+        run_folder.leave(
+            folder, settings, truth.described(settings, outcome.images.dataset), text=learn_outputs.text(outcome),
+            write=lambda new: learn_outputs.write(new, outcome), figures=learn_outputs.figures(outcome),
+        )  # fmt: skip
+
+
+def _outcome(settings: dict[str, Any]) -> "learn_outputs.Outcome":
     method = settings["scorer"].get("method", "all")
     if method not in NUMBERS:
         raise SettingsError(f"scorer={method}: expected one to learn, of {', '.join(NUMBERS)}")
@@ -117,11 +124,7 @@ def learn(settings: dict[str, Any]) -> None:
     with watch("learning"):
         for school in _schools(settings, matches, candidates, judgment):
             results.append(list(_lessons(school, varied, checkpoints)))
-    outcome = learn_outputs.Outcome(settings, images, judgment, matches, candidates, results, watch.seconds)
-    folder = folder or runs.claimed_run_folder(Path("runs"), images.dataset.name)
-    with runs.writing(folder) as new:
-        text = learn_outputs.write(new, outcome)
-    print(f"\n{text}\nresults: {folder}")
+    return learn_outputs.Outcome(settings, images, judgment, matches, candidates, results, watch.seconds)
 
 
 def _schools(settings: dict[str, Any], matches: MatchSet, candidates: Shortlist, judgment: Judge) -> Iterator[School]:

@@ -1,21 +1,25 @@
 """What a run leaves: rows of results, the table, predictions and figures."""
 
 from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from experiments import build
-from mfvpr.data.datasets import Dataset
+from experiments import truth
+from experiments.run_folder import Figure
+from experiments.settings import SettingsError
+from mfvpr.data.datasets import Dataset, ImageFolder
 from mfvpr.data.files import write_text
 from mfvpr.data.images import read_image, resize
 from mfvpr.evaluation import recall_at_k
 from mfvpr.features import LocalExtractor
 from mfvpr.pipeline import FeatureSet, MatchSet, explain
 from mfvpr.report import runs
-from mfvpr.report.figures import histogram_figure
+from mfvpr.report.figures import Answer, histogram_figure
+from mfvpr.report.rankings import Rankings, write_failures, write_predictions
 from mfvpr.report.tables import Table
 from mfvpr.scoring import HistogramOfShifts, Scorer
 from mfvpr.types import Shortlist
@@ -47,13 +51,24 @@ class Outcome:
     seconds: dict[str, float]
     fingerprint: dict[str, str]  # of the images
 
-    @property
+    shown: int | list[int]  # figures: how many, or of which queries
+
+    @cached_property
     def thresholds(self) -> list[float]:
         """What counts as right, in the unit of the ground truth; none without ground truth."""
-        if self.dataset.truth is None:
-            return []
-        recall = self.settings["recall"]
-        return sorted(set(recall["tolerances"])) if self.dataset.truth.unit == "frames" else [recall["radius"]]
+        return truth.thresholds(self.settings, self.dataset.truth)
+
+    @cached_property
+    def right(self) -> np.ndarray | None:
+        """`[Q, N]` bool by the threshold in the middle, which predictions, failures and figures go by."""
+        found = self.dataset.truth
+        return None if found is None else found.positives(self.thresholds[len(self.thresholds) // 2])
+
+    def is_right(self, system: "System") -> np.ndarray | None:
+        """`[Q, C]` bool in the order of a ranking."""
+        if self.right is None:
+            return None
+        return np.take_along_axis(self.right, np.maximum(system.rows, 0), axis=1) & (system.rows >= 0)
 
     @property
     def headline(self) -> str:
@@ -63,33 +78,35 @@ class Outcome:
         return "histogram" if "histogram" in self.systems else list(self.systems)[1]
 
 
+def text(outcome: Outcome) -> str:
+    """For the terminal: what was evaluated, and the table."""
+    table = f"\n{recall_table(result_rows(outcome)).text()}" if outcome.thresholds else ""
+    return f"{heading(outcome)}\n{table}"
+
+
 def heading(outcome: Outcome) -> str:
     """One line that says what was evaluated."""
-    truth, settings = outcome.dataset.truth, outcome.settings
-    kind = "no ground truth: rankings only" if truth is None else f"recall in %, ± in {truth.unit}"
+    settings = outcome.settings
     return (
         f"{outcome.dataset.name}: {len(outcome.queries)} queries, {len(outcome.database)} database images, "
         f"{outcome.candidates.indices.shape[1]} candidates ({settings['retrieval']['name']}), "
-        f"{settings['features']['name']} features; {kind}"
+        f"{settings['features']['name']} features; {truth.in_words(settings, outcome.dataset)}"
     )
 
 
-def write(folder: Path, outcome: Outcome) -> Table:
-    """All files of a run folder; the table comes back to be printed."""
+def write(folder: Path, outcome: Outcome) -> None:
+    """All files of a run folder but the figures."""
     rows = result_rows(outcome)
-    table = recall_table(rows)
-    runs.write_results(folder, rows)
+    runs.write_json(folder / "results.json", rows)
     if outcome.thresholds:
-        runs.write_table(folder, table)
-    _write_predictions(folder, outcome)
+        runs.write_table(folder, recall_table(rows), heading(outcome))
+    _write_rankings(folder, outcome)
     _write_skipped(folder, outcome)
-    _write_figures(folder, outcome)
-    return table
 
 
 def result_rows(outcome: Outcome) -> list[dict[str, Any]]:
     """One row per system and threshold."""
-    settings, truth = outcome.settings, outcome.dataset.truth
+    settings, found = outcome.settings, outcome.dataset.truth
     common = {
         "filter": settings["retrieval"],
         "features": settings["features"],
@@ -99,13 +116,14 @@ def result_rows(outcome: Outcome) -> list[dict[str, Any]]:
         "database": len(outcome.database),
         "dataset": outcome.dataset.name,
         "data_fingerprint": outcome.fingerprint,
+        "ground_truth": truth.described(settings, outcome.dataset),
         "seconds": outcome.seconds,
         "versions": runs.versions(),
     }
     judged: list[tuple[dict[str, float], dict[str, dict[str, float]]]] = [({}, {})]
-    if truth is not None:
-        name = "tolerance" if truth.unit == "frames" else "radius"
-        judged = [({name: value}, _recall(outcome, truth.positives(value))) for value in outcome.thresholds]
+    if found is not None:
+        name = "tolerance" if found.unit == "frames" else "radius"
+        judged = [({name: value}, _recall(outcome, found.positives(value))) for value in outcome.thresholds]
     return [
         {"system": name, "scorer": system.scorer, "parameters": system.parameters, **threshold,
          "recall_at": recall.get(name, {}), **common}
@@ -132,7 +150,8 @@ def recall_table(rows: list[dict[str, Any]]) -> Table:
 
     def cells(found: list[dict[str, Any]]) -> list[tuple[str, str]]:
         def label(row: dict[str, Any], k: str) -> str:
-            return f"R@{k} ±{row['tolerance']}" if "tolerance" in row else f"R@{k} {row['radius']:g} m"
+            unit = row["ground_truth"]["unit"]
+            return truth.label(k, row["tolerance" if unit == "frames" else "radius"], unit)
 
         first = [(row, k) for row in found for k in list(row["recall_at"])[:1]]
         others = [(found[middle], k) for k in list(found[middle]["recall_at"])[1:]]
@@ -143,13 +162,16 @@ def recall_table(rows: list[dict[str, Any]]) -> Table:
     return Table(header, [[system, *(text for _, text in cells(found))] for system, found in lines])
 
 
-def _write_predictions(folder: Path, outcome: Outcome) -> None:
+def _write_rankings(folder: Path, outcome: Outcome) -> None:
     names = outcome.dataset.queries.names, outcome.dataset.database.names
     for name, system in outcome.systems.items():
-        file = folder / "predictions" / f"{name.replace(' + ', '_')}.csv"
-        runs.write_predictions(file, *names, system.rows, system.scores)
-    headline = outcome.systems[outcome.headline]
-    runs.write_predictions(folder / "predictions.csv", *names, headline.rows, headline.scores)
+        found = Rankings(*names, system.rows, system.scores, outcome.is_right(system))
+        file = f"{name.replace(' + ', '_')}.csv"
+        write_predictions(folder / "predictions" / file, found)
+        write_failures(folder / "failures" / file, found)
+        if name == outcome.headline:
+            write_predictions(folder / "predictions.csv", found)
+            write_failures(folder / "failures.csv", found)
 
 
 def _write_skipped(folder: Path, outcome: Outcome) -> None:
@@ -162,39 +184,80 @@ def _write_skipped(folder: Path, outcome: Outcome) -> None:
         write_text(folder / "skipped.csv", Table(["folder", "image", "reason"], bad).csv())
 
 
-def _write_figures(folder: Path, outcome: Outcome) -> None:
+def asked_figures(asked: int | list[int | str], dataset: Dataset) -> int | list[int]:
+    """How many figures, or of which queries, as rows; what is asked for may be names."""
+    if isinstance(asked, int):
+        return asked
+    names = {name: row for row, name in enumerate(dataset.queries.names)}
+    rows = [names.get(one, -1) if isinstance(one, str) else one for one in asked]
+    for one, row in zip(asked, rows, strict=True):
+        if not 0 <= row < len(names):
+            raise SettingsError(
+                f"figures=[{one}]: expected rows of queries from 0 to {len(names) - 1}, or names such as "
+                f"{dataset.queries.names[0]}"
+            )
+    return list(dict.fromkeys(rows))
+
+
+def figures(outcome: Outcome) -> list[Figure]:
     """The paper's figure for a few queries, right and wrong ones, spread over the sequence."""
-    queries, database = outcome.dataset.queries, outcome.dataset.database
+    return [
+        (f"{verdict}_{query:04d}.png", partial(_draw, outcome=outcome, query=query, verdict=verdict))
+        for query, verdict in _shown(outcome).items()
+    ]
+
+
+def _draw(path: Path, outcome: Outcome, query: int, verdict: str) -> None:
+    """What was answered; where that is wrong, below it what is right."""
+    system, names = outcome.systems[outcome.headline], outcome.dataset.queries.names
+    answers = [_answer(outcome, query, 0, verdict)]
+    if verdict == "wrong":
+        answers += _right_answer(outcome, query)
+    image = _image(outcome, outcome.dataset.queries, query)
+    title = f"{outcome.headline}, {verdict}: {names[query]} -> {outcome.dataset.database.names[system.rows[query, 0]]}"
+    histogram_figure(path, image, answers, title=title)
+
+
+def _answer(outcome: Outcome, query: int, rank: int, verdict: str) -> Answer:
+    """The candidate at a rank from 0."""
+    system, database = outcome.systems[outcome.headline], outcome.dataset.database
+    row = int(system.rows[query, rank])
+    place = int(np.flatnonzero(outcome.candidates.indices[query] == row)[0])
+    pair = jax.tree.map(lambda field: field[place], outcome.matches[query])
     scorer = outcome.scorers.get("histogram")
     scorer = scorer if isinstance(scorer, HistogramOfShifts) else HistogramOfShifts()
+    caption = f"{verdict}: {database.names[row]}, rank {rank + 1}, score {system.scores[query, rank]:.5g}"
+    return Answer(_image(outcome, database, row), caption, pair, explain(scorer, pair))
+
+
+def _right_answer(outcome: Outcome, query: int) -> list[Answer]:
+    """The first right candidate; else the right image, which the filter missed; nothing where there is none."""
+    right, found = outcome.is_right(outcome.systems[outcome.headline]), outcome.dataset.truth
+    if right is not None and right[query].any():
+        return [_answer(outcome, query, int(np.argmax(right[query])), "right")]
+    row = None if found is None else found.place(query)
+    if row is None:
+        return []
+    database, num_candidates = outcome.dataset.database, outcome.candidates.indices.shape[1]
+    caption = f"right: {database.names[row]}, not among the {num_candidates} candidates"
+    return [Answer(_image(outcome, database, row), caption, None, None)]
+
+
+def _image(outcome: Outcome, folder: ImageFolder, row: int) -> np.ndarray:
     size, interpolation = outcome.extractor.image_size, outcome.extractor.interpolation
-    best = outcome.systems[outcome.headline].rows[:, 0]
-    shown = _shown(outcome, best)
-    for query, verdict in build.track("figures")(shown.items(), len(shown)) if shown else ():
-        place = int(np.flatnonzero(outcome.candidates.indices[query] == best[query])[0])
-        pair = jax.tree.map(lambda field: field[place], outcome.matches[query])  # noqa: B023
-        histogram_figure(
-            folder / "figures" / f"{verdict.split()[0]}_{query:04d}.png",
-            resize(read_image(queries.paths[query]), size, interpolation),
-            resize(read_image(database.paths[best[query]]), size, interpolation),
-            pair,
-            explain(scorer, pair),
-            title=f"{outcome.headline}, {verdict}: {queries.names[query]} -> {database.names[best[query]]}",
-        )
+    return resize(read_image(folder.paths[row]), size, interpolation)
 
 
-def _shown(outcome: Outcome, best: np.ndarray) -> dict[int, str]:
+def _shown(outcome: Outcome) -> dict[int, str]:
     """Queries that get a figure, with what became of them: half right, half wrong where that can be told."""
-    number, found, truth = outcome.settings["figures"], best >= 0, outcome.dataset.truth
-    if truth is None:
-        return dict.fromkeys(_spread(np.flatnonzero(found), number), "best")
-    positives = truth.positives(outcome.thresholds[len(outcome.thresholds) // 2])
-    right = positives[np.arange(len(best)), np.maximum(best, 0)] & found
-    shown = dict.fromkeys(_spread(np.flatnonzero(right), (number + 1) // 2), "right")
-    for query in _spread(np.flatnonzero(found & ~right), number // 2):
-        place = truth.place(query)
-        shown[query] = f"wrong (truth: {'nowhere' if place is None else outcome.dataset.database.names[place]})"
-    return shown
+    system, asked = outcome.systems[outcome.headline], outcome.shown
+    found, right = system.rows[:, 0] >= 0, outcome.is_right(system)
+    verdicts = np.full(len(found), "best") if right is None else np.where(right[:, 0], "right", "wrong")
+    if isinstance(asked, list):
+        return {query: str(verdicts[query]) for query in asked if found[query]}
+    numbers = {"best": asked} if right is None else {"right": (asked + 1) // 2, "wrong": asked // 2}
+    return {query: verdict for verdict, number in numbers.items()
+            for query in _spread(np.flatnonzero(found & (verdicts == verdict)), number)}  # fmt: skip
 
 
 def _spread(items: np.ndarray, number: int) -> list[int]:

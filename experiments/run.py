@@ -1,42 +1,42 @@
 """The main job, stage by stage."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from experiments import build, outputs, prepare
+from experiments import build, outputs, prepare, run_folder, truth
 from experiments.outputs import Outcome, System
 from mfvpr import pipeline
 from mfvpr.pipeline import MatchSet
-from mfvpr.report import runs
 from mfvpr.types import Shortlist
 
 
 def evaluate(settings: dict[str, Any]) -> None:
     """Images -> features -> shortlist and matches -> scores -> rankings -> recall, in a run folder."""
-    folder = build.expanded(settings["out"]) if settings["out"] else None
-    runs.check_free(folder or runs.new_run_folder(Path("runs"), settings["dataset"]["name"]))
+    with run_folder.claimed(settings) as folder:
+        outcome = _outcome(settings)
+        run_folder.leave(
+            folder, settings, truth.described(settings, outcome.dataset), text=outputs.text(outcome),
+            write=lambda new: outputs.write(new, outcome), figures=outputs.figures(outcome),
+        )  # fmt: skip
+
+
+def _outcome(settings: dict[str, Any]) -> Outcome:
     scorers = build.scorers(settings["scorer"])
     tools = prepare.extractors(settings)
     watch = prepare.Stopwatch()
     with watch("data"):
         images = prepare.images(settings)
+    shown = outputs.asked_figures(settings["figures"], images.dataset)
     made = prepare.extracted(settings, tools, images, watch)
     with watch("matching"):
         matches = prepare.match(settings, made)
     with watch("scores"):
         systems = _systems(settings, scorers, matches, made.candidates)
-
-    outcome = Outcome(
+    return Outcome(
         settings, images.dataset, made.extractor, made.database, made.queries, made.candidates, matches, scorers,
-        systems, watch.seconds, images.fingerprints,
+        systems, watch.seconds, images.fingerprints, shown,
     )  # fmt: skip
-    folder = folder or runs.claimed_run_folder(Path("runs"), images.dataset.name)
-    with runs.writing(folder) as new:
-        table = outputs.write(new, outcome)
-    shown = f"{table.text()}\n" if outcome.thresholds else ""
-    print(f"\n{outputs.heading(outcome)}\n\n{shown}results: {folder}")
 
 
 def _systems(settings: dict[str, Any], scorers: dict, matches: MatchSet, candidates: Shortlist) -> dict[str, System]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments import build, prepare, stores, sweep_outputs
+from experiments import build, prepare, run_folder, stores, sweep_outputs, truth
 from experiments.axes import BYTES_PER_SETTING, Axes, as_setting, axes, require_bins, require_memory, scorer
 from experiments.judging import Judge, judge
 from mfvpr import sweeping
@@ -18,8 +18,27 @@ from mfvpr.types import Shortlist
 
 def sweep(settings: dict[str, Any]) -> None:
     """Matches -> rows of every setting's ranking -> the best setting -> table, heat maps, files."""
-    folder = build.expanded(settings["out"]) if settings["out"] else None
-    runs.check_free(folder or runs.new_run_folder(Path("runs"), settings["dataset"]["name"]))
+    settings = _as_final(settings)
+    with run_folder.claimed(settings) as folder:
+        found, kept = _found(settings)
+        run_folder.leave(
+            folder, settings, truth.described(settings, found.images.dataset), text=sweep_outputs.text(found),
+            write=lambda new: sweep_outputs.write(new, found), figures=sweep_outputs.figures(found),
+        )  # fmt: skip
+    if kept is not None:
+        shutil.rmtree(kept, ignore_errors=True)
+
+
+def _as_final(settings: dict[str, Any]) -> dict[str, Any]:
+    """Where the score with the filter decides, every setting has it, with the c of the fusion if none is varied."""
+    grid = settings["grid"]
+    if settings["final"] == "score" or grid["c"] is not None or not any(grid.values()):
+        return settings
+    return settings | {"grid": grid | {"c": [settings["fusion"]["c"]]}}
+
+
+def _found(settings: dict[str, Any]) -> tuple[sweep_outputs.Found, Path | None]:
+    """What the sweep found, and where its blocks are kept until that is written."""
     varied = axes(settings)
     if settings["search"] == "grid":
         require_memory(f"grid: {varied.size:,} settings", varied.size * BYTES_PER_SETTING,
@@ -39,13 +58,7 @@ def sweep(settings: dict[str, Any]) -> None:
     kept = _kept(settings, images, candidates)
     with watch("sweep"):
         written, rows = _search(settings, varied, judgment, matches, candidates, kept)
-    found = sweep_outputs.Found(settings, images, varied, judgment, written, rows, watch.seconds)
-    folder = folder or runs.claimed_run_folder(Path("runs"), images.dataset.name)
-    with runs.writing(folder) as new:
-        text = sweep_outputs.write(new, found)
-    print(f"\n{text}\nresults: {folder}")
-    if kept is not None:
-        shutil.rmtree(kept, ignore_errors=True)
+    return sweep_outputs.Found(settings, images, varied, judgment, written, rows, watch.seconds), kept
 
 
 def _search(

@@ -22,7 +22,9 @@ class Rule(NamedTuple):
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+    if isinstance(value, bool):
+        return False
+    return isinstance(value, int) or (isinstance(value, numbers.Real) and math.isfinite(value))
 
 
 def _is_count(value: Any) -> bool:
@@ -56,13 +58,25 @@ def _between(low: int, high: int) -> Rule:
     return Rule(lambda value: _is_count(value) and low <= value <= high, f"a whole number from {low} to {high}")
 
 
+MAX_BINS = 1024  # of a histogram per axis: the library's limit, which is slow to import
+MAX_SHOWN = 200  # characters of a value that is refused
 # Beyond these bounds float32 and int32 would fail, without a word.
 _POSITIVE = Rule(lambda value: _is_number(value) and 1e-6 <= value <= 1e12, "a number above 0 (1e-6 to 1e12)")
 _NOT_NEGATIVE = Rule(lambda value: _is_number(value) and 0 <= value <= 1e12, "a number not below 0 (at most 1e12)")
 _COUNT = Rule(lambda value: _is_count(value) and 0 < value <= 10**6, "a whole number above 0 (at most 1000000)")
 _INDEX = Rule(lambda value: _is_count(value) and 0 <= value <= 10**6, "a whole number not below 0 (at most 1000000)")
 _SIDE = _between(16, 4096)
+_DISTANCE = Rule(lambda value: _is_number(value) and 1e-6 <= value <= 2, "a number above 0 and at most 2")
 _TEXT = Rule(lambda value: isinstance(value, str) and bool(value), "text")
+_PATH = Rule(
+    lambda value: isinstance(value, str) and bool(value) and "${" not in value,
+    "a path, with names of variables filled in (double quotes let the shell do that)",
+)
+_QUERY = Rule(lambda value: _INDEX.holds(value) or _TEXT.holds(value), "a row or a name of a query")
+_FIGURES = Rule(
+    lambda value: _INDEX.holds(value) or _list_of(_QUERY).holds(value),
+    "how many (at most 1000000), or a list of rows or names of queries",
+)
 _FLAG = _one_of(True, False)
 _WEIGHT = _one_of("fs", "dmf", "unit")
 
@@ -79,12 +93,12 @@ RULES: dict[str, Rule] = {
     "retrieval.name": _one_of("vlad", "mixvpr"),
     # data
     "seed": _INDEX,
-    "cache": _TEXT,
-    "root": _TEXT,
-    "database": _TEXT,
-    "queries": _TEXT,
+    "cache": _PATH,
+    "root": _PATH,
+    "database": _PATH,
+    "queries": _PATH,
     "ground_truth": _one_of("order", "index", "utm", "none"),
-    "index_file": _or(_TEXT, None),
+    "index_file": _or(_PATH, None),
     # features and filter
     "image_size": _list_of(_SIDE, 2),
     "interpolation": _one_of("pil_bilinear", "pil_bicubic", "cv2_linear", "cv2_area", "torch_bilinear"),
@@ -102,7 +116,7 @@ RULES: dict[str, Rule] = {
     "candidates": _or(_COUNT, "all"),
     # matching
     "cross_check": _one_of("mutual", "opencv_legacy", "none"),
-    "max_distance": _or(_POSITIVE, None),
+    "max_distance": _or(_DISTANCE, None),
     "max_matches": _or(_COUNT, None),
     "chunk_size": _or(_COUNT, None),
     # scores
@@ -124,7 +138,7 @@ RULES: dict[str, Rule] = {
     "align": _one_of("min_edge", "zero_center", "zero_edge"),
     "sigma_is_variance": _FLAG,
     "direction": _one_of("candidate_minus_query", "query_minus_candidate"),
-    "max_bins": _or(_COUNT, None),
+    "max_bins": _or(_between(1, MAX_BINS), None),
     "filter_score": _one_of("cosine", "negative_euclidean"),
     "ties": _one_of("filter", "index"),
     "c": _or(_NOT_NEGATIVE, "auto"),
@@ -133,10 +147,10 @@ RULES: dict[str, Rule] = {
     "tolerances": _list_of(_INDEX),
     "radius": _POSITIVE,
     "ks": _list_of(_COUNT),
-    "store": _or(_TEXT, None),
+    "store": _or(_PATH, None),
     "on_bad_image": _one_of("fail", "skip"),
-    "figures": _INDEX,
-    "out": _or(_TEXT, None),
+    "figures": _FIGURES,
+    "out": _or(_PATH, None),
     # sweeps
     "temperature": _or(_POSITIVE, None),
     "search": _one_of("grid", "optuna"),
@@ -151,7 +165,7 @@ RULES: dict[str, Rule] = {
     "batch": _between(1, 1024),
     "learning_rate": _POSITIVE,
     "hidden": _between(1, 1024),
-    "checkpoints": _or(_TEXT, None),
+    "checkpoints": _or(_PATH, None),
     "chunk.settings": _or(_COUNT, None),
     "chunk.queries": _or(_COUNT, None),
 }
@@ -166,8 +180,19 @@ def check(settings: Mapping[str, Any]) -> None:
         if rule is None:
             raise SettingsError(f"{path}={value}: this is a group of settings; set one of its members (see --help)")
         if not rule.holds(value):
-            shown = "null" if value is None else value
-            raise SettingsError(f"{path}={shown}: expected {rule.expected}")
+            raise SettingsError(f"{path}={_shown(value)}: expected {rule.expected}")
+    _check_vocabulary(settings.get("retrieval", {}))
+
+
+def _check_vocabulary(settings: Mapping[str, Any]) -> None:
+    words, samples = (settings.get(name, 1) for name in ("num_words", "max_samples"))
+    if samples < words:
+        raise SettingsError(f"retrieval.max_samples={samples}: expected at least retrieval.num_words={words}")
+
+
+def _shown(value: Any) -> str:
+    text = "null" if value is None else str(value)
+    return text if len(text) <= MAX_SHOWN else f"{text[: MAX_SHOWN // 2]}..."
 
 
 def _leaves(settings: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:

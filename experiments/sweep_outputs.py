@@ -1,7 +1,6 @@
 """What a sweep leaves: all settings as table, CSV and JSON, heat maps, and a summary for the terminal."""
 
 import itertools
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -10,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from experiments import truth
 from experiments.axes import Axes, shown
 from experiments.judging import Judge
 from experiments.prepare import Images
+from experiments.run_folder import Figure
 from mfvpr import sweeping
 from mfvpr.data.files import write_text
 from mfvpr.report import runs
@@ -59,15 +60,16 @@ class Found:
         return [sweeping.best_setting(one[:size, self.judge.main], axes) for one in self.judge.tuning(self.rows)]
 
 
-def write(folder: Path, found: Found) -> str:
-    """All files of the run folder; the summary comes back to be printed."""
-    runs.write_table(folder, _table(found, range(len(found.written))))
-    write_text(folder / "results.json", json.dumps(_results(found), indent=1, ensure_ascii=False) + "\n")
-    for name, draw in _heat_maps(found):
-        draw(folder / "figures" / name)
-    text = "\n".join(_summary(found))
-    write_text(folder / "summary.txt", text + "\n")
-    return text
+def text(found: Found) -> str:
+    """The summary, for the terminal."""
+    return "\n".join(_summary(found))
+
+
+def write(folder: Path, found: Found) -> None:
+    """All files of the run folder but the figures."""
+    runs.write_table(folder, _table(found, range(len(found.written))), _heading(found))
+    runs.write_json(folder / "results.json", _results(found))
+    write_text(folder / "summary.txt", text(found) + "\n")
 
 
 def _table(found: Found, numbers: Sequence[int]) -> Table:
@@ -85,15 +87,20 @@ def _table(found: Found, numbers: Sequence[int]) -> Table:
     return Table([*names, *header], lines, text_columns=0)
 
 
-def _summary(found: Found) -> Iterator[str]:
-    judge, dataset = found.judge, found.images.dataset
-    main = judge.thresholds[judge.main]
-    features, num_candidates = found.settings["features"], judge.views[0].shape[1]
-    yield (
-        f"{dataset.name}: {len(dataset.queries)} queries, {num_candidates} candidates of {len(dataset.database)} "
-        f"database images, {found.rows.shape[1]} settings of the {found.axes.method} score, {features['name']} "
-        f"features at {features['image_size'][0]} x {features['image_size'][1]} px; recall in %\n"
+def _heading(found: Found) -> str:
+    dataset, features = found.images.dataset, found.settings["features"]
+    return (
+        f"{dataset.name}: {len(dataset.queries)} queries, {found.judge.views[0].shape[1]} candidates of "
+        f"{len(dataset.database)} database images, {found.rows.shape[1]} settings of the {found.axes.method} score, "
+        f"{features['name']} features at {features['image_size'][0]} x {features['image_size'][1]} px; "
+        f"{truth.in_words(found.settings, dataset)}"
     )
+
+
+def _summary(found: Found) -> Iterator[str]:
+    judge = found.judge
+    main = judge.thresholds[judge.main]
+    yield _heading(found) + "\n"
     best = np.argsort(-found.recall[:, judge.main], kind="stable")[:TOP].tolist()
     beside = "" if found.own in best else "; last: the scorer's own values"
     yield f"Best settings by {judge.label(1, main)}, all queries{beside}."
@@ -161,6 +168,7 @@ def _results(found: Found) -> dict[str, Any]:
         "data_fingerprint": found.images.fingerprints,
         "scorer": settings["scorer"], "features": settings["features"], "filter": settings["retrieval"],
         "matching": settings["matching"], "candidates": settings["candidates"], "fusion": settings["fusion"],
+        "final": settings["final"], "ground_truth": truth.described(settings, found.images.dataset),
         "axes": dict(found.axes.values), "own": dict(found.axes.own), "search": settings["search"],
         "unit": judge.unit, "thresholds": list(judge.thresholds), "ks": ks, "split": settings["split"],
         "chosen": [found.written[number] for number in found.chosen],
@@ -175,10 +183,12 @@ def _results(found: Found) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _heat_maps(found: Found) -> Iterator[tuple[str, Any]]:
-    """Every pair of axes with several values, the others at the best setting (of all queries)."""
-    if not found.is_grid:
-        return
+def figures(found: Found) -> list[Figure]:
+    """Heat maps of every pair of axes with several values, the others at the best setting (of all queries)."""
+    return list(_heat_maps(found)) if found.is_grid else []
+
+
+def _heat_maps(found: Found) -> Iterator[Figure]:
     values = {name: list(map(shown, axis)) for name, axis in found.axes.values.items()}
     recall = found.recall[: found.axes.size, found.judge.main].reshape(*map(len, values.values()))
     names = [name for name, axis in values.items() if len(axis) > 1]

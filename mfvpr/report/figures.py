@@ -1,6 +1,8 @@
-"""The paper's histogram figure: both images with their matches beside the histogram of shifts, its peak marked."""
+"""The paper's histogram figure: images with their matches beside the histogram of shifts, its peak marked."""
 
 import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,49 +21,73 @@ _AGREES, _DIFFERS = "#2fa8ff", "#ff9a1f"  # told apart by color-blind people as 
 _GAP = 12  # px between the two images
 
 
+@dataclass(frozen=True)
+class Answer:
+    """A database image beside the query.
+
+    Attributes:
+        image: `[H, W, 3]` uint8, at the size that the points refer to.
+        caption: above it.
+        matches: of this pair, `[K, ...]`, NumPy; None where it was not matched.
+        explanation: of these matches, see `mfvpr.pipeline.explain`.
+    """
+
+    image: np.ndarray
+    caption: str
+    matches: Matches | None
+    explanation: Explanation | None
+
+
 def histogram_figure(
-    path: Path,
-    query_image: np.ndarray,
-    candidate_image: np.ndarray,
-    matches: Matches,
-    explanation: Explanation,
-    *,
-    title: str,
-    max_lines: int = 30,
+    path: Path, query_image: np.ndarray, answers: Sequence[Answer], *, title: str, max_lines: int = 30
 ) -> None:
-    """Write the figure of one pair.
+    """Write the figure of one query.
 
     Args:
         path: image file to write.
         query_image: `[H, W, 3]` uint8, at the size that the points refer to.
-        candidate_image: likewise.
-        matches: of this pair, `[K, ...]`, NumPy.
-        explanation: of these matches, see `mfvpr.pipeline.explain`.
+        answers: one below the other, their histograms in the same colors.
         title: above everything.
         max_lines: matches drawn, the heaviest (the paper shows 30); blue where they agree with the peak.
     """
-    figure = Figure(figsize=(12, 4.6), layout="constrained")
+    figure = Figure(figsize=(12, 0.2 + 4.4 * len(answers)), layout="constrained")
     FigureCanvasAgg(figure)
-    pair, heat = figure.subplots(1, 2, width_ratios=(2, 1.15))
-    figure.suptitle(title, fontsize=11, parse_math=False)  # a file's name may hold a $
-    _draw_pair(pair, query_image, candidate_image, matches, explanation, max_lines)
-    image = _draw_histogram(heat, explanation)
-    figure.colorbar(image, ax=heat, label="bin score", shrink=0.85)
+    figure.suptitle(_drawable(title), fontsize=11, parse_math=False)  # a file's name may hold a $
+    top = max(1e-9, *(float(answer.explanation.score) for answer in answers if answer.explanation))
+    for (pair, heat), answer in zip(
+        figure.subplots(len(answers), 2, width_ratios=(2, 1.15), squeeze=False), answers, strict=True
+    ):
+        _draw_pair(pair, query_image, answer, max_lines)
+        if answer.explanation is None:
+            heat.set_axis_off()
+        else:
+            figure.colorbar(_draw_histogram(heat, answer.explanation, top), ax=heat, label="bin score", shrink=0.85)
     with replacing(path) as temporary, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # names in scripts that the font lacks
         figure.savefig(temporary, dpi=110, bbox_inches="tight", pad_inches=0.15)
 
 
-def _draw_pair(
-    axes: Axes, query: np.ndarray, candidate: np.ndarray, matches: Matches, explanation: Explanation, max_lines: int
-) -> None:
+def _drawable(text: str) -> str:
+    """Without the bytes of a file name that are no UTF-8."""
+    return text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+
+
+def _draw_pair(axes: Axes, query: np.ndarray, answer: Answer, max_lines: int) -> None:
     offset = query.shape[1] + _GAP
-    canvas = np.full((max(len(query), len(candidate)), offset + candidate.shape[1], 3), 255, np.uint8)
+    height = max(len(query), len(answer.image))
+    canvas = np.full((height, offset + answer.image.shape[1], 3), 255, np.uint8)
     canvas[: len(query), : query.shape[1]] = query
-    canvas[: len(candidate), offset:] = candidate
+    canvas[: len(answer.image), offset:] = answer.image
     axes.imshow(canvas)
     axes.set_axis_off()
+    words = "query | candidate"
+    if answer.matches is not None and answer.explanation is not None:
+        words = _draw_matches(axes, offset, answer.matches, answer.explanation, max_lines)
+    axes.set_title(f"{_drawable(answer.caption)}\n{words}", fontsize=9, parse_math=False)
 
+
+def _draw_matches(axes: Axes, offset: int, matches: Matches, explanation: Explanation, max_lines: int) -> str:
+    """What was drawn, in words."""
     count = int(matches.mask.sum())
     heaviest = np.argsort(-np.where(matches.mask, explanation.weights, -np.inf), kind="stable")[: min(max_lines, count)]
     start, end = matches.points0[heaviest], matches.points1[heaviest] + [offset, 0]
@@ -70,14 +96,13 @@ def _draw_pair(
     axes.add_collection(LineCollection(list(lines), colors=colors, linewidths=0.8, alpha=0.9))
     for points in (start, end):
         axes.scatter(points[:, 0], points[:, 1], s=7, c=colors, linewidths=0)
-    axes.set_title(
+    return (
         f"query | candidate: {len(heaviest)} heaviest of {count} matches; blue agree with the peak "
-        f"({explanation.agrees[heaviest].sum()}; of all {explanation.agrees.sum()})",
-        fontsize=9,
+        f"({explanation.agrees[heaviest].sum()}; of all {explanation.agrees.sum()})"
     )
 
 
-def _draw_histogram(axes: Axes, explanation: Explanation) -> AxesImage:
+def _draw_histogram(axes: Axes, explanation: Explanation, top: float) -> AxesImage:
     scores, centers_x, centers_y = explanation.histogram
     inside = scores > -np.inf
     rows, columns = inside.any(axis=1), inside.any(axis=0)
@@ -85,7 +110,6 @@ def _draw_histogram(axes: Axes, explanation: Explanation) -> AxesImage:
     width = float(explanation.histogram.centers_x[1] - explanation.histogram.centers_x[0])
     half = width / 2
     extent = (centers_x[0] - half, centers_x[-1] + half, centers_y[-1] + half, centers_y[0] - half)
-    top = max(float(explanation.score), 1e-9)
     image = axes.imshow(scores, extent=extent, cmap="magma", interpolation="nearest", vmin=0, vmax=top)
     axes.set_xlabel("shift x, px (candidate minus query; square: tallest bin, cross: refined peak)", fontsize=8)
     axes.set_ylabel("shift y, px")

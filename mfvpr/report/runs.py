@@ -1,11 +1,14 @@
-"""A run folder: appears whole under its name, or not at all."""
+"""A run folder: of one run alone, and its files appear together."""
 
+import fcntl
 import json
 import os
 import platform
+import re
 import shutil
+import subprocess
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from functools import cache
@@ -13,63 +16,112 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mfvpr.data.files import write_text
 from mfvpr.errors import InputError
 from mfvpr.report.tables import Table
 
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "opencv-python-headless", "pillow")
+_UNFINISHED = ".unfinished"
+_LAST = "results.json"
 
 
 def new_run_folder(root: Path, name: str) -> Path:
-    """`root/name/<time>` with a counter where two runs share a second."""
-    stem = root / name / datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    folder, counter = stem, 1
-    while folder.exists():
-        counter += 1
-        folder = stem.with_name(f"{stem.name}-{counter}")
-    return folder
+    """`root/name/<time>`, to be `claimed`."""
+    return root / name / datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
 
 
-def claimed_run_folder(root: Path, name: str) -> Path:
-    """A `new_run_folder`, made empty at once, so that no run that ends in the same second takes it; for `writing`."""
-    while True:
-        folder = new_run_folder(root, name)
-        with suppress(FileExistsError):  # another run was faster
-            folder.mkdir(parents=True)
-            return folder
+@contextmanager
+def claimed(folder: Path, *, numbered: bool = False) -> Iterator[Path]:
+    """A new or empty folder for this process alone, until the block ends or the process does, however that ends.
 
+    It is removed again, with the folders that were made for it, where nothing was left in it.
 
-def check_free(folder: Path) -> None:
-    """Refuse a run folder that already holds something, or cannot be made."""
-    if os.path.lexists(folder) and (folder.is_symlink() or not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: expected a new or empty run folder; name another with out=DIR, or remove it")
-    parent = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
+    Args:
+        folder: of the run.
+        numbered: where there is such a folder, `folder-2`, `folder-3`, ... is taken instead.
+
+    Raises:
+        InputError: the folder cannot be made or written to, is not empty, or another run has it.
+    """
+    above = [parent for parent in folder.absolute().parents if not parent.exists()]
+    with _telling_why(folder):
+        folder = _made(folder, numbered)
     try:
-        with tempfile.TemporaryDirectory(dir=parent):
+        with _telling_why(folder):
+            handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            _take(handle, folder)
+            yield folder
+        finally:
+            os.close(handle)
+    finally:
+        with suppress(OSError):  # not empty
+            for one in (folder, *above):
+                one.rmdir()
+
+
+def _made(folder: Path, numbered: bool) -> Path:
+    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+        raise InputError(f"{folder}: expected a new or empty run folder, got a link or a file; name another")
+    wanted, number = folder, 1
+    while True:
+        try:
+            wanted.mkdir(parents=True, exist_ok=not numbered)
+            return wanted
+        except FileExistsError:
+            number += 1
+            wanted = folder.with_name(f"{folder.name}-{number}")
+
+
+def _take(handle: int, folder: Path) -> None:
+    """Lock an open folder, and check that a run can be written into it."""
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise InputError(f"{folder}: another run is using this folder; wait until it ends, or name another") from None
+    except OSError:
+        pass  # a file system without locks of folders, such as NFS
+    with _telling_why(folder):
+        found = {path.name for path in folder.iterdir()}
+        if found - {_UNFINISHED}:
+            raise InputError(f"{folder}: expected a new or empty run folder; name another, or remove it")
+        shutil.rmtree(folder / _UNFINISHED, ignore_errors=True)  # of a run that was killed
+        with tempfile.TemporaryFile(dir=folder):
             pass
+
+
+@contextmanager
+def _telling_why(folder: Path) -> Iterator[None]:
+    try:
+        yield
     except OSError as error:
-        raise InputError(
-            f"{folder}: {parent} cannot be written to ({error.strerror}); name another run folder with out=DIR"
-        ) from None
+        raise InputError(f"{folder}: cannot be written to ({error.strerror}); name another run folder") from None
 
 
 @contextmanager
 def writing(folder: Path) -> Iterator[Path]:
-    """A temporary folder beside `folder` that takes its name when the block ends without an error; else both go."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    """A temporary folder in a `claimed` one, whose files move up when the block ends without an error.
+
+    `results.json` comes last: where it is, everything is.
+    """
+    temporary = folder / _UNFINISHED
+    temporary.mkdir()
     try:
         yield temporary
-        temporary.chmod(0o755)
-        os.replace(temporary, folder)  # an empty folder of that name is replaced
-    except BaseException:
-        with suppress(OSError):  # not there, or not empty
-            folder.rmdir()
-        raise
+        for path in sorted(temporary.iterdir(), key=lambda path: path.name == _LAST):
+            os.replace(path, folder / path.name)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def commit(place: Path) -> str | None:
+    """The commit of the repository that a folder lies in, `-dirty` where files differ from it; None without one."""
+    asked = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    try:
+        found = subprocess.run(asked, cwd=place, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return found.stdout.strip() or None
 
 
 @cache
@@ -82,35 +134,14 @@ def versions() -> dict[str, str]:
     }
 
 
-def write_results(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """`results.json`: one row per system and tolerance."""
-    write_text(folder / "results.json", json.dumps(rows, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+def write_json(path: Path, value: Any) -> None:
+    """Readable JSON, valid whatever the names of files."""
+    text = json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False)
+    write_text(path, re.sub("[\ud800-\udfff]", lambda found: f"\\u{ord(found[0]):04x}", text) + "\n")
 
 
-def write_table(folder: Path, table: Table) -> None:
+def write_table(folder: Path, table: Table, heading: str) -> None:
     """The same table as Markdown, CSV and LaTeX."""
-    write_text(folder / "table.md", table.markdown())
+    write_text(folder / "table.md", f"{heading}\n\n{table.markdown()}")
     write_text(folder / "table.csv", table.csv())
-    write_text(folder / "table.tex", table.latex())
-
-
-def write_predictions(
-    path: Path, query_names: Sequence[str], database_names: Sequence[str], rows: np.ndarray, scores: np.ndarray
-) -> None:
-    """One line per query: its name, then database names with their scores, best first.
-
-    Args:
-        path: CSV file.
-        query_names: of Q images.
-        database_names: of N images.
-        rows: `[Q, C]` database rows in rank order, -1 = none (left out).
-        scores: `[Q, C]` in the same order.
-    """
-    header = ["query", *(f"{what}_{place + 1}" for place in range(rows.shape[1]) for what in ("database", "score"))]
-    lines = []
-    for name, ranked, values in zip(query_names, rows, scores, strict=True):
-        cells = [name]
-        for row, value in zip(ranked, values, strict=True):
-            cells += [database_names[row], f"{value:.7g}"] if row >= 0 else ["", ""]
-        lines.append(cells)
-    write_text(path, Table(header, lines).csv())
+    write_text(folder / "table.tex", f"% {heading}\n{table.latex()}")

@@ -1,0 +1,172 @@
+"""The command line as checked settings, with Hydra; what it says of a mistake, in our words."""
+
+import difflib
+import os
+import re
+import shlex
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from experiments.errors import one_line
+from experiments.groups import PROGRAMS, check_choice, groups
+from experiments.launch import CONF
+from experiments.settings import SettingsError, check
+
+PATHS = {"dataset.database", "dataset.queries", "dataset.root", "dataset.index_file", "dataset.cache"}
+PATHS |= {"store", "out", "checkpoints"}
+MULTIRUN = ("-m", "--multirun")
+MOST_DIGITS = 300  # more are no number of float64, and Python refuses to read thousands
+
+
+def run(program: Callable[[dict[str, Any]], None], config: str) -> None:
+    """`program(settings)`, once, or with `--multirun` for each combination of several values."""
+
+    def task(found: DictConfig) -> None:
+        job = HydraConfig.get()
+        many = job.mode == RunMode.MULTIRUN
+        with _one_of_many() if many else one_line(), _our_words(config):  # in here, or Hydra adds lines of its own
+            for name in sorted(OmegaConf.missing_keys(found)):
+                raise SettingsError(_no_default(name))
+            settings: Any = OmegaConf.to_container(found, resolve=True)
+            check(settings)
+            _require_device()
+            command = shlex.join(job.overrides.task if many else typed)
+            program(settings | {"multirun": many, "command": f"python -m experiments.{PROGRAMS[config]} {command}"})
+
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises instead of printing and exiting with 1
+    with _our_words(config):
+        typed = sys.argv[1:]
+        for argument in typed:
+            _check_form(argument, config)
+        many = sorted({*MULTIRUN} & {*typed})  # first, or Hydra takes no settings after it
+        settings = [argument for argument in typed if argument not in MULTIRUN]
+        sys.argv[1:] = many[:1] + [_as_typed(argument, several=bool(many)) for argument in settings]
+        hydra.main(version_base="1.3", config_path=str(CONF), config_name=config)(task)()
+
+
+def _require_device() -> None:
+    """Refuse a device that JAX was asked for and does not have, before anything is begun."""
+    import jax  # here, since mistakes in settings need not wait for it
+
+    try:
+        jax.devices()
+    except RuntimeError as error:
+        asked = f"JAX_PLATFORMS={os.environ['JAX_PLATFORMS']}" if os.environ.get("JAX_PLATFORMS") else "JAX"
+        reason = (str(error).splitlines() or ["no reason given"])[0]
+        raise SettingsError(
+            f"{asked}: expected a device that JAX can use here ({reason}); set JAX_PLATFORMS=cpu"
+        ) from error
+
+
+@contextmanager
+def _one_of_many() -> Iterator[None]:
+    """A job of a multirun: what is wrong with it is told at once, and again by Hydra when the others are done."""
+    job = HydraConfig.get()
+    chosen = [override for override in job.overrides.task if override.partition("=")[0] not in PATHS]
+    print(f"job {job.job.num}: {' '.join(chosen)}", file=sys.stderr)
+    try:
+        with one_line():
+            yield
+    except SystemExit as left:
+        if not isinstance(left.__context__, Exception) or left.code != 2:
+            raise  # interrupted: no other job is begun
+        raise left.__context__ from None
+
+
+def _check_form(argument: str, config: str) -> None:
+    """Refuse what is no setting, in words of our own rather than of Hydra's grammar."""
+    name, equals, value = argument.partition("=")
+    if argument.startswith(("+", "~")):
+        raise SettingsError(f"{argument}: settings can be set, not added or removed; write name=value")
+    if argument in MULTIRUN:
+        return
+    if argument.startswith("-"):
+        raise SettingsError(f"{argument}: unknown option; expected --help, --version, --multirun, or name=value")
+    if not equals or not name.strip():
+        raise SettingsError(f"{argument}: expected name=value; put quotes around values with spaces")
+    if re.search(rf"\d{{{MOST_DIGITS},}}", value):
+        raise SettingsError(f"{name}={value[:20]}...: expected a number of fewer than {MOST_DIGITS} digits")
+    check_choice(name, value, config)
+
+
+def _as_typed(argument: str, several: bool) -> str:
+    """A setting quoted for Hydra where its grammar would not take the value as it was typed (paths, mostly).
+
+    Where `several`, in a multirun, paths stand between commas.
+    """
+    name, equals, value = argument.partition("=")
+    is_path = name in PATHS and value not in ("", "null") and value[0] not in "'\""
+    if not equals or argument.startswith("-") or not (is_path or _unparsable(argument)):
+        return argument
+    for special in ("\\", "'", "${"):
+        value = value.replace(special, f"\\{special}")
+    values = value.split(",") if several and is_path else [value]
+    return f"{name}=" + ",".join(f"'{one}'" for one in values)
+
+
+def _unparsable(argument: str) -> bool:
+    try:
+        OverridesParser.create().parse_override(argument)
+    except HydraException:
+        return True
+    return False
+
+
+@contextmanager
+def _our_words(config: str) -> Iterator[None]:
+    """Hydra's errors as ours."""
+    try:
+        yield
+    except (HydraException, OmegaConfBaseException) as error:
+        raise SettingsError(_explain(error, config)) from error
+
+
+def _explain(error: Exception, config: str) -> str:
+    """One line of a Hydra message, with the nearest setting where one is unknown."""
+    text = " ".join((str(error) or str(error.__cause__)).split())
+    text = text.partition(" Config search path")[0].partition(" See https")[0]
+    if missing := re.search(r"Missing mandatory value: ([\w.]+)", text):
+        return _no_default(missing[1])
+    unknown = re.search(r"Could not override '([^']*)'", text) or re.search(r"Key '([^']*)' is not in struct", text)
+    if not unknown:
+        return text
+    wrong = unknown.group(1)
+    nearest = max(_setting_names(config), key=lambda name: _likeness(wrong, name))
+    alike = max(_likeness(wrong, nearest)) >= 0.6
+    return f"{wrong}: unknown setting; " + (f"the nearest is {nearest}" if alike else "see --help")
+
+
+def _no_default(name: str) -> str:
+    return f"{name}: this setting has no default; give {name}=VALUE"
+
+
+def _likeness(wrong: str, name: str) -> tuple[float, float]:
+    """How alike two dotted names are: their last parts first, then all."""
+    pairs = ((wrong.rpartition(".")[2], name.rpartition(".")[2]), (wrong, name))
+    last, whole = (difflib.SequenceMatcher(None, *pair).ratio() for pair in pairs)
+    return last, whole
+
+
+def _setting_names(config: str) -> list[str]:
+    """Every setting of the configuration that the command line's groups choose."""
+    chosen = [argument for argument in sys.argv[1:] if argument.partition("=")[0] in groups(config)]
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        names, pending = [], [("", hydra.compose(config, chosen))]
+    while pending:
+        prefix, node = pending.pop()
+        for name in node:
+            names.append(f"{prefix}{name}")
+            child = node._get_node(name)
+            if isinstance(child, DictConfig) and not child._is_missing():
+                pending.append((f"{prefix}{name}.", child))
+    return names

@@ -1,0 +1,53 @@
+"""The groups of conf/ that a program takes, and their choices; without Hydra, which takes a while to import."""
+
+import difflib
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from experiments.launch import CONF
+from experiments.settings import SettingsError
+
+PROGRAMS = {"config": "evaluate", "sweep": "sweep", "learn": "learn"}  # by their file in conf/
+
+
+def defaults(file: Path) -> list[Any]:
+    """The defaults list of a file of conf/."""
+    return (yaml.safe_load(file.read_text(encoding="utf-8")) or {}).get("defaults", [])
+
+
+def groups(config: str) -> dict[str, str | None]:
+    """Group -> the choice that is made where the user makes none, of a program."""
+    found: dict[str, str | None] = {}
+    for entry in defaults(CONF / f"{config}.yaml"):
+        if isinstance(entry, dict):
+            found |= {group: choice for group, choice in entry.items() if (CONF / group).is_dir()}
+        elif entry != "_self_":
+            found |= groups(entry)
+    return found
+
+
+def choices(group: str) -> list[str]:
+    """Of a group; none where there is no such group."""
+    return sorted(path.stem for path in (CONF / group).glob("*.yaml")) if group.isidentifier() else []
+
+
+def check_choice(name: str, value: str, config: str) -> None:
+    """Refuse a choice that a group does not have, and a group that a program does not take.
+
+    Args:
+        name: of a setting, which may be a group.
+        value: as it was typed; several between commas.
+        config: of the program.
+    """
+    known, own = choices(name), groups(config)
+    if known and name not in own:
+        others = [program for other, program in PROGRAMS.items() if name in groups(other)]
+        typed = " or ".join(f"python -m experiments.{program} {name}={value}" for program in others)
+        raise SettingsError(f"{name}={value}: experiments.{PROGRAMS[config]} has no group {name}; type {typed}")
+    for choice in value.split(",") if known else []:
+        if choice not in known and not (choice == "null" and own[name] is None):
+            nearest = difflib.get_close_matches(choice, known, n=1)
+            hint = f"; the nearest is {nearest[0]}" if nearest else ""
+            raise SettingsError(f"{name}={value}: expected one of {', '.join(known)}{hint}")

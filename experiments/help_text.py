@@ -1,0 +1,87 @@
+"""What `--help` prints: the files of conf/ as they are, comments and all, for the groups that were chosen."""
+
+import re
+import textwrap
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+from experiments.groups import check_choice, choices, defaults, groups
+from experiments.launch import CONF
+
+_WHOLE = ("system", "experiment")  # groups whose choices set values of all others
+
+
+def help_text(config: str, arguments: Sequence[str]) -> str:
+    """How to call a program, its groups, and its settings with the choices among the arguments."""
+    typed = dict(argument.split("=", 1) for argument in arguments if "=" in argument)
+    for name, value in typed.items():
+        check_choice(name, value, config)
+    made = groups(config)
+    chosen = made | {group: typed[group] for group in _WHOLE if group in typed and group in made}
+    chosen |= _overridden(chosen) | {group: choice for group, choice in typed.items() if group in made}
+    return "\n".join([*_parts(config, chosen)])
+
+
+def _parts(config: str, chosen: dict[str, str | None]) -> Iterator[str]:
+    yield from (line.removeprefix("#").removeprefix(" ") for line in _header(CONF / f"{config}.yaml"))
+    yield "\nGroups, each with the choice whose settings follow, and other choices:\n"
+    for group, choice in chosen.items():
+        others = ", ".join(other for other in choices(group) if other != choice)
+        yield f"  {group}={choice or 'null'}".ljust(26) + others
+    yield "\nSettings:\n"
+    for group, choice in chosen.items():
+        if group not in _WHOLE:
+            yield from [*_section(group, _merged(CONF / group / f"{choice}.yaml")), ""]
+    for file in (*(entry for entry in defaults(CONF / f"{config}.yaml") if _is_file(entry)), config):
+        yield from [*_body(CONF / f"{file}.yaml"), ""]
+    for group in _WHOLE:
+        if choice := chosen.get(group):
+            file = CONF / group / f"{choice}.yaml"
+            yield from [f"# {group}={choice}, over the settings above:", *_header(file), *_body(file), ""]
+
+
+def _overridden(chosen: dict[str, str | None]) -> dict[str, str]:
+    """The choices that a system or an experiment makes in other groups."""
+    return {
+        name.removeprefix("override /"): choice
+        for group in _WHOLE
+        if chosen.get(group)
+        for entry in defaults(CONF / group / f"{chosen[group]}.yaml")
+        for name, choice in entry.items()
+    }
+
+
+def _section(name: str, lines: Iterable[str]) -> list[str]:
+    return [f"{name}:", *textwrap.indent("\n".join(lines), "  ").splitlines()]
+
+
+def _merged(file: Path) -> list[str]:
+    """A choice with what it is made from; of values that stand in both, its own."""
+    own, inherited = _body(file), []
+    keys = {line.partition(":")[0] for line in own}
+    for entry in defaults(file):
+        if entry == "_self_":
+            continue
+        other, _, place = entry.partition("@")
+        lines = _merged(file.with_name(f"{other}.yaml"))
+        lines = _section(place, lines) if place else lines
+        inherited += [line for line in lines if line.startswith(("#", " ")) or line.partition(":")[0] not in keys]
+    return [*_header(file), *inherited, *own]
+
+
+def _is_file(entry: object) -> bool:
+    return isinstance(entry, str) and entry != "_self_"
+
+
+def _header(file: Path) -> list[str]:
+    """The comment that a file begins with."""
+    text = file.read_text(encoding="utf-8")
+    found = re.match(r"(?:#.*\n)*", text)
+    return [line for line in (found[0] if found else "").splitlines() if not line.startswith("# @")]
+
+
+def _body(file: Path) -> list[str]:
+    """A file's settings with their comments: without its header, and what only Hydra reads."""
+    text = re.sub(r"\A(?:#.*\n)*", "", file.read_text(encoding="utf-8"))
+    text = re.sub(r"^(?:defaults|hydra):.*\n(?:[ -].*\n|\n)*", "", text, flags=re.MULTILINE)
+    return text.strip("\n").splitlines()

@@ -1,0 +1,77 @@
+"""The folder of a run: claimed before the work and filled after it, the tables before any figure."""
+
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+from experiments import build
+from experiments.settings import SettingsError
+from mfvpr.errors import InputError
+from mfvpr.report import runs
+
+Figure = tuple[str, Callable[[Path], None]]  # name of the file, and what draws it there
+_OF_THE_START = ("multirun", "command")  # what `command_line` adds to the settings
+
+
+@contextmanager
+def claimed(settings: Mapping[str, Any]) -> Iterator[Path]:
+    """The run folder that the settings name, for this run alone."""
+    out, name = settings["out"], settings["dataset"]["name"]
+    folder = build.expanded(out) if out else runs.new_run_folder(Path("runs"), name)
+    with ExitStack() as claim:
+        try:
+            folder = claim.enter_context(runs.claimed(folder, numbered=not out))
+        except InputError as error:
+            raise SettingsError(f"{error} with out=DIR") from error
+        yield folder
+
+
+def leave(
+    folder: Path,
+    settings: Mapping[str, Any],
+    ground_truth: Mapping[str, Any],
+    *,
+    text: str,
+    write: Callable[[Path], None],
+    figures: Sequence[Figure],
+) -> None:
+    """Files, then the text on stdout, then figures: what is computed is never lost to what comes after.
+
+    Args:
+        folder: `claimed`.
+        settings: of the run.
+        ground_truth: what the recall refers to.
+        text: for the terminal; printed where the files cannot be written, too.
+        write: the files, into the folder that it is given.
+        figures: one that cannot be drawn costs a warning.
+    """
+    try:
+        with runs.writing(folder) as new:
+            write(new)
+            runs.write_json(new / "run.json", _about(settings, ground_truth))
+    except OSError as error:
+        raise SettingsError(
+            f"{folder}: the results cannot be written ({error.strerror}); they are printed above, and features and "
+            "matches are kept where there is a store: make room, or name another folder with out=DIR"
+        ) from error
+    finally:
+        print(f"\n{text}", flush=True)
+    for name, draw in build.track("figures")(figures, len(figures)):
+        try:
+            draw(folder / "figures" / name)
+        except Exception as error:
+            print(f"warning: {folder}/figures/{name}: not drawn ({error})", file=sys.stderr)
+    print(f"results: {folder}")
+
+
+def _about(settings: Mapping[str, Any], ground_truth: Mapping[str, Any]) -> dict[str, Any]:
+    """What made the results."""
+    return {
+        "command": settings.get("command"),
+        "settings": {name: value for name, value in settings.items() if name not in _OF_THE_START},
+        "ground_truth": ground_truth,
+        "commit": runs.commit(Path()),
+        "versions": runs.versions(),
+    }

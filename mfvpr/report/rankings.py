@@ -1,0 +1,76 @@
+"""Rankings as files: what was answered to each query, and where it went wrong."""
+
+import csv
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mfvpr.data.files import replacing
+
+
+@dataclass(frozen=True)
+class Rankings:
+    """What a system answers.
+
+    Attributes:
+        queries: names of Q images.
+        database: names of N images.
+        rows: `[Q, C]` database rows, best first, -1 = none.
+        scores: `[Q, C]` in that order.
+        right: `[Q, C]` bool in that order; None = unknown.
+    """
+
+    queries: Sequence[str]
+    database: Sequence[str]
+    rows: np.ndarray
+    scores: np.ndarray
+    right: np.ndarray | None
+
+
+def write_predictions(path: Path, found: Rankings) -> None:
+    """CSV with a line per query and candidate, best first: `query,rank,database,score,right`.
+
+    `right` is 1 or 0, or empty where it is unknown.
+    """
+    lines = (
+        [found.queries[query], rank + 1, found.database[row], _written(found.scores[query, rank]),
+         "" if found.right is None else int(found.right[query, rank])]
+        for (query, rank), row in np.ndenumerate(found.rows) if row >= 0
+    )  # fmt: skip
+    _write_csv(path, ("query", "rank", "database", "score", "right"), lines)
+
+
+def write_failures(path: Path, found: Rankings) -> None:
+    """CSV with a line per query whose first answer is wrong: `query,answer,rank,right_answer,score,margin`.
+
+    `rank`, `right_answer` and `score` are of the first right candidate, empty where there is none; `margin` is how
+    much higher the first answer scores. Nothing is written where it is unknown what is right.
+    """
+    if found.right is None:
+        return
+    lines = []
+    for query in map(int, np.flatnonzero(~found.right[:, 0])):
+        row = int(found.rows[query, 0])
+        answer = found.database[row] if row >= 0 else ""
+        lines.append([found.queries[query], answer, *_first_right(found, found.right[query], query)])
+    _write_csv(path, ("query", "answer", "rank", "right_answer", "score", "margin"), lines)
+
+
+def _first_right(found: Rankings, right: np.ndarray, query: int) -> list[str | int]:
+    if not right.any():
+        return [""] * 4
+    rank, scores = int(np.argmax(right)), found.scores[query]
+    name = found.database[int(found.rows[query, rank])]
+    return [rank + 1, name, _written(scores[rank]), _written(scores[0] - scores[rank])]
+
+
+def _written(value: Any) -> str:
+    return f"{value:.7g}"
+
+
+def _write_csv(path: Path, header: Sequence[str], lines: Iterable[Sequence[str | int]]) -> None:
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", errors="surrogateescape") as file:
+        csv.writer(file, lineterminator="\n").writerows([header, *lines])
