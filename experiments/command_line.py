@@ -4,8 +4,9 @@ import difflib
 import os
 import re
 import shlex
+import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -17,9 +18,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from experiments.errors import one_line
+from experiments.errors import on_interrupt, one_line
 from experiments.groups import PROGRAMS, check_choice, groups
-from experiments.launch import CONF
+from experiments.launch import CONF, Program
 from experiments.settings import SettingsError, check
 
 PATHS = {"dataset.database", "dataset.queries", "dataset.root", "dataset.index_file", "dataset.cache"}
@@ -28,8 +29,8 @@ MULTIRUN = ("-m", "--multirun")
 MOST_DIGITS = 300  # more are no number of float64, and Python refuses to read thousands
 
 
-def run(program: Callable[[dict[str, Any]], None], config: str) -> None:
-    """`program(settings)`, once, or with `--multirun` for each combination of several values."""
+def run(program: Program, config: str) -> None:
+    """`program()(settings)`, once, or with `--multirun` for each combination of several values."""
 
     def task(found: DictConfig) -> None:
         job = HydraConfig.get()
@@ -39,9 +40,11 @@ def run(program: Callable[[dict[str, Any]], None], config: str) -> None:
                 raise SettingsError(_no_default(name))
             settings: Any = OmegaConf.to_container(found, resolve=True)
             check(settings)
+            work = program()
             _require_device()
             command = shlex.join(job.overrides.task if many else typed)
-            program(settings | {"multirun": many, "command": f"python -m experiments.{PROGRAMS[config]} {command}"})
+            with on_interrupt(signal.default_int_handler):
+                work(settings | {"multirun": many, "command": f"python -m experiments.{PROGRAMS[config]} {command}"})
 
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises instead of printing and exiting with 1
     with _our_words(config):
@@ -56,7 +59,7 @@ def run(program: Callable[[dict[str, Any]], None], config: str) -> None:
 
 def _require_device() -> None:
     """Refuse a device that JAX was asked for and does not have, before anything is begun."""
-    import jax  # here, since mistakes in settings need not wait for it
+    import jax
 
     try:
         jax.devices()

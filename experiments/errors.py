@@ -3,11 +3,14 @@
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import FrameType
 from typing import NoReturn
 
 from experiments.settings import SettingsError
+
+_INTERRUPTED = "\ninterrupted; nothing half-written was left, and what was finished is kept\n"
 
 
 @contextmanager
@@ -16,7 +19,7 @@ def one_line() -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        print("\ninterrupted; nothing half-written was left, and what was finished is kept", file=sys.stderr)
+        print(_INTERRUPTED, end="", file=sys.stderr)
         sys.exit(130)
     except BrokenPipeError:  # whoever read our output has left: `| head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -37,6 +40,22 @@ def refuse(reason: str) -> NoReturn:
     """One line on stderr, exit code 2."""
     print("error:", *reason.splitlines(), file=sys.stderr)
     sys.exit(2)
+
+
+@contextmanager
+def on_interrupt(answer: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """Ctrl-C is answered so until the block ends."""
+    before = signal.signal(signal.SIGINT, answer)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def leave(*_: object) -> NoReturn:
+    """Of `on_interrupt` before anything is begun: an extension that is being imported could lose an exception."""
+    os.write(2, _INTERRUPTED.encode())
+    os._exit(130)
 
 
 def unwind_on_sigterm() -> None:

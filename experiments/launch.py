@@ -12,17 +12,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from experiments.errors import one_line, unwind_on_sigterm
+from experiments.errors import leave, on_interrupt, one_line, unwind_on_sigterm
 
+Program = Callable[[], Callable[[dict[str, Any]], None]]  # imports the job, which takes a while, and returns it
 CONF = Path(__file__).parent.parent / "conf"
 FOLDERS = ("MFVPR_CACHE", "MFVPR_WEIGHTS")  # variables that name a folder
 
 
-def launch(program: Callable[[dict[str, Any]], None], config: str = "config") -> None:
-    """`program(settings)` with the settings of conf/`config`.yaml and the command line, as plain and checked values."""
-    unwind_on_sigterm()
-    sys.unraisablehook = _keep_interrupt
-    with one_line():
+def launch(program: Program, config: str = "config") -> None:
+    """`program()(settings)` with the settings of conf/`config`.yaml and the command line, plain and checked."""
+    with on_interrupt(leave), one_line():
+        unwind_on_sigterm()
+        sys.unraisablehook = _keep_interrupt
         if "--version" in sys.argv[1:]:
             print(version())
         elif {"--help", "-h"} & {*sys.argv[1:]}:

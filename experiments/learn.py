@@ -1,15 +1,16 @@
 """Learned scores beside hand-set and grid-searched ones, on queries that none of them was chosen on."""
 
+from collections.abc import Callable
 from typing import Any
 
 from experiments.launch import launch
 
 
-def learn(settings: dict[str, Any]) -> None:
-    """Learn, print the table, leave a run folder."""
+def learn() -> Callable[[dict[str, Any]], None]:
+    """Learning, its table, a run folder."""
     from experiments import lessons  # here, so that --help and a wrong setting need not wait for JAX
 
-    lessons.learn(settings)
+    return lessons.learn
 
 
 if __name__ == "__main__":
