@@ -59,7 +59,7 @@ def axes(settings: dict[str, Any]) -> Axes:
         if name not in known:
             raise SettingsError(f"grid.{name}: scorer={method} has no such parameter; it has "
                                 f"{', '.join(n for n in settings['grid'] if n in known)}")  # fmt: skip
-        if len(set(map(str, axis))) < len(axis):
+        if len(set(axis)) < len(axis):
             raise SettingsError(f"grid.{name}={axis}: expected different values")
     if not values:
         raise SettingsError("grid: expected at least one axis, such as 'grid.sigma=[10,22.5]', or an experiment=; see "

@@ -91,11 +91,11 @@ def global_extractor(settings: dict[str, Any]) -> Callable[[Sequence[Features]],
 def _network(group: str, name: str, weights: str | None) -> Any:
     """The network with its weights, converted before."""
     from mfvpr.weights.files import load_model
-    from mfvpr.weights.registry import REGISTRY, entry_of
+    from mfvpr.weights.registry import REGISTRY
 
-    if weights is None or entry_of(weights).network != name:
-        expected = ", ".join(entry.name for entry in REGISTRY.values() if entry.network == name)
-        raise SettingsError(f"{group}.weights={weights}: expected weights of {name}: one of {expected}")
+    known = [entry.name for entry in REGISTRY.values() if entry.network == name]
+    if weights not in known:
+        raise SettingsError(f"{group}.weights={weights}: expected weights of {name}: one of {', '.join(known)}")
     return load_model(weights)
 
 

@@ -26,6 +26,7 @@ from experiments.settings import SettingsError, check
 PATHS = {"dataset.database", "dataset.queries", "dataset.root", "dataset.index_file", "dataset.cache"}
 PATHS |= {"store", "out", "checkpoints"}
 MULTIRUN = ("-m", "--multirun")
+_NAME = r"[A-Za-z_][\w/@]*(?:\.\w+)*"  # of a setting, or of a group
 MOST_DIGITS = 300  # more are no number of float64, and Python refuses to read thousands
 
 
@@ -63,7 +64,7 @@ def _require_device() -> None:
 
     try:
         jax.devices()
-    except RuntimeError as error:
+    except (RuntimeError, AssertionError) as error:  # the latter for `cuda` where there is no plugin
         asked = f"JAX_PLATFORMS={os.environ['JAX_PLATFORMS']}" if os.environ.get("JAX_PLATFORMS") else "JAX"
         reason = (str(error).splitlines() or ["no reason given"])[0]
         raise SettingsError(
@@ -95,7 +96,7 @@ def _check_form(argument: str, config: str) -> None:
         return
     if argument.startswith("-"):
         raise SettingsError(f"{argument}: unknown option; expected --help, --version, --multirun, or name=value")
-    if not equals or not name.strip():
+    if not equals or not re.fullmatch(_NAME, name):
         raise SettingsError(f"{argument}: expected name=value; put quotes around values with spaces")
     if re.search(rf"\d{{{MOST_DIGITS},}}", value):
         raise SettingsError(f"{name}={value[:20]}...: expected a number of fewer than {MOST_DIGITS} digits")
@@ -140,6 +141,12 @@ def _explain(error: Exception, config: str) -> str:
     text = text.partition(" Config search path")[0].partition(" See https")[0]
     if missing := re.search(r"Missing mandatory value: ([\w.]+)", text):
         return _no_default(missing[1])
+    if unresolved := re.match(r"(.*) full_key: ([\w.]+)", text):
+        return f"{unresolved[2]}: {unresolved[1]}"
+    if several := re.match(r"Ambiguous value for argument '(.*?)' 1\.", text):
+        return f"{several[1]}: expected one value; write [...] for a list; to run once for each, add --multirun"
+    if group := re.match(r"Error merging override (\S+)", text):
+        return f"{group[1]}: this is a group of settings; set one of its members (see --help)"
     unknown = re.search(r"Could not override '([^']*)'", text) or re.search(r"Key '([^']*)' is not in struct", text)
     if not unknown:
         return text

@@ -47,7 +47,8 @@ def check_choice(name: str, value: str, config: str) -> None:
         typed = " or ".join(f"python -m experiments.{program} {name}={value}" for program in others)
         raise SettingsError(f"{name}={value}: experiments.{PROGRAMS[config]} has no group {name}; type {typed}")
     for choice in value.split(",") if known else []:
-        if choice not in known and not (choice == "null" and own[name] is None):
+        if choice not in known:
             nearest = difflib.get_close_matches(choice, known, n=1)
             hint = f"; the nearest is {nearest[0]}" if nearest else ""
+            hint = "; leave it out for none" if choice == "null" and own[name] is None else hint
             raise SettingsError(f"{name}={value}: expected one of {', '.join(known)}{hint}")

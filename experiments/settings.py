@@ -82,7 +82,10 @@ _WEIGHT = _one_of("fs", "dmf", "unit")
 
 
 def _axis(rule: Rule) -> Rule:
-    return _or(_list_of(rule), None)
+    listed = _list_of(rule)
+    return Rule(
+        lambda value: value is None or listed.holds(value), f"{listed.expected}; null is the scorer's own value"
+    )
 
 
 RULES: dict[str, Rule] = {

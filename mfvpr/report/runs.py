@@ -84,7 +84,7 @@ def _take(handle: int, folder: Path) -> None:
     with _telling_why(folder):
         found = {path.name for path in folder.iterdir()}
         if found - {_UNFINISHED}:
-            raise InputError(f"{folder}: expected a new or empty run folder; name another, or remove it")
+            raise InputError(f"{folder}: expected a new or empty run folder; remove it, or name another")
         shutil.rmtree(folder / _UNFINISHED, ignore_errors=True)  # of a run that was killed
         with tempfile.TemporaryFile(dir=folder):
             pass
