@@ -3,6 +3,7 @@
 Nothing slow is imported before Ctrl-C is answered: Hydra and JAX come later, when they are needed.
 """
 
+import io
 import os
 import signal
 import sys
@@ -24,6 +25,8 @@ def launch(program: Program, config: str = "config") -> None:
     with on_interrupt(leave), one_line():
         unwind_on_sigterm()
         sys.unraisablehook = _keep_interrupt
+        if isinstance(sys.stdout, io.TextIOWrapper):
+            sys.stdout.reconfigure(errors="backslashreplace")  # names that the terminal cannot show cost no results
         if "--version" in sys.argv[1:]:
             print(version())
         elif {"--help", "-h"} & {*sys.argv[1:]}:

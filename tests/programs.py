@@ -36,7 +36,8 @@ def typed(monkeypatch, capsys, program, *arguments):
     handler, code = signal.getsignal(signal.SIGTERM), 0
     capsys.readouterr()
     try:
-        launch(getattr(import_module(f"experiments.{program}"), program), program)
+        config = "config" if program == "evaluate" else program
+        launch(getattr(import_module(f"experiments.{program}"), program), config)
     except SystemExit as left:
         code = left.code
     finally:

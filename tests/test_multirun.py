@@ -5,14 +5,11 @@ import subprocess
 import sys
 import threading
 import time
-from datetime import datetime
-from types import SimpleNamespace
 
 import pytest
 
 from experiments import prepare, stores
 from mfvpr.data import match_store
-from mfvpr.report import runs
 from tests.programs import CANDIDATES, QUERIES, results, shared, small, typed
 from tests.test_experiments import ROOT, composed
 
@@ -113,31 +110,3 @@ def test_who_waits_for_a_store_says_so_and_gets_it(tmp_path):
     other.join(timeout=30)
     assert told == [f"{tmp_path}/s: in use by process {os.getpid()}; waiting until it is free"]
     assert got == [[False]]
-
-
-def test_run_folders_of_one_second_differ(tmp_path, monkeypatch):
-    monkeypatch.setattr(runs, "datetime", SimpleNamespace(now=lambda: datetime(2030, 1, 2, 3, 4, 5)))
-    claimed, start = [], threading.Barrier(8)
-
-    def claim():
-        start.wait()
-        claimed.append(runs.claimed_run_folder(tmp_path, "street").name)
-
-    threads = [threading.Thread(target=claim) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(timeout=30)
-    names = [f"2030-01-02_03-04-05{suffix}" for suffix in ("", *(f"-{number}" for number in range(2, 9)))]
-    assert sorted(claimed) == names
-
-
-def test_a_claimed_run_folder_goes_when_the_run_fails(tmp_path):
-    def interrupted():
-        with runs.writing(runs.claimed_run_folder(tmp_path, "street")) as new:
-            (new / "half").write_text("written")
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        interrupted()
-    assert list((tmp_path / "street").iterdir()) == []

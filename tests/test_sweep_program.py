@@ -88,6 +88,12 @@ def test_every_file_tells_the_same(swept):
         assert (out / name).read_text().count("22.5") >= 4
     assert {"mfvpr", "jax", "numpy"} <= set(found["versions"])
     assert set(map(len, found["data_fingerprint"].values())) == {16}
+    assert found["ground_truth"]["kind"] == "index"
+    assert found["ground_truth"]["thresholds"] == [0, 1]
+    heading = (out / "summary.txt").read_text().splitlines()[0]
+    assert f"within 0, 1 frames of the ground truth ({found['ground_truth']['file']})" in heading
+    assert (out / "table.md").read_text().startswith(f"{heading}\n\n|")
+    assert (out / "table.tex").read_text().startswith(f"% {heading}\n\\begin")
     assert (found["unit"], found["thresholds"], found["ks"]) == ("frames", [0, 1], [1, 5])
 
 
@@ -159,6 +165,13 @@ def test_without_a_store(root, sweep, tmp_path):
     found = sweep(tmp_path / "swept", "grid.sigma=[10]", *(f"{name}={value}" for name, value in common.items()))
     for tolerance, recall in recall_of(found, sigma=10).items():
         assert recall == pytest.approx(expected["histogram", tolerance], abs=1e-6)
+
+
+def test_where_the_combined_score_decides_every_setting_is_combined(sweep, swept, tmp_path):
+    found = sweep(tmp_path / "out", "grid.sigma=[10]", "grid.weight=[unit]", "final=combined", "fusion.c=2")
+    assert found["own"] == {"sigma": 22.5, "weight": "fs", "c": 2}
+    own = {"sigma": 10, "weight": "unit", "c": 2}
+    assert recall_of(found, **own) == recall_of(swept[1], **own) != recall_of(swept[1], **own | {"c": 0})
 
 
 def test_other_scores_and_their_axes(sweep, swept, tmp_path):

@@ -1,0 +1,151 @@
+"""Command lines as they are typed: help, groups, mistakes, and Ctrl-C before anything has begun."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from experiments import groups, settings
+from experiments.launch import CONF, launch
+from mfvpr import pipeline
+from tests.programs import typed
+from tests.test_experiments import ROOT, composed, run
+
+PROGRAMS = {program: config for config, program in groups.PROGRAMS.items()}
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_help_has_every_setting_and_the_comments_of_conf(monkeypatch, capsys, program):
+    code, stdout, stderr = typed(monkeypatch, capsys, program, "--help")
+    assert (code, stderr) == (0, "")
+    pending = [composed(config=PROGRAMS[program])]
+    while pending:
+        for name, value in pending.pop().items():
+            assert re.search(rf"^ *{name}:", stdout, flags=re.MULTILINE), name
+            pending += [value] if isinstance(value, dict) else []
+    text = (CONF / "common.yaml").read_text()
+    for line in text[text.index("candidates:") : text.index("hydra:")].splitlines():
+        assert line in stdout
+    assert "image_size: [336, 336]  # width, height" in stdout
+    assert f"python -m experiments.{program}" in stdout
+    assert "hydra:" not in stdout
+    for group in ("system", "experiment"):
+        assert (f"  {group}=null" in stdout) == (group in groups.groups(PROGRAMS[program]))
+
+
+def test_help_is_of_the_groups_that_were_chosen(monkeypatch, capsys):
+    _, anchor, _ = typed(monkeypatch, capsys, "sweep", "--help", "experiment=anchor", "dataset=corridor")
+    assert "  window: 10  # cells" in anchor
+    assert "sigma: 22.5" not in anchor
+    assert "  num_bins: [10, 15, 20]" in anchor
+    assert "  database: ${.root}/ref" in anchor
+    assert "  index_file: null" in anchor
+    assert "database: ???" not in anchor
+    _, system, _ = typed(monkeypatch, capsys, "evaluate", "system=mix_hist_10", "-h", "retrieval=vlad")
+    assert "  weights: d2_tf  # d2_tf, d2_ots" in system
+    assert "  num_words: 64" in system
+
+
+def test_help_needs_neither_hydra_nor_jax():
+    code = ("import sys; from experiments.launch import launch; from experiments.evaluate import evaluate; "
+            "sys.argv = ['evaluate', '--help']; launch(evaluate); "
+            "assert not {'hydra', 'omegaconf', 'numpy', 'jax'} & {*sys.modules}")  # fmt: skip
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("program", [*PROGRAMS])
+def test_version(monkeypatch, capsys, program):
+    code, stdout, _ = typed(monkeypatch, capsys, program, "candidates=3", "--version")
+    assert code == 0
+    assert re.fullmatch(r"mfvpr \d+\.\d+\.\d+ \(jax .*, Python .*\)\n", stdout)
+
+
+@pytest.mark.parametrize(
+    ("program", "arguments", "words"),
+    [
+        ("evaluate", ["experiment=histogram"], "type python -m experiments.sweep experiment=histogram"),
+        ("learn", ["experiment=anchor"], "experiments.learn has no group experiment; type python -m experiments.sweep"),
+        ("sweep", ["system=mix_hist_5"], "the nearest is mix_hist_50"),
+        ("sweep", ["system=null"], "leave it out for none"),
+        ("sweep", ["system=mix_hist_50"], "grid: expected at least one axis"),
+        ("sweep", ["system=mix_hist_comb_10", "experiment=anchor", "grid.sigma=[3]"], "grid.sigma: scorer=anchor has"),
+        ("learn", ["system=mix_hist_50", "learning_rate=0"], "learning_rate=0: expected"),
+        ("evaluate", ["=5"], "=5: expected name=value"),
+        ("evaluate", [".=5"], ".=5: expected name=value"),
+        ("evaluate", ["candidates =5"], "candidates =5: expected name=value"),
+        ("evaluate", ["ü=5"], "ü=5: expected name=value"),
+        ("evaluate", ["candidates:5"], "expected name=value"),
+        ("evaluate", ["--cfg", "job"], "--cfg: unknown option; expected --help, --version, --multirun, or name=value"),
+        ("evaluate", [f"candidates={'9' * 5000}"], "candidates=99999999999999999999...: expected a number of fewer"),
+        ("evaluate", [f"scorer.histogram.sigma={'9' * 299}"], "...: expected a number above 0"),
+        ("evaluate", ["scorer.histogram.sigma=1e400"], "scorer.histogram.sigma=inf: expected a number above 0"),
+        ("evaluate", [f"candidates={'[' * 500}"], "[...: expected a whole number"),
+        ("evaluate", ["candidates=1,2"], "candidates=1,2: expected one value; write [...] for a list; to run once for"),
+        ("evaluate", ["candidates=range(1,3)"], "requires --multirun"),
+        ("evaluate", ["candidates=${nope}"], "candidates: Interpolation key 'nope' not found"),
+        ("evaluate", ["store=${oc.env:NOPE}"], "store=${oc.env:NOPE}: expected a path"),
+        ("evaluate", ["store='${x}'"], "store: Interpolation key 'x' not found"),
+        ("evaluate", ["out=runs/${x"], "out=runs/${x: expected a path"),
+        ("evaluate", ["scorer.histogram.max_bins=100000"], "expected a whole number from 1 to 1024, or null"),
+        ("evaluate", ["retrieval.max_samples=63"], "max_samples=63: expected at least retrieval.num_words=64"),
+        ("evaluate", ["matching.max_distance=3"], "matching.max_distance=3: expected a number above 0 and at most 2"),
+        ("sweep", ["grid.max_distance=[1,3]"], "grid.max_distance=[1, 3]: expected a list of one or more"),
+        ("sweep", ["grid.sigma=[1,1.0]"], "grid.sigma=[1, 1.0]: expected different values"),
+        ("sweep", ["grid=[1]"], "grid=[1]: this is a group of settings"),
+        ("evaluate", ["figures=[1.5]"], "figures=[1.5]: expected how many"),
+        ("evaluate", ["features=aliked", "features.weights=d2_tf"], "weights=d2_tf: expected weights of aliked"),
+        ("evaluate", ["out=/"], "/: expected a new or empty run folder"),
+        ("evaluate", ["out=/dev/null"], "/dev/null: expected a new or empty run folder, got a link or a file"),
+        ("evaluate", ["out=/dev/null/x"], "/x: cannot be written to (Not a directory); name another run folder"),
+    ],
+)  # fmt: skip
+def test_mistakes_are_one_line_and_leave_nothing(tmp_path, monkeypatch, capsys, program, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    code, stdout, stderr = typed(monkeypatch, capsys, program, *arguments)
+    assert (code, stdout) == (2, ""), stderr
+    assert words in stderr
+    assert stderr.count("\n") == 1
+    assert len(stderr) < 400
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bins_have_the_library_s_limit():
+    assert settings.MAX_BINS == pipeline.MAX_BINS
+
+
+def test_an_empty_variable_is_unset(monkeypatch):
+    found = []
+    monkeypatch.setenv("MFVPR_CACHE", "")
+    monkeypatch.setenv("MFVPR_WEIGHTS", "")
+    monkeypatch.setattr(sys, "argv", ["evaluate"])
+    launch(lambda: found.append)
+    assert found[0]["store"] == "~/.cache/mfvpr/features"
+    assert found[0]["dataset"]["cache"] == "~/.cache/mfvpr"
+    assert "MFVPR_WEIGHTS" not in os.environ
+
+
+def test_a_device_that_is_not_there_is_one_line():
+    for name in ("cuda", "nonsense"):
+        done = run("candidates=3", JAX_PLATFORMS=name)
+        assert done.returncode == 2
+        assert f"error: JAX_PLATFORMS={name}: expected a device that JAX can use here" in done.stderr
+        assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("module", ["yaml", "omegaconf", "jaxlib", "jax"])
+def test_ctrl_c_during_imports_is_one_line(tmp_path, module):
+    command = [sys.executable, "-X", "importtime", "-m", "experiments.evaluate", f"out={tmp_path}/out"]
+    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    for line in process.stderr:
+        if line.rpartition("|")[2].strip() == module:
+            break
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130, stderr[-2000:]
+    assert stderr.endswith("\ninterrupted; nothing half-written was left, and what was finished is kept\n")
+    assert "Traceback" not in stderr
+    assert list(tmp_path.iterdir()) == []

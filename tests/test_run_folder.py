@@ -1,0 +1,334 @@
+"""What a run leaves, and what it leaves when something goes wrong: claims, full disks, foreign names."""
+
+import csv
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from experiments import build, outputs
+from experiments import run as evaluation
+from experiments.settings import SettingsError
+from mfvpr.errors import InputError
+from mfvpr.report import runs
+from tests.programs import CANDIDATES, QUERIES, shared, small, typed
+from tests.test_experiments import ROOT, composed
+
+LINES = ("scorer=histogram", "figures=4")
+
+
+@pytest.fixture(scope="session")
+def root(tmp_path_factory):
+    return shared(tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
+def evaluated(root, tmp_path_factory):
+    out = tmp_path_factory.mktemp("evaluated") / "out"
+    evaluation.evaluate(composed(*small(root), *LINES, f"out={out}"))
+    return out
+
+
+@pytest.fixture(scope="session")
+def outcome(root):
+    return evaluation._outcome(composed(*small(root), *LINES, "candidates=3"))
+
+
+def rows(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+# --- contents ----------------------------------------------------------------------------------------------------
+
+
+def test_predictions_are_long_and_agree_with_the_recall(evaluated):
+    found = json.loads((evaluated / "results.json").read_text())
+    for system in ("filter", "histogram", "histogram + filter"):
+        lines = rows(evaluated / "predictions" / f"{system.replace(' + ', '_')}.csv")
+        assert list(lines[0]) == ["query", "rank", "database", "score", "right"]
+        assert [int(line["rank"]) for line in lines] == QUERIES * [*range(1, CANDIDATES + 1)]
+        scores = np.array([float(line["score"]) for line in lines]).reshape(QUERIES, -1)
+        assert np.all(np.diff(scores) <= 0)
+        right = np.array([int(line["right"]) for line in lines]).reshape(QUERIES, -1)
+        recall = next(row["recall_at"] for row in found if row["system"] == system and row["tolerance"] == 1)
+        assert right[:, 0].mean() == pytest.approx(recall["1"], abs=1e-6)
+        assert right[:, :5].any(axis=1).mean() == pytest.approx(recall["5"], abs=1e-6)
+    assert (evaluated / "predictions.csv").read_bytes() == (evaluated / "predictions" / "histogram.csv").read_bytes()
+
+
+@pytest.mark.parametrize("system", ["filter", "histogram", "histogram_filter"])
+def test_failures_are_the_wrong_first_answers(evaluated, system):
+    ranked = {}
+    for line in rows(evaluated / "predictions" / f"{system}.csv"):
+        ranked.setdefault(line["query"], []).append(line)
+    wrong = {query: lines for query, lines in ranked.items() if lines[0]["right"] == "0"}
+    failures = rows(evaluated / "failures" / f"{system}.csv")
+    assert [line["query"] for line in failures] == list(wrong)
+    assert 0 < len(failures) < QUERIES
+    assert {bool(line["rank"]) for line in failures} == {True, False} or system != "filter"
+    for line in failures:
+        lines = wrong[line["query"]]
+        assert line["answer"] == lines[0]["database"]
+        first = next((one for one in lines if one["right"] == "1"), None)
+        if first is None:
+            assert [line[name] for name in ("rank", "right_answer", "score", "margin")] == [""] * 4
+        else:
+            assert (line["rank"], line["right_answer"], line["score"]) == (
+                first["rank"], first["database"], first["score"])  # fmt: skip
+            margin = float(lines[0]["score"]) - float(first["score"])
+            assert float(line["margin"]) == pytest.approx(margin, abs=1e-5)
+
+
+def test_without_ground_truth_nothing_is_right_or_failed(root, tmp_path):
+    none = ("dataset.ground_truth=none", "dataset.index_file=null", "figures=2", f"out={tmp_path}/out")
+    evaluation.evaluate(composed(*small(root), *LINES, *none))
+    assert {line["right"] for line in rows(tmp_path / "out" / "predictions.csv")} == {""}
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {"results.json", "run.json", "predictions.csv", "predictions", "figures"}
+    assert {path.name.split("_")[0] for path in (tmp_path / "out" / "figures").iterdir()} == {"best"}
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["ground_truth"]["kind"] == "none"
+
+
+def test_heading_and_tables_say_the_same(evaluated, capsys):
+    found = json.loads((evaluated / "results.json").read_text())
+    truth = found[0]["ground_truth"]
+    assert (truth["kind"], truth["unit"], truth["thresholds"]) == ("index", "frames", [0, 1])
+    heading, _, *table = (evaluated / "table.md").read_text().splitlines()
+    assert heading.endswith(f"recall in %, within 0, 1 frames of the ground truth ({truth['file']})")
+    latex = (evaluated / "table.tex").read_text()
+    assert latex.startswith(f"% {heading}\n")
+    for line in rows(evaluated / "table.csv"):
+        assert f"| {' | '.join(line.values())} |" in table
+        assert f"{' & '.join(line.values())} \\\\\n" in latex
+
+
+def test_a_run_says_how_it_was_made(root, tmp_path, monkeypatch, capsys):
+    subprocess.run(["git", "init", "--quiet", tmp_path], check=True)
+    identity = ("-c", "user.name=a", "-c", "user.email=a@b.c")
+    subprocess.run(["git", *identity, "commit", "--quiet", "--allow-empty", "-m", "x"], cwd=tmp_path, check=True)
+    monkeypatch.chdir(tmp_path)
+    code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *small(root), "scorer=count", "figures=0", "out=a b")
+    assert code == 0, stderr
+    assert stdout.endswith("results: a b\n")
+    found = json.loads((tmp_path / "a b" / "run.json").read_text())
+    assert found["command"].startswith("python -m experiments.evaluate dataset=folder dataset.database=")
+    assert found["command"].endswith(" scorer=count figures=0 'out=a b'")
+    expected = composed(*small(root), "scorer=count", "figures=0", "out='a b'")
+    assert found["settings"] == expected
+    head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert found["commit"] == head.stdout.strip()
+    assert {"mfvpr", "jax", "python"} <= found["versions"].keys()
+    (tmp_path / "file").write_text("x")
+    subprocess.run(["git", "add", "file"], cwd=tmp_path, check=True)
+    assert runs.commit(tmp_path) == found["commit"] + "-dirty"
+    assert runs.commit(Path("/")) is None
+
+
+def test_a_wrong_figure_has_the_right_image_below(evaluated, outcome):
+    sizes = {path.name: Image.open(path).size for path in (evaluated / "figures").iterdir()}
+    assert len(sizes) == 4
+    assert min(height for name, (_, height) in sizes.items() if name.startswith("wrong")) > 700
+    assert max(height for name, (_, height) in sizes.items() if name.startswith("right")) < 600
+
+    system = outcome.systems["histogram"]
+    right = outcome.is_right(system)
+    found = {bool(right[query].any()): query for query in np.flatnonzero(~right[:, 0])}
+    names = outcome.dataset.database.names
+    query = found[True]
+    rank = int(np.argmax(right[query]))
+    [answer] = outputs._right_answer(outcome, query)
+    score = f"{system.scores[query, rank]:.5g}"
+    assert answer.caption == f"right: {names[system.rows[query, rank]]}, rank {rank + 1}, score {score}"
+    assert float(answer.explanation.score) == pytest.approx(float(score), rel=1e-3)
+    [answer] = outputs._right_answer(outcome, found[False])
+    assert answer.caption == f"right: {names[outcome.dataset.truth.place(found[False])]}, not among the 3 candidates"
+    assert answer.matches is None
+
+
+def test_figures_of_chosen_queries(outcome):
+    asked = outputs.asked_figures
+    assert asked([5, "0002.png", 5], outcome.dataset) == [5, 2]
+    assert asked(7, outcome.dataset) == 7
+    for wrong in (24, -1, "nope.png"):
+        with pytest.raises(SettingsError, match=r"expected rows of queries from 0 to 23, or names such as 0000"):
+            asked([0, wrong], outcome.dataset)
+    assert list(outputs._shown(replace(outcome, shown=[5, 2]))) == [5, 2]
+
+
+# --- the claim ---------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_in_use_is_refused_at_the_start(root, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(evaluation, "_outcome", lambda *_: pytest.fail("it was begun"))
+    with runs.claimed(tmp_path / "out"):
+        code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *small(root), f"out={tmp_path}/out")
+    assert (code, stdout) == (2, "")
+    expected = "another run is using this folder; wait until it ends, or name another with out=DIR"
+    assert stderr == f"error: {tmp_path}/out: {expected}\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_claim_of_a_killed_run_is_free(tmp_path):
+    code = ("import sys; from pathlib import Path; from mfvpr.report import runs\n"
+            "with runs.claimed(Path(sys.argv[1])) as folder, runs.writing(folder) as new:\n"
+            "    (new / 'half').write_text('written'); print('held', flush=True); sys.stdin.read()")  # fmt: skip
+    process = subprocess.Popen([sys.executable, "-c", code, tmp_path / "out"], cwd=ROOT, stdin=subprocess.PIPE,
+                               stdout=subprocess.PIPE, text=True)  # fmt: skip
+    with process:
+        assert process.stdout.readline() == "held\n"
+        with pytest.raises(InputError, match="another run is using"), runs.claimed(tmp_path / "out"):
+            pass
+        process.send_signal(signal.SIGKILL)
+    assert list((tmp_path / "out").iterdir()) != []
+    with runs.claimed(tmp_path / "out") as folder:
+        assert list(folder.iterdir()) == []
+        with runs.writing(folder) as new:
+            (new / "results.json").write_text("all")
+    assert [path.name for path in folder.iterdir()] == ["results.json"]
+
+
+def test_a_claimed_folder_goes_with_its_parents_when_the_run_fails(tmp_path):
+    def interrupted():
+        with runs.claimed(tmp_path / "a" / "b" / "out") as folder, runs.writing(folder) as new:
+            (new / "half").write_text("written")
+            raise KeyboardInterrupt
+
+    (tmp_path / "a").mkdir()
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert list(tmp_path.rglob("*")) == [tmp_path / "a"]
+
+
+def test_run_folders_of_one_second_differ(tmp_path, monkeypatch):
+    monkeypatch.setattr(runs, "datetime", SimpleNamespace(now=lambda: datetime(2030, 1, 2, 3, 4, 5)))
+    claimed, together = [], threading.Barrier(8)
+
+    def claim():
+        together.wait()
+        with runs.claimed(runs.new_run_folder(tmp_path, "street"), numbered=True) as folder:
+            claimed.append(folder.name)
+            together.wait()
+
+    threads = [threading.Thread(target=claim) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(timeout=30)
+    names = [f"2030-01-02_03-04-05{suffix}" for suffix in ("", *(f"-{number}" for number in range(2, 9)))]
+    assert sorted(claimed) == names
+    assert list(tmp_path.rglob("*-*")) == []
+
+
+# --- what goes wrong at the end ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def limited(monkeypatch):
+    """From the writing of the results on, files cannot grow beyond so many bytes, as on a full disk."""
+    before, text = resource.getrlimit(resource.RLIMIT_FSIZE), outputs.text
+
+    def limit(size):
+        def then(outcome):
+            resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+            return text(outcome)
+
+        monkeypatch.setattr(outputs, "text", then)
+
+    yield limit
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_full_disk_costs_no_table(root, evaluated, tmp_path, monkeypatch, capsys, limited):
+    limited(2000)
+    code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *small(root), *LINES, f"out={tmp_path}/out")
+    assert code == 2
+    assert "\nhistogram + filter " in stdout
+    last = stderr.splitlines()[-1]
+    assert last.startswith(f"error: {tmp_path}/out: the results cannot be written (File too large); they are printed")
+    assert "with out=DIR" in last
+    assert "Traceback" not in stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_figure_that_cannot_be_drawn_costs_a_warning(root, evaluated, tmp_path, monkeypatch, capsys, limited):
+    limited(30_000)
+    code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *small(root), *LINES, f"out={tmp_path}/out")
+    assert code == 0, stderr
+    assert stdout.endswith(f"results: {tmp_path}/out\n")
+    warnings = [line for line in stderr.splitlines() if line.startswith(f"warning: {tmp_path}/out/figures/wrong_")]
+    assert len(warnings) == 2
+    assert all("not drawn ([Errno 27] File too large" in line for line in warnings)
+    assert (tmp_path / "out" / "predictions.csv").read_bytes() == (evaluated / "predictions.csv").read_bytes()
+    assert not [path for path in (tmp_path / "out").rglob(".*")]
+
+
+def test_ctrl_c_while_figures_are_drawn_keeps_the_tables(root, evaluated, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(outputs, "histogram_figure", lambda *_, **__: os.kill(os.getpid(), signal.SIGINT))
+    code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *small(root), *LINES, f"out={tmp_path}/out")
+    assert code == 130
+    assert "\nhistogram + filter " in stdout
+    assert stderr.endswith("\ninterrupted; nothing half-written was left, and what was finished is kept\n")
+    names = {path.name for path in evaluated.iterdir()} - {"figures"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == names
+
+
+def test_names_that_are_no_utf8_cost_nothing(root, tmp_path, monkeypatch, capsys):
+    """Of images, of their folder, and of the run folder."""
+    from mfvpr.data.streets import streets_folder
+
+    street = streets_folder(root, num_frames=QUERIES, image_size=(160, 120))
+    place = tmp_path / os.fsdecode(b"data\xff")
+    for side in ("database", "queries"):
+        (place / side).mkdir(parents=True)
+        for path in sorted((street / side).iterdir())[:6]:
+            shutil.copy(path, place / side / os.fsdecode(b"\xfe" + path.name.encode()))
+    out = tmp_path / os.fsdecode(b"out\xff")
+    arguments = [f"dataset.database={place}/database", f"dataset.queries={place}/queries", f"out={out}", "figures=2",
+                 "dataset.ground_truth=order", "dataset.index_file=null", "scorer=histogram"]  # fmt: skip
+    code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *small(root), *arguments)
+    assert code == 0, stderr
+    assert stdout.endswith("out\\udcff\n")
+    assert "warning" not in stderr
+    assert len(list((out / "figures").iterdir())) == 2
+    assert b"\xfe0000.png,1,\xfe000" in (out / "predictions.csv").read_bytes()
+    run = json.loads((out / "run.json").read_text(encoding="utf-8"))
+    assert run["settings"]["out"] == str(out)
+    json.loads((out / "results.json").read_text(encoding="utf-8"))
+
+
+# --- progress ----------------------------------------------------------------------------------------------------
+
+
+def test_progress_without_a_terminal_is_a_line_per_tenth(capsys):
+    assert list(build.track("matching")(range(234), 234)) == list(range(234))
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split()[1] for line in lines] == [f"{percent}" for percent in range(0, 101, 10)]
+    assert lines[5].startswith("matching              50 %  117 of 234  ")
+    bar = build.bar("drawing", 3)
+    bar.update(3)
+    bar.close()
+    assert [line.split()[1] for line in capsys.readouterr().err.splitlines()] == ["0", "100"]
+
+
+def test_no_progress_is_shown_of_nothing(capsys):
+    assert list(build.track("features")([], 0)) == []
+    assert capsys.readouterr().err == ""
+
+
+def test_progress_in_a_terminal_is_a_bar(monkeypatch, capsys):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    assert list(build.track("matching")(range(9), 9)) == list(range(9))
+    assert "\rmatching            : 100%|" in capsys.readouterr().err
