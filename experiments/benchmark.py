@@ -14,6 +14,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from experiments.errors import one_line
+from experiments.launch import version
+
 if TYPE_CHECKING:
     from experiments.contestants import Lineup
 
@@ -27,23 +30,41 @@ def main() -> None:
         "what", nargs="?", choices=("scores", "sweeps", "networks"), default="scores", help="default: scores"
     )
     parser.add_argument(
-        "--rounds", type=int, help="timed calls of each contestant (default 15; of sweeps 7, of networks 5)"
+        "--rounds", type=positive, help="timed calls of each contestant (default 15; of sweeps 7, of networks 5)"
     )
     parser.add_argument("--out", type=Path, help="JSON file to write (default runs/benchmark_WHAT.json)")
+    parser.add_argument("--version", action="version", version=version(), help="print it and exit")
     arguments = parser.parse_args()
+    with one_line():
+        compete(arguments.what, arguments.rounds, arguments.out or Path(f"runs/benchmark_{arguments.what}.json"))
 
+
+def compete(what: str, rounds: int | None, out: Path) -> None:
+    """Everyone in turns.
+
+    Args:
+        what: which benchmark.
+        rounds: None = the benchmark's own.
+        out: JSON file to write.
+    """
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # leaves torch its part of a GPU
-    if arguments.what == "scores":  # here, so that --help need not wait for JAX
+    if what == "scores":  # here, so that --help need not wait for JAX
         from experiments.contestants import lineup
-    elif arguments.what == "sweeps":
+    elif what == "sweeps":
         from experiments.sweep_contestants import lineup
     else:
         from experiments.network_contestants import lineup
 
     contest = lineup()
-    rounds = arguments.rounds or contest.rounds
-    seconds, results = take_turns([run for _, _, run in contest.entries], rounds)
-    report(contest, seconds, results, arguments.out or Path(f"runs/benchmark_{arguments.what}.json"))
+    seconds, results = take_turns([run for _, _, run in contest.entries], rounds or contest.rounds)
+    report(contest, seconds, results, out)
+
+
+def positive(text: str) -> int:
+    """A whole number above 0, of an option."""
+    if not text.isascii() or not text.isdigit() or not int(text[:9]) > 0:
+        raise argparse.ArgumentTypeError(f"expected a whole number above 0, got {text}")
+    return int(text[:9])
 
 
 def take_turns(runs: list[Callable[[], Any]], rounds: int) -> tuple[list[list[float]], list[Any]]:

@@ -30,8 +30,11 @@ def main() -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
+    from experiments.launch import version
+
     parser = _Parser(prog="python -m experiments.weights", description="Weights live in MFVPR_WEIGHTS, by default "
                      "~/.cache/mfvpr/weights. None come with the package; each has its own license.")  # fmt: skip
+    parser.add_argument("--version", action="version", version=version(), help="print it and exit")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     command = commands.add_parser("list", help="all known weights, their licenses, and whether they are installed")
     command.set_defaults(run=list_weights)

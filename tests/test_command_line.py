@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from experiments import groups, settings
-from experiments.launch import CONF, launch
+from experiments.launch import CONF, launch, version
 from mfvpr import pipeline
 from tests.programs import typed
 from tests.test_experiments import ROOT, composed, run
@@ -149,3 +149,9 @@ def test_ctrl_c_during_imports_is_one_line(tmp_path, module):
     assert stderr.endswith("\ninterrupted; nothing half-written was left, and what was finished is kept\n")
     assert "Traceback" not in stderr
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("program", ["benchmark", "weights"])
+def test_version_of_programs_without_settings(program):
+    done = run("--version", program=program)
+    assert (done.returncode, done.stdout) == (0, f"{version()}\n")
