@@ -81,7 +81,7 @@ def test_fusion_with_a_constant_and_balanced(candidates, matches):
     scores = pipeline.score({"count": mfvpr.MatchCount()}, matches, candidates)["count"]
     np.testing.assert_allclose(pipeline.fuse(candidates, scores, 10.0), 10 * candidates.scores + scores, rtol=1e-5)
     distance = np.sqrt(2 - 2 * candidates.scores)
-    euclidean = pipeline.fuse(candidates, scores, 10.0, euclidean=True)
+    euclidean = pipeline.fuse(candidates, scores, 10.0, filter_score="negative_euclidean")
     np.testing.assert_allclose(euclidean, scores - 10 * distance, rtol=1e-5)
     by_index = np.take_along_axis(candidates.indices, pipeline.rank(candidates, 0 * scores, ties="index"), axis=1)
     np.testing.assert_array_equal(by_index, np.sort(candidates.indices, axis=1))
@@ -127,8 +127,8 @@ class Counted:
 @pytest.fixture
 def matched(monkeypatch):
     """Counts the queries that are matched."""
-    counted = Counted(pipeline._match)
-    monkeypatch.setattr(pipeline, "_match", counted)
+    counted = Counted(pipeline.match_shortlist)
+    monkeypatch.setattr(pipeline, "match_shortlist", counted)
     return counted
 
 

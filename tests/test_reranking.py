@@ -88,7 +88,7 @@ def test_fine_bins_do_not_tax_coarse_ones(matches):
     sizes = matches.image_size0, matches.image_size1
     groups = by_capacity(HistogramOfShifts(), {"bin_size": np.array([6.0, 14.0, 15.0])}, 3, *sizes)
     needed = [HistogramOfShifts(bin_size=size).with_capacity(*sizes).max_bins for size in (6.0, 14.0, 15.0)]
-    assert [list(rows) for _, rows in groups] == [[1, 2], [0]]
+    assert [list(rows) for _, rows in groups] == [[0], [1, 2]]
     for scorer, rows in groups:
         worst = max(needed[row] for row in rows)
         assert worst <= scorer.max_bins < worst + 8

@@ -2,16 +2,15 @@
 
 from dataclasses import replace
 
-import jax
 import numpy as np
 import pytest
 
 import mfvpr
 from mfvpr import pipeline, sweeping
 from mfvpr.pipeline import MatchSet
-from mfvpr.sweeping.batches import image_sizes, slots
+from mfvpr.sweeping.batches import slots
 from mfvpr.sweeping.settings import groups
-from mfvpr.types import Shortlist
+from mfvpr.types import Shortlist, per_match
 from tests.builders import random_matches
 
 FS, DMF = mfvpr.FeatureScoreWeight(), mfvpr.DescriptorDistanceWeight()
@@ -19,19 +18,22 @@ QUERIES, CANDIDATES, DATABASE = 7, 5, 9
 
 
 def make_set():
-    """Few to many matches a pair, some pairs without, and a shortlist that ends early for one query."""
+    """Few to many matches a pair, with a confidence, some pairs without; images of two sizes on either side; and a
+    shortlist that ends early for one query."""
     rng = np.random.default_rng(4)
     flat, counts = [], []
-    for _ in range(QUERIES):
-        pairs = [random_matches(rng, count) for count in rng.permutation([0, 3, 20, 33, 70])]
+    for query in range(QUERIES):
+        sizes = [((336, 336), (640, 480))[query % 2], *[((336, 336), (400, 300))[row % 2] for row in range(CANDIDATES)]]
+        pairs = [
+            random_matches(rng, count, sizes=(sizes[0], size))
+            for count, size in zip(rng.permutation([0, 3, 20, 33, 70]), sizes[1:], strict=True)
+        ]
         counts.append([int(pair.mask.sum()) for pair in pairs])
         joined = {
             name: np.concatenate([getattr(pair, name)[pair.mask] for pair in pairs])
-            for name in ("points0", "points1", "distance", "scores0", "scores1", "mask")
+            for name in (*per_match(pairs[0]), "mask")
         }
-        sizes = np.stack([pair.image_size1 for pair in pairs])
-        none = {"ratio": None, "confidence": None}
-        flat.append(replace(pairs[0], **joined, **none, image_size0=pairs[0].image_size0, image_size1=sizes))
+        flat.append(replace(pairs[0], **joined, image_size1=np.stack([pair.image_size1 for pair in pairs])))
     indices = np.stack([rng.permutation(DATABASE)[:CANDIDATES] for _ in range(QUERIES)]).astype(np.int32)
     indices[2, 3:] = -1
     scores = np.sort(rng.random((QUERIES, CANDIDATES)).astype(np.float32))[:, ::-1]
@@ -44,19 +46,15 @@ def data():
     return make_set()
 
 
-_score = jax.jit(mfvpr.score_candidates)
-
-
 def one_by_one(scorer, setting, match_set, candidates, view=None, **options):
     """Rows of one setting, by the functions that an evaluation calls."""
     setting = dict(setting)
     limit, fused, c = setting.pop("max_distance", np.inf), "c" in setting, setting.pop("c", None)
     scorer = replace(scorer, **setting)
-    scorer = pipeline._prepare(scorer, match_set.matches[0])
     scores = []
     for query in range(QUERIES):
         padded = match_set[query]
-        scores.append(_score(scorer, replace(padded, mask=padded.mask & (padded.distance <= limit))))
+        scores.append(mfvpr.score_candidates(scorer, replace(padded, mask=padded.mask & (padded.distance <= limit))))
     view = candidates.mask if view is None else view
     seen = replace(candidates, mask=candidates.mask & view)
     scores = np.array(scores, np.float32)
@@ -89,7 +87,7 @@ def test_one_setting_beside_a_grid_leaves_it_whole(data):
     scorer = mfvpr.HistogramOfShifts()
     settings = sweeping.grid({"sigma": [9.0, 20.0, 30.0], "weight": [FS, DMF], "max_distance": [0.8, 2.0]})
     settings.insert(3, {"sigma": 9.0, "weight": FS, "max_distance": 1.1})
-    found = list(groups(scorer, settings, image_sizes(data[0])))
+    found = list(groups(scorer, settings, data[0].image_sizes))
     assert sorted(group.rows.shape for group in found) == [(1, 5), (2, 4)]
     assert sorted(row for group in found for row in group.rows.reshape(-1)) == list(range(13))
     for rows, setting in zip(sweeping.sweep(scorer, settings, *data)[0], settings, strict=True):
@@ -123,7 +121,7 @@ def test_views_hide_candidates_and_ties_may_go_by_index(data):
     _, candidates = data
     view = np.random.default_rng(1).random(candidates.mask.shape) < 0.6
     settings = [{"max_distance": limit, "c": c} for limit in (0.05, 2.0) for c in (None, 0.0)]  # 0.05: mostly ties
-    got = sweeping.sweep(mfvpr.MatchCount(), settings, *data, views=[candidates.mask, view], by_index=True)
+    got = sweeping.sweep(mfvpr.MatchCount(), settings, *data, views=[candidates.mask, view], ties="index")
     for seen, rows in zip((candidates.mask, view), got, strict=True):
         for found, setting in zip(rows, settings, strict=True):
             expected = one_by_one(mfvpr.MatchCount(), setting, *data, view=seen, ties="index")
