@@ -66,7 +66,7 @@ def _blocks(similarity: Array, axis: int) -> Array:
 
 
 def _look(blocks: Array, tops: Array, axis: int) -> Nearest:
-    """The largest entry, in the first block that has it; `tops` are the blocks' largest, or -inf for one to leave out."""
+    """The largest entry, in the first block that has it; `tops` are the blocks' largest, -inf for one to leave out."""
     largest = jnp.max(tops, axis=axis, keepdims=True)
     block = first(tops == largest, axis)
     place = first(_block(blocks, block, axis) == largest, axis)

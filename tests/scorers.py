@@ -75,6 +75,6 @@ FOREIGN_VALUES = [Wrapped(), Strongest(), Sampled(jax.random.key(3))]
 FOREIGN = [plain, *FOREIGN_VALUES, HistogramOfShifts(weight=closest)]
 
 
-def name(scorer):
+def title(scorer):
     """For the names of tests."""
     return getattr(scorer, "__name__", type(scorer).__name__)

@@ -7,10 +7,10 @@ import pytest
 
 import mfvpr
 from mfvpr.testing import check_scorer
-from tests.scorers import FOREIGN, OWN, name
+from tests.scorers import FOREIGN, OWN, title
 
 
-@pytest.mark.parametrize("scorer", [*OWN, *FOREIGN], ids=name)
+@pytest.mark.parametrize("scorer", [*OWN, *FOREIGN], ids=title)
 def test_what_keeps_the_contract_passes(scorer):
     check_scorer(scorer)
 

@@ -12,11 +12,11 @@ from mfvpr.errors import InputError
 from mfvpr.numerics import held
 from mfvpr.scoring.parameters import fit
 from tests.builders import SIZE, make_matches, per_match, random_matches
-from tests.scorers import FOREIGN, FOREIGN_VALUES, OWN, Wrapped, name, plain
+from tests.scorers import FOREIGN, FOREIGN_VALUES, OWN, Wrapped, plain, title
 
-everyone = pytest.mark.parametrize("scorer", [*OWN, *FOREIGN], ids=name)
-values = pytest.mark.parametrize("scorer", [*OWN, *FOREIGN_VALUES], ids=name)
-own = pytest.mark.parametrize("scorer", OWN, ids=name)
+everyone = pytest.mark.parametrize("scorer", [*OWN, *FOREIGN], ids=title)
+values = pytest.mark.parametrize("scorer", [*OWN, *FOREIGN_VALUES], ids=title)
+own = pytest.mark.parametrize("scorer", OWN, ids=title)
 _score = jax.jit(lambda scorer, matches: scorer(matches))  # once per shape: hence 60 slots wherever possible
 _score_all = jax.jit(score_candidates)
 gradients = jax.jit(jax.grad(lambda scorer, inputs, mask: scorer(Matches(mask=mask, **inputs)), argnums=(0, 1)))

@@ -8,10 +8,12 @@ import pytest
 import mfvpr
 from mfvpr import pipeline, sweeping
 from mfvpr.pipeline import MatchSet
+from mfvpr.scoring.parameters import with_parameters
 from mfvpr.sweeping.batches import slots
 from mfvpr.sweeping.settings import groups
 from mfvpr.types import Shortlist, per_match
 from tests.builders import random_matches
+from tests.scorers import FOREIGN, Wrapped, title
 
 FS, DMF = mfvpr.FeatureScoreWeight(), mfvpr.DescriptorDistanceWeight()
 QUERIES, CANDIDATES, DATABASE = 7, 5, 9
@@ -50,7 +52,7 @@ def one_by_one(scorer, setting, match_set, candidates, view=None, **options):
     """Rows of one setting, by the functions that an evaluation calls."""
     setting = dict(setting)
     limit, fused, c = setting.pop("max_distance", np.inf), "c" in setting, setting.pop("c", None)
-    scorer = replace(scorer, **setting)
+    scorer = with_parameters(scorer, setting)
     scores = []
     for query in range(QUERIES):
         padded = match_set[query]
@@ -70,10 +72,12 @@ CASES = [
     (mfvpr.AnchorPoints(), {"num_bins": [6, 8], "window": [4, 6], "tolerance": [1, 2.5], "weight": [DMF, FS]}),
     (mfvpr.AggregatedScore(), {"weight": [FS, DMF], "max_distance": [1.0, 2.0], "mean": ["unweighted", "median"]}),
     (mfvpr.MatchCount(), {"max_distance": [0.5, 1.0, 1.5]}),
+    (Wrapped(), {"inner.sigma": [9.0, 22.5], "inner.bin_size": [8.0, 15.0], "inner.align": ["min_edge", "zero_edge"]}),
+    *((scorer, {"max_distance": [0.8, 3.0], "c": [None, 0.0]}) for scorer in FOREIGN),
 ]
 
 
-@pytest.mark.parametrize(("scorer", "axes"), CASES, ids=lambda value: type(value).__name__)
+@pytest.mark.parametrize(("scorer", "axes"), CASES, ids=lambda value: "" if isinstance(value, dict) else title(value))
 def test_sweep_is_one_evaluation_per_setting(data, scorer, axes):
     settings = sweeping.grid(axes)
     got = sweeping.sweep(scorer, settings, *data, depth=CANDIDATES)
@@ -193,3 +197,70 @@ def test_memory_is_told_beforehand(data):
     assert sweeping.result_bytes(2, 10, 7, 3) == np.zeros((2, 10, 7, 3), np.int32).nbytes
     one = sweeping.block_bytes(match_set, CANDIDATES, 10, 1)
     assert one < sweeping.block_bytes(match_set, CANDIDATES, 20, 1) < sweeping.block_bytes(match_set, CANDIDATES, 20, 7)
+
+
+def other_matches(match_set, candidates):
+    moved = [replace(one, points1=one.points1[::-1].copy()) for one in match_set.matches]
+    return replace(match_set, matches=moved), candidates
+
+
+def other_sizes(match_set, candidates):
+    return replace(
+        match_set, matches=[replace(m, image_size1=m.image_size1 / 2) for m in match_set.matches]
+    ), candidates
+
+
+def other_shortlist(match_set, candidates):
+    return match_set, replace(candidates, indices=np.where(candidates.mask, candidates.indices[:, ::-1], -1))
+
+
+def other_filter(match_set, candidates):
+    return match_set, replace(candidates, scores=candidates.scores[:, ::-1])
+
+
+@pytest.mark.parametrize("change", [other_matches, other_sizes, other_shortlist, other_filter])
+def test_blocks_of_other_data_in_the_same_folder_are_not_taken(data, tmp_path, change):
+    scorer, settings = mfvpr.HistogramOfShifts(bin_size=20.0), [{"sigma": 9.0, "c": 0.5}, {"sigma": 20.0, "c": 0.5}]
+    sweeping.sweep(scorer, settings, *data, folder=tmp_path)
+    other = change(*data)
+    expected = sweeping.sweep(scorer, settings, *other)
+    np.testing.assert_array_equal(sweeping.sweep(scorer, settings, *other, folder=tmp_path), expected)
+    np.testing.assert_array_equal(
+        sweeping.sweep(scorer, settings, *data, folder=tmp_path), sweeping.sweep(scorer, settings, *data)
+    )
+
+
+def test_nor_are_those_of_other_views_options_or_scorers_of_one_name(data, tmp_path):
+    _, candidates = data
+    settings = [{"max_distance": 0.3}, {"max_distance": 2.0}]
+    view = np.random.default_rng(1).random(candidates.mask.shape) < 0.6
+
+    def scorer(factor):
+        @mfvpr.value
+        class Score:
+            number: float = 1.0
+
+            def __call__(self, matches):
+                return factor * self.number * mfvpr.MatchCount()(matches)
+
+        return Score()
+
+    cases = [
+        (scorer(1.0), {}),
+        (scorer(-1.0), {}),
+        (scorer(1.0), {"views": [view]}),
+        (scorer(1.0), {"views": [~view]}),
+        (scorer(1.0), {"ties": "index"}),
+        (lambda matches: mfvpr.MatchCount()(matches), {}),
+        (lambda matches: -mfvpr.MatchCount()(matches), {}),
+    ]
+    fused = [{"c": c} for c in (10.0, 20.0)]
+    for made, options in cases:
+        expected = sweeping.sweep(made, settings, *data, **options)
+        np.testing.assert_array_equal(
+            sweeping.sweep(made, settings, *data, **options, folder=tmp_path), expected, err_msg=str(options)
+        )
+    for kind in ("cosine", "negative_euclidean"):
+        expected = sweeping.sweep(mfvpr.MatchCount(), fused, *data, filter_score=kind)
+        kept = sweeping.sweep(mfvpr.MatchCount(), fused, *data, filter_score=kind, folder=tmp_path)
+        np.testing.assert_array_equal(kept, expected)
