@@ -43,7 +43,7 @@ HOMES = {
     "matplotlib": {"report"},
     "hydra": set(),
     "omegaconf": set(),
-    "torch": {"weights"},  # the checkpoint reader
+    "torch": set(),
     "flax": {"models", "weights", "features"},
     "tensorstore": {"data"},
     "safetensors": {"weights"},
