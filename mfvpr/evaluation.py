@@ -15,8 +15,10 @@ def frame_positives(query_index: np.ndarray, database_index: np.ndarray, *, tole
         tolerance: in frames.
     """
     query_index, database_index = np.asarray(query_index, np.int64), np.asarray(database_index, np.int64)
-    near = np.abs(database_index[None, :] - query_index[:, None]) <= tolerance
-    return near & (query_index >= 0)[:, None]
+    positives = np.zeros((len(query_index), len(database_index)), bool)
+    for row in np.flatnonzero(query_index >= 0):  # row by row: numbers take eight times the memory of bool
+        np.less_equal(np.abs(database_index - query_index[row]), tolerance, out=positives[row])
+    return positives
 
 
 def radius_positives(query_xy: np.ndarray, database_xy: np.ndarray, *, radius: float = 25.0) -> np.ndarray:

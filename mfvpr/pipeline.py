@@ -61,9 +61,16 @@ class MatchSet:
         return replace(flat, mask=mask, image_size0=sizes, **slots)
 
 
-def shortlist(query_descriptors: np.ndarray, database_descriptors: np.ndarray, num_candidates: int) -> Shortlist:
-    """The filter's candidates of all queries `[Q, C]`, NumPy."""
-    return jax.tree.map(np.asarray, _retrieve(query_descriptors, database_descriptors, num_candidates=num_candidates))
+def shortlist(
+    query_descriptors: np.ndarray,
+    database_descriptors: np.ndarray,
+    num_candidates: int,
+    *,
+    allowed: np.ndarray | None = None,
+) -> Shortlist:
+    """The filter's candidates of all queries `[Q, C]`, NumPy, among database images `allowed` `[Q, N]`; None = all."""
+    found = _retrieve(query_descriptors, database_descriptors, num_candidates=num_candidates, mask=allowed)
+    return jax.tree.map(np.asarray, found)
 
 
 def match(
