@@ -12,7 +12,7 @@ import mfvpr
 from mfvpr.learning import losses
 from mfvpr.learning.match_weight import LearnedWeight
 from mfvpr.learning.parameters import from_logarithms, to_logarithms
-from mfvpr.types import Array, Matches
+from mfvpr.types import Array, Matches, value
 
 NUMBERS = {"histogram": ("sigma",), "anchor": ("tolerance",), "sum": ()}  # learned besides the temperature
 START_TEMPERATURE = {"histogram": 0.1, "anchor": 0.3, "sum": 1.0}  # the histogram's in units of the scores' spread
@@ -23,7 +23,7 @@ LOSSES: dict[str, losses.Loss] = {
 }
 
 
-@dataclass(frozen=True)
+@value
 class Lesson:
     """Queries to learn from, padded.
 
@@ -34,9 +34,6 @@ class Lesson:
     filter_scores: np.ndarray
     positives: np.ndarray
     mask: np.ndarray
-
-
-jax.tree_util.register_dataclass(Lesson)
 
 
 @dataclass(frozen=True)

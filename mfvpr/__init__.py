@@ -11,7 +11,7 @@ from mfvpr.matching import compact, filter_matches, match, match_candidates, sof
 from mfvpr.reranking import balancing_c, combine, rank, rerank, score_candidates, score_grid
 from mfvpr.retrieval import retrieve
 from mfvpr.scoring import AggregatedScore, AnchorPoints, HistogramOfShifts, MatchCount, ShiftHistogram
-from mfvpr.types import Features, Matches, Ranking, Shortlist
+from mfvpr.types import Features, Matches, Ranking, Shortlist, value
 from mfvpr.weighting import DescriptorDistanceWeight, FeatureScoreWeight, UnitWeight
 
 __version__ = "0.1.0"
@@ -45,4 +45,5 @@ __all__ = [
     "score_candidates",
     "score_grid",
     "soft_match",
+    "value",
 ]

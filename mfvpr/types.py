@@ -5,16 +5,59 @@ Points are (x, y) in pixels of the image that the detector saw. `mask` is True o
 never matters, NaN included. Every field may carry leading batch axes. Arrays may be NumPy's or JAX's.
 """
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any, TypeVar, dataclass_transform
 
 import jax
 
 Array = Any  # jax.Array or np.ndarray: the host builds with NumPy what the device computes with
+Class = TypeVar("Class", bound=type)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass_transform(frozen_default=True, field_specifiers=(field,))
+def value(cls: Class) -> Class:
+    """Class decorator: a frozen dataclass and a pytree, whose fields `jit` may trace, batch and differentiate.
+
+        @value
+        class Threshold:
+            largest: float = 0.8
+            kind: str = field(default="l2", metadata={"static": True})
+
+    Fields are leaves, or subtrees; those with the metadata `static` (a word, a flag, a capacity: what chooses the
+    program) are compared instead, and must be hashable. A whole number in a field whose default is a `float` is one.
+    Unflattening calls no `__init__`.
+
+    `jax.tree_util.register_dataclass` registers the same, but up to jaxlib 0.10 at least its nodes are compared without
+    their class: `jit` takes one class's program for another's, by the luck of the hashes.
+    """
+    made: Any = cls if is_dataclass(cls) and "__dataclass_fields__" in vars(cls) else dataclass(frozen=True)(cls)
+    static = [f.name for f in fields(made) if f.metadata.get("static")]
+    dynamic = [f.name for f in fields(made) if not f.metadata.get("static")]
+    floats = {f.name for f in fields(made) if isinstance(f.default, float)}
+    keys = [jax.tree_util.GetAttrKey(name) for name in dynamic]
+
+    def child(self: Any, name: str) -> Any:
+        found = getattr(self, name)
+        return float(found) if type(found) is int and name in floats else found
+
+    def flatten(self: Any) -> tuple[list[Any], tuple[Any, ...]]:
+        return [child(self, name) for name in dynamic], tuple(getattr(self, name) for name in static)
+
+    def flatten_with_keys(self: Any) -> tuple[list[tuple[Any, Any]], tuple[Any, ...]]:
+        children, chosen = flatten(self)
+        return list(zip(keys, children, strict=True)), chosen
+
+    def unflatten(chosen: tuple[Any, ...], children: Any) -> Any:
+        self = object.__new__(made)
+        for name, content in (*zip(static, chosen, strict=True), *zip(dynamic, children, strict=True)):
+            object.__setattr__(self, name, content)
+        return self
+
+    jax.tree_util.register_pytree_with_keys(made, flatten_with_keys, unflatten, flatten)
+    return made
+
+
+@value
 class Features:
     """Local features of one image.
 
@@ -33,8 +76,7 @@ class Features:
     image_size: Array  # [..., 2]
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@value
 class Matches:
     """Putative matches between a query image (0) and a candidate (1).
 
@@ -58,14 +100,19 @@ class Matches:
     scores0: Array  # [..., K]
     scores1: Array  # [..., K]
     mask: Array  # [..., K]
-    image_size0: Array  # [..., 2]
-    image_size1: Array  # [..., 2]
+    image_size0: Array = field(metadata={"per_pair": True})  # [..., 2]
+    image_size1: Array = field(metadata={"per_pair": True})  # [..., 2]
     ratio: Array | None = None  # [..., K]
     confidence: Array | None = None  # [..., K]
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+def per_match(matches: Matches) -> dict[str, Array]:
+    """The fields with a value for every match, `[..., K, ...]` by name: those that are there, but for the mask."""
+    names = [f.name for f in fields(matches) if f.name != "mask" and not f.metadata.get("per_pair")]
+    return {name: found for name in names if (found := getattr(matches, name)) is not None}
+
+
+@value
 class Shortlist:
     """The filter's best candidates for each query.
 
@@ -80,8 +127,7 @@ class Shortlist:
     mask: Array  # [Q, C]
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@value
 class Ranking:
     """A re-ranked shortlist.
 

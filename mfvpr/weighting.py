@@ -1,25 +1,19 @@
 """Match weights (paper, section IV-B): values that map one pair's Matches to one weight per slot.
 
 What they return on padding is arbitrary; `match_weights` is the form that scorers use.
-
-A weight without numbers is registered as static: to `jit`, pytrees of different classes without leaves look alike
-(jaxlib 0.10), and one weight's program would now and then be used for another.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 
 from mfvpr.numerics import as_float, masked
-from mfvpr.types import Array, Matches
+from mfvpr.types import Array, Matches, value
 
 Weight = Callable[[Matches], Array]
 
 
-@jax.tree_util.register_static
-@dataclass(frozen=True)
+@value
 class FeatureScoreWeight:
     """FS-weight: w = scores0 + scores1, in units of the detector's scores."""
 
@@ -27,8 +21,7 @@ class FeatureScoreWeight:
         return matches.scores0 + matches.scores1
 
 
-@jax.tree_util.register_static
-@dataclass(frozen=True)
+@value
 class DescriptorDistanceWeight:
     """DMF-weight: w = 2 - distance, in [0, 2]."""
 
@@ -36,8 +29,7 @@ class DescriptorDistanceWeight:
         return 2.0 - matches.distance
 
 
-@jax.tree_util.register_static
-@dataclass(frozen=True)
+@value
 class UnitWeight:
     """w = 1: every match counts the same."""
 
@@ -45,8 +37,7 @@ class UnitWeight:
         return jnp.ones_like(matches.distance)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@value
 class ChosenWeight:
     """One of several weights, by its number: so the kind of weight may be traced and batched like a parameter."""
 

@@ -1,21 +1,19 @@
 """A match weight that is learned: a small network of what is known about one match."""
 
 import math
-from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mfvpr.numerics import as_float, masked
-from mfvpr.types import Array, Matches
+from mfvpr.types import Array, Matches, value
 
 FEATURE_NAMES = ("scores0", "scores1", "distance", "ratio", "x0", "y0", "x1", "y1")
 _UNIT_BIAS = math.log(math.e - 1)  # softplus of it is 1
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@value
 class LearnedWeight:
     """w = softplus(v . tanh(z M + b) + c) of the standardized inputs z of a match; above 0, dimensionless.
 

@@ -1,17 +1,16 @@
 """A linear projection of local descriptors to fewer dimensions."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mfvpr.numerics import masked, safe_sqrt
-from mfvpr.types import Array, Features
+from mfvpr.types import Array, Features, value
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@value
 class Projection:
     """x -> x M / |x M|; a descriptor that M annihilates, and padding, become 0.
 

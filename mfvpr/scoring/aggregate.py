@@ -1,6 +1,6 @@
 """Aggregated score (paper, section III-C): every match counts, less so the further its shift is from the mean."""
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import jax
 import jax.numpy as jnp
@@ -8,12 +8,11 @@ import jax.numpy as jnp
 from mfvpr.numerics import masked, masked_mean, masked_median, positive, safe_sqrt
 from mfvpr.scoring.choices import check_choices, choice
 from mfvpr.scoring.shifts import image_sizes, match_shifts
-from mfvpr.types import Array, Matches
+from mfvpr.types import Array, Matches, value
 from mfvpr.weighting import DescriptorDistanceWeight, Weight, match_confidence, match_weights
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@value
 class AggregatedScore:
     """s = sum_k w_k ((W - |x_k - mean x|)^2 + (H - |y_k - mean y|)^2) over the shifts, in weight x px^2.
 

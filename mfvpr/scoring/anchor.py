@@ -5,7 +5,7 @@ for cells of the second; the winner is the cell's match. A cell's displacement i
 paper's ||((i, j) - (k, l)) - (m_ij - m_kl)|| is the distance of two displacements. Lengths are cells.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import jax
 import jax.numpy as jnp
@@ -13,14 +13,13 @@ import jax.numpy as jnp
 from mfvpr.numerics import as_float, masked, positive, safe_sqrt
 from mfvpr.scoring.choices import check_choices, choice
 from mfvpr.scoring.shifts import image_sizes
-from mfvpr.types import Array, Matches
+from mfvpr.types import Array, Matches, value
 from mfvpr.weighting import FeatureScoreWeight, Weight, match_confidence, match_weights
 
 _LEAST_SHARE = 1e-12  # of the winner's votes, below which a target has none: keeps the logarithm's gradient finite
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@value
 class AnchorPoints:
     """s = sum over anchor cells a of w_a sum over cells b in the window of max(tolerance - |d_a - d_b|, 0).
 

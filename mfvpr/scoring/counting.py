@@ -1,16 +1,12 @@
 """The number of matches as a score, the re-ranking of SelaVPR (Lu et al., ICLR 2024)."""
 
-from dataclasses import dataclass
-
-import jax
 import jax.numpy as jnp
 
-from mfvpr.types import Array, Matches
+from mfvpr.types import Array, Matches, value
 from mfvpr.weighting import match_confidence
 
 
-@jax.tree_util.register_static  # no numbers; see weighting
-@dataclass(frozen=True)
+@value
 class MatchCount:
     """Number of matches, each counted with its confidence.
 

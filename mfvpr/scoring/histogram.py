@@ -5,7 +5,7 @@ product, `votes_y [By, K] @ votes_x [Bx, K]^T`, instead of K x By x Bx exponenti
 """
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -15,7 +15,7 @@ import numpy as np
 from mfvpr.numerics import is_concrete, masked, positive
 from mfvpr.scoring.choices import check_choices, choice
 from mfvpr.scoring.shifts import image_sizes, match_shifts
-from mfvpr.types import Array, Matches
+from mfvpr.types import Array, Matches, value
 from mfvpr.weighting import FeatureScoreWeight, Weight, match_weights
 
 TRACED_MAX_BINS = 64  # capacity where nobody set one and the values are traced: 10.5 px bins at 336 px
@@ -34,8 +34,7 @@ class ShiftHistogram(NamedTuple):
     centers_y: Array
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@value
 class HistogramOfShifts:
     """s_ij = sum_k w_k exp(-((x_k - x_ij)^2 + (y_k - y_ij)^2) / (2 sigma^2)); the score is the maximum over bins.
 

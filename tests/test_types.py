@@ -1,0 +1,100 @@
+"""`value`: dataclasses that jit tells apart, whatever they hold."""
+
+from dataclasses import FrozenInstanceError, dataclass, field, fields
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mfvpr
+from mfvpr.types import per_match
+from tests.builders import random_matches
+
+
+def one_number(factor):
+    """A scorer class of its own, as users write them by the dozen: one number, `factor` times which is its score."""
+
+    class Score:
+        number: float = 1.0
+
+        def __call__(self, matches):
+            return factor * self.number * jnp.any(matches.mask).astype(jnp.float32)
+
+    Score.__annotations__ = {"number": float}
+    Score.__name__ = Score.__qualname__ = f"Score{factor}"
+    return mfvpr.value(Score)
+
+
+def test_jit_never_takes_one_class_for_another():
+    evaluate = jax.jit(lambda scorer, matches: scorer(matches))
+    matches = random_matches(np.random.default_rng(0), 3)
+    wrong = [factor for factor in range(400) if evaluate(one_number(factor)(), matches) != factor]
+    assert wrong == []
+
+
+def test_nor_do_grids_and_candidates():
+    matches = jax.tree.map(lambda leaf: leaf[None], random_matches(np.random.default_rng(0), 3))
+    for factor in range(60):
+        scorer = one_number(factor)()
+        np.testing.assert_array_equal(mfvpr.score_grid(scorer, matches, number=[1.0, 2.0])[:, 0], [factor, 2 * factor])
+        assert mfvpr.score_candidates(scorer, matches) == factor
+
+
+def test_classes_without_leaves_are_told_apart_too():
+    @mfvpr.value
+    class First:
+        pass
+
+    @mfvpr.value
+    class Second:
+        pass
+
+    assert jax.tree.structure(First()) != jax.tree.structure(Second())
+    assert jax.tree.structure(First()) == jax.tree.structure(First())
+
+
+@mfvpr.value
+class Example:
+    number: float = 1.0
+    count: int = 3
+    inner: object = mfvpr.HistogramOfShifts(sigma=10.0)
+    kind: str = field(default="a", metadata={"static": True})
+
+
+def test_leaves_keep_their_types_and_floats_given_as_whole_numbers_are_floats():
+    leaves, structure = jax.tree.flatten(Example(number=2, count=5))
+    assert leaves[:2] == [2.0, 5]
+    assert [type(leaf) for leaf in leaves[:2]] == [float, int]
+    assert jax.tree.unflatten(structure, leaves) == Example(number=2.0, count=5)
+    assert structure != jax.tree.structure(Example(kind="b"))
+    paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(Example())]
+    assert paths[:3] == [".number", ".count", ".inner.bin_size"]
+
+
+def test_values_are_frozen_and_equal_by_content():
+    with pytest.raises(FrozenInstanceError):
+        Example().number = 2.0
+    assert Example() == Example()
+    assert Example(number=2.0) != Example()
+
+
+def test_a_dataclass_may_be_registered_as_it_is():
+    @mfvpr.value
+    @dataclass
+    class Mutable:
+        number: float = 1.0
+
+    made = Mutable()
+    made.number = 4.0
+    assert jax.tree.leaves(made) == [4.0]
+
+
+def test_every_field_of_matches_is_of_a_match_or_of_the_pair():
+    """A field that is added must not be lost by stores and batches, which go by `per_match`."""
+    matches = random_matches(np.random.default_rng(0), 5, capacity=8)
+    sizes = {"image_size0", "image_size1"}
+    assert set(per_match(matches)) == {f.name for f in fields(matches)} - sizes - {"mask"}
+    assert all(len(values) == 8 for values in per_match(matches).values())
+    without = mfvpr.Matches(**{f.name: getattr(matches, f.name) for f in fields(matches) if f.name != "ratio"})
+    assert "ratio" not in per_match(without)
