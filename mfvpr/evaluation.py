@@ -26,8 +26,11 @@ def radius_positives(query_xy: np.ndarray, database_xy: np.ndarray, *, radius: f
     query_xy, database_xy = np.asarray(query_xy, np.float64), np.asarray(database_xy, np.float64)
     positives = np.zeros((len(query_xy), len(database_xy)), bool)
     if positives.size:
-        for row, near in zip(positives, KDTree(database_xy).query_ball_point(query_xy, radius), strict=True):
-            row[near] = True
+        tree = KDTree(database_xy)
+        for row, xy in zip(
+            positives, query_xy, strict=True
+        ):  # one by one: as lists, all neighbors take eight times that
+            row[tree.query_ball_point(xy, radius)] = True
     return positives
 
 
