@@ -198,7 +198,7 @@ def test_a_long_file_of_labels_is_read_in_seconds(tmp_path):
 
 def test_positives_take_little_more_than_themselves():
     """Nordland has 27,592 frames on each side: eight bytes for each pair would be 6 GB, of which there were two."""
-    number = 2000
+    number = 600
     rows = FrameTruth(tuple((row,) for row in range(number)), number)
     places = RadiusTruth(*2 * [np.stack([np.arange(number), np.zeros(number)], axis=1)])
     for positives, expected in (
@@ -212,7 +212,7 @@ def test_positives_take_little_more_than_themselves():
             peak = tracemalloc.get_traced_memory()[1]
         finally:
             tracemalloc.stop()
-        assert peak < 1.2 * number**2
+        assert peak < 1.5 * number**2
         assert found.sum() == expected
 
 
