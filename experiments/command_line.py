@@ -24,6 +24,7 @@ from experiments.launch import CONF, Program
 from experiments.settings import SettingsError, check
 
 PATHS = {"dataset.database", "dataset.queries", "dataset.root", "dataset.index_file", "dataset.cache"}
+PATHS |= {"dataset.database_labels", "dataset.query_labels"}
 PATHS |= {"store", "out", "checkpoints"}
 MULTIRUN = ("-m", "--multirun")
 _NAME = r"[A-Za-z_][\w/@]*(?:\.\w+)*"  # of a setting, or of a group

@@ -10,6 +10,7 @@ from experiments import truth
 from experiments.settings import SettingsError
 from mfvpr import sweeping
 from mfvpr.data.datasets import Dataset
+from mfvpr.data.ground_truth import Unit, threshold_words
 from mfvpr.statistics import bootstrap_interval
 from mfvpr.sweeping import Half
 from mfvpr.types import Shortlist
@@ -30,7 +31,7 @@ class Judge:
     """
 
     thresholds: Sequence[float]
-    unit: str
+    unit: Unit
     positives: Sequence[np.ndarray]
     halves: Sequence[Half]
     views: Sequence[np.ndarray]
@@ -49,7 +50,7 @@ class Judge:
 
     def label(self, k: int, threshold: float) -> str:
         """R@K and what counts, for tables."""
-        return truth.label(k, threshold, self.unit)
+        return f"R@{k}{threshold_words(self.unit, threshold)}"
 
     def recall(self, rows: np.ndarray, k: int = 1) -> np.ndarray:
         """`[S, thresholds]` recall at k of all queries, of rows `[S, Q, depth]`."""
@@ -84,7 +85,7 @@ def judge(settings: dict[str, Any], dataset: Dataset) -> Judge:
     """Before matching: what is wrong with the ground truth is told early."""
     if dataset.truth is None:
         raise SettingsError(
-            "dataset.ground_truth=none: choosing settings needs a ground truth; set order, index or utm"
+            "dataset.ground_truth=none: choosing settings needs a ground truth; set order, index, utm or label"
         )
     thresholds = truth.thresholds(settings, dataset.truth)
     positives = [dataset.truth.positives(threshold) for threshold in thresholds]

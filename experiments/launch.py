@@ -17,7 +17,6 @@ from experiments.errors import leave, on_interrupt, one_line, unwind_on_sigterm
 
 Program = Callable[[], Callable[[dict[str, Any]], None]]  # imports the job, which takes a while, and returns it
 CONF = Path(__file__).parent.parent / "conf"
-FOLDERS = ("MFVPR_CACHE", "MFVPR_WEIGHTS")  # variables that name a folder
 
 
 def launch(program: Program, config: str = "config") -> None:
@@ -35,9 +34,8 @@ def launch(program: Program, config: str = "config") -> None:
             print(help_text.help_text(config, sys.argv[1:]))
         else:
             warnings.filterwarnings("ignore", "A worker stopped")  # joblib renews one that has grown; no job is lost
-            for name in FOLDERS:
-                if not os.environ.get(name):  # empty is unset, and not the root of the file system
-                    os.environ.pop(name, None)
+            if not os.environ.get("MFVPR_CACHE"):  # empty is unset, or the cache would be the root of the file system
+                os.environ.pop("MFVPR_CACHE", None)
             from experiments import command_line
 
             command_line.run(program, config)

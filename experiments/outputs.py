@@ -13,7 +13,8 @@ from experiments.run_folder import Figure
 from experiments.settings import SettingsError
 from mfvpr.data.datasets import Dataset, ImageFolder
 from mfvpr.data.files import write_text
-from mfvpr.data.images import read_image, resize
+from mfvpr.data.ground_truth import Unit, threshold_words
+from mfvpr.data.images import resize
 from mfvpr.evaluation import recall_at_k
 from mfvpr.features import LocalExtractor
 from mfvpr.pipeline import FeatureSet, MatchSet, explain
@@ -23,6 +24,8 @@ from mfvpr.report.rankings import Rankings, write_failures, write_predictions
 from mfvpr.report.tables import Table
 from mfvpr.scoring import HistogramOfShifts, Scorer
 from mfvpr.types import Shortlist
+
+_THRESHOLDS: dict[Unit, str] = {"frames": "tolerance", "m": "radius"}  # their names in results
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,7 @@ class Outcome:
     systems: dict[str, System]
     seconds: dict[str, float]
     fingerprint: dict[str, str]  # of the images
-
+    reading: dict[str, Any]  # what it did to them
     shown: int | list[int]  # figures: how many, or of which queries
 
     @cached_property
@@ -117,13 +120,16 @@ def result_rows(outcome: Outcome) -> list[dict[str, Any]]:
         "dataset": outcome.dataset.name,
         "data_fingerprint": outcome.fingerprint,
         "ground_truth": truth.described(settings, outcome.dataset),
+        "reading": outcome.reading,
         "seconds": outcome.seconds,
         "versions": runs.versions(),
     }
     judged: list[tuple[dict[str, float], dict[str, dict[str, float]]]] = [({}, {})]
     if found is not None:
-        name = "tolerance" if found.unit == "frames" else "radius"
-        judged = [({name: value}, _recall(outcome, found.positives(value))) for value in outcome.thresholds]
+        name = _THRESHOLDS.get(found.unit)
+        judged = [
+            ({name: value} if name else {}, _recall(outcome, found.positives(value))) for value in outcome.thresholds
+        ]
     return [
         {"system": name, "scorer": system.scorer, "parameters": system.parameters, **threshold,
          "recall_at": recall.get(name, {}), **common}
@@ -150,8 +156,8 @@ def recall_table(rows: list[dict[str, Any]]) -> Table:
 
     def cells(found: list[dict[str, Any]]) -> list[tuple[str, str]]:
         def label(row: dict[str, Any], k: str) -> str:
-            unit = row["ground_truth"]["unit"]
-            return truth.label(k, row["tolerance" if unit == "frames" else "radius"], unit)
+            threshold = next((row[name] for name in _THRESHOLDS.values() if name in row), 0)
+            return f"R@{k}{threshold_words(row['ground_truth']['unit'], threshold)}"
 
         first = [(row, k) for row in found for k in list(row["recall_at"])[:1]]
         others = [(found[middle], k) for k in list(found[middle]["recall_at"])[1:]]
@@ -245,7 +251,7 @@ def _right_answer(outcome: Outcome, query: int) -> list[Answer]:
 
 def _image(outcome: Outcome, folder: ImageFolder, row: int) -> np.ndarray:
     size, interpolation = outcome.extractor.image_size, outcome.extractor.interpolation
-    return resize(read_image(folder.paths[row]), size, interpolation)
+    return resize(folder.read(row), size, interpolation)
 
 
 def _shown(outcome: Outcome) -> dict[int, str]:

@@ -35,7 +35,7 @@ def _outcome(settings: dict[str, Any]) -> Outcome:
         systems = _systems(settings, scorers, matches, made.candidates)
     return Outcome(
         settings, images.dataset, made.extractor, made.database, made.queries, made.candidates, matches, scorers,
-        systems, watch.seconds, images.fingerprints, shown,
+        systems, watch.seconds, images.fingerprints, images.reading, shown,
     )  # fmt: skip
 
 

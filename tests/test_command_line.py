@@ -1,6 +1,5 @@
 """Command lines as they are typed: help, groups, mistakes, and Ctrl-C before anything has begun."""
 
-import os
 import re
 import signal
 import subprocess
@@ -9,7 +8,7 @@ import sys
 import pytest
 
 from experiments import groups, settings
-from experiments.launch import CONF, launch, version
+from experiments.launch import CONF, version
 from mfvpr import pipeline
 from tests.programs import typed
 from tests.test_experiments import ROOT, composed, run
@@ -115,17 +114,6 @@ def test_mistakes_are_one_line_and_leave_nothing(tmp_path, monkeypatch, capsys, 
 
 def test_bins_have_the_library_s_limit():
     assert settings.MAX_BINS == pipeline.MAX_BINS
-
-
-def test_an_empty_variable_is_unset(monkeypatch):
-    found = []
-    monkeypatch.setenv("MFVPR_CACHE", "")
-    monkeypatch.setenv("MFVPR_WEIGHTS", "")
-    monkeypatch.setattr(sys, "argv", ["evaluate"])
-    launch(lambda: found.append)
-    assert found[0]["store"] == "~/.cache/mfvpr/features"
-    assert found[0]["dataset"]["cache"] == "~/.cache/mfvpr"
-    assert "MFVPR_WEIGHTS" not in os.environ
 
 
 def test_a_device_that_is_not_there_is_one_line():

@@ -108,7 +108,7 @@ def test_heading_and_tables_say_the_same(evaluated, capsys):
     truth = found[0]["ground_truth"]
     assert (truth["kind"], truth["unit"], truth["thresholds"]) == ("index", "frames", [0, 1])
     heading, _, *table = (evaluated / "table.md").read_text().splitlines()
-    assert heading.endswith(f"recall in %, within 0, 1 frames of the ground truth ({truth['file']})")
+    assert heading.endswith(f"recall in %, within 0, 1 frames of the ground truth: {truth['files'][0]}")
     latex = (evaluated / "table.tex").read_text()
     assert latex.startswith(f"% {heading}\n")
     for line in rows(evaluated / "table.csv"):

@@ -91,7 +91,7 @@ def test_every_file_tells_the_same(swept):
     assert found["ground_truth"]["kind"] == "index"
     assert found["ground_truth"]["thresholds"] == [0, 1]
     heading = (out / "summary.txt").read_text().splitlines()[0]
-    assert f"within 0, 1 frames of the ground truth ({found['ground_truth']['file']})" in heading
+    assert f"within 0, 1 frames of the ground truth: {found['ground_truth']['files'][0]}" in heading
     assert (out / "table.md").read_text().startswith(f"{heading}\n\n|")
     assert (out / "table.tex").read_text().startswith(f"% {heading}\n\\begin")
     assert (found["unit"], found["thresholds"], found["ks"]) == ("frames", [0, 1], [1, 5])
