@@ -18,11 +18,12 @@ def defaults(file: Path) -> list[Any]:
 
 
 def groups(config: str) -> dict[str, str | None]:
-    """Group -> the choice that is made where the user makes none, of a program."""
+    """Group -> the choice that is made where the user makes none, of a program; `${scorer}` = that group's."""
     found: dict[str, str | None] = {}
     for entry in defaults(CONF / f"{config}.yaml"):
         if isinstance(entry, dict):
-            found |= {group: choice for group, choice in entry.items() if (CONF / group).is_dir()}
+            entries = {group.removeprefix("optional "): choice for group, choice in entry.items()}
+            found |= {group: choice for group, choice in entries.items() if (CONF / group).is_dir()}
         elif entry != "_self_":
             found |= groups(entry)
     return found
@@ -42,7 +43,9 @@ def check_choice(name: str, value: str, config: str) -> None:
         config: of the program.
     """
     known, own = choices(name), groups(config)
-    if known and name not in own:
+    if name not in own and not {*value.split(",")} & {*known}:
+        return
+    if name not in own:
         others = [program for other, program in PROGRAMS.items() if name in groups(other)]
         typed = " or ".join(f"python -m experiments.{program} {name}={value}" for program in others)
         raise SettingsError(f"{name}={value}: experiments.{PROGRAMS[config]} has no group {name}; type {typed}")

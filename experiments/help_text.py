@@ -19,6 +19,9 @@ def help_text(config: str, arguments: Sequence[str]) -> str:
     made = groups(config)
     chosen = made | {group: typed[group] for group in _WHOLE if group in typed and group in made}
     chosen |= _overridden(chosen) | {group: choice for group, choice in typed.items() if group in made}
+    for group, choice in chosen.items():
+        if choice and choice.startswith("${"):
+            chosen[group] = chosen[choice[2:-1]]
     return "\n".join([*_parts(config, chosen)])
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from experiments import groups, settings
 from experiments.launch import CONF, version
-from mfvpr import pipeline
+from mfvpr.scoring import histogram
 from tests.programs import typed
 from tests.test_experiments import ROOT, composed, run
 
@@ -113,7 +113,7 @@ def test_mistakes_are_one_line_and_leave_nothing(tmp_path, monkeypatch, capsys, 
 
 
 def test_bins_have_the_library_s_limit():
-    assert settings.MAX_BINS == pipeline.MAX_BINS
+    assert settings.MAX_BINS == histogram.MAX_BINS
 
 
 def test_a_device_that_is_not_there_is_one_line():

@@ -168,10 +168,11 @@ def test_without_a_store(root, sweep, tmp_path):
 
 
 def test_where_the_combined_score_decides_every_setting_is_combined(sweep, swept, tmp_path):
-    found = sweep(tmp_path / "out", "grid.sigma=[10]", "grid.weight=[unit]", "final=combined", "fusion.c=2")
-    assert found["own"] == {"sigma": 22.5, "weight": "fs", "c": 2}
-    own = {"sigma": 10, "weight": "unit", "c": 2}
-    assert recall_of(found, **own) == recall_of(swept[1], **own) != recall_of(swept[1], **own | {"c": 0})
+    found = sweep(tmp_path / "final", "grid.sigma=[10]", "final=combined", "fusion.c=100")
+    given = sweep(tmp_path / "given", "grid.sigma=[10]", "grid.c=[0,100]", "fusion.c=100")
+    assert found["own"] == {"sigma": 22.5, "c": 100}
+    combined, alone = (recall_of(given, sigma=10, c=c) for c in (100, 0))
+    assert recall_of(found, sigma=10, c=100) == combined != alone
 
 
 def test_other_scores_and_their_axes(sweep, swept, tmp_path):
@@ -253,7 +254,10 @@ def test_mistakes_are_one_line_and_exit_code_2(root, tmp_path, monkeypatch, caps
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["grid.bin_size=[15,0.01]"], "bin_size=0.01: expected at most 1024 bins per axis, these images need 32000"),
+        (
+            ["grid.bin_size=[15,0.01]"],
+            "bin_size=0.01: expected at most 1024 bins per axis, images of this size need 32000",
+        ),
         ([SIGMA, "scorer.max_bins=3"], "scorer.max_bins=3: expected null, or at least 22"),
         (["search=optuna", "grid.bin_size=[0.1,5]"], "bin_size=0.1: expected at most 1024 bins"),
     ],
