@@ -60,7 +60,7 @@ def test_a_job_waits_for_the_matches_of_another_and_a_single_run_does_not(root, 
     overrides = *small(root), SIGMA
     settings = composed(*overrides, config="sweep")
     recipe = stores.matches_recipe(settings, prepare.images(settings).fingerprints, CANDIDATES)
-    path = stores.matches_path(settings["store"], prepare.matches_name(settings), recipe)
+    path = stores.matches_path(settings["store"], recipe)
     taken, told = threading.Event(), threading.Event()
 
     def another():
