@@ -43,7 +43,6 @@ HOMES = {
     "omegaconf": set(),
     "torch": {"weights"},  # the checkpoint reader
     "flax": {"models", "weights", "features"},
-    "tensorstore": {"data"},
     "safetensors": {"weights"},
     "tqdm": set(),
     "optax": {"learning"},
