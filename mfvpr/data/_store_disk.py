@@ -28,9 +28,8 @@ def locked(folder: Path, content: str, waiting: Callable[[str], None] | None = N
         with suppress(OSError):  # a full disk; the lock holds without its owner's name
             os.ftruncate(handle, 0)
             os.write(handle, str(os.getpid()).encode())
-        try:
-            yield
-        finally:
+        yield
+        with suppress(OSError):
             os.ftruncate(handle, 0)
     finally:
         os.close(handle)

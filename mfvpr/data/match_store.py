@@ -7,7 +7,7 @@
 
 A row store (`mfvpr.data.row_store`) that gives back the very same bits. Its rows are the fields of QueryMatches, and
 those of its Matches that are there, by their names. They are compressed, since points of the query come again with
-every candidate: a match takes 21 bytes of the 32 that it has.
+every candidate: a match takes about 23 bytes of the 32 that it has.
 """
 
 from collections.abc import Callable, Mapping

@@ -242,11 +242,11 @@ def kill_rounds(root: str, kind: str, rounds: int) -> None:
     print(json.dumps(told))
 
 
-@pytest.mark.parametrize(("kind", "rounds", "torn"), [("features", 50, 5), ("matches", 30, 3)])
-def test_killed_processes_end_in_the_same_files(tmp_path, kind, rounds, torn):
+@pytest.mark.parametrize(("kind", "rounds"), [("features", 50), ("matches", 30)])
+def test_killed_processes_end_in_the_same_files(tmp_path, kind, rounds):
     told = json.loads(run_here(f"kill_rounds({str(tmp_path)!r}, {kind!r}, {rounds})"))
     assert told["killed"] == rounds
-    assert told["torn"] >= torn  # kills in the middle of writing, as the files show
+    assert told["torn"] > 0  # kills in the middle of writing, as the files show
     assert (told["failed"], told["twice"], told["different"]) == (0, 0, 0)
 
 
