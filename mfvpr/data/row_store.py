@@ -56,7 +56,7 @@ class RowStore(Generic[Item]):
     _writable: bool = field(repr=False)
     _pack: Callable[[Item], Parts] = field(repr=False)
     _unpack: Callable[[Parts], Item] = field(repr=False)
-    _layout: dict[str, Any] | None = field(default=None, repr=False)
+    _layout: dict[str, str] | None = field(default=None, repr=False)
 
     @property
     def done(self) -> np.ndarray:
@@ -88,8 +88,8 @@ class RowStore(Generic[Item]):
             raise ValueError(f"{self.folder}: was complete, so it is open for reading; open it again to write")
         rows = {row: self._packed(row, item) for row, item in items.items()}
         self._check_layouts(rows)
-        sizes = [row_bytes(sum(part.nbytes for part in parts.values()), len(parts)) for parts in rows.values()]
-        with told(self.folder, self.kind.content, int(np.sum(~self.done) * np.mean(sizes))):
+        taken = [row_bytes(sum(part.nbytes for part in parts.values()), len(parts)) for parts in rows.values()]
+        with told(self.folder, self.kind.content, int(np.sum(~self.done) * np.mean(taken))):
             for _ in ordered_map(self._write_row, rows.items(), workers=THREADS):
                 pass
 
@@ -143,16 +143,19 @@ class RowStore(Generic[Item]):
 
     def _check_layouts(self, rows: Mapping[int, Parts]) -> None:
         """What one row has, all have: nothing is lost, or made up, where rows are put together."""
-        if self._layout is None:
-            found = (self._read_parts(self._path(row, self.counts[row])) for row in np.flatnonzero(self.done).tolist())
-            self._layout = next((_layout(parts) for parts in found if parts), None)
-        for row, parts in rows.items():
-            self._layout = self._layout or _layout(parts)
-            if differs := difference(_layout(parts), self._layout):
+        layouts = {row: layout_of(parts) for row, parts in rows.items()}
+        expected = self._layout or self._stored_layout() or next(iter(layouts.values()))
+        for row, layout in layouts.items():
+            if differs := difference(layout, expected):
                 raise InputError(
                     f"{self.folder}: row {row}: {differs} as in the other {self.kind.rows}; choose another path, or "
                     "delete this folder"
                 )
+        self._layout = expected
+
+    def _stored_layout(self) -> dict[str, str] | None:
+        found = (self._read_parts(self._path(row, self.counts[row])) for row in np.flatnonzero(self.done).tolist())
+        return next((layout_of(parts) for parts in found if parts), None)
 
     def _remove(self, damaged: Mapping[int, Path]) -> str:
         """What is told of damaged rows, which are no longer done."""
@@ -241,6 +244,6 @@ def _counts(folder: Path, num_rows: int, *, known: bool = True) -> np.ndarray:
     return counts
 
 
-def _layout(parts: Parts) -> dict[str, Any]:
+def layout_of(parts: Parts) -> dict[str, str]:
     """What rows have in common: names, types and lengths of axes but for the first."""
     return {name: f"{part.dtype}{list(part.shape[1:])}" for name, part in parts.items()}
