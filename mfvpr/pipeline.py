@@ -124,8 +124,8 @@ def match(
 def _stored(store: MatchStore, candidates: Shortlist) -> dict[int, QueryMatches]:
     """What the store holds of these candidates, by row."""
     found = dict(store.read())
-    same = all(np.array_equal(one.indices, candidates.indices[row]) for row, one in found.items())
-    if candidates.indices.shape != tuple(store.sizes.values()) or not same:
+    same_shape = candidates.indices.shape == tuple(store.sizes.values())
+    if not same_shape or any((one.indices != candidates.indices[row]).any() for row, one in found.items()):
         raise InputError(
             f"{store.folder}: expected matches of these candidates, got those of another shortlist; choose another "
             "path, or delete this folder"

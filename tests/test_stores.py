@@ -70,7 +70,7 @@ def test_another_shortlist_is_refused_before_anything_is_written(drawn, candidat
         replace(candidates, indices=candidates.indices[:, ::-1]),
         replace(candidates, indices=np.where(np.arange(QUERIES)[:, None] == 3, 0, candidates.indices)),
         Shortlist(*(values[:, :3] for values in (candidates.indices, candidates.scores, candidates.mask))),
-        Shortlist(*(values[:5] for values in (candidates.indices, candidates.scores, candidates.mask))),
+        Shortlist(*(values[:2] for values in (candidates.indices, candidates.scores, candidates.mask))),
     ]
     for other in others:
         with opened() as store:
