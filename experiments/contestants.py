@@ -119,7 +119,7 @@ def _matched(query: Features, candidates: Features) -> Matches:
 
 
 def of_mfvpr(data: Data) -> list[Entry]:
-    """This library, called as its users call it, and under a `jit` of theirs; the bare matrix product of its matching."""
+    """This library as its users call it, and under a `jit` of theirs; the bare matrix product of its matching."""
     histogram, images = mfvpr.HistogramOfShifts(max_bins=len(CENTERS)), (data.query, data.candidates)
     pair = jax.tree.map(lambda leaf: leaf[0], data.matches)
 
