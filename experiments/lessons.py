@@ -110,8 +110,7 @@ def learn(settings: dict[str, Any]) -> None:
     judgment = judge(settings, images.dataset)
     matches, candidates = prepare.matched(settings, tools, images, watch)
     axes.require_bins(settings, varied, matches)
-    euclidean = settings["fusion"]["filter_score"] == "negative_euclidean"
-    candidates = replace(candidates, scores=pipeline.filter_scores(candidates, euclidean=euclidean))
+    candidates = replace(candidates, scores=pipeline.filter_scores(candidates, settings["fusion"]["filter_score"]))
     checkpoints = _checkpoints(settings, images, candidates, judgment)
     results = []
     with watch("learning"):
@@ -229,7 +228,7 @@ def _searched(school: School, varied: axes.Axes, spread: float, *, fused: bool) 
     matches, candidates = school.part(school.half.tune)
     rows = sweeping.sweep(
         axes.scorer(school.settings), settings, matches, candidates, views=[school.seen[school.half.tune]], depth=1,
-        by_index=school.settings["ties"] == "index", track=build.track(f"{school.name}: grid" + " + filter" * fused),
+        ties=school.settings["ties"], track=build.track(f"{school.name}: grid" + " + filter" * fused),
     )  # fmt: skip
     right = school.judge.positives[school.judge.main][school.half.tune]
     best = sweeping.best_setting(sweeping.hits(rows[0], right).mean(axis=-1), values)
