@@ -118,13 +118,15 @@ def features_recipe(settings: dict[str, Any], images: str) -> dict[str, Any]:
 def matches_recipe(settings: dict[str, Any], images: dict[str, str], num_candidates: int) -> dict[str, Any]:
     """All that changes a shortlist and its matches: features and descriptors of both sides, and the matching."""
     matching = {key: value for key, value in settings["matching"].items() if key != "chunk_size"}
-    return {
+    recipe = {
         side: {
             "features": features_recipe(settings["features"], fingerprint),
             "descriptors": features_recipe(settings["retrieval"], fingerprint),
         }
         for side, fingerprint in images.items()
     } | {"candidates": num_candidates, "matching": matching, "on_bad_image": settings["on_bad_image"]}
+    neighbors = settings["dataset"].get("exclude_neighbors")
+    return recipe if neighbors is None else recipe | {"exclude_neighbors": neighbors}
 
 
 def _account(name: str, store: FeatureStore, settings: dict[str, Any]) -> str:

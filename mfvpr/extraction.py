@@ -4,14 +4,13 @@ import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
 import numpy as np
 
 from mfvpr.data.datasets import ImageFolder
-from mfvpr.data.images import Interpolation, ordered_map, read_image, resize
+from mfvpr.data.images import Interpolation, ordered_map, resize
 from mfvpr.data.threads import available_cpus
 from mfvpr.errors import InputError
 from mfvpr.features import GlobalExtractor, LocalExtractor
@@ -191,11 +190,10 @@ def _image_batches(
     track: Track,
 ) -> Iterator[tuple[list[int], np.ndarray]]:
     """(rows, images `[B, H, W, 3]`) of the readable ones among `wanted`; the reasons of the others go into `bad`."""
-    load = partial(_load, size=extractor.image_size, interpolation=extractor.interpolation)
-    paths = folder.paths
+    load = partial(_load, folder, size=extractor.image_size, interpolation=extractor.interpolation)
 
     def readable() -> Iterator[tuple[int, np.ndarray]]:
-        images = ordered_map(load, [paths[row] for row in wanted], workers=available_cpus())
+        images = ordered_map(load, wanted, workers=available_cpus())
         for row, image in zip(wanted, track(images, len(wanted)), strict=True):
             if isinstance(image, InputError):
                 if not skip_bad:
@@ -209,9 +207,11 @@ def _image_batches(
         yield list(rows), np.stack(images)
 
 
-def _load(path: Path, *, size: tuple[int, int], interpolation: Interpolation) -> np.ndarray | InputError:
+def _load(
+    folder: ImageFolder, row: int, *, size: tuple[int, int], interpolation: Interpolation
+) -> np.ndarray | InputError:
     try:
-        return resize(read_image(path), size, interpolation)
+        return resize(folder.read(row), size, interpolation)
     except InputError as error:
         return error
 

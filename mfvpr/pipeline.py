@@ -72,9 +72,15 @@ class MatchSet:
         return np.repeat(sizes0, len(sizes1), 0), np.tile(sizes1, (len(sizes0), 1))
 
 
-def shortlist(query_descriptors: np.ndarray, database_descriptors: np.ndarray, num_candidates: int) -> Shortlist:
-    """The filter's candidates of all queries `[Q, C]`, NumPy."""
-    found = retrieval.retrieve(query_descriptors, database_descriptors, num_candidates=num_candidates)
+def shortlist(
+    query_descriptors: np.ndarray,
+    database_descriptors: np.ndarray,
+    num_candidates: int,
+    *,
+    allowed: np.ndarray | None = None,
+) -> Shortlist:
+    """The filter's candidates of all queries `[Q, C]`, NumPy, among database images `allowed` `[Q, N]`; None = all."""
+    found = retrieval.retrieve(query_descriptors, database_descriptors, num_candidates=num_candidates, mask=allowed)
     return jax.tree.map(np.asarray, found)
 
 

@@ -26,7 +26,7 @@ SIFT = Sift(max_keypoints=400)
 
 @pytest.fixture(scope="module")
 def street(small_street):
-    return folder_dataset(small_street / "database", small_street / "queries")
+    return folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,8 @@ import pytest
 
 from experiments import prepare, stores
 from mfvpr import InputError, Shortlist, pipeline
-from mfvpr.data.datasets import fingerprint, image_folder
+from mfvpr.data.contents import contents
+from mfvpr.data.datasets import image_folder
 from mfvpr.data.match_store import open_match_store
 from mfvpr.data.store_manifest import store_path
 from mfvpr.extraction import FeatureSet, _stack
@@ -104,8 +105,9 @@ def test_matching_without_a_store_is_the_same(drawn, candidates, opened):
 
 def settings_of(folder, *changes):
     return composed(
-        "dataset=folder", f"dataset.database={folder}/database", f"dataset.queries={folder}/queries", "candidates=3",
-        "features.max_keypoints=40", "features.image_size=[160,120]", "retrieval.num_words=4", *changes,
+        "dataset=folder", f"dataset.database={folder}/database", f"dataset.queries={folder}/queries",
+        "dataset.ground_truth=order", "candidates=3", "features.max_keypoints=40",
+        "features.image_size=[160,120]", "retrieval.num_words=4", *changes,
         config="sweep",
     )  # fmt: skip
 
@@ -117,7 +119,7 @@ def matches_path(settings, images=None):
 
 def test_a_store_belongs_to_images_whatever_their_data_set_is_called(small_street, tmp_path, capsys):
     folder, extractor = image_folder(small_street / "database"), Sift(max_keypoints=40)
-    settings, images = {"name": "sift", "max_keypoints": 40}, fingerprint(folder)
+    settings, images = {"name": "sift", "max_keypoints": 40}, contents(folder).fingerprint
     for name in ("summer database", "winter queries"):
         with stores.opened(str(tmp_path), name, folder, extractor, settings, images, wait=False) as store:
             assert store.done.all() == (name != "summer database")
