@@ -62,6 +62,11 @@ class Name:
         return f"{self.module}.{self.name}"
 
 
+def excerpt(text: str) -> str:
+    """What a file says, short and on one line, for a message."""
+    return repr(text if len(text) <= 60 else f"{text[:57]}...")[1:-1]
+
+
 def read_pickle(file: BinaryIO) -> Content:
     """The next pickle of a file, which then stands behind it.
 
@@ -163,7 +168,7 @@ def _storage(identity: Any) -> Storage:
 
 
 def _refused(name: Name) -> InputError:
-    return InputError(f"it asks for {str(name)[:80]}, where plain dense tensors are expected; {_MEND}")
+    return InputError(f"it asks for {excerpt(str(name))}, where plain dense tensors are expected; {_MEND}")
 
 
 def _as(kind: type, value: Any) -> Any:

@@ -403,4 +403,7 @@ def test_other_content(path):
     assert "got an empty dict" in refused_content(path, {"state_dict": {}})
     assert "expected tensors only, got str at note" in refused_content(path, {"a": np.zeros(3), "note": "text"})
     assert "expected tensors only, got Name at a" in refused_content(path, {"a": Global("os", "system")})
+    assert "got one by the number 3" in refused_content(path, {3: np.zeros(3)})
+    assert r"got str at two\nlines \x1b[2J" in refused_content(path, {"two\nlines \x1b[2J": "text"})
+    assert r"it asks for os.\x1b[2Jsystem," in refused_content(path, Call(Global("os", "\x1b[2Jsystem"), ()))
     assert len(refused_content(path, {1000 * "long": "text"})) < len(str(path)) + 150
