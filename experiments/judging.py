@@ -9,7 +9,7 @@ import numpy as np
 from experiments.settings import SettingsError
 from mfvpr import sweeping
 from mfvpr.data.datasets import Dataset
-from mfvpr.statistics import bootstrap_interval
+from mfvpr.statistics import recall_interval
 from mfvpr.sweeping import Half
 from mfvpr.types import Shortlist
 
@@ -24,8 +24,6 @@ class Judge:
         positives: `[threshold][Q, N]` bool.
         halves: where to choose and where to report; none = both on all queries.
         views: candidates `[Q, C]` bool that are ranked: all, and for each half those that choosing may see.
-        resamples: of the bootstrap.
-        seed: of the bootstrap.
     """
 
     thresholds: Sequence[float]
@@ -33,8 +31,6 @@ class Judge:
     positives: Sequence[np.ndarray]
     halves: Sequence[Half]
     views: Sequence[np.ndarray]
-    resamples: int
-    seed: int
 
     @property
     def main(self) -> int:
@@ -76,7 +72,7 @@ class Judge:
 
     def interval(self, hits: np.ndarray) -> tuple[float, float]:
         """Of the recall `[R]`, 95 %."""
-        return bootstrap_interval(hits, resamples=self.resamples, seed=self.seed)
+        return recall_interval(hits)
 
 
 def judge(settings: dict[str, Any], dataset: Dataset) -> Judge:
@@ -95,5 +91,5 @@ def judge(settings: dict[str, Any], dataset: Dataset) -> Judge:
     for half in halves:
         if not len(half.tune) or not positives[-1][half.tune].any():
             raise SettingsError(f"split={split}: no query of one half has a place far enough from the other half; "
-                                "use more queries, smaller tolerances, or split=null")  # fmt: skip
-    return Judge(thresholds, truth.unit, positives, halves, [], settings["resamples"], settings["seed"])
+                                "use more queries or smaller tolerances")  # fmt: skip
+    return Judge(thresholds, truth.unit, positives, halves, [])
