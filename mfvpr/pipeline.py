@@ -75,6 +75,7 @@ def match(
     max_distance: float | None = None,
     max_matches: int | None = None,
     chunk_size: int | None = None,
+    with_ratio: bool = False,
     store: MatchStore | None = None,
     track: Track = untracked,
 ) -> MatchSet:
@@ -88,6 +89,7 @@ def match(
         max_distance: see there.
         max_matches: see there.
         chunk_size: see there.
+        with_ratio: see there; what a store holds always has it.
         store: of these features, candidates and options. Only queries that it lacks are matched, with the ratio of
             their distances; some at a time are on disk before the next are begun; and what comes back was read from it.
         track: progress.
@@ -98,7 +100,8 @@ def match(
     options = {"cross_check": cross_check, "max_matches": max_matches, "chunk_size": chunk_size}
     if store is None:
         rows = track(range(len(queries)), len(queries))
-        return _match_set([one for _, one in _matched(queries, database, candidates, rows, max_distance, **options)])
+        found = _matched(queries, database, candidates, rows, max_distance, with_ratio=with_ratio, **options)
+        return _match_set([one for _, one in found])
     if missing := np.flatnonzero(~store.done).tolist():
         rows = track(missing, len(missing))
         found = _matched(queries, database, candidates, rows, max_distance, with_ratio=True, **options)

@@ -14,7 +14,7 @@ from mfvpr.learning.training import Fit, Record
 from tests.programs import QUERIES, results, shared, small, snapshot, typed
 from tests.test_experiments import composed
 
-SUM = ("scorer=sum", "grid.sigma=null", "grid.bin_size=null")
+SUM = ("scorer=sum",)
 SHORT = (*SUM, "split=first_half", "steps=4", "every=2", "batch=4", "learning_rate=0.05")
 ROWS = ["paper", "paper + filter", "grid search", "grid search + filter", "gradient", "gradient + filter",
         "match weights", "match weights + filter"]  # fmt: skip
@@ -225,14 +225,14 @@ def test_a_loss_that_turns_infinite_is_told(root, tmp_path, monkeypatch, capsys,
         (["split=null"], "split=null: what is learned is never reported on the same queries"),
         (["scorer=count"], "scorer=count: expected one to learn, of histogram, anchor, sum"),
         (["scorer=all"], "scorer=all: expected one to learn"),
-        (["scorer=anchor"], "grid.sigma: scorer=anchor has no such parameter"),
+        (["scorer=anchor", "grid.sigma=[10]"], "grid.sigma: scorer=anchor has no such parameter; it has window, tolerance, "),
         (["loss=hinge"], "loss=hinge: expected one of cross_entropy, recall, average_precision"),
         (["steps=0"], "steps=0: expected a whole number above 0"),
         (["learning_rate=nan"], "learning_rate=nan: expected a number above 0"),
         (["learning_rat=1"], "the nearest is learning_rate"),
         (["grid.sigma=[]"], "grid.sigma=[]: expected a list of one or more"),
         (["dataset.ground_truth=none", "dataset.index_file=null"], "choosing settings needs a ground truth"),
-        (["recall.tolerances=[30]"], "split=both: no query of one half has a place far enough"),
+        (["recall.tolerances=[30]"], "far enough from the other half; use more queries or smaller tolerances\n"),
     ],
 )
 def test_mistakes_are_one_line_and_exit_code_2(root, tmp_path, monkeypatch, capsys, arguments, words):
