@@ -28,7 +28,7 @@ __all__ = ["Explanation", "FeatureSet", "MatchSet", "Track", "describe", "explai
 
 MAX_BINS = 1024  # per axis: the histograms of 50 candidates then take 200 MB
 STORE_BATCH = 8  # queries whose matches may be lost when a run is killed
-_PER_MATCH = ("points0", "points1", "distance", "scores0", "scores1", "ratio")
+_PER_MATCH = ("points0", "points1", "distance", "scores0", "scores1", "ratio", "confidence")
 
 
 @dataclass(frozen=True)
