@@ -141,6 +141,36 @@ def test_the_papers_rows_are_an_evaluation(root, learn, untrained, tmp_path, cha
             assert found == pytest.approx(row["recall_at"]["1"], abs=1e-6)
 
 
+def rows_of(results):
+    return {row["score"]: row for row in results["rows"]}
+
+
+def test_without_a_store_the_recalls_are_the_same(learn, learned, untrained, tmp_path):
+    """Match weights, which look at the ratio, are begun as well."""
+    found = rows_of(learn(tmp_path / "out", *SHORT, "store=null"))
+    assert list(found) == ROWS
+    for name in ROWS[:4]:
+        assert found[name]["recall_at_1"] == rows_of(learned[1])[name]["recall_at_1"]
+
+
+@pytest.mark.parametrize(
+    ("axes", "names"), [(("grid.weight=[dmf]",), {"weight"}), (("grid.weight=null", "grid.c=[auto]"), {"c"})]
+)
+def test_an_axis_that_is_not_searched_has_the_scorers_own_value(learn, untrained, tmp_path, axes, names):
+    own = ("grid.c=null", "fusion.c=0.7") if names == {"weight"} else ()
+    rows = rows_of(learn(tmp_path / "out", *SUM, *own, *axes, "split=first_half", "steps=1"))
+    for filtered in ("", " + filter"):
+        found, expected = rows[f"grid search{filtered}"], rows[f"paper{filtered}"]
+        assert found["recall_at_1"] == expected["recall_at_1"]
+        assert {*found["halves"]["first_half"]["values"]} == names - ({"c"} if not filtered else set())
+
+
+def test_anchors_are_searched_over_what_they_have(learn, untrained, tmp_path):
+    rows = rows_of(learn(tmp_path / "out", "scorer=anchor", "scorer.num_bins=5", "split=first_half", "steps=1"))
+    assert {*rows["grid search"]["halves"]["first_half"]["values"]} == {"window", "tolerance", "weight"}
+    assert {*rows["gradient"]["halves"]["first_half"]["values"]} == {"tolerance", "temperature"}
+
+
 def test_an_interrupted_learning_goes_on_to_the_same_end(root, learn, learned, tmp_path, monkeypatch):
     """Interrupted in the middle of the second training."""
     saved, save = [], checkpoints.save

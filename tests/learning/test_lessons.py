@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from experiments import lessons
-from experiments.models import LOSSES
-from mfvpr import AggregatedScore, HistogramOfShifts, score_candidates
+from experiments.models import LOSSES, model
+from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, score_candidates
 from mfvpr.learning.losses import cross_entropy, mean_loss
 from mfvpr.learning.match_weight import FEATURE_NAMES
+from tests.builders import random_matches
 from tests.learning.schools import QUERIES, SIZES, TOLERANCES, school
 
 
@@ -89,3 +90,12 @@ def test_images_of_two_sizes_are_learned_from_as_one_by_one():
     assert np.all(np.isfinite(scores))
     expected = mean_loss(cross_entropy, 2 * scores / start.unit, at.right[at.learning], at.usable[at.learning])
     assert float(found) == pytest.approx(float(expected), rel=1e-4)
+
+
+def test_anchors_start_near_the_hard_score():
+    matches = [random_matches(np.random.default_rng(seed), 200) for seed in range(10)]
+    matches = jax.tree.map(lambda *leaves: np.stack(leaves), *matches)
+    start = model("it", "anchor", AnchorPoints(), 1.0, fused=None, weight=None)
+    soft = scores_of_one(start.scorer_of(start.start), matches)
+    hard = scores_of_one(AnchorPoints(temperature=None), matches)
+    assert np.median(np.abs(soft / hard - 1)) < 0.08
