@@ -13,9 +13,9 @@ import numpy as np
 from experiments import build
 from experiments.settings import SettingsError
 from mfvpr import sweeping
-from mfvpr.pipeline import MAX_BINS, MatchSet
+from mfvpr.pipeline import MatchSet
 from mfvpr.scoring import HistogramOfShifts, Scorer
-from mfvpr.sweeping.batches import image_sizes
+from mfvpr.scoring.histogram import MAX_BINS
 
 OF_MATCHES = ("max_distance", "c")  # what is no parameter of a scorer
 BYTES_PER_SETTING = 2000  # of Python's own, about
@@ -117,7 +117,7 @@ def require_bins(settings: dict[str, Any], varied: Axes, matches: MatchSet) -> N
         return
     finest = min(varied.values.get("bin_size", [own.bin_size]))
     needed = max(
-        replace(own, bin_size=finest, align=align).with_capacity(*image_sizes(matches)).max_bins or 1
+        replace(own, bin_size=finest, align=align).with_capacity(*matches.image_sizes).max_bins or 1
         for align in varied.values.get("align", [own.align])
     )
     if needed > MAX_BINS:

@@ -30,7 +30,15 @@ def one_line() -> Iterator[None]:
 
         if not isinstance(error, InputError):
             raise
-        refuse(str(error))
+        refuse(with_command(error))
+
+
+def with_command(error: Exception) -> str:
+    """The message, and where weights are to be installed, how."""
+    from experiments.weights import how_to_install
+    from mfvpr.weights.files import WeightsError
+
+    return f"{error}: {how_to_install(error.entry)}" if isinstance(error, WeightsError) else str(error)
 
 
 def refuse(reason: str) -> NoReturn:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optax
 
@@ -24,8 +23,8 @@ from mfvpr.learning.training import Fit, fit
 from mfvpr.numerics import round_up
 from mfvpr.pipeline import MatchSet
 from mfvpr.report import runs
+from mfvpr.scoring import parameters
 from mfvpr.sweeping import Half
-from mfvpr.sweeping.batches import image_sizes
 from mfvpr.types import Matches, Shortlist
 
 VALIDATION = 0.25  # of the queries to learn on, the end of their block
@@ -113,8 +112,7 @@ def learn(settings: dict[str, Any]) -> None:
     judgment = judge(settings, images.dataset)
     matches, candidates = prepare.matched(settings, tools, images, watch, with_ratio=True)
     axes.require_bins(settings, varied, matches)
-    euclidean = settings["fusion"]["filter_score"] == "negative_euclidean"
-    candidates = replace(candidates, scores=pipeline.filter_scores(candidates, euclidean=euclidean))
+    candidates = replace(candidates, scores=pipeline.filter_scores(candidates, settings["fusion"]["filter_score"]))
     checkpoints = _checkpoints(settings, images, candidates, judgment)
     results = []
     with watch("learning"):
@@ -183,7 +181,7 @@ def _start(school: School, name: str, method: str, own: Any, *, fused: bool, lea
         weight = LearnedWeight.create(seed, sample.matches, school.settings["hidden"])
     spread = _spread(school, own)
     start = 0.3 * _balance(school, spread) if fused else None
-    return model(name, method, _compilable(own, school.matches), spread, fused=start, weight=weight)
+    return model(name, method, parameters.fit(own, *school.matches.image_sizes), spread, fused=start, weight=weight)
 
 
 def _fit(school: School, start: Model, folder: Path | None, recipe: dict[str, Any]) -> Fit:
@@ -245,25 +243,14 @@ def _ranked(
     """`[S, q, 1]` the first row of some queries' rankings of the candidates that are seen, by every setting."""
     matches, candidates = school.part(queries)
     track = build.track(f"{school.name}: {name}") if len(settings) > 1 else pipeline.untracked
-    by_index = school.settings["ties"] == "index"
-    return sweeping.sweep(
-        scorer, settings, matches, candidates, views=[seen[queries]], depth=1, by_index=by_index, track=track
-    )[0]
-
-
-def _compilable(scorer: Any, matches: MatchSet) -> Any:
-    """A scorer whose numbers are arrays, with room for the bins of every image size that occurs."""
-    if isinstance(scorer, mfvpr.HistogramOfShifts):
-        scorer = scorer.with_capacity(*image_sizes(matches))
-    return jax.tree.map(
-        lambda leaf: np.float32(leaf) if jnp.issubdtype(jnp.result_type(leaf), jnp.floating) else leaf, scorer
-    )
+    views, ties = [seen[queries]], school.settings["ties"]
+    return sweeping.sweep(scorer, settings, matches, candidates, views=views, depth=1, ties=ties, track=track)[0]
 
 
 def _spread(school: School, scorer: Any) -> float:
     """Standard deviation of the scores that learning may see."""
     matches, candidates = school.part(school.learning)
-    scores = pipeline.score({"it": _compilable(scorer, school.matches)}, matches, candidates)["it"]
+    scores = pipeline.score({"it": scorer}, matches, candidates)["it"]
     return float(np.std(scores[school.seen[school.learning]])) or 1.0
 
 

@@ -45,10 +45,10 @@ def _systems(settings: dict[str, Any], scorers: dict, matches: MatchSet, candida
     group = settings["scorer"]
     parameters = {name: group if "method" in group else group[name] for name in scorers}
     combined = "histogram" if "histogram" in scorers else next(iter(scorers))
-    c, euclidean = settings["fusion"]["c"], settings["fusion"]["filter_score"] == "negative_euclidean"
+    c, filter_score = settings["fusion"]["c"], settings["fusion"]["filter_score"]
     found = {"filter": ("none", {}, candidates.scores)}
     found |= {name: (name, parameters[name], scores[name]) for name in scorers}
-    fused = pipeline.fuse(candidates, scores[combined], None if c == "auto" else c, euclidean=euclidean)
+    fused = pipeline.fuse(candidates, scores[combined], None if c == "auto" else c, filter_score=filter_score)
     found[f"{combined} + filter"] = (combined, parameters[combined] | settings["fusion"], fused)
     return {name: _system(candidates, settings["ties"], *values) for name, values in found.items()}
 

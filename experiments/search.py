@@ -56,8 +56,8 @@ def _search(
     def rows_of(written: list[dict[str, Any]], label: str) -> np.ndarray:
         return sweeping.sweep(
             scorer(settings), list(map(as_setting, written)), matches, candidates,
-            views=judgment.views, depth=max(settings["recall"]["ks"]), by_index=settings["ties"] == "index",
-            euclidean=settings["fusion"]["filter_score"] == "negative_euclidean",
+            views=judgment.views, depth=max(settings["recall"]["ks"]), ties=settings["ties"],
+            filter_score=settings["fusion"]["filter_score"],
             settings_per_block=settings["chunk"]["settings"], queries_per_block=settings["chunk"]["queries"],
             folder=kept, track=build.track(label),
         )  # fmt: skip

@@ -6,19 +6,19 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from experiments.errors import one_line, refuse, unwind_on_sigterm
+from experiments.errors import one_line, refuse, unwind_on_sigterm, with_command
 
 if TYPE_CHECKING:
     from mfvpr.weights.registry import Entry
 
 # Functions import what they need: --help and wrong usage need not wait for JAX.
-CONVERT = "python -m experiments.weights convert"
+PROGRAM = "python -m experiments.weights"
 _CHUNK = 1 << 18
 
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        refuse(f"{message}; see python -m experiments.weights --help")
+        refuse(f"{message}; see {PROGRAM} --help")
 
 
 def main() -> None:
@@ -29,13 +29,19 @@ def main() -> None:
         arguments.pop("run")(**arguments)
 
 
+def how_to_install(entry: "Entry") -> str:
+    """The command that an installation begins with."""
+    command = f"convert {shlex.quote(entry.file)}" if entry.sha256 is None else f"download {entry.name}"
+    return f"{PROGRAM} {command}"
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="python -m experiments.weights", description="Weights live in MFVPR_WEIGHTS, by default "
+    parser = _Parser(prog=PROGRAM, description="Weights live in MFVPR_WEIGHTS, by default "
                      "~/.cache/mfvpr/weights. None come with the package; each has its own license.")  # fmt: skip
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     command = commands.add_parser("list", help="all known weights, their licenses, and whether they are installed")
     command.set_defaults(run=list_weights)
-    command = commands.add_parser("convert", help="install an official checkpoint (needs torch)")
+    command = commands.add_parser("convert", help="install an official checkpoint")
     command.add_argument("file", metavar="FILE", type=Path, help="a checkpoint under its official name")
     command.add_argument("--as", dest="name", metavar="NAME", help="what FILE is, where it has another name")
     command.set_defaults(run=convert)
@@ -71,7 +77,9 @@ def convert(file: Path, name: str | None) -> None:
 
     entry = _recognized(file, name)
     path = install(file, entry.name)
-    print(f"{path}: {entry.name}, {read_manifest(entry.name).parameters:,} parameters")
+    manifest = read_manifest(entry.name)
+    rounded = f", {manifest.rounded} of its tensors rounded from float64 to float32" if manifest.rounded else ""
+    print(f"{path}: {entry.name}, {manifest.parameters:,} parameters{rounded}")
 
 
 def verify(names: Iterable[str]) -> None:
@@ -89,7 +97,7 @@ def verify(names: Iterable[str]) -> None:
         try:
             print(f"{entry.name}: {_verified(entry)}")
         except InputError as error:
-            print(f"{entry.name}: BAD, {str(error).removeprefix(f'{entry.name}: ')}")
+            print(f"{entry.name}: BAD, {with_command(error).removeprefix(f'{entry.name}: ')}")
             bad += 1
     if bad:
         refuse(f"{bad} of {len(entries)} could not be verified")
@@ -105,7 +113,7 @@ def download(name: str) -> None:
     entry = entry_of(name)
     if entry.sha256 is None:
         raise InputError(f"{name}: no hash is published, so it cannot be fetched safely; get {entry.file} from "
-                         f"{entry.source}, then: {CONVERT} {shlex.quote(entry.file)}")  # fmt: skip
+                         f"{entry.source}, then: {how_to_install(entry)}")  # fmt: skip
     target = weights_folder() / entry.file
     size = f"{entry.size:,} bytes" if entry.size else "size not published"
     print(f"{entry.file}: {entry.source}, {size}, {entry.license}", flush=True)
@@ -115,7 +123,7 @@ def download(name: str) -> None:
         _fetch(entry, target)
         print(f"{target}: downloaded, with the published hash")
     if name in NETWORKS:
-        print(f"to install it: {CONVERT} {shlex.quote(str(target))}")
+        print(f"to install it: {PROGRAM} convert {shlex.quote(str(target))}")
 
 
 def _fetch(entry: "Entry", target: Path) -> None:
@@ -195,7 +203,7 @@ def _verified(entry: "Entry") -> str:
             raise InputError(f"expected {entry.parameters:,} parameters, got {parameters:,}")
         good.append(f"{parameters:,} parameters as converted")
     if not good:
-        raise InputError(f"{original}: not there; fetch it: python -m experiments.weights download {entry.name}")
+        raise InputError(f"{original}: not there; fetch it: {how_to_install(entry)}")
     return "good, " + ", ".join(good)
 
 

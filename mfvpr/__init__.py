@@ -2,17 +2,28 @@
 
 Images become features; features become a shortlist and matches; matches become scores; scores become a ranking;
 rankings become recall. The names below are the core of that sentence, on arrays; `mfvpr.data`, `mfvpr.features`,
-`mfvpr.pipeline` and `mfvpr.report` put it to work on images and files.
+`mfvpr.pipeline` and `mfvpr.report` put it to work on images and files. `value`, `Scorer` and what follows from them is
+what a scorer of your own is written with; `mfvpr.testing.check_scorer` says whether it keeps the contract.
 """
 
 from mfvpr.errors import InputError
 from mfvpr.evaluation import frame_positives, radius_positives, recall_at_k
 from mfvpr.matching import compact, filter_matches, match, match_candidates, soft_match
+from mfvpr.numerics import masked, masked_mean, masked_median, safe_sqrt
 from mfvpr.reranking import balancing_c, combine, rank, rerank, score_candidates, score_grid
 from mfvpr.retrieval import retrieve
-from mfvpr.scoring import AggregatedScore, AnchorPoints, HistogramOfShifts, MatchCount, ShiftHistogram
+from mfvpr.scoring import (
+    AggregatedScore,
+    AnchorPoints,
+    HistogramOfShifts,
+    MatchCount,
+    Scorer,
+    ShiftHistogram,
+    image_sizes,
+    match_shifts,
+)
 from mfvpr.types import Features, Matches, Ranking, Shortlist, value
-from mfvpr.weighting import DescriptorDistanceWeight, FeatureScoreWeight, UnitWeight
+from mfvpr.weighting import DescriptorDistanceWeight, FeatureScoreWeight, UnitWeight, Weight, match_weights
 
 __version__ = "0.1.0"
 
@@ -27,21 +38,30 @@ __all__ = [
     "MatchCount",
     "Matches",
     "Ranking",
+    "Scorer",
     "ShiftHistogram",
     "Shortlist",
     "UnitWeight",
+    "Weight",
     "balancing_c",
     "combine",
     "compact",
     "filter_matches",
     "frame_positives",
+    "image_sizes",
+    "masked",
+    "masked_mean",
+    "masked_median",
     "match",
     "match_candidates",
+    "match_shifts",
+    "match_weights",
     "radius_positives",
     "rank",
     "recall_at_k",
     "rerank",
     "retrieve",
+    "safe_sqrt",
     "score_candidates",
     "score_grid",
     "soft_match",

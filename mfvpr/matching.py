@@ -1,22 +1,23 @@
 """Features of two images -> Matches: nearest neighbors, hard or soft, and filters of the matches found.
 
-The similarity matrix is the cost. It is formed once per pair, read four times while it is in cache (the maxima of its
-rows and columns, and the first place of each) and never stored for more than one chunk of candidates. `argmax` would
-read it the same number of times and take several times longer on XLA's CPU backend.
+The similarity matrix is the cost. It is formed once per pair, read once along its rows and once along its columns while
+it is in cache (see `neighbors`), and never stored for more than one chunk of candidates.
 """
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
 
-from mfvpr.numerics import as_float, masked, positive, safe_sqrt
-from mfvpr.types import Array, Features, Matches
+from mfvpr.neighbors import nearest, nearest_two
+from mfvpr.numerics import as_float, at_least_single, compiled, masked, platform, positive, safe_sqrt
+from mfvpr.types import Array, Features, Matches, per_match
 
 CrossCheck = Literal["mutual", "opencv_legacy", "none"]
-_PER_MATCH = ("points0", "points1", "distance", "scores0", "scores1", "ratio", "confidence")
+CHUNK_BYTES = 2**28  # of the similarities that exist at the same time, elsewhere than on a CPU
 
 
 def match(
@@ -33,15 +34,14 @@ def match(
             before 2019: every candidate keypoint picks its nearest query keypoint, which keeps the closest of its
             suitors. `none` keeps the nearest of every query keypoint. (The paper says cross-check.)
         with_ratio: also give the ratio of the distances to the nearest and the second nearest descriptor of the
-            candidate, matched or not (Lowe, IJCV 2004): 1 where both are 0 or there is no second. It costs another
-            pass over the similarities.
+            candidate, matched or not (Lowe, IJCV 2004): 1 where both are 0 or there is no second.
 
     Returns:
         Matches with K = N0 slots. A descriptor that is not finite matches nothing.
     """
     if cross_check not in get_args(CrossCheck):
         raise ValueError(f"cross_check={cross_check!r}: expected one of {', '.join(get_args(CrossCheck))}")
-    features0, features1 = jax.tree.map(jnp.asarray, (features0, _at_least_one(features1)))
+    features0, features1 = _ready(features0), _ready(_at_least_one(features1))
     similarity = _similarity(features0, features1)
     nearest1, valid = _neighbors(similarity, cross_check)
     return Matches(
@@ -72,7 +72,7 @@ def soft_match(features0: Features, features1: Features, *, temperature: float |
     Returns:
         Matches with K = N0 slots, real where the query has a keypoint with a finite descriptor and the candidate any.
     """
-    features0, features1 = jax.tree.map(jnp.asarray, (features0, _at_least_one(features1)))
+    features0, features1 = _ready(features0), _ready(_at_least_one(features1))
     real0, real1 = (f.mask & jnp.all(jnp.isfinite(f.descriptors), axis=-1) for f in (features0, features1))
     similarity = _products(masked(features0.descriptors, real0), masked(features1.descriptors, real1))
     logits = similarity / positive(temperature, similarity.dtype)
@@ -107,13 +107,18 @@ def match_candidates(
         cross_check: as in `match`.
         with_ratio: as in `match`.
         chunk_size: candidates whose similarity matrices exist at the same time; by default 1 on a CPU, where the
-            matrix then stays in cache, and all of them elsewhere.
+            matrix then stays in cache, and elsewhere as many as take 256 MB.
 
     Returns:
         Matches with leading axis C and K = N0 slots.
     """
-    one = lambda candidate: match(query, candidate, cross_check=cross_check, with_ratio=with_ratio)  # noqa: E731
-    return _chunked_map(one, candidates, len(candidates.mask), chunk_size)
+    chunk_size = _chunk_size(chunk_size, query, candidates)
+    return _match_candidates(query, candidates, cross_check=cross_check, with_ratio=with_ratio, chunk_size=chunk_size)
+
+
+@partial(compiled, static_argnames=("cross_check", "with_ratio", "chunk_size"))
+def _match_candidates(query: Features, candidates: Features, *, chunk_size: int, **options: Any) -> Matches:
+    return _chunked_map(lambda candidate: match(query, candidate, **options), candidates, chunk_size)
 
 
 def match_shortlist(
@@ -122,26 +127,53 @@ def match_shortlist(
     indices: Array,
     *,
     cross_check: CrossCheck = "mutual",
+    max_distance: float | Array | None = None,
+    max_matches: int | None = None,
     with_ratio: bool = False,
     chunk_size: int | None = None,
 ) -> Matches:
     """`match` of one query with the rows `indices` `[C]` of a database `[M, N1, ...]`; -1 gives no matches.
 
-    The same as `match_candidates` of the rows gathered, without the copy of their descriptors.
+    The same as `match_candidates` of the rows gathered, without the copy of their descriptors; with `max_distance` or
+    `max_matches` only what `filter_matches` keeps of each pair.
     """
+    return _match_shortlist(
+        query, database, indices, max_distance, cross_check=cross_check, max_matches=max_matches,
+        with_ratio=with_ratio, chunk_size=_chunk_size(chunk_size, query, database),
+    )  # fmt: skip
 
+
+@partial(compiled, static_argnames=("cross_check", "max_matches", "with_ratio", "chunk_size"))
+def _match_shortlist(
+    query: Features,
+    database: Features,
+    indices: Array,
+    max_distance: Array | None,
+    *,
+    max_matches: int | None,
+    chunk_size: int,
+    **options: Any,
+) -> Matches:
     def one(index: Array) -> Matches:
         candidate = jax.tree.map(lambda field: jnp.asarray(field)[jnp.maximum(index, 0)], database)
         candidate = replace(candidate, mask=candidate.mask & (index >= 0))
-        return match(query, candidate, cross_check=cross_check, with_ratio=with_ratio)
+        return filter_matches(match(query, candidate, **options), max_distance=max_distance, max_matches=max_matches)
 
-    return _chunked_map(one, indices, len(indices), chunk_size)
+    return _chunked_map(one, indices, chunk_size)
 
 
-def _chunked_map(function: Callable, items: Any, count: int, chunk_size: int | None) -> Matches:
-    if chunk_size is not None and chunk_size < 1:
-        raise ValueError(f"chunk_size={chunk_size}: expected a whole number above 0")
-    chunk_size = chunk_size or (1 if jax.default_backend() == "cpu" else count)
+def _chunk_size(asked: int | None, query: Features, candidates: Features) -> int:
+    """Candidates at a time: one on a CPU, where its matrix then stays in cache; elsewhere what CHUNK_BYTES hold."""
+    if asked is None:
+        if platform((query, candidates)) == "cpu":
+            return 1
+        return max(1, CHUNK_BYTES // (4 * query.mask.shape[-1] * candidates.mask.shape[-1] + 1))
+    if asked < 1:
+        raise ValueError(f"chunk_size={asked}: expected a whole number above 0")
+    return asked
+
+
+def _chunked_map(function: Callable[[Any], Matches], items: Any, chunk_size: int) -> Matches:
     return jax.lax.map(function, items, batch_size=None if chunk_size == 1 else chunk_size)
 
 
@@ -173,8 +205,14 @@ def compact(matches: Matches, capacity: int) -> Matches:
         values = jnp.asarray(values)
         return values[slots] if len(values) else jnp.zeros((capacity, *values.shape[1:]), values.dtype)
 
-    per_match = jax.tree.map(packed, {name: getattr(matches, name) for name in _PER_MATCH})
-    return replace(matches, mask=jnp.arange(capacity) < jnp.sum(matches.mask), **per_match)
+    entries = jax.tree.map(packed, per_match(matches))
+    return replace(matches, mask=jnp.arange(capacity) < jnp.sum(matches.mask), **entries)
+
+
+def _ready(features: Features) -> Features:
+    """On the device, with descriptors of at least single precision: products of half ones in half flip near-ties."""
+    features = jax.tree.map(jnp.asarray, features)
+    return replace(features, descriptors=at_least_single(features.descriptors))
 
 
 def _at_least_one(features: Features) -> Features:
@@ -215,33 +253,22 @@ def _distance(features0: Features, features1: Features, index1: Array, real: Arr
 
 def _ratio(features0: Features, features1: Features, similarity: Array) -> Array:
     """`[N0]` distance to the nearest descriptor over that to the second nearest; 1 where there is no second."""
-    nearest, _ = _neighbors(similarity, "none")
-    columns = jnp.arange(similarity.shape[1], dtype=jnp.int32)
-    second, some = _neighbors(jnp.where(columns[None] == nearest[:, None], -jnp.inf, similarity), "none")
-    closest, next_closest = (_distance(features0, features1, index, some) for index in (nearest, second))
+    nearest1, second1 = nearest_two(similarity)
+    some = second1.similarity > -jnp.inf
+    closest, next_closest = (_distance(features0, features1, found.index, some) for found in (nearest1, second1))
     apart = some & (closest < next_closest)  # not where both are 0, nor where rounding swaps two of one distance
     return jnp.where(apart, closest / jnp.where(apart, next_closest, 1.0), 1.0)
-
-
-def _first(hit: Array, axis: int) -> Array:
-    """First index of True along `axis`; 0 where there is none."""
-    size = hit.shape[axis]
-    index = jax.lax.broadcasted_iota(jnp.int32, hit.shape, axis)
-    first = jnp.min(jnp.where(hit, index, size), axis=axis, initial=size)
-    return jnp.where(first == size, 0, first)
 
 
 def _neighbors(similarity: Array, cross_check: CrossCheck) -> tuple[Array, Array]:
     """For each row its column `[N0]` int32, and whether the pair counts `[N0]` bool."""
     rows = jnp.arange(similarity.shape[0], dtype=jnp.int32)
-    best1 = jnp.max(similarity, axis=1, keepdims=True)
-    nearest1, some = _first(similarity == best1, axis=1), best1[:, 0] > -jnp.inf
+    nearest1 = nearest(similarity, axis=1)
+    some = nearest1.similarity > -jnp.inf
     if cross_check == "none":
-        return nearest1, some
-    best0 = jnp.max(similarity, axis=0, keepdims=True, initial=-jnp.inf)
-    nearest0 = _first(similarity == best0, axis=0)
+        return nearest1.index, some
+    nearest0 = nearest(similarity, axis=0)
     if cross_check == "mutual":
-        return nearest1, some & (nearest0[nearest1] == rows)
-    suitors = jnp.where(nearest0[None] == rows[:, None], similarity, -jnp.inf)
-    best = jnp.max(suitors, axis=1)
-    return _first(suitors == best[:, None], axis=1), jnp.isfinite(best)
+        return nearest1.index, some & (nearest0.index[nearest1.index] == rows)
+    suitors = nearest(jnp.where(nearest0.index[None] == rows[:, None], similarity, -jnp.inf), axis=1)
+    return suitors.index, jnp.isfinite(suitors.similarity)

@@ -1,12 +1,18 @@
-"""The few array idioms that every room shares: masked reductions, safe roots, rounding up to a capacity."""
+"""The few array idioms that every room shares: masked reductions, safe roots, capacities, and where `jit` begins."""
 
-from typing import Any
+from collections.abc import Callable
+from functools import partial, wraps
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.core import Tracer
+from jax.tree_util import Partial
 from jax.typing import ArrayLike
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+Tree = TypeVar("Tree")
 
 
 def masked(values: Array, mask: Array, fill: ArrayLike = 0.0) -> Array:
@@ -22,6 +28,12 @@ def as_float(values: ArrayLike) -> Array:
     """`values` themselves where they are floating point, else in the default float type."""
     values = jnp.asarray(values)
     return values if jnp.issubdtype(values.dtype, jnp.floating) else values.astype(float)
+
+
+def at_least_single(values: ArrayLike) -> Array:
+    """`values` as `as_float`, and float16 or bfloat16 as float32, which holds their products exactly."""
+    values = as_float(values)
+    return values.astype(jnp.float32) if jnp.finfo(values.dtype).bits < 32 else values
 
 
 def positive(value: ArrayLike | None, dtype: Any) -> Array:
@@ -59,6 +71,42 @@ def round_up(size: int, multiple: int) -> int:
     return max(1, -(-size // multiple)) * multiple
 
 
+def masked_std(values: Array, mask: Array) -> Array:
+    """Standard deviation of all real entries, `[]`, with a gradient of 0 where it is 0; 0 where there are none."""
+    values, mask = values.reshape(-1), mask.reshape(-1)
+    return safe_sqrt(masked_mean(masked(values - masked_mean(values, mask), mask) ** 2, mask))
+
+
+def compiled(function: Function, **options: Any) -> Function:
+    """`jax.jit` of what is plural, where it is defined; under a caller's `jit` it is inlined.
+
+    With a plain function among the arguments, such as a user's scorer, or the weight of one, it runs op by op: a kept
+    program would go on with what the function's closure held at the first call. `held` is for many calls in a row.
+    """
+    program = jax.jit(function, **options)
+
+    @wraps(function)
+    def call(*arguments: Any, **named: Any) -> Any:
+        plain = any(callable(leaf) for leaf in jax.tree.leaves((arguments, named)))
+        return (function if plain else program)(*arguments, **named)
+
+    return call  # pyright: ignore[reportReturnType]
+
+
+def held(tree: Tree) -> Tree:
+    """`tree` whose plain functions are static parts, new ones at each call: what `compiled` keeps serves until then."""
+    return jax.tree.map(lambda leaf: Partial(partial(leaf)) if callable(leaf) else leaf, tree)
+
+
 def is_concrete(tree: Any) -> bool:
     """True where no leaf is traced, so that Python may look at the values."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def platform(tree: Any) -> str:
+    """Where the first array on a device is, "cpu" or "gpu"; where there is none, JAX's default."""
+    for leaf in jax.tree.leaves(tree):
+        if isinstance(leaf, Array) and not isinstance(leaf, Tracer):
+            return next(iter(leaf.devices())).platform
+    default = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    return getattr(default, "platform", default) or jax.default_backend()

@@ -1,34 +1,36 @@
 """The whole way over a data set: extract and describe (`mfvpr.extraction`), shortlist, match, score, rank.
 
-Files and threads stay on the host; each computation is one compiled program per shape, called for every query. Here is
-where `jit` lives. `track` wraps the iterable of a stage: a progress bar, or nothing.
+Files and threads stay on the host; each computation is one compiled program per shape, called for every query. `track`
+wraps the iterable of a stage: a progress bar, or nothing.
 """
 
 import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Literal
 
 import jax
 import numpy as np
 
-from mfvpr import matching, reranking, retrieval
+from mfvpr import reranking, retrieval
 from mfvpr.data.match_store import MatchStore, QueryMatches
 from mfvpr.errors import InputError
 from mfvpr.extraction import FeatureSet, Track, describe, extract, untracked
-from mfvpr.matching import CrossCheck
-from mfvpr.numerics import round_up
+from mfvpr.matching import CrossCheck, match_shortlist
+from mfvpr.numerics import compiled, held, round_up
 from mfvpr.scoring import HistogramOfShifts, Scorer, ShiftHistogram
-from mfvpr.types import Array, Features, Matches, Shortlist
+from mfvpr.scoring.parameters import fit
+from mfvpr.types import Array, Matches, Shortlist, per_match
 from mfvpr.weighting import match_weights
 
 __all__ = ["Explanation", "FeatureSet", "MatchSet", "Track", "describe", "explain", "extract", "fuse", "match", "rank",
            "score", "shortlist", "stored_matches", "untracked"]  # fmt: skip
 
-MAX_BINS = 1024  # per axis: the histograms of 50 candidates then take 200 MB
+Ties = Literal["filter", "index"]
+FilterScore = Literal["cosine", "negative_euclidean"]
+
+BIN_STEP = 16  # capacities of histograms are multiples of it
 STORE_BATCH = 8  # queries whose matches may be lost when a run is killed
-_PER_MATCH = ("points0", "points1", "distance", "scores0", "scores1", "ratio", "confidence")
 
 
 @dataclass(frozen=True)
@@ -60,10 +62,20 @@ class MatchSet:
         sizes = np.broadcast_to(flat.image_size0, flat.image_size1.shape)
         return replace(flat, mask=mask, image_size0=sizes, **slots)
 
+    @property
+    def image_sizes(self) -> tuple[np.ndarray, np.ndarray]:
+        """All combinations of sizes of query and database images, `[n, 2]` each."""
+        sizes0, sizes1 = (
+            np.unique(np.concatenate([np.reshape(getattr(one, name), (-1, 2)) for one in self.matches]), axis=0)
+            for name in ("image_size0", "image_size1")
+        )
+        return np.repeat(sizes0, len(sizes1), 0), np.tile(sizes1, (len(sizes0), 1))
+
 
 def shortlist(query_descriptors: np.ndarray, database_descriptors: np.ndarray, num_candidates: int) -> Shortlist:
     """The filter's candidates of all queries `[Q, C]`, NumPy."""
-    return jax.tree.map(np.asarray, _retrieve(query_descriptors, database_descriptors, num_candidates=num_candidates))
+    found = retrieval.retrieve(query_descriptors, database_descriptors, num_candidates=num_candidates)
+    return jax.tree.map(np.asarray, found)
 
 
 def match(
@@ -140,10 +152,9 @@ def score(
 
     All scorers are one program, which other parameter values use again (histograms: within a capacity of 16 bins).
     """
-    first = match_set.matches[0]
-    prepared = {name: _prepare(scorer, first) for name, scorer in scorers.items()}
+    fitted = held(fit(dict(scorers), *match_set.image_sizes, multiple=BIN_STEP))
     queries = range(len(match_set.matches))
-    rows = [_score(prepared, match_set[query]) for query in track(queries, len(queries))]
+    rows = [_score(fitted, match_set[query]) for query in track(queries, len(queries))]
     scores = {name: np.array([row[name] for row in rows]) for name in scorers}
     return {name: np.where(candidates.mask, values, np.nan) for name, values in scores.items()}
 
@@ -171,33 +182,37 @@ class Explanation:
 
 def explain(scorer: HistogramOfShifts, matches: Matches) -> Explanation:
     """The parts of one pair's score, for figures and for steering; one program for all pairs."""
-    return Explanation(*jax.tree.map(np.asarray, _explain(_prepare(scorer, matches), matches)))
+    fitted = fit(scorer, matches.image_size0, matches.image_size1, multiple=BIN_STEP)
+    return Explanation(*jax.tree.map(np.asarray, _explain(fitted, matches)))
 
 
-def fuse(candidates: Shortlist, scores: np.ndarray, c: float | None, *, euclidean: bool = False) -> np.ndarray:
+def fuse(
+    candidates: Shortlist, scores: np.ndarray, c: float | None, *, filter_score: FilterScore = "cosine"
+) -> np.ndarray:
     """Combined scores `[Q, C]` of filter and re-ranking.
 
     Args:
         candidates: the filter's, with their cosine similarities.
         scores: `[Q, C]` of the re-ranking.
         c: weight of the filter; None balances the spread of both per query.
-        euclidean: the filter's score is minus the Euclidean distance of the unit descriptors instead.
+        filter_score: the filter's score, see `filter_scores`.
     """
-    return np.asarray(_fuse(filter_scores(candidates, euclidean=euclidean), scores, candidates.mask, c))
+    return np.asarray(reranking.fuse(filter_scores(candidates, filter_score), scores, candidates.mask, c))
 
 
-def filter_scores(candidates: Shortlist, *, euclidean: bool = False) -> np.ndarray:
+def filter_scores(candidates: Shortlist, kind: FilterScore = "cosine") -> np.ndarray:
     """The filter's part of a combined score `[Q, C]`: cosine similarity, or minus the Euclidean distance."""
     cosine = candidates.scores
-    return -np.sqrt(np.maximum(2 - 2 * cosine, 0)) if euclidean else cosine
+    return -np.sqrt(np.maximum(2 - 2 * cosine, 0)) if kind == "negative_euclidean" else cosine
 
 
-def rank(candidates: Shortlist, scores: np.ndarray, *, ties: Literal["filter", "index"] = "filter") -> np.ndarray:
+def rank(candidates: Shortlist, scores: np.ndarray, *, ties: Ties = "filter") -> np.ndarray:
     """Positions `[Q, C]` into the shortlist, best first, those without a candidate last.
 
     Equal scores keep the filter's order, or go by database index.
     """
-    return np.asarray(_rank(scores, candidates.mask, tie_break=candidates.indices if ties == "index" else None))
+    tie_break = candidates.indices if ties == "index" else None
+    return np.asarray(reranking.rank(scores, candidates.mask, tie_break=tie_break))
 
 
 def _matched(
@@ -211,7 +226,8 @@ def _matched(
     """(row, all of that query), one after the other, NumPy."""
     device_database = jax.device_put(database.features)
     for row in rows:
-        found = _match(queries[row], device_database, candidates.indices[row], max_distance, **options)
+        indices = candidates.indices[row]
+        found = match_shortlist(queries[row], device_database, indices, max_distance=max_distance, **options)
         found = jax.tree.map(np.asarray, found)
         counts = found.mask.sum(axis=1, dtype=np.int32)
         entries = {name: values[found.mask] for name, values in per_match(found).items()}
@@ -225,58 +241,13 @@ def _match_set(found: Sequence[QueryMatches]) -> MatchSet:
     return MatchSet([one.matches for one in found], counts, round_up(int(counts.max(initial=0)), 64))
 
 
-def per_match(matches: Matches) -> dict[str, np.ndarray]:
-    """The fields with a value for every match; the ratio only where there is one."""
-    return {name: values for name in _PER_MATCH if (values := getattr(matches, name)) is not None}
-
-
-_retrieve = jax.jit(retrieval.retrieve, static_argnames="num_candidates")
-_rank = jax.jit(reranking.rank)
-_fuse = jax.jit(reranking.fuse)
-
-
-@partial(jax.jit, static_argnames=("cross_check", "max_matches", "chunk_size", "with_ratio"))
-def _match(
-    query: Features,
-    database: Features,
-    indices: Array,
-    max_distance: Array | None,
-    *,
-    cross_check: CrossCheck,
-    max_matches: int | None,
-    chunk_size: int | None,
-    with_ratio: bool = False,
-) -> Matches:
-    found = matching.match_shortlist(
-        query, database, indices, cross_check=cross_check, chunk_size=chunk_size, with_ratio=with_ratio
-    )
-    keep = partial(matching.filter_matches, max_distance=max_distance, max_matches=max_matches)
-    return jax.vmap(keep)(found)
-
-
-@jax.jit
+@compiled
 def _score(scorers: dict[str, Scorer], matches: Matches) -> dict[str, Array]:
     return {name: reranking.score_candidates(scorer, matches) for name, scorer in scorers.items()}
 
 
-@jax.jit
+@compiled
 def _explain(scorer: HistogramOfShifts, matches: Matches) -> tuple[Any, ...]:
     shift, peak = scorer.dominant_shift(matches), scorer.dominant_shift(matches, refine=True)
     weights = match_weights(scorer.weight, matches)
     return scorer.histogram(matches), scorer(matches), shift, peak, weights, scorer.agrees(matches, peak)
-
-
-def _prepare(scorer: Any, matches: Matches) -> Any:
-    """A scorer whose numbers are float32 arrays (one type, one program) and whose histogram has a capacity."""
-    if isinstance(scorer, HistogramOfShifts):
-        needed = scorer.with_capacity(matches.image_size0, matches.image_size1).max_bins or 1
-        if needed > MAX_BINS:
-            raise InputError(
-                f"bin_size={scorer.bin_size}: expected at most {MAX_BINS} bins per axis, these images need {needed}; "
-                "use larger bins"
-            )
-        if scorer.max_bins is None:
-            scorer = replace(scorer, max_bins=round_up(needed, 16))
-        elif scorer.max_bins < needed:
-            raise InputError(f"max_bins={scorer.max_bins}: expected at least {needed}, which these images need")
-    return jax.tree.map(np.float32, scorer)

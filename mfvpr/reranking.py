@@ -5,7 +5,7 @@ Scorers know one pair; here is where `vmap` (over candidates) and `lax.map` (ove
 
 import difflib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from mfvpr.matching import filter_matches
-from mfvpr.numerics import is_concrete, masked, round_up
+from mfvpr.numerics import compiled, is_concrete, masked, masked_std
 from mfvpr.scoring import HistogramOfShifts, Scorer
+from mfvpr.scoring.parameters import fit, numbers, with_parameters
 from mfvpr.types import Array, Matches, Ranking
 from mfvpr.weighting import ChosenWeight, Weight, match_weights
 
@@ -24,11 +25,21 @@ BIN_STEP = 8  # capacities of histograms are multiples of it
 
 
 def score_candidates(scorer: Scorer, matches: Matches) -> Array:
-    """Scores `[C]` of matches `[C, K, ...]`."""
-    return jax.vmap(_fit(scorer, matches.image_size0, matches.image_size1))(matches)
+    """Scores `[C]` of matches `[C, K, ...]`.
+
+    Compiled once per shape; other numbers in the scorer compile nothing. A scorer that is a plain function, or holds
+    one, runs op by op. What needs a capacity gets that of the images: under a caller's `jit`, where these are traced,
+    it must have one before (`max_bins` of the histogram).
+    """
+    return _score_candidates(fit_candidates(scorer, matches, multiple=2 * BIN_STEP), matches)
 
 
-@jax.jit  # here, or every call of score_grid would compile its loop again
+@compiled
+def _score_candidates(scorer: Scorer, matches: Matches) -> Array:
+    return jax.vmap(scorer)(matches)
+
+
+@compiled
 def score_settings(
     scorer: Any, matches: Matches, settings: Mapping[str, Array], weightings: Mapping[str, Array]
 ) -> Array:
@@ -46,7 +57,7 @@ def score_settings(
     """
 
     def one(setting: dict[str, Array]) -> Array:
-        chosen = replace(scorer, **setting)
+        chosen = with_parameters(scorer, setting)
         return jax.vmap(partial(_score_weightings, chosen, weightings=weightings), out_axes=-1)(matches)
 
     return _map(one, settings)
@@ -88,8 +99,9 @@ def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> 
     Args:
         scorer: the scorer whose other parameters stay.
         matches: `[C, K, ...]`.
-        **axes: values of the scorer's numeric parameters, e.g. `sigma=[10., 22.5], bin_size=[10., 15.]`; of
-            `max_distance`, beyond which matches do not count; and of `weight`, e.g. `weight=[UnitWeight(), ...]`.
+        **axes: values of the scorer's numbers, e.g. `sigma=[10., 22.5], bin_size=[10., 15.]`, or of those of its
+            parts, `**{"inner.sigma": [10., 22.5]}`; of `max_distance`, beyond which matches do not count; and of
+            `weight`, e.g. `weight=[UnitWeight(), ...]`.
 
     Raises:
         ValueError: an axis is empty, not one-dimensional, or names no numeric parameter of the scorer.
@@ -103,7 +115,7 @@ def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> 
     outer = [name for name in values if name not in WEIGHTINGS]
     settings, weightings = _product(values, outer), _product(values, inner)
     rows = int(np.prod([len(values[name]) for name in outer]))
-    parts = by_capacity(scorer, settings, rows, matches.image_size0, matches.image_size1)
+    parts = by_capacity(scorer, settings, rows, *_sizes(matches))
     scores = [
         score_settings(fitted, matches, {name: axis[part] for name, axis in settings.items()}, weightings)
         for fitted, part in parts
@@ -128,18 +140,16 @@ def by_capacity(
     One that needs none, has its own, or is traced, serves all. Capacities are multiples of 8 bins: few programs,
     and little padding.
     """
-    bin_sizes = settings.get("bin_size")
-    every = np.arange(num_settings)
-    if bin_sizes is None or not isinstance(scorer, HistogramOfShifts) or scorer.max_bins is not None:
-        return [(_fit(scorer, image_size0, image_size1), every)]
-    if not is_concrete((bin_sizes, scorer.shift_range, image_size0, image_size1)):
-        return [(scorer, every)]
-    needed = {
-        value: replace(scorer, bin_size=value).with_capacity(image_size0, image_size1).max_bins
-        for value in np.unique(bin_sizes)
-    }
-    capacities = np.array([round_up(needed[value] or 1, BIN_STEP) for value in np.asarray(bin_sizes)])
-    return [(replace(scorer, max_bins=int(c)), np.flatnonzero(capacities == c)) for c in np.unique(capacities)]
+    if not is_concrete(settings):
+        chosen = with_parameters(scorer, {name: values[0] for name, values in settings.items()})
+        return [(fit(chosen, image_size0, image_size1, multiple=BIN_STEP), np.arange(num_settings))]
+    settings = jax.tree.map(np.asarray, settings)
+    found: dict[Any, tuple[Any, list[int]]] = {}
+    for row in range(num_settings):
+        chosen = with_parameters(scorer, {name: values[row] for name, values in settings.items()})
+        fitted = fit(chosen, image_size0, image_size1, multiple=BIN_STEP)
+        found.setdefault(jax.tree.structure(fitted), (fitted, []))[1].append(row)
+    return [(fitted, np.array(rows)) for fitted, rows in found.values()]
 
 
 def combine(filter_scores: Array, rerank_scores: Array, *, c: float | Array = 1e6) -> Array:
@@ -154,14 +164,14 @@ def balancing_c(filter_scores: Array, rerank_scores: Array, mask: Array) -> Arra
     """
 
     def spread(scores: Array) -> Array:
-        real = mask & jnp.isfinite(scores)
-        return jnp.std(masked(scores, real), where=real)
+        return masked_std(scores, mask & jnp.isfinite(scores))
 
     filter_spread = spread(filter_scores)
     c = spread(rerank_scores) / jnp.where(filter_spread > 0, filter_spread, 1.0)
     return jnp.where((filter_spread > 0) & jnp.isfinite(c), c, 0.0)
 
 
+@compiled
 def fuse(filter_scores: Array, scores: Array, mask: Array, c: float | Array | None) -> Array:
     """Combined scores `[Q, C]` of several queries; `c` None balances the spread of both scores per query."""
     if c is None:
@@ -169,6 +179,7 @@ def fuse(filter_scores: Array, scores: Array, mask: Array, c: float | Array | No
     return combine(filter_scores, scores, c=c)
 
 
+@compiled
 def rank(scores: Array, mask: Array | None = None, *, tie_break: Array | None = None) -> Array:
     """Positions `[..., C]` int32 in descending order of `scores` `[..., C]`.
 
@@ -187,12 +198,19 @@ def rerank(scores: Array, mask: Array | None = None) -> Ranking:
     return Ranking(order=rank(scores, mask), scores=scores)
 
 
-def _fit(scorer: Any, image_size0: Array, image_size1: Array) -> Any:
-    """A histogram without a capacity gets the one that concrete values ask for, before vmap hides them."""
-    if not isinstance(scorer, HistogramOfShifts) or scorer.max_bins is not None:
-        return scorer
-    sizes = image_size0, image_size1
-    return scorer.with_capacity(*sizes) if is_concrete((scorer, sizes)) else scorer
+def fit_candidates(scorer: Any, matches: Matches, *, multiple: int = 1) -> Any:
+    """`fit` to the images of matches `[..., K]`."""
+    return fit(scorer, *_sizes(matches), multiple=multiple)
+
+
+def _sizes(matches: Matches) -> tuple[Array, Array]:
+    """Both image sizes `[..., 2]`, without those of pairs that have no matches, which may be anything."""
+    sizes = matches.image_size0, matches.image_size1
+    if not is_concrete((matches.mask, sizes)):
+        return sizes
+    some = np.any(matches.mask, axis=-1)
+    size0, size1 = (np.broadcast_to(size, (*some.shape, 2))[some] for size in sizes)
+    return size0, size1
 
 
 def _weights(scorer: Any, axes: Mapping[str, Any]) -> tuple[Weight, ...]:
@@ -206,23 +224,21 @@ def _weights(scorer: Any, axes: Mapping[str, Any]) -> tuple[Weight, ...]:
 
 def _axis(scorer: Any, name: str, axis: Sequence[float] | Array) -> Array:
     """One checked axis of a grid, float `[n]`."""
-    numeric = [
-        f.name
-        for f in fields(scorer)
-        if not f.metadata.get("static") and (f.name == "temperature" or _is_number(getattr(scorer, f.name)))
-    ]
-    numeric += ["max_distance", "weight"] if hasattr(scorer, "weight") else ["max_distance"]
+    values = numbers(scorer)
+    numeric = [*values, *(["weight"] if hasattr(scorer, "weight") else []), "max_distance"]
     if name not in numeric:
         nearest = difflib.get_close_matches(name, numeric, n=1) or numeric
         raise ValueError(
-            f"{type(scorer).__name__} has no numeric parameter {name!r}; expected one of {', '.join(numeric)}"
-            + (f" (nearest: {nearest[0]})" if numeric else "")
+            f"{type(scorer).__name__} has no numeric parameter {name!r}; expected one of {', '.join(numeric)} "
+            f"(nearest: {nearest[0]})"
         )
-    values = jnp.asarray(axis, dtype=int if name == "weight" else float)
-    if values.ndim != 1 or values.size == 0:
-        raise ValueError(f"grid axis {name}: expected at least one value in one dimension, got shape {values.shape}")
-    return values
+    points = jnp.asarray(axis)
+    if not (jnp.issubdtype(points.dtype, jnp.integer) and (name == "weight" or _is_whole(values.get(name)))):
+        points = points.astype(float)
+    if points.ndim != 1 or points.size == 0:
+        raise ValueError(f"grid axis {name}: expected at least one value in one dimension, got shape {points.shape}")
+    return points
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float | np.ndarray | np.generic | jax.Array) and np.ndim(value) == 0
+def _is_whole(number: Any) -> bool:
+    return number is not None and jnp.issubdtype(jnp.result_type(number), jnp.integer)

@@ -1,12 +1,15 @@
 """The filter: global descriptors -> Shortlist, by exact search."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 
-from mfvpr.numerics import masked
+from mfvpr.numerics import at_least_single, compiled, masked
 from mfvpr.types import Array, Shortlist
 
 
+@partial(compiled, static_argnames="num_candidates")
 def retrieve(
     query_descriptors: Array, database_descriptors: Array, *, num_candidates: int, mask: Array | None = None
 ) -> Shortlist:
@@ -22,7 +25,8 @@ def retrieve(
         Shortlist `[Q, C]` by descending cosine similarity; the first row wins a tie. A database image whose
         descriptor is not finite never appears; a query whose own is not finite gets an empty shortlist.
     """
-    similarity = jnp.matmul(query_descriptors, database_descriptors.T, precision=jax.lax.Precision.HIGHEST)
+    queries, database = at_least_single(query_descriptors), at_least_single(database_descriptors)
+    similarity = jnp.matmul(queries, database.T, precision=jax.lax.Precision.HIGHEST)
     usable = jnp.isfinite(similarity) if mask is None else jnp.isfinite(similarity) & mask[None]
     depth = min(num_candidates, database_descriptors.shape[0])
     scores, indices = jax.lax.top_k(masked(similarity, usable, -jnp.inf), depth)

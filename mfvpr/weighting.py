@@ -4,11 +4,12 @@ What they return on padding is arbitrary; `match_weights` is the form that score
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import jax.numpy as jnp
 
 from mfvpr.numerics import as_float, masked
-from mfvpr.types import Array, Matches, value
+from mfvpr.types import Array, Matches, per_match, value
 
 Weight = Callable[[Matches], Array]
 
@@ -50,7 +51,9 @@ class ChosenWeight:
 
 def match_weights(weight: Weight, matches: Matches) -> Array:
     """`[K]` weights times the matches' confidence, 0 on padding."""
-    weights = masked(as_float(weight(matches)), matches.mask)
+    # Padding is 1 before any arithmetic of the weight: else its NaN would return in the gradients.
+    clean = {name: masked(jnp.asarray(values), matches.mask, 1) for name, values in per_match(matches).items()}
+    weights = masked(as_float(weight(replace(matches, **clean))), matches.mask)
     return weights if matches.confidence is None else weights * match_confidence(matches)
 
 

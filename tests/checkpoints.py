@@ -1,56 +1,137 @@
-"""Checkpoints without torch: a reader of its zip files, and random weights under the public names and shapes."""
+"""Checkpoints without torch: a writer of its files, byte by byte; random weights under the public names and shapes."""
 
 import math
 import pickle
+import struct
 import zipfile
 import zlib
-from collections import OrderedDict
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from mfvpr.weights.checkpoint import read_checkpoint
+
 ALIKED = Path(__file__).parent.parent.parent / "shared" / "weights" / "aliked"
-_STORAGES = {
-    "FloatStorage": np.dtype("<f4"),
-    "DoubleStorage": np.dtype("<f8"),
-    "HalfStorage": np.dtype("<f2"),
-    "LongStorage": np.dtype("<i8"),
-    "IntStorage": np.dtype("<i4"),
+KINDS = {
+    "f4": "FloatStorage",
+    "f8": "DoubleStorage",
+    "f2": "HalfStorage",
+    "i8": "LongStorage",
+    "i4": "IntStorage",
+    "i2": "ShortStorage",
+    "i1": "CharStorage",
+    "u1": "ByteStorage",
+    "b1": "BoolStorage",
+    "c8": "ComplexFloatStorage",
 }
 
 
-class _Unpickler(pickle.Unpickler):
-    """Knows ordered dictionaries and tensors, and nothing that could run."""
+class Global(NamedTuple):
+    """A name that a pickle asks for."""
 
-    def __init__(self, archive: zipfile.ZipFile, name: str) -> None:
-        super().__init__(archive.open(name))
-        self._archive, self._folder = archive, name.removesuffix("data.pkl")
-
-    def find_class(self, module: str, name: str) -> object:
-        if (module, name) == ("collections", "OrderedDict"):
-            return OrderedDict
-        if (module, name) == ("torch._utils", "_rebuild_tensor_v2"):
-            return _tensor
-        if module == "torch" and name in _STORAGES:
-            return _STORAGES[name]
-        raise pickle.UnpicklingError(f"{module}.{name} is not allowed")
-
-    def persistent_load(self, pid: tuple) -> np.ndarray:
-        _, dtype, key, *_ = pid
-        return np.frombuffer(self._archive.read(f"{self._folder}data/{key}"), dtype)
+    module: str
+    name: str
 
 
-def _tensor(storage: np.ndarray, offset: int, size: tuple, stride: tuple, *_: object) -> np.ndarray:
-    strides = [step * storage.itemsize for step in stride]
-    return np.lib.stride_tricks.as_strided(storage[offset:], size, strides, writeable=False).copy()
+class Call(NamedTuple):
+    """A call that a pickle asks for."""
+
+    function: Any
+    arguments: Any
 
 
-def read_zip(path: Path) -> dict:
-    """What `torch.save` wrote, tensors as arrays."""
-    with zipfile.ZipFile(path) as archive:
-        (name,) = (name for name in archive.namelist() if name.endswith("/data.pkl"))
-        return _Unpickler(archive, name).load()
+@dataclass
+class View:
+    """A tensor, and what its file says of it; by default the whole array."""
+
+    array: np.ndarray
+    offset: Any = 0
+    shape: Any = None
+    strides: Any = None
+    kind: str | None = None
+    key: str | None = None
+    count: Any = None
+    module: str = "torch"
+
+
+class Writer:
+    """Pickles as torch does, protocol 2; the arrays of tensors gather in `storages`."""
+
+    def __init__(self, *, legacy: bool = False) -> None:
+        self.storages: dict[str, np.ndarray] = {}
+        self.legacy = legacy
+
+    def pickled(self, value: Any) -> bytes:
+        return b"\x80\x02" + self._put(value) + b"."
+
+    def _put(self, value: Any) -> bytes:
+        if isinstance(value, bytes):  # instructions
+            return value
+        if isinstance(value, Global):
+            return f"c{value.module}\n{value.name}\n".encode()
+        if isinstance(value, Call):
+            return self._put(value.function) + self._put(value.arguments) + b"R"
+        if isinstance(value, np.ndarray):
+            return self._put(View(value))
+        if isinstance(value, View):
+            return self._tensor(value)
+        if isinstance(value, dict):
+            return b"}(" + b"".join(self._put(item) for pair in value.items() for item in pair) + b"u"
+        if isinstance(value, (tuple, list)):
+            items = b"".join(map(self._put, value))
+            return b"(" + items + b"t" if isinstance(value, tuple) else b"](" + items + b"e"
+        if isinstance(value, str):
+            return b"X" + struct.pack("<I", len(value.encode())) + value.encode()
+        if isinstance(value, float):
+            return b"G" + struct.pack(">d", value)
+        if type(value) is int and -(2**31) <= value < 2**31:
+            return b"J" + struct.pack("<i", value)
+        return pickle.dumps(value, protocol=2)[2:-1]  # None, True, False, large numbers
+
+    def _tensor(self, view: View) -> bytes:
+        array = view.array
+        key = str(len(self.storages)) if view.key is None else view.key
+        self.storages[key] = array
+        kind = view.kind or KINDS[array.dtype.str[1:]]
+        count = array.size if view.count is None else view.count
+        identity = ("storage", Global(view.module, kind), key, "cpu", count) + ((None,) if self.legacy else ())
+        shape = array.shape if view.shape is None else view.shape
+        strides = tuple(step // array.itemsize for step in array.strides) if view.strides is None else view.strides
+        hooks = Call(Global("collections", "OrderedDict"), ())
+        arguments = (self._put(identity) + b"Q", view.offset, shape, strides, False, hooks)
+        return self._put(Call(Global("torch._utils", "_rebuild_tensor_v2"), arguments))
+
+
+def write_zip(path: Path, content: Any, *, order: str = "little", compression: int = zipfile.ZIP_STORED) -> Path:
+    """A checkpoint as torch has written them since 1.6."""
+    writer = Writer()
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        archive.writestr(f"{path.stem}/data.pkl", writer.pickled(content))
+        archive.writestr(f"{path.stem}/byteorder", order)
+        for key, array in writer.storages.items():
+            archive.writestr(f"{path.stem}/data/{key}", array.astype(array.dtype.newbyteorder(order)).tobytes("A"))
+        archive.writestr(f"{path.stem}/version", "3\n")
+    return path
+
+
+def write_legacy(path: Path, content: Any) -> Path:
+    """A checkpoint as torch wrote them before."""
+    writer = Writer(legacy=True)
+    pickles = [
+        0x1950A86A20F9469CFC6C,
+        1001,
+        {"protocol_version": 1001, "little_endian": True, "type_sizes": {"int": 4}},
+    ]
+    parts = [writer.pickled(value) for value in (*pickles, content)]
+    parts.append(writer.pickled(sorted(writer.storages)))
+    for key in sorted(writer.storages):
+        array = writer.storages[key]
+        parts.append(struct.pack("<q", array.size) + array.tobytes("A"))
+    path.write_bytes(b"".join(parts))
+    return path
 
 
 def random_checkpoint(shapes: Mapping[str, tuple[int, ...]], seed: int = 0) -> dict[str, np.ndarray]:
@@ -79,7 +160,7 @@ def at_hand() -> Iterator[tuple[str, dict[str, np.ndarray]]]:
     yield "d2_tf", random_checkpoint(d2net_shapes())
     yield "mixvpr_4096", random_checkpoint(mixvpr_shapes())
     for path in sorted(ALIKED.glob("*.pth")):
-        yield path.stem, read_zip(path)
+        yield path.stem, read_checkpoint(path)
 
 
 def d2net_shapes() -> dict[str, tuple[int, ...]]:

@@ -12,8 +12,9 @@ ALLOWED = {
     "numerics": set(),
     "types": set(),
     "weighting": {"numerics", "types"},
-    "matching": {"numerics", "types"},
-    "scoring": {"numerics", "types", "weighting", "scoring"},
+    "neighbors": {"types"},
+    "matching": {"neighbors", "numerics", "types"},
+    "scoring": {"errors", "numerics", "types", "weighting", "scoring"},
     "retrieval": {"numerics", "types"},
     "reranking": {"matching", "numerics", "types", "scoring", "weighting"},
     "learning": {
@@ -33,6 +34,7 @@ ALLOWED = {
     "features": {"errors", "types", "numerics", "data", "models", "features"},
     "extraction": {"errors", "types", "numerics", "data", "features"},
     "statistics": set(),
+    "testing": {"reranking", "scoring", "types"},
     "report": {"errors", "types", "data", "pipeline", "report"},
 }
 HOMES = {
@@ -41,7 +43,7 @@ HOMES = {
     "matplotlib": {"report"},
     "hydra": set(),
     "omegaconf": set(),
-    "torch": {"weights"},  # the checkpoint reader
+    "torch": set(),
     "flax": {"models", "weights", "features"},
     "tensorstore": {"data"},
     "safetensors": {"weights"},

@@ -63,7 +63,7 @@ def test_aliked_recognizes_the_street(weights, small_street, tmp_path):
     ("arguments", "words"),
     [
         (["features=d2net"], "d2_tf: not installed in NOWHERE; get d2_tf.pth from https://"),
-        (["features=aliked"], "python -m experiments.weights convert aliked-n16.pth"),
+        (["features=aliked"], "and install it: python -m experiments.weights download aliked-n16"),
         (["retrieval=mixvpr"], "weights none stated"),
         (["features=d2net", "features.weights=mixvpr_512"], "features.weights=mixvpr_512: expected weights of d2net"),
         (["retrieval=mixvpr", "retrieval.image_size=[224,224]"], "MixVPR takes [320, 320] only"),

@@ -1,5 +1,7 @@
 """The matcher against the float64 loop: random, empty, single, tied and duplicated features."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mfvpr import Features, compact, filter_matches, match, match_candidates
+from mfvpr import Features, compact, filter_matches, match, match_candidates, matching, retrieve
 from mfvpr.matching import match_shortlist
 from tests import oracles
 from tests.builders import make_features, random_matches, unit
@@ -191,3 +193,64 @@ def test_real_size_agrees_with_a_vectorised_check():
     assert (np.asarray(matches.mask) == mutual).mean() > 0.998  # float32 rounding may flip a near-tie
     agree = mutual & np.asarray(matches.mask)
     np.testing.assert_array_equal(np.asarray(matches.points1)[agree], two.keypoints[similarity.argmax(1)][agree])
+
+
+def test_half_precision_gives_what_single_precision_of_the_same_values_gives():
+    rng = np.random.default_rng(4)
+    pair = [make_features(rng, 60, dimension=64) for _ in range(2)]
+    half = [replace(one, descriptors=one.descriptors.astype(np.float16)) for one in pair]
+    single = [replace(one, descriptors=one.descriptors.astype(np.float32)) for one in half]
+    for got, expected in zip(jax.tree.leaves(match_once(*half)), jax.tree.leaves(match_once(*single)), strict=True):
+        np.testing.assert_array_equal(got, expected)
+    descriptors = [one.descriptors for one in half]
+    lists = [retrieve(*(values.astype(kind) for values in descriptors), num_candidates=9) for kind in ("f2", "f4")]
+    np.testing.assert_array_equal(lists[0].indices, lists[1].indices)
+    np.testing.assert_array_equal(lists[0].scores, lists[1].scores)
+
+
+def test_a_distance_at_the_limit_is_near_enough():
+    matches = random_matches(np.random.default_rng(5), 12)
+    for slot in range(12):
+        assert filter_matches(matches, max_distance=matches.distance[slot]).mask[slot]
+        below = np.nextafter(matches.distance[slot], np.float32(0))
+        assert not filter_matches(matches, max_distance=below).mask[slot]
+
+
+def test_whoever_calls_it_matching_compiles_once(compilations):
+    rng = np.random.default_rng(6)
+    query, *others = (make_features(rng, 20) for _ in range(5))
+    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *others)
+    calls = [
+        lambda limit: match_candidates(query, batch),
+        lambda limit: match_candidates(query, batch, with_ratio=True),
+        lambda limit: match_shortlist(query, batch, np.array([2, -1, 0]), max_distance=limit, max_matches=7),
+        lambda limit: retrieve(query.descriptors, batch.descriptors[0], num_candidates=3),
+    ]
+    for call in calls:
+        call(1.0)
+    compilations.reset()
+    for call in calls:
+        call(0.7)
+    assert compilations.count == 0
+
+
+def test_a_shortlist_keeps_what_the_filter_of_every_pair_keeps():
+    rng = np.random.default_rng(7)
+    query, *others = (make_features(rng, 20) for _ in range(4))
+    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *others)
+    got = match_shortlist(query, batch, np.array([2, -1, 0]), max_distance=1.1, max_matches=3)
+    assert not got.mask[1].any()
+    for place, row in ((0, 2), (2, 0)):
+        expected = filter_matches(match_once(query, others[row]), max_distance=1.1, max_matches=3)
+        np.testing.assert_array_equal(got.mask[place], expected.mask)
+
+
+@pytest.mark.parametrize(("platform", "expected"), [("cpu", 1), ("gpu", 2**28 // (4 * 20 * 30 + 1))])
+def test_a_chunk_is_what_fits_where_the_data_are(monkeypatch, platform, expected):
+    rng = np.random.default_rng(8)
+    batch = jax.tree.map(lambda leaf: leaf[None], make_features(rng, 30))
+    monkeypatch.setattr(matching, "platform", lambda tree: platform)
+    assert matching._chunk_size(None, make_features(rng, 20), batch) == expected
+    assert matching._chunk_size(7, make_features(rng, 20), batch) == 7
+    with pytest.raises(ValueError, match="chunk_size=0: expected a whole number above 0"):
+        match_candidates(make_features(rng, 20), batch, chunk_size=0)

@@ -15,8 +15,11 @@ from mfvpr.data.match_store import open_match_store
 from mfvpr.errors import InputError
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import fit_vlad
+from mfvpr.pipeline import MatchSet
+from mfvpr.types import Shortlist, per_match
 from tests import oracles
-from tests.builders import real
+from tests.builders import random_matches, real
+from tests.scorers import FOREIGN, OWN, plain, title
 
 SIFT = Sift(max_keypoints=400)
 
@@ -81,7 +84,7 @@ def test_fusion_with_a_constant_and_balanced(candidates, matches):
     scores = pipeline.score({"count": mfvpr.MatchCount()}, matches, candidates)["count"]
     np.testing.assert_allclose(pipeline.fuse(candidates, scores, 10.0), 10 * candidates.scores + scores, rtol=1e-5)
     distance = np.sqrt(2 - 2 * candidates.scores)
-    euclidean = pipeline.fuse(candidates, scores, 10.0, euclidean=True)
+    euclidean = pipeline.fuse(candidates, scores, 10.0, filter_score="negative_euclidean")
     np.testing.assert_allclose(euclidean, scores - 10 * distance, rtol=1e-5)
     by_index = np.take_along_axis(candidates.indices, pipeline.rank(candidates, 0 * scores, ties="index"), axis=1)
     np.testing.assert_array_equal(by_index, np.sort(candidates.indices, axis=1))
@@ -127,8 +130,8 @@ class Counted:
 @pytest.fixture
 def matched(monkeypatch):
     """Counts the queries that are matched."""
-    counted = Counted(pipeline._match)
-    monkeypatch.setattr(pipeline, "_match", counted)
+    counted = Counted(pipeline.match_shortlist)
+    monkeypatch.setattr(pipeline, "match_shortlist", counted)
     return counted
 
 
@@ -264,3 +267,49 @@ def test_numbers_cost_no_compilation_within_a_capacity(features, candidates, mat
     assert all((first[name] != second[name]).any() for name in first)
     scores(10, 13.0, 4, 1)  # 52 bins: the next capacity, one program more
     assert compilations.count == 1
+
+
+SIZES = ((336, 336), (640, 480))
+
+
+@pytest.fixture(scope="module")
+def mixed_sizes():
+    """Queries and candidates of two sizes, matches with a confidence."""
+    rng, queries, pairs_each = np.random.default_rng(5), 4, 3
+    flat, counts = [], []
+    for query in range(queries):
+        sizes = [SIZES[query % 2], *(SIZES[place % 2] for place in range(pairs_each))]
+        pairs = [random_matches(rng, 30, sizes=(sizes[0], size)) for size in sizes[1:]]
+        joined = {
+            field: np.concatenate([getattr(pair, field)[pair.mask] for pair in pairs])
+            for field in (*per_match(pairs[0]), "mask")
+        }
+        flat.append(replace(pairs[0], **joined, image_size1=np.stack([pair.image_size1 for pair in pairs])))
+        counts.append([30] * pairs_each)
+    indices = np.tile(np.arange(pairs_each, dtype=np.int32), (queries, 1))
+    listed = Shortlist(indices, rng.random(indices.shape).astype(np.float32), indices >= 0)
+    return MatchSet(flat, np.array(counts), 64), listed
+
+
+@pytest.mark.parametrize("scorer", [*OWN, *FOREIGN], ids=title)
+def test_every_scorer_on_images_of_two_sizes_with_a_confidence(mixed_sizes, scorer):
+    match_set, listed = mixed_sizes
+    got = pipeline.score({"it": scorer}, match_set, listed)["it"]
+    for query in range(len(got)):
+        np.testing.assert_allclose(got[query], mfvpr.score_candidates(scorer, match_set[query]), rtol=2e-6)
+    assert np.isfinite(got).all()
+    assert got.any()
+
+
+def test_what_a_function_holds_may_change_between_calls(mixed_sizes):
+    factor = [1.0]
+    scorer = lambda matches: factor[0] * plain(matches)  # noqa: E731
+    first = pipeline.score({"it": scorer}, *mixed_sizes)["it"]
+    factor[0] = 2.0
+    np.testing.assert_allclose(pipeline.score({"it": scorer}, *mixed_sizes)["it"], 2 * first, rtol=2e-6)
+
+
+def test_too_many_bins_for_one_of_the_sizes_are_refused(mixed_sizes):
+    scorer = mfvpr.HistogramOfShifts(max_bins=50)  # enough for the first query, which is the smaller one
+    with pytest.raises(InputError, match="max_bins=50: expected at least 86"):
+        pipeline.score({"it": scorer}, *mixed_sizes)

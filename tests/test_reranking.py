@@ -25,10 +25,11 @@ from mfvpr import (
     score_candidates,
     score_grid,
 )
-from mfvpr.reranking import by_capacity
+from mfvpr.reranking import by_capacity, fuse
 from mfvpr.weighting import ChosenWeight
 from tests import oracles
 from tests.builders import random_matches
+from tests.scorers import FOREIGN, Strongest, Wrapped, plain, title
 
 
 @pytest.fixture
@@ -88,7 +89,7 @@ def test_fine_bins_do_not_tax_coarse_ones(matches):
     sizes = matches.image_size0, matches.image_size1
     groups = by_capacity(HistogramOfShifts(), {"bin_size": np.array([6.0, 14.0, 15.0])}, 3, *sizes)
     needed = [HistogramOfShifts(bin_size=size).with_capacity(*sizes).max_bins for size in (6.0, 14.0, 15.0)]
-    assert [list(rows) for _, rows in groups] == [[1, 2], [0]]
+    assert [list(rows) for _, rows in groups] == [[0], [1, 2]]
     for scorer, rows in groups:
         worst = max(needed[row] for row in rows)
         assert worst <= scorer.max_bins < worst + 8
@@ -163,3 +164,60 @@ def test_balancing_c_equalizes_the_spread_of_real_candidates():
     c = balancing_c(filter_scores, scores, mask)
     np.testing.assert_allclose(c * np.std(filter_scores[:3]), np.std(scores[:3]), rtol=1e-6)
     assert balancing_c(jnp.ones(4), scores, mask) == 0.0
+
+
+def test_a_score_that_is_no_number_takes_no_part_in_the_balance():
+    """Its candidate is there: neither its score nor the filter's similarity to it may matter to the others."""
+    filter_scores, mask = jnp.array([0.5, 0.7, 0.9, 0.1]), jnp.ones(4, bool)
+    for broken in (np.nan, np.inf):
+        c = balancing_c(filter_scores, jnp.array([10.0, 50.0, 30.0, broken]), mask)
+        expected = np.std([10.0, 50.0, 30.0]) / np.std(np.array([0.5, 0.7, 0.9, 0.1]))
+        np.testing.assert_allclose(c, expected, rtol=1e-6)
+    assert balancing_c(filter_scores, jnp.full(4, jnp.nan), mask) == 0.0
+
+
+def test_balanced_fusion_has_a_gradient_where_all_scores_are_equal():
+    filter_scores, mask = jnp.array([[0.5, 0.7], [0.3, 0.3]]), jnp.ones((2, 2), bool)
+    total = lambda scores: jnp.sum(fuse(filter_scores, scores, mask, None) ** 2)  # noqa: E731
+    for scores in (jnp.full((2, 2), 3.0), jnp.array([[1.0, 2.0], [4.0, 4.0]])):
+        assert np.isfinite(jax.grad(total)(scores)).all()
+
+
+def test_parameters_of_parts_are_axes_by_dotted_names(matches):
+    got = score_grid(
+        Wrapped(), matches, **{"inner.sigma": [10.0, 30.0], "share": [0.0, 1.0, 2.0], "inner.bin_size": [8.0, 15.0]}
+    )
+    assert got.shape == (2, 3, 2, 3)
+    for i, sigma in enumerate((10.0, 30.0)):
+        for j, share in enumerate((0.0, 1.0, 2.0)):
+            for k, bin_size in enumerate((8.0, 15.0)):
+                scorer = Wrapped(HistogramOfShifts(sigma=sigma, bin_size=bin_size), share)
+                np.testing.assert_allclose(got[i, j, k], score_candidates(scorer, matches), rtol=2e-6)
+
+
+def test_whole_numbers_stay_whole_where_they_are_meant_to(matches):
+    got = score_grid(Strongest(), matches, place=[0, 1, 3])
+    expected = [score_candidates(Strongest(place), matches) for place in (0, 1, 3)]
+    np.testing.assert_allclose(got, expected)
+
+
+def test_a_plain_function_has_the_axis_of_distances(matches):
+    got = score_grid(plain, matches, max_distance=[0.7, 1.5])
+    for row, limit in zip(got, (0.7, 1.5), strict=True):
+        near = jax.vmap(partial(filter_matches, max_distance=limit))(matches)
+        np.testing.assert_allclose(row, score_candidates(plain, near), rtol=2e-6)
+
+
+@pytest.mark.parametrize("scorer", FOREIGN, ids=title)
+def test_foreign_scorers_are_gridded_as_they_score(matches, scorer):
+    got = score_grid(scorer, matches, max_distance=[2.0, 3.0])
+    np.testing.assert_allclose(got, [score_candidates(scorer, matches)] * 2, rtol=2e-6)
+
+
+def test_fusion_and_ranking_compile_once_for_all_callers(compilations):
+    scores, mask = jnp.ones((2, 4)), jnp.ones((2, 4), bool)
+    for _ in range(2):
+        rank(fuse(scores, scores, mask, None), mask, tie_break=jnp.arange(8).reshape(2, 4))
+        rank(fuse(scores, scores, mask, 0.5), mask)
+        compiled, compilations.count = compilations.count, 0
+    assert compiled == 0

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from mfvpr.data.images import Interpolation
+from mfvpr.errors import InputError
 from mfvpr.features.network import compiled, in_batches
 from mfvpr.models.mixvpr import IMAGE_SIZE, MixVPR, preprocess
 from mfvpr.types import Features
@@ -48,11 +49,16 @@ class MixVprDescriptor:
         """`[B, D]` float32 descriptors of unit length, of images `[B, 320, 320, 3]` RGB, 0 .. 255, uint8 or float32.
 
         Raises:
-            ValueError: no images, or of another size.
+            InputError: the images have another size.
+            ValueError: no images.
         """
         if images is None:
             raise ValueError("MixVPR describes images, but got none")
-        return np.stack(in_batches(self._program, images, self.batch_size))
+        if images.shape[1:3] != IMAGE_SIZE[::-1]:
+            height, width = images.shape[1:3]
+            raise InputError(f"MixVPR: expected images of {IMAGE_SIZE[0]} x {IMAGE_SIZE[1]} px, got {width} x {height}")
+        found = in_batches(self._program, images, self.batch_size)
+        return np.array(found, np.float32).reshape(len(images), self.dimension)
 
     @cached_property
     def _program(self) -> Callable[..., Any]:

@@ -1,11 +1,13 @@
 """3 x 3 convolutions, on a CPU with half the products.
 
 Winograd's F(4, 3) (Lavin & Gray, CVPR 2016) along the rows: four rows of the result come from six rows of the input by
-six convolutions with 1 x 3 kernels, where the definition takes twelve. VGG16's rounding errors grow by half. Libraries
-of other processors choose for themselves.
+six convolutions with 1 x 3 kernels, where the definition takes twelve. VGG16's rounding errors grow by half, and depend
+on which of the four rows it is: where the input repeats itself, the result differs in its last bits. Whoever compares
+neighbors there asks for the definition. Libraries of other processors choose for themselves.
 """
 
 from collections.abc import Sequence
+from functools import partial
 
 import jax.numpy as jnp
 from flax import nnx
@@ -54,14 +56,21 @@ class Conv3x3(nnx.Module):
         self.dilation = dilation
         self.precision = precision
 
-    def __call__(self, x: Array) -> Array:
-        """`[B, H, W, C]` -> `[B, H, W, D]`."""
+    def __call__(self, x: Array, uniform: Array | bool = False) -> Array:
+        """`[B, H, W, C]` -> `[B, H, W, D]`.
+
+        Args:
+            x: the input.
+            uniform: `[]` bool, whether equal neighborhoods must give equal bits, which takes half as long again.
+        """
 
         def direct(x: Array, kernel: Array) -> Array:
             return _convolved(x, kernel, self.dilation, self.dilation, self.precision)
 
         def fast(x: Array, kernel: Array) -> Array:
-            return winograd(x, kernel, self.dilation, self.precision)
+            return lax.cond(
+                uniform, direct, partial(winograd, dilation=self.dilation, precision=self.precision), x, kernel
+            )
 
         kernel = self.kernel[...]
         is_wide = x.shape[-1] >= _WIDE

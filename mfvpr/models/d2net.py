@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jax import Array
+from jax import Array, lax
 
 from mfvpr.models.imagenet import DEVIATION, MEAN
 from mfvpr.models.sampling import between, neighbors
@@ -23,6 +23,10 @@ Preprocessing = Literal["caffe", "torch"]
 
 STRIDE = 4  # px between positions of the map
 SCALES = (0.5, 1.0, 2.0)  # of the multi-scale detection, in this order
+_FIELD = (
+    -10,
+    11,
+)  # cells of 4 x 4 px that lie within what a position of the map sees (92 x 92 px), from its own cell on
 _EDGE_THRESHOLD = 5  # largest ratio of the principal curvatures
 _EPSILON = 1e-12  # of the normalization, where a descriptor is zero
 
@@ -42,8 +46,30 @@ class D2Net(nnx.Module):
 
     def __call__(self, images: Array) -> Array:
         """Dense maps `[B, h, w, 512]` of preprocessed images `[B, H, W, 3]`; h = H // 4 - 1, w = W // 4 - 1."""
-        dense = self.vgg(images)
+        dense = self.vgg(images, uniform=_repeats(images))
         return nnx.relu(dense) if self.relu else dense
+
+
+def _repeats(images: Array) -> Array:
+    """Whether two neighbors in the map see the same pixels of images `[B, H, W, 3]`, as in a white sky; `[]` bool.
+
+    Then the map is level there, unless the rounding makes peaks. Beyond the border all is taken to be the same.
+    """
+    batch, height, width, _ = images.shape
+    rows, columns = -(-height // STRIDE), -(-width // STRIDE)
+    before, after = _FIELD
+    found = jnp.zeros((), bool)
+    for shifted in (images[:, STRIDE:] == images[:, :-STRIDE], images[:, :, STRIDE:] == images[:, :, :-STRIDE]):
+        same = jnp.all(shifted, axis=-1)
+        missing = (STRIDE * rows - same.shape[1], STRIDE * columns - same.shape[2])
+        same = jnp.pad(same, ((0, 0), (0, missing[0]), (0, missing[1])), constant_values=True)
+        same = jnp.all(same.reshape(batch, rows, STRIDE, columns, STRIDE), axis=(2, 4))
+        for axis in (1, 2):
+            padding = [(-before, after) if axis == other else (0, 0) for other in range(3)]
+            window = [after - before + 1 if axis == other else 1 for other in range(3)]
+            same = lax.reduce_window(same, True, lax.bitwise_and, window, (1, 1, 1), padding)
+        found |= jnp.any(same)
+    return found
 
 
 class Detections(NamedTuple):
@@ -206,7 +232,7 @@ def select(dense: Array, seen: Survey, capacity: int) -> Detections:
     inside = (jnp.floor(position) >= 0) & (jnp.ceil(position) <= last)
     valid = (seen.detected & jnp.all(inside & (jnp.abs(seen.step) < 0.5), axis=-1)).reshape(-1)
     order = seen.channel.reshape(-1) * valid.size + jnp.arange(valid.size)  # int32 suffices up to 4 million positions
-    _, strongest = jax.lax.top_k(jnp.where(valid, seen.score.reshape(-1), -jnp.inf), min(capacity, valid.size))
+    _, strongest = lax.top_k(jnp.where(valid, seen.score.reshape(-1), -jnp.inf), min(capacity, valid.size))
     order = jnp.sort(jnp.where(valid, order, jnp.iinfo(order.dtype).max)[strongest])
     place = order % valid.size
     position = position.reshape(-1, 2)[place]

@@ -47,14 +47,14 @@ class Vgg16(nnx.Module):
             setattr(self, name, Conv3x3(inputs, LAYERS[name], dilation=dilation, precision=precision, rngs=rngs))
             inputs = LAYERS[name]
 
-    def __call__(self, images: jax.Array) -> jax.Array:
-        """`[B, H, W, 3]` float32 -> `[B, h, w, D]`, before the last layer's ReLU."""
+    def __call__(self, images: jax.Array, uniform: jax.Array | bool = False) -> jax.Array:
+        """`[B, H, W, 3]` float32 -> `[B, h, w, D]`, before the last layer's ReLU; `uniform` as of `Conv3x3`."""
         first, *others = self.layers
-        x = getattr(self, first)(images)
+        x = getattr(self, first)(images, uniform)
         for name in others:
             starts_block = name.endswith("_1")
             x = _POOLS[self.pools[_block(name) - 2]](x) if starts_block else nnx.relu(x)
-            x = getattr(self, name)(x)
+            x = getattr(self, name)(x, uniform)
         return x
 
 

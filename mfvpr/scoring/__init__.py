@@ -6,8 +6,24 @@ from mfvpr.scoring.aggregate import AggregatedScore
 from mfvpr.scoring.anchor import AnchorPoints
 from mfvpr.scoring.counting import MatchCount
 from mfvpr.scoring.histogram import HistogramOfShifts, ShiftHistogram
+from mfvpr.scoring.shifts import image_sizes, match_shifts
 from mfvpr.types import Array, Matches
 
 Scorer = Callable[[Matches], Array]
+"""Maps the Matches of ONE pair, slots `[K]`, to a score `[]` float32: larger = more likely the same place, exactly 0
+for a pair without matches, and the same whatever the order of the matches, how much is padding, and what that holds.
 
-__all__ = ["AggregatedScore", "AnchorPoints", "HistogramOfShifts", "MatchCount", "Scorer", "ShiftHistogram"]
+Any callable will do. A class decorated with `mfvpr.value` gets more than a plain function: its numbers may be swept,
+traced and learned, and its programs are kept. `mfvpr.testing.check_scorer` checks all of this.
+"""
+
+__all__ = [
+    "AggregatedScore",
+    "AnchorPoints",
+    "HistogramOfShifts",
+    "MatchCount",
+    "Scorer",
+    "ShiftHistogram",
+    "image_sizes",
+    "match_shifts",
+]

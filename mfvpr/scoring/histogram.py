@@ -6,19 +6,21 @@ product, `votes_y [By, K] @ votes_x [Bx, K]^T`, instead of K x By x Bx exponenti
 
 import math
 from dataclasses import field, replace
-from typing import Any, NamedTuple, cast
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mfvpr.numerics import is_concrete, masked, positive
+from mfvpr.errors import InputError
+from mfvpr.numerics import compiled, is_concrete, masked, positive, round_up
 from mfvpr.scoring.choices import check_choices, choice
 from mfvpr.scoring.shifts import image_sizes, match_shifts
 from mfvpr.types import Array, Matches, value
 from mfvpr.weighting import FeatureScoreWeight, Weight, match_weights
 
-TRACED_MAX_BINS = 64  # capacity where nobody set one and the values are traced: 10.5 px bins at 336 px
+MAX_BINS = 1024  # per axis, where nobody asks for more: the histograms of 50 pairs then take 200 MB
 _MEAN_SHIFT_STEPS = 30
 
 
@@ -52,9 +54,9 @@ class HistogramOfShifts:
             0; `zero_edge` puts an edge there.
         sigma_is_variance: read `sigma` as the variance, px^2.
         direction: shift of a match, candidate minus query point or the reverse.
-        max_bins: capacity of bins per axis. By default as many as concrete values ask for, or 64 where they are
-            traced. A histogram that needs more than its capacity scores NaN, never a wrong number: set `max_bins`
-            before `jit` for larger images or finer bins (`with_capacity` does).
+        max_bins: capacity of bins per axis; by default as many as concrete values ask for, at most 1024. Where image
+            sizes or bins are traced it must be set before `jit` or `vmap`, as `with_capacity` does; a histogram that
+            then needs more scores NaN, never a wrong number.
         temperature: in units of the score; T > 0 scores T log(mean over bins of e^(s_ij / T)), at most the maximum
             and smooth in everything but the number of bins. None is the paper's maximum; not above 0 scores NaN.
     """
@@ -107,13 +109,7 @@ class HistogramOfShifts:
         centers: the maximum of the same sum of Gaussians over all shifts, reached from that bin by mean shift
         (Comaniciu & Meer, PAMI 2002).
         """
-        scores, centers, inside, fits = self._vote(matches)
-        scores = jnp.where(inside, scores, -jnp.inf)
-        row, column = jnp.unravel_index(jnp.argmax(scores), scores.shape)
-        shift = jnp.stack([centers[column, 0], centers[row, 1]])
-        if refine:
-            shift = self._climb(shift, self._shifts(matches), match_weights(self.weight, matches))
-        return jnp.where(jnp.max(scores) > 0, jnp.where(fits, shift, jnp.nan), 0.0)
+        return _dominant_shift(self._for(matches), matches, refine=refine)
 
     def agrees(self, matches: Matches, shift: Array) -> Array:
         """`[K]` bool: real matches whose shift lies within two standard deviations of `shift` `[2]` along both axes."""
@@ -121,20 +117,49 @@ class HistogramOfShifts:
         near = jnp.all(jnp.abs(shifts - shift[None]) <= 2 * self._deviation(shifts.dtype), axis=-1)
         return near & matches.mask
 
-    def with_capacity(self, image_size0: Array, image_size1: Array) -> "HistogramOfShifts":
-        """This scorer with `max_bins` set to what its concrete values need.
+    def with_capacity(self, image_size0: Array, image_size1: Array, *, multiple: int = 1) -> "HistogramOfShifts":
+        """This scorer with `max_bins` set to what its concrete values need, rounded up to a `multiple`.
 
         `bin_size` and the sizes may be batched: the capacity serves all of them.
 
         Raises:
-            ValueError: `bin_size` is not above 0.
+            InputError: `bin_size` is not above 0, or so small that more than 1024 bins are needed.
         """
+        return replace(self, max_bins=round_up(self._needed(image_size0, image_size1, most=MAX_BINS), multiple))
+
+    def fitted(self, image_size0: Array, image_size1: Array, multiple: int = 1) -> "HistogramOfShifts":
+        """`with_capacity` where there is none; as it is where values are traced.
+
+        Raises:
+            InputError: as there, or there is one that is too small.
+        """
+        if not is_concrete((self.bin_size, self.shift_range, image_size0, image_size1)):
+            return self
+        if self.max_bins is None:
+            return self.with_capacity(image_size0, image_size1, multiple=multiple)
+        if self.max_bins < (needed := self._needed(image_size0, image_size1)):
+            raise InputError(f"max_bins={self.max_bins}: expected at least {needed}, which images of this size need")
+        return self
+
+    def _needed(self, image_size0: Array, image_size1: Array, most: float = math.inf) -> int:
+        """Bins along an axis that concrete values need."""
         finest = replace(self, bin_size=np.min(self.bin_size))
         if not finest.bin_size > 0:
-            raise ValueError(f"HistogramOfShifts(bin_size={finest.bin_size}): expected a number above 0")
+            raise InputError(f"HistogramOfShifts(bin_size={finest.bin_size}): expected a number above 0")
         _, num_bins = finest._lattice(image_size0, image_size1, float, np)
-        needed = np.max(num_bins, where=np.isfinite(num_bins), initial=1)  # padding pairs may have any size
-        return replace(self, max_bins=int(needed))
+        needed = int(np.max(num_bins, where=np.isfinite(num_bins), initial=1))  # padding pairs may have any size
+        if needed > most:
+            raise InputError(
+                f"bin_size={finest.bin_size:g}: expected at most {most} bins per axis, images of this size need "
+                f"{needed}; use larger bins, or set max_bins"
+            )
+        return needed
+
+    def _for(self, matches: Matches) -> "HistogramOfShifts":
+        """With the capacity that one pair needs."""
+        if is_concrete(matches) and not np.any(matches.mask):  # the sizes may be anything
+            return replace(self, max_bins=self.max_bins or min(self._needed(*image_sizes(matches)), MAX_BINS))
+        return self.fitted(matches.image_size0, matches.image_size1)
 
     def _vote(self, matches: Matches) -> tuple[Array, Array, Array, Array]:
         """Scores `[B, B]` (y, x), centers `[B, 2]`, which bins are in range `[B, B]`, whether all bins fit `[]`."""
@@ -152,12 +177,13 @@ class HistogramOfShifts:
         return *votes, centers, inside[:, 1:] & inside[None, :, 0], jnp.all(num_bins <= len(index))
 
     def _capacity(self, matches: Matches) -> int:
-        if self.max_bins is not None:
-            return self.max_bins
-        values = (self.bin_size, self.shift_range, matches.image_size0, matches.image_size1)
-        if not is_concrete(values):
-            return TRACED_MAX_BINS
-        return cast(int, self.with_capacity(matches.image_size0, matches.image_size1).max_bins)
+        capacity = self._for(matches).max_bins
+        if capacity is None:
+            raise ValueError(
+                "HistogramOfShifts: the number of bins must be known before image sizes or bin_size are traced; set "
+                "max_bins=, or call with_capacity(image_size0, image_size1), before jit, vmap or grad"
+            )
+        return capacity
 
     def _lattice(self, image_size0: Array, image_size1: Array, dtype: Any, xp: Any) -> tuple[Array, Array]:
         """Center of the first bin and number of bins, both `[..., 2]` along (x, y); in NumPy or JAX (`xp`)."""
@@ -191,16 +217,29 @@ class HistogramOfShifts:
         sigmas = (centers[:, None] - shifts[None]) / self._deviation(shifts.dtype)
         return jnp.where(jnp.abs(sigmas) > self.truncate, 0.0, jnp.exp(-0.5 * sigmas**2))
 
-    def _climb(self, start: Array, shifts: Array, weights: Array) -> Array:
-        """Fixed-point iteration to the mode of sum_k w_k exp(-|s - s_k|^2 / (2 sigma^2))."""
 
-        def step(_: int, shift: Array) -> Array:
-            distance = jnp.sum((shifts - shift[None]) ** 2, axis=-1)
-            pull = weights * jnp.exp(-0.5 * distance / self._deviation(shifts.dtype) ** 2)
-            total = jnp.sum(pull)
-            return jnp.where(total > 0, pull @ shifts / jnp.where(total > 0, total, 1.0), shift)
+@partial(compiled, static_argnames="refine")  # or the loop would be compiled at every call
+def _dominant_shift(scorer: HistogramOfShifts, matches: Matches, *, refine: bool) -> Array:
+    scores, centers, inside, fits = scorer._vote(matches)
+    scores = jnp.where(inside, scores, -jnp.inf)
+    row, column = jnp.unravel_index(jnp.argmax(scores), scores.shape)
+    shift = jnp.stack([centers[column, 0], centers[row, 1]])
+    if refine:
+        shifts = scorer._shifts(matches)
+        shift = _climb(shift, shifts, match_weights(scorer.weight, matches), scorer._deviation(shifts.dtype))
+    return jnp.where(jnp.max(scores) > 0, jnp.where(fits, shift, jnp.nan), 0.0)
 
-        return jax.lax.fori_loop(0, _MEAN_SHIFT_STEPS, step, start)
+
+def _climb(start: Array, shifts: Array, weights: Array, deviation: Array) -> Array:
+    """Fixed-point iteration to the mode of sum_k w_k exp(-|s - s_k|^2 / (2 sigma^2))."""
+
+    def step(_: int, shift: Array) -> Array:
+        distance = jnp.sum((shifts - shift[None]) ** 2, axis=-1)
+        pull = weights * jnp.exp(-0.5 * distance / deviation**2)
+        total = jnp.sum(pull)
+        return jnp.where(total > 0, pull @ shifts / jnp.where(total > 0, total, 1.0), shift)
+
+    return jax.lax.fori_loop(0, _MEAN_SHIFT_STEPS, step, start)
 
 
 def _bins(votes_x: Array, votes_y: Array, weights: Array) -> Array:

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from mfvpr.numerics import round_up
-from mfvpr.pipeline import MatchSet, per_match
-from mfvpr.types import Matches
+from mfvpr.pipeline import MatchSet
+from mfvpr.types import Matches, per_match
 
 BATCH_SLOTS = 2**14  # matches of a batch of pairs: its votes stay in cache
 PAIRS_STEP = 8
@@ -51,15 +51,6 @@ def batches(match_set: MatchSet, queries: range) -> Iterator[tuple[np.ndarray, M
                 fields[name][mask] = values[source]
             padded = np.concatenate([part, np.repeat(part[-1:], pairs - len(part))])  # padding has image sizes as well
             yield part, Matches(**fields, mask=mask, image_size0=sizes0[padded], image_size1=sizes1[padded])
-
-
-def image_sizes(match_set: MatchSet) -> tuple[np.ndarray, np.ndarray]:
-    """All combinations of sizes of query and database images, `[n, 2]` each."""
-    sizes0, sizes1 = (
-        np.unique(np.concatenate([np.reshape(getattr(one, name), (-1, 2)) for one in match_set.matches]), axis=0)
-        for name in ("image_size0", "image_size1")
-    )
-    return np.repeat(sizes0, len(sizes1), 0), np.tile(sizes1, (len(sizes0), 1))
 
 
 def _flattened(match_set: MatchSet, queries: range) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:

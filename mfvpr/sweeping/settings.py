@@ -2,14 +2,16 @@
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
-import jax
 import numpy as np
 
 from mfvpr import reranking
+from mfvpr.numerics import held
 from mfvpr.reranking import WEIGHTINGS
+from mfvpr.scoring import parameters
+from mfvpr.scoring.parameters import with_parameters
 from mfvpr.weighting import ChosenWeight
 
 Setting = Mapping[str, Any]
@@ -26,12 +28,14 @@ class Group:
         settings: `[G]` values by parameter.
         weightings: `[W]` values of `weight` (an option's number) and `max_distance`.
         rows: `[G, W]` numbers of the settings.
+        program: what the scorer computes, where that is asked.
     """
 
     scorer: Any
     settings: Mapping[str, np.ndarray]
     weightings: Mapping[str, np.ndarray]
     rows: np.ndarray
+    program: str = ""
 
     def blocks(self, size: int) -> Iterator["Group"]:
         """Parts of one shape with at most `size` settings each; the last repeats what it has to reach it."""
@@ -68,14 +72,15 @@ def groups(scorer: Any, settings: Sequence[Setting], image_sizes: tuple[np.ndarr
         settings: the same names in each. What is static, or None, costs a program for each value.
         image_sizes: all that occur, `[n, 2]` of queries and of database images.
     """
-    static = {field.name for field in fields(scorer) if field.metadata.get("static")}
+    static = parameters.choices(scorer)
     weights = list({id(s["weight"]): s["weight"] for s in settings if "weight" in s}.values())
     for choices, members in _grouped(
         settings, range(len(settings)), lambda name, value: name in static or value is None
     ):
-        chosen = jax.tree.map(np.float32, replace(scorer, **choices))
+        chosen = with_parameters(scorer, choices)
         if weights:
-            chosen = replace(chosen, weight=ChosenWeight(tuple(jax.tree.map(np.float32, weights)), 0))
+            chosen = replace(chosen, weight=ChosenWeight(tuple(weights), 0))
+        chosen = held(chosen)
         for rows in _products(settings, members):
             values = _arrays([settings[row] for row in rows[:, 0]], weights, without={*choices, *WEIGHTINGS})
             weightings = _arrays(

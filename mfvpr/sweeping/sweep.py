@@ -9,7 +9,7 @@ import itertools
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +19,11 @@ import numpy as np
 from mfvpr import reranking
 from mfvpr.data.files import replacing
 from mfvpr.data.images import ordered_map
-from mfvpr.pipeline import MatchSet, Track, filter_scores, untracked
-from mfvpr.sweeping.batches import BYTES_PER_SLOT, batches, image_sizes, slots
+from mfvpr.numerics import compiled
+from mfvpr.pipeline import FilterScore, MatchSet, Ties, Track, filter_scores, untracked
+from mfvpr.sweeping.batches import BYTES_PER_SLOT, batches, slots
 from mfvpr.sweeping.settings import FUSION, Group, Setting, distinct, groups
-from mfvpr.types import Array, Matches, Shortlist
+from mfvpr.types import Array, Matches, Shortlist, per_match
 
 SETTINGS_PER_BLOCK = 64
 BLOCK_BYTES = 2**28
@@ -39,8 +40,8 @@ class Work:
         candidates: of the part, `[q, C]`.
         views: V times the candidates `[q, C]` bool that are ranked.
         depth: rows kept of each ranking.
-        by_index: equal scores go by database row.
-        euclidean: what the filter's scores are.
+        ties: as in `pipeline.rank`.
+        filter_score: as in `pipeline.fuse`.
     """
 
     match_set: MatchSet
@@ -48,8 +49,15 @@ class Work:
     candidates: Shortlist
     views: Sequence[np.ndarray]
     depth: int
-    by_index: bool
-    euclidean: bool
+    ties: Ties
+    filter_score: FilterScore
+
+    @cached_property
+    def digest(self) -> str:
+        """Of the matches, the shortlist and the views of these queries."""
+        found = self.match_set
+        matches = [found.matches[query] for query in self.queries]
+        return _digest(found.counts[self.queries.start : self.queries.stop], matches, self.candidates, list(self.views))
 
     def parts(self, size: int) -> Iterator["Work"]:
         """The same for at most `size` queries at a time."""
@@ -62,7 +70,8 @@ class Work:
 
 def sweep(
     scorer: Any, settings: Sequence[Setting], match_set: MatchSet, candidates: Shortlist, *,
-    views: Sequence[np.ndarray] | None = None, depth: int = 10, by_index: bool = False, euclidean: bool = False,
+    views: Sequence[np.ndarray] | None = None, depth: int = 10, ties: Ties = "filter",
+    filter_score: FilterScore = "cosine",
     settings_per_block: int | None = None, queries_per_block: int | None = None,
     folder: Path | None = None, track: Track = untracked,
 ) -> np.ndarray:  # fmt: skip
@@ -77,11 +86,12 @@ def sweep(
         candidates: their shortlist.
         views: V times the candidates `[Q, C]` bool that are ranked; by default one, all of the shortlist.
         depth: how many rows of a ranking are kept.
-        by_index: equal scores go by database row, not by the filter.
-        euclidean: as in `pipeline.fuse`.
+        ties: as in `pipeline.rank`.
+        filter_score: as in `pipeline.fuse`.
         settings_per_block: by default 64. The result does not depend on it, nor on the next.
         queries_per_block: by default what 256 MB hold.
-        folder: where finished blocks are kept, to be read instead of being computed again; None = nowhere.
+        folder: where finished blocks are kept, to be read instead of being computed again; None = nowhere. Blocks of
+            other matches, shortlists, values or scorers, by what their code computes, may lie there as well.
         track: progress over blocks.
 
     Returns:
@@ -92,8 +102,11 @@ def sweep(
     scored, places = distinct(settings)
     per_block = min(settings_per_block or SETTINGS_PER_BLOCK, len(scored))
     queries = queries_per_block or queries_that_fit(match_set, num_candidates, per_block)
-    work = Work(match_set, range(num_queries), candidates, views, depth, by_index, euclidean)
-    blocks = [one for group in groups(scorer, scored, image_sizes(match_set)) for one in group.blocks(per_block)]
+    work = Work(match_set, range(num_queries), candidates, views, depth, ties, filter_score)
+    found_groups = list(groups(scorer, scored, match_set.image_sizes))
+    if folder is not None:
+        found_groups = [replace(group, program=_program(group, match_set.matches[0])) for group in found_groups]
+    blocks = [one for group in found_groups for one in group.blocks(per_block)]
     found = np.full((len(views), len(settings), num_queries, depth), -1, np.int32)
     steps = ((part, block) for part in work.parts(queries) for block in blocks)
     held: dict[range, list[tuple[np.ndarray, Matches]]] = {}
@@ -161,13 +174,13 @@ def _scores(block: Group, held: Sequence[tuple[np.ndarray, Matches]], shape: tup
 
 def _first_rows(part: Work, scores: np.ndarray, cs: Sequence[Any], view: np.ndarray) -> np.ndarray:
     """`[W, q, depth]` database rows by scores `[W, q, C]`, each fused with its own c."""
-    indices, of_filter = part.candidates.indices, filter_scores(part.candidates, euclidean=part.euclidean)
+    indices, of_filter = part.candidates.indices, filter_scores(part.candidates, part.filter_score)
     rows = np.full((*scores.shape[:2], part.depth), -1, np.int32)
     kinds = np.array(["alone" if c == _ALONE else "balanced" if c is None else "given" for c in cs])
     for kind in np.unique(kinds):
         members = np.flatnonzero(kinds == kind)
         c = np.array([cs[int(member)] for member in members], np.float32) if kind == "given" else None
-        tie_break = indices if part.by_index else None
+        tie_break = indices if part.ties == "index" else None
         order = np.asarray(_orders(of_filter, scores[members], c, view, tie_break, fused=kind != "alone"))
         order = order[..., : part.depth]
         ranked = np.where(np.take_along_axis(view[None], order, -1), np.take_along_axis(indices[None], order, -1), -1)
@@ -175,7 +188,7 @@ def _first_rows(part: Work, scores: np.ndarray, cs: Sequence[Any], view: np.ndar
     return rows
 
 
-@partial(jax.jit, static_argnames="fused")
+@partial(compiled, static_argnames="fused")
 def _orders(
     of_filter: Array, scores: Array, c: Array | None, view: Array, tie_break: Array | None, *, fused: bool
 ) -> Array:
@@ -211,10 +224,25 @@ def _kept(
 
 
 def _fingerprint(part: Work, block: Group, cs: Sequence[Any]) -> str:
-    """All that a block's rows depend on, but for the matches and the shortlist."""
-    leaves, structure = jax.tree.flatten((block.scorer, dict(block.settings), dict(block.weightings), list(part.views)))
-    options = part.queries, part.depth, part.by_index, part.euclidean, [repr(c) for c in cs]
-    digest = hashlib.sha256(repr((structure, options, block.rows.tolist())).encode())
-    for leaf in leaves:
-        digest.update(np.asarray(leaf).tobytes() + b";")
+    """All that a block's rows depend on: matches and shortlist, the scorer's program, and its numbers."""
+    options = part.depth, part.ties, part.filter_score, [repr(c) for c in cs], block.rows.tolist()
+    numbers = block.scorer, dict(block.settings), dict(block.weightings)
+    return _digest(repr(options), block.program, part.digest, numbers)
+
+
+def _program(group: Group, matches: Matches) -> str:
+    """What the scorer computes, for one pair: a user's code may change while its class keeps its name."""
+    example = {name: np.zeros((1, 8, *values.shape[1:]), values.dtype) for name, values in per_match(matches).items()}
+    sizes = np.ones((1, 2), np.float32)
+    pair = Matches(**example, mask=np.ones((1, 8), bool), image_size0=sizes, image_size1=sizes)
+    values = [{name: axis[:1] for name, axis in found.items()} for found in (group.settings, group.weightings)]
+    return jax.jit(reranking.score_settings).lower(group.scorer, pair, *values).as_text()
+
+
+def _digest(*parts: Any) -> str:
+    """Of texts, and of the types, shapes and bytes of the arrays in pytrees."""
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(parts):
+        array = np.frombuffer(leaf.encode(), np.uint8) if isinstance(leaf, str) else np.asarray(leaf)
+        digest.update(f"{array.dtype}{array.shape};".encode() + array.tobytes())
     return digest.hexdigest()[:24]

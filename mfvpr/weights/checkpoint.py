@@ -1,42 +1,60 @@
-"""Reads torch checkpoints as plain data: tensors come out as arrays, and nothing in the file is executed."""
+"""Reads torch checkpoints, of both formats and without torch, as plain data: nothing in the file is executed."""
 
-import pickle
-import re
-import warnings
+import io
+import math
+import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
-from types import ModuleType
-from typing import Any
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 
 from mfvpr.errors import InputError
+from mfvpr.weights.pickles import Storage, Tensor, read_pickle
+
+Order = Literal["little", "big"]
 
 _WRAPPERS = ("model", "state_dict")
+_ORDERS: dict[bytes, Order] = {b"little": "little", b"big": "big"}
+_DTYPES = {
+    "FloatStorage": np.dtype("f4"),
+    "DoubleStorage": np.dtype("f8"),
+    "LongStorage": np.dtype("i8"),  # this and the following hold counters
+    "IntStorage": np.dtype("i4"),
+    "ShortStorage": np.dtype("i2"),
+    "CharStorage": np.dtype("i1"),
+    "ByteStorage": np.dtype("u1"),
+    "BoolStorage": np.dtype("?"),
+}
+_MAGIC, _PROTOCOL = 0x1950A86A20F9469CFC6C, 1001  # with which files begin that are no zip, those before torch 1.6
+_DAMAGE = (ArithmeticError, LookupError, TypeError, ValueError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile)
 
 
 def read_checkpoint(path: Path | str) -> dict[str, np.ndarray]:
-    """Tensors by key, in the file's own types (bfloat16 as float32); those below `model` or `state_dict`, if nested.
+    """Tensors by key, read-only, in the file's own types; those below `model` or `state_dict`, if nested.
 
     Raises:
-        InputError: the file is no checkpoint, is damaged, or holds anything but data; or torch is missing.
+        InputError: the file is no checkpoint, is damaged, or holds anything but float32, float64 and integer tensors.
     """
     path = Path(path)
     _check_file(path)
-    content = _loaded(path)
-    for key in _WRAPPERS:
-        if isinstance(content, Mapping) and isinstance(content.get(key), Mapping):
-            content = content[key]
-            break
-    if not isinstance(content, Mapping) or not content:
-        kind = f"an empty {type(content).__name__}" if content == {} else type(content).__name__
-        raise InputError(f"{path}: expected tensors by name, got {kind}; use the official file")
-    return {str(key): _array(path, str(key), value) for key, value in content.items()}
+    try:
+        with path.open("rb") as file:
+            is_zip = file.read(2) == b"PK"
+            file.seek(0)
+            return _read_zip(file) if is_zip else _read_legacy(file)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except _DAMAGE as error:
+        raise InputError(f"{path}: this checkpoint is damaged; download it again") from error
 
 
 def _check_file(path: Path) -> None:
-    """Refuse what needs no torch to be told from a checkpoint."""
+    """Refuse by its first bytes what is no checkpoint."""
     again = "download it again"
     if path.exists() and not path.is_file():  # a pipe would be waited for
         raise InputError(f"{path}: expected a checkpoint file, got {'a folder' if path.is_dir() else 'no plain file'}")
@@ -55,34 +73,86 @@ def _check_file(path: Path) -> None:
         raise InputError(f"{path}: expected a torch checkpoint, got {kind}; {again}")
 
 
-def _torch() -> ModuleType:
-    try:
-        import torch
-    except ImportError as error:
-        raise InputError("converting checkpoints needs PyTorch, and nothing else does: pip install torch") from error
-    return torch
+def _read_zip(file: BinaryIO) -> dict[str, np.ndarray]:
+    """A pickle, and one entry for the values of each storage; uncompressed, with checksums."""
+    with zipfile.ZipFile(file) as archive:
+        entries = archive.infolist()
+        names = [entry.filename for entry in entries]
+        packed = any(entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1 for entry in entries)
+        if packed or len(set(names)) < len(names) or sum(entry.file_size for entry in entries) > _size(file):
+            raise InputError("expected each entry of the zip file once and uncompressed; use the official file")
+        if broken := archive.testzip():
+            raise InputError(f"this checkpoint is damaged, by the checksum of {broken[:80]}; download it again")
+        (pickle,) = (name for name in names if name.split("/")[1:] == ["data.pkl"])
+        folder = pickle.removesuffix("data.pkl")
+        order = _ORDERS[archive.read(f"{folder}byteorder") if f"{folder}byteorder" in names else b"little"]
+        content = read_pickle(io.BytesIO(archive.read(pickle)))
+        return _arrays(content.value, order, lambda storage: archive.read(f"{folder}data/{storage.key}"))
 
 
-def _loaded(path: Path) -> Any:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torch's remarks on how the file was written
-        torch = _torch()
-        try:
-            return torch.load(path, map_location="cpu", weights_only=True)
-        except pickle.UnpicklingError as error:
-            wanted = re.search(r"GLOBAL ([\w.]+)", str(error))
-            what = f"it asks for {wanted[1]}" if wanted else "its pickle is damaged or more than data"
-            reason = f"{what}; nothing was executed, use the official file"
-        except Exception:  # torch raises half a dozen kinds, its own texts are paragraphs
-            reason = "this checkpoint is damaged; download it again"
-    raise InputError(f"{path}: {reason}")
+def _read_legacy(file: BinaryIO) -> dict[str, np.ndarray]:
+    """Five pickles: two numbers, the byte order, the content, the keys of its storages; then their values."""
+    if (read_pickle(file).value, read_pickle(file).value) != (_MAGIC, _PROTOCOL):
+        raise InputError("expected a torch checkpoint, got another pickle; use the official file")
+    order: Order = "little" if read_pickle(file).value["little_endian"] else "big"
+    content, keys = read_pickle(file), read_pickle(file).value
+    places = {}
+    for key in keys:
+        storage = content.storages[key]
+        size = storage.count * _dtype(storage).itemsize
+        if int.from_bytes(file.read(8), order) != storage.count or file.tell() + size > _size(file):
+            raise ValueError
+        places[key] = file.tell(), size
+        file.seek(size, os.SEEK_CUR)
+    if file.tell() != _size(file):
+        raise ValueError
+
+    def values(storage: Storage) -> bytes:
+        place, size = places[storage.key]
+        file.seek(place)
+        return file.read(size)
+
+    return _arrays(content.value, order, values)
 
 
-def _array(path: Path, key: str, value: Any) -> np.ndarray:
-    torch = _torch()
-    if not isinstance(value, torch.Tensor):
-        raise InputError(f"{path}: expected tensors only, got {type(value).__name__} at {key}")
-    value = value.detach()
-    if value.layout is not torch.strided or value.is_quantized:
-        raise InputError(f"{path}: expected dense tensors, got {value.layout} at {key}")
-    return (value.float() if value.dtype is torch.bfloat16 else value).numpy()
+def _size(file: BinaryIO) -> int:
+    return os.fstat(file.fileno()).st_size
+
+
+def _arrays(content: Any, order: Order, values: Callable[[Storage], bytes]) -> dict[str, np.ndarray]:
+    """Tensors of a pickle's content as arrays; `order` is that of their bytes."""
+    values = cache(values)
+    for key in _WRAPPERS:
+        if isinstance(content, dict) and isinstance(content.get(key), dict):
+            content = content[key]
+            break
+    if not isinstance(content, dict) or not content:
+        kind = "an empty dict" if content == {} else type(content).__name__
+        raise InputError(f"expected tensors by name, got {kind}; use the official file")
+    arrays = {}
+    for key, tensor in content.items():
+        where = f" at {str(key)[:80]}"
+        if not isinstance(tensor, Tensor):
+            raise InputError(f"expected tensors only, got {type(tensor).__name__}{where}")
+        dtype = _dtype(tensor.storage, where).newbyteorder(order)
+        raw = values(tensor.storage)
+        if len(raw) != tensor.storage.count * dtype.itemsize:
+            raise ValueError
+        if math.prod(tensor.shape) > tensor.storage.count:
+            raise InputError(f"expected no more values than the file stores{where}; use the official file")
+        strides = [step * dtype.itemsize for step in tensor.strides]
+        view = np.ndarray(tensor.shape, dtype, raw, tensor.offset * dtype.itemsize, strides)  # checks its bounds
+        arrays[str(key)] = view.astype(dtype.newbyteorder("="), copy=False)
+    return arrays
+
+
+def _dtype(storage: Storage, where: str = "") -> np.dtype:
+    """Of a storage's values; `where` ends the message.
+
+    Raises:
+        InputError: neither float32 nor float64 nor an integer.
+    """
+    if storage.kind not in _DTYPES:
+        kind = storage.kind.removesuffix("Storage")
+        raise InputError(f"expected tensors of float32 or float64, got {kind[:80]}{where}; use the official file")
+    return _DTYPES[storage.kind]

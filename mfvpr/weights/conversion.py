@@ -1,11 +1,11 @@
 """Foreign checkpoints -> our parameters: one table per network, one converter for all.
 
 Nothing is guessed and nothing is left over: every source key is used once or listed as ignored, every target is filled
-once, every shape is checked, and all that is wrong is told together.
+once, every type and shape is checked. What is wrong is counted by kind, with an example of each.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
@@ -42,7 +42,7 @@ class Table:
 def convert(
     source: Mapping[str, np.ndarray], table: Table, shapes: Mapping[str, tuple[int, ...]]
 ) -> dict[str, np.ndarray]:
-    """Parameters by dotted path, float32, from a checkpoint's tensors.
+    """Parameters by dotted path, float32 (float64 is rounded), from a checkpoint's tensors.
 
     Args:
         source: tensors by their keys in the checkpoint.
@@ -50,33 +50,58 @@ def convert(
         shapes: what the network expects, by dotted path.
 
     Raises:
-        InputError: keys are missing, left over, or of another shape; the message lists all of them.
+        InputError: keys are missing, left over, or of another shape or type.
     """
     found: dict[str, np.ndarray] = {}
     origin: dict[str, str] = {}
-    problems: list[str] = []
+    problems: dict[str, list[str]] = {}
+
+    def wrong(kind: str, example: str) -> None:
+        problems.setdefault(kind, []).append(example)
+
     for key, value in source.items():
-        if any(re.fullmatch(pattern, key) for pattern in table.ignored):
+        if _is_ignored(key, table):
             continue
         targets = _targets(key, table)
-        if len(targets) != 1 or targets[0][0] not in shapes:
-            problems.append(f"unknown key {key}" if len(targets) < 2 else f"{key} matches several rules")
+        if len(targets) > 1:
+            wrong("with several rules", _short(key))
+            continue
+        if not targets or targets[0][0] not in shapes:
+            wrong("unknown", _short(key))
             continue
         target, layout = targets[0]
         if target in origin:
-            problems.append(f"{key} and {origin[target]} both fill {target}")
+            wrong("twice", f"{key} and {origin[target]}")
             continue
         origin[target] = key
-        array = _laid_out(np.asarray(value), layout)
-        if array is None or array.shape != shapes[target]:
-            wanted = _source_shape(shapes[target], layout)
-            problems.append(f"{key} -> {target}: expected shape {wanted}, got {np.shape(value)}")
+        expected = _source_shape(shapes[target], layout)
+        if value.shape != expected:
+            wrong("of another shape", f"{key}: expected {expected}, got {value.shape}")
+        elif value.dtype not in (np.float32, np.float64):
+            wrong("of another type", f"{key}: expected float32 or float64, got {value.dtype}")
         else:
-            found[target] = array
-    problems += [f"nothing fills {target}" for target in shapes if target not in origin]
+            found[target] = _laid_out(value, layout)
+    for target in shapes:
+        if target not in origin:
+            wrong("missing", target)
     if problems:
-        raise InputError(f"{len(problems)} of the network's keys do not fit: " + "; ".join(problems))
+        kinds = (f"{len(examples)} {kind} ({examples[0]})" for kind, examples in problems.items())
+        raise InputError(f"keys do not fit the network: {', '.join(kinds)}")
     return found
+
+
+def share_known(keys: Iterable[str], table: Table) -> float:
+    """How many of the keys the table names, from 0 to 1."""
+    known = [_is_ignored(key, table) or bool(_targets(key, table)) for key in keys]
+    return sum(known) / max(len(known), 1)
+
+
+def _is_ignored(key: str, table: Table) -> bool:
+    return any(re.fullmatch(pattern, key) for pattern in table.ignored)
+
+
+def _short(key: str) -> str:
+    return key if len(key) <= 60 else f"{key[:57]}..."
 
 
 def _targets(key: str, table: Table) -> list[tuple[str, Layout]]:
@@ -84,14 +109,10 @@ def _targets(key: str, table: Table) -> list[tuple[str, Layout]]:
     return [(match.expand(rule.target), rule.layout) for match, rule in matches if match]
 
 
-def _laid_out(array: np.ndarray, layout: Layout) -> np.ndarray | None:
-    """The array in our layout, contiguous float32; None where it has another rank."""
+def _laid_out(array: np.ndarray, layout: Layout) -> np.ndarray:
+    """The array in our layout, contiguous float32."""
     axes = layout.value
-    if axes is not None:
-        if array.ndim != len(axes):
-            return None
-        array = array.transpose(axes)
-    return np.ascontiguousarray(array, np.float32).reshape(array.shape)
+    return np.array(array if axes is None else array.transpose(axes), np.float32, order="C")
 
 
 def _source_shape(shape: tuple[int, ...], layout: Layout) -> tuple[int, ...]:

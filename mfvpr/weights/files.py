@@ -3,7 +3,6 @@
 import hashlib
 import json
 import os
-import shlex
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -21,6 +20,7 @@ if TYPE_CHECKING:
     from flax import nnx
 
 FORMAT = 1
+_MEND = "install it again"
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,18 @@ class Manifest:
     source_file: str
     source_sha256: str
     format: int = FORMAT
+    rounded: int = 0  # of the source's tensors, from float64 to float32
+
+
+class WeightsError(InputError):
+    """Weights that are not installed, or no longer as they were; `entry` says which to install."""
+
+    def __init__(self, message: str, entry: Entry) -> None:
+        super().__init__(message, entry)
+        self.entry = entry
+
+    def __str__(self) -> str:
+        return str(self.args[0])
 
 
 def weights_folder() -> Path:
@@ -47,18 +59,20 @@ def install(checkpoint: Path, name: str, folder: Path | None = None) -> Path:
     Raises:
         InputError: unknown name, no network for it, not the published file, no checkpoint, or keys that do not fit.
     """
-    from mfvpr.weights.networks import blueprint, network_of
+    from mfvpr.weights.networks import blueprint, network_of, resemblance
 
     entry = entry_of(name)
-    table = network_of(entry).table
+    network = network_of(entry)
     check_published(checkpoint, entry)
     tensors = read_checkpoint(checkpoint)
     plan = blueprint(entry)
     try:
-        arrays = convert(tensors, table, plan.shapes)
+        arrays = convert(tensors, network.table, plan.shapes)
     except InputError as error:
-        raise InputError(f"{checkpoint}: {error}; use the official {entry.file}") from error
-    return save(name, arrays, checkpoint, parameters=plan.parameters, folder=folder)
+        reason = resemblance(list(tensors), network) or error
+        raise InputError(f"{checkpoint}: {reason}; use the official {entry.file}") from error
+    rounded = sum(tensor.dtype == np.float64 for tensor in tensors.values())
+    return save(name, arrays, checkpoint, parameters=plan.parameters, rounded=rounded, folder=folder)
 
 
 def check_published(checkpoint: Path, entry: Entry) -> None:
@@ -89,7 +103,13 @@ def check_sha256(sha256: str, entry: Entry, origin: object) -> None:
 
 
 def save(
-    name: str, arrays: Mapping[str, np.ndarray], source: Path, *, parameters: int, folder: Path | None = None
+    name: str,
+    arrays: Mapping[str, np.ndarray],
+    source: Path,
+    *,
+    parameters: int,
+    rounded: int = 0,
+    folder: Path | None = None,
 ) -> Path:
     """Write the arrays and, last, the manifest: until then, and if it never comes, `load` refuses the file.
 
@@ -98,6 +118,7 @@ def save(
         arrays: by dotted path.
         source: the checkpoint they came from.
         parameters: how many the network has.
+        rounded: how many of the source's tensors were rounded from float64.
         folder: `weights_folder()` by default.
 
     Raises:
@@ -114,7 +135,7 @@ def save(
     with replacing(target) as temporary:
         temporary.write_bytes(content)
     sha256 = hashlib.sha256(content).hexdigest()
-    manifest = Manifest(name, sha256, len(content), parameters, source.name, file_sha256(source))
+    manifest = Manifest(name, sha256, len(content), parameters, source.name, file_sha256(source), rounded=rounded)
     write_text(target.with_suffix(".json"), json.dumps(asdict(manifest), indent=1) + "\n")
     return target
 
@@ -123,7 +144,8 @@ def load(name: str, folder: Path | None = None) -> dict[str, np.ndarray]:
     """Arrays by dotted path, from a file that is byte for byte what was saved.
 
     Raises:
-        InputError: unknown name; not installed (the message says how to); no manifest, another's, or a damaged file.
+        InputError: unknown name.
+        WeightsError: not installed; no manifest, another's, or a damaged file.
     """
     from safetensors import SafetensorError
     from safetensors.numpy import load as deserialized
@@ -132,21 +154,22 @@ def load(name: str, folder: Path | None = None) -> dict[str, np.ndarray]:
     manifest = read_manifest(name, folder)
     path = _path(entry, folder)
     if (size := path.stat().st_size) != manifest.size:
-        raise InputError(f"{path}: expected {manifest.size} bytes, got {size}; {_mend(entry)}")
+        raise WeightsError(f"{path}: expected {manifest.size} bytes, got {size}; {_MEND}", entry)
     content = path.read_bytes()
     if hashlib.sha256(content).hexdigest() != manifest.sha256:
-        raise InputError(f"{path}: the file has changed since it was written (sha256 differs); {_mend(entry)}")
+        raise WeightsError(f"{path}: the file has changed since it was written (sha256 differs); {_MEND}", entry)
     try:
         return deserialized(content)
     except (SafetensorError, KeyError, ValueError, TypeError) as error:
-        raise InputError(f"{path}: expected a safetensors file, got: {error}; {_mend(entry)}") from error
+        raise WeightsError(f"{path}: expected a safetensors file, got: {error}; {_MEND}", entry) from error
 
 
 def load_model(name: str, folder: Path | None = None) -> "nnx.Module":
     """The network of this name with its weights, ready for inference.
 
     Raises:
-        InputError: as `load`; or the file's arrays are not this network's.
+        InputError: unknown name, or no network for it.
+        WeightsError: as `load`; or the file's arrays are not this network's.
     """
     from mfvpr.weights.networks import blueprint, network_of
 
@@ -156,14 +179,14 @@ def load_model(name: str, folder: Path | None = None) -> "nnx.Module":
     try:
         return blueprint(entry).filled(arrays)
     except InputError as error:  # written by another version of the network
-        raise InputError(f"{_path(entry, folder)}: {error}; {_mend(entry)}") from error
+        raise WeightsError(f"{_path(entry, folder)}: {error}; {_MEND}", entry) from error
 
 
 def fingerprint(name: str, folder: Path | None = None) -> str:
     """The sha256 of the runtime file, as its manifest has it.
 
     Raises:
-        InputError: not installed, or no manifest.
+        WeightsError: not installed, or no manifest.
     """
     return read_manifest(name, folder).sha256
 
@@ -172,25 +195,29 @@ def read_manifest(name: str, folder: Path | None = None) -> Manifest:
     """The manifest of an installed runtime file; the file itself is not read.
 
     Raises:
-        InputError: not installed, or no manifest of this name and format.
+        WeightsError: not installed, or no manifest of this name and format.
     """
     entry = entry_of(name)
     path = _path(entry, folder).with_suffix(".json")
     if not path.with_suffix(".safetensors").is_file():
-        raise InputError(_how_to_install(entry, folder))
+        raise WeightsError(
+            f"{name}: not installed in {folder or weights_folder()}; get {entry.file} from {entry.source} "
+            f"({entry.license}) and install it",
+            entry,
+        )
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
         manifest = Manifest(**values)
         if any(type(getattr(manifest, field.name)) is not field.type for field in fields(Manifest)):
             raise TypeError
     except FileNotFoundError as error:
-        raise InputError(f"{path}: there is no manifest, so the file was never finished; {_mend(entry)}") from error
+        raise WeightsError(f"{path}: there is no manifest, so the file was never finished; {_MEND}", entry) from error
     except (ValueError, TypeError) as error:
-        raise InputError(f"{path}: expected a manifest of format {FORMAT}; {_mend(entry)}") from error
+        raise WeightsError(f"{path}: expected a manifest of format {FORMAT}; {_MEND}", entry) from error
     if manifest.format != FORMAT:
-        raise InputError(f"{path}: expected a manifest of format {FORMAT}, got {manifest.format}; {_mend(entry)}")
+        raise WeightsError(f"{path}: expected a manifest of format {FORMAT}, got {manifest.format}; {_MEND}", entry)
     if manifest.name != name:
-        raise InputError(f"{path}: expected the manifest of {name}, got that of {manifest.name}; {_mend(entry)}")
+        raise WeightsError(f"{path}: expected the manifest of {name}, got that of {manifest.name}; {_MEND}", entry)
     return manifest
 
 
@@ -208,15 +235,3 @@ def file_sha256(path: Path) -> str:
 
 def _path(entry: Entry, folder: Path | None) -> Path:
     return (folder or weights_folder()) / f"{entry.name}.safetensors"
-
-
-def _mend(entry: Entry) -> str:
-    return f"write it again: python -m experiments.weights convert {shlex.quote(entry.file)}"
-
-
-def _how_to_install(entry: Entry, folder: Path | None) -> str:
-    command = f"python -m experiments.weights convert {shlex.quote(entry.file)}"
-    return (
-        f"{entry.name}: not installed in {folder or weights_folder()}; get {entry.file} from {entry.source} "
-        f"({entry.license}), then: {command}"
-    )

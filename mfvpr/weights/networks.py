@@ -1,16 +1,17 @@
 """Which network each published file fills, and how."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import accumulate
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from mfvpr.errors import InputError
-from mfvpr.weights.conversion import Rule, Table, convert
-from mfvpr.weights.registry import Entry
+from mfvpr.weights.conversion import Rule, Table, convert, share_known
+from mfvpr.weights.registry import REGISTRY, Entry
 from mfvpr.weights.tables import ALIKED, D2NET, MIXVPR
 
 if TYPE_CHECKING:
@@ -45,6 +46,9 @@ def _aliked(variant: str) -> Callable[..., "nnx.Module"]:
 
 
 _ALIKED = ("aliked-t16", "aliked-n16", "aliked-n16rot", "aliked-n32")
+
+_MOST = 0.5  # of the keys tell whose they are
+_LONGEST_PREFIX = 4  # parts between dots
 
 # By the registry's names. Entries that are not here have no network in this version.
 NETWORKS: dict[str, Network] = {
@@ -93,6 +97,20 @@ def network_of(entry: Entry) -> Network:
             f"{entry.name}: the network {entry.network} is not part of this version; its files are listed and verified"
         )
     return NETWORKS[entry.name]
+
+
+def resemblance(keys: Sequence[str], expected: Network) -> str | None:
+    """Why the keys are not those of the expected network, where another's or a prefix before them explains it."""
+    if share_known(keys, expected.table) > _MOST:
+        return None
+    for name, network in NETWORKS.items():
+        if network.table is not expected.table and share_known(keys, network.table) > _MOST:
+            return f"expected the keys of another network, got those of {REGISTRY[name].network}"
+    *parts, _ = keys[0].split(".", maxsplit=_LONGEST_PREFIX)
+    for prefix in accumulate(f"{part}." for part in parts):
+        if share_known([key.removeprefix(prefix) for key in keys], expected.table) > _MOST:
+            return f"its keys begin with {prefix[:60]}, which the official file's do not"
+    return None
 
 
 def blueprint(entry: Entry) -> Blueprint:

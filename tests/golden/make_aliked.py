@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from mfvpr.data.images import read_image, resize
-from tests.checkpoints import random_checkpoint, read_zip
+from mfvpr.weights.checkpoint import read_checkpoint
+from tests.checkpoints import random_checkpoint
 from tests.golden.make_d2net import projections, samples, texture
 
 GOLDEN = Path(__file__).parent / "aliked.npz"
@@ -81,7 +82,7 @@ def shapes(variant: str) -> dict[str, tuple[int, ...]]:
 
 def checkpoint(case: Case, weights: Path) -> dict[str, np.ndarray]:
     """The case's weights, by the public names."""
-    return read_zip(weights / f"{case.variant}.pth") if case.image else random_checkpoint(shapes(case.variant))
+    return read_checkpoint(weights / f"{case.variant}.pth") if case.image else random_checkpoint(shapes(case.variant))
 
 
 def picture(case: Case, images: Path) -> np.ndarray:

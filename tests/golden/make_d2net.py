@@ -22,9 +22,19 @@ class Case(NamedTuple):
     height: int
     preprocessing: str
     multiscale: bool
+    plain: int = 0  # rows from the top that are of one gray
+    gray: int = 255
 
     def __str__(self) -> str:
-        return f"{self.width}x{self.height}-{self.preprocessing}{'-multiscale' if self.multiscale else ''}"
+        plain = f"-{self.plain}_rows_of_{self.gray}" if self.plain else ""
+        return f"{self.width}x{self.height}-{self.preprocessing}{'-multiscale' if self.multiscale else ''}{plain}"
+
+    @property
+    def image(self) -> np.ndarray:
+        """`[height, width, 3]` uint8."""
+        image = texture(self.width, self.height)
+        image[: self.plain] = self.gray
+        return image
 
 
 CASES = (
@@ -34,6 +44,11 @@ CASES = (
     Case(256, 192, "caffe", False),
     Case(250, 187, "caffe", False),
     Case(210, 154, "caffe", True),
+)
+# Of one size. What sees nothing but one gray has no keypoints; where texture or border comes into view, there are some.
+PLAIN = (
+    Case(337, 251, "caffe", False, plain=140),
+    *(Case(337, 251, "caffe", False, plain=251, gray=gray) for gray in (0, 128, 255)),
 )
 
 
@@ -82,8 +97,8 @@ def main(clone: str) -> None:
     checkpoint = random_checkpoint(d2net_shapes())
     network.load_state_dict({name: torch.from_numpy(values) for name, values in checkpoint.items()})
     golden = {}
-    for case in CASES:
-        image = preprocess_image(texture(case.width, case.height), case.preprocessing).astype(np.float32)
+    for case in CASES + PLAIN:
+        image = preprocess_image(case.image, case.preprocessing).astype(np.float32)
         with torch.no_grad():
             batch = torch.from_numpy(image[None])
             scales = [0.5, 1, 2] if case.multiscale else [1]

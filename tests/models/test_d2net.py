@@ -16,7 +16,7 @@ from mfvpr.weights.networks import blueprint
 from mfvpr.weights.registry import entry_of
 from mfvpr.weights.tables import D2NET
 from tests.checkpoints import d2net_shapes, random_checkpoint
-from tests.golden.make_d2net import CASES, GOLDEN, projections, samples, texture
+from tests.golden.make_d2net import CASES, GOLDEN, PLAIN, projections, samples, texture
 from tests.models import d2net_oracle as oracle
 
 
@@ -131,6 +131,40 @@ def test_maps_and_features_are_those_of_the_public_code(model, case):
     np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1, atol=1e-6)
     np.testing.assert_array_equal(features.image_size, size)
     assert features.mask.all()
+
+
+@pytest.fixture(scope="module")
+def plain(model) -> D2NetFeatures:
+    return D2NetFeatures(model, (PLAIN[0].width, PLAIN[0].height))
+
+
+@pytest.mark.parametrize("case", PLAIN, ids=str)
+def test_plain_areas_have_the_keypoints_of_the_public_code_and_no_more(plain, case):
+    """Fast convolutions that round by position would make peaks of what is level, and lose those at its rim."""
+    with np.load(GOLDEN) as file:
+        golden = {name: file[f"{case}/{name}"] for name in ("keypoints", "scores", "projections")}
+    (features,) = plain(case.image[None])
+    assert len(features.scores) == len(golden["scores"]) > 10
+    np.testing.assert_allclose(features.keypoints, golden["keypoints"], atol=1e-2)
+    np.testing.assert_allclose(features.scores, golden["scores"], rtol=1e-5)
+    np.testing.assert_allclose(projections(features.descriptors), golden["projections"], atol=1e-4)
+
+
+def test_neighbors_that_see_the_same_pixels_have_the_same_bits(model):
+    """A position sees 92 x 92 px; elsewhere the fast convolutions are at work."""
+    image = texture(160, 128)
+    wide, tall = image.copy(), image.copy()
+    wide[2:94, 30:126] = 200
+    tall[30:126, 2:94] = 200
+    maps = compiled(model, lambda model, images: (model(images), nnx.relu(model.vgg(images, uniform=True))))
+    (usual, wide, tall), (uniform, *_) = zip(
+        *(maps(preprocess(image[None])) for image in (image, wide, tall)), strict=True
+    )
+    np.testing.assert_array_equal(wide[0, 11, 18], wide[0, 11, 19])
+    np.testing.assert_array_equal(tall[0, 18, 11], tall[0, 19, 11])
+    if jax.default_backend() == "cpu":
+        assert not np.array_equal(usual, uniform)
+    np.testing.assert_allclose(usual, uniform, atol=1e-5 * uniform.max())
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from mfvpr.errors import InputError
 from mfvpr.features.mixvpr import MixVprDescriptor
 from mfvpr.models.mixvpr import MixVPR, preprocess
 from mfvpr.models.resnet import ResNet50
@@ -120,10 +121,15 @@ def test_bytes_and_floats_are_preprocessed_alike():
 def test_other_image_sizes_are_refused(model):
     with pytest.raises(ValueError, match="320 x 320 px only, got 640 x 480"):
         model(jnp.zeros((1, 480, 640, 3)))
-    with pytest.raises(ValueError, match="320 x 320 px only, got 336 x 336"):
-        MixVprDescriptor(model)(np.zeros((1, 336, 336, 3), np.uint8), ())
+    with pytest.raises(InputError, match="MixVPR: expected images of 320 x 320 px, got 336 x 300"):
+        MixVprDescriptor(model)(np.zeros((1, 300, 336, 3), np.uint8), ())
     with pytest.raises(ValueError, match="got none"):
         MixVprDescriptor(model)(None, ())
+
+
+def test_no_images_give_no_descriptors(model):
+    none = MixVprDescriptor(model)(np.zeros((0, 320, 320, 3), np.uint8), ())
+    assert (none.shape, none.dtype) == ((0, 4096), np.float32)
 
 
 @pytest.mark.parametrize("channels, rows", SIZES)

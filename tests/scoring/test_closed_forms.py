@@ -124,3 +124,18 @@ def test_numbers_without_meaning_give_no_number():
 def test_a_histogram_without_votes_has_no_shift():
     matches = make_matches([[10, 10]], [[50, 20]], scores0=[0.0], scores1=[0.0])
     np.testing.assert_array_equal(HistogramOfShifts().dominant_shift(matches), 0)
+
+
+@pytest.mark.parametrize(
+    ("count", "align"),
+    [(count, "min_edge") for count in (15, 29, 30, 31, 58, 60)]
+    + [(count, "zero_edge" if count % 2 == 0 else "zero_center") for count in (15, 29, 30, 31, 58, 60)],
+)
+def test_rounding_adds_no_bin_that_holds_nothing(count, align):
+    """Bins that tile the range exactly, in widths that binary fractions only approximate."""
+    scorer = HistogramOfShifts(bin_size=2 * SIZE / count, align=align)
+    matches = make_matches([[10, 10]], [[20, 20]])
+    assert scorer.with_capacity(matches.image_size0, matches.image_size1).max_bins == count
+    bins = replace(scorer, max_bins=count + 3).histogram(matches)
+    assert int((bins.scores > -np.inf).any(axis=0).sum()) == count
+    np.testing.assert_allclose(bins.centers_x[0], -SIZE + SIZE / count, rtol=1e-5)

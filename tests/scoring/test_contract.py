@@ -8,34 +8,39 @@ import numpy as np
 import pytest
 
 from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, MatchCount, Matches, UnitWeight, score_candidates
-from tests.builders import make_matches, per_match, random_matches
+from mfvpr.errors import InputError
+from mfvpr.numerics import held
+from mfvpr.scoring.parameters import fit
+from tests.builders import SIZE, make_matches, per_match, random_matches
+from tests.scorers import FOREIGN, FOREIGN_VALUES, OWN, Wrapped, plain, title
 
-ALL_SCORERS = [
-    HistogramOfShifts(),
-    HistogramOfShifts(bin_size=20.0, sigma=12.0, truncate=3.0, align="zero_center", weight=UnitWeight()),
-    HistogramOfShifts(shift_range=(100.0, 50.0), align="zero_edge", direction="query_minus_candidate"),
-    AnchorPoints(),
-    AnchorPoints(window_mode="asymmetric", first="candidate", cell_weight="cell_sum", include_self=False),
-    AnchorPoints(window_mode="odd_down", cell_weight="ones", tolerance=1.5),
-    AggregatedScore(),
-    AggregatedScore(mean="weighted", clamp=True),
-    AggregatedScore(mean="median"),
-    MatchCount(),
-    HistogramOfShifts(temperature=0.05),
-    AnchorPoints(num_bins=8, temperature=0.2),
-    AggregatedScore(mean="weighted", clamp=True, temperature=30.0),
-]
-scorers = pytest.mark.parametrize("scorer", ALL_SCORERS, ids=lambda s: f"{type(s).__name__}")
-score = jax.jit(lambda scorer, matches: scorer(matches))  # once per shape: hence 60 slots wherever possible
-score_all = jax.jit(score_candidates)
+everyone = pytest.mark.parametrize("scorer", [*OWN, *FOREIGN], ids=title)
+values = pytest.mark.parametrize("scorer", [*OWN, *FOREIGN_VALUES], ids=title)
+own = pytest.mark.parametrize("scorer", OWN, ids=title)
+_score = jax.jit(lambda scorer, matches: scorer(matches))  # once per shape: hence 60 slots wherever possible
+_score_all = jax.jit(score_candidates)
 gradients = jax.jit(jax.grad(lambda scorer, inputs, mask: scorer(Matches(mask=mask, **inputs)), argnums=(0, 1)))
+SIZES = np.array([SIZE, SIZE], np.float32)
+
+
+def fitted(scorer):
+    """With the capacity that the tests' images need."""
+    return held(fit(scorer, SIZES, SIZES))
+
+
+def score(scorer, matches):
+    return _score(fitted(scorer), matches)
+
+
+def score_all(scorer, matches):
+    return _score_all(fitted(scorer), matches)
 
 
 def stack(items):
     return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *items)
 
 
-@scorers
+@everyone
 def test_scalar_float32_and_exactly_zero_without_matches(scorer):
     nothing = score(scorer, random_matches(np.random.default_rng(0), 0, capacity=60))
     assert nothing.shape == ()
@@ -44,7 +49,7 @@ def test_scalar_float32_and_exactly_zero_without_matches(scorer):
     assert score(scorer, random_matches(np.random.default_rng(0), 40, capacity=60)) > 0
 
 
-@scorers
+@everyone
 @pytest.mark.parametrize("garbage", [np.nan, np.inf, -1e30, 7.0])
 def test_padding_never_matters(scorer, garbage):
     tight = random_matches(np.random.default_rng(1), 60)
@@ -52,7 +57,7 @@ def test_padding_never_matters(scorer, garbage):
     np.testing.assert_allclose(score(scorer, loose), score(scorer, tight), rtol=2e-6)
 
 
-@scorers
+@everyone
 def test_order_of_matches_does_not_matter(scorer):
     matches = random_matches(np.random.default_rng(2), 60)
     order = np.random.default_rng(3).permutation(60)
@@ -60,7 +65,7 @@ def test_order_of_matches_does_not_matter(scorer):
     np.testing.assert_allclose(score(scorer, shuffled), score(scorer, matches), rtol=2e-6)
 
 
-@scorers
+@everyone
 @pytest.mark.parametrize("batch", [1, 2, 5])
 def test_batch_equals_loop_and_neighbors_do_not_matter(scorer, batch):
     rng = np.random.default_rng(4)
@@ -69,7 +74,7 @@ def test_batch_equals_loop_and_neighbors_do_not_matter(scorer, batch):
     np.testing.assert_allclose(score_all(scorer, stack(pairs)), loop, rtol=2e-6, atol=0)
 
 
-@scorers
+@values
 def test_one_trace_serves_all_parameter_values(scorer):
     traces = []
 
@@ -78,25 +83,26 @@ def test_one_trace_serves_all_parameter_values(scorer):
         traces.append(1)
         return scorer(matches)
 
-    matches = random_matches(np.random.default_rng(5), 30)
+    scorer, matches = fitted(scorer), random_matches(np.random.default_rng(5), 30)
     eager, compiled = scorer(matches), score(scorer, matches)
     np.testing.assert_allclose(compiled, eager, rtol=2e-6)
     for factor in (1.1, 1.3):
-        changed = jax.tree.map(lambda value, factor=factor: value * factor, scorer)
+        grow = lambda leaf, factor=factor: leaf * factor if isinstance(leaf, float) else leaf  # noqa: E731
+        changed = jax.tree.map(grow, scorer)
         np.testing.assert_allclose(score(changed, matches), changed(matches), rtol=2e-6)
     assert len(traces) == 1
 
 
-@scorers
+@own
 @pytest.mark.parametrize("count", [0, 1, 25])
 def test_gradients_are_finite(scorer, count):
     matches = random_matches(np.random.default_rng(6), count, capacity=60)
     inputs = {f.name: getattr(matches, f.name) for f in fields(matches) if f.name != "mask"}
-    for gradient in jax.tree.leaves(gradients(jax.tree.map(float, scorer), inputs, matches.mask)):
+    for gradient in jax.tree.leaves(gradients(fitted(scorer), inputs, matches.mask)):
         assert np.isfinite(gradient).all()
 
 
-@scorers
+@own
 def test_gradients_agree_with_finite_differences(scorer):
     """Along a random direction of weights and distances, where every score is smooth."""
     matches = random_matches(np.random.default_rng(7), 20)
@@ -114,20 +120,21 @@ def test_gradients_agree_with_finite_differences(scorer):
     np.testing.assert_allclose(jax.grad(along)(0.0) / scale, numeric / scale, atol=2e-3)
 
 
-@scorers
+@everyone
 def test_a_masked_pair_may_have_any_size(scorer):
     rng = np.random.default_rng(9)
     pair, empty = random_matches(rng, 60), random_matches(rng, 0, capacity=60)
     empty = replace(empty, image_size0=np.full(2, np.nan, np.float32), image_size1=np.zeros(2, np.float32))
-    scorer = jax.tree.map(float, scorer)
     scores = score_all(scorer, stack([pair, empty]))
     np.testing.assert_allclose(scores[0], score(scorer, pair), rtol=2e-6)
     assert scores[1] == 0.0
-    for gradient in jax.tree.leaves(jax.jit(jax.grad(score))(scorer, empty)):
-        assert np.isfinite(gradient).all()
+    numbers = [leaf for leaf in jax.tree.leaves(scorer) if isinstance(leaf, float)]
+    if len(numbers) == len(jax.tree.leaves(scorer)):
+        for gradient in jax.tree.leaves(jax.jit(jax.grad(score))(fitted(scorer), empty)):
+            assert np.isfinite(gradient).all()
 
 
-@scorers
+@everyone
 @pytest.mark.parametrize("candidates", [0, 3])
 def test_no_slots_and_no_candidates(scorer, candidates):
     pair = per_match(make_matches([], []), lambda rows: rows[:0])
@@ -136,7 +143,7 @@ def test_no_slots_and_no_candidates(scorer, candidates):
     assert score_all(scorer, batch).shape == (candidates,)
 
 
-@scorers
+@everyone
 def test_integers_and_double_precision_mode_are_welcome(scorer):
     matches = random_matches(np.random.default_rng(10), 60)
     matches = replace(matches, points0=matches.points0.round(), points1=matches.points1.round())
@@ -172,3 +179,59 @@ def test_positions_of_the_arguments_are_the_papers_order():
     assert AnchorPoints(12, 8, 2.0, UnitWeight()) == AnchorPoints(
         num_bins=12, window=8, tolerance=2.0, weight=UnitWeight()
     )
+
+
+def test_images_of_other_sizes_are_never_scored_with_too_few_bins():
+    """The first thing that users of JAX do; 64 bins would not hold these images."""
+    matches = stack([random_matches(np.random.default_rng(11), 30, sizes=((640, 480), (800, 600))) for _ in range(2)])
+    expected = score_candidates(HistogramOfShifts(), matches)
+    assert (expected > 0).all()
+    for scorer in (HistogramOfShifts(), Wrapped()):
+        for traced in (_score_all, jax.jit(jax.vmap(scorer))):
+            with pytest.raises(ValueError, match=r"before image sizes or bin_size are traced; set max_bins="):
+                traced(scorer, matches) if traced is _score_all else traced(matches)
+    roomy = HistogramOfShifts().with_capacity(matches.image_size0, matches.image_size1)
+    np.testing.assert_allclose(_score_all(roomy, matches), expected, rtol=2e-6)
+
+
+def test_a_capacity_is_found_inside_of_wrappers():
+    matches = stack([random_matches(np.random.default_rng(12), 30, sizes=((640, 480), (800, 600))) for _ in range(2)])
+    plain = score_candidates(HistogramOfShifts(sigma=18.0), matches) + 0.25 * score_candidates(MatchCount(), matches)
+    np.testing.assert_allclose(score_candidates(Wrapped(), matches), plain, rtol=2e-6)
+
+
+def test_a_capacity_that_is_too_small_is_told_where_it_can_be():
+    matches = stack([random_matches(np.random.default_rng(13), 30)])
+    with pytest.raises(InputError, match="max_bins=44: expected at least 45"):
+        score_candidates(HistogramOfShifts(max_bins=44), matches)
+    with pytest.raises(
+        InputError, match=r"bin_size=0.5: expected at most 1024 bins per axis, .* need 1344; use larger"
+    ):
+        score_candidates(HistogramOfShifts(bin_size=0.5), matches)
+    assert np.isnan(_score_all(HistogramOfShifts(max_bins=44), matches)).all()
+
+
+def test_calls_with_other_numbers_compile_nothing(compilations):
+    matches = stack([random_matches(np.random.default_rng(count), 40 + count, capacity=64) for count in range(3)])
+    scorers = [HistogramOfShifts(), AnchorPoints(), AggregatedScore(temperature=3.0), Wrapped(), HistogramOfShifts()]
+    for scorer in scorers:
+        score_candidates(scorer, matches)
+    HistogramOfShifts().dominant_shift(jax.tree.map(lambda leaf: leaf[0], matches), refine=True)
+    compilations.reset()
+    for factor in (0.99, 1.0, 1.01):
+        for scorer in scorers:
+            score_candidates(jax.tree.map(lambda number: number * factor, scorer), matches)  # noqa: B023
+        pair = jax.tree.map(lambda leaf: leaf[1], matches)
+        HistogramOfShifts(sigma=20 * factor).dominant_shift(pair, refine=True)
+    assert compilations.count == 0
+
+
+def test_a_function_that_changes_is_not_taken_for_what_it_was():
+    matches = stack([random_matches(np.random.default_rng(14), 30)])
+    held_by_closure = {"factor": 1.0}
+    scorer = lambda matches: held_by_closure["factor"] * plain(matches)  # noqa: E731
+    weighted = HistogramOfShifts(weight=lambda matches: held_by_closure["factor"] * matches.scores0)
+    first = [score_candidates(one, matches) for one in (scorer, weighted)]
+    held_by_closure["factor"] = 2.0
+    for one, before in zip((scorer, weighted), first, strict=True):
+        np.testing.assert_allclose(score_candidates(one, matches), 2 * before, rtol=2e-6)

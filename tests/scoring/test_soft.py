@@ -23,9 +23,11 @@ from tests.builders import SIZE, double, make_features, make_matches, random_mat
 
 HISTOGRAMS = [
     HistogramOfShifts(bin_size=24.0, max_bins=30),
-    HistogramOfShifts(bin_size=24.0, sigma=400.0, sigma_is_variance=True, truncate=2.0, weight=UnitWeight()),
-    HistogramOfShifts(bin_size=24.0, align="zero_center", shift_range=(100.0, 50.0)),
-    HistogramOfShifts(bin_size=24.0, align="zero_edge", direction="query_minus_candidate"),
+    HistogramOfShifts(
+        bin_size=24.0, sigma=400.0, sigma_is_variance=True, truncate=2.0, weight=UnitWeight(), max_bins=30
+    ),
+    HistogramOfShifts(bin_size=24.0, align="zero_center", shift_range=(100.0, 50.0), max_bins=30),
+    HistogramOfShifts(bin_size=24.0, align="zero_edge", direction="query_minus_candidate", max_bins=30),
 ]
 ANCHORS = [
     AnchorPoints(5, 4, 2.5),

@@ -2,36 +2,40 @@
 
 from dataclasses import replace
 
-import jax
 import numpy as np
 import pytest
 
 import mfvpr
 from mfvpr import pipeline, sweeping
 from mfvpr.pipeline import MatchSet
-from mfvpr.sweeping.batches import image_sizes, slots
+from mfvpr.scoring.parameters import with_parameters
+from mfvpr.sweeping.batches import slots
 from mfvpr.sweeping.settings import groups
-from mfvpr.types import Shortlist
+from mfvpr.types import Shortlist, per_match
 from tests.builders import random_matches
+from tests.scorers import FOREIGN, Wrapped, title
 
 FS, DMF = mfvpr.FeatureScoreWeight(), mfvpr.DescriptorDistanceWeight()
 QUERIES, CANDIDATES, DATABASE = 7, 5, 9
 
 
 def make_set():
-    """Few to many matches a pair, some pairs without, and a shortlist that ends early for one query."""
+    """Few to many matches a pair, with a confidence, some pairs without; images of two sizes on either side; and a
+    shortlist that ends early for one query."""
     rng = np.random.default_rng(4)
     flat, counts = [], []
-    for _ in range(QUERIES):
-        pairs = [random_matches(rng, count) for count in rng.permutation([0, 3, 20, 33, 70])]
+    for query in range(QUERIES):
+        sizes = [((336, 336), (640, 480))[query % 2], *[((336, 336), (400, 300))[row % 2] for row in range(CANDIDATES)]]
+        pairs = [
+            random_matches(rng, count, sizes=(sizes[0], size))
+            for count, size in zip(rng.permutation([0, 3, 20, 33, 70]), sizes[1:], strict=True)
+        ]
         counts.append([int(pair.mask.sum()) for pair in pairs])
         joined = {
             name: np.concatenate([getattr(pair, name)[pair.mask] for pair in pairs])
-            for name in ("points0", "points1", "distance", "scores0", "scores1", "mask")
+            for name in (*per_match(pairs[0]), "mask")
         }
-        sizes = np.stack([pair.image_size1 for pair in pairs])
-        none = {"ratio": None, "confidence": None}
-        flat.append(replace(pairs[0], **joined, **none, image_size0=pairs[0].image_size0, image_size1=sizes))
+        flat.append(replace(pairs[0], **joined, image_size1=np.stack([pair.image_size1 for pair in pairs])))
     indices = np.stack([rng.permutation(DATABASE)[:CANDIDATES] for _ in range(QUERIES)]).astype(np.int32)
     indices[2, 3:] = -1
     scores = np.sort(rng.random((QUERIES, CANDIDATES)).astype(np.float32))[:, ::-1]
@@ -44,19 +48,15 @@ def data():
     return make_set()
 
 
-_score = jax.jit(mfvpr.score_candidates)
-
-
 def one_by_one(scorer, setting, match_set, candidates, view=None, **options):
     """Rows of one setting, by the functions that an evaluation calls."""
     setting = dict(setting)
     limit, fused, c = setting.pop("max_distance", np.inf), "c" in setting, setting.pop("c", None)
-    scorer = replace(scorer, **setting)
-    scorer = pipeline._prepare(scorer, match_set.matches[0])
+    scorer = with_parameters(scorer, setting)
     scores = []
     for query in range(QUERIES):
         padded = match_set[query]
-        scores.append(_score(scorer, replace(padded, mask=padded.mask & (padded.distance <= limit))))
+        scores.append(mfvpr.score_candidates(scorer, replace(padded, mask=padded.mask & (padded.distance <= limit))))
     view = candidates.mask if view is None else view
     seen = replace(candidates, mask=candidates.mask & view)
     scores = np.array(scores, np.float32)
@@ -72,10 +72,12 @@ CASES = [
     (mfvpr.AnchorPoints(), {"num_bins": [6, 8], "window": [4, 6], "tolerance": [1, 2.5], "weight": [DMF, FS]}),
     (mfvpr.AggregatedScore(), {"weight": [FS, DMF], "max_distance": [1.0, 2.0], "mean": ["unweighted", "median"]}),
     (mfvpr.MatchCount(), {"max_distance": [0.5, 1.0, 1.5]}),
+    (Wrapped(), {"inner.sigma": [9.0, 22.5], "inner.bin_size": [8.0, 15.0], "inner.align": ["min_edge", "zero_edge"]}),
+    *((scorer, {"max_distance": [0.8, 3.0], "c": [None, 0.0]}) for scorer in FOREIGN),
 ]
 
 
-@pytest.mark.parametrize(("scorer", "axes"), CASES, ids=lambda value: type(value).__name__)
+@pytest.mark.parametrize(("scorer", "axes"), CASES, ids=lambda value: "" if isinstance(value, dict) else title(value))
 def test_sweep_is_one_evaluation_per_setting(data, scorer, axes):
     settings = sweeping.grid(axes)
     got = sweeping.sweep(scorer, settings, *data, depth=CANDIDATES)
@@ -89,7 +91,7 @@ def test_one_setting_beside_a_grid_leaves_it_whole(data):
     scorer = mfvpr.HistogramOfShifts()
     settings = sweeping.grid({"sigma": [9.0, 20.0, 30.0], "weight": [FS, DMF], "max_distance": [0.8, 2.0]})
     settings.insert(3, {"sigma": 9.0, "weight": FS, "max_distance": 1.1})
-    found = list(groups(scorer, settings, image_sizes(data[0])))
+    found = list(groups(scorer, settings, data[0].image_sizes))
     assert sorted(group.rows.shape for group in found) == [(1, 5), (2, 4)]
     assert sorted(row for group in found for row in group.rows.reshape(-1)) == list(range(13))
     for rows, setting in zip(sweeping.sweep(scorer, settings, *data)[0], settings, strict=True):
@@ -123,7 +125,7 @@ def test_views_hide_candidates_and_ties_may_go_by_index(data):
     _, candidates = data
     view = np.random.default_rng(1).random(candidates.mask.shape) < 0.6
     settings = [{"max_distance": limit, "c": c} for limit in (0.05, 2.0) for c in (None, 0.0)]  # 0.05: mostly ties
-    got = sweeping.sweep(mfvpr.MatchCount(), settings, *data, views=[candidates.mask, view], by_index=True)
+    got = sweeping.sweep(mfvpr.MatchCount(), settings, *data, views=[candidates.mask, view], ties="index")
     for seen, rows in zip((candidates.mask, view), got, strict=True):
         for found, setting in zip(rows, settings, strict=True):
             expected = one_by_one(mfvpr.MatchCount(), setting, *data, view=seen, ties="index")
@@ -195,3 +197,70 @@ def test_memory_is_told_beforehand(data):
     assert sweeping.result_bytes(2, 10, 7, 3) == np.zeros((2, 10, 7, 3), np.int32).nbytes
     one = sweeping.block_bytes(match_set, CANDIDATES, 10, 1)
     assert one < sweeping.block_bytes(match_set, CANDIDATES, 20, 1) < sweeping.block_bytes(match_set, CANDIDATES, 20, 7)
+
+
+def other_matches(match_set, candidates):
+    moved = [replace(one, points1=one.points1[::-1].copy()) for one in match_set.matches]
+    return replace(match_set, matches=moved), candidates
+
+
+def other_sizes(match_set, candidates):
+    return replace(
+        match_set, matches=[replace(m, image_size1=m.image_size1 / 2) for m in match_set.matches]
+    ), candidates
+
+
+def other_shortlist(match_set, candidates):
+    return match_set, replace(candidates, indices=np.where(candidates.mask, candidates.indices[:, ::-1], -1))
+
+
+def other_filter(match_set, candidates):
+    return match_set, replace(candidates, scores=candidates.scores[:, ::-1])
+
+
+@pytest.mark.parametrize("change", [other_matches, other_sizes, other_shortlist, other_filter])
+def test_blocks_of_other_data_in_the_same_folder_are_not_taken(data, tmp_path, change):
+    scorer, settings = mfvpr.HistogramOfShifts(bin_size=20.0), [{"sigma": 9.0, "c": 0.5}, {"sigma": 20.0, "c": 0.5}]
+    sweeping.sweep(scorer, settings, *data, folder=tmp_path)
+    other = change(*data)
+    expected = sweeping.sweep(scorer, settings, *other)
+    np.testing.assert_array_equal(sweeping.sweep(scorer, settings, *other, folder=tmp_path), expected)
+    np.testing.assert_array_equal(
+        sweeping.sweep(scorer, settings, *data, folder=tmp_path), sweeping.sweep(scorer, settings, *data)
+    )
+
+
+def test_nor_are_those_of_other_views_options_or_scorers_of_one_name(data, tmp_path):
+    _, candidates = data
+    settings = [{"max_distance": 0.3}, {"max_distance": 2.0}]
+    view = np.random.default_rng(1).random(candidates.mask.shape) < 0.6
+
+    def scorer(factor):
+        @mfvpr.value
+        class Score:
+            number: float = 1.0
+
+            def __call__(self, matches):
+                return factor * self.number * mfvpr.MatchCount()(matches)
+
+        return Score()
+
+    cases = [
+        (scorer(1.0), {}),
+        (scorer(-1.0), {}),
+        (scorer(1.0), {"views": [view]}),
+        (scorer(1.0), {"views": [~view]}),
+        (scorer(1.0), {"ties": "index"}),
+        (lambda matches: mfvpr.MatchCount()(matches), {}),
+        (lambda matches: -mfvpr.MatchCount()(matches), {}),
+    ]
+    fused = [{"c": c} for c in (10.0, 20.0)]
+    for made, options in cases:
+        expected = sweeping.sweep(made, settings, *data, **options)
+        np.testing.assert_array_equal(
+            sweeping.sweep(made, settings, *data, **options, folder=tmp_path), expected, err_msg=str(options)
+        )
+    for kind in ("cosine", "negative_euclidean"):
+        expected = sweeping.sweep(mfvpr.MatchCount(), fused, *data, filter_score=kind)
+        kept = sweeping.sweep(mfvpr.MatchCount(), fused, *data, filter_score=kind, folder=tmp_path)
+        np.testing.assert_array_equal(kept, expected)

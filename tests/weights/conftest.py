@@ -73,4 +73,4 @@ def arrays():
 
 @pytest.fixture
 def torch() -> ModuleType:
-    return pytest.importorskip("torch", reason="torch, of the extra `convert`, is not installed")
+    return pytest.importorskip("torch", reason="torch, of the extra `benchmark`, is not installed")

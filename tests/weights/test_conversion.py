@@ -1,4 +1,4 @@
-"""Every key once, every target once, every shape; and all that is wrong in one message."""
+"""Every key once, every target once, every type and shape; and what is wrong in one short message."""
 
 import hashlib
 
@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from mfvpr.errors import InputError
+from mfvpr.weights.checkpoint import read_checkpoint
 from mfvpr.weights.conversion import Layout, Rule, Table, convert
-from mfvpr.weights.networks import NETWORKS, blueprint, network_of
+from mfvpr.weights.networks import NETWORKS, blueprint, network_of, resemblance
 from mfvpr.weights.registry import REGISTRY, entry_of
-from tests.checkpoints import ALIKED, d2net_shapes, mixvpr_shapes, random_checkpoint, read_zip
+from tests.checkpoints import ALIKED, d2net_shapes, mixvpr_shapes, random_checkpoint
 from tests.weights.conftest import PARAMETERS, SHAPES, SOURCE_SHAPES, TABLE, tiny_entry
 
 PUBLIC = {
@@ -34,43 +35,83 @@ def test_layouts(source):
     np.testing.assert_array_equal(found["bn.var"], source["net.bn.running_var"])
 
 
-def test_all_that_is_wrong_is_told_together(source):
+def message(source, table=TABLE, shapes=SHAPES):
+    with pytest.raises(InputError) as caught:
+        convert(source, table, shapes)
+    assert len(str(caught.value)) < 300
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_what_is_wrong_is_counted_by_kind_with_an_example_of_each(source):
     source["net.conv.kernel"] = source.pop("net.conv.weight")
     del source["net.mix.1.bias"]
     source["net.mix.2.bias"] = np.zeros(2, np.float32)
     source["net.bn.weight"] = np.zeros(7, np.float32)
     source["net.mix.0.weight"] = source["net.mix.0.weight"].T
     source["net.mix.1.weight"] = np.zeros((2, 5, 1), np.float32)
-    with pytest.raises(InputError) as caught:
-        convert(source, TABLE, SHAPES)
-    message = str(caught.value)
-    for words in (
-        "unknown key net.conv.kernel",
-        "nothing fills conv.kernel",
-        "nothing fills mix.1.bias",
-        "unknown key net.mix.2.bias",
-        "net.bn.weight -> bn.scale: expected shape (4,), got (7,)",
-        "net.mix.0.weight -> mix.0.kernel: expected shape (5, 4), got (4, 5)",
-        "net.mix.1.weight -> mix.1.kernel: expected shape (2, 5), got (2, 5, 1)",
-    ):
-        assert words in message
-    assert "\n" not in message
-    assert message.startswith("7 of")
+    told = message(source)
+    assert told.startswith("keys do not fit the network: ")
+    assert "2 unknown (net.conv.kernel)" in told
+    assert "2 missing (conv.kernel)" in told
+    assert "3 of another shape (net.bn.weight: expected (4,), got (7,))" in told
+    source = random_checkpoint(SOURCE_SHAPES)
+    source["net.mix.0.weight"] = source["net.mix.0.weight"].T
+    assert "1 of another shape (net.mix.0.weight: expected (5, 4), got (4, 5))" in message(source)
 
 
 def test_filled_twice_and_ambiguous_rules(source):
     twice = Table((*TABLE.rules, Rule(r"copy", "conv.bias"), Rule(r"net\.bn\.bi.*", "bn.bias")), TABLE.ignored)
-    with pytest.raises(InputError) as caught:
-        convert(source | {"copy": np.zeros(4)}, twice, SHAPES)
-    assert "copy and net.conv.bias both fill conv.bias" in str(caught.value)
-    assert "net.bn.bias matches several rules" in str(caught.value)
+    told = message(source | {"copy": np.zeros(4)}, twice)
+    assert "1 twice (copy and net.conv.bias)" in told
+    assert "1 with several rules (net.bn.bias)" in told
+    assert "1 missing (bn.bias)" in told
 
 
-def test_float64_and_scalars():
+def test_a_message_stays_short(source):
+    foreign = {f"{place}{500 * '.long'}": np.zeros(3, np.float32) for place in range(500)}
+    assert "500 unknown (0.long.long" in message(foreign)
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.int64, np.complex64, bool])
+def test_other_types_than_float32_and_float64_are_refused(source, dtype):
+    source["net.mix.0.bias"] = np.ones(5, dtype)
+    expected = f"1 of another type (net.mix.0.bias: expected float32 or float64, got {np.dtype(dtype)})"
+    assert expected in message(source)
+    del source["net.mix.0.bias"]
+    source["net.bn.num_batches_tracked"] = np.ones(3, dtype)  # ignored, whatever it is
+    assert message(source) == "keys do not fit the network: 1 missing (mix.0.bias)"
+
+
+def test_float64_is_rounded_and_scalars_stay():
     table = Table((Rule("a", "a", Layout.LINEAR), Rule("s", "s")))
-    found = convert({"a": np.arange(6.0).reshape(2, 3), "s": np.float64(2)}, table, {"a": (3, 2), "s": ()})
+    third = np.float64([1, 2, 3]) / 3
+    found = convert({"a": np.stack([third, -third]), "s": np.float64(2)}, table, {"a": (3, 2), "s": ()})
+    np.testing.assert_array_equal(found["a"], np.stack([third, -third], 1).astype(np.float32))
     assert found["a"].dtype == np.float32
     assert found["s"].shape == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda key: key, None),
+        (lambda key: f"module.{key}", "its keys begin with module., which the official file's do not"),
+        (lambda key: f"state.model.{key}", "its keys begin with state.model., which the official file's do not"),
+        (lambda key: f"{key}.renamed", None),
+    ],
+)
+def test_a_prefix_is_recognized(change, expected):
+    keys = [change(key) for key in d2net_shapes()]
+    assert resemblance(keys, NETWORKS["d2_tf"]) == expected
+
+
+def test_other_networks_are_recognized():
+    told = "expected the keys of another network, got those of {}"
+    assert resemblance(list(mixvpr_shapes()), NETWORKS["d2_tf"]) == told.format("mixvpr")
+    assert resemblance(list(d2net_shapes()), NETWORKS["aliked-n16"]) == told.format("d2net")
+    assert resemblance(list(mixvpr_shapes(64, 2)), NETWORKS["mixvpr_4096"]) is None  # its shapes tell
+    assert resemblance(["posenc.Wr.weight", "layers.0.bias"], NETWORKS["aliked-n16"]) is None
 
 
 def test_blueprint_of_the_small_network(folder):
@@ -104,7 +145,7 @@ def test_real_aliked_weights_are_the_registrys_and_convert(name):
     assert len(content) == entry.size
     assert hashlib.sha256(content).hexdigest() == entry.sha256
     plan = blueprint(entry)
-    found = convert(read_zip(ALIKED / entry.file), NETWORKS[name].table, plan.shapes)
+    found = convert(read_checkpoint(ALIKED / entry.file), NETWORKS[name].table, plan.shapes)
     assert found.keys() == plan.shapes.keys()
     assert all(np.isfinite(array).all() for array in found.values())
     assert plan.parameters == entry.parameters

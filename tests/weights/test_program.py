@@ -12,10 +12,11 @@ from pathlib import Path
 
 import pytest
 
+from experiments.errors import one_line
 from experiments.weights import main
 from mfvpr.weights.files import load_model, save
 from mfvpr.weights.registry import REGISTRY
-from tests.checkpoints import ALIKED, d2net_shapes, random_checkpoint
+from tests.checkpoints import ALIKED, d2net_shapes, random_checkpoint, write_legacy, write_zip
 from tests.weights.conftest import PARAMETERS, SOURCE_SHAPES, tiny_entry
 
 ROOT = Path(__file__).parent.parent.parent
@@ -54,11 +55,8 @@ def refused(program):
 
 
 @pytest.fixture
-def tiny_checkpoint(torch, tmp_path):
-    path = tmp_path / "tiny.pth"
-    tensors = {key: torch.from_numpy(array) for key, array in random_checkpoint(SOURCE_SHAPES).items()}
-    torch.save({"model": tensors}, path)
-    return path
+def tiny_checkpoint(tmp_path):
+    return write_zip(tmp_path / "tiny.pth", {"model": random_checkpoint(SOURCE_SHAPES)})
 
 
 def test_help_and_wrong_usage_do_not_wait_for_jax():
@@ -122,6 +120,26 @@ def test_convert_list_verify(program, folder, tiny_checkpoint):
     assert program("list")[1].splitlines()[-1].split()[-2:] == ["yes", "-"]
     for arguments in ([], ["tiny"]):
         assert program("verify", *arguments) == (0, f"tiny: good, {PARAMETERS} parameters as converted\n", "")
+
+
+def test_convert_says_what_was_rounded(program, tmp_path):
+    tensors = random_checkpoint(SOURCE_SHAPES)
+    tensors["net.bn.bias"] = tensors["net.bn.bias"].astype(float)
+    code, stdout, _ = program("convert", write_zip(tmp_path / "tiny.pth", tensors))
+    assert code == 0
+    assert stdout.endswith(f"tiny, {PARAMETERS} parameters, 1 of its tensors rounded from float64 to float32\n")
+
+
+def test_missing_weights_are_answered_with_a_command(program, folder, capfd):
+    for name, command in (("aliked-n16", "download aliked-n16"), ("d2_tf", "convert d2_tf.pth"),
+                          ("mixvpr_512", "convert 'resnet50_MixVPR_512_channels(256)_rows(2).ckpt'")):  # fmt: skip
+        with pytest.raises(SystemExit) as caught, one_line():
+            load_model(name)
+        assert caught.value.code == 2
+        stderr = capfd.readouterr().err
+        assert stderr.startswith(f"error: {name}: not installed in {folder}; get ")
+        assert stderr.endswith(f" and install it: python -m experiments.weights {command}\n")
+        assert f" and install it: python -m experiments.weights {command}\n" in program("verify", name)[1]
 
 
 def test_convert_under_another_name(program, refused, folder, tiny_checkpoint):
@@ -298,7 +316,7 @@ def run(*arguments, **environment):
 
 
 @pytest.mark.skipif(not ALIKED.is_dir(), reason="no ../shared/weights: weights do not ship with the project")
-def test_real_weights_from_checkpoint_to_network(torch, tmp_path):
+def test_real_weights_from_checkpoint_to_network(tmp_path):
     place = {"MFVPR_WEIGHTS": str(tmp_path)}
     done = run("convert", ALIKED / "aliked-n16.pth", **place)
     assert (done.returncode, done.stderr) == (0, "")
@@ -311,10 +329,9 @@ def test_real_weights_from_checkpoint_to_network(torch, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["aliked-n16.json", "aliked-n16.safetensors"]
 
 
-def test_d2net_from_checkpoint_to_network(torch, program, tmp_path):
-    path = tmp_path / "d2_tf.pth"
+def test_d2net_from_checkpoint_to_network(program, tmp_path):
     arrays = random_checkpoint(d2net_shapes())
-    torch.save({"model": {key: torch.from_numpy(array) for key, array in arrays.items()}}, path)
+    path = write_legacy(tmp_path / "d2_tf.pth", {"model": arrays})
     code, stdout, _ = program("convert", path)
     assert code == 0
     assert stdout.endswith("d2_tf, 7,635,264 parameters\n")

@@ -1,0 +1,197 @@
+"""The contract of scorers as a test for those of other people: `check_scorer(MyScorer())` in a test of your own.
+
+What is checked is what the library relies on when it pads, batches, sweeps and learns; see `mfvpr.Scorer`.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mfvpr.reranking import score_candidates
+from mfvpr.scoring import Scorer
+from mfvpr.scoring.parameters import fit
+from mfvpr.types import Array, Matches, per_match
+
+SLOTS = 48
+COUNTS = (0, 1, 2, 17, 40)
+TOLERANCE = 1e-4  # of the largest score: float32 sums in another order
+
+
+def check_scorer(scorer: Scorer, *, image_size: tuple[int, int] = (336, 336), seed: int = 0) -> None:
+    """Check that a scorer keeps the contract, on made-up matches.
+
+    In this order: it is a value or a plain function; scores are scalars, float32 and finite, and exactly 0 without
+    matches; padding and the order of the matches change nothing; a batch scores as its pairs do; jit scores as without,
+    with one trace for all numbers; gradients are finite.
+
+    Args:
+        scorer: any; a sampling one must be reproducible, and may hold a key.
+        image_size: (width, height) of the made-up images, px.
+        seed: of the made-up matches.
+
+    Raises:
+        AssertionError: it does not; the message says what broke, and the usual mend.
+    """
+    _check_is_value(scorer)
+    pairs = [_made_up(np.random.default_rng([seed, count]), count, image_size) for count in COUNTS]
+    scorer = fit(scorer, pairs[0].image_size0, pairs[0].image_size1)
+    scores = np.array([_check_scalar(scorer, pair, count) for pair, count in zip(pairs, COUNTS, strict=True)])
+    close = _Close(TOLERANCE * float(np.abs(scores).max()))
+    score_of = jax.jit(lambda pair: scorer(pair))
+    for pair, score in zip(pairs, scores, strict=True):
+        close(score_of(pair), score, "jit scores otherwise than without; use jax.numpy on matches")
+        _check_padding(score_of, pair, score, close)
+        _check_order(score_of, pair, score, close)
+    _check_batch(scorer, pairs, scores, close)
+    _check_one_trace(scorer, pairs[-1], close)
+    gradients = jax.jit(_gradients(scorer))
+    for pair in pairs:
+        _check_gradients(type(scorer).__name__, gradients, pair)
+
+
+def _check_is_value(scorer: Any) -> None:
+    name = type(scorer).__name__
+    if jax.tree_util.all_leaves([scorer]) and not hasattr(scorer, "__code__"):
+        raise AssertionError(
+            f"{name} is no pytree, so that its numbers cannot be batched, and every call compiles: decorate the class "
+            "with @mfvpr.value, or pass a plain function"
+        )
+    for path, leaf in jax.tree_util.tree_leaves_with_path(scorer):
+        if not (callable(leaf) or isinstance(leaf, int | float | complex | np.ndarray | np.generic | jax.Array)):
+            raise AssertionError(
+                f"{name}{jax.tree_util.keystr(path)} = {leaf!r} is no number: jit cannot trace it; mark the field as "
+                "static, with field(metadata={'static': True})"
+            )
+
+
+def _check_scalar(scorer: Scorer, pair: Matches, count: int) -> np.ndarray:
+    score = scorer(pair)
+    shape, dtype = np.shape(score), jnp.asarray(score).dtype
+    if shape != () or dtype != jnp.float32:
+        raise AssertionError(f"expected a scalar of float32, got shape {shape} of {dtype} for {count} matches")
+    if not np.isfinite(score):
+        raise AssertionError(
+            f"the score of {count} matches is {score}: padding holds NaN, so take values by mfvpr.masked(values, "
+            "matches.mask) before any arithmetic"
+        )
+    if count == 0 and score != 0:
+        raise AssertionError(f"a pair without matches scores {score}, expected exactly 0")
+    return np.asarray(score)
+
+
+def _check_padding(scorer: Scorer, pair: Matches, score: np.ndarray, close: "_Close") -> None:
+    for garbage in (np.inf, -1e30, 7.0):
+        close(scorer(_padded(pair, garbage, SLOTS)), score, f"padding that holds {garbage} changes the score; take "
+              "values by mfvpr.masked(values, matches.mask)")  # fmt: skip
+    close(scorer(_padded(pair, np.nan, SLOTS + 16)), score, "more slots of padding change the score; count with "
+          "matches.mask, not with the number of slots")  # fmt: skip
+
+
+def _check_order(scorer: Scorer, pair: Matches, score: np.ndarray, close: "_Close") -> None:
+    order = np.random.default_rng(1).permutation(len(pair.mask))
+    shuffled = replace(pair, mask=pair.mask[order], **{n: values[order] for n, values in per_match(pair).items()})
+    close(scorer(shuffled), score, "the order of the matches, and where padding stands among them, changes the score")
+
+
+def _check_batch(scorer: Scorer, pairs: list[Matches], scores: np.ndarray, close: "_Close") -> None:
+    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *pairs)
+    close(score_candidates(scorer, batch), scores, "vmap over a batch of pairs does not score as the pairs one by one")
+
+
+def _check_one_trace(scorer: Scorer, pair: Matches, close: "_Close") -> None:
+    traces = []
+
+    @jax.jit
+    def score(scorer: Any, pair: Matches) -> Array:
+        traces.append(1)
+        return scorer(pair)
+
+    if any(callable(leaf) for leaf in jax.tree.leaves(scorer)):
+        return  # what holds a function has a program for it alone
+    for changed in _with_other_numbers(scorer):
+        expected = changed(pair)
+        close(score(changed, pair), expected, "jit scores other numbers otherwise than without; use jax.numpy on them")
+    if len(traces) > 1:
+        raise AssertionError(f"{len(traces)} traces for three sets of numbers, expected one: keep numbers as they are "
+                             "given, and what changes shapes in static fields")  # fmt: skip
+
+
+def _with_other_numbers(scorer: Any) -> Iterator[Any]:
+    """The scorer, and twice with its floating point numbers a little larger."""
+    for factor in (1.0, 1.01, 1.02):
+        yield jax.tree.map(lambda leaf: leaf * factor if _is_floating(leaf) else leaf, scorer)  # noqa: B023
+
+
+def _gradients(scorer: Any) -> Callable[[Matches], tuple[list[Array], dict[str, Array]]]:
+    """Gradients of one pair's score for the scorer's floating point numbers, and for what belongs to a match."""
+    leaves, structure = jax.tree.flatten(scorer)
+    places = [place for place, leaf in enumerate(leaves) if _is_floating(leaf)]
+
+    def gradients(pair: Matches) -> tuple[list[Array], dict[str, Array]]:
+        def score(numbers: list[Array], entries: dict[str, Array]) -> Array:
+            changed = dict(enumerate(leaves)) | dict(zip(places, numbers, strict=True))
+            return jax.tree.unflatten(structure, changed.values())(replace(pair, **entries))
+
+        numbers = [jnp.asarray(leaves[place], jnp.float32) for place in places]
+        return jax.grad(score, argnums=(0, 1))(numbers, per_match(pair))
+
+    return gradients
+
+
+def _check_gradients(name: str, gradients: Callable[[Matches], Any], pair: Matches) -> None:
+    count = int(pair.mask.sum())
+    of_numbers, of_entries = gradients(pair)
+    for gradient in of_numbers:
+        if not np.isfinite(gradient).all():
+            raise AssertionError(f"a gradient for a number of {name} is not finite with {count} matches")
+    for entry, gradient in of_entries.items():
+        if not np.isfinite(gradient).all():
+            raise AssertionError(
+                f"the gradient for {entry} is not finite with {count} matches: mask values before any arithmetic, not "
+                "its result, and use mfvpr.safe_sqrt for lengths"
+            )
+
+
+class _Close:
+    """Asserts that scores are equal up to rounding, which is relative to the largest of them."""
+
+    def __init__(self, tolerance: float) -> None:
+        self.tolerance = tolerance
+
+    def __call__(self, got: Any, expected: Any, broken: str) -> None:
+        got, expected = np.asarray(got), np.asarray(expected)
+        if got.shape != expected.shape or not (np.abs(got - expected) <= self.tolerance).all():
+            raise AssertionError(f"{broken}: got {got}, expected {expected}")
+
+
+def _is_floating(leaf: Any) -> bool:
+    return not callable(leaf) and jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
+
+
+def _made_up(rng: np.random.Generator, count: int, image_size: tuple[int, int]) -> Matches:
+    """Matches of one pair, half of which share a shift; padding holds NaN."""
+    size = np.array(image_size, np.float32)
+    points0, anywhere = (rng.uniform(0, size, (count, 2)) for _ in range(2))
+    points1 = np.where(rng.random((count, 1)) < 0.5, np.clip(points0 + size / 9, 0, size - 1), anywhere)
+    unit = (rng.uniform(0.05, 0.95, count) for _ in range(5))
+    entries = [np.asarray(values, np.float32) for values in (points0, points1, *unit)]
+    points0, points1, distance, scores0, scores1, ratio, confidence = entries
+    pair = Matches(points0, points1, distance, scores0, scores1, np.ones(count, bool), size, size, ratio, confidence)
+    return _padded(pair, np.nan, SLOTS)
+
+
+def _padded(pair: Matches, garbage: float, slots: int) -> Matches:
+    """The real matches in `slots` slots, `garbage` in the others."""
+    real: Callable[[np.ndarray], np.ndarray] = lambda values: values[np.asarray(pair.mask)]  # noqa: E731
+    count = int(np.sum(pair.mask))
+
+    def padded(values: np.ndarray) -> np.ndarray:
+        rows = np.full((slots, *values.shape[1:]), garbage, np.float32)
+        rows[:count] = real(values)
+        return rows
+
+    return replace(pair, mask=np.arange(slots) < count, **{n: padded(values) for n, values in per_match(pair).items()})

@@ -1,0 +1,124 @@
+"""`check_scorer` accepts what keeps the contract and names what does not."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mfvpr
+from mfvpr.testing import check_scorer
+from tests.scorers import FOREIGN, OWN, title
+
+
+@pytest.mark.parametrize("scorer", [*OWN, *FOREIGN], ids=title)
+def test_what_keeps_the_contract_passes(scorer):
+    check_scorer(scorer)
+
+
+def test_other_images_and_seeds_pass():
+    check_scorer(mfvpr.HistogramOfShifts(), image_size=(640, 480), seed=5)
+
+
+class Unregistered:
+    def __call__(self, matches):
+        return jnp.sum(matches.mask.astype(jnp.float32))
+
+
+@mfvpr.value
+class Worded:
+    word: str = "mean"
+
+    def __call__(self, matches):
+        return jnp.sum(matches.mask.astype(jnp.float32))
+
+
+@mfvpr.value
+class Baked:
+    """Its number is looked at by Python: jit cannot."""
+
+    number: float = 2.0
+
+    def __call__(self, matches):
+        return float(self.number) * jnp.sum(matches.mask.astype(jnp.float32))
+
+
+def real(matches):
+    return jnp.sum(matches.mask.astype(jnp.float32))
+
+
+def lengths(shifts):
+    return jnp.sqrt(jnp.sum(shifts**2, axis=-1))
+
+
+def numpy_only(matches):
+    return np.float32(np.sum(np.asarray(matches.mask)))
+
+
+BROKEN = {
+    "is no pytree.*@mfvpr.value": Unregistered(),
+    r"Worded\.word = 'mean' is no number.*static": Worded(),
+    "expected a scalar of float32, got shape": lambda m: m.mask.astype(jnp.float32),
+    "of int32": lambda m: jnp.sum(m.mask.astype(jnp.int32)),
+    "the score of 0 matches is nan.*mfvpr.masked": lambda m: jnp.sum(m.distance),
+    "a pair without matches scores 1.0, expected exactly 0": lambda m: 1.0 + real(m),
+    "padding that holds inf changes the score": lambda m: (
+        jnp.sum(jnp.isinf(m.distance).astype(jnp.float32)) * jnp.any(m.mask).astype(jnp.float32)
+    ),
+    "more slots of padding change the score": lambda m: real(m) / len(m.mask),
+    "the order of the matches": lambda m: jnp.sum(jnp.where(m.mask, jnp.arange(len(m.mask), dtype=jnp.float32), 0.0)),
+    "the gradient for points. is not finite": lambda m: jnp.sum(mfvpr.masked(lengths(m.points1 - m.points0), m.mask)),
+}
+
+
+@pytest.mark.parametrize("words", BROKEN)
+def test_what_breaks_it_is_named(words):
+    with pytest.raises(AssertionError, match=words):
+        check_scorer(BROKEN[words])
+
+
+def test_what_jit_cannot_do_is_told_by_jax():
+    for scorer in (Baked(), numpy_only):
+        with pytest.raises((AssertionError, jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)):
+            check_scorer(scorer)
+
+
+def test_jit_that_scores_otherwise_is_named():
+    def score(matches):
+        return (2.0 if isinstance(matches.mask, jax.core.Tracer) else 1.0) * real(matches)
+
+    with pytest.raises(AssertionError, match="jit scores otherwise"):
+        check_scorer(score)
+
+
+def test_a_batch_that_scores_otherwise_is_named():
+    @jax.custom_batching.custom_vmap
+    def count(mask):
+        return jnp.sum(mask.astype(jnp.float32))
+
+    @count.def_vmap
+    def _(axis_size, in_batched, mask):
+        return jnp.full(axis_size, jnp.mean(mask.astype(jnp.float32))), True
+
+    with pytest.raises(AssertionError, match="vmap over a batch of pairs"):
+        check_scorer(lambda matches: count(matches.mask))
+
+
+def test_a_trace_for_every_number_is_named():
+    class Static:
+        """Its number is part of the structure, and changes with the leaf beside it."""
+
+        def __init__(self, number):
+            self.number = number
+
+        def __call__(self, matches):
+            return self.number * real(matches)
+
+    def unflatten(_, leaves):
+        return Static(*leaves)
+
+    def flatten(scorer):
+        return (scorer.number,), None if isinstance(scorer.number, jax.core.Tracer) else float(scorer.number)
+
+    jax.tree_util.register_pytree_node(Static, flatten, unflatten)
+    with pytest.raises(AssertionError, match="3 traces for three sets of numbers, expected one"):
+        check_scorer(Static(2.0))
