@@ -45,10 +45,11 @@ class Vlad:
         word = _nearest(descriptors, self.centers)
         cell = np.repeat(np.arange(len(real)) * len(self.centers), list(map(len, real))) + word
         order = np.argsort(cell, kind="stable")
-        occupied, starts = np.unique(cell[order], return_index=True)
+        occupied, starts, counts = np.unique(cell[order], return_index=True, return_counts=True)
         residuals = np.zeros((len(real) * len(self.centers), self.centers.shape[1]), np.float32)
         if len(order):
-            residuals[occupied] = np.add.reduceat((descriptors - self.centers[word])[order], starts)
+            sums = np.add.reduceat(descriptors[order], starts)
+            residuals[occupied] = sums - counts[:, None] * self.centers[occupied % len(self.centers)]
         vlad = _normalized(residuals)
         vlad = np.sign(vlad) * np.abs(vlad) ** self.power
         return _normalized(vlad.reshape(len(real), self.dimension))
