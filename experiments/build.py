@@ -12,6 +12,7 @@ from tqdm import tqdm
 import mfvpr
 from experiments.settings import SettingsError
 from mfvpr.data.datasets import Dataset, folder_dataset
+from mfvpr.data.ground_truth import CHOICES
 from mfvpr.data.streets import streets_folder
 from mfvpr.features import GlobalExtractor, LocalExtractor
 from mfvpr.features.sift import Sift
@@ -44,16 +45,14 @@ def dataset(settings: dict[str, Any], progress: Callable[[int, int], None]) -> D
         root = streets_folder(expanded(settings["cache"]), seed=settings["seed"], progress=progress)
         return folder_dataset(
             root / "database", root / "queries", name="streets", ground_truth="index",
-            index_file=root / "ground_truth.csv",
+            index_file=root / "ground_truth.csv", widen_index=True,
         )  # fmt: skip
-    index_file = settings["index_file"]
-    return folder_dataset(
-        expanded(settings["database"]),
-        expanded(settings["queries"]),
-        name=settings["name"],
-        ground_truth=settings["ground_truth"],
-        index_file=expanded(index_file) if index_file else None,
-    )
+    if settings["ground_truth"] is None:
+        raise SettingsError(f"dataset.ground_truth: nothing is assumed of your own images; set it to one of {CHOICES}")
+    options = {name: value for name, value in settings.items() if name not in ("root", "exclude_neighbors")}
+    for name in ("database", "queries", "index_file", "database_labels", "query_labels"):
+        options[name] = expanded(options[name]) if options[name] else None
+    return folder_dataset(**options)
 
 
 def local_extractor(settings: dict[str, Any]) -> LocalExtractor:

@@ -9,6 +9,7 @@ import numpy as np
 from experiments.settings import SettingsError
 from mfvpr import sweeping
 from mfvpr.data.datasets import Dataset
+from mfvpr.data.ground_truth import Unit, threshold_words
 from mfvpr.statistics import recall_interval
 from mfvpr.sweeping import Half
 from mfvpr.types import Shortlist
@@ -27,7 +28,7 @@ class Judge:
     """
 
     thresholds: Sequence[float]
-    unit: str
+    unit: Unit
     positives: Sequence[np.ndarray]
     halves: Sequence[Half]
     views: Sequence[np.ndarray]
@@ -44,7 +45,7 @@ class Judge:
 
     def label(self, k: int, threshold: float) -> str:
         """R@K and what counts, for tables."""
-        return f"R@{k} ±{threshold:g}" if self.unit == "frames" else f"R@{k} {threshold:g} m"
+        return f"R@{k}{threshold_words(self.unit, threshold)}"
 
     def recall(self, rows: np.ndarray, k: int = 1) -> np.ndarray:
         """`[S, thresholds]` recall at k of all queries, of rows `[S, Q, depth]`."""
@@ -80,10 +81,10 @@ def judge(settings: dict[str, Any], dataset: Dataset) -> Judge:
     truth = dataset.truth
     if truth is None:
         raise SettingsError(
-            "dataset.ground_truth=none: choosing settings needs a ground truth; set order, index or utm"
+            "dataset.ground_truth=none: choosing settings needs a ground truth; set order, index, utm or label"
         )
     recall = settings["recall"]
-    thresholds = sorted(set(recall["tolerances"])) if truth.unit == "frames" else [recall["radius"]]
+    thresholds = truth.thresholds(tolerances=recall["tolerances"], radius=recall["radius"])
     positives = [truth.positives(threshold) for threshold in thresholds]
     both = dict(zip(("first_half", "second_half"), sweeping.halves(positives[-1]), strict=True))
     split = settings["split"]

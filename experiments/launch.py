@@ -24,6 +24,7 @@ from experiments.errors import one_line, unwind_on_sigterm
 from experiments.settings import SettingsError, check
 
 PATHS = {"dataset.database", "dataset.queries", "dataset.root", "dataset.index_file", "dataset.cache"}
+PATHS |= {"dataset.database_labels", "dataset.query_labels"}
 PATHS |= {"store", "out", "checkpoints"}
 MULTIRUN = ("-m", "--multirun")
 CONF = Path(__file__).parent.parent / "conf"
@@ -44,6 +45,8 @@ def launch(program: Callable[[dict[str, Any]], None], config: str = "config") ->
     unwind_on_sigterm()
     sys.unraisablehook = _keep_interrupt
     warnings.filterwarnings("ignore", "A worker stopped")  # joblib renews one that has grown; no job is lost
+    if not os.environ.get("MFVPR_CACHE"):  # empty counts as unset, or the cache would be the root of the file system
+        os.environ.pop("MFVPR_CACHE", None)
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises instead of printing and exiting with 1
     with one_line(), _our_words(config):
         for argument in sys.argv[1:]:

@@ -14,6 +14,7 @@ from experiments.axes import shown
 from experiments.judging import Judge
 from experiments.prepare import Images
 from mfvpr.data.files import replacing, write_text
+from mfvpr.data.ground_truth import threshold_words
 from mfvpr.learning.match_weight import FEATURE_NAMES, LearnedWeight
 from mfvpr.learning.training import Fit
 from mfvpr.pipeline import MatchSet
@@ -101,10 +102,9 @@ def _table(outcome: Outcome) -> Table:
             name, *(f"{100 * one.mean():.1f}" for one in hits), f"[{100 * low:.1f}, {100 * high:.1f}]", compared,
             "" if hits is first else f"{test.p_value:.2g}",
         ])  # fmt: skip
-    main = judge.thresholds[judge.main]
-    unit = "±" if judge.unit == "frames" else "m "
+    words = threshold_words(judge.unit, judge.thresholds[judge.main])
     header = [judge.label(1, threshold) for threshold in judge.thresholds]
-    return Table(["score", *header, f"95 % at {unit}{main:g}", "against paper", "p"], lines)
+    return Table(["score", *header, f"95 % at{words}" if words else "95 %", "against paper", "p"], lines)
 
 
 def _remarks(outcome: Outcome) -> Iterator[str]:
@@ -132,6 +132,7 @@ def _results(outcome: Outcome) -> dict[str, Any]:
     ]
     return {
         "dataset": outcome.images.dataset.name, "data_fingerprint": outcome.images.fingerprints,
+        "reading": outcome.images.reading,
         "unit": judge.unit, "thresholds": list(judge.thresholds),
         "queries": {"reported": [half.report.tolist() for half in judge.halves],
                     "chosen_on": [half.tune.tolist() for half in judge.halves]},

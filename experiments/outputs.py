@@ -10,7 +10,8 @@ import numpy as np
 from experiments import build
 from mfvpr.data.datasets import Dataset
 from mfvpr.data.files import write_text
-from mfvpr.data.images import read_image, resize
+from mfvpr.data.ground_truth import Unit, threshold_words
+from mfvpr.data.images import resize
 from mfvpr.evaluation import recall_at_k
 from mfvpr.features import LocalExtractor
 from mfvpr.pipeline import FeatureSet, MatchSet, explain
@@ -19,6 +20,9 @@ from mfvpr.report.figures import histogram_figure
 from mfvpr.report.tables import Table
 from mfvpr.scoring import HistogramOfShifts, Scorer
 from mfvpr.types import Shortlist
+
+_UNITS: dict[Unit, str] = {"frames": ", ± in frames", "m": ", ± in m", "exact": ""}
+_THRESHOLDS: dict[Unit, str] = {"frames": "tolerance", "m": "radius"}  # their names in results
 
 
 @dataclass(frozen=True)
@@ -46,6 +50,7 @@ class Outcome:
     systems: dict[str, System]
     seconds: dict[str, float]
     fingerprint: dict[str, str]  # of the images
+    reading: dict[str, Any]  # what it did to them
 
     @property
     def thresholds(self) -> list[float]:
@@ -53,7 +58,7 @@ class Outcome:
         if self.dataset.truth is None:
             return []
         recall = self.settings["recall"]
-        return sorted(set(recall["tolerances"])) if self.dataset.truth.unit == "frames" else [recall["radius"]]
+        return self.dataset.truth.thresholds(tolerances=recall["tolerances"], radius=recall["radius"])
 
     @property
     def headline(self) -> str:
@@ -66,7 +71,7 @@ class Outcome:
 def heading(outcome: Outcome) -> str:
     """One line that says what was evaluated."""
     truth, settings = outcome.dataset.truth, outcome.settings
-    kind = "no ground truth: rankings only" if truth is None else f"recall in %, ± in {truth.unit}"
+    kind = "no ground truth: rankings only" if truth is None else f"recall in %{_UNITS[truth.unit]}"
     return (
         f"{outcome.dataset.name}: {len(outcome.queries)} queries, {len(outcome.database)} database images, "
         f"{outcome.candidates.indices.shape[1]} candidates ({settings['retrieval']['name']}), "
@@ -99,13 +104,16 @@ def result_rows(outcome: Outcome) -> list[dict[str, Any]]:
         "database": len(outcome.database),
         "dataset": outcome.dataset.name,
         "data_fingerprint": outcome.fingerprint,
+        "reading": outcome.reading,
         "seconds": outcome.seconds,
         "versions": runs.versions(),
     }
     judged: list[tuple[dict[str, float], dict[str, dict[str, float]]]] = [({}, {})]
     if truth is not None:
-        name = "tolerance" if truth.unit == "frames" else "radius"
-        judged = [({name: value}, _recall(outcome, truth.positives(value))) for value in outcome.thresholds]
+        name = _THRESHOLDS.get(truth.unit)
+        judged = [
+            ({name: value} if name else {}, _recall(outcome, truth.positives(value))) for value in outcome.thresholds
+        ]
     return [
         {"system": name, "scorer": system.scorer, "parameters": system.parameters, **threshold,
          "recall_at": recall.get(name, {}), **common}
@@ -132,7 +140,9 @@ def recall_table(rows: list[dict[str, Any]]) -> Table:
 
     def cells(found: list[dict[str, Any]]) -> list[tuple[str, str]]:
         def label(row: dict[str, Any], k: str) -> str:
-            return f"R@{k} ±{row['tolerance']}" if "tolerance" in row else f"R@{k} {row['radius']:g} m"
+            return f"R@{k}" + "".join(
+                threshold_words(unit, row[name]) for unit, name in _THRESHOLDS.items() if name in row
+            )
 
         first = [(row, k) for row in found for k in list(row["recall_at"])[:1]]
         others = [(found[middle], k) for k in list(found[middle]["recall_at"])[1:]]
@@ -175,8 +185,8 @@ def _write_figures(folder: Path, outcome: Outcome) -> None:
         pair = jax.tree.map(lambda field: field[place], outcome.matches[query])  # noqa: B023
         histogram_figure(
             folder / "figures" / f"{verdict.split()[0]}_{query:04d}.png",
-            resize(read_image(queries.paths[query]), size, interpolation),
-            resize(read_image(database.paths[best[query]]), size, interpolation),
+            resize(queries.read(query), size, interpolation),
+            resize(database.read(int(best[query])), size, interpolation),
             pair,
             explain(scorer, pair),
             title=f"{outcome.headline}, {verdict}: {queries.names[query]} -> {database.names[best[query]]}",

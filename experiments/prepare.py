@@ -4,7 +4,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,10 @@ from tqdm import tqdm
 
 from experiments import build, stores
 from mfvpr import pipeline
-from mfvpr.data.datasets import Dataset, ImageFolder, fingerprint
+from mfvpr.data.contents import Contents, contents
+from mfvpr.data.datasets import Dataset, ImageFolder
+from mfvpr.data.sequences import OwnRows, own_rows, without_neighbors
+from mfvpr.extraction import Descriptors
 from mfvpr.features import GlobalExtractor, LocalExtractor
 from mfvpr.pipeline import FeatureSet, MatchSet
 from mfvpr.types import Features, Shortlist
@@ -33,10 +36,20 @@ class Stopwatch:
 
 @dataclass(frozen=True)
 class Images:
-    """A data set with the fingerprints of its folders."""
+    """A data set with what its files hold."""
 
     dataset: Dataset
-    fingerprints: dict[str, str]  # by side
+    contents: dict[str, Contents]  # by side
+
+    @property
+    def fingerprints(self) -> dict[str, str]:
+        """Of both folders, by side."""
+        return {side: found.fingerprint for side, found in self.contents.items()}
+
+    @property
+    def reading(self) -> dict[str, Any]:
+        """What reading does to the images, by side."""
+        return {side: found.summary() for side, found in self.contents.items()}
 
     @property
     def sides(self) -> dict[str, ImageFolder]:
@@ -64,8 +77,15 @@ class Extracted:
 
 def images(settings: dict[str, Any]) -> Images:
     """The data set that the settings name."""
-    dataset = _dataset(settings["dataset"])
-    return Images(dataset, {"database": fingerprint(dataset.database), "query": fingerprint(dataset.queries)})
+    dataset, neighbors = _dataset(settings["dataset"]), settings["dataset"].get("exclude_neighbors")
+    remembered = build.expanded(settings["store"]) / "contents" if settings["store"] else None
+    database, queries = (contents(folder, remembered) for folder in (dataset.database, dataset.queries))
+    own = own_rows(queries, database)
+    if neighbors is not None:
+        dataset = without_neighbors(dataset, own, neighbors)
+    found = Images(dataset, {"database": database, "query": queries})
+    _warn_of_images(settings, found, own)
+    return found
 
 
 def extractors(settings: dict[str, Any]) -> Extractors:
@@ -82,7 +102,16 @@ def extracted(settings: dict[str, Any], tools: Extractors, found: Images, watch:
         )
     _warn(found.dataset, database, queries)
     with watch("filter"):
-        candidates = _shortlist(settings, tools.describer, found, {"database": database, "query": queries})
+        described = _described(settings, tools.describer, found, {"database": database, "query": queries})
+        candidates = pipeline.shortlist(
+            described["query"].values,
+            described["database"].values,
+            _num_candidates(settings, found),
+            allowed=found.dataset.allowed,
+        )
+    database, queries = (
+        replace(one, bad=described[side].bad) for side, one in (("database", database), ("query", queries))
+    )
     return Extracted(tools.local, database, queries, candidates)
 
 
@@ -98,7 +127,8 @@ def matched(
         with watch("matching"):
             return match(settings, made, **options), made.candidates
     num_candidates = _num_candidates(settings, found)
-    name, recipe = matches_name(settings), stores.matches_recipe(settings, found.fingerprints, num_candidates)
+    name = f"{settings['dataset']['name']} {settings['features']['name']} matches"
+    recipe = stores.matches_recipe(settings, found.fingerprints, num_candidates)
     typical = tools.local.typical_count // 3  # of mutual nearest neighbors
     queries = len(found.dataset.queries)
     sizes = queries, num_candidates, typical
@@ -109,11 +139,6 @@ def matched(
                 return match(settings, made, store=store, **options), made.candidates
         with watch("matches read"):
             return pipeline.stored_matches(store)
-
-
-def matches_name(settings: dict[str, Any]) -> str:
-    """What a run's matches are called."""
-    return f"{settings['dataset']['name']} {settings['features']['name']} matches"
 
 
 def match(settings: dict[str, Any], made: Extracted, **options: Any) -> MatchSet:
@@ -148,6 +173,36 @@ def _dataset(settings: dict[str, Any]) -> Dataset:
             one.close()
 
 
+def _warn_of_images(settings: dict[str, Any], found: Images, own: OwnRows) -> None:
+    """What is in the data set that may give wrong numbers, and what was done about it."""
+    dataset, among = found.dataset, sum(map(bool, own))
+    if among and dataset.allowed is None:
+        _tell(f"warning: {among} of {len(own)} queries are database images themselves, so that each finds itself; set "
+              "dataset.exclude_neighbors=N to leave out what is within N frames of it (0 = itself alone)")  # fmt: skip
+    if dataset.allowed is not None and among < len(own):
+        _tell(f"note: {len(own) - among} of {len(own)} queries are no database images; nothing is left out for them")
+    for side, did in found.reading.items():
+        if did["turned"]:
+            _tell(f"note: {did['turned']} {side} images are turned as their EXIF orientation says")
+        if did["scaled_16bit"]:
+            _tell(f"note: {did['scaled_16bit']} 16-bit {side} images are scaled to 8 bits")
+    bits, largest = dataset.database.bits, max(did["largest_16bit"] or 0 for did in found.reading.values())
+    used = max(largest.bit_length(), 8)
+    if largest and bits is not None and not bits - 1 <= used <= bits:
+        look = "dark" if used < bits else "cut off"
+        _tell(f"warning: the largest value of all 16-bit images is {largest}, so that they come out {look}; "
+              f"dataset.bits={used} would use their range")  # fmt: skip
+    recall, truth = settings["recall"], dataset.truth
+    if truth is not None:
+        widest = truth.thresholds(tolerances=recall["tolerances"], radius=recall["radius"])[-1]
+        if not truth.positives(widest).any():
+            _tell("warning: the ground truth gives no query a right answer; every recall will be 0")
+
+
+def _tell(text: str) -> None:
+    print(text, file=sys.stderr)
+
+
 def _warn(dataset: Dataset, database: FeatureSet, queries: FeatureSet) -> None:
     for found, images in ((database, dataset.database), (queries, dataset.queries)):
         for reason in found.bad.values():
@@ -156,8 +211,6 @@ def _warn(dataset: Dataset, database: FeatureSet, queries: FeatureSet) -> None:
         if empty:
             print(f"warning: {images.paths[empty[0]]}: no keypoints, so no matches ({len(empty)} such images of "
                   f"{len(images)}); scores are 0", file=sys.stderr)  # fmt: skip
-    if dataset.truth is not None and all(dataset.truth.place(row) is None for row in range(len(dataset.queries))):
-        print("warning: the ground truth gives no query a place; every recall will be 0", file=sys.stderr)
 
 
 def _features(
@@ -171,12 +224,13 @@ def _features(
         return pipeline.extract(folder, extractor, store=store, skip_bad=skip_bad, track=build.track(label))
 
 
-def _shortlist(
+def _described(
     settings: dict[str, Any],
     describer: Callable[[Sequence[Features]], GlobalExtractor],
     found: Images,
     features: dict[str, FeatureSet],
-) -> Shortlist:
+) -> dict[str, Descriptors]:
+    """Global descriptors by side."""
     asked, available = settings["candidates"], len(found.dataset.database)
     if asked != "all" and asked > available:
         print(
@@ -186,12 +240,14 @@ def _shortlist(
     chosen, database = settings["retrieval"], features["database"]
     extractor = describer([database[row] for row in range(len(database))])
     root = settings["store"] if extractor.image_size is not None else None  # VLAD takes no time
-    skip_bad, wait, descriptors = settings["on_bad_image"] == "skip", _is_one_of_many(settings), {}
+    skip_bad, wait, described = settings["on_bad_image"] == "skip", _is_one_of_many(settings), {}
     for side, folder in found.sides.items():
         name = f"{settings['dataset']['name']} {side} {chosen['name']}"
         with stores.opened(root, name, folder, extractor, chosen, found.fingerprints[side], wait=wait) as store:
-            descriptors[side] = pipeline.describe(
+            described[side] = pipeline.describe(
                 folder, features[side], extractor, store=store, skip_bad=skip_bad,
                 track=build.track(f"{side} descriptors"),
             )  # fmt: skip
-    return pipeline.shortlist(descriptors["query"], descriptors["database"], _num_candidates(settings, found))
+        for row in described[side].bad.keys() - features[side].bad.keys():
+            print(f"warning: {described[side].bad[row]}", file=sys.stderr)
+    return described

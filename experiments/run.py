@@ -30,7 +30,7 @@ def evaluate(settings: dict[str, Any]) -> None:
 
     outcome = Outcome(
         settings, images.dataset, made.extractor, made.database, made.queries, made.candidates, matches, scorers,
-        systems, watch.seconds, images.fingerprints,
+        systems, watch.seconds, images.fingerprints, images.reading,
     )  # fmt: skip
     folder = folder or runs.claimed_run_folder(Path("runs"), images.dataset.name)
     with runs.writing(folder) as new:

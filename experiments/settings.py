@@ -83,8 +83,14 @@ RULES: dict[str, Rule] = {
     "root": _TEXT,
     "database": _TEXT,
     "queries": _TEXT,
-    "ground_truth": _one_of("order", "index", "utm", "none"),
+    "ground_truth": _one_of(None, "order", "index", "utm", "label", "none"),  # None: asked for, see build.dataset
     "index_file": _or(_TEXT, None),
+    "widen_index": _FLAG,
+    "database_labels": _or(_TEXT, None),
+    "query_labels": _or(_TEXT, None),
+    "exclude_neighbors": _or(_INDEX, None),
+    "orient": _FLAG,
+    "bits": _or(_between(8, 16), None),
     # features and filter
     "image_size": _list_of(_SIDE, 2),
     "interpolation": _one_of("pil_bilinear", "pil_bicubic", "cv2_linear", "cv2_area", "torch_bilinear"),

@@ -158,7 +158,7 @@ def _results(found: Found) -> dict[str, Any]:
     recall = np.stack([judge.recall(found.rows[0], k) for k in ks], axis=-1)  # [S, thresholds, ks]
     return {
         "dataset": found.images.dataset.name,
-        "data_fingerprint": found.images.fingerprints,
+        "data_fingerprint": found.images.fingerprints, "reading": found.images.reading,
         "scorer": settings["scorer"], "features": settings["features"], "filter": settings["retrieval"],
         "matching": settings["matching"], "candidates": settings["candidates"], "fusion": settings["fusion"],
         "axes": dict(found.axes.values), "own": dict(found.axes.own), "search": settings["search"],

@@ -15,8 +15,10 @@ def frame_positives(query_index: np.ndarray, database_index: np.ndarray, *, tole
         tolerance: in frames.
     """
     query_index, database_index = np.asarray(query_index, np.int64), np.asarray(database_index, np.int64)
-    near = np.abs(database_index[None, :] - query_index[:, None]) <= tolerance
-    return near & (query_index >= 0)[:, None]
+    positives = np.zeros((len(query_index), len(database_index)), bool)
+    for row in np.flatnonzero(query_index >= 0):  # row by row: numbers take eight times the memory of bool
+        np.less_equal(np.abs(database_index - query_index[row]), tolerance, out=positives[row])
+    return positives
 
 
 def radius_positives(query_xy: np.ndarray, database_xy: np.ndarray, *, radius: float = 25.0) -> np.ndarray:
@@ -24,8 +26,11 @@ def radius_positives(query_xy: np.ndarray, database_xy: np.ndarray, *, radius: f
     query_xy, database_xy = np.asarray(query_xy, np.float64), np.asarray(database_xy, np.float64)
     positives = np.zeros((len(query_xy), len(database_xy)), bool)
     if positives.size:
-        for row, near in zip(positives, KDTree(database_xy).query_ball_point(query_xy, radius), strict=True):
-            row[near] = True
+        tree = KDTree(database_xy)
+        for row, xy in zip(
+            positives, query_xy, strict=True
+        ):  # one by one: as lists, all neighbors take eight times that
+            row[tree.query_ball_point(xy, radius)] = True
     return positives
 
 

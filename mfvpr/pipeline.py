@@ -72,9 +72,15 @@ class MatchSet:
         return np.repeat(sizes0, len(sizes1), 0), np.tile(sizes1, (len(sizes0), 1))
 
 
-def shortlist(query_descriptors: np.ndarray, database_descriptors: np.ndarray, num_candidates: int) -> Shortlist:
-    """The filter's candidates of all queries `[Q, C]`, NumPy."""
-    found = retrieval.retrieve(query_descriptors, database_descriptors, num_candidates=num_candidates)
+def shortlist(
+    query_descriptors: np.ndarray,
+    database_descriptors: np.ndarray,
+    num_candidates: int,
+    *,
+    allowed: np.ndarray | None = None,
+) -> Shortlist:
+    """The filter's candidates of all queries `[Q, C]`, NumPy, among database images `allowed` `[Q, N]`; None = all."""
+    found = retrieval.retrieve(query_descriptors, database_descriptors, num_candidates=num_candidates, mask=allowed)
     return jax.tree.map(np.asarray, found)
 
 
@@ -101,31 +107,36 @@ def match(
         max_distance: see there.
         max_matches: see there.
         chunk_size: see there.
-        with_ratio: see there; what a store holds always has it.
-        store: of these features, candidates and options. Only queries that it lacks are matched, with the ratio of
-            their distances; some at a time are on disk before the next are begun; and what comes back was read from it.
+        with_ratio: see there; a store always has the ratio.
+        store: of these features, candidates and options. Only queries that it lacks are matched; some at a time are on
+            disk before the next are begun; and what comes back was read from it.
         track: progress.
 
     Raises:
-        InputError: the store cannot be used, or is of other candidates.
+        InputError: the store cannot be used, or is of other candidates: then nothing is written.
     """
     options = {"cross_check": cross_check, "max_matches": max_matches, "chunk_size": chunk_size}
-    if store is None:
-        rows = track(range(len(queries)), len(queries))
-        found = _matched(queries, database, candidates, rows, max_distance, with_ratio=with_ratio, **options)
-        return _match_set([one for _, one in found])
-    if missing := np.flatnonzero(~store.done).tolist():
-        rows = track(missing, len(missing))
-        found = _matched(queries, database, candidates, rows, max_distance, with_ratio=True, **options)
-        while batch := dict(itertools.islice(found, STORE_BATCH)):
-            store.write(batch)
-    match_set, stored = stored_matches(store)
-    if not np.array_equal(stored.indices, candidates.indices):
+    found = {} if store is None else _stored(store, candidates)
+    if missing := [row for row in range(len(queries)) if row not in found]:
+        options["with_ratio"] = with_ratio or store is not None
+        made = _matched(queries, database, candidates, track(missing, len(missing)), max_distance, **options)
+        while batch := dict(itertools.islice(made, STORE_BATCH)):
+            if store is not None:
+                store.write(batch)
+            found |= batch if store is None else store.read(batch)
+    return _match_set([found[row] for row in range(len(queries))])
+
+
+def _stored(store: MatchStore, candidates: Shortlist) -> dict[int, QueryMatches]:
+    """What the store holds of these candidates, by row."""
+    found = dict(store.read())
+    same_shape = candidates.indices.shape == tuple(store.sizes.values())
+    if not same_shape or any((one.indices != candidates.indices[row]).any() for row, one in found.items()):
         raise InputError(
             f"{store.folder}: expected matches of these candidates, got those of another shortlist; choose another "
             "path, or delete this folder"
         )
-    return match_set
+    return found
 
 
 def stored_matches(store: MatchStore) -> tuple[MatchSet, Shortlist]:
@@ -140,8 +151,7 @@ def stored_matches(store: MatchStore) -> tuple[MatchSet, Shortlist]:
             "the matching first"
         )
     found = [one for _, one in store.read()]
-    indices = np.array([one.indices for one in found], np.int32).reshape(-1, store.num_candidates)
-    scores = np.array([one.filter_scores for one in found], np.float32).reshape(indices.shape)
+    indices, scores = np.array([one.indices for one in found]), np.array([one.filter_scores for one in found])
     return _match_set(found), Shortlist(indices=indices, scores=scores, mask=indices >= 0)
 
 

@@ -19,7 +19,7 @@ def retrieve(
         query_descriptors: `[Q, D]`, unit length.
         database_descriptors: `[N, D]`, unit length.
         num_candidates: C; beyond N the shortlist ends in -1.
-        mask: `[N]` bool, False for database images that must not appear.
+        mask: `[N]` or `[Q, N]` bool, False for database images that must not appear (for that query).
 
     Returns:
         Shortlist `[Q, C]` by descending cosine similarity; the first row wins a tie. A database image whose
@@ -27,7 +27,7 @@ def retrieve(
     """
     queries, database = at_least_single(query_descriptors), at_least_single(database_descriptors)
     similarity = jnp.matmul(queries, database.T, precision=jax.lax.Precision.HIGHEST)
-    usable = jnp.isfinite(similarity) if mask is None else jnp.isfinite(similarity) & mask[None]
+    usable = jnp.isfinite(similarity) if mask is None else jnp.isfinite(similarity) & jnp.atleast_2d(mask)
     depth = min(num_candidates, database_descriptors.shape[0])
     scores, indices = jax.lax.top_k(masked(similarity, usable, -jnp.inf), depth)
     padding = ((0, 0), (0, num_candidates - depth))

@@ -52,5 +52,6 @@ def results(place):
 
 
 def snapshot(place):
-    """Every file below a folder."""
-    return {path: path.read_bytes() for path in sorted(place.rglob("*")) if path.is_file()}
+    """Every file below a folder, but what is remembered of images."""
+    files = (path for path in sorted(place.rglob("*")) if path.is_file() and path.parent.name != "contents")
+    return {path: path.read_bytes() for path in files}

@@ -35,7 +35,7 @@ def composed(*overrides, config="config"):
 
 
 def folder(street, *more):
-    index = ("dataset.ground_truth=index", f"dataset.index_file={street}/ground_truth.csv")
+    index = ("dataset.ground_truth=index", f"dataset.index_file={street}/ground_truth.csv", "dataset.widen_index=true")
     return ("dataset=folder", f"dataset.database={street}/database", f"dataset.queries={street}/queries", *index, *more)
 
 
@@ -93,8 +93,19 @@ def test_values_without_meaning_are_refused(name, value):
         (["features.image_size=[336]"], "features.image_size=[336]: expected a list of 2"),
         (["dataset=folder"], "dataset.database: this setting has no default; give dataset.database=VALUE"),
         (["dataset=grief_season"], "dataset.root: this setting has no default"),
+        (
+            ["dataset=folder", "dataset.database=a", "dataset.queries=b"],
+            "dataset.ground_truth: nothing is assumed of your",
+        ),
+        (
+            ["dataset=folder", "dataset.database=a", "dataset.queries=b", "dataset.bits=7"],
+            "whole number from 8 to 16, or",
+        ),
         (["+new=1"], "+new=1: settings can be set, not added"),
-        (["dataset=folder", "dataset.database=nope", "dataset.queries=nope"], "nope: expected a folder of images"),
+        (
+            ["dataset=folder", "dataset.database=nope", "dataset.queries=nope", "dataset.ground_truth=none"],
+            "nope: expected a folder of images",
+        ),
         (["word"], "word: expected name=value"),
         (["scorer=[count,sum]"], "expected one of all"),
         (["features=null"], "features=null: expected one of aliked, d2net, sift"),
@@ -127,7 +138,8 @@ def test_bad_images_by_policy(small_street, tmp_path):
             (root / name / f"é {path.name}").write_bytes(path.read_bytes())
     (root / "database" / "é 0003.png").write_bytes(b"")
     Image.new("RGB", (30, 30)).save(root / "queries" / "é 0005.png")
-    arguments = ["dataset=folder", f"dataset.database={root}/database", f"dataset.queries={root}/queries", *QUICK,
+    arguments = ["dataset=folder", f"dataset.database={root}/database", f"dataset.queries={root}/queries",
+                 "dataset.ground_truth=order", *QUICK,
                  "candidates=99", f"out={tmp_path}/out"]  # fmt: skip
 
     failed = run(*arguments)

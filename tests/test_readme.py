@@ -42,7 +42,7 @@ def test_commands_run(command, small_street, weights, tmp_path):
     folders = {f"dataset.{name}=DIR": f"dataset.{name}={path}" for name, path in places.items()}
     arguments = [folders.get(argument, argument) for argument in arguments]
     if not any(argument.startswith("dataset=") for argument in arguments):  # streets would take longer
-        arguments += ["dataset=folder", *list(folders.values())[:2]]
+        arguments += ["dataset=folder", "dataset.ground_truth=order", *list(folders.values())[:2]]
     known = "vlad" if "mixvpr" not in command and "system" not in command else "mixvpr"
     quick = [setting for setting in QUICK if known == "vlad" or not setting.startswith("retrieval.")]
     done = run("--help") if "--help" in arguments else run(*arguments, *quick, cwd=tmp_path, MFVPR_WEIGHTS=str(weights))

@@ -1,21 +1,41 @@
 """A data set: database images, query images, and where the queries really are."""
 
-import hashlib
+import os
 import re
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from mfvpr.data.ground_truth import Truth, truth_by_order, truth_from_file, truth_from_names
-from mfvpr.data.images import SUFFIXES, ordered_map
+import numpy as np
+
+from mfvpr.data.ground_truth import (
+    CHOICES,
+    KINDS,
+    Truth,
+    truth_by_order,
+    truth_from_file,
+    truth_from_labels,
+    truth_from_names,
+)
+from mfvpr.data.images import SUFFIXES, read_image
 from mfvpr.errors import InputError
 
 
 @dataclass(frozen=True)
 class ImageFolder:
-    """Images below `root`, by relative POSIX path in natural order (image2 before image10)."""
+    """Images below `root`, by relative POSIX path in natural order (image2 before image10).
+
+    Attributes:
+        root: folder.
+        names: of the images.
+        orient: how they are read, see `mfvpr.data.images.read_image`.
+        bits: likewise.
+    """
 
     root: Path
     names: tuple[str, ...]
+    orient: bool = True
+    bits: int | None = 16
 
     @property
     def paths(self) -> list[Path]:
@@ -25,84 +45,139 @@ class ImageFolder:
     def __len__(self) -> int:
         return len(self.names)
 
+    def read(self, row: int) -> np.ndarray:
+        """One image, `[H, W, 3]` uint8 RGB; raises as `read_image` does."""
+        return read_image(self.root / self.names[row], orient=self.orient, bits=self.bits)
+
 
 @dataclass(frozen=True)
 class Dataset:
-    """Database and queries with their ground truth (None = only rankings can be told)."""
+    """Database and queries with their ground truth.
+
+    Attributes:
+        name: what results call it.
+        database: images to find.
+        queries: images to find them for.
+        truth: which are right; None = only rankings can be told.
+        allowed: `[Q, N]` bool, which database images a query may find; None = all.
+    """
 
     name: str
     database: ImageFolder
     queries: ImageFolder
     truth: Truth | None
+    allowed: np.ndarray | None = None
 
 
-def image_folder(root: Path) -> ImageFolder:
-    """All images below `root`, subfolders included.
+def image_folder(root: Path, *, orient: bool = True, bits: int | None = 16) -> ImageFolder:
+    """All images below `root`, subfolders included, linked ones as well; hidden files and folders are not.
+
+    Args:
+        root: folder.
+        orient: how the images are read, see `mfvpr.data.images.read_image`.
+        bits: likewise.
 
     Raises:
-        InputError: no such folder, or no images in it.
+        InputError: no such folder, one that cannot be listed, a link that leads to nothing or back to a folder that it
+            is in, or no images.
     """
     if not root.is_dir():
-        raise InputError(
-            f"{root}: expected a folder of images, got {'a file' if root.exists() else 'nothing'}; check the path"
-        )
-    names = [
-        path.relative_to(root).as_posix()
-        for path in root.rglob("*")
-        if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
-    ]
+        found = "a file" if os.path.lexists(root) else "nothing"
+        raise InputError(f"{root}: expected a folder of images, got {found}; check the path")
+    names = [path.relative_to(root).as_posix() for path in _images_below(root)]
     if not names:
         raise InputError(f"{root}: expected images ({', '.join(sorted(SUFFIXES))}), found none; check the path")
-    return ImageFolder(root, tuple(sorted(names, key=_natural)))
+    return ImageFolder(root, tuple(sorted(names, key=_natural)), orient, bits)
 
 
 def folder_dataset(
-    database: Path, queries: Path, *, name: str = "folder", ground_truth: str = "order", index_file: Path | None = None
+    database: Path,
+    queries: Path,
+    *,
+    ground_truth: str | None,
+    name: str = "folder",
+    index_file: Path | None = None,
+    widen_index: bool = False,
+    database_labels: Path | None = None,
+    query_labels: Path | None = None,
+    orient: bool = True,
+    bits: int | None = 16,
 ) -> Dataset:
     """Two folders of images as a data set.
 
     Args:
         database: folder of database images.
         queries: folder of query images.
+        ground_truth: one of `ground_truth.KINDS`, which says what each means. Nothing is assumed.
         name: what results call it.
-        ground_truth: `order` (query i shows database image i), `index` (`index_file`), `utm` (in the names), `none`.
         index_file: for `index`, see `ground_truth.truth_from_file`.
+        widen_index: for `index`, whether database images within a tolerance in frames count as well.
+        database_labels: for `label`, see `ground_truth.truth_from_labels`.
+        query_labels: likewise.
+        orient: how the images are read, see `mfvpr.data.images.read_image`.
+        bits: likewise.
     """
-    database_folder, query_folder = image_folder(database), image_folder(queries)
-    return Dataset(name, database_folder, query_folder, _truth(database_folder, query_folder, ground_truth, index_file))
+    database_folder, query_folder = (image_folder(root, orient=orient, bits=bits) for root in (database, queries))
+    files = {"index_file": index_file, "database_labels": database_labels, "query_labels": query_labels}
+    _check_files(ground_truth, files)
+    names = query_folder.names, database_folder.names
+    truth: Truth | None = None
+    if ground_truth == "order":
+        truth = truth_by_order(len(query_folder), len(database_folder))
+    elif ground_truth == "utm":
+        truth = truth_from_names(*names)
+    elif index_file:
+        truth = truth_from_file(index_file, *names, widened=widen_index)
+    elif query_labels and database_labels:
+        truth = truth_from_labels(query_labels, database_labels, *names)
+    return Dataset(name, database_folder, query_folder, truth)
 
 
-def fingerprint(folder: ImageFolder) -> str:
-    """SHA-256 over names and contents of all images, in order; the first 16 hexadecimal digits."""
-    digest = hashlib.sha256()
-    for name, content in zip(folder.names, ordered_map(_content_digest, folder.paths, workers=2), strict=True):
-        digest.update(name.encode("utf-8", "surrogateescape") + b"\0" + content)
-    return digest.hexdigest()[:16]
+def _check_files(ground_truth: str | None, files: Mapping[str, Path | None]) -> None:
+    """Refuse an unknown kind of ground truth, and files that it lacks or does not read."""
+    if ground_truth not in KINDS:
+        raise InputError(f"ground_truth={ground_truth}: expected one of {CHOICES}")
+    for option, path in files.items():
+        kind = "index" if option == "index_file" else "label"
+        if path is not None and kind != ground_truth:
+            raise InputError(f"{path}: given as {option}, but ground_truth={ground_truth}; set it to {kind}")
+        if path is None and kind == ground_truth:
+            raise InputError(f"ground_truth={kind}: expected a file; give {option} as well")
 
 
-def _truth(database: ImageFolder, queries: ImageFolder, kind: str, index_file: Path | None) -> Truth | None:
-    if index_file is not None and kind != "index":
-        raise InputError(f"{index_file}: given as index file, but dataset.ground_truth={kind}; set it to index")
-    if kind == "order":
-        return truth_by_order(len(queries), len(database))
-    if kind == "index":
-        if index_file is None:
-            raise InputError("ground truth by index: expected a file; set dataset.index_file=FILE (.csv, .npz, .json)")
-        return truth_from_file(index_file, queries.names, database.names)
-    return truth_from_names(queries.names, database.names) if kind == "utm" else None
-
-
-def _content_digest(path: Path) -> bytes:
-    try:
-        if path.is_file():
-            with path.open("rb") as file:
-                return hashlib.file_digest(file, "sha256").digest()
-    except OSError:
-        pass  # whoever reads the image will tell
-    return b"unreadable"
+def _images_below(root: Path) -> Iterator[Path]:
+    """Paths of all images."""
+    waiting: list[tuple[Path, tuple[tuple[int, int], ...]]] = [(root, ())]  # folders, with those that they are in
+    while waiting:
+        folder, above = waiting.pop()
+        try:
+            status = folder.stat()
+            entries = list(os.scandir(folder))
+            folders = {entry.name for entry in entries if entry.is_dir()}
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be listed ({error.strerror}); make it readable, or remove it") from None
+        this = (status.st_dev, status.st_ino)
+        if this in above:
+            raise InputError(f"{folder}: a link back to {folder.resolve()}, which it is in; remove it")
+        for entry in entries:
+            path = folder / entry.name
+            if entry.name.startswith("."):
+                continue
+            if entry.name in folders:
+                waiting.append((path, (*above, this)))
+            elif path.suffix.lower() in SUFFIXES:
+                yield path
+            elif entry.is_symlink() and not path.exists():
+                raise InputError(f"{path}: a link to nothing, which may have been a folder; mend or remove it")
 
 
 def _natural(name: str) -> tuple[list[tuple[int, int, str]], str]:
     """Sort key in which runs of digits compare as numbers."""
     parts = re.split(r"(\d+)", name)
-    return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts], name
+    return [_number(part) if part.isdecimal() else (0, 0, part) for part in parts], name
+
+
+def _number(digits: str) -> tuple[int, int, str]:
+    """As its value sorts, at any length."""
+    value = digits.lstrip("0")
+    return 1, len(value), value

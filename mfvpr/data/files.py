@@ -22,7 +22,16 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def printable(text: str) -> str:
+    """`text` that any stream, figure or file of UTF-8 takes: what no UTF-8 stands for is written as \\udcXX.
+
+    Such characters are how Python gives the bytes of a file name that is not UTF-8; in JSON, \\udcXX reads back as the
+    same name.
+    """
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
 def write_text(path: Path, text: str) -> None:
-    """Write UTF-8 text, atomically."""
+    """Write `printable` text as UTF-8, atomically."""
     with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", errors="surrogateescape")  # file names may not be UTF-8
+        temporary.write_text(printable(text), encoding="utf-8")

@@ -1,49 +1,108 @@
-"""Where each query really is: by file order, an index file, or UTM coordinates in the file names.
+"""Where each query really is: by file order, an index file, labels, or UTM coordinates in the file names.
 
-Truth comes in two kinds, each with a threshold that decides what still counts: frames of the database sequence, or a
-radius in meters.
+Truth comes in three kinds. Two have a threshold that decides what still counts: frames of the database sequence, or a
+radius in meters. The third is exact: a database image is right or it is not.
 """
 
 import csv
 import json
-import math
-from collections.abc import Iterable, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from mfvpr.errors import InputError
-from mfvpr.evaluation import frame_positives, radius_positives
+from mfvpr.evaluation import radius_positives
+
+KINDS = {
+    "order": "query i shows database image i",
+    "index": "a file of pairs",
+    "utm": "positions in the names, @easting@northing@...",
+    "label": "two csv files of name,label: the same label (floor, room) is right",
+    "none": "rankings only",
+}
+MAX_DIGITS = 20  # of a row number
+CHOICES = "; ".join(f"{kind} ({meaning})" for kind, meaning in KINDS.items())
+FARTHEST = 1e9  # meters; beyond, distances lose their centimeters, and at last their meaning
+Unit = Literal["frames", "m", "exact"]
 
 
-@dataclass(frozen=True)
-class FrameTruth:
-    """The database rows that show each query's place; neighbors within a tolerance in frames count as well."""
+class Truth(ABC):
+    """Which database images are right for each query."""
 
-    unit: ClassVar[str] = "frames"
-    rows: tuple[tuple[int, ...], ...]  # per query; empty = unknown place, which counts as a failure
-    num_database: int
+    @property
+    @abstractmethod
+    def unit(self) -> Unit:
+        """Of thresholds; "exact" = they do not matter."""
 
+    @abstractmethod
     def positives(self, threshold: float) -> np.ndarray:
-        """`[Q, N]` bool for a tolerance in frames, inclusive."""
-        positives = np.zeros((len(self.rows), self.num_database), bool)
-        for place in range(max(map(len, self.rows), default=0)):
-            index = np.array([rows[place] if place < len(rows) else -1 for rows in self.rows])
-            positives |= frame_positives(index, np.arange(self.num_database), tolerance=int(threshold))
-        return positives
+        """`[Q, N]` bool, what counts as right at a threshold, inclusive."""
+
+    @abstractmethod
+    def distance(self, query: int) -> np.ndarray:
+        """`[N]` from each database image to the query's place, in the unit; infinite where it is never right."""
 
     def place(self, query: int) -> int | None:
         """The database row that shows the query's place best, None if there is none."""
-        return self.rows[query][0] if self.rows[query] else None
+        distance = self.distance(query)
+        best = int(np.argmin(distance)) if distance.size else None
+        return best if best is not None and np.isfinite(distance[best]) else None
+
+    def thresholds(self, *, tolerances: Iterable[int], radius: float) -> list[float]:
+        """Those of the unit, ascending: tolerances in frames, or the radius in meters; 0 alone where truth is exact."""
+        return {"frames": sorted(set(tolerances)), "m": [radius], "exact": [0]}[self.unit]
+
+
+def threshold_words(unit: Unit, threshold: float) -> str:
+    """What stands behind R@K in a table."""
+    return {"frames": f" ±{threshold:g}", "m": f" {threshold:g} m", "exact": ""}[unit]
 
 
 @dataclass(frozen=True)
-class RadiusTruth:
+class FrameTruth(Truth):
+    """The database rows that show each query's place; neighbors within a tolerance in frames count as well.
+
+    Attributes:
+        rows: per query; empty = unknown place, which counts as a failure.
+        num_database: N.
+        widened: False = no neighbors count, at any tolerance.
+    """
+
+    rows: tuple[tuple[int, ...], ...]
+    num_database: int
+    widened: bool = True
+
+    @property
+    def unit(self) -> Unit:
+        """Frames, where there are tolerances."""
+        return "frames" if self.widened else "exact"
+
+    def positives(self, threshold: float) -> np.ndarray:
+        """`[Q, N]` bool for a tolerance in frames, inclusive."""
+        tolerance = int(threshold) if self.widened else 0
+        positives = np.zeros((len(self.rows), self.num_database), bool)
+        for right, rows in zip(positives, self.rows, strict=True):
+            for row in rows:
+                right[max(row - tolerance, 0) : row + tolerance + 1] = True
+        return positives
+
+    def distance(self, query: int) -> np.ndarray:
+        """`[N]` frames to the nearest of the query's rows."""
+        distance = np.full(self.num_database, np.inf)
+        for row in self.rows[query]:
+            distance = np.minimum(distance, np.abs(np.arange(self.num_database) - row))
+        return distance if self.widened else np.where(distance > 0, np.inf, 0.0)
+
+
+@dataclass(frozen=True)
+class RadiusTruth(Truth):
     """Positions in meters; database images within a radius of the query count."""
 
-    unit: ClassVar[str] = "m"
+    unit: ClassVar[Unit] = "m"
     query_xy: np.ndarray  # [Q, 2]
     database_xy: np.ndarray  # [N, 2]
 
@@ -51,20 +110,56 @@ class RadiusTruth:
         """`[Q, N]` bool for a radius in meters, inclusive."""
         return radius_positives(self.query_xy, self.database_xy, radius=threshold)
 
-    def place(self, query: int) -> int | None:
-        """The database row nearest to the query."""
-        return int(np.argmin(np.linalg.norm(self.database_xy - self.query_xy[query], axis=1)))
+    def distance(self, query: int) -> np.ndarray:
+        """`[N]` meters."""
+        return np.linalg.norm(self.database_xy - self.query_xy[query], axis=1)
 
 
-Truth = FrameTruth | RadiusTruth
+@dataclass(frozen=True)
+class LabelTruth(Truth):
+    """Labels, of floors or rooms, as numbers; database images of the query's label are right. -1 = no label."""
+
+    unit: ClassVar[Unit] = "exact"
+    query_labels: np.ndarray  # [Q]
+    database_labels: np.ndarray  # [N]
+
+    def positives(self, threshold: float = 0) -> np.ndarray:
+        """`[Q, N]` bool, at any threshold."""
+        return (self.query_labels[:, None] == self.database_labels) & (self.query_labels >= 0)[:, None]
+
+    def distance(self, query: int) -> np.ndarray:
+        """`[N]` 0 or infinite."""
+        label = self.query_labels[query]
+        return np.where((self.database_labels == label) & (label >= 0), 0.0, np.inf)
+
+
+@dataclass(frozen=True)
+class AllowedTruth(Truth):
+    """Another truth, of which some database images are no answer to some queries."""
+
+    truth: Truth
+    allowed: np.ndarray  # [Q, N] bool
+
+    @property
+    def unit(self) -> Unit:
+        """The other's."""
+        return self.truth.unit
+
+    def positives(self, threshold: float) -> np.ndarray:
+        """`[Q, N]` bool, the other's that are allowed."""
+        return self.truth.positives(threshold) & self.allowed
+
+    def distance(self, query: int) -> np.ndarray:
+        """`[N]` the other's; infinite where an image is not allowed."""
+        return np.where(self.allowed[query], self.truth.distance(query), np.inf)
 
 
 def truth_by_order(num_queries: int, num_database: int) -> FrameTruth:
     """Query i shows database image i, in file order."""
     if num_queries != num_database:
         raise InputError(
-            f"ground truth by file order: expected as many queries as database images, got {num_queries} and "
-            f"{num_database}; use dataset.ground_truth=index with dataset.index_file=FILE, utm, or none"
+            f"ground_truth=order: expected as many queries as database images, got {num_queries} and {num_database}; "
+            "name the pairs in an index file, or use another ground truth"
         )
     return FrameTruth(tuple((row,) for row in range(num_queries)), num_database)
 
@@ -76,7 +171,22 @@ def truth_from_names(query_names: Sequence[str], database_names: Sequence[str]) 
     )
 
 
-def truth_from_file(path: Path, query_names: Sequence[str], database_names: Sequence[str]) -> Truth:
+def truth_from_labels(
+    query_file: Path, database_file: Path, query_names: Sequence[str], database_names: Sequence[str]
+) -> LabelTruth:
+    """Same label = right, from a csv with the columns `name,label` for each side, one line per image.
+
+    A query with an empty label has no right answer, and a database image with one is nobody's; labels are compared as
+    they are written, but for spaces around them.
+    """
+    labels = [_labels(query_file, query_names), _labels(database_file, database_names)]
+    numbers = {"": -1} | {label: number for number, label in enumerate(sorted({*labels[0], *labels[1]} - {""}))}
+    return LabelTruth(*(np.array([numbers[label] for label in side], np.int32) for side in labels))
+
+
+def truth_from_file(
+    path: Path, query_names: Sequence[str], database_names: Sequence[str], *, widened: bool = False
+) -> Truth:
     """Truth from an index file.
 
     * `.csv`: a header with the columns `query` and `database` (or SSM-VPR's `Live` and `Reference`), then one line per
@@ -84,30 +194,44 @@ def truth_from_file(path: Path, query_names: Sequence[str], database_names: Sequ
       database cell says that there is none.
     * `.npz`: arrays `query` and `database`, the same pairs; or Patch-NetVLAD's `utmQ` and `utmDb`.
     * `.json`: VPR-Bench's `[[query, [database, ...]], ...]`.
+
+    Args:
+        path: index file.
+        query_names: of the images.
+        database_names: of the images.
+        widened: whether database images within a tolerance in frames of a pair's count as well, as in a sequence; if
+            not, the pairs are all that is right.
     """
-    if not path.is_file():
-        found = "a folder" if path.is_dir() else "nothing"
-        raise InputError(f"{path}: expected an index file (.csv, .npz or .json), got {found}; set dataset.index_file")
     readers = {".csv": _csv_pairs, ".npz": _npz_pairs, ".json": _json_pairs}
     if path.suffix.lower() not in readers:
         raise InputError(f"{path}: expected an index file named .csv, .npz or .json, got {path.suffix or 'no suffix'}")
-    try:
-        found = readers[path.suffix.lower()](path)
-    except InputError:
-        raise
-    except Exception as error:  # a parser on a foreign file
-        if "allow_pickle" in str(error):
-            error = ValueError("it holds Python objects, which are never loaded")
-        raise InputError(f"{path}: cannot be read as {path.suffix} ({error}); see README, Your own images") from None
+    found = _parsed(path, readers[path.suffix.lower()])
     if isinstance(found, RadiusTruth):
         _same_count(path, "query positions (utmQ)", len(found.query_xy), len(query_names))
         _same_count(path, "database positions (utmDb)", len(found.database_xy), len(database_names))
         return found
-    return _frame_truth(path, found, query_names, database_names)
+    return _frame_truth(path, found, query_names, database_names, widened)
+
+
+def _parsed(path: Path, reader: Callable[[Path], Any]) -> Any:
+    """What `reader` finds in a foreign file."""
+    if not path.is_file():
+        found = "a folder" if path.is_dir() else "nothing"
+        raise InputError(f"{path}: expected a ground truth file, got {found}; check the path")
+    try:
+        return reader(path)
+    except InputError:
+        raise
+    except Exception as error:
+        reason = "it holds Python objects, which are never loaded" if "allow_pickle" in str(error) else str(error)
+        reason = " ".join(reason.split())
+        raise InputError(
+            f"{path}: cannot be read as {path.suffix or 'csv'} ({reason}); see README, Your own images"
+        ) from None
 
 
 def _frame_truth(
-    path: Path, pairs: Iterable[tuple[Any, Any]], queries: Sequence[str], database: Sequence[str]
+    path: Path, pairs: Iterable[tuple[Any, Any]], queries: Sequence[str], database: Sequence[str], widened: bool
 ) -> Truth:
     query_rows, database_rows = _row_table(queries), _row_table(database)
     rows: dict[int, list[int]] = {}
@@ -122,17 +246,51 @@ def _frame_truth(
             f"{path}: expected ground truth for all {len(queries)} queries, got it for {len(rows)}; the first without "
             f"is {missing[0]} (a line with an empty database cell says that it has no place)"
         )
-    return FrameTruth(tuple(tuple(rows[row]) for row in range(len(queries))), len(database))
+    return FrameTruth(tuple(tuple(rows[row]) for row in range(len(queries))), len(database), widened)
+
+
+def _labels(path: Path, names: Sequence[str]) -> list[str]:
+    """The label of every image."""
+    table = _row_table(names)
+    labels: dict[int, str] = {}
+    for number, (name, label) in enumerate(_parsed(path, _csv_labels), start=1):
+        row = table.get(name.strip())
+        if row is None:
+            several = any(PurePosixPath(one).name == name.strip() for one in names)
+            mend = "several images have this name, give their paths" if several else "no image has this name, remove it"
+            raise InputError(f"{path}: entry {number}: got {_shortened(name)!r}; {mend}")
+        if row in labels:
+            raise InputError(f"{path}: entry {number}: {_shortened(name)!r} has a label already; keep one of them")
+        labels[row] = label.strip()
+    missing = [name for row, name in enumerate(names) if row not in labels]
+    if missing:
+        raise InputError(
+            f"{path}: expected labels of all {len(names)} images, got {len(labels)}; the first without is {missing[0]} "
+            "(a line with an empty label says that it has none)"
+        )
+    return [labels[row] for row in range(len(names))]
+
+
+def _csv_columns(path: Path, *choices: tuple[str, str]) -> list[tuple[str, str]]:
+    """The first of the pairs of columns that a csv has."""
+    with path.open(newline="", encoding="utf-8-sig", errors="surrogateescape") as file:  # as file names are read
+        lines = csv.reader(file)
+        names = [name.strip().lower() for name in next(lines, [])]
+        for pair in choices:
+            if {*pair} <= {*names}:
+                first, second = map(names.index, pair)
+                short = [""] * len(names)  # cells that a line lacks are empty
+                return [((line + short)[first], (line + short)[second]) for line in lines if line]
+    found = _shortened(",".join(names)) or "no header"
+    raise InputError(f"{path}: expected a header with the columns {','.join(choices[0])}; got {found}")
 
 
 def _csv_pairs(path: Path) -> list[tuple[str, str]]:
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        reader = csv.DictReader(file)
-        names = {name.strip().lower(): name for name in reader.fieldnames or []}
-        for query, database in (("query", "database"), ("live", "reference")):
-            if query in names and database in names:
-                return [(line[names[query]] or "", line[names[database]] or "") for line in reader]
-    raise InputError(f"{path}: expected a header with the columns query,database; got {','.join(names) or 'no header'}")
+    return _csv_columns(path, ("query", "database"), ("live", "reference"))
+
+
+def _csv_labels(path: Path) -> list[tuple[str, str]]:
+    return _csv_columns(path, ("name", "label"))
 
 
 def _npz_pairs(path: Path) -> list[tuple[Any, Any]] | RadiusTruth:
@@ -140,10 +298,10 @@ def _npz_pairs(path: Path) -> list[tuple[Any, Any]] | RadiusTruth:
         if {"utmQ", "utmDb"} <= set(arrays):
             positions = [arrays[name].astype(np.float64) for name in ("utmQ", "utmDb")]
             for name, xy in zip(("utmQ", "utmDb"), positions, strict=True):
-                if xy.ndim != 2 or xy.shape[1] != 2 or not np.isfinite(xy).all():
-                    raise InputError(
-                        f"{path}: {name}: expected finite positions [n, 2] in meters, got shape {xy.shape}"
-                    )
+                if xy.ndim != 2 or xy.shape[1] != 2:
+                    raise InputError(f"{path}: {name}: expected positions [n, 2] in meters, got shape {xy.shape}")
+                if not (np.abs(xy) <= FARTHEST).all():  # NaN neither
+                    raise InputError(f"{path}: {name}: expected positions of at most {FARTHEST:g} m, got others")
             return RadiusTruth(*positions)
         if {"query", "database"} <= set(arrays):
             if arrays["query"].shape != arrays["database"].shape or arrays["query"].ndim != 1:
@@ -178,11 +336,17 @@ def _row(path: Path, line: int, side: str, value: Any, table: dict[str, int], co
     text = str(value).strip()
     if text in table:
         return table[text]
-    if text.isascii() and text.isdigit() and int(text) < count:
+    if text.isascii() and text.isdigit() and len(text) < MAX_DIGITS and int(text) < count:
         return int(text)
     raise InputError(
-        f"{path}: pair {line}: expected the name of a {side} image or a number from 0 to {count - 1}, got {text!r}"
+        f"{path}: pair {line}: expected the name of a {side} image or a number from 0 to {count - 1}, got "
+        f"{_shortened(text)!r}"
     )
+
+
+def _shortened(text: str) -> str:
+    """Foreign text, for a message of one line."""
+    return text if len(text) <= 60 else f"{text[:40]}... ({len(text)} characters)"
 
 
 def _position(name: str) -> tuple[float, float]:
@@ -191,9 +355,13 @@ def _position(name: str) -> tuple[float, float]:
     try:
         easting, northing = float(fields[1]), float(fields[2])
     except (IndexError, ValueError):
-        raise InputError(f"{name}: expected a name like @easting@northing@...; use dataset.ground_truth=none") from None
-    if not (math.isfinite(easting) and math.isfinite(northing)):
-        raise InputError(f"{name}: expected finite easting and northing, got {easting} and {northing}")
+        raise InputError(
+            f"{name}: expected a name like @easting@northing@...; or choose another ground truth"
+        ) from None
+    if not (abs(easting) <= FARTHEST and abs(northing) <= FARTHEST):  # NaN neither
+        raise InputError(
+            f"{name}: expected easting and northing of at most {FARTHEST:g} m, got {easting:g} and {northing:g}"
+        )
     return easting, northing
 
 

@@ -1,14 +1,27 @@
 """Folders and ground truth of every kind, right and wrong."""
 
 import json
+import os
+import tempfile
+import tracemalloc
+from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from mfvpr import InputError
-from mfvpr.data.datasets import fingerprint, folder_dataset, image_folder
-from mfvpr.data.files import replacing, write_text
+from mfvpr import InputError, frame_positives
+from mfvpr.data.datasets import folder_dataset, image_folder
+from mfvpr.data.files import printable, replacing, write_text
+from mfvpr.data.ground_truth import (
+    AllowedTruth,
+    FrameTruth,
+    LabelTruth,
+    RadiusTruth,
+    threshold_words,
+    truth_from_labels,
+)
 
 
 def fill(folder, names):
@@ -38,9 +51,11 @@ def test_names_are_relative_in_natural_order_and_kept_apart(tmp_path):
 
 def test_order(folders):
     database, queries = folders
-    with pytest.raises(InputError, match="got 2 and 3"):
-        folder_dataset(database, queries)
-    truth = folder_dataset(database, database).truth
+    with pytest.raises(
+        InputError, match="ground_truth=order: expected as many queries as database images, got 2 and 3"
+    ):
+        folder_dataset(database, queries, ground_truth="order")
+    truth = folder_dataset(database, database, ground_truth="order").truth
     np.testing.assert_array_equal(truth.positives(0), np.eye(3, dtype=bool))
     assert truth.positives(1).sum() == 7
     assert folder_dataset(database, queries, ground_truth="none").truth is None
@@ -81,6 +96,144 @@ def test_utm_reads_the_file_name_only(tmp_path):
     np.testing.assert_array_equal(truth.positives(25), [[True, True]])
 
 
+def test_nothing_is_assumed(folders):
+    """Not even where the counts agree."""
+    database, _ = folders
+    for kind in (None, "names"):
+        with pytest.raises(InputError) as caught:
+            folder_dataset(database, database, ground_truth=kind)
+        for choice in ("order (query i shows", "index (a file", "utm (positions", "label (two", "none (rankings"):
+            assert choice in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+def test_an_index_file_says_all_that_is_right_unless_neighbors_count(folders, tmp_path):
+    write_text(tmp_path / "gt.csv", "query,database\na.png,2.png\nb.png,\n")
+    index = {"ground_truth": "index", "index_file": tmp_path / "gt.csv"}
+    exact = folder_dataset(*folders, **index).truth
+    widened = folder_dataset(*folders, **index, widen_index=True).truth
+    for tolerance in (0, 1, 5):
+        np.testing.assert_array_equal(exact.positives(tolerance), [[False, False, True], [False] * 3])
+    np.testing.assert_array_equal(widened.positives(1), [[False, True, True], [False] * 3])
+    assert exact.thresholds(tolerances=[5, 1, 2, 1], radius=25.0) == [0]
+    assert widened.thresholds(tolerances=[5, 1, 2, 1], radius=25.0) == [1, 2, 5]
+    assert (exact.place(0), exact.place(1), widened.place(0), widened.place(1)) == (2, None, 2, None)
+    assert [threshold_words(truth.unit, 2) for truth in (exact, widened)] == ["", " ±2"]
+
+
+def labels(tmp_path, database, queries):
+    write_text(tmp_path / "db.csv", "name,label\n" + database)
+    write_text(tmp_path / "q.csv", "name,label\n" + queries)
+    return {"ground_truth": "label", "database_labels": tmp_path / "db.csv", "query_labels": tmp_path / "q.csv"}
+
+
+def test_labels(folders, tmp_path):
+    files = labels(tmp_path, "2.png, hall\n0.png,kitchen\n1.png,hall \n", "b.png,attic\na.png,hall\n")
+    truth = folder_dataset(*folders, **files).truth
+    np.testing.assert_array_equal(truth.positives(5), [[False, True, True], [False, False, False]])
+    assert (truth.place(0), truth.place(1)) == (1, None)
+    assert truth.thresholds(tolerances=[1, 2], radius=25.0) == [0]
+
+
+def test_no_label_is_nobodys(folders, tmp_path):
+    truth = folder_dataset(*folders, **labels(tmp_path, "0.png,\n1.png,\n2.png,x\n", "a.png,\nb.png,x\n")).truth
+    np.testing.assert_array_equal(truth.positives(0), [[False, False, False], [False, False, True]])
+
+
+@pytest.mark.parametrize(
+    ("database", "words"),
+    [
+        ("0.png,x\n1.png,x\n", "expected labels of all 3 images, got 2; the first without is 2.png"),
+        ("0.png,x\n1.png,x\n0.png,x\n2.png,x\n", "entry 3: '0.png' has a label already"),
+        ("0.png,x\n1.png,x\n2.png,x\n9.png,x\n", "entry 4: got '9.png'; no image has this name"),
+        ("0.png,x\n" + 5000 * "9" + ",x\n", "(5000 characters)'; no image has this name"),
+    ],
+)
+def test_wrong_labels_are_named_in_one_line(folders, tmp_path, database, words):
+    with pytest.raises(InputError) as caught:
+        folder_dataset(*folders, **labels(tmp_path, database, "a.png,x\nb.png,x\n"))
+    assert words in str(caught.value)
+    assert str(tmp_path / "db.csv") in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400
+
+
+def test_a_name_in_two_folders_needs_its_path(tmp_path):
+    both = fill(tmp_path / "both", ["left/0.png", "right/0.png"])
+    with pytest.raises(InputError, match=r"got '0\.png'; several images have this name, give their paths"):
+        folder_dataset(both, both, **labels(tmp_path, "0.png,x\n", "left/0.png,x\nright/0.png,y\n"))
+    full = "left/0.png,x\nright/0.png,y\n"
+    truth = folder_dataset(both, both, **labels(tmp_path, full, full)).truth
+    np.testing.assert_array_equal(truth.positives(0), np.eye(2, dtype=bool))
+
+
+def test_files_are_given_for_the_ground_truth_that_reads_them(folders, tmp_path):
+    files = labels(tmp_path, "", "")
+    for options, words in (
+        ({"ground_truth": "order", "index_file": tmp_path / "db.csv"}, "given as index_file, but ground_truth=order"),
+        (files | {"ground_truth": "none"}, "given as database_labels, but ground_truth=none; set it to label"),
+        (files | {"query_labels": None}, "ground_truth=label: expected a file; give query_labels as well"),
+        (files | {"query_labels": tmp_path / "no.csv"}, "no.csv: expected a ground truth file, got nothing"),
+    ):
+        with pytest.raises(InputError, match=words):
+            folder_dataset(*folders, **options)
+
+
+def test_as_many_labels_as_anyone_has():
+    rng = np.random.default_rng(0)
+    truth = LabelTruth(rng.integers(-1, 60, 2000), rng.integers(-1, 60, 3000))
+    positives = truth.positives(0)
+    for query in (0, 7, 1999):
+        right = (truth.database_labels == truth.query_labels[query]) & (truth.query_labels[query] >= 0)
+        np.testing.assert_array_equal(positives[query], right)
+        np.testing.assert_array_equal(np.isfinite(truth.distance(query)), right)
+
+
+def test_a_long_file_of_labels_is_read_in_seconds(tmp_path):
+    names = [f"{number}.png" for number in range(30_000)]
+    write_text(tmp_path / "l.csv", "name,label\n" + "".join(f"{name},{len(name)}\n" for name in reversed(names)))
+    truth = truth_from_labels(tmp_path / "l.csv", tmp_path / "l.csv", names, names)
+    np.testing.assert_array_equal(truth.query_labels, np.repeat(range(5), [10, 90, 900, 9000, 20_000]))
+
+
+def test_positives_take_little_more_than_themselves():
+    """Nordland has 27,592 frames on each side: eight bytes for each pair would be 6 GB, of which there were two."""
+    number = 600
+    rows = FrameTruth(tuple((row,) for row in range(number)), number)
+    places = RadiusTruth(*2 * [np.stack([np.arange(number), np.zeros(number)], axis=1)])
+    for positives, expected in (
+        (lambda: rows.positives(2), 5 * number - 6),
+        (lambda: frame_positives(np.arange(number), np.arange(number), tolerance=2), 5 * number - 6),
+        (lambda: places.positives(1e6), number**2),
+    ):
+        tracemalloc.start()
+        try:
+            found = positives()
+            peak = tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+        assert peak < 1.5 * number**2
+        assert found.sum() == expected
+
+
+@pytest.mark.parametrize("tolerance", [0, 1, 4, 10**6])
+def test_frames_are_a_loop_over_all_pairs(tolerance):
+    truth = FrameTruth(((3, 7), (), (0,), (9,)), 10)
+    for query, rows in enumerate(truth.rows):
+        expected = [any(abs(row - one) <= tolerance for one in rows) for row in range(10)]
+        np.testing.assert_array_equal(truth.positives(tolerance)[query], expected)
+        np.testing.assert_array_equal(truth.distance(query) <= tolerance, expected)
+
+
+def test_what_is_not_allowed_is_not_right():
+    allowed = np.array([[True, False, False, True], [False, True, True, True]])
+    truth = AllowedTruth(FrameTruth(((1,), (0,)), 4), allowed)
+    np.testing.assert_array_equal(truth.positives(1), [[True, False, False, False], [False, True, False, False]])
+    assert not truth.positives(0).any()
+    assert (truth.place(0), truth.place(1), truth.unit) == (0, 1, "frames")
+    assert AllowedTruth(truth, np.zeros_like(allowed)).place(0) is None
+
+
 def bad_npz(path):
     np.savez(path, query=np.array([{"a": 1}], dtype=object), database=np.array([0]))
 
@@ -89,6 +242,16 @@ def bad_npz(path):
     ("name", "content", "words"),
     [
         ("missing.csv", None, "got nothing"),
+        ("gt.csv", f"query,database\n0,0\n1,{5000 * '1'}\n", "(5000 characters)'"),
+        ("gt.csv", f"query,database\n0,0\n1,{5000 * '0'}1\n", "(5001 characters)'"),
+        ("gt.json", f"[[0, [{5000 * '1'}]], [1, []]]", "cannot be read as .json"),
+        ("gt.json", f"[[0, [{4000 * '1'}]], [1, []]]", "(4000 characters)'"),
+        ("gt.json", 100_000 * "[", "cannot be read as .json"),
+        (
+            "gt.npz",
+            lambda p: np.savez(p, utmQ=np.full((2, 2), 1e308), utmDb=np.zeros((3, 2))),
+            "utmQ: expected positions of at most 1e+09 m",
+        ),
         ("gt.txt", "x", "named .csv, .npz or .json"),
         ("gt.csv", "", "no header"),
         ("gt.csv", "a,b\n0,0\n", "got a,b"),
@@ -108,9 +271,9 @@ def bad_npz(path):
         (
             "gt.npz",
             lambda p: np.savez(p, utmQ=np.full((2, 2), np.nan), utmDb=np.zeros((3, 2))),
-            "utmQ: expected finite",
+            "utmQ: expected positions of at most",
         ),
-        ("gt.npz", lambda p: np.savez(p, utmQ=np.zeros(()), utmDb=np.zeros((3, 2))), "utmQ: expected finite"),
+        ("gt.npz", lambda p: np.savez(p, utmQ=np.zeros(()), utmDb=np.zeros((3, 2))), "utmQ: expected positions [n, 2]"),
         ("gt.npz", lambda p: np.savez(p, query=np.arange(2), database=np.arange(3)), "of one length"),
         ("gt.npz", lambda p: np.savez(p, other=np.zeros(2)), "got other"),
         ("gt.npz", lambda p: np.savez(p, utmQ=np.zeros((5, 2)), utmDb=np.zeros((3, 2))), "expected 2 query positions"),
@@ -129,7 +292,9 @@ def test_wrong_index_files_are_named_in_one_line(folders, tmp_path, name, conten
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["plain.png", "@a@b@.png", "@1.png", "@nan@1@.png", "@inf@1@.png"])
+@pytest.mark.parametrize(
+    "name", ["plain.png", "@a@b@.png", "@1.png", "@nan@1@.png", "@inf@1@.png", "@1e308@1e308@.png", "@5@-1e10@.png"]
+)
 def test_names_without_coordinates_are_named(tmp_path, name):
     folder = fill(tmp_path / "db", [name])
     with pytest.raises(InputError, match=r"easting"):
@@ -146,18 +311,97 @@ def test_missing_and_empty_folders(tmp_path):
     ):
         with pytest.raises(InputError, match=words):
             image_folder(path)
-    with pytest.raises(InputError, match=r"set dataset\.index_file"):
+    with pytest.raises(InputError, match="ground_truth=index: expected a file; give index_file as well"):
         folder_dataset(fill(tmp_path / "a", ["0.png"]), tmp_path / "a", ground_truth="index")
 
 
-def test_fingerprint_follows_names_contents_and_order(tmp_path):
-    one, two = fill(tmp_path / "1", ["a.png", "b.png"]), fill(tmp_path / "2", ["a.png", "b.png"])
-    same = fingerprint(image_folder(one)), fingerprint(image_folder(two))
-    assert same[0] == same[1]
-    (two / "b.png").rename(two / "c.png")
-    assert fingerprint(image_folder(two)) != same[0]
-    (one / "b.png").write_bytes(b"other")
-    assert fingerprint(image_folder(one)) != same[0]
+def test_numbers_of_any_length_sort_by_value(tmp_path):
+    names = [f"{number}.png" for number in ("2", "10", "0010", "9" * 200, "1" + "0" * 200, "0" * 150 + "3")]
+    long = "/".join(["7" * 200] * 15)  # the digits of a path are read folder by folder
+    folder = image_folder(fill(tmp_path, [*names, f"{long}/1.png"]))
+    order = [folder.names.index(names[place]) for place in (0, 5, 1, 3, 4)]
+    assert order == sorted(order)
+
+
+def test_linked_folders_are_followed(tmp_path):
+    real = fill(tmp_path / "real", ["deep/1.png", "2.png"])
+    root = fill(tmp_path / "root", ["0.png"])
+    (root / "one").symlink_to(real)
+    (root / "other").symlink_to(real / "deep", target_is_directory=True)  # twice by different links is no loop
+    (root / "3.png").symlink_to(real / "2.png")
+    assert image_folder(root).names == ("0.png", "3.png", "one/2.png", "one/deep/1.png", "other/1.png")
+    (tmp_path / "entry").symlink_to(root)
+    assert len(image_folder(tmp_path / "entry")) == 5
+
+
+def test_links_in_circles_or_to_nothing_are_refused(tmp_path):
+    for number, (place, target, words) in enumerate(
+        (
+            ("sub/back", "..", "back: a link back to "),
+            ("sub/up", "../..", "a link back to "),
+            ("self", "self", "cannot be listed"),
+            ("gone", "nowhere", "gone: a link to nothing, which may have been a folder; mend or remove it"),
+        )
+    ):
+        root = fill(tmp_path / str(number) / "root", ["sub/0.png"])
+        (root / place).symlink_to(target)
+        with pytest.raises(InputError, match=words) as caught:
+            image_folder(root)
+        assert "\n" not in str(caught.value)
+
+
+def test_what_is_no_image_is_ignored(tmp_path):
+    folder = fill(tmp_path, ["0.png", ".hidden/1.png", "a.png/2.png", "empty.png/.x.png"])
+    (folder / "notes.txt").write_text("no image")
+    (folder / ".#lock").symlink_to("nowhere")
+    os.mkfifo(folder / "pipe")
+    assert image_folder(folder).names == ("0.png", "a.png/2.png")
+
+
+@contextmanager
+def as_nobody():
+    """Without the rights of root, who may read everything."""
+    if os.geteuid() != 0:
+        yield
+        return
+    os.seteuid(65534)
+    try:
+        yield
+    finally:
+        os.seteuid(0)
+
+
+@pytest.mark.parametrize("closed", ["root", "root/sub"])
+def test_unreadable_folders_and_files_are_errors(closed):
+    with tempfile.TemporaryDirectory(dir="/tmp") as name:  # pytest's own is closed to others
+        place = Path(name)
+        place.chmod(0o755)
+        fill(place / "root", ["0.png", "sub/1.png"])
+        (place / closed).chmod(0)
+        try:
+            with as_nobody(), pytest.raises(InputError, match=f"{closed}: cannot be listed .Permission denied."):
+                image_folder(place / "root")
+        finally:
+            (place / closed).chmod(0o755)
+        (place / "root" / "0.png").chmod(0)
+        with as_nobody(), pytest.raises(InputError, match=r"0\.png: cannot be opened .Permission denied."):
+            image_folder(place / "root").read(0)
+
+
+def test_names_that_are_not_utf8(tmp_path):
+    folder = fill(tmp_path / "db", ["0.png"])
+    (folder / "0.png").rename(folder / os.fsdecode(b"caf\xe9.png"))
+    (name,) = image_folder(folder).names
+    assert image_folder(folder).read(0).shape == (4, 4, 3)
+    assert printable(name) == "caf\\udce9.png"
+    assert printable("café 日本") == "café 日本"
+    write_text(tmp_path / "a.csv", f"{name},1\n")
+    assert (tmp_path / "a.csv").read_text(encoding="utf-8") == "caf\\udce9.png,1\n"
+    write_text(tmp_path / "a.json", json.dumps([name], ensure_ascii=False))
+    assert json.loads((tmp_path / "a.json").read_text(encoding="utf-8")) == [name]  # the very name
+    (tmp_path / "gt.csv").write_bytes(b"query,database\ncaf\xe9.png,0\n")  # as a shell writes it
+    truth = folder_dataset(folder, folder, ground_truth="index", index_file=tmp_path / "gt.csv").truth
+    assert truth.place(0) == 0
 
 
 def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):

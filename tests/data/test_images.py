@@ -1,8 +1,11 @@
 """Decoding and resampling: what Pillow gives, and what every broken file is told."""
 
 import os
+import struct
 import threading
 import time
+import zlib
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,7 +13,8 @@ import pytest
 from PIL import Image
 
 from mfvpr import InputError
-from mfvpr.data.images import MAX_PIXELS, ordered_map, read_image, resize
+from mfvpr.data.images import MAX_PIXELS, Header, ordered_map, read_header, read_image, resize
+from mfvpr.features.sift import Sift
 from tests.golden import make_resize
 
 
@@ -25,11 +29,9 @@ def test_lossless_files_come_back(tmp_path, photo, name):
     np.testing.assert_array_equal(read_image(tmp_path / name), photo)
 
 
-@pytest.mark.parametrize("mode", ["L", "RGBA", "CMYK", "P", "1", "I;16", "LA"])
+@pytest.mark.parametrize("mode", ["L", "RGBA", "CMYK", "P", "1", "LA"])
 def test_every_mode_decodes_to_pillows_rgb(tmp_path, photo, mode):
-    image = (
-        Image.fromarray(photo).convert("L").convert("I;16") if mode == "I;16" else Image.fromarray(photo).convert(mode)
-    )
+    image = Image.fromarray(photo).convert(mode)
     path = tmp_path / ("a.tiff" if mode == "CMYK" else "a.png")
     image.save(path)
     with Image.open(path) as stored:
@@ -126,17 +128,138 @@ def test_ordered_map_passes_errors_on():
         list(ordered_map(lambda x: 1 / x, [1, 0, 2], workers=2))
 
 
-def test_orientation_tags_are_left_alone_as_by_pillow(tmp_path, photo):
+# What an image looks like that is to be shown upright, as a camera stores it under each EXIF orientation.
+STORED = {
+    1: lambda image: image,
+    2: lambda image: image[:, ::-1],
+    3: lambda image: image[::-1, ::-1],
+    4: lambda image: image[::-1],
+    5: lambda image: image.transpose(1, 0, 2),
+    6: lambda image: image.transpose(1, 0, 2)[::-1],
+    7: lambda image: image.transpose(1, 0, 2)[::-1, ::-1],
+    8: lambda image: image.transpose(1, 0, 2)[:, ::-1],
+}
+
+
+def tag(orientation):
     exif = Image.Exif()
-    exif[0x0112] = 6  # to be shown rotated by 90 degrees
+    exif[0x0112] = orientation
+    return exif
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tif", "a.webp", "a.jpg"])
+@pytest.mark.parametrize("orientation", STORED)
+def test_orientation_is_applied_unless_switched_off(tmp_path, orientation, name):
+    photo = np.zeros((32, 48, 3), np.uint8)  # four colors in its corners: exact enough after JPEG, too
+    photo[:16, :24], photo[:16, 24:], photo[16:, :24] = (250, 0, 0), (0, 250, 0), (0, 0, 250)
+    stored = np.ascontiguousarray(STORED[orientation](photo))
+    lossless = {"quality": 100, "subsampling": 0} if name == "a.jpg" else {"lossless": True} if "webp" in name else {}
+    Image.fromarray(stored).save(tmp_path / name, exif=tag(orientation), **lossless)
+    tolerance = 2 if name == "a.jpg" else 0
+    np.testing.assert_allclose(read_image(tmp_path / name).astype(int), photo, atol=tolerance)
+    np.testing.assert_allclose(read_image(tmp_path / name, orient=False).astype(int), stored, atol=tolerance)
+    assert read_header((tmp_path / name).read_bytes()) == Header(orientation, None)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tif"])
+def test_orientation_of_16_bit_color(tmp_path, photo, name):
+    deep = np.ascontiguousarray(STORED[6](photo).astype(np.uint16) * 16)
+    content = np.asarray(cv2.imencode(Path(name).suffix, deep[..., ::-1])[1])
+    (tmp_path / name).write_bytes(content)
+    with_orientation(tmp_path / name, 6)
+    np.testing.assert_array_equal(read_image(tmp_path / name, bits=12), photo)
+    np.testing.assert_array_equal(read_image(tmp_path / name, bits=12, orient=False), STORED[6](photo))
+
+
+def with_orientation(path, orientation):
+    """The tag put into a file of 16-bit color, which Pillow cannot write."""
+    content = path.read_bytes()
+    if path.suffix == ".png":
+        body = b"eXIf" + tag(orientation).tobytes().removeprefix(b"Exif\0\0")
+        chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
+        path.write_bytes(content[:33] + chunk + content[33:])  # behind the header's
+    else:
+        order = "<" if content[:2] == b"II" else ">"
+        (start,) = struct.unpack(order + "I", content[4:8])
+        (count,) = struct.unpack(order + "H", content[start : start + 2])
+        entries = [content[start + 2 + 12 * place :][:12] for place in range(count)]
+        entries = [entry for entry in entries if struct.unpack(order + "H", entry[:2]) != (0x0112,)]
+        entries.append(struct.pack(order + "HHIHH", 0x0112, 3, 1, orientation, 0))
+        entries.sort(key=lambda entry: struct.unpack(order + "H", entry[:2]))
+        table = struct.pack(order + "H", len(entries)) + b"".join(entries) + bytes(4)
+        path.write_bytes(content[:4] + struct.pack(order + "I", len(content)) + content[8:] + table)
+
+
+@pytest.mark.parametrize("exif", [tag(0), tag(9), b"Exif\0\0garbage"], ids=["0", "9", "garbage"])
+def test_an_orientation_without_meaning_is_none(tmp_path, photo, exif):
     Image.fromarray(photo).save(tmp_path / "a.png", exif=exif)
     np.testing.assert_array_equal(read_image(tmp_path / "a.png"), photo)
 
 
-def test_16_bits_are_what_pillow_makes_of_them(tmp_path):
-    deep = np.array([[0, 100, 255, 256, 40_000]], np.uint16)
-    Image.fromarray(deep).save(tmp_path / "a.png")
-    np.testing.assert_array_equal(read_image(tmp_path / "a.png")[..., 0], [[0, 100, 255, 255, 255]])
+def write_deep(path, values):
+    """A 16-bit file of gray `[H, W]` or color `[H, W, 3]`; big-endian TIFF as .tiff."""
+    if path.suffix == ".tiff":
+        Image.frombytes("I;16B", values.shape[::-1], values.astype(">u2").tobytes()).save(path)
+    elif path.suffix == ".pgm":
+        path.write_bytes(b"P5 %d %d 65535\n" % values.shape[::-1] + values.astype(">u2").tobytes())
+    else:
+        path.write_bytes(np.asarray(cv2.imencode(path.suffix, values[..., ::-1] if values.ndim == 3 else values)[1]))
+
+
+@pytest.mark.parametrize("factor", [256, 257])
+@pytest.mark.parametrize("name", ["a.png", "a.tif", "a.tiff", "a.pgm"])
+def test_16_bit_copies_are_their_originals(tmp_path, photo, name, factor):
+    gray = photo[..., 0]
+    write_deep(tmp_path / name, gray.astype(np.uint16) * factor)
+    np.testing.assert_array_equal(read_image(tmp_path / name), np.repeat(gray[..., None], 3, axis=2))
+    if name in ("a.png", "a.tif"):
+        write_deep(tmp_path / name, photo.astype(np.uint16) * factor)
+        np.testing.assert_array_equal(read_image(tmp_path / name), photo)
+    header = read_header((tmp_path / name).read_bytes())
+    assert header == Header(1, 0 if name == "a.pgm" else factor * int(photo[..., : 1 + 2 * (name < "a.tiff")].max()))
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tif"])
+def test_bits_in_use_are_a_choice(tmp_path, photo, name):
+    """Cameras of 12 bits write files of 16."""
+    path, twelve = tmp_path / name, photo.astype(np.uint16) * 16 + 7
+    for values in (twelve[..., 0], twelve):
+        write_deep(path, values)
+        original = photo if values.ndim == 3 else np.repeat(photo[..., :1], 3, axis=2)
+        np.testing.assert_array_equal(read_image(path, bits=12), original)
+        np.testing.assert_array_equal(read_image(path), original // 16)
+        np.testing.assert_array_equal(read_image(path, bits=8), np.minimum(np.int32(16) * original + 7, 255))
+        with Image.open(path) as image:
+            np.testing.assert_array_equal(read_image(path, bits=None), np.asarray(image.convert("RGB")))
+
+
+def test_netpbm_files_state_their_range(tmp_path):
+    gray = np.array([[0, 1000, 4095]], ">u2")
+    (tmp_path / "a.pgm").write_bytes(b"P5 3 1 4095\n" + gray.tobytes())
+    (tmp_path / "a.ppm").write_bytes(b"P6 3 1 4095\n" + np.repeat(gray.ravel(), 3).tobytes())
+    for bits in (12, 16):
+        for name in ("a.pgm", "a.ppm"):
+            np.testing.assert_array_equal(read_image(tmp_path / name, bits=bits)[0, :, 0], [0, 62, 255])
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.float32])
+def test_32_bits_have_no_range(tmp_path, dtype):
+    path = tmp_path / "a.tif"
+    Image.fromarray(np.array([[0, 300]], dtype)).save(path)
+    with pytest.raises(InputError, match=r"a\.tif: expected 8 or 16 bits a channel, got 32.*; convert it"):
+        read_image(path)
+    np.testing.assert_array_equal(read_image(path, bits=None)[0, :, 0], [0, 255])
+
+
+def test_16_bit_copies_have_the_same_features(tmp_path, small_street):
+    frame = sorted((small_street / "database").iterdir())[0]
+    deep = read_image(frame).astype(np.uint16) * 257
+    write_deep(tmp_path / "deep.png", deep)
+    sift = Sift(image_size=(160, 120), max_keypoints=50)
+    one, other = sift(np.stack([resize(read_image(path), (160, 120)) for path in (frame, tmp_path / "deep.png")]))
+    assert len(one.mask) == 50
+    for got, expected in zip(vars(other).values(), vars(one).values(), strict=True):
+        np.testing.assert_array_equal(got, expected)
 
 
 def test_an_image_of_one_pixel_fills_any_size(tmp_path):

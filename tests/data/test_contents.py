@@ -1,0 +1,202 @@
+"""What is remembered of image files: content decides, and nothing is read twice without a reason."""
+
+import hashlib
+import os
+import shutil
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mfvpr.data import contents as module
+from mfvpr.data.contents import Content, contents
+from mfvpr.data.datasets import image_folder
+
+SETTLED = 30_000_000  # ns; the real one would keep every test waiting for seconds
+
+
+@pytest.fixture(autouse=True)
+def quickly_settled(monkeypatch):
+    monkeypatch.setattr(module, "SETTLED", SETTLED)
+
+
+def settle():
+    time.sleep(2 * SETTLED / 1e9)
+
+
+def fill(folder, number=3):
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    for row in range(number):
+        Image.fromarray(rng.integers(0, 256, (40, 60, 3), dtype=np.uint8)).save(folder / f"{row}.png")
+    return folder
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return fill(tmp_path / "images")
+
+
+@pytest.fixture
+def cache(tmp_path):
+    return tmp_path / "cache"
+
+
+def fingerprint(folder, cache=None):
+    return contents(image_folder(folder), cache).fingerprint
+
+
+def record(cache):
+    (path,) = cache.iterdir()
+    return path
+
+
+def bytes_read():
+    """By this process, files and pipes alike."""
+    return int(Path("/proc/self/io").read_text().split()[1])
+
+
+def test_the_fingerprint_follows_names_contents_and_order(tmp_path, folder):
+    other = tmp_path / "other"
+    shutil.copytree(folder, other)
+    assert fingerprint(folder) == fingerprint(other)
+    digest = hashlib.sha256()
+    for path in sorted(folder.iterdir()):
+        digest.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
+    assert fingerprint(folder) == digest.hexdigest()[:16]
+    (other / "1.png").rename(other / "9.png")
+    assert fingerprint(other) != fingerprint(folder)
+    before = fingerprint(folder)
+    (folder / "1.png").write_bytes(b"other")
+    assert fingerprint(folder) != before
+
+
+@pytest.mark.skipif(not Path("/proc/self/io").exists(), reason="only Linux counts what a process reads")
+def test_a_second_run_reads_no_image(tmp_path, cache):
+    folder = image_folder(fill(tmp_path / "images", 30))
+    settle()
+    size = sum(path.stat().st_size for path in folder.paths)
+    counts, found = [], []
+    for _ in range(2):
+        before = bytes_read()
+        found.append(contents(folder, cache))
+        counts.append(bytes_read() - before)
+    assert found[0] == found[1]
+    assert counts[0] >= size
+    assert counts[1] < size / 10
+
+
+def test_content_decides_whatever_times_and_names_say(tmp_path, folder, cache):
+    settle()
+    first = fingerprint(folder, cache)
+    path, times = folder / "1.png", (folder / "1.png").stat()
+    os.utime(path)  # other times, same content
+    settle()
+    assert fingerprint(folder, cache) == first
+
+    content = path.read_bytes()
+    changed = content[:-20] + bytes(20)
+    for stamp in (None, (times.st_atime_ns, times.st_mtime_ns)):  # same size; then the same time as well
+        path.write_bytes(changed)
+        if stamp:
+            os.utime(path, ns=stamp)
+        assert fingerprint(folder, cache) == fingerprint(folder) != first
+        path.write_bytes(content)
+        assert fingerprint(folder, cache) == first
+        settle()
+        assert fingerprint(folder, cache) == first
+
+    shutil.copytree(folder, tmp_path / "copy")
+    assert fingerprint(tmp_path / "copy", cache) == first
+
+
+def test_what_has_just_been_written_is_not_trusted(folder, cache, monkeypatch):
+    """It may be written again within the same tick of the clock, with the same times."""
+    monkeypatch.setattr(module, "SETTLED", 10**12)
+    fingerprint(folder, cache)
+    assert not any(name in record(cache).read_text() for name in ("0.png", "1.png"))
+    monkeypatch.setattr(module, "SETTLED", SETTLED)
+    settle()
+    fingerprint(folder, cache)
+    assert all(name in record(cache).read_text() for name in ("0.png", "1.png", "2.png"))
+
+
+@pytest.mark.parametrize("damage", [
+    lambda content: b"",
+    lambda content: content[: len(content) // 2],
+    lambda content: content.replace(b'"1.png"', b'"0.png"'),
+    lambda content: bytes(reversed(content)),
+    lambda content: b"\xff" + content,
+    lambda content: content.replace(b"1 ", b"0 ", 1),
+])  # fmt: skip
+def test_damaged_records_cost_time_only(folder, cache, damage):
+    settle()
+    first = fingerprint(folder, cache)
+    intact = record(cache).read_bytes()
+    assert damage(intact) != intact
+    record(cache).write_bytes(damage(intact))
+    assert fingerprint(folder, cache) == first
+    assert record(cache).read_bytes() == intact
+
+
+def test_many_writers_of_one_record(folder, cache):
+    settle()
+    first, start = fingerprint(folder), threading.Barrier(8)
+
+    def run(_):
+        start.wait()
+        return {fingerprint(folder, cache) for _ in range(5)}
+
+    with ThreadPoolExecutor(8) as pool:
+        assert set.union(*pool.map(run, range(8))) == {first}
+    assert len(list(cache.iterdir())) == 1
+    assert fingerprint(folder, cache) == first
+
+
+def test_a_cache_that_cannot_be_written_costs_time_only(folder, tmp_path):
+    (tmp_path / "file").write_text("")
+    settle()
+    assert fingerprint(folder, tmp_path / "file") == fingerprint(folder)
+
+
+def test_files_that_cannot_be_read_are_left_to_whoever_reads_images(folder, cache):
+    (folder / "3.png").symlink_to("nowhere")
+    os.mkfifo(folder / "4.png")
+    (folder / "5.png").write_bytes(b"no image")
+    settle()
+    for _ in range(2):
+        files = contents(image_folder(folder), cache).files
+        assert files[3:5] == (Content(), Content())
+        assert files[5] == Content(hashlib.sha256(b"no image").hexdigest())
+
+
+def test_names_that_are_not_utf8_are_remembered(folder, cache):
+    (folder / "0.png").rename(folder / os.fsdecode(b"\xe9.png"))
+    settle()
+    assert fingerprint(folder, cache) == fingerprint(folder, cache) == fingerprint(folder)
+    assert "udce9" in record(cache).read_text()
+
+
+def test_how_images_are_read_is_part_of_the_fingerprint_where_it_matters(folder, cache):
+    plain = contents(image_folder(folder))
+    assert plain.summary() == {"orient": True, "turned": 0, "bits": 16, "scaled_16bit": 0, "largest_16bit": None}
+    for options in ({"orient": False}, {"bits": 12}, {"bits": None}):
+        assert replace(plain, folder=replace(plain.folder, **options)).fingerprint == plain.fingerprint
+
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("RGB", (4, 6)).save(folder / "3.jpg", exif=exif)
+    Image.fromarray(np.array([[7, 4095]], np.uint16)).save(folder / "4.png")
+    settle()
+    found = [contents(image_folder(folder), cache) for _ in range(2)]
+    assert found[0].files == found[1].files
+    assert found[1].summary() == {"orient": True, "turned": 1, "bits": 16, "scaled_16bit": 1, "largest_16bit": 4095}
+    ways = [contents(image_folder(folder, orient=orient, bits=bits), cache)
+            for orient in (True, False) for bits in (16, 12, None)]  # fmt: skip
+    assert len({way.fingerprint for way in ways}) == 6
+    assert ways[-1].summary()["turned"] == ways[-1].summary()["scaled_16bit"] == 0

@@ -1,0 +1,75 @@
+"""Database and queries of one sequence: nothing finds itself."""
+
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mfvpr import InputError, pipeline
+from mfvpr.data.contents import contents
+from mfvpr.data.datasets import folder_dataset
+from mfvpr.data.sequences import own_rows, without_neighbors
+from tests.builders import unit
+
+
+@pytest.fixture
+def sequence(tmp_path):
+    folder = tmp_path / "sequence"
+    folder.mkdir()
+    for row in range(6):
+        Image.new("RGB", (4, 4), (row, 0, 0)).save(folder / f"{row}.png")
+    return folder
+
+
+def owned(database, queries, ground_truth="none"):
+    dataset = folder_dataset(database, queries, ground_truth=ground_truth)
+    return dataset, own_rows(contents(dataset.queries), contents(dataset.database))
+
+
+def test_the_same_images_are_known_by_content(sequence, tmp_path):
+    assert owned(sequence, sequence)[1] == tuple((row,) for row in range(6))
+    other = tmp_path / "other"
+    other.mkdir()
+    for name, source in (("b.png", "4.png"), ("a.png", "1.png")):
+        shutil.copy(sequence / source, other / name)
+    Image.new("RGB", (4, 4), (99, 0, 0)).save(other / "c.png")
+    shutil.copy(sequence / "1.png", sequence / "5.png")  # the robot stood still
+    assert owned(sequence, other)[1] == ((1, 5), (4,), ())
+
+
+def test_files_that_cannot_be_read_are_not_the_same(sequence, tmp_path):
+    (sequence / "6.png").symlink_to("nowhere")
+    assert owned(sequence, sequence)[1][6] == ()
+
+
+def test_neighbors_are_neither_found_nor_right(sequence):
+    dataset, own = owned(sequence, sequence, "order")
+    for neighbors in (0, 1):
+        allowed = np.abs(np.arange(6)[:, None] - np.arange(6)) > neighbors
+        found = without_neighbors(dataset, own, neighbors)
+        np.testing.assert_array_equal(found.allowed, allowed)
+        np.testing.assert_array_equal(found.truth.positives(2), dataset.truth.positives(2) & allowed)
+    assert not found.truth.positives(1).any()  # a query whose right answers are all left out has none
+    assert without_neighbors(owned(sequence, sequence)[0], own, 0).truth is None
+
+
+def test_two_sequences_have_no_neighbors(sequence, tmp_path):
+    (tmp_path / "other").mkdir()
+    Image.new("RGB", (4, 4), (99, 0, 0)).save(tmp_path / "other" / "0.png")
+    dataset, own = owned(sequence, tmp_path / "other")
+    with pytest.raises(InputError, match="exclude_neighbors=2: expected queries that are among the database images"):
+        without_neighbors(dataset, own, 2)
+
+
+def test_the_shortlist_leaves_out_what_is_not_allowed():
+    rng = np.random.default_rng(0)
+    descriptors = unit(rng.normal(size=(6, 8)))
+    everything = pipeline.shortlist(descriptors, descriptors, 6)
+    np.testing.assert_array_equal(everything.indices[:, 0], np.arange(6))
+    allowed = np.abs(np.arange(6)[:, None] - np.arange(6)) > 1
+    found = pipeline.shortlist(descriptors, descriptors, 6, allowed=allowed)
+    for query in range(6):
+        expected = [row for row in everything.indices[query] if allowed[query, row]]
+        np.testing.assert_array_equal(found.indices[query], expected + [-1] * (6 - len(expected)))
+    np.testing.assert_array_equal(found.mask, found.indices >= 0)

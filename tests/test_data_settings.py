@@ -1,0 +1,184 @@
+"""What the programs make of data settings: what is right, what is left out, how images are read."""
+
+import csv
+import json
+import os
+import shutil
+import signal
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from experiments import prepare, stores
+from experiments.launch import launch
+from experiments.run import evaluate
+from mfvpr import InputError
+from mfvpr.data.images import read_image
+from tests.test_experiments import composed, folder
+
+QUICK = ("figures=0", "features.max_keypoints=60", "features.image_size=[160,120]", "retrieval.num_words=8",
+         "scorer=sum", "candidates=4")  # fmt: skip
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    """An evaluation in this process: its rows, what it printed, and its folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*settings, name="out"):
+        place, kept = tmp_path / name, "store=null" if not any("store=" in one for one in settings) else "scorer=sum"
+        evaluate(composed(*QUICK, kept, f"out={place}", *settings) | {"multirun": False})
+        return json.loads((place / "results.json").read_text()), capsys.readouterr(), place
+
+    return run
+
+
+def recall(rows, **threshold):
+    return {row["system"]: row["recall_at"]["1"] for row in rows if threshold.items() <= row.items()}
+
+
+def ranked(place):
+    """Database names by query, best first."""
+    with (place / "predictions.csv").open(newline="") as file:
+        return {query: names[::2] for query, *names in list(csv.reader(file))[1:]}
+
+
+def same(street, *more):
+    """The database against itself."""
+    place = f"{street}/database"
+    return ("dataset=folder", f"dataset.database={place}", f"dataset.queries={place}", *more)
+
+
+def test_an_image_that_finds_itself_is_told_and_left_out(small_street, tmp_path, run):
+    order = "dataset.ground_truth=order"
+    rows, printed, _ = run(*same(small_street, order), name="told")
+    assert "warning: 10 of 10 queries are database images themselves" in printed.err
+    assert set(recall(rows, tolerance=1).values()) == {1.0}
+
+    shutil.copytree(small_street / "database", tmp_path / "copy")  # by content
+    copied = (*same(small_street, order)[:2], f"dataset.queries={tmp_path}/copy", order)
+    assert "10 of 10 queries are database images" in run(*copied, name="copied")[1].err
+
+    rows, printed, place = run(*same(small_street, order, "dataset.exclude_neighbors=1"), name="left_out")
+    assert "database images themselves" not in printed.err
+    assert set(recall(rows, tolerance=1).values()) == {0.0}  # all that is within a frame is left out
+    assert 0 < recall(rows, tolerance=5)["sum"] <= 1
+    found = ranked(place)
+    assert len(found) == 10
+    for query, names in found.items():
+        assert len(names) == 4
+        assert all(abs(int(name[:4]) - int(query[:4])) > 1 for name in names)
+
+
+def test_nothing_right_is_told_beforehand(small_street, run):
+    settings = ("dataset.ground_truth=order", "dataset.exclude_neighbors=5", "recall.tolerances=[0,5]")
+    rows, printed, _ = run(*same(small_street, *settings))
+    assert "warning: the ground truth gives no query a right answer; every recall will be 0" in printed.err
+    assert set(recall(rows).values()) == {0.0}
+
+
+def test_two_sequences_cannot_exclude_neighbors(small_street, run):
+    with pytest.raises(InputError, match="exclude_neighbors=0: expected queries that are among the database images"):
+        run(*folder(small_street, "dataset.exclude_neighbors=0"))
+
+
+def test_matches_are_kept_apart_by_what_is_left_out(small_street):
+    recipes = [
+        stores.matches_recipe(composed(*same(small_street, "dataset.ground_truth=order", *more)), {"query": "a"}, 4)
+        for more in ([], ["dataset.exclude_neighbors=0"], ["dataset.exclude_neighbors=1"])
+    ]
+    assert recipes[0] != recipes[1] != recipes[2] != recipes[0]
+
+
+def test_labels_are_right_and_make_one_column(small_street, tmp_path, run):
+    for side in ("database", "query"):
+        lines = [f"{row:04d}.png,floor {row // 5}\n" for row in range(10)]
+        (tmp_path / f"{side}.csv").write_text("name,label\n" + "".join(lines))
+    files = [f"dataset.{side}_labels={tmp_path}/{side}.csv" for side in ("database", "query")]
+    rows, printed, place = run(*folder(small_street)[:3], "dataset.ground_truth=label", *files)
+    assert (place / "table.csv").read_text().splitlines()[0] == "system,R@1,R@5,R@10"
+    assert all("tolerance" not in row and "radius" not in row for row in rows)
+    right = [int(query[:4]) // 5 == int(names[0][:4]) // 5 for query, names in ranked(place).items()]
+    assert recall(rows)["sum"] == np.mean(right)
+    assert "recall in %" in printed.out
+    assert "±" not in printed.out
+
+
+def test_pairs_of_an_index_file_are_all_that_is_right_unless_asked(small_street, run):
+    exact, printed, place = run(*folder(small_street, "dataset.widen_index=false"), name="exact")
+    assert (place / "table.csv").read_text().splitlines()[0] == "system,R@1,R@5,R@10"
+    assert len(exact) == 3
+    assert "±" not in printed.out
+    widened, _, place = run(*folder(small_street, "recall.tolerances=[0,1]"), name="widened")
+    assert (place / "table.csv").read_text().splitlines()[0] == "system,R@1 ±0,R@1 ±1,R@5 ±1,R@10 ±1"
+    assert recall(exact) == recall(widened, tolerance=0)
+
+
+def test_turned_and_16_bit_copies_give_the_same_and_it_is_said(small_street, tmp_path, run):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    turned, deep = tmp_path / "turned", tmp_path / "deep"
+    for place in (turned, deep):
+        place.mkdir()
+    for path in sorted((small_street / "database").iterdir()):
+        Image.fromarray(np.rot90(read_image(path))).save(turned / path.name, exif=exif)
+    for path in sorted((small_street / "queries").iterdir()):
+        gray = np.asarray(Image.open(path).convert("L"))
+        Image.fromarray(gray).save(turned.parent / path.name)
+        Image.fromarray(gray.astype(np.uint16) * 257).save(deep / path.name)
+    plain = tmp_path / "plain"
+    plain.mkdir()
+    for path in tmp_path.glob("*.png"):
+        path.rename(plain / path.name)
+
+    store = f"store={tmp_path}/store"
+    common = ("dataset=folder", "dataset.ground_truth=order", store)
+    usual = run(*common, f"dataset.database={small_street}/database", f"dataset.queries={plain}", name="usual")
+    other = run(*common, f"dataset.database={turned}", f"dataset.queries={deep}", name="other")
+    assert [row["recall_at"] for row in usual[0]] == [row["recall_at"] for row in other[0]]
+    assert (usual[2] / "predictions.csv").read_text() == (other[2] / "predictions.csv").read_text()
+    assert usual[0][0]["reading"]["query"]["scaled_16bit"] == usual[0][0]["reading"]["database"]["turned"] == 0
+    assert other[0][0]["reading"] == {
+        "database": {"orient": True, "turned": 10, "bits": 16, "scaled_16bit": 0, "largest_16bit": None},
+        "query": {"orient": True, "turned": 0, "bits": 16, "scaled_16bit": 10,
+                  "largest_16bit": other[0][0]["reading"]["query"]["largest_16bit"]},
+    }  # fmt: skip
+    assert "note: 10 database images are turned as their EXIF orientation says" in other[1].err
+    assert "note: 10 16-bit query images are scaled to 8 bits" in other[1].err
+    assert "warning: the largest value" not in other[1].err
+
+    # The same store: what was read otherwise is not taken for it.
+    off = run(*common, f"dataset.database={turned}", f"dataset.queries={deep}", "dataset.orient=false",
+              "dataset.bits=12", name="off")  # fmt: skip
+    assert "so that they come out cut off; dataset.bits=16 would use their range" in off[1].err
+    assert (off[2] / "predictions.csv").read_text() != (other[2] / "predictions.csv").read_text()
+
+
+def test_a_second_run_is_told_the_same_of_its_images(small_street, tmp_path, monkeypatch):
+    settings = composed(*folder(small_street, f"store={tmp_path}/store"))
+    first, second = prepare.images(settings), prepare.images(settings)
+    assert first.fingerprints == second.fingerprints
+    assert first.reading == second.reading
+    assert len(list((tmp_path / "store" / "contents").iterdir())) == 2
+
+
+@pytest.mark.parametrize("value", ["", None, "elsewhere"])
+def test_an_empty_cache_variable_is_none(value, monkeypatch):
+    """Or features would be kept in the root of the file system."""
+    monkeypatch.setenv("MFVPR_CACHE", value or "")
+    if value is None:
+        monkeypatch.delenv("MFVPR_CACHE")
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    monkeypatch.setattr(sys, "argv", ["evaluate"])
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
+    monkeypatch.setattr("logging.shutdown", lambda *_: None)
+    handler, seen = signal.getsignal(signal.SIGTERM), []
+    try:
+        launch(seen.append)
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+    root = value or "~/.cache/mfvpr"
+    assert (seen[0]["store"], seen[0]["dataset"]["cache"]) == (f"{root}/features", root)
+    assert os.environ.get("MFVPR_CACHE", "unset") == (value or "unset")
