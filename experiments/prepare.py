@@ -115,12 +115,17 @@ def extracted(settings: dict[str, Any], tools: Extractors, found: Images, watch:
     return Extracted(tools.local, database, queries, candidates)
 
 
-def matched(settings: dict[str, Any], tools: Extractors, found: Images, watch: Stopwatch) -> tuple[MatchSet, Shortlist]:
-    """Matches and shortlist, from their store where they are all there; then no features are read."""
+def matched(
+    settings: dict[str, Any], tools: Extractors, found: Images, watch: Stopwatch, **options: Any
+) -> tuple[MatchSet, Shortlist]:
+    """Matches and shortlist, from their store where they are all there; then no features are read.
+
+    `options` are those of `pipeline.match` that the settings do not have.
+    """
     if settings["store"] is None:
         made = extracted(settings, tools, found, watch)
         with watch("matching"):
-            return match(settings, made), made.candidates
+            return match(settings, made, **options), made.candidates
     num_candidates = _num_candidates(settings, found)
     name = f"{settings['dataset']['name']} {settings['features']['name']} matches"
     recipe = stores.matches_recipe(settings, found.fingerprints, num_candidates)
@@ -131,7 +136,7 @@ def matched(settings: dict[str, Any], tools: Extractors, found: Images, watch: S
         if not store.done.all():
             made = extracted(settings, tools, found, watch)
             with watch("matching"):
-                return match(settings, made, store=store), made.candidates
+                return match(settings, made, store=store, **options), made.candidates
         with watch("matches read"):
             return pipeline.stored_matches(store)
 

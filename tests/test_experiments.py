@@ -52,7 +52,7 @@ CHOICES = [
 def test_every_conf_composes_and_passes_its_own_checks(group, choice):
     paths = {"folder": ["dataset.database=a", "dataset.queries=b"]}
     needs = paths.get(choice, ["dataset.root=r"] if choice in ("grief_season", "corridor") else [])
-    config = "sweep" if group == "experiment" else "config"
+    config = {"experiment": "sweep", "grid": "learn"}.get(group, "config")
     settings.check(composed(f"{group}={choice}", *needs, config=config))
 
 
