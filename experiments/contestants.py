@@ -37,6 +37,7 @@ class Lineup:
 
 
 MATCHING, HISTOGRAM, ANCHOR, SUM = "matching", "histogram", "anchor", "sum"
+SHIFT = "refined shift of a pair"
 BOTH = "matching + histogram"
 SLOTS = 384  # of 700: `compact` to what these pairs need
 CENTERS = np.arange(-SIZE + BIN / 2, SIZE, BIN, dtype=np.float32)
@@ -118,8 +119,9 @@ def _matched(query: Features, candidates: Features) -> Matches:
 
 
 def of_mfvpr(data: Data) -> list[Entry]:
-    """This library, and what its matching is made of: the bare matrix product of the same shapes."""
-    histogram = mfvpr.HistogramOfShifts(max_bins=len(CENTERS))
+    """This library as its users call it, and under a `jit` of theirs; the bare matrix product of its matching."""
+    histogram, images = mfvpr.HistogramOfShifts(max_bins=len(CENTERS)), (data.query, data.candidates)
+    pair = jax.tree.map(lambda leaf: leaf[0], data.matches)
 
     def product(query: Features, candidates: Features) -> jax.Array:
         return jax.lax.map(lambda descriptors: query.descriptors @ descriptors.T, candidates.descriptors)
@@ -130,20 +132,21 @@ def of_mfvpr(data: Data) -> list[Entry]:
     def both(query: Features, candidates: Features) -> jax.Array:
         return mfvpr.score_candidates(histogram, _matched(query, candidates))
 
-    def on_device(function: Callable, *inputs: Any) -> Callable[[], Any]:
-        compiled = jax.jit(function)
-        return lambda: jax.block_until_ready(compiled(*inputs))
+    def done(function: Callable, *inputs: Any, **options: Any) -> Callable[[], Any]:
+        return lambda: jax.block_until_ready(function(*inputs, **options))
 
-    images = data.query, data.candidates
     score = mfvpr.score_candidates
     return [
-        (MATCHING, "bare product (JAX)", on_device(product, *images)),
-        (MATCHING, "bare product (JAX), not stored", on_device(product_summed, *images)),
-        (MATCHING, "mfvpr", on_device(mfvpr.match_candidates, *images)),
-        (BOTH, "mfvpr", on_device(both, *images)),
-        (HISTOGRAM, "mfvpr", on_device(score, histogram, data.matches)),
-        (ANCHOR, "mfvpr", on_device(score, mfvpr.AnchorPoints(), data.matches)),
-        (SUM, "mfvpr", on_device(score, mfvpr.AggregatedScore(), data.matches)),
+        (MATCHING, "bare product (JAX)", done(jax.jit(product), *images)),
+        (MATCHING, "bare product (JAX), not stored", done(jax.jit(product_summed), *images)),
+        (MATCHING, "mfvpr", done(mfvpr.match_candidates, *images)),
+        (MATCHING, "mfvpr, under jit", done(jax.jit(mfvpr.match_candidates), *images)),
+        (MATCHING, "mfvpr, with ratio", done(mfvpr.match_candidates, *images, with_ratio=True)),
+        (BOTH, "mfvpr", done(jax.jit(both), *images)),
+        (HISTOGRAM, "mfvpr", done(score, mfvpr.HistogramOfShifts(), data.matches)),
+        (ANCHOR, "mfvpr", done(score, mfvpr.AnchorPoints(), data.matches)),
+        (SUM, "mfvpr", done(score, mfvpr.AggregatedScore(), data.matches)),
+        (SHIFT, "mfvpr", done(mfvpr.HistogramOfShifts().dominant_shift, pair, refine=True)),
     ]
 
 

@@ -21,7 +21,8 @@ def help_text(config: str, arguments: Sequence[str]) -> str:
     chosen |= _overridden(chosen) | {group: choice for group, choice in typed.items() if group in made}
     for group, choice in chosen.items():
         if choice and choice.startswith("${"):
-            chosen[group] = chosen[choice[2:-1]]
+            other = chosen[choice[2:-1]]
+            chosen[group] = other if other in choices(group) else None
     return "\n".join([*_parts(config, chosen)])
 
 
@@ -33,7 +34,7 @@ def _parts(config: str, chosen: dict[str, str | None]) -> Iterator[str]:
         yield f"  {group}={choice or 'null'}".ljust(26) + others
     yield "\nSettings:\n"
     for group, choice in chosen.items():
-        if group not in _WHOLE:
+        if choice and group not in _WHOLE:
             yield from [*_section(group, _merged(CONF / group / f"{choice}.yaml")), ""]
     for file in (*(entry for entry in defaults(CONF / f"{config}.yaml") if _is_file(entry)), config):
         yield from [*_body(CONF / f"{file}.yaml"), ""]

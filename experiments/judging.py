@@ -11,7 +11,7 @@ from experiments.settings import SettingsError
 from mfvpr import sweeping
 from mfvpr.data.datasets import Dataset
 from mfvpr.data.ground_truth import Unit, threshold_words
-from mfvpr.statistics import bootstrap_interval
+from mfvpr.statistics import recall_interval
 from mfvpr.sweeping import Half
 from mfvpr.types import Shortlist
 
@@ -26,8 +26,6 @@ class Judge:
         positives: `[threshold][Q, N]` bool.
         halves: where to choose and where to report; none = both on all queries.
         views: candidates `[Q, C]` bool that are ranked: all, and for each half those that choosing may see.
-        resamples: of the bootstrap.
-        seed: of the bootstrap.
     """
 
     thresholds: Sequence[float]
@@ -35,8 +33,6 @@ class Judge:
     positives: Sequence[np.ndarray]
     halves: Sequence[Half]
     views: Sequence[np.ndarray]
-    resamples: int
-    seed: int
 
     @property
     def main(self) -> int:
@@ -78,7 +74,7 @@ class Judge:
 
     def interval(self, hits: np.ndarray) -> tuple[float, float]:
         """Of the recall `[R]`, 95 %."""
-        return bootstrap_interval(hits, resamples=self.resamples, seed=self.seed)
+        return recall_interval(hits)
 
 
 def judge(settings: dict[str, Any], dataset: Dataset) -> Judge:
@@ -95,5 +91,5 @@ def judge(settings: dict[str, Any], dataset: Dataset) -> Judge:
     for half in halves:
         if not len(half.tune) or not positives[-1][half.tune].any():
             raise SettingsError(f"split={split}: no query of one half has a place far enough from the other half; "
-                                "use more queries, smaller tolerances, or split=null")  # fmt: skip
-    return Judge(thresholds, dataset.truth.unit, positives, halves, [], settings["resamples"], settings["seed"])
+                                "use more queries or smaller tolerances")  # fmt: skip
+    return Judge(thresholds, dataset.truth.unit, positives, halves, [])

@@ -23,6 +23,7 @@ from mfvpr.learning.training import Fit, fit
 from mfvpr.numerics import round_up
 from mfvpr.pipeline import MatchSet
 from mfvpr.report import runs
+from mfvpr.scoring import parameters
 from mfvpr.sweeping import Half
 from mfvpr.types import Matches, Shortlist
 
@@ -81,7 +82,7 @@ class School:
         return round_up(int(self.usable[self.half.tune].sum(axis=1).max()), 8)
 
     def lesson(self, queries: np.ndarray, size: int) -> Lesson:
-        """Some queries, padded to `size`; padding has no candidates."""
+        """Some queries, padded to `size`; padding has no candidates, and what is no candidate has no matches."""
         padded = np.concatenate([queries, np.repeat(queries[-1:], size - len(queries))])
         places = np.argsort(~self.usable[padded], axis=1, kind="stable")[:, : self.width]
         take = partial(np.take_along_axis, indices=places, axis=1)
@@ -89,6 +90,7 @@ class School:
         matches = [jax.tree.map(lambda values: values[order], self.matches[query])  # noqa: B023
                    for query, order in zip(padded, places, strict=True)]  # fmt: skip
         stacked: Matches = jax.tree.map(lambda *values: np.stack(values), *matches)
+        stacked = replace(stacked, mask=stacked.mask & mask[..., None])
         return Lesson(stacked, take(self.candidates.scores[padded]), take(self.right[padded]), mask)
 
 
@@ -115,7 +117,7 @@ def _outcome(settings: dict[str, Any]) -> "learn_outputs.Outcome":
     with watch("data"):
         images = prepare.images(settings)
     judgment = judge(settings, images.dataset)
-    matches, candidates = prepare.matched(settings, tools, images, watch)
+    matches, candidates = prepare.matched(settings, tools, images, watch, with_ratio=True)
     axes.require_bins(settings, varied, matches)
     candidates = replace(candidates, scores=pipeline.filter_scores(candidates, settings["fusion"]["filter_score"]))
     checkpoints = _checkpoints(settings, images, candidates, judgment)
@@ -149,23 +151,28 @@ def _lessons(
     school: School, varied: axes.Axes, checkpoints: Callable[[str, str], Any]
 ) -> Iterator["learn_outputs.Result"]:
     """Every row of the table, on the queries of the half that is reported on."""
-    settings, own = school.settings, axes.scorer(school.settings)
-    c = settings["fusion"]["c"]
-    yield _reported(school, "paper", own, None)
-    yield _reported(school, "paper + filter", own, "auto" if c == "auto" else float(c))
+    own, c = axes.scorer(school.settings), _own_c(school.settings)
+    yield _reported(school, "paper", own, {})
+    yield _reported(school, "paper + filter", own, {"c": c})
     spread = _spread(school, own)
     for fused in (False, True):
-        scorer, chosen_c, written = _searched(school, varied, spread, fused=fused)
-        name = "grid search" + " + filter" * fused
-        yield replace(_reported(school, name, scorer, chosen_c if fused else None), values=written)
+        chosen, written = _searched(school, varied, spread, fused=fused)
+        yield replace(_reported(school, "grid search" + " + filter" * fused, own, chosen), values=written)
     for learned_weight in (False, True):
         for fused in (False, True):
             name = ("match weights" if learned_weight else "gradient") + " + filter" * fused
             start = _start(school, name, varied.method, own, fused=fused, learned_weight=learned_weight)
             fitted = _fit(school, start, *checkpoints(school.name, name))
-            final = start.c_of(fitted.parameters)
-            found = _reported(school, name, start.scorer_of(fitted.parameters), None if final is None else float(final))
-            yield replace(found, values=_values(start, fitted), fitted=fitted)
+            values = _values(start, fitted)
+            setting = {"c": values["c"]} if fused else {}
+            found = _reported(school, name, start.scorer_of(fitted.parameters), setting)
+            yield replace(found, values=values, fitted=fitted)
+
+
+def _own_c(settings: dict[str, Any]) -> float | None:
+    """The filter's weight by hand, None = balanced."""
+    c = settings["fusion"]["c"]
+    return None if c == "auto" else float(c)
 
 
 def _start(school: School, name: str, method: str, own: Any, *, fused: bool, learned_weight: bool) -> Model:
@@ -176,11 +183,8 @@ def _start(school: School, name: str, method: str, own: Any, *, fused: bool, lea
         sample = school.lesson(school.learning[: school.settings["batch"]], school.settings["batch"])
         weight = LearnedWeight.create(seed, sample.matches, school.settings["hidden"])
     spread = _spread(school, own)
-    sizes = school.matches[0].image_size0, school.matches[0].image_size1
-    scorer = own.with_capacity(*sizes) if isinstance(own, mfvpr.HistogramOfShifts) else own
-    scorer = jax.tree.map(np.float32, scorer)
     start = 0.3 * _balance(school, spread) if fused else None
-    return model(name, method, scorer, spread, fused=start, weight=weight)
+    return model(name, method, parameters.fit(own, *school.matches.image_sizes), spread, fused=start, weight=weight)
 
 
 def _fit(school: School, start: Model, folder: Path | None, recipe: dict[str, Any]) -> Fit:
@@ -208,37 +212,42 @@ def _fit(school: School, start: Model, folder: Path | None, recipe: dict[str, An
     )  # fmt: skip
 
 
-def _reported(school: School, name: str, scorer: Any, c: float | str | None) -> "learn_outputs.Result":
-    """A scorer on the half that is reported on, with all candidates; `c` None = not fused."""
-    matches, candidates = school.part(school.half.report)
-    scores = pipeline.score({"it": scorer}, matches, candidates)["it"]
-    if c is not None:
-        scores = pipeline.fuse(candidates, scores, None if isinstance(c, str) else c)
-    order = pipeline.rank(candidates, scores, ties=school.settings["ties"])
-    rows = np.take_along_axis(np.where(candidates.mask, candidates.indices, -1), order, axis=1)
+def _reported(school: School, name: str, scorer: Any, setting: dict[str, Any]) -> "learn_outputs.Result":
+    """A scorer with the values of a setting, on the half that is reported on, with all candidates."""
+    [rows] = _ranked(school, name, scorer, [setting], school.half.report, school.candidates.mask)
     hits = np.stack([sweeping.hits(rows, right[school.half.report]) for right in school.judge.positives])
     return learn_outputs.Result(school.name, name, hits, {}, None)
 
 
-def _searched(school: School, varied: axes.Axes, spread: float, *, fused: bool) -> tuple[Any, Any, dict[str, Any]]:
-    """The best setting of the grid on the half to choose on: its scorer, its c, and its values as written."""
+def _searched(
+    school: School, varied: axes.Axes, spread: float, *, fused: bool
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The best setting of the grid on the half to choose on: its values, and as they were written."""
     values = {name: axis for name, axis in varied.values.items() if name != "c" or fused}
-    balance = _balance(school, spread)
-    written = sweeping.grid(values)
-    settings = [axes.as_setting(one) for one in written]
-    if fused:
-        settings = [{**one, "c": None if one["c"] is None else one["c"] * balance} for one in settings]
-    matches, candidates = school.part(school.half.tune)
-    rows = sweeping.sweep(
-        axes.scorer(school.settings), settings, matches, candidates, views=[school.seen[school.half.tune]], depth=1,
-        ties=school.settings["ties"], track=build.track(f"{school.name}: grid" + " + filter" * fused),
-    )  # fmt: skip
-    right = school.judge.positives[school.judge.main][school.half.tune]
-    best = sweeping.best_setting(sweeping.hits(rows[0], right).mean(axis=-1), values)
-    chosen = dict(settings[best])
-    c = chosen.pop("c", None)
-    own: Any = axes.scorer(school.settings)
-    return replace(own, **chosen), "auto" if c is None else c, written[best]
+    written, balance = sweeping.grid(values), _balance(school, spread)
+
+    def setting(one: dict[str, Any]) -> dict[str, Any]:
+        chosen = dict(axes.as_setting(one))
+        if fused and "c" not in chosen:
+            return chosen | {"c": _own_c(school.settings)}
+        return chosen | ({"c": chosen["c"] * balance} if chosen.get("c") is not None else {})
+
+    settings, tune = [setting(one) for one in written], school.half.tune
+    own = axes.scorer(school.settings)
+    rows = _ranked(school, "grid search" + " + filter" * fused, own, settings, tune, school.seen)
+    right = school.judge.positives[school.judge.main][tune]
+    best = sweeping.best_setting(sweeping.hits(rows, right).mean(axis=-1), values)
+    return settings[best], written[best]
+
+
+def _ranked(
+    school: School, name: str, scorer: Any, settings: list[dict[str, Any]], queries: np.ndarray, seen: np.ndarray
+) -> np.ndarray:
+    """`[S, q, 1]` the first row of some queries' rankings of the candidates that are seen, by every setting."""
+    matches, candidates = school.part(queries)
+    track = build.track(f"{school.name}: {name}") if len(settings) > 1 else pipeline.untracked
+    views, ties = [seen[queries]], school.settings["ties"]
+    return sweeping.sweep(scorer, settings, matches, candidates, views=views, depth=1, ties=ties, track=track)[0]
 
 
 def _spread(school: School, scorer: Any) -> float:

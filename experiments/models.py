@@ -15,7 +15,9 @@ from mfvpr.learning.parameters import from_logarithms, to_logarithms
 from mfvpr.types import Array, Matches, value
 
 NUMBERS = {"histogram": ("sigma",), "anchor": ("tolerance",), "sum": ()}  # learned besides the temperature
-START_TEMPERATURE = {"histogram": 0.1, "anchor": 0.3, "sum": 1.0}  # the histogram's in units of the scores' spread
+# The histogram's in units of the scores' spread. Anchors then score within 3 % (median) of the hard form, on matches of
+# SIFT and of ALIKED across seasons; at 0.3 they are 43 % below it.
+START_TEMPERATURE = {"histogram": 0.1, "anchor": 0.03, "sum": 1.0}
 LOSSES: dict[str, losses.Loss] = {
     "cross_entropy": losses.cross_entropy,
     "recall": lambda *query: losses.smooth_recall_at_1(*query, temperature=1.0),

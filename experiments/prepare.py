@@ -4,7 +4,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from mfvpr import pipeline
 from mfvpr.data.contents import Contents, contents
 from mfvpr.data.datasets import Dataset, ImageFolder
 from mfvpr.data.sequences import OwnRows, own_rows, without_neighbors
+from mfvpr.extraction import Descriptors
 from mfvpr.features import GlobalExtractor, LocalExtractor
 from mfvpr.pipeline import FeatureSet, MatchSet
 from mfvpr.types import Features, Shortlist
@@ -101,18 +102,33 @@ def extracted(settings: dict[str, Any], tools: Extractors, found: Images, watch:
         )
     _warn(found.dataset, database, queries)
     with watch("filter"):
-        candidates = _shortlist(settings, tools.describer, found, {"database": database, "query": queries})
+        described = _described(settings, tools.describer, found, {"database": database, "query": queries})
+        candidates = pipeline.shortlist(
+            described["query"].values,
+            described["database"].values,
+            _num_candidates(settings, found),
+            allowed=found.dataset.allowed,
+        )
+    database, queries = (
+        replace(one, bad=described[side].bad) for side, one in (("database", database), ("query", queries))
+    )
     return Extracted(tools.local, database, queries, candidates)
 
 
-def matched(settings: dict[str, Any], tools: Extractors, found: Images, watch: Stopwatch) -> tuple[MatchSet, Shortlist]:
-    """Matches and shortlist, from their store where they are all there; then no features are read."""
+def matched(
+    settings: dict[str, Any], tools: Extractors, found: Images, watch: Stopwatch, **options: Any
+) -> tuple[MatchSet, Shortlist]:
+    """Matches and shortlist, from their store where they are all there; then no features are read.
+
+    `options` are those of `pipeline.match` that the settings do not have.
+    """
     if settings["store"] is None:
         made = extracted(settings, tools, found, watch)
         with watch("matching"):
-            return match(settings, made), made.candidates
+            return match(settings, made, **options), made.candidates
     num_candidates = _num_candidates(settings, found)
-    name, recipe = matches_name(settings), stores.matches_recipe(settings, found.fingerprints, num_candidates)
+    name = f"{settings['dataset']['name']} {settings['features']['name']} matches"
+    recipe = stores.matches_recipe(settings, found.fingerprints, num_candidates)
     typical = tools.local.typical_count // 3  # of mutual nearest neighbors
     queries = len(found.dataset.queries)
     sizes = queries, num_candidates, typical
@@ -120,14 +136,9 @@ def matched(settings: dict[str, Any], tools: Extractors, found: Images, watch: S
         if not store.done.all():
             made = extracted(settings, tools, found, watch)
             with watch("matching"):
-                return match(settings, made, store=store), made.candidates
+                return match(settings, made, store=store, **options), made.candidates
         with watch("matches read"):
             return pipeline.stored_matches(store)
-
-
-def matches_name(settings: dict[str, Any]) -> str:
-    """What a run's matches are called."""
-    return f"{settings['dataset']['name']} {settings['features']['name']} matches"
 
 
 def match(settings: dict[str, Any], made: Extracted, **options: Any) -> MatchSet:
@@ -213,12 +224,13 @@ def _features(
         return pipeline.extract(folder, extractor, store=store, skip_bad=skip_bad, track=build.track(label))
 
 
-def _shortlist(
+def _described(
     settings: dict[str, Any],
     describer: Callable[[Sequence[Features]], GlobalExtractor],
     found: Images,
     features: dict[str, FeatureSet],
-) -> Shortlist:
+) -> dict[str, Descriptors]:
+    """Global descriptors by side."""
     asked, available = settings["candidates"], len(found.dataset.database)
     if asked != "all" and asked > available:
         print(
@@ -228,14 +240,14 @@ def _shortlist(
     chosen, database = settings["retrieval"], features["database"]
     extractor = describer([database[row] for row in range(len(database))])
     root = settings["store"] if extractor.image_size is not None else None  # VLAD takes no time
-    skip_bad, wait, descriptors = settings["on_bad_image"] == "skip", _is_one_of_many(settings), {}
+    skip_bad, wait, described = settings["on_bad_image"] == "skip", _is_one_of_many(settings), {}
     for side, folder in found.sides.items():
         name = f"{settings['dataset']['name']} {side} {chosen['name']}"
         with stores.opened(root, name, folder, extractor, chosen, found.fingerprints[side], wait=wait) as store:
-            descriptors[side] = pipeline.describe(
+            described[side] = pipeline.describe(
                 folder, features[side], extractor, store=store, skip_bad=skip_bad,
                 track=build.track(f"{side} descriptors"),
             )  # fmt: skip
-    return pipeline.shortlist(
-        descriptors["query"], descriptors["database"], _num_candidates(settings, found), allowed=found.dataset.allowed
-    )
+        for row in described[side].bad.keys() - features[side].bad.keys():
+            print(f"warning: {described[side].bad[row]}", file=sys.stderr)
+    return described

@@ -165,7 +165,6 @@ RULES: dict[str, Rule] = {
     "search": _one_of("grid", "optuna"),
     "trials": _between(1, 100_000),
     "split": _one_of(None, "first_half", "second_half", "both"),
-    "resamples": _between(100, 1_000_000),
     # learning
     "loss": _one_of("cross_entropy", "recall", "average_precision"),
     "steps": _COUNT,

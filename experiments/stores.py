@@ -34,7 +34,7 @@ def opened(
 
     Args:
         root: folder of all stores.
-        name: what is stored, for people.
+        name: what is stored, for people; the store has the extractor's, so that other data sets share it.
         folder: the images.
         extractor: what makes the features.
         settings: of the extractor; with the weights and the images they are what the store is keyed by.
@@ -45,7 +45,7 @@ def opened(
         yield None
         return
     recipe, waiting = features_recipe(settings, images), _tell if wait else None
-    path = store_path(build.expanded(root), name, recipe)
+    path = store_path(build.expanded(root), settings["name"], recipe)
     with open_store(path, recipe, num_images=len(folder), waiting=waiting) as store:
         missing = len(folder) - int(store.done.sum())
         if missing:
@@ -84,7 +84,7 @@ def opened_matches(
         typical_matches: of a pair, about.
         wait: for another process that has the store open, instead of refusing it.
     """
-    path, waiting = matches_path(root, name, recipe), _tell if wait else None
+    path, waiting = matches_path(root, recipe), _tell if wait else None
     sizes = {"num_queries": num_queries, "num_candidates": num_candidates}
     with open_match_store(path, recipe, **sizes, waiting=waiting) as store:
         missing = num_queries - int(store.done.sum())
@@ -98,9 +98,10 @@ def opened_matches(
         yield store
 
 
-def matches_path(root: str, name: str, recipe: dict[str, Any]) -> Path:
-    """Where a run's matches are kept."""
-    return store_path(build.expanded(root), name, recipe, MATCHES)
+def matches_path(root: str, recipe: dict[str, Any]) -> Path:
+    """Where a run's matches are kept, whatever its data set is called."""
+    name = recipe["database"]["features"]["extractor"]["name"]
+    return store_path(build.expanded(root), f"{name}_matches", recipe, MATCHES)
 
 
 def features_recipe(settings: dict[str, Any], images: str) -> dict[str, Any]:

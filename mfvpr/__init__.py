@@ -25,7 +25,7 @@ from mfvpr.scoring import (
 from mfvpr.types import Features, Matches, Ranking, Shortlist, value
 from mfvpr.weighting import DescriptorDistanceWeight, FeatureScoreWeight, UnitWeight, Weight, match_weights
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "AggregatedScore",

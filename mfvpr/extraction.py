@@ -11,6 +11,7 @@ import numpy as np
 
 from mfvpr.data.datasets import ImageFolder
 from mfvpr.data.images import Interpolation, ordered_map, resize
+from mfvpr.data.threads import available_cpus
 from mfvpr.errors import InputError
 from mfvpr.features import GlobalExtractor, LocalExtractor
 from mfvpr.numerics import round_up
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 Item = TypeVar("Item")
 Track = Callable[[Iterable[Any], int], Iterable[Any]]
 
-DECODING_THREADS = 4
 _PER_KEYPOINT = ("keypoints", "descriptors", "scores", "mask")
 
 
@@ -37,7 +37,8 @@ class FeatureSet:
 
     Attributes:
         features: `[M, N, ...]`, padded, NumPy.
-        bad: reason by row, for images that gave no usable features; their masks are all False.
+        bad: reason by row, for images that are not used: they gave no usable features (their masks are all False), or
+            no usable global descriptor.
     """
 
     features: Features
@@ -49,6 +50,19 @@ class FeatureSet:
     def __getitem__(self, row: int) -> Features:
         """Features `[N, ...]` of one image."""
         return jax.tree.map(lambda field: field[row], self.features)
+
+
+@dataclass(frozen=True)
+class Descriptors:
+    """Global descriptors of all images of a folder.
+
+    Attributes:
+        values: `[M, D]` float32; NaN for bad images, which no shortlist contains.
+        bad: reason by row, for images that gave no usable features or descriptor.
+    """
+
+    values: np.ndarray
+    bad: Mapping[int, str]
 
 
 def extract(
@@ -103,8 +117,8 @@ def describe(
     store: "FeatureStore | None" = None,
     skip_bad: bool = False,
     track: Track = untracked,
-) -> np.ndarray:
-    """Global descriptors `[M, D]` float32 of every image; NaN for bad ones, which no shortlist contains.
+) -> Descriptors:
+    """Global descriptors of every image.
 
     Args:
         folder: the images.
@@ -117,6 +131,7 @@ def describe(
     Raises:
         InputError: as `extract`.
     """
+    bad = dict(feature_set.bad)
     if extractor.image_size is None:
         rows = track(range(len(folder)), len(folder))
         batches = (
@@ -125,9 +140,9 @@ def describe(
         descriptors = np.concatenate(list(batches))
     else:
         whole = extract(folder, _WholeImage(extractor), store=store, skip_bad=skip_bad, track=track)
-        descriptors = np.where(whole.features.mask[:, :1], whole.features.descriptors[:, 0], np.nan)
-    descriptors[list(feature_set.bad)] = np.nan
-    return descriptors
+        bad, descriptors = {**whole.bad, **bad}, whole.features.descriptors[:, 0]
+    descriptors[list(bad)] = np.nan
+    return Descriptors(descriptors, bad)
 
 
 @dataclass(frozen=True)
@@ -178,11 +193,11 @@ def _image_batches(
     load = partial(_load, folder, size=extractor.image_size, interpolation=extractor.interpolation)
 
     def readable() -> Iterator[tuple[int, np.ndarray]]:
-        images = ordered_map(load, wanted, workers=DECODING_THREADS)
+        images = ordered_map(load, wanted, workers=available_cpus())
         for row, image in zip(wanted, track(images, len(wanted)), strict=True):
             if isinstance(image, InputError):
                 if not skip_bad:
-                    raise InputError(f"{image} (or set on_bad_image=skip)")
+                    raise InputError(f"{image}, or skip bad images")
                 bad[row] = str(image)
             else:
                 yield row, image
@@ -213,7 +228,8 @@ def _finite(features: Features) -> bool:
 
 def _stack(found: Iterable[tuple[int, Features]], counts: np.ndarray) -> Features:
     """Padded features `[M, N, ...]` of all rows, from (row, Features); rows that are not among them are empty."""
-    capacity = round_up(int(counts.max()), 32)
+    most = int(counts.max())
+    capacity = 1 if most == 1 else round_up(most, 32)  # a global descriptor takes one slot
     arrays: dict[str, np.ndarray] = {}
     for row, features in found:
         if not arrays:

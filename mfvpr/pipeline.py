@@ -93,6 +93,7 @@ def match(
     max_distance: float | None = None,
     max_matches: int | None = None,
     chunk_size: int | None = None,
+    with_ratio: bool = False,
     store: MatchStore | None = None,
     track: Track = untracked,
 ) -> MatchSet:
@@ -106,29 +107,36 @@ def match(
         max_distance: see there.
         max_matches: see there.
         chunk_size: see there.
-        store: of these features, candidates and options. Only queries that it lacks are matched, with the ratio of
-            their distances; some at a time are on disk before the next are begun; and what comes back was read from it.
+        with_ratio: see there; a store always has the ratio.
+        store: of these features, candidates and options. Only queries that it lacks are matched; some at a time are on
+            disk before the next are begun; and what comes back was read from it.
         track: progress.
 
     Raises:
-        InputError: the store cannot be used, or is of other candidates.
+        InputError: the store cannot be used, or is of other candidates: then nothing is written.
     """
     options = {"cross_check": cross_check, "max_matches": max_matches, "chunk_size": chunk_size}
-    if store is None:
-        rows = track(range(len(queries)), len(queries))
-        return _match_set([one for _, one in _matched(queries, database, candidates, rows, max_distance, **options)])
-    if missing := np.flatnonzero(~store.done).tolist():
-        rows = track(missing, len(missing))
-        found = _matched(queries, database, candidates, rows, max_distance, with_ratio=True, **options)
-        while batch := dict(itertools.islice(found, STORE_BATCH)):
-            store.write(batch)
-    match_set, stored = stored_matches(store)
-    if not np.array_equal(stored.indices, candidates.indices):
+    found = {} if store is None else _stored(store, candidates)
+    if missing := [row for row in range(len(queries)) if row not in found]:
+        options["with_ratio"] = with_ratio or store is not None
+        made = _matched(queries, database, candidates, track(missing, len(missing)), max_distance, **options)
+        while batch := dict(itertools.islice(made, STORE_BATCH)):
+            if store is not None:
+                store.write(batch)
+            found |= batch if store is None else store.read(batch)
+    return _match_set([found[row] for row in range(len(queries))])
+
+
+def _stored(store: MatchStore, candidates: Shortlist) -> dict[int, QueryMatches]:
+    """What the store holds of these candidates, by row."""
+    found = dict(store.read())
+    same_shape = candidates.indices.shape == tuple(store.sizes.values())
+    if not same_shape or any((one.indices != candidates.indices[row]).any() for row, one in found.items()):
         raise InputError(
             f"{store.folder}: expected matches of these candidates, got those of another shortlist; choose another "
             "path, or delete this folder"
         )
-    return match_set
+    return found
 
 
 def stored_matches(store: MatchStore) -> tuple[MatchSet, Shortlist]:
@@ -143,8 +151,7 @@ def stored_matches(store: MatchStore) -> tuple[MatchSet, Shortlist]:
             "the matching first"
         )
     found = [one for _, one in store.read()]
-    indices = np.array([one.indices for one in found], np.int32).reshape(-1, store.num_candidates)
-    scores = np.array([one.filter_scores for one in found], np.float32).reshape(indices.shape)
+    indices, scores = np.array([one.indices for one in found]), np.array([one.filter_scores for one in found])
     return _match_set(found), Shortlist(indices=indices, scores=scores, mask=indices >= 0)
 
 

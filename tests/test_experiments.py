@@ -52,7 +52,8 @@ CHOICES = [
 def test_every_conf_composes_and_passes_its_own_checks(group, choice):
     paths = {"folder": ["dataset.database=a", "dataset.queries=b"]}
     needs = paths.get(choice, ["dataset.root=r"] if choice in ("grief_season", "corridor") else [])
-    for config in {"experiment": ["sweep"], "system": ["config", "sweep", "learn"]}.get(group, ["config"]):
+    programs = {"experiment": ["sweep"], "system": ["config", "sweep", "learn"], "grid": ["learn"]}
+    for config in programs.get(group, ["config"]):
         settings.check(composed(f"{group}={choice}", *needs, config=config))
 
 

@@ -114,13 +114,50 @@ def test_global_descriptors_are_stored_as_well(tmp_path, opened):
         with opened(folder) as store:
             found.append(pipeline.describe(folder, features, mean, store=store, skip_bad=True))
     assert mean.seen == 3 + 3
-    np.testing.assert_array_equal(found[0], found[1])
-    np.testing.assert_allclose(found[0], plain, atol=3e-4)
-    assert np.isnan(plain[2]).all()
-    np.testing.assert_allclose(np.linalg.norm(plain[[0, 1, 3]], axis=1), 1, rtol=1e-5)
+    np.testing.assert_array_equal(found[0].values, found[1].values)
+    np.testing.assert_allclose(found[0].values, plain.values, atol=3e-4)
+    assert np.isnan(plain.values[2]).all()
+    np.testing.assert_allclose(np.linalg.norm(plain.values[[0, 1, 3]], axis=1), 1, rtol=1e-5)
+    for one in (*found, plain):
+        assert one.bad == features.bad
+        assert list(one.bad) == [2]
 
 
-@pytest.mark.parametrize(("images", "features", "paper", "readme"), [(220, 686, 304, 157), (1415, 681, 1942, 1006)])
+class Dark(Mean):
+    """Divides by the mean color, which is not finite where all is black."""
+
+    def __call__(self, images, features):
+        with np.errstate(divide="ignore"):
+            return (1 / images.mean((1, 2))).astype(np.float32)
+
+
+def test_images_without_a_global_descriptor_are_listed(tmp_path, opened):
+    """Their local features may be fine."""
+    for name, color in (("a", (200, 10, 10)), ("b", (0, 0, 0)), ("d", (10, 10, 200))):
+        Image.new("RGB", (30, 20), color).save(tmp_path / f"{name}.png")
+    (tmp_path / "c.png").write_bytes(b"")
+    folder = image_folder(tmp_path)
+    features = pipeline.extract(folder, SIFT, skip_bad=True)
+    assert list(features.bad) == [2]
+    with opened(folder) as store:
+        for described in (
+            pipeline.describe(folder, features, Dark(), skip_bad=True),
+            pipeline.describe(folder, features, Dark(), store=store, skip_bad=True),
+        ):
+            assert sorted(described.bad) == [1, 2]
+            assert "b.png: features are not finite" in described.bad[1]
+            assert np.isnan(described.values).any(axis=1).tolist() == [False, True, True, False]
+
+
+def test_global_descriptors_take_no_more_memory_than_they_are(folder):
+    """One slot each, whatever local features are padded to."""
+    features = pipeline.extract(folder, SIFT)
+    values = pipeline.describe(folder, features, Mean()).values
+    assert values.shape == (len(folder), 3)
+    assert values.base is None or values.base.nbytes == values.nbytes
+
+
+@pytest.mark.parametrize(("images", "features", "paper", "readme"), [(220, 686, 304, 153), (1415, 681, 1942, 978)])
 def test_the_papers_databases_take_about_half(images, features, paper, readme):
     ours = (forecast_bytes(images, features, 512) + forecast_bytes(images, 1, 4096)) / 2**20
     assert ours <= 0.55 * paper

@@ -49,14 +49,15 @@ def test_clahe_finds_more_in_the_dark(image):
     assert len(Sift(clahe_clip=3.0)(dark)[0].mask) > 1.2 * len(Sift()(dark)[0].mask)
 
 
-@given(st.integers(0, 2**32 - 1), st.sampled_from([0, 1, 7, 40]), st.sampled_from([0.5, 1.0]))
-def test_vlad_agrees_with_the_oracle(seed, count, power):
+@given(st.integers(0, 2**32 - 1), st.lists(st.sampled_from([0, 1, 7, 40]), max_size=4), st.sampled_from([0.5, 1.0]))
+def test_vlad_agrees_with_the_oracle(seed, counts, power):
     rng = np.random.default_rng(seed)
     centers = rng.normal(size=(5, 16)).astype(np.float32)
-    features = make_features(rng, count, capacity=44)
-    (got,) = Vlad(centers, power)(None, [features])
-    expected = oracles.vlad(features.descriptors[features.mask], centers, power)
+    images = [make_features(rng, count, capacity=44) for count in (*counts, 7)]
+    got = Vlad(centers, power)(None, images)
+    expected = [oracles.vlad(features.descriptors[features.mask], centers, power) for features in images]
     np.testing.assert_allclose(got, expected, atol=2e-5)
+    assert got.dtype == np.float32
 
 
 def test_vocabulary_is_reproducible_and_finds_clusters():
@@ -71,8 +72,46 @@ def test_vocabulary_is_reproducible_and_finds_clusters():
     assert found.sum() >= 2  # a start at random may put two words into one cluster
 
 
+def test_last_bits_and_one_keypoint_less_hardly_move_the_words():
+    """Descriptors anywhere on the sphere, where k-means is as unstable as it can be."""
+    rng = np.random.default_rng(2)
+    images = [make_features(rng, 60) for _ in range(40)]
+    before = fit_vlad(images, num_words=12, seed=3).centers
+    assert np.linalg.norm(before[:, None] - before, axis=-1)[np.triu_indices(12, 1)].min() > 0.02
+    for features in images:
+        features.descriptors[:] = np.nextafter(features.descriptors, rng.choice([-2, 2], features.descriptors.shape))
+    np.testing.assert_allclose(fit_vlad(images, num_words=12, seed=3).centers, before, atol=1e-5)
+    images[7].mask[5] = False
+    np.testing.assert_allclose(fit_vlad(images, num_words=12, seed=3).centers, before, atol=0.02)
+
+
+def test_a_vocabulary_of_some_images_knows_no_others():
+    rng = np.random.default_rng(3)
+    images = [make_features(rng, 20) for _ in range(5)]
+    before = fit_vlad(images, num_words=4, max_samples=30).centers
+    unseen = 0
+    for features in images:
+        kept = features.descriptors.copy()
+        features.descriptors[:] = kept[0]
+        unseen += np.array_equal(fit_vlad(images, num_words=4, max_samples=30).centers, before)
+        features.descriptors[:] = kept
+    assert unseen == 3
+
+
+def test_identical_features_and_single_ones_have_words():
+    alike = make_features(np.random.default_rng(4), 9)
+    alike.descriptors[:] = alike.descriptors[0]
+    for images in ([alike], [make_features(np.random.default_rng(5), 1)] * 9):
+        np.testing.assert_allclose(np.linalg.norm(fit_vlad(images, num_words=9).centers, axis=1), 1, atol=1e-3)
+
+
 def test_fewer_features_than_words_is_the_users_to_mend():
     with pytest.raises(
         InputError, match="10 local features in 1 database images: expected at least one for each of the 64 words"
     ):
         fit_vlad([make_features(np.random.default_rng(2), 10)])
+
+
+def test_fewer_samples_than_words_are_the_users_to_mend():
+    with pytest.raises(InputError, match=r"^max_samples=10: expected at least one for each of num_words=64 words$"):
+        fit_vlad([make_features(np.random.default_rng(2), 100)], max_samples=10)

@@ -45,7 +45,6 @@ HOMES = {
     "omegaconf": set(),
     "torch": set(),
     "flax": {"models", "weights", "features"},
-    "tensorstore": {"data"},
     "safetensors": {"weights"},
     "tqdm": set(),
     "optax": {"learning"},

@@ -14,7 +14,7 @@ from mfvpr.learning.training import Fit, Record
 from tests.programs import QUERIES, results, shared, small, snapshot, typed
 from tests.test_experiments import composed
 
-SUM = ("scorer=sum", "grid.sigma=null", "grid.bin_size=null")
+SUM = ("scorer=sum",)
 SHORT = (*SUM, "split=first_half", "steps=4", "every=2", "batch=4", "learning_rate=0.05")
 ROWS = ["paper", "paper + filter", "grid search", "grid search + filter", "gradient", "gradient + filter",
         "match weights", "match weights + filter"]  # fmt: skip
@@ -141,6 +141,36 @@ def test_the_papers_rows_are_an_evaluation(root, learn, untrained, tmp_path, cha
             assert found == pytest.approx(row["recall_at"]["1"], abs=1e-6)
 
 
+def rows_of(results):
+    return {row["score"]: row for row in results["rows"]}
+
+
+def test_without_a_store_the_recalls_are_the_same(learn, learned, untrained, tmp_path):
+    """Match weights, which look at the ratio, are begun as well. A store rounds its matches: settings may tie."""
+    found = rows_of(learn(tmp_path / "out", *SHORT, "store=null"))
+    assert list(found) == ROWS
+    for name in ROWS[:2]:
+        assert found[name]["recall_at_1"] == rows_of(learned[1])[name]["recall_at_1"], name
+
+
+@pytest.mark.parametrize(
+    ("axes", "names"), [(("grid.weight=[dmf]",), {"weight"}), (("grid.weight=null", "grid.c=[auto]"), {"c"})]
+)
+def test_an_axis_that_is_not_searched_has_the_scorers_own_value(learn, untrained, tmp_path, axes, names):
+    own = ("grid.c=null", "fusion.c=0.7") if names == {"weight"} else ()
+    rows = rows_of(learn(tmp_path / "out", *SUM, *own, *axes, "split=first_half", "steps=1"))
+    for filtered in ("", " + filter"):
+        found, expected = rows[f"grid search{filtered}"], rows[f"paper{filtered}"]
+        assert found["recall_at_1"] == expected["recall_at_1"]
+        assert {*found["halves"]["first_half"]["values"]} == names - ({"c"} if not filtered else set())
+
+
+def test_anchors_are_searched_over_what_they_have(learn, untrained, tmp_path):
+    rows = rows_of(learn(tmp_path / "out", "scorer=anchor", "scorer.num_bins=5", "split=first_half", "steps=1"))
+    assert {*rows["grid search"]["halves"]["first_half"]["values"]} == {"window", "tolerance", "weight"}
+    assert {*rows["gradient"]["halves"]["first_half"]["values"]} == {"tolerance", "temperature"}
+
+
 def test_an_interrupted_learning_goes_on_to_the_same_end(root, learn, learned, tmp_path, monkeypatch):
     """Interrupted in the middle of the second training."""
     saved, save = [], checkpoints.save
@@ -225,14 +255,17 @@ def test_a_loss_that_turns_infinite_is_told(root, tmp_path, monkeypatch, capsys,
         (["split=null"], "split=null: what is learned is never reported on the same queries"),
         (["scorer=count"], "scorer=count: expected one to learn, of histogram, anchor, sum"),
         (["scorer=all"], "scorer=all: expected one to learn"),
-        (["scorer=anchor"], "grid.sigma: scorer=anchor has no such parameter"),
+        (
+            ["scorer=anchor", "grid.sigma=[10]"],
+            "grid.sigma: scorer=anchor has no such parameter; it has window, tolerance, ",
+        ),
         (["loss=hinge"], "loss=hinge: expected one of cross_entropy, recall, average_precision"),
         (["steps=0"], "steps=0: expected a whole number above 0"),
         (["learning_rate=nan"], "learning_rate=nan: expected a number above 0"),
         (["learning_rat=1"], "the nearest is learning_rate"),
         (["grid.sigma=[]"], "grid.sigma=[]: expected a list of one or more"),
         (["dataset.ground_truth=none", "dataset.index_file=null"], "choosing settings needs a ground truth"),
-        (["recall.tolerances=[30]"], "split=both: no query of one half has a place far enough"),
+        (["recall.tolerances=[30]"], "far enough from the other half; use more queries or smaller tolerances\n"),
     ],
 )
 def test_mistakes_are_one_line_and_exit_code_2(root, tmp_path, monkeypatch, capsys, arguments, words):

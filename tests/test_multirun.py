@@ -57,7 +57,12 @@ def test_a_job_waits_for_the_matches_of_another_and_a_single_run_does_not(root, 
     overrides = *small(root), SIGMA
     settings = composed(*overrides, config="sweep")
     recipe = stores.matches_recipe(settings, prepare.images(settings).fingerprints, CANDIDATES)
-    path = stores.matches_path(settings["store"], prepare.matches_name(settings), recipe)
+    path = stores.matches_path(settings["store"], recipe)
+    assert typed(monkeypatch, capsys, "sweep", *overrides, f"out={tmp_path}/first")[0] == 0
+    with match_store.open_match_store(path, recipe, num_queries=QUERIES, num_candidates=CANDIDATES) as complete:
+        assert complete.done.all()  # so others read it at the same time
+        assert typed(monkeypatch, capsys, "sweep", *overrides, f"out={tmp_path}/second")[0] == 0
+    next(path.glob("3-*.npz")).unlink()
     taken, told = threading.Event(), threading.Event()
 
     def another():
@@ -77,7 +82,7 @@ def test_a_job_waits_for_the_matches_of_another_and_a_single_run_does_not(root, 
     other.join(timeout=60)
     assert code == 0, stderr
     assert f"{path}: in use by process {os.getpid()}; waiting until it is free\n" in stderr
-    assert {place.name for place in tmp_path.iterdir()} == {"runs", "job"}
+    assert {place.name for place in tmp_path.iterdir()} == {"runs", "first", "second", "job"}
 
 
 def test_jobs_in_several_processes(root, tmp_path):

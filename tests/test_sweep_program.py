@@ -300,7 +300,7 @@ def test_matches_of_something_else_are_refused(root, swept, tmp_path, monkeypatc
         settings = composed(*small(root), *changes, config="sweep")
         images = prepare.images(settings)
         recipe = stores.matches_recipe(settings, images.fingerprints, settings["candidates"])
-        return stores.matches_path(settings["store"], prepare.matches_name(settings), recipe)
+        return stores.matches_path(settings["store"], recipe)
 
     own, foreign = place(f"store={tmp_path}/store"), place(change)
     with match_store.open_match_store(own, {"other": 1}, num_queries=24, num_candidates=8):

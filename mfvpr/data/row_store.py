@@ -1,61 +1,62 @@
 """Rows of arrays on disk, for whoever makes them slowly and reads them often: the common part of all stores.
 
-A store is a Zarr v3 group of arrays whose first axis is the row. Chunks belong to one row each and are compressed, with
-a checksum; what a row does not fill costs nothing. Its manifest says what the rows were made from.
-
-`count` int32 `[M]`, the entries of each row, is -1, without a chunk, until all else of a row is on disk: one small
-file, which appears as a whole, says that the row is done. So a process may be killed at any moment, and the next one
-goes on.
+A store is a folder with a manifest, which says what the rows were made from, and one file for each row that is done:
+`<row>-<entries>.npz` (`mfvpr.data.arrays`). A file appears as a whole, when it is on disk, so a process may be killed
+at any moment, and the next one goes on. A file knows its store and its row: exchanged ones are noticed like damaged
+ones.
 """
 
-import itertools
-import math
-from collections import deque
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, Generic, TypeVar
 
 import numpy as np
-import tensorstore as ts
 
-from mfvpr.data._store_disk import (
-    Column,
-    commit,
-    free_bytes,
-    is_damage,
-    locked,
-    open_arrays,
-    read_counts,
-    reason,
-    told,
-    too_full,
+from mfvpr.data._store_disk import free_bytes, locked, told, too_full
+from mfvpr.data.arrays import read_arrays, write_arrays
+from mfvpr.data.images import ordered_map
+from mfvpr.data.store_manifest import (
+    Kind,
+    check_owned,
+    difference,
+    is_settled,
+    manifest_of,
+    recipe_fingerprint,
+    settle_manifest,
 )
-from mfvpr.data.store_manifest import Kind, check_owned, settle_manifest
 from mfvpr.errors import InputError
 
-READ_AHEAD = 16  # rows
+THREADS = 4  # that read ahead, or write the rows of a batch
 BLOCK = 4096  # bytes that a file system hands out at a time
+ARRAY_OVERHEAD = 400  # bytes at most that an array takes in its file beside its values
+
+Item = TypeVar("Item")
+Parts = Mapping[str, np.ndarray]
 
 
 @dataclass(eq=False)
-class RowStore:
+class RowStore(Generic[Item]):
     """An open store; made by `open_rows`.
 
     Attributes:
         folder: where it is, absolute.
         kind: what it holds.
+        sizes: lengths of axes by name, first M.
         counts: `[M]` int32 entries of each row, -1 = not done. To be read only.
-        columns: its arrays but for `count`; empty until the first row tells them.
     """
 
     folder: Path
     kind: Kind
+    sizes: Mapping[str, int]
     counts: np.ndarray
-    _context: ts.Context = field(repr=False)
-    columns: dict[str, Column] = field(default_factory=dict, repr=False)
-    _arrays: dict[str, ts.TensorStore] = field(default_factory=dict, repr=False)
+    _fingerprint: str = field(repr=False)
+    _writable: bool = field(repr=False)
+    _pack: Callable[[Item], Parts] = field(repr=False)
+    _unpack: Callable[[Parts], Item] = field(repr=False)
+    _layout: dict[str, str] | None = field(default=None, repr=False)
 
     @property
     def done(self) -> np.ndarray:
@@ -67,99 +68,108 @@ class RowStore:
         """Bytes that the store takes on disk."""
         return sum(path.stat().st_blocks * 512 for path in self.folder.rglob("*"))
 
-    def resume(self, columns: Mapping[str, Column]) -> None:
-        """Go on with what is on disk; arrays that are not there are made.
-
-        Raises:
-            InputError: damaged beyond what the next run mends by itself, or the folder cannot be written.
-        """
-        with told(self.folder, self.kind.content):
-            self._open(columns)
-            self.counts[:] = read_counts(self._arrays["count"])
-
-    def write(self, rows: Mapping[int, Mapping[str, np.ndarray]], columns: Mapping[str, Column]) -> None:
+    def write(self, items: Mapping[int, Item]) -> None:
         """Store a batch of rows. When this returns they are done, and on disk.
 
         Args:
-            rows: by row, every column's value: `[*shape]`, or `[count, *shape]` where it has entries.
-            columns: what the arrays are, if they are not there yet.
+            items: by row.
 
         Raises:
-            InputError: the disk is full, or cannot be written. Rows done before stay intact.
-            ValueError: a row that is done or does not exist.
+            InputError: the disk is full, or cannot be written: rows done before stay intact. Or a row has other arrays
+                than those before it.
+            ValueError: a row that is done or does not exist, what cannot be stored, or a store that was complete when
+                it was opened.
         """
-        if not rows:
+        if not items:
             return
-        if refused := [row for row in rows if not 0 <= row < len(self.counts) or self.counts[row] >= 0]:
+        if refused := [row for row in items if not 0 <= row < len(self.counts) or self.counts[row] >= 0]:
             raise ValueError(f"{self.folder}: row {refused[0]} is done or does not exist")
-        entries = next(name for name, column in columns.items() if column.chunk)
-        counts = {row: len(parts[entries]) for row, parts in rows.items()}
-        needed = forecast_bytes(columns, int((~self.done).sum()), sum(counts.values()) / len(counts))
-        with told(self.folder, self.kind.content, needed):
-            if not self.columns:
-                self._open(columns)
-            commit([self._write_part(row, name, part) for row, parts in rows.items() for name, part in parts.items()])
-            commit([self._arrays["count"][row].write(count) for row, count in counts.items()])
-        self.counts[list(counts)] = list(counts.values())
+        if not self._writable:
+            raise ValueError(f"{self.folder}: was complete, so it is open for reading; open it again to write")
+        rows = {row: self._packed(row, item) for row, item in items.items()}
+        self._check_layouts(rows)
+        taken = [row_bytes(sum(part.nbytes for part in parts.values()), len(parts)) for parts in rows.values()]
+        with told(self.folder, self.kind.content, int(np.sum(~self.done) * np.mean(taken))):
+            for _ in ordered_map(self._write_row, rows.items(), workers=THREADS):
+                pass
 
-    def read(self, rows: Iterable[int] | None = None) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-        """(row, its value by column) of rows that are done, by default of all; some are read ahead on threads.
+    def read(self, rows: Iterable[int] | None = None) -> Iterator[tuple[int, Item]]:
+        """(row, item) of rows that are done, by default of all; some are read ahead on threads.
 
         Raises:
-            InputError: some were damaged on disk, told after the others were given; they are no longer done, so that
-                the next run makes them anew. Or the disk cannot be read.
+            InputError: some were damaged on disk, told after the others were given; they are removed, so that the next
+                run makes them anew. Or the disk cannot be read.
             ValueError: a row that is not done.
         """
         rows = np.flatnonzero(self.done).tolist() if rows is None else list(rows)
         if missing := [row for row in rows if self.counts[row] < 0]:
             raise ValueError(f"{self.folder}: row {missing[0]} is not done")
-        damaged: dict[int, str] = {}
-        requests = ((row, self._request(row)) for row in rows)
-        waiting = deque(itertools.islice(requests, READ_AHEAD))
-        while waiting:
-            row, futures = waiting.popleft()
-            waiting.extend(itertools.islice(requests, 1))
-            with told(self.folder, self.kind.content):
-                try:
-                    parts = {name: future.result() for name, future in futures.items()}
-                except ValueError as error:
-                    if not is_damage(error):
-                        raise
-                    damaged[row] = reason(error)
-                    continue
-            yield row, parts
+        paths = [self._path(row, self.counts[row]) for row in rows]
+        damaged: dict[int, Path] = {}
+        for row, path, parts in zip(rows, paths, ordered_map(self._read_parts, paths, workers=THREADS), strict=True):
+            if parts is None:
+                damaged[row] = path
+            else:
+                yield row, self._unpack(parts)
         if damaged:
-            self._report(damaged)
+            raise InputError(self._remove(damaged))
 
-    def _open(self, columns: Mapping[str, Column]) -> None:
-        self._arrays.update(open_arrays(self.folder, len(self.counts), columns, self._context))
-        self.columns.update(columns)
+    def _path(self, row: int, count: int) -> Path:
+        return self.folder / f"{row}-{count}.npz"
 
-    def _write_part(self, row: int, name: str, part: np.ndarray) -> ts.WriteFutures:
-        """Whole chunks: nothing is read before, so whatever an interrupted run left does not matter."""
-        array, chunk = self._arrays[name], self.columns[name].chunk
-        if chunk is None:
-            return array[row].write(part)
-        length = -(-len(part) // chunk) * chunk
-        padded = np.full((length, *part.shape[1:]), np.nan, array.dtype.numpy_dtype)
-        padded[: len(part)] = part
-        return array[row, :length].write(padded)
+    def _about(self, path: Path) -> str:
+        return f"{self._fingerprint} {path.name}"
 
-    def _request(self, row: int) -> dict[str, ts.Future]:
-        count = int(self.counts[row])
-        return {
-            name: (self._arrays[name][row, :count] if column.chunk else self._arrays[name][row]).read()
-            for name, column in self.columns.items()
-        }
+    def _packed(self, row: int, item: Item) -> Parts:
+        try:
+            return self._pack(item)
+        except ValueError as error:
+            raise ValueError(f"{self.folder}: row {row}: {error}") from None
 
-    def _report(self, damaged: Mapping[int, str]) -> NoReturn:
+    def _write_row(self, row_parts: tuple[int, Parts]) -> None:
+        row, parts = row_parts
+        count = len(next(iter(parts.values())))
+        path = self._path(row, count)
+        write_arrays(path, parts, self._about(path), compress=self.kind.compress)
+        self.counts[row] = count
+
+    def _read_parts(self, path: Path) -> Parts | None:
+        """None where the file is damaged, or another's, or gone."""
         with told(self.folder, self.kind.content):
-            commit([self._arrays["count"][row].write(-1) for row in damaged])
+            try:
+                return read_arrays(path, self._about(path))
+            except (InputError, FileNotFoundError):
+                return None
+
+    def _check_layouts(self, rows: Mapping[int, Parts]) -> None:
+        """What one row has, all have: nothing is lost, or made up, where rows are put together."""
+        layouts = {row: layout_of(parts) for row, parts in rows.items()}
+        expected = self._layout or self._stored_layout() or next(iter(layouts.values()))
+        for row, layout in layouts.items():
+            if differs := difference(layout, expected):
+                raise InputError(
+                    f"{self.folder}: row {row}: {differs} as in the other {self.kind.rows}; choose another path, or "
+                    "delete this folder"
+                )
+        self._layout = expected
+
+    def _stored_layout(self) -> dict[str, str] | None:
+        found = (self._read_parts(self._path(row, self.counts[row])) for row in np.flatnonzero(self.done).tolist())
+        return next((layout_of(parts) for parts in found if parts), None)
+
+    def _remove(self, damaged: Mapping[int, Path]) -> str:
+        """What is told of damaged rows, which are no longer done."""
         self.counts[list(damaged)] = -1
-        row, what = next(iter(damaged.items()))
-        raise InputError(
+        row, path = next(iter(damaged.items()))
+        mend = f"run again, which {self.kind.remake} them anew"
+        for file in damaged.values():
+            with suppress(OSError):
+                file.unlink(missing_ok=True)
+        if any(file.exists() for file in damaged.values()):
+            mend = f"they cannot be removed; make the folder writable and {mend}"
+        return (
             f"{self.folder}: {self.kind.content} of {len(damaged)} {self.kind.rows} are damaged on disk, the first in "
-            f"row {row} ({what}); run again, which {self.kind.remake} them anew"
+            f"row {row} ({path.name}); {mend}"
         )
 
 
@@ -169,40 +179,47 @@ def open_rows(
     kind: Kind,
     recipe: Mapping[str, Any],
     sizes: Mapping[str, int],
+    *,
+    pack: Callable[[Item], Parts],
+    unpack: Callable[[Parts], Item],
     waiting: Callable[[str], None] | None = None,
-) -> Iterator[RowStore]:
-    """The store in `folder`, made if it is not there; no other process can open it meanwhile. No row is done yet.
+) -> Iterator[RowStore[Item]]:
+    """The store in `folder`, made if it is not there.
+
+    One that lacks rows is held alone; a complete one is read by any number of processes, and may be on a disk that
+    cannot be written.
 
     Args:
         folder: see `store_manifest.store_path`.
         kind: what it holds.
         recipe: what the rows are made from (JSON values only). Kept in plain text.
         sizes: lengths of axes by name, first that of the rows.
+        pack: what is stored of an item, arrays by name; the first has a value for each of the row's entries.
+        unpack: the item again.
         waiting: is told, in one line, which process this waits for; None = refuse a store that is in use.
 
     Raises:
         InputError: made from something else, in use, no store at all, or the folder cannot be written.
     """
     folder = folder.absolute()  # the working directory may change
-    with told(folder, kind.content):
-        str(folder).encode()  # tensorstore takes no path that is not Unicode
-        check_owned(folder, kind)
-        folder.mkdir(parents=True, exist_ok=True)
-    with locked(folder, kind.content, waiting):
+    manifest, num_rows = manifest_of(kind, recipe, sizes), next(iter(sizes.values()))
+    with ExitStack() as stack:
         with told(folder, kind.content):
-            settle_manifest(folder, kind, recipe, sizes)
-        counts = np.full(next(iter(sizes.values())), -1, np.int32)
-        yield RowStore(folder, kind, counts, ts.Context({"file_io_sync": True}))  # one for all arrays
+            check_owned(folder, kind)
+            counts = _counts(folder, num_rows, known=is_settled(folder, kind, manifest))
+        if writable := bool((counts < 0).any()):
+            with told(folder, kind.content):
+                folder.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(locked(folder, kind.content, waiting))
+            with told(folder, kind.content):
+                settle_manifest(folder, kind, manifest)
+                counts = _counts(folder, num_rows)  # another process may have made some
+        yield RowStore(folder, kind, sizes, counts, recipe_fingerprint(recipe, kind), writable, pack, unpack)
 
 
-def forecast_bytes(columns: Mapping[str, Column], num_rows: int, entries_per_row: float) -> int:
-    """Bytes on disk that rows with so many entries take at most."""
-
-    def of(column: Column) -> float:
-        values = math.prod(column.shape) * (entries_per_row if column.chunk else 1)
-        return np.dtype(column.dtype).itemsize * values
-
-    return num_rows * sum(int(-(-of(column) // BLOCK)) * BLOCK for column in (*columns.values(), Column("int32")))
+def row_bytes(num_bytes: float, num_arrays: int) -> int:
+    """Bytes on disk that a row takes at most whose values take `num_bytes`."""
+    return -(-int(num_bytes + num_arrays * ARRAY_OVERHEAD) // BLOCK) * BLOCK
 
 
 def require_space(folder: Path, num_bytes: int) -> None:
@@ -214,3 +231,19 @@ def require_space(folder: Path, num_bytes: int) -> None:
     free = free_bytes(folder)
     if free < num_bytes:
         raise InputError(too_full(folder, num_bytes, free))
+
+
+def _counts(folder: Path, num_rows: int, *, known: bool = True) -> np.ndarray:
+    """`[M]` int32 entries of each row, as the names of the files tell; -1 = not done. Of what is not `known`, none."""
+    counts = np.full(num_rows, -1, np.int32)
+    for path in folder.iterdir() if known else ():
+        if name := re.fullmatch(r"(0|[1-9]\d{0,8})-(0|[1-9]\d{0,8})\.npz", path.name):
+            row, count = map(int, name.groups())
+            if row < num_rows:
+                counts[row] = count
+    return counts
+
+
+def layout_of(parts: Parts) -> dict[str, str]:
+    """What rows have in common: names, types and lengths of axes but for the first."""
+    return {name: f"{part.dtype}{list(part.shape[1:])}" for name, part in parts.items()}

@@ -1,7 +1,6 @@
 """What the rows of a store were made from, in plain text beside them: never mixed, never reused by mistake.
 
-The manifest is the `zarr.json` of the store's Zarr group, in its attributes. It is written before anything else and
-compared, ingredient by ingredient, whenever the store is opened.
+The manifest is written before anything else and compared, ingredient by ingredient, whenever the store is opened.
 """
 
 import hashlib
@@ -17,7 +16,9 @@ from typing import Any
 from mfvpr.data.files import replacing
 from mfvpr.errors import InputError
 
-MANIFEST = "zarr.json"
+MANIFEST = "manifest.json"
+_OLD_MANIFEST = "zarr.json"  # of format 1
+_LEFTOVER = re.compile(r"\.(manifest|\d+-\d+)-\w+\.(json|npz)")  # was being written when its process was killed
 _ABSENT = object()
 
 
@@ -30,21 +31,23 @@ class Kind:
         content: what a row is made of.
         rows: what a row belongs to.
         remake: what the next run does with a row that is not done.
+        compress: whether that is worth its time.
     """
 
     store: str
     content: str
     rows: str
     remake: str
+    compress: bool
 
     @property
     def format(self) -> str:
         """Of the arrays on disk, with its version."""
-        return f"mfvpr {self.store} 1"
+        return f"mfvpr {self.store} 2"
 
 
-FEATURES = Kind("feature store", "features", "images", "extracts")
-MATCHES = Kind("match store", "matches", "queries", "matches")
+FEATURES = Kind("feature store", "features", "images", "extracts", compress=False)
+MATCHES = Kind("match store", "matches", "queries", "matches", compress=True)
 
 
 def recipe_fingerprint(recipe: Mapping[str, Any], kind: Kind = FEATURES) -> str:
@@ -68,6 +71,11 @@ def check_owned(folder: Path, kind: Kind) -> None:
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of {kind.content}, got a file; choose another path")
     if folder.is_dir() and not (folder / MANIFEST).exists():
+        if (folder / _OLD_MANIFEST).exists():
+            raise InputError(
+                f"{folder}: expected {kind.format!r}, got the format of an earlier version; choose another path, or "
+                "delete this folder"
+            )
         foreign = sorted(path.name for path in folder.iterdir() if path.name != "lock" and not _is_leftover(path))
         if foreign:
             raise InputError(
@@ -76,58 +84,50 @@ def check_owned(folder: Path, kind: Kind) -> None:
             )
 
 
-def settle_manifest(folder: Path, kind: Kind, recipe: Mapping[str, Any], sizes: Mapping[str, int]) -> None:
-    """Write the manifest, or compare it with the one that is there. Whoever calls holds the store's lock.
+def manifest_of(kind: Kind, recipe: Mapping[str, Any], sizes: Mapping[str, int]) -> dict[str, Any]:
+    """What a manifest says (JSON).
 
     Args:
-        folder: the store's.
-        kind: what it holds.
+        kind: what the store holds.
         recipe: what that is made from.
-        sizes: lengths of its axes by name, which the manifest tells as well.
+        sizes: lengths of its axes by name.
+    """
+    content = {"format": kind.format, **sizes, "recipe": recipe, "fingerprint": recipe_fingerprint(recipe, kind)}
+    return json.loads(json.dumps(content))  # tuples become lists
+
+
+def is_settled(folder: Path, kind: Kind, manifest: Mapping[str, Any]) -> bool:
+    """Whether the store has its manifest.
 
     Raises:
         InputError: the store was made from something else, or its manifest cannot be understood.
-        OSError: it cannot be read or written.
+        OSError: it cannot be read.
     """
-    content = {"format": kind.format, **sizes, "recipe": recipe, "fingerprint": recipe_fingerprint(recipe, kind)}
-    expected = json.loads(json.dumps(content))  # tuples become lists
     path = folder / MANIFEST
     if not path.exists():
-        for leftover in filter(_is_leftover, folder.iterdir()):
-            leftover.unlink()
-        _write(path, expected)
-    found = _read(path, kind)
-    if difference := _difference(found, expected):
+        return False
+    if differs := difference(_read(path, kind), manifest):
         raise InputError(
-            f"{path}: these {kind.content} were made with {difference}; choose another path, or delete this folder"
+            f"{path}: these {kind.content} were made with {differs}; choose another path, or delete this folder"
         )
+    return True
 
 
-def _is_leftover(path: Path) -> bool:
-    """A manifest that was being written when the process was killed."""
-    return path.name.startswith(".zarr-") and path.suffix == ".json"
+def settle_manifest(folder: Path, kind: Kind, manifest: Mapping[str, Any]) -> None:
+    """Clear away what a killed process left, and write the manifest if it is not there. Whoever calls holds the lock.
+
+    Raises:
+        InputError: as `is_settled`.
+        OSError: it cannot be read or written.
+    """
+    for leftover in filter(_is_leftover, folder.iterdir()):
+        leftover.unlink()
+    if not is_settled(folder, kind, manifest):
+        _write(folder / MANIFEST, manifest)
 
 
-def _write(path: Path, manifest: Mapping[str, Any]) -> None:
-    group = {"zarr_format": 3, "node_type": "group", "attributes": {"mfvpr": manifest}}
-    with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
-        file.write(json.dumps(group, indent=1, sort_keys=True, allow_nan=False))
-        file.flush()
-        os.fsync(file.fileno())  # what comes later is on disk when it is written; so must this be
-
-
-def _read(path: Path, kind: Kind) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))["attributes"]["mfvpr"]
-    except (ValueError, KeyError, TypeError):
-        raise InputError(
-            f"{path}: expected the manifest of a {kind.store}, got something else; choose another path, or delete "
-            "this folder"
-        ) from None
-
-
-def _difference(found: Any, expected: Any, name: str = "") -> str | None:
-    """The first ingredient that differs, as `name=found, expected ...`; those of `expected` come first."""
+def difference(found: Any, expected: Any, name: str = "") -> str | None:
+    """What differs first in two JSON values, as `name=found, expected ...`; the names of `expected` come first."""
     if isinstance(found, dict) and isinstance(expected, dict):
         parts = [
             (f"{name}.{key}".lstrip("."), found.get(key, _ABSENT), expected.get(key, _ABSENT))
@@ -140,8 +140,32 @@ def _difference(found: Any, expected: Any, name: str = "") -> str | None:
         return None
     else:
         return f"{name}={_short(found)}, expected {_short(expected)}"
-    differences = (_difference(one, other, part) for part, one, other in parts)
+    differences = (difference(one, other, part) for part, one, other in parts)
     return next(filter(None, differences), None)
+
+
+def _is_leftover(path: Path) -> bool:
+    return _LEFTOVER.fullmatch(path.name) is not None
+
+
+def _write(path: Path, manifest: Mapping[str, Any]) -> None:
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        file.write(json.dumps(manifest, indent=1, sort_keys=True, allow_nan=False))
+        file.flush()
+        os.fsync(file.fileno())  # what comes later is on disk when it is written; so must this be
+
+
+def _read(path: Path, kind: Kind) -> Any:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if "format" in content:
+            return content
+    except (ValueError, TypeError):
+        pass
+    raise InputError(
+        f"{path}: expected the manifest of a {kind.store}, got something else; choose another path, or delete this "
+        "folder"
+    )
 
 
 def _short(value: Any) -> str:

@@ -4,8 +4,10 @@ Every checkpoint carries the recipe of what is trained, and the shapes of its ar
 expected before anything in the folder changes. The last two are kept.
 """
 
+import fcntl
 import json
 import logging
+import os
 import warnings
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,8 +21,34 @@ import orbax.checkpoint as ocp
 
 from mfvpr.errors import InputError
 
-FORMAT = "mfvpr training 1"
+FORMAT = "mfvpr training 2"
 _KEPT = 2
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Keep other processes from training in a folder, which is made where it is not there; ends with the process.
+
+    Raises:
+        InputError: another process holds it, it holds something else, or it cannot be made.
+    """
+    _holds_checkpoints(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise InputError(
+            f"{folder}: no checkpoint can be kept here ({_reason(error)}); check the path, its permissions and its disk"
+        ) from None
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            message = f"{folder}: another process trains here; wait until it ends, or choose another folder"
+            raise InputError(message) from None
+        yield
+    finally:
+        os.close(handle)
 
 
 def save(folder: Path, step: int, recipe: Mapping[str, Any], state: Any, progress: Any) -> None:
@@ -78,6 +106,12 @@ def restore(folder: Path, recipe: Mapping[str, Any], state: Any) -> tuple[Any, A
     if _checksum(leaves, record.get("progress")) != record.get("checksum"):
         raise _damaged(where, "another checksum")
     return jax.tree.unflatten(jax.tree.structure(state), leaves), record["progress"]
+
+
+def newest(folder: Path) -> Path | None:
+    """The newest checkpoint, None where there is none."""
+    steps = [int(path.name) for path in folder.iterdir() if path.name.isdecimal()]
+    return folder / str(max(steps)) if steps else None
 
 
 def named(tree: Any, is_leaf: Callable[[Any], bool] | None = None) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -82,12 +83,13 @@ def fit(
         every: steps from one validation, and checkpoint, to the next; the last step has both as well.
         patience: validations without a gain after which to stop.
         folder: where checkpoints are kept; a training that is found there goes on, and ends with the very bits of one
-            that was never interrupted (given the same `every`).
+            that was never interrupted (given the same `every`), also where it had ended and is given more steps.
         recipe: JSON values that say what is trained: the model, the data, every setting that the result depends on.
         track: progress over the steps.
 
     Raises:
-        InputError: the folder holds something else, or the checkpoint of something else, or of more steps.
+        InputError: the folder cannot be used, another process trains in it, or it holds something else, or the
+            checkpoint of something else, or of more steps.
         TrainingError: loss, gradient, parameters or validation are not finite. The last checkpoint stays.
     """
     if every < 1 or steps < 0 or (patience is not None and (validate is None or patience < 1)):
@@ -95,8 +97,9 @@ def fit(
     update = _update(objective, optimizer)
     training = _Training(update, batches, validate, steps, every, patience, folder, recipe or {}, track)
     parameters = _strong(parameters)
-    state, history = training.begin(_State(parameters, parameters, _strong(optimizer.init(parameters))))
-    state, history = training.descend(state, history)
+    start = _State(parameters, parameters, _strong(optimizer.init(parameters)))
+    with checkpoints.held(folder) if folder else nullcontext():
+        state, history = training.descend(*training.begin(start))
     exhausted = _exhausted(history, patience)
     ended = f"no gain in {patience} validations" if exhausted else f"all {steps} steps are done"
     return Fit(state.best, _best(history).step, tuple(history), ended)
@@ -131,62 +134,67 @@ class _Training:
     recipe: Mapping[str, Any]
     track: Track
 
-    def begin(self, state: _State) -> tuple[_State, list[Record]]:
-        """Where the folder's training stands, or `state` at the start."""
+    def begin(self, state: _State) -> tuple[_State, list[Record], list[float]]:
+        """Where the folder's training stands, or `state` at the start; and the losses since the last validation."""
         stored = checkpoints.restore(self.folder, self.recipe, state) if self.folder else None
         if stored is None:
-            return state, [Record(0, None, self.validation(state.parameters, 0, []))]
-        state, history = _strong(stored[0]), [Record(*row) for row in stored[1]]
-        if history[-1].step > self.steps:
+            return state, [Record(0, None, self.validation(state.parameters, 0))], []
+        state, (rows, losses) = _strong(stored[0]), stored[1]
+        history = [Record(*row) for row in rows]
+        if (done := history[-1].step + len(losses)) > self.steps:
             raise InputError(
-                f"{self.folder}: this checkpoint is of step {history[-1].step}, expected at most {self.steps}; "
-                "ask for more steps, or choose another folder"
+                f"{self.folder}: this checkpoint is of step {done}, expected at most {self.steps}; ask for more steps, "
+                "or choose another folder"
             )
-        return state, history
+        return state, history, losses
 
-    def descend(self, state: _State, history: list[Record]) -> tuple[_State, list[Record]]:
+    def descend(self, state: _State, history: list[Record], losses: list[float]) -> tuple[_State, list[Record]]:
         """All steps that are left, unless patience ends before."""
-        done, losses = history[-1].step, []
+        done = history[-1].step + len(losses)
         left = 0 if _exhausted(history, self.patience) else self.steps - done
         for step in self.track(range(done, done + left), left):
-            state, loss = self.advance(state, step, history)
-            losses.append(loss)
-            if (step + 1) % self.every and step + 1 < self.steps:
-                continue
-            validation = self.validation(state.parameters, step + 1, history)
-            history, losses = [*history, Record(step + 1, float(np.mean(losses)), validation)], []
-            if _best(history) is history[-1]:
-                state = state._replace(best=state.parameters)
-            if self.folder:
-                checkpoints.save(self.folder, step + 1, self.recipe, state, history)
+            state, loss = self.advance(state, step)
+            losses = [*losses, loss]
+            if due := (step + 1) % self.every == 0:
+                state, history, losses = self.validated(state, history, losses)
+            if self.folder and (due or step + 1 == self.steps):
+                checkpoints.save(self.folder, step + 1, self.recipe, state, (history, losses))
             if _exhausted(history, self.patience):
                 break
+        if losses:  # after the checkpoint: whoever asks for more steps would not have validated here
+            state, history, _ = self.validated(state, history, losses)
         return state, history
 
-    def advance(self, state: _State, step: int, history: Sequence[Record]) -> tuple[_State, float]:
+    def validated(self, state: _State, history: list[Record], losses: list[float]) -> tuple[_State, list[Record], list]:
+        """With one more record; no losses are left."""
+        step = history[-1].step + len(losses)
+        history = [*history, Record(step, float(np.mean(losses)), self.validation(state.parameters, step))]
+        return state._replace(best=state.parameters) if _best(history) is history[-1] else state, history, []
+
+    def advance(self, state: _State, step: int) -> tuple[_State, float]:
         """One step, and its loss before it."""
         batch = self.batches(step)
         parameters, memory, loss, gradient, finite = self.update(state.parameters, state.optimizer, batch)
         if not finite:
             suspects = checkpoints.named({"loss": loss, "gradient": gradient, "updated": parameters})
             culprit = next(name for name, leaf in suspects.items() if not np.all(np.isfinite(leaf)))
-            raise self.broken(f"{culprit} of batch {step}", state.parameters, step, history)
+            raise self.broken(f"{culprit} of batch {step}", state.parameters, step)
         return _State(parameters, state.best, memory), float(loss)
 
-    def validation(self, parameters: Any, step: int, history: Sequence[Record]) -> float | None:
+    def validation(self, parameters: Any, step: int) -> float | None:
         if self.validate is None:
             return None
         value = float(self.validate(parameters))
         if not math.isfinite(value):
-            raise self.broken("validation", parameters, step, history)
+            raise self.broken("validation", parameters, step)
         return value
 
-    def broken(self, what: str, parameters: Any, step: int, history: Sequence[Record]) -> TrainingError:
+    def broken(self, what: str, parameters: Any, step: int) -> TrainingError:
         leaves = checkpoints.named(parameters).items()
         scalars = [f"{name or 'parameter'}={float(leaf):.6g}" for name, leaf in leaves if leaf.ndim == 0]
         values = f" at {', '.join(scalars)}" if scalars else ""
-        saved = self.folder and history and history[-1].step
-        kept = f"the last good checkpoint is {self.folder}/{saved}" if saved else "there is no checkpoint yet"
+        saved = self.folder and checkpoints.newest(self.folder)
+        kept = f"the last good checkpoint is {saved}" if saved else "there is no checkpoint yet"
         return TrainingError(
             f"step {step}: {what} is not finite{values}; {kept}; look at the data, or lower the learning rate"
         )

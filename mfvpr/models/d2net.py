@@ -51,9 +51,9 @@ class D2Net(nnx.Module):
 
 
 def _repeats(images: Array) -> Array:
-    """Whether two neighbors in the map see the same pixels of images `[B, H, W, 3]`, as in a white sky; `[]` bool.
+    """Whether in any of the images `[B, H, W, 3]` two neighbors in the map see the same, as in a white sky; `[]` bool.
 
-    Then the map is level there, unless the rounding makes peaks. Beyond the border all is taken to be the same.
+    The map is level there, unless the rounding makes peaks. Beyond the border all is taken to be the same.
     """
     batch, height, width, _ = images.shape
     rows, columns = -(-height // STRIDE), -(-width // STRIDE)

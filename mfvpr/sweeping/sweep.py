@@ -6,7 +6,6 @@ block by block (some settings, some queries), which bounds the memory and is whe
 
 import hashlib
 import itertools
-import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -17,8 +16,10 @@ import jax
 import numpy as np
 
 from mfvpr import reranking
-from mfvpr.data.files import replacing
+from mfvpr.data.arrays import read_arrays, write_arrays
 from mfvpr.data.images import ordered_map
+from mfvpr.data.threads import available_cpus
+from mfvpr.errors import InputError
 from mfvpr.numerics import compiled
 from mfvpr.pipeline import FilterScore, MatchSet, Ties, Track, filter_scores, untracked
 from mfvpr.sweeping.batches import BYTES_PER_SLOT, batches, slots
@@ -164,7 +165,7 @@ def _scores(block: Group, held: Sequence[tuple[np.ndarray, Matches]], shape: tup
     alone, together = order[: len(first)], order[len(first) :]
     found = itertools.chain(
         (score(held[number]) for number in alone),
-        ordered_map(score, [held[number] for number in together], workers=os.cpu_count() or 1),
+        ordered_map(score, [held[number] for number in together], workers=available_cpus()),
     )
     for number, values in zip(order, found, strict=True):
         places, _ = held[number]
@@ -209,23 +210,27 @@ def _kept(
     """A block's rows, from its file where that is there and whole; else computed and written."""
     if folder is None:
         return compute()
-    path = folder / f"{_fingerprint(part, block, cs)}.npy"
-    if path.exists():
-        try:
-            rows = np.load(path, allow_pickle=False)
-            if rows.dtype == np.int32 and rows.shape == (len(part.views), len(cs), len(part.queries), part.depth):
-                return rows
-        except (OSError, ValueError, EOFError):
-            pass  # damaged: computed again
+    key = _fingerprint(part, block, cs)
+    path = folder / f"{key}.npz"
+    try:
+        return read_arrays(path, key)["rows"]
+    except (OSError, InputError):
+        pass  # not there, or damaged
     rows = compute()
-    with replacing(path) as temporary:
-        np.save(temporary, rows)
+    write_arrays(path, {"rows": rows}, key)
     return rows
 
 
 def _fingerprint(part: Work, block: Group, cs: Sequence[Any]) -> str:
     """All that a block's rows depend on: matches and shortlist, the scorer's program, and its numbers."""
-    options = part.depth, part.ties, part.filter_score, [repr(c) for c in cs], block.rows.tolist()
+    options = (
+        part.depth,
+        part.ties,
+        part.filter_score,
+        [repr(c) for c in cs],
+        block.rows.tolist(),
+        [*block.settings, *block.weightings],
+    )
     numbers = block.scorer, dict(block.settings), dict(block.weightings)
     return _digest(repr(options), block.program, part.digest, numbers)
 

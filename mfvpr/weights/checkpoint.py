@@ -12,7 +12,7 @@ from typing import Any, BinaryIO, Literal
 import numpy as np
 
 from mfvpr.errors import InputError
-from mfvpr.weights.pickles import Storage, Tensor, read_pickle
+from mfvpr.weights.pickles import Storage, Tensor, excerpt, read_pickle
 
 Order = Literal["little", "big"]
 
@@ -82,7 +82,7 @@ def _read_zip(file: BinaryIO) -> dict[str, np.ndarray]:
         if packed or len(set(names)) < len(names) or sum(entry.file_size for entry in entries) > _size(file):
             raise InputError("expected each entry of the zip file once and uncompressed; use the official file")
         if broken := archive.testzip():
-            raise InputError(f"this checkpoint is damaged, by the checksum of {broken[:80]}; download it again")
+            raise InputError(f"this checkpoint is damaged, by the checksum of {excerpt(broken)}; download it again")
         (pickle,) = (name for name in names if name.split("/")[1:] == ["data.pkl"])
         folder = pickle.removesuffix("data.pkl")
         order = _ORDERS[archive.read(f"{folder}byteorder") if f"{folder}byteorder" in names else b"little"]
@@ -131,7 +131,9 @@ def _arrays(content: Any, order: Order, values: Callable[[Storage], bytes]) -> d
         raise InputError(f"expected tensors by name, got {kind}; use the official file")
     arrays = {}
     for key, tensor in content.items():
-        where = f" at {str(key)[:80]}"
+        if not isinstance(key, str):
+            raise InputError(f"expected tensors by name, got number {excerpt(str(key))}; use the official one")
+        where = f" at {excerpt(key)}"
         if not isinstance(tensor, Tensor):
             raise InputError(f"expected tensors only, got {type(tensor).__name__}{where}")
         dtype = _dtype(tensor.storage, where).newbyteorder(order)
@@ -142,7 +144,7 @@ def _arrays(content: Any, order: Order, values: Callable[[Storage], bytes]) -> d
             raise InputError(f"expected no more values than the file stores{where}; use the official file")
         strides = [step * dtype.itemsize for step in tensor.strides]
         view = np.ndarray(tensor.shape, dtype, raw, tensor.offset * dtype.itemsize, strides)  # checks its bounds
-        arrays[str(key)] = view.astype(dtype.newbyteorder("="), copy=False)
+        arrays[key] = view.astype(dtype.newbyteorder("="), copy=False)
     return arrays
 
 
@@ -153,6 +155,6 @@ def _dtype(storage: Storage, where: str = "") -> np.dtype:
         InputError: neither float32 nor float64 nor an integer.
     """
     if storage.kind not in _DTYPES:
-        kind = storage.kind.removesuffix("Storage")
-        raise InputError(f"expected tensors of float32 or float64, got {kind[:80]}{where}; use the official file")
+        kind = excerpt(storage.kind.removesuffix("Storage"))
+        raise InputError(f"expected tensors of float32 or float64, got {kind}{where}; use the official file")
     return _DTYPES[storage.kind]

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mfvpr.errors import InputError
+from mfvpr.weights.pickles import excerpt
 
 
 class Layout(Enum):
@@ -64,10 +65,10 @@ def convert(
             continue
         targets = _targets(key, table)
         if len(targets) > 1:
-            wrong("with several rules", _short(key))
+            wrong("with several rules", excerpt(key))
             continue
         if not targets or targets[0][0] not in shapes:
-            wrong("unknown", _short(key))
+            wrong("unknown", excerpt(key))
             continue
         target, layout = targets[0]
         if target in origin:
@@ -98,10 +99,6 @@ def share_known(keys: Iterable[str], table: Table) -> float:
 
 def _is_ignored(key: str, table: Table) -> bool:
     return any(re.fullmatch(pattern, key) for pattern in table.ignored)
-
-
-def _short(key: str) -> str:
-    return key if len(key) <= 60 else f"{key[:57]}..."
 
 
 def _targets(key: str, table: Table) -> list[tuple[str, Layout]]:

@@ -50,7 +50,7 @@ class WeightsError(InputError):
 
 def weights_folder() -> Path:
     """Where runtime files live: the environment variable MFVPR_WEIGHTS, or ~/.cache/mfvpr/weights."""
-    return Path(os.environ.get("MFVPR_WEIGHTS") or "~/.cache/mfvpr/weights").expanduser()
+    return Path(os.path.expanduser(os.environ.get("MFVPR_WEIGHTS") or "~/.cache/mfvpr/weights"))
 
 
 def install(checkpoint: Path, name: str, folder: Path | None = None) -> Path:

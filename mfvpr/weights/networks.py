@@ -11,6 +11,7 @@ import numpy as np
 
 from mfvpr.errors import InputError
 from mfvpr.weights.conversion import Rule, Table, convert, share_known
+from mfvpr.weights.pickles import excerpt
 from mfvpr.weights.registry import REGISTRY, Entry
 from mfvpr.weights.tables import ALIKED, D2NET, MIXVPR
 
@@ -109,7 +110,7 @@ def resemblance(keys: Sequence[str], expected: Network) -> str | None:
     *parts, _ = keys[0].split(".", maxsplit=_LONGEST_PREFIX)
     for prefix in accumulate(f"{part}." for part in parts):
         if share_known([key.removeprefix(prefix) for key in keys], expected.table) > _MOST:
-            return f"its keys begin with {prefix[:60]}, which the official file's do not"
+            return f"its keys begin with {excerpt(prefix)}, which the official file's do not"
     return None
 
 

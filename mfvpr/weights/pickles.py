@@ -1,7 +1,7 @@
 """Reads what torch pickles, as data: an interpreter of the few instructions that checkpoints take, which calls nothing.
 
 Python's own unpickler looks up and calls whatever a file names. Here a name stays a name: ordered dictionaries, tensors
-and parameters are known by theirs, and all else is refused.
+and parameters are known by theirs, a training's notes beside them are left unread, and all else is refused.
 """
 
 import pickletools
@@ -12,6 +12,12 @@ from typing import Any, BinaryIO, NamedTuple
 from mfvpr.errors import InputError
 
 _LARGEST = 1 << 22  # bytes of a pickle, which holds names and shapes; values lie elsewhere
+_NOTES = {  # the command line and the losses, as D2-Net's training keeps them
+    "argparse.Namespace",
+    "_codecs.encode",
+    "numpy.dtype",
+    *(f"numpy.{core}.multiarray.scalar" for core in ("core", "_core")),
+}
 _MEND = "nothing was executed, use the official file"
 
 
@@ -41,6 +47,10 @@ class Content(NamedTuple):
     storages: dict[str, Storage]
 
 
+class Unread:
+    """A note that nobody asks for."""
+
+
 @dataclass(frozen=True)
 class Name:
     """What a pickle asks for."""
@@ -50,6 +60,11 @@ class Name:
 
     def __str__(self) -> str:
         return f"{self.module}.{self.name}"
+
+
+def excerpt(text: str) -> str:
+    """What a file says, short and on one line, for a message."""
+    return repr(text if len(text) <= 60 else f"{text[:57]}...")[1:-1]
 
 
 def read_pickle(file: BinaryIO) -> Content:
@@ -115,9 +130,10 @@ def read_pickle(file: BinaryIO) -> Content:
                 stack.append(storage)
             case "REDUCE" | "NEWOBJ":
                 stack.append(_made(*popped(2)))
-            case "BUILD":  # notes on an ordered dictionary, which nobody reads
+            case "BUILD":  # fills a note, or adds one to an ordered dictionary
                 popped(1)
-                _as(dict, stack[-1])
+                if type(stack[-1]) not in (dict, Unread):
+                    raise TypeError
             case "STOP":
                 (value,) = popped(1)
                 return Content(value, storages)
@@ -135,6 +151,8 @@ def _made(name: Any, arguments: Any) -> Any:
             return Tensor(storage, _count(offset), _counts(shape), _counts(strides))
         case "torch._utils._rebuild_parameter", (Tensor() as tensor, _, _):
             return tensor
+        case note, _ if note in _NOTES:
+            return Unread()
     raise _refused(name)
 
 
@@ -150,7 +168,7 @@ def _storage(identity: Any) -> Storage:
 
 
 def _refused(name: Name) -> InputError:
-    return InputError(f"it asks for {str(name)[:80]}, where plain dense tensors are expected; {_MEND}")
+    return InputError(f"it asks for {excerpt(str(name))}, where plain dense tensors are expected; {_MEND}")
 
 
 def _as(kind: type, value: Any) -> Any:

@@ -1,7 +1,6 @@
 """Small stores of features and of matches, for tests."""
 
 import hashlib
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from mfvpr import Features, Matches
+from mfvpr.data import store_manifest
 from mfvpr.data.feature_store import open_store
 from mfvpr.data.match_store import QueryMatches, open_match_store
 from tests.builders import make_features
@@ -24,8 +24,6 @@ RECIPE = {
     "images": [{"name": f"{row}.png", "sha256": f"{row:064x}"} for row in range(3)],
 }
 MATCH_RECIPE = {"features": "0123", "shortlist": {"name": "mixvpr", "candidates": 4}, "cross_check": "mutual"}
-ARRAYS = ("descriptors", "keypoints", "scores", "image_size", "count")
-MATCH_ARRAYS = ("query", "candidate", "shortlist", "filter_scores", "sizes", "count")
 
 
 def features_of(row: int, count: int = 40, dimension: int = 16) -> Features:
@@ -37,11 +35,11 @@ def assert_same(got: Features, expected: Features) -> None:
         np.testing.assert_array_equal(getattr(got, part.name), getattr(expected, part.name))
 
 
-def matches_of(row: int, counts: tuple[int, ...] = (30, 0, 25, 5)) -> QueryMatches:
+def matches_of(row: int, counts: tuple[int, ...] = (30, 0, 25, 5), **more: Any) -> QueryMatches:
     """Matches of one query with so many matches of each candidate; no candidate where there are none."""
     rng, total = np.random.default_rng(row), sum(counts)
     numbers = lambda *shape: rng.uniform(0, 336, shape).astype(np.float32)  # noqa: E731
-    flat = Matches(
+    flat = dict(
         points0=numbers(total, 2),
         points1=numbers(total, 2),
         distance=numbers(total),
@@ -53,7 +51,7 @@ def matches_of(row: int, counts: tuple[int, ...] = (30, 0, 25, 5)) -> QueryMatch
         ratio=numbers(total),
     )
     indices = np.where(np.array(counts) > 0, rng.permutation(len(counts)), -1).astype(np.int32)
-    return QueryMatches(flat, np.array(counts, np.int32), indices, numbers(len(counts)))
+    return QueryMatches(Matches(**flat | more), np.array(counts, np.int32), indices, numbers(len(counts)))
 
 
 @dataclass(frozen=True)
@@ -62,14 +60,16 @@ class Subject:
 
     open: Callable[[Path, int], AbstractContextManager[Any]]
     row_of: Callable[..., Any]
-    arrays: tuple[str, ...]
+    kind: store_manifest.Kind
 
 
-FEATURES = Subject(lambda folder, rows: open_store(folder, RECIPE, num_images=rows), features_of, ARRAYS)
+FEATURES = Subject(
+    lambda folder, rows: open_store(folder, RECIPE, num_images=rows), features_of, store_manifest.FEATURES
+)
 MATCHES = Subject(
     lambda folder, rows: open_match_store(folder, MATCH_RECIPE, num_queries=rows, num_candidates=4),
     matches_of,
-    MATCH_ARRAYS,
+    store_manifest.MATCHES,
 )
 
 
@@ -87,8 +87,8 @@ def read_all(folder: Path, num_rows: int = 3, subject: Subject = FEATURES) -> di
         return dict(store.read())
 
 
-def chunk_of(folder: Path, name: str, row: int = 1) -> Path:
-    [path] = (folder / name).glob(f"c.{row}*")
+def file_of(folder: Path, row: int = 1) -> Path:
+    [path] = folder.glob(f"{row}-*.npz")
     return path
 
 
@@ -99,18 +99,18 @@ def flip(path: Path, position: int) -> None:
 
 
 DAMAGE: dict[str, Callable[[Path], Any]] = {
-    "missing": Path.unlink,
     "empty": lambda path: path.write_bytes(b""),
     "short": lambda path: path.write_bytes(path.read_bytes()[:-3]),
+    "half": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
     "long": lambda path: path.write_bytes(path.read_bytes() + b"abc"),
     "flipped": lambda path: flip(path, path.stat().st_size // 2),
-    "swapped": lambda path: shutil.copy(path.parent.parent / "count" / "zarr.json", path),
+    "another's": lambda path: path.write_bytes(file_of(path.parent, 0).read_bytes()),
 }
 
 
 def digests(folder: Path) -> dict[str, str]:
-    """SHA-256 of every file; leftovers of tensorstore's would be seen."""
-    files = (path for path in folder.rglob("*") if path.is_file())
+    """SHA-256 of every file but the lock; leftovers would be seen."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != "lock")
     return {path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 

@@ -144,8 +144,10 @@ def test_changed_progress_is_damage(tmp_path):
 
 def test_a_place_that_cannot_be_written_is_told(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match=r"file/sub: the checkpoint of step 5 cannot be written \(.*check the path"):
+    with pytest.raises(InputError, match=r"file/sub: no checkpoint can be kept here \(.*check the path"):
         train(tmp_path / "file" / "sub")
+    with pytest.raises(InputError, match=r"file/sub: the checkpoint of step 5 cannot be written \(.*check the path"):
+        checkpoints.save(tmp_path / "file" / "sub", 5, RECIPE, STATE, [])
 
 
 def test_killed_while_saving_the_newest_whole_one_is_there(tmp_path):

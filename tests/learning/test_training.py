@@ -140,6 +140,43 @@ def test_goes_on_to_the_bit(tmp_path, whole):
     assert contents(tmp_path) == before
 
 
+@pytest.mark.parametrize("validated", [True, False])
+def test_more_steps_than_were_asked_for_first_change_nothing(tmp_path, validated):
+    """Seven steps end between two validations, where one of 20 steps would neither look nor choose."""
+    given = {} if validated else {"validate": None}
+    short = train(tmp_path, steps=7, **given)
+    assert [record.step for record in short.history] == [0, 5, 7]
+    before = contents(tmp_path)
+    assert same(train(tmp_path, steps=7, batches=None, **given), short)
+    assert contents(tmp_path) == before
+    assert same(short, train(steps=7, **given))
+    assert same(train(tmp_path, steps=9, **given), train(steps=9, **given))
+    assert same(train(tmp_path, **given), train(**given))
+
+
+def test_the_best_between_two_validations_is_of_the_shorter_training_alone(tmp_path):
+    """Step 7 has the best validation; whoever goes on to step 20 never saw it."""
+
+    def at_seven(parameters):
+        return abs(float(parameters["slope"]) - float(seven["slope"]))
+
+    seven = train(steps=7, every=7, validate=None).parameters
+    assert train(tmp_path, steps=7, validate=at_seven).step == 7
+    longer = train(tmp_path, validate=at_seven)
+    assert longer.step != 7
+    assert same(longer, train(validate=at_seven))
+
+
+def test_a_second_training_in_one_folder_is_refused(tmp_path):
+    def second(step):
+        if step == 8:
+            with pytest.raises(InputError, match="another process trains here; wait until it ends, or choose another"):
+                train(tmp_path)
+        return batches(step)
+
+    assert same(train(tmp_path, batches=second), train(tmp_path))
+
+
 def test_an_ended_training_stays_ended(tmp_path):
     falling = iter(range(100))
     ended = train(tmp_path, steps=100, patience=3, validate=lambda parameters: -min(next(falling), 2))

@@ -153,17 +153,20 @@ def test_finished_blocks_are_read_and_damaged_ones_computed_again(data, tmp_path
     assert len(kept) == 4
     kept[0].write_bytes(kept[0].read_bytes()[:-5])
     kept[1].write_bytes(b"")
+    turned = bytearray(kept[2].read_bytes())
+    turned[len(turned) // 2] ^= 1  # a row of the right shape, but another
+    kept[2].write_bytes(turned)
     computed = []
     module = sweeping.sweep.__globals__
     scores = module["_scores"]
     monkeypatch.setitem(module, "_scores", lambda *inputs: computed.append(1) or scores(*inputs))
     np.testing.assert_array_equal(sweeping.sweep(scorer, settings, *data, **chunks), expected)
-    assert len(computed) == 9 - 4 + 2
+    assert len(computed) == 9 - 4 + 3
     np.testing.assert_array_equal(sweeping.sweep(scorer, settings, *data, **chunks), expected)
-    assert len(computed) == 9 - 4 + 2
+    assert len(computed) == 9 - 4 + 3
     other = [{**setting, "sigma": setting["sigma"] + 1} for setting in settings]
     sweeping.sweep(scorer, other, *data, **chunks)
-    assert len(computed) == 9 - 4 + 2 + 9
+    assert len(computed) == 9 - 4 + 3 + 9
 
 
 def test_one_program_per_shape_and_capacity(data, compilations):

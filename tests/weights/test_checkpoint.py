@@ -5,6 +5,7 @@ import pickle
 import struct
 import tracemalloc
 import zipfile
+from argparse import Namespace
 from contextlib import suppress
 
 import numpy as np
@@ -146,6 +147,29 @@ def test_other_tensors_of_torch_are_refused(torch, path, zipped):
     ):
         torch.save({"a": tensor}, path, _use_new_zipfile_serialization=zipped)
         assert words in refused(path)
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_notes_of_a_training_are_left_unread(torch, path, zipped):
+    """As the public training code of D2-Net writes them, which torch's own safe reader refuses."""
+    network = torch.nn.Linear(2, 3)
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
+    network(torch.ones(1, 2)).sum().backward()
+    optimizer.step()
+    losses = [np.mean([0.5, 0.25]), np.float32(0.1)]
+    notes = {"args": Namespace(lr=1e-3, gpu=None, dataset=("a", 2)), "epoch_idx": 9, "train_loss_history": losses}
+    content = notes | {"model": network.state_dict(), "optimizer": optimizer.state_dict()}
+    torch.save(content, path, _use_new_zipfile_serialization=zipped)
+    assert_same(read_checkpoint(path), {key: tensor.numpy() for key, tensor in network.state_dict().items()})
+
+
+@WRITERS
+def test_notes_are_known_without_torch(path, arrays, write):
+    dtype = Call(Global("numpy", "dtype"), ("f8", 0, 1))
+    loss = Call(Global("numpy.core.multiarray", "scalar"), (dtype, Call(Global("_codecs", "encode"), ("x", "latin1"))))
+    line = b"cargparse\nNamespace\n)\x81}(X\x02\0\0\0lrK\x01ub"
+    assert_same(read_checkpoint(write(path, {"args": line, "losses": [loss], "model": arrays})), arrays)
+    assert "expected tensors only, got Unread at args" in refused(write(path, {"args": line}))
 
 
 def test_types_are_refused_by_key(path):
@@ -379,4 +403,7 @@ def test_other_content(path):
     assert "got an empty dict" in refused_content(path, {"state_dict": {}})
     assert "expected tensors only, got str at note" in refused_content(path, {"a": np.zeros(3), "note": "text"})
     assert "expected tensors only, got Name at a" in refused_content(path, {"a": Global("os", "system")})
+    assert "got one by the number 3" in refused_content(path, {3: np.zeros(3)})
+    assert r"got str at two\nlines \x1b[2J" in refused_content(path, {"two\nlines \x1b[2J": "text"})
+    assert r"it asks for os.\x1b[2Jsystem," in refused_content(path, Call(Global("os", "\x1b[2Jsystem"), ()))
     assert len(refused_content(path, {1000 * "long": "text"})) < len(str(path)) + 150

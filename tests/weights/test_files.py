@@ -191,6 +191,8 @@ def test_folder(monkeypatch):
     monkeypatch.setenv("MFVPR_WEIGHTS", "~/w")
     assert weights_folder().is_absolute()
     assert weights_folder().name == "w"
+    monkeypatch.setenv("MFVPR_WEIGHTS", "~nobody-of-this-name/w")  # a folder of this name, as shells have it
+    assert weights_folder().parts == ("~nobody-of-this-name", "w")
     monkeypatch.setenv("MFVPR_WEIGHTS", "")
     assert weights_folder().parts[-3:] == (".cache", "mfvpr", "weights")
 

@@ -1,0 +1,66 @@
+"""Arrays in one file that is whole, unchanged and the one that was meant; or an error.
+
+The file is NumPy's own `.npz` (`numpy.load` reads it) that ends with a digest of what it holds and of what it is about.
+"""
+
+import hashlib
+import io
+import os
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from mfvpr.data.files import replacing
+from mfvpr.errors import InputError
+
+_DIGEST = hashlib.sha256().digest_size
+
+
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: str = "", *, compress: bool = False) -> None:
+    """Write arrays by name. When this returns they are on disk; until then, whatever was there before.
+
+    Args:
+        path: `.npz`.
+        arrays: of numbers, flags or text.
+        about: what the arrays are of; who reads them must say the same, so exchanged files are noticed.
+        compress: worth its time where values come again; numbers that look random shrink by a tenth.
+
+    Raises:
+        OSError: the disk is full, or cannot be written.
+        ValueError: an array of Python objects.
+    """
+    buffer = io.BytesIO()
+    kind = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
+    with zipfile.ZipFile(buffer, "w", kind, compresslevel=1) as archive:
+        archive.comment = bytes(_DIGEST)  # the end of the file
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)
+    content = buffer.getbuffer()[:-_DIGEST]
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        file.write(content)
+        file.write(_digest(content, about))
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def read_arrays(path: Path, about: str = "") -> dict[str, np.ndarray]:
+    """What `write_arrays` wrote.
+
+    Raises:
+        InputError: any bit differs, or the arrays are about something else.
+        OSError: there is no such file, or it cannot be read.
+    """
+    content = memoryview(path.read_bytes())
+    if content[-_DIGEST:] != _digest(content[:-_DIGEST], about):
+        raise InputError(f"{path}: expected arrays as they were written here, got others or damaged ones; delete it")
+    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+        return dict(archive)
+
+
+def _digest(content: memoryview, about: str) -> bytes:
+    digest = hashlib.sha256(content)
+    digest.update(about.encode("utf-8", "surrogateescape"))
+    return digest.digest()

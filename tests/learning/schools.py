@@ -1,0 +1,40 @@
+"""A small path with its matches, as the lessons of experiments.learn see it."""
+
+from dataclasses import fields
+
+import numpy as np
+
+from experiments import lessons
+from experiments.judging import Judge
+from mfvpr import Matches, Shortlist, sweeping
+from mfvpr.pipeline import MatchSet
+from tests.builders import random_matches
+
+QUERIES = 32
+TOLERANCES = (0, 1, 2)  # frames; the middle one decides
+SIZES = (96, 200)  # px, of every other image: the first is the smaller
+
+
+def matches_of(query, candidates, rng, sizes):
+    """Matches of one query with its candidates one after the other, and their counts; the right ones share a shift."""
+    pairs = [random_matches(rng, int(rng.integers(4, 12)), sizes=((sizes[query % 2],) * 2, (sizes[c % 2],) * 2))
+             for c in candidates]  # fmt: skip
+    joined = {f.name: [getattr(pair, f.name) for pair in pairs] for f in fields(Matches)}
+    flat = {name: np.concatenate(parts) for name, parts in joined.items() if "size" not in name}
+    flat |= {"image_size0": pairs[0].image_size0, "image_size1": np.stack(joined["image_size1"])}
+    return Matches(**flat), [len(pair.mask) for pair in pairs]
+
+
+def school(settings=None, *, sizes=SIZES, half=0):
+    """The school of one half; every query has all frames as candidates, in an order of its own."""
+    rng = np.random.default_rng(0)
+    indices = np.stack([rng.permutation(QUERIES) for _ in range(QUERIES)]).astype(np.int32)
+    scores = -np.sort(-rng.random(indices.shape).astype(np.float32), axis=1)
+    candidates = Shortlist(indices=indices, scores=scores, mask=np.ones(indices.shape, bool))
+    found = [matches_of(query, indices[query], rng, sizes) for query in range(QUERIES)]
+    matches = MatchSet([one for one, _ in found], np.array([counts for _, counts in found]), 16)
+    apart = np.abs(np.arange(QUERIES)[:, None] - np.arange(QUERIES))
+    positives = [apart <= tolerance for tolerance in TOLERANCES]
+    judge = Judge(TOLERANCES, "frames", positives, sweeping.halves(positives[-1]), [])
+    settings = {"split": "both", "ties": "filter", "seed": 0, "batch": 4, "hidden": 5} | (settings or {})
+    return list(lessons._schools(settings, matches, candidates, judge))[half]
