@@ -14,7 +14,11 @@ PROGRAMS = {"config": "evaluate", "sweep": "sweep", "learn": "learn"}  # by thei
 
 def defaults(file: Path) -> list[Any]:
     """The defaults list of a file of conf/."""
-    return (yaml.safe_load(file.read_text(encoding="utf-8")) or {}).get("defaults", [])
+    return _read(file).get("defaults", [])
+
+
+def _read(file: Path) -> dict[str, Any]:
+    return yaml.safe_load(file.read_text(encoding="utf-8")) or {}
 
 
 def groups(config: str) -> dict[str, str | None]:
@@ -43,9 +47,9 @@ def check_choice(name: str, value: str, config: str) -> None:
         config: of the program.
     """
     known, own = choices(name), groups(config)
-    if name not in own and not {*value.split(",")} & {*known}:
-        return
-    if name not in own:
+    if known and name not in own:
+        if name in _read(CONF / f"{config}.yaml"):
+            raise SettingsError(f"{name}={value}: this is a group of settings; set one of its members (see --help)")
         others = [program for other, program in PROGRAMS.items() if name in groups(other)]
         typed = " or ".join(f"python -m experiments.{program} {name}={value}" for program in others)
         raise SettingsError(f"{name}={value}: experiments.{PROGRAMS[config]} has no group {name}; type {typed}")
