@@ -7,14 +7,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from experiments.launch import CONF
 from experiments.settings import RULES, check
 from tests import checkpoints
+from tests.builders import make_matches
 from tests.test_experiments import QUICK, ROOT, composed, run
 
 README = (ROOT / "README.md").read_text()
+BESIDE = [(ROOT / place).read_text() for place in ("experiments/results.md", "conf/README.md")]
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", README, flags=re.DOTALL)
 COMMANDS = [line for language, block in BLOCKS if language == "sh" for line in block.splitlines()]
 
@@ -74,25 +77,42 @@ def test_benchmark_runs(tmp_path):
     assert out.is_file()
 
 
-@pytest.mark.parametrize("code", [block for language, block in BLOCKS if language == "python"])
-def test_library_example(code, small_street, tmp_path, monkeypatch, capsys):
-    assert len([line for line in code.splitlines() if line.strip() and "import" not in line]) <= 10
+EXAMPLES = [block for language, block in BLOCKS if language == "python"]
+
+
+def lines(code):
+    return [line for line in code.splitlines() if line.strip()]
+
+
+def test_library_example(small_street, tmp_path, monkeypatch, capsys):
+    assert len([line for line in lines(EXAMPLES[0]) if "import" not in line]) <= 10
     shutil.copy(small_street / "queries" / "0004.png", tmp_path / "query.jpg")
     shutil.copy(small_street / "database" / "0004.png", tmp_path / "candidate.jpg")
     monkeypatch.chdir(tmp_path)
-    exec(compile(code, "README.md", "exec"), {})
+    exec(compile(EXAMPLES[0], "README.md", "exec"), {})
     printed = capsys.readouterr().out
     for name in ("HistogramOfShifts", "AnchorPoints", "AggregatedScore", "candidate minus query"):
         assert name in printed
 
 
+def test_a_scorer_of_your_own_keeps_the_contract():
+    """The example checks itself; what it scores is the number of matches that agree."""
+    code, made = EXAMPLES[1], {}
+    assert len(lines(code)) <= 15
+    exec(compile(code, "README.md", "exec"), made)
+    points = np.random.default_rng(0).uniform(50, 250, (12, 2))
+    assert made["Concentration"]()(make_matches(points, points + 30)) == pytest.approx(12)
+    assert len(EXAMPLES) == 2
+
+
 def test_settings_that_the_text_names_exist():
-    names = re.findall(r"`(?:[\w.]+\.)?(\w+)=[^`(]*`", README)
+    names = re.findall(r"`(?:[\w.]+\.)?(\w+)=[^`(]*`", "".join([README, *BESIDE]))
     assert len(names) > 20
     groups = {path.name for path in CONF.iterdir() if path.is_dir()}
     assert set(names) <= {rule.rpartition(".")[2] for rule in RULES} | groups
 
 
 def test_readme_names_no_machine_path():
-    assert not re.search(r"/(work|tmp|root|home)/", README)
+    assert not re.search(r"/(work|tmp|root|home)/", "".join([README, *BESIDE]))
+    assert len(README.splitlines()) <= 250
     assert Path(ROOT / "LICENSE").read_text().startswith("MIT")
