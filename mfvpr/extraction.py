@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -43,6 +43,15 @@ class FeatureSet:
 
     features: Features
     bad: Mapping[int, str]
+
+    @classmethod
+    def of(cls, images: Sequence[Features]) -> "FeatureSet":
+        """Features of your own, image by image `[N_i, ...]`, of as many keypoints as each has; padding is dropped."""
+        real = [
+            replace(image, **{name: np.asarray(getattr(image, name))[np.asarray(image.mask)] for name in _PER_KEYPOINT})
+            for image in images
+        ]
+        return cls(_stack(enumerate(real), np.array([len(image.mask) for image in real])), {})
 
     def __len__(self) -> int:
         return len(self.features.mask)

@@ -1,16 +1,18 @@
 """Features of a folder through a store: extracted once, whatever happens in between."""
 
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from mfvpr import pipeline
+from mfvpr import match, pipeline
 from mfvpr.data.datasets import image_folder
 from mfvpr.data.feature_store import forecast_bytes, open_store
 from mfvpr.features.sift import Sift
 from mfvpr.types import Features
+from tests.builders import make_features
 
 SIFT = Sift(max_keypoints=60, batch_size=3)
 
@@ -177,3 +179,19 @@ def test_a_forecast_is_not_exceeded(folder, opened):
         forecast = forecast_bytes(len(folder), 700, 512)
         assert 0.8 * forecast < store.size_bytes <= forecast + 100_000  # folders and what describes the arrays
         assert store.size_bytes <= 0.55 * 2064 * 700 * len(folder)
+
+
+def test_features_of_ones_own_are_matched_as_they_are():
+    """As hloc keeps them: half precision, another number in every image; and padded ones."""
+    rng = np.random.default_rng(0)
+    images = [make_features(rng, count, capacity=40) for count in (7, 0, 40, 33)]
+    images[2] = replace(images[2], descriptors=images[2].descriptors.astype(np.float16).astype(np.float32))
+    found = pipeline.FeatureSet.of(images)
+    assert len(found) == 4
+    assert found.features.mask.sum(axis=1).tolist() == [7, 0, 40, 33]
+    candidates = pipeline.shortlist(np.eye(4, dtype=np.float32), np.ones((4, 4), np.float32) / 2, 4)
+    matches = pipeline.match(found, found, candidates)
+    for query, row in ((0, 2), (2, 3), (3, 0), (1, 2)):
+        alone = match(images[query], images[row])
+        place = candidates.indices[query].tolist().index(row)
+        assert matches.counts[query, place] == alone.mask.sum()
