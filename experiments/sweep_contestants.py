@@ -1,7 +1,9 @@
-"""Who takes part in the benchmark of sweeps: a grid of the histogram's parameters, and what it is made of."""
+"""Who takes part in the benchmark of sweeps: grids of the scores' parameters, mfvpr's and NumPy's."""
 
+import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -11,34 +13,45 @@ import numpy as np
 import mfvpr
 from experiments import contestants
 from experiments.contestants import CANDIDATES, SIZE, Entry, Lineup
+from experiments.numpy_sweeps import Workers, flush_denormals
 from mfvpr.types import Matches
+from mfvpr.weighting import match_weights
 
 SIGMAS, BIN_SIZES = (5.0, 10.0, 15.0, 22.5, 30.0, 45.0), (5.0, 10.0, 15.0, 20.0)  # px
+WEIGHTS = (mfvpr.FeatureScoreWeight(), mfvpr.DescriptorDistanceWeight(), mfvpr.UnitWeight())
+DISTANCE_SHARES = (0.25, 0.5, 0.75, 1.0)  # of the matches are nearer than the four distances
 WINDOWS, TOLERANCES = (4.0, 6.0, 8.0, 10.0, 12.0), (1.0, 2.0, 3.0, 4.0, 5.0)  # cells
 SLOTS = 256
-HISTOGRAM, WEIGHTED, ANCHOR = (
-    "histogram, 6 x 4 grid",
-    "histogram, 6 x 4 x 3 weights x 4 distances",
-    "anchor, 5 x 5 grid",
-)
-SETTINGS = {HISTOGRAM: 24, WEIGHTED: 24 * 12, ANCHOR: 25}
+HISTOGRAM, WEIGHTED, ANCHOR = "6 x 4 histograms", "6 x 4 x 3 weights x 4 distances", "5 x 5 anchors"
+SAME, OTHER = "same place", "other place"  # nearly all matches agree, none do
 
 
 def lineup() -> Lineup:
     """Everyone, on the same pairs."""
-    matches = _matches()
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    teams = {f"NumPy, {count} process{'es' * (count > 1)}": Workers(count) for count in sorted({1, cores})}
+    same = _matches()
+    places = {SAME: same, OTHER: _shuffled(same)}
+    flushed = "flushed for all" if flush_denormals() else "flushed for mfvpr only (NumPy needs torch for it)"
     return Lineup(
-        title=f"{CANDIDATES} pairs with {SLOTS} matches each",
-        setting={"pairs": CANDIDATES, "matches_per_pair": SLOTS, "sigma": SIGMAS, "bin_size": BIN_SIZES},
-        entries=[*_of_mfvpr(matches), *_bare_products(), *_of_numpy(matches)],
+        title=f"{CANDIDATES} pairs with {SLOTS} matches each; denormal floats {flushed}",
+        setting={
+            "pairs": CANDIDATES, "matches_per_pair": SLOTS, "sigma": SIGMAS, "bin_size": BIN_SIZES,
+            "denormals": flushed,
+        },
+        entries=[entry for place, pairs in places.items() for entry in _histograms(place, pairs, teams)]
+        + _anchors(same),
         rounds=7,
         remarks=_remarks,
-    )
+    )  # fmt: skip
 
 
 def _remarks(seconds: Mapping[tuple[str, str], list[float]], results: Mapping[tuple[str, str], Any]) -> Iterable[str]:
     for (step, name), taken in seconds.items():
-        yield f"{step}, {name}: {CANDIDATES * SETTINGS[step] / np.median(taken):,.0f} pair-scores per second"
+        ours = np.asarray(results[step, "mfvpr"])
+        rate = f"{step}, {name}: {ours.size / np.median(taken):,.0f} pair-scores per second"
+        theirs = np.asarray(results[step, name]).reshape(ours.shape)
+        yield rate if name == "mfvpr" else f"{rate}, scores differ by {np.max(abs(theirs / ours - 1)):.1e} at most"
 
 
 def _matches() -> Matches:
@@ -48,62 +61,39 @@ def _matches() -> Matches:
     return jax.device_put(replace(matches, mask=jnp.ones_like(matches.mask)))
 
 
-def _of_mfvpr(matches: Matches) -> list[Entry]:
-    weights = [mfvpr.FeatureScoreWeight(), mfvpr.DescriptorDistanceWeight(), mfvpr.UnitWeight()]
-    distances = (0.6, 0.9, 1.2, 2.0)
+def _shuffled(matches: Matches) -> Matches:
+    """As between images of different places, which is what most pairs of a sweep are: points that do not correspond."""
+    order = np.random.default_rng(0).permuted(np.tile(np.arange(SLOTS), (CANDIDATES, 1)), axis=1)
+    return replace(matches, points1=jnp.take_along_axis(matches.points1, order[..., None], axis=1))
 
-    def grid(scorer: Any, **axes: Any) -> Callable[[], Any]:
-        return lambda: jax.block_until_ready(mfvpr.score_grid(scorer, matches, **axes))
 
-    histogram, shared = mfvpr.HistogramOfShifts(), {"sigma": SIGMAS, "bin_size": BIN_SIZES}
+def _histograms(place: str, matches: Matches, teams: Mapping[str, Workers]) -> list[Entry]:
+    distances = np.quantile(np.asarray(matches.distance), DISTANCE_SHARES).astype(np.float32)
+    shared = {"sigma": SIGMAS, "bin_size": BIN_SIZES}
+    steps = {HISTOGRAM: shared, WEIGHTED: shared | {"weight": WEIGHTS, "max_distance": distances}}
+    near = (np.asarray(matches.distance)[:, None] <= distances[:, None]).astype(np.float32)  # [C, 4, K]
+    kinds = [np.asarray(jax.vmap(partial(match_weights, weight))(matches)) for weight in WEIGHTS]
+    every = np.concatenate([kind[:, None] * near for kind in kinds], axis=1)
+    weights = {HISTOGRAM: kinds[0][:, None], WEIGHTED: every}
+    shifts = np.asarray(matches.points1 - matches.points0)
+
+    def numpy_grid(team: Workers, weights: np.ndarray) -> Callable[[], Any]:
+        return lambda: team(shifts, weights, SIGMAS, BIN_SIZES, SIZE)
+
+    found = []
+    for step, axes in steps.items():
+        found.append((f"{step}, {place}", "mfvpr", _grid(mfvpr.HistogramOfShifts(), matches, **axes)))
+        found += [(f"{step}, {place}", name, numpy_grid(team, weights[step])) for name, team in teams.items()]
+    return found
+
+
+def _anchors(matches: Matches) -> list[Entry]:
+    axes = {"window": WINDOWS, "tolerance": TOLERANCES}
     return [
-        (HISTOGRAM, "mfvpr", grid(histogram, **shared)),
-        (WEIGHTED, "mfvpr", grid(histogram, **shared, weight=weights, max_distance=distances)),
-        (ANCHOR, "mfvpr", grid(mfvpr.AnchorPoints(), window=WINDOWS, tolerance=TOLERANCES)),
+        (f"{ANCHOR}, {cells} cells a side", "mfvpr", _grid(mfvpr.AnchorPoints(num_bins=cells), matches, **axes))
+        for cells in (10, 15, 20)
     ]
 
 
-def _bare_products() -> list[Entry]:
-    """What a histogram cannot do without: the product of its votes along y and x, and its largest entry."""
-    rng = np.random.default_rng(0)
-    bins = [int(np.ceil(2 * SIZE / size)) for size in BIN_SIZES]
-    votes = [jax.device_put(rng.random((2, CANDIDATES, count, SLOTS)).astype(np.float32)) for count in bins]
-
-    @jax.jit
-    def one(votes: list[jax.Array]) -> list[jax.Array]:
-        exact = jax.lax.Precision.HIGHEST
-        return [jnp.max(jnp.matmul(y, x.mT, precision=exact), axis=(1, 2)) for y, x in votes]
-
-    def repeated(times: int) -> Callable[[], Any]:
-        return lambda: [jax.block_until_ready(one(votes)) for _ in range(times)]
-
-    return [(HISTOGRAM, "bare product (JAX)", repeated(len(SIGMAS))), (WEIGHTED, "bare product (JAX)", repeated(72))]
-
-
-def _of_numpy(matches: Matches) -> list[Entry]:
-    """Pair by pair and setting by setting, all bins and matches of a pair at once."""
-    shifts, weights = np.asarray(matches.points1 - matches.points0), np.asarray(matches.scores0 + matches.scores1)
-
-    def broadcast() -> list[float]:
-        found = []
-        for size in BIN_SIZES:
-            centers = np.arange(-SIZE + size / 2, SIZE + size / 2, size, dtype=np.float32)
-            x, y = (np.square(centers[None] - shifts[:, :, axis, None]) for axis in (0, 1))  # [C, K, B]
-            for sigma in SIGMAS:
-                for of_x, of_y, weight in zip(x, y, weights, strict=True):
-                    votes = np.exp((of_x[:, None] + of_y[:, :, None]) * np.float32(-0.5 / sigma**2))
-                    found.append(float(np.tensordot(weight, votes, 1).max()))
-        return found
-
-    def separable() -> list[float]:
-        found = []
-        for size in BIN_SIZES:
-            centers = np.arange(-SIZE + size / 2, SIZE + size / 2, size, dtype=np.float32)
-            x, y = (np.square(centers[:, None] - shifts[:, None, :, axis]) for axis in (0, 1))  # [C, B, K]
-            for sigma in SIGMAS:
-                scale = np.float32(-0.5 / sigma**2)
-                for of_x, of_y, weight in zip(x, y, weights, strict=True):
-                    found.append(float((np.exp(of_y * scale) * weight @ np.exp(of_x * scale).T).max()))
-        return found
-
-    return [(HISTOGRAM, "NumPy, broadcast", broadcast), (HISTOGRAM, "NumPy, separable", separable)]
+def _grid(scorer: Any, matches: Matches, **axes: Any) -> Callable[[], Any]:
+    return lambda: jax.block_until_ready(mfvpr.score_grid(scorer, matches, **axes))

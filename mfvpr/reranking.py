@@ -4,7 +4,9 @@ Scorers know one pair; here is where `vmap` (over candidates) and `lax.map` (ove
 """
 
 import difflib
+import os
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -55,34 +57,43 @@ def score_settings(
         weightings: `[W]` values of what only says how much a match counts, which is cheap to vary: `max_distance`
             (matches further apart do not count) and `weight` (an option of the scorer's `ChosenWeight`); none: W = 1.
     """
+    if isinstance(scorer, HistogramOfShifts):  # its Gaussians are the same for all weightings
+        weights = jax.vmap(partial(_weights_of, scorer, weightings))(matches)
+        return _map(lambda setting: with_parameters(scorer, setting).all_reweighted(matches, weights).T, settings)
 
     def one(setting: dict[str, Array]) -> Array:
         chosen = with_parameters(scorer, setting)
-        return jax.vmap(partial(_score_weightings, chosen, weightings=weightings), out_axes=-1)(matches)
+        return jax.vmap(partial(_score_weightings, chosen, weightings), out_axes=-1)(matches)
 
     return _map(one, settings)
 
 
-def _score_weightings(scorer: Any, matches: Matches, weightings: Mapping[str, Array]) -> Array:
-    """Scores `[W]` of one pair."""
+def _weighted(scorer: Any, matches: Matches, weighting: Mapping[str, Array]) -> tuple[Any, Matches]:
+    """A scorer with its weight, and the matches that count."""
+    near = filter_matches(matches, max_distance=weighting.get("max_distance"))
+    if "weight" not in weighting:
+        return scorer, near
+    return replace(scorer, weight=replace(scorer.weight, index=weighting["weight"])), near
 
-    def weighted(weighting: dict[str, Array]) -> tuple[Any, Matches]:
-        near = filter_matches(matches, max_distance=weighting.get("max_distance"))
-        if "weight" not in weighting:
-            return scorer, near
-        return replace(scorer, weight=replace(scorer.weight, index=weighting["weight"])), near
 
-    def weights(weighting: dict[str, Array]) -> Array:
-        chosen, near = weighted(weighting)
+def _weights_of(scorer: Any, weightings: Mapping[str, Array], matches: Matches) -> Array:
+    """Weights `[W, K]` of one pair's matches."""
+
+    def one(weighting: dict[str, Array]) -> Array:
+        chosen, near = _weighted(scorer, matches, weighting)
         return match_weights(chosen.weight, near)
 
-    def score(weighting: dict[str, Array]) -> Array:
-        chosen, near = weighted(weighting)
+    return jax.vmap(one)(dict(weightings)) if weightings else one({})[None]
+
+
+def _score_weightings(scorer: Any, weightings: Mapping[str, Array], matches: Matches) -> Array:
+    """Scores `[W]` of one pair."""
+
+    def one(weighting: dict[str, Array]) -> Array:
+        chosen, near = _weighted(scorer, matches, weighting)
         return chosen(near)
 
-    if isinstance(scorer, HistogramOfShifts):  # its Gaussians are the same for all weightings
-        return scorer.reweighted(matches, _map(weights, weightings))
-    return _map(score, weightings)
+    return _map(one, weightings)
 
 
 def _map(function: Callable[[dict[str, Array]], Array], values: Mapping[str, Array]) -> Array:
@@ -116,14 +127,41 @@ def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> 
     settings, weightings = _product(values, outer), _product(values, inner)
     rows = int(np.prod([len(values[name]) for name in outer]))
     parts = by_capacity(scorer, settings, rows, *_sizes(matches))
-    scores = [
-        score_settings(fitted, matches, {name: axis[part] for name, axis in settings.items()}, weightings)
-        for fitted, part in parts
-    ]
+
+    def score(matches: Matches) -> Array:
+        scores = [
+            score_settings(fitted, matches, {name: axis[part] for name, axis in settings.items()}, weightings)
+            for fitted, part in parts
+        ]
+        return jnp.concatenate(scores)
+
+    scores = _on_every_core(score, matches) if is_concrete((scorer, matches, values)) else score(matches)
     order = np.argsort(np.concatenate([part for _, part in parts]))
     names = outer + inner
-    found = jnp.concatenate(scores)[order].reshape(*(len(values[name]) for name in names), -1)
+    found = scores[order].reshape(*(len(values[name]) for name in names), -1)
     return jnp.moveaxis(found, range(len(names)), [list(axes).index(name) for name in names])
+
+
+def _on_every_core(function: Callable[[Matches], Array], matches: Matches) -> Array:
+    """`function` of matches `[C, K, ...]`, with the candidates along its last axis: a part of them on every core.
+
+    Elsewhere than on a CPU, with settings of JAX's that other threads would not know, or few candidates: at once.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = len(matches.mask)
+    own = jnp.zeros(0).dtype != jnp.float32 or jax.config.values["jax_default_device"] is not None
+    if cores == 1 or count < 4 * cores or own or jax.default_backend() != "cpu":
+        return function(matches)
+    size = -(-count // cores)
+    starts = [min(core * size, count - size) for core in range(cores)]  # of one size, hence one program: some overlap
+
+    def part(start: int) -> Array:
+        return jax.block_until_ready(function(jax.tree.map(lambda leaf: leaf[start : start + size], matches)))
+
+    with ThreadPoolExecutor(cores) as pool:
+        found = list(pool.map(part, starts))
+    new = [core * size - start for core, start in enumerate(starts)]
+    return jnp.concatenate([scores[..., skip:] for scores, skip in zip(found, new, strict=True)], axis=-1)
 
 
 def _product(values: Mapping[str, Array], names: Sequence[str]) -> dict[str, Array]:

@@ -27,7 +27,8 @@ class AnchorPoints:
     tolerance 1 and unit cell weights it counts exact agreements, as SSM-VPR does.
 
     Attributes:
-        num_bins: cells per side; memory grows with its fourth power.
+        num_bins: cells per side; memory grows with the square of their number, or of the
+            matches' where these are fewer.
         window: width of the square window around an anchor, cells.
         tolerance: largest distance of two displacements that still counts, cells.
         weight: match weight, FS by default as in the paper.
@@ -62,41 +63,52 @@ class AnchorPoints:
     def __call__(self, matches: Matches) -> Array:
         """Score of one pair, `[]` float32."""
         cells = self._cells if self.temperature is None else self._soft_cells
-        rows, columns, occupancy, weights = cells(matches)
+        index, rows, columns, occupancy, weights = cells(matches)
         # Two [cells, cells] planes, not one array with a trailing axis of 2, which costs nine times as much on a CPU.
         distance = safe_sqrt((rows[:, None] - rows[None]) ** 2 + (columns[:, None] - columns[None]) ** 2)
-        support = masked(jnp.maximum(self.tolerance - distance, 0.0), self._neighbors()) * occupancy[None]
+        support = masked(jnp.maximum(self.tolerance - distance, 0.0), self._neighbors(index)) * occupancy[None]
         return jnp.sum(weights * jnp.sum(support, axis=1))
 
-    def _cells(self, matches: Matches) -> tuple[Array, Array, Array, Array]:
-        """Per cell of the first image, all `[cells]`: displacement in rows and in columns, occupancy, weight."""
+    def _cells(self, matches: Matches) -> tuple[Array, Array, Array, Array, Array]:
+        """Row-major number of some cells of the first image, all that are occupied among them, and of each of them:
+        displacement in rows and in columns, occupancy, weight."""
         num_cells = self.num_bins**2
         weights = match_weights(self.weight, matches)
         anchor, target = (self._cell(position) for position in self._positions(matches))
+        few = len(anchor) < num_cells
 
         vote = anchor * num_cells + target
-        votes = jnp.zeros(num_cells**2, weights.dtype).at[vote].add(weights)
-        strength = jax.lax.stop_gradient(votes[vote])  # [K]; which cell wins has no gradient, its weight below has
+        # Which cell wins has no gradient, its weight below has.
+        strength = jax.lax.stop_gradient(_sums_by_key(weights, vote, num_cells**2, pairwise=few))  # [K]
         real = match_confidence(matches) > 0
         member = jnp.where(real, anchor, num_cells)  # out of range: what is no match is dropped
         best = jnp.full(num_cells, -jnp.inf, weights.dtype).at[member].max(strength, mode="drop")
         contender = jnp.where(strength == best[anchor], target, num_cells)
         winner = jnp.full(num_cells, num_cells, jnp.int32).at[member].min(contender, mode="drop")
 
-        cells = jnp.arange(num_cells, dtype=jnp.int32)
-        occupied = winner < num_cells
-        winner = jnp.where(occupied, winner, cells)
-        rows, columns = winner // self.num_bins - cells // self.num_bins, winner % self.num_bins - cells % self.num_bins
-        cell_weights = {
-            "winner_sum": lambda: votes[cells * num_cells + winner],
-            "cell_sum": lambda: jnp.sum(votes.reshape(num_cells, num_cells), axis=1),
-            "ones": lambda: jnp.ones(num_cells, weights.dtype),
+        if few:  # every match stands for its cell, of which the first counts
+            number = jnp.arange(len(anchor), dtype=jnp.int32)
+            first = jnp.full(num_cells, len(anchor), jnp.int32).at[member].min(number, mode="drop")
+            cells, occupied = anchor, real & (first[anchor] == number)
+        else:
+            cells = jnp.arange(num_cells, dtype=jnp.int32)
+            occupied = winner < num_cells
+        won = jnp.where(occupied, winner[cells], cells)
+        rows, columns = won // self.num_bins - cells // self.num_bins, won % self.num_bins - cells % self.num_bins
+        counted = {
+            "winner_sum": lambda: jnp.where(target == winner[anchor], weights, 0.0),
+            "cell_sum": lambda: weights,
+            "ones": lambda: None,
         }[self.cell_weight]()
+        if counted is None:
+            cell_weights = jnp.ones_like(occupied, weights.dtype)
+        else:
+            cell_weights = jnp.zeros(num_cells, weights.dtype).at[anchor].add(counted)[cells]
         rows, columns, occupancy = (values.astype(weights.dtype) for values in (rows, columns, occupied))
-        return rows, columns, occupancy, masked(cell_weights, occupied)
+        return cells, rows, columns, occupancy, masked(cell_weights, occupied)
 
-    def _soft_cells(self, matches: Matches) -> tuple[Array, Array, Array, Array]:
-        """As `_cells`, smooth in points and weights."""
+    def _soft_cells(self, matches: Matches) -> tuple[Array, Array, Array, Array, Array]:
+        """As `_cells`, of all cells, smooth in points and weights."""
         weights = match_weights(self.weight, matches)
         temperature = positive(self.temperature, weights.dtype)
         anchor, target = (self._membership(position, temperature) for position in self._positions(matches))
@@ -108,14 +120,15 @@ class AnchorPoints:
         share = votes / jnp.maximum(most, jnp.finfo(votes.dtype).tiny ** 0.5)
         chosen = jax.nn.softmax(jnp.log(jnp.maximum(share, _LEAST_SHARE)) / temperature, axis=1)
 
-        row, column = jnp.divmod(jnp.arange(self.num_bins**2, dtype=votes.dtype), self.num_bins)
+        cells = jnp.arange(self.num_bins**2, dtype=jnp.int32)
+        row, column = (index.astype(votes.dtype) for index in jnp.divmod(cells, self.num_bins))
         rows, columns = (jnp.sum(chosen * index[None], axis=1) - index for index in (row, column))
         cell_weights = {
             "winner_sum": lambda: jnp.sum(chosen * votes, axis=1),
             "cell_sum": lambda: jnp.sum(votes, axis=1),
             "ones": lambda: occupancy,
         }[self.cell_weight]()
-        return rows, columns, occupancy, cell_weights
+        return cells, rows, columns, occupancy, cell_weights
 
     def _positions(self, matches: Matches) -> tuple[Array, Array]:
         """`[K, 2]` (x, y) of all points of the anchors' image and of the other, in cells; 0 on padding."""
@@ -136,15 +149,14 @@ class AnchorPoints:
         along = jax.nn.softmax(-(distance**2) / temperature, axis=-1)  # [K, (x, y), bins]
         return (along[:, 1, :, None] * along[:, 0, None, :]).reshape(len(position), self.num_bins**2)
 
-    def _neighbors(self) -> Array:
-        """`[cells, cells]` True where the second cell lies in the window around the first."""
-        index = jnp.arange(self.num_bins, dtype=float)
-        offset = index[None] - index[:, None]
+    def _neighbors(self, cells: Array) -> Array:
+        """`[n, n]` True where the second of some cells `[n]` lies in the window around the first."""
         low, high = self._reach()
-        near = (offset >= low) & (offset <= high)  # [bins, bins], along either axis
-        inside = near[:, None, :, None] & near[None, :, None, :]
-        inside = inside.reshape(self.num_bins**2, self.num_bins**2)
-        return inside if self.include_self else inside & ~jnp.eye(len(inside), dtype=bool)
+        row, column = (index.astype(float) for index in jnp.divmod(cells, self.num_bins))
+        offsets = row[None] - row[:, None], column[None] - column[:, None]
+        row_near, column_near = ((offset >= low) & (offset <= high) for offset in offsets)
+        inside = row_near & column_near
+        return inside if self.include_self else inside & (cells[None] != cells[:, None])
 
     def _reach(self) -> tuple[Array, Array]:
         """Lowest and highest offset of a neighbor."""
@@ -158,3 +170,10 @@ class AnchorPoints:
             half = jnp.floor((window - 1) / 2)
             return -half, half
         return -window, window
+
+
+def _sums_by_key(values: Array, keys: Array, num_keys: int, *, pairwise: bool) -> Array:
+    """`[K]` for each, the sum of all `values` `[K]` of its key."""
+    if pairwise:  # few values and very many keys
+        return jnp.sum(jnp.where(keys[:, None] == keys[None], values[:, None], 0.0), axis=0)
+    return jnp.zeros(num_keys, values.dtype).at[keys].add(values)[keys]

@@ -17,6 +17,7 @@ from mfvpr.errors import InputError
 from mfvpr.numerics import compiled, is_concrete, masked, positive, round_up
 from mfvpr.scoring.choices import check_choices, choice
 from mfvpr.scoring.shifts import image_sizes, match_shifts
+from mfvpr.scoring.tallest import Lattice, tallest_bins
 from mfvpr.types import Array, Matches, value
 from mfvpr.weighting import FeatureScoreWeight, Weight, match_weights
 
@@ -96,6 +97,24 @@ class HistogramOfShifts:
         found = score(weights[0])[None] if len(weights) == 1 else jax.lax.map(score, weights)
         return jnp.where(jnp.any(matches.mask), jnp.where(fits, found, jnp.nan), 0.0)
 
+    def all_reweighted(self, matches: Matches, weights: Array) -> Array:
+        """`reweighted` of pairs `[C, K, ...]` by weights `[C, W, K]`: scores `[C, W]`, quick where there are many.
+
+        On a CPU pair by pair, which keeps what is worked on in the cache, and by branch and bound where that pays:
+        the largest of all bins either way, but how long it takes depends on the data.
+        """
+        every = jax.vmap(self.reweighted)
+        if self.temperature is not None:
+            return every(matches, weights)
+        return jax.lax.platform_dependent(matches, weights, cpu=self._pair_by_pair, default=every)
+
+    def _pair_by_pair(self, matches: Matches, weights: Array) -> Array:
+        capacity, shifts = self._capacity(matches), jax.vmap(self._planes)(matches)
+        lattice = jax.vmap(self._lattice_of)(matches)
+        found = jax.lax.map(lambda pair: tallest_bins(*pair, capacity), (shifts, weights, lattice))
+        fits = jnp.all(lattice.num_bins <= capacity, axis=1)[:, None]
+        return jnp.where(jnp.any(matches.mask, axis=1)[:, None], jnp.where(fits, found, jnp.nan), 0.0)
+
     def histogram(self, matches: Matches) -> ShiftHistogram:
         """All bins of one pair with their centers."""
         scores, centers, inside, fits = self._vote(matches)
@@ -168,13 +187,19 @@ class HistogramOfShifts:
 
     def _votes(self, matches: Matches) -> tuple[Array, Array, Array, Array, Array]:
         """Votes `[B, K]` along x and along y, without weights; centers, bins in range and whether they fit."""
-        shifts = self._shifts(matches)
+        shifts = self._planes(matches)
         first, num_bins = self._lattice(*image_sizes(matches), shifts.dtype, jnp)
         index = jnp.arange(self._capacity(matches), dtype=shifts.dtype)[:, None]
         centers = first[None] + index * jnp.asarray(self.bin_size, dtype=shifts.dtype)
         inside = index < num_bins[None]  # [B, 2]
-        votes = (self._gaussian(centers[:, axis], shifts[:, axis]) for axis in (0, 1))
+        votes = (self._gaussian(centers[:, axis], shifts[axis]) for axis in (0, 1))
         return *votes, centers, inside[:, 1:] & inside[None, :, 0], jnp.all(num_bins <= len(index))
+
+    def _lattice_of(self, matches: Matches) -> Lattice:
+        """Of one pair."""
+        dtype = self._shifts(matches).dtype
+        bin_size, truncate = (jnp.asarray(number, dtype=dtype) for number in (self.bin_size, self.truncate))
+        return Lattice(*self._lattice(*image_sizes(matches), dtype, jnp), bin_size, self._deviation(dtype), truncate)
 
     def _capacity(self, matches: Matches) -> int:
         capacity = self._for(matches).max_bins
@@ -206,6 +231,11 @@ class HistogramOfShifts:
     def _shifts(self, matches: Matches) -> Array:
         shifts = match_shifts(matches)
         return shifts if self.direction == "candidate_minus_query" else -shifts
+
+    def _planes(self, matches: Matches) -> Array:
+        """`[2, K]` shifts along x and along y."""
+        # Contiguous for good: strided coordinates would keep the exponentials from being vectorized.
+        return jax.lax.optimization_barrier(self._shifts(matches).T)
 
     def _deviation(self, dtype: Any) -> Array:
         sigma = positive(self.sigma, dtype)

@@ -1,0 +1,173 @@
+"""The tallest bin of a histogram of shifts without most of its bins: branch and bound.
+
+Bins are cut into square blocks. A cheap upper bound of every block's bins is one product of about a hundredth of the
+histogram's size; then the most promising blocks are evaluated bin by bin, until no other block's bound exceeds the
+tallest bin found. Lengths are pixels.
+
+Why nothing is lost. With w+ = max(w, 0), every bin c of a block holds at most
+
+- sum_k w+_k max_c g(x_k - c_x) max_c g(y_k - c_y), the vote for the block's column and row nearest to the match; and
+- e^(h^2 / 4 s^2) times the largest of the untruncated sums at the corners of the square of width h that holds the
+  block's bins: with c counted from its middle, f(c) e^(|c|^2 / 2 s^2) is a sum of exponentials of linear functions of
+  c with weights w+, hence convex, hence largest at a corner, where |c|^2 = h^2 / 2.
+
+The first is used where blocks are wider than the deviation s, the second elsewhere, where it is the closer one. Bounds
+are raised by a relative 2^-10 + K 2^-22, more than float32 rounds off sums of K votes (down to 1e-35 of a weight), and
+a block is left out only where its raised bound does not exceed a bin that was evaluated. So no vote is neglected: the
+result is the maximum over all bins, as exact as their float32 sums, whatever the weights, the deviation or `truncate`.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from mfvpr.types import Array
+
+BLOCKS_AT_ONCE = 4
+MOST_ROUNDS = 16  # after them all bins cost less
+WORTHWHILE = 2**13  # bins times weightings from which on a bound costs less than all bins
+_SLACK = 2**-10  # of a bound: rounded positions and exponentials
+_SLACK_PER_MATCH = 2**-22  # of a bound: rounded sums
+
+
+class Lattice(NamedTuple):
+    """Where the bins are, and how votes fall off.
+
+    first, num_bins: `[2]` (x, y) center of the first bin, and how many there are.  bin_size, deviation, truncate: `[]`.
+    """
+
+    first: Array
+    num_bins: Array
+    bin_size: Array
+    deviation: Array
+    truncate: Array
+
+    def centers(self, axis: int, index: Array) -> Array:
+        """Of bins by their (whole) number along an axis."""
+        return self.first[axis] + index * self.bin_size
+
+
+def gaussian(distance: Array, deviation: Array, truncate: Array) -> Array:
+    """Votes of matches at a distance along one axis."""
+    sigmas = distance / deviation
+    return jnp.where(jnp.abs(sigmas) > truncate, 0.0, jnp.exp(-0.5 * sigmas**2))
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(3,))
+def tallest_bins(shifts: Array, weights: Array, lattice: Lattice, capacity: int) -> Array:
+    """Maximum over the bins in range `[W]`, by several weights `[W, K]` of one pair's matches.
+
+    Its derivative is that of the maximum over all bins.
+
+    Args:
+        shifts: `[2, K]` along x and along y.
+        weights: `[W, K]`, 0 on padding; if one of them is not finite, their maximum is NaN.
+        lattice: of at most `capacity` bins along each axis.
+        capacity: static.
+    """
+    find = _search if capacity**2 * len(weights) > WORTHWHILE else _all_bins
+    return find(shifts, weights, lattice, capacity)
+
+
+@tallest_bins.defjvp
+def _derivative(capacity: int, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    return jax.jvp(partial(_all_bins, capacity=capacity), primals, tangents)
+
+
+def _all_bins(shifts: Array, weights: Array, lattice: Lattice, capacity: int) -> Array:
+    index = jnp.arange(capacity, dtype=shifts.dtype)
+    votes_x, votes_y = (
+        gaussian(lattice.centers(axis, index)[:, None] - shifts[axis][None], lattice.deviation, lattice.truncate)
+        for axis in (0, 1)
+    )
+    inside = (index < lattice.num_bins[1])[:, None] & (index < lattice.num_bins[0])[None]
+
+    def tallest(weights: Array) -> Array:
+        bins = jnp.matmul(votes_y * weights[None], votes_x.T, precision=jax.lax.Precision.HIGHEST)
+        return jnp.max(bins, where=inside, initial=-jnp.inf)
+
+    return tallest(weights[0])[None] if len(weights) == 1 else jax.lax.map(tallest, weights)
+
+
+def _search(shifts: Array, weights: Array, lattice: Lattice, capacity: int) -> Array:
+    side = _side(capacity)
+    count = -(-capacity // side)
+    usable = jnp.all(jnp.isfinite(weights), axis=1)
+    bounds = _bounds(shifts, jnp.where(usable[:, None], weights, 0.0), lattice, side, count)
+
+    def promise(tallest: Array, left: Array) -> tuple[Array, Array]:
+        """The blocks whose bounds exceed the tallest bins most, and by which factor, of those that are left."""
+        below = jnp.where(tallest < 0, jnp.inf, 0.0)  # as negative weights can be: even a bin without votes is taller
+        tallest = jnp.where(tallest > 0, tallest, jnp.finfo(tallest.dtype).tiny)
+        factors = jnp.max(bounds / tallest[None, :, None] + below[None, :, None], axis=1).reshape(-1)
+        return jax.lax.top_k(jnp.where(left, factors, 0.0), min(BLOCKS_AT_ONCE, count**2))
+
+    def step(state: tuple) -> tuple:
+        rounds, tallest, left, _, blocks = state
+        tallest = jnp.maximum(tallest, _evaluate(blocks, shifts, weights, lattice, side, count))
+        left &= jnp.all(numbers[:, None] != blocks[None], axis=1)
+        return rounds + 1, tallest, left, *promise(tallest, left)
+
+    numbers, left = jnp.arange(count**2, dtype=jnp.int32), jnp.ones(count**2, bool)
+    nothing = jnp.full(len(weights), -jnp.inf, bounds.dtype)
+    start = step((0, nothing, left, *promise(jnp.max(bounds, axis=(0, 2)), left)))
+    state = jax.lax.while_loop(lambda state: (state[3][0] > 1) & (state[0] < MOST_ROUNDS), step, start)
+    _, tallest, _, factors, _ = state
+    return jax.lax.cond(
+        factors[0] > 1,  # a field so flat that all bins are nearly as tall
+        lambda: _all_bins(shifts, weights, lattice, capacity),
+        lambda: jnp.where(usable, tallest, jnp.nan),
+    )
+
+
+def _side(capacity: int) -> int:
+    """Bins along a side of a block."""
+    return 2 if capacity <= 48 else 3 if capacity <= 96 else 4 if capacity <= 256 else 8
+
+
+def _bounds(shifts: Array, weights: Array, lattice: Lattice, side: int, count: int) -> Array:
+    """`[count (y), W, count (x)]` what no bin of a block exceeds, 0 for blocks out of range."""
+    width = side * lattice.bin_size
+    narrow = width <= lattice.deviation
+    start = side * jnp.arange(count + 1, dtype=shifts.dtype)
+    votes_x, votes_y = (_block_votes(shifts[axis], axis, start, lattice, side, narrow) for axis in (0, 1))
+    raised = jnp.maximum(weights, 0.0) * (1 + _SLACK + _SLACK_PER_MATCH * weights.shape[1])
+    columns = (raised[:, None] * votes_x[None]).reshape(-1, weights.shape[1])
+    sums = jnp.matmul(votes_y, columns.T, precision=jax.lax.Precision.HIGHEST)
+    sums = sums.reshape(count + 1, len(weights), count + 1)
+
+    corners = jnp.maximum(sums[1:], sums[:-1])
+    corners = jnp.maximum(corners[..., 1:], corners[..., :-1])
+    bounds = jnp.where(narrow, corners * jnp.exp((width / (2 * lattice.deviation)) ** 2), sums[:-1, :, :-1])
+    x, y = (start[:-1] < lattice.num_bins[axis] for axis in (0, 1))
+    return jnp.where(y[:, None, None] & x[None, None], bounds, 0.0)
+
+
+def _block_votes(shifts: Array, axis: int, start: Array, lattice: Lattice, side: int, narrow: Array) -> Array:
+    """`[count + 1, K]` along one axis: votes for a block's first bin where blocks are narrow, else for its nearest."""
+    last = lattice.num_bins[axis] - 1
+    lower = lattice.centers(axis, start)[:, None]
+    upper = lattice.centers(axis, jnp.minimum(start + (side - 1), last))[:, None]
+    below = jnp.floor((shifts - lattice.first[axis]) / lattice.bin_size)
+    neighbors = (lattice.centers(axis, jnp.clip(below + step, 0, last)) for step in (0, 1))
+    nearest = jnp.minimum(*(jnp.abs(shifts - center) for center in neighbors))  # of all bins
+    distance = jnp.maximum(jnp.maximum(lower - shifts[None], shifts[None] - upper), nearest[None])
+    distance = jnp.where(narrow, lower - shifts[None], distance)
+    return gaussian(distance, lattice.deviation, jnp.where(narrow, jnp.inf, lattice.truncate))
+
+
+def _evaluate(blocks: Array, shifts: Array, weights: Array, lattice: Lattice, side: int, count: int) -> Array:
+    """`[W]` tallest bin in range of some blocks `[n]`."""
+
+    def along(axis: int, block: Array) -> tuple[Array, Array]:
+        index = block.astype(shifts.dtype)[:, None] * side + jnp.arange(side, dtype=shifts.dtype)[None]
+        distance = lattice.centers(axis, index)[..., None] - shifts[axis][None, None]
+        return gaussian(distance, lattice.deviation, lattice.truncate), index < lattice.num_bins[axis]
+
+    (votes_x, inside_x), (votes_y, inside_y) = along(0, blocks % count), along(1, blocks // count)
+    votes = (votes_y[:, :, None] * votes_x[:, None]).reshape(-1, weights.shape[1])
+    inside = (inside_y[:, :, None] & inside_x[:, None]).reshape(-1)
+    bins = jnp.matmul(weights, votes.T, precision=jax.lax.Precision.HIGHEST)
+    return jnp.max(bins, axis=1, where=inside[None], initial=-jnp.inf)
