@@ -94,6 +94,7 @@ def report(contest: "Lineup", seconds: list[list[float]], results: list[Any], ou
     import numpy as np
 
     from mfvpr.data.files import write_text
+    from mfvpr.numerics import available_cpus
     from mfvpr.report.runs import versions
     from mfvpr.report.tables import Table
 
@@ -111,7 +112,7 @@ def report(contest: "Lineup", seconds: list[list[float]], results: list[Any], ou
     ]  # fmt: skip
     table = Table(["step", "who", "median, ms", "quartiles, ms", "/ mfvpr"], lines, text_columns=2)
     remarks = list(contest.remarks(dict(zip(names, seconds, strict=True)), dict(zip(names, results, strict=True))))
-    machine = {"device": jax.devices()[0].device_kind, "cores": os.cpu_count(), "processor": platform.machine()}
+    machine = {"device": jax.devices()[0].device_kind, "cores": available_cpus(), "processor": platform.machine()}
     setting = contest.setting | {"machine": machine, "versions": versions(), "rounds": len(seconds[0])}
     write_text(out, json.dumps(setting | {"remarks": remarks, "results": found}, indent=1) + "\n")
     print(f"\n{contest.title}; {machine}\n", table.text(), *remarks, f"results: {out}", sep="\n")

@@ -11,10 +11,9 @@ import numpy as np
 
 from mfvpr.data.datasets import ImageFolder
 from mfvpr.data.images import Interpolation, ordered_map, resize
-from mfvpr.data.threads import available_cpus
 from mfvpr.errors import InputError
 from mfvpr.features import GlobalExtractor, LocalExtractor
-from mfvpr.numerics import round_up
+from mfvpr.numerics import available_cpus, round_up
 from mfvpr.types import Features
 
 if TYPE_CHECKING:

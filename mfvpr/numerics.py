@@ -1,5 +1,6 @@
 """The few array idioms that every room shares: masked reductions, safe roots, capacities, and where `jit` begins."""
 
+import os
 from collections.abc import Callable
 from functools import partial, wraps
 from typing import Any, TypeVar
@@ -101,6 +102,13 @@ def held(tree: Tree) -> Tree:
 def is_concrete(tree: Any) -> bool:
     """True where no leaf is traced, so that Python may look at the values."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def available_cpus() -> int:
+    """Processors that this process may run on: fewer than the machine has where a scheduler or container says so."""
+    if hasattr(os, "sched_getaffinity"):  # Linux
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def platform(tree: Any) -> str:

@@ -4,7 +4,6 @@ Scorers know one pair; here is where `vmap` (over candidates) and `lax.map` (ove
 """
 
 import difflib
-import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -16,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mfvpr.matching import filter_matches
-from mfvpr.numerics import compiled, is_concrete, masked, masked_std
+from mfvpr.numerics import available_cpus, compiled, is_concrete, masked, masked_std, platform
 from mfvpr.scoring import HistogramOfShifts, Scorer
 from mfvpr.scoring.parameters import fit, numbers, with_parameters
 from mfvpr.types import Array, Matches, Ranking
@@ -147,10 +146,9 @@ def _on_every_core(function: Callable[[Matches], Array], matches: Matches) -> Ar
 
     Elsewhere than on a CPU, with settings of JAX's that other threads would not know, or few candidates: at once.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    count = len(matches.mask)
+    cores, count = available_cpus(), len(matches.mask)
     own = jnp.zeros(0).dtype != jnp.float32 or jax.config.values["jax_default_device"] is not None
-    if cores == 1 or count < 4 * cores or own or jax.default_backend() != "cpu":
+    if cores == 1 or count < 4 * cores or own or platform(matches) != "cpu":
         return function(matches)
     size = -(-count // cores)
     starts = [min(core * size, count - size) for core in range(cores)]  # of one size, hence one program: some overlap

@@ -28,7 +28,7 @@ ALLOWED = {
         "learning",
     },
     "evaluation": set(),
-    "data": {"errors", "evaluation", "types", "data"},
+    "data": {"errors", "evaluation", "numerics", "types", "data"},
     "models": {"errors", "numerics", "types", "models"},
     "weights": {"errors", "data", "models", "weights"},
     "features": {"errors", "types", "numerics", "data", "models", "features"},

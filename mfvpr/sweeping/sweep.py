@@ -18,9 +18,8 @@ import numpy as np
 from mfvpr import reranking
 from mfvpr.data.arrays import read_arrays, write_arrays
 from mfvpr.data.images import ordered_map
-from mfvpr.data.threads import available_cpus
 from mfvpr.errors import InputError
-from mfvpr.numerics import compiled
+from mfvpr.numerics import available_cpus, compiled
 from mfvpr.pipeline import FilterScore, MatchSet, Ties, Track, filter_scores, untracked
 from mfvpr.sweeping.batches import BYTES_PER_SLOT, batches, slots
 from mfvpr.sweeping.settings import FUSION, Group, Setting, distinct, groups

@@ -7,7 +7,7 @@ import pytest
 
 from mfvpr import InputError
 from mfvpr.data.arrays import read_arrays, write_arrays
-from mfvpr.data.threads import available_cpus
+from mfvpr.numerics import available_cpus
 
 ARRAYS = {
     "scores": np.random.default_rng(0).normal(size=(3, 4)).astype(np.float32),
