@@ -44,8 +44,8 @@ class AnchorPoints:
     the mean target position, weighted by V^(1/T), and its winner's summed weight the mean of V, weighted likewise:
     T -> 0 is the winner, T = 1 the mean of all votes. A cell with n matches is occupied to n^2 / (n^2 + T), which it
     counts in the window, and weighs where w_a is 1. Weights must not be negative. The window moves in whole cells: its
-    gradient is 0. On matches of SIFT and ALIKED across seasons the soft score is within 3 % of the hard one (median; 90 %
-    of pairs within 7 %) at T = 0.03, some 11 % below it at 0.1 and 43 % at 0.3.
+    gradient is 0. On matches of SIFT and ALIKED across seasons the soft score is within 3 % of the hard one (median; 90
+    % of pairs within 7 %) at T = 0.03, some 11 % below it at 0.1 and 43 % at 0.3.
     """
 
     num_bins: int = field(default=15, metadata={"static": True})
