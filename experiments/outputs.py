@@ -238,12 +238,13 @@ def _answer(outcome: Outcome, query: int, rank: int, verdict: str) -> Answer:
 
 def _right_answer(outcome: Outcome, query: int) -> list[Answer]:
     """The first right candidate; else the right image, which the filter missed; nothing where there is none."""
-    right, found = outcome.is_right(outcome.systems[outcome.headline]), outcome.dataset.truth
-    if right is not None and right[query].any():
-        return [_answer(outcome, query, int(np.argmax(right[query])), "right")]
-    row = None if found is None else found.place(query)
-    if row is None:
+    ranked, truth = outcome.is_right(outcome.systems[outcome.headline]), outcome.dataset.truth
+    if ranked is None or outcome.right is None or truth is None or not outcome.right[query].any():
         return []
+    if ranked[query].any():
+        return [_answer(outcome, query, int(np.argmax(ranked[query])), "right")]
+    nearest = truth.place(query)
+    row = nearest if nearest is not None and outcome.right[query, nearest] else int(np.argmax(outcome.right[query]))
     database, num_candidates = outcome.dataset.database, outcome.candidates.indices.shape[1]
     caption = f"right: {database.names[row]}, not among the {num_candidates} candidates"
     return [Answer(_image(outcome, database, row), caption, None, None)]

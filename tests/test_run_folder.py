@@ -20,6 +20,7 @@ import pytest
 from experiments import build, outputs
 from experiments import run as evaluation
 from experiments.settings import SettingsError
+from mfvpr.data.ground_truth import AllowedTruth
 from mfvpr.data.images import read_image
 from mfvpr.data.streets import streets_folder
 from mfvpr.errors import InputError
@@ -157,6 +158,23 @@ def test_a_wrong_figure_has_the_right_image_below(evaluated, outcome):
     [answer] = outputs._right_answer(outcome, found[False])
     assert answer.caption == f"right: {names[outcome.dataset.truth.place(found[False])]}, not among the 3 candidates"
     assert answer.matches is None
+
+
+def test_what_does_not_count_is_never_shown_as_right(outcome):
+    """Where the nearest image is left out, as a neighbor in one sequence, another is; or none."""
+    right = outcome.is_right(outcome.systems["histogram"])
+    query = int(np.flatnonzero(~right.any(axis=1))[0])
+    names, truth = outcome.dataset.database.names, outcome.dataset.truth
+    allowed = np.ones((len(outcome.dataset.queries), len(names)), bool)
+    allowed[query, truth.place(query)] = False
+
+    def answers(allowed):
+        dataset = replace(outcome.dataset, truth=AllowedTruth(truth, allowed))
+        return [answer.caption for answer in outputs._right_answer(replace(outcome, dataset=dataset), query)]
+
+    other = int(np.argmax(outcome.right[query] & allowed[query]))
+    assert answers(allowed) == [f"right: {names[other]}, not among the 3 candidates"]
+    assert answers(np.zeros_like(allowed)) == []
 
 
 def test_figures_of_chosen_queries(outcome):
