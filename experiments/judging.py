@@ -24,6 +24,7 @@ class Judge:
         thresholds: what counts as right, frames or meters.
         unit: of the thresholds.
         positives: `[threshold][Q, N]` bool.
+        places: `[Q, N]` bool, images of a query's place at the widest threshold, also those that are no answer.
         halves: where to choose and where to report; none = both on all queries.
         views: candidates `[Q, C]` bool that are ranked: all, and for each half those that choosing may see.
     """
@@ -31,6 +32,7 @@ class Judge:
     thresholds: Sequence[float]
     unit: Unit
     positives: Sequence[np.ndarray]
+    places: np.ndarray
     halves: Sequence[Half]
     views: Sequence[np.ndarray]
 
@@ -85,11 +87,12 @@ def judge(settings: dict[str, Any], dataset: Dataset) -> Judge:
         )
     thresholds = truth.thresholds(settings, dataset.truth)
     positives = [dataset.truth.positives(threshold) for threshold in thresholds]
-    both = dict(zip(("first_half", "second_half"), sweeping.halves(positives[-1]), strict=True))
+    places = dataset.truth.shows_place(thresholds[-1])
+    both = dict(zip(("first_half", "second_half"), sweeping.halves(places), strict=True))
     split = settings["split"]
     halves = list(both.values()) if split == "both" else [both[split]] if split else []
     for half in halves:
         if not len(half.tune) or not positives[-1][half.tune].any():
             raise SettingsError(f"split={split}: no query of one half has a place far enough from the other half; "
                                 "use more queries or smaller tolerances")  # fmt: skip
-    return Judge(thresholds, dataset.truth.unit, positives, halves, [])
+    return Judge(thresholds, dataset.truth.unit, positives, places, halves, [])

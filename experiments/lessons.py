@@ -132,7 +132,7 @@ def _schools(settings: dict[str, Any], matches: MatchSet, candidates: Shortlist,
     names = ["first_half", "second_half"] if settings["split"] == "both" else [settings["split"]]
     for name, half in zip(names, judgment.halves, strict=True):
         cut = len(half.tune) - round(VALIDATION * len(half.tune))
-        apart = sweeping.separated(judgment.positives[-1], half.tune[:cut], half.tune[cut:])
+        apart = sweeping.separated(judgment.places, half.tune[:cut], half.tune[cut:])
         seen = candidates.mask & half.allowed[np.maximum(candidates.indices, 0)]
         school = School(settings, matches, candidates, judgment, half, apart.tune, apart.report, seen, name)
         teaches = np.asarray((school.right & school.usable).any(axis=1))

@@ -14,6 +14,7 @@ from experiments import build, stores
 from mfvpr import pipeline
 from mfvpr.data.contents import Contents, contents
 from mfvpr.data.datasets import Dataset, ImageFolder
+from mfvpr.data.ground_truth import threshold_words
 from mfvpr.data.sequences import OwnRows, own_rows, without_neighbors
 from mfvpr.extraction import Descriptors
 from mfvpr.features import GlobalExtractor, LocalExtractor
@@ -194,9 +195,17 @@ def _warn_of_images(settings: dict[str, Any], found: Images, own: OwnRows) -> No
               f"dataset.bits={used} would use their range")  # fmt: skip
     recall, truth = settings["recall"], dataset.truth
     if truth is not None:
-        widest = truth.thresholds(tolerances=recall["tolerances"], radius=recall["radius"])[-1]
-        if not truth.positives(widest).any():
+        thresholds = truth.thresholds(tolerances=recall["tolerances"], radius=recall["radius"])
+        without = [threshold for threshold in thresholds if not truth.positives(threshold).any()]
+        if without == thresholds:
             _tell("warning: the ground truth gives no query a right answer; every recall will be 0")
+        elif without:
+            words = ", ".join(threshold_words(truth.unit, threshold).strip() for threshold in without)
+            mend = "larger recall.tolerances" + ", or fewer dataset.exclude_neighbors" * (dataset.allowed is not None)
+            _tell(f"warning: no query has a right answer within {words}, so that recall will be 0 there; use {mend}")
+    deepest, available = max(recall["ks"]), _num_candidates(settings, found)
+    if deepest > available:
+        _tell(f"note: R@{deepest} is R@{available}, of the filter too: no more candidates are looked at")
 
 
 def _tell(text: str) -> None:

@@ -169,6 +169,8 @@ def _recognized(file: Path, name: str | None) -> "Entry":
     for entry in REGISTRY.values():
         if entry.file == file.name:
             return entry
+    if not file.exists():
+        raise InputError(f"{file}: no such file")
     raise InputError(f"{file}: no official file name; say what it is with --as NAME, one of {', '.join(REGISTRY)}")
 
 

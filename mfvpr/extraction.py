@@ -45,7 +45,15 @@ class FeatureSet:
 
     @classmethod
     def of(cls, images: Sequence[Features]) -> "FeatureSet":
-        """Features of your own, image by image `[N_i, ...]`, of as many keypoints as each has; padding is dropped."""
+        """Features of your own, image by image `[N_i, ...]`, of as many keypoints as each has; padding is dropped.
+
+        Raises:
+            InputError: there are none, their arrays do not fit, or descriptors are not of unit length.
+        """
+        if not images:
+            raise InputError("FeatureSet.of: expected the features of at least one image, got none")
+        for number, image in enumerate(images):
+            _check(image, number)
         real = [
             replace(image, **{name: np.asarray(getattr(image, name))[np.asarray(image.mask)] for name in _PER_KEYPOINT})
             for image in images
@@ -228,6 +236,29 @@ def _batches(items: Iterable[Item], size: int) -> Iterator[list[Item]]:
     iterator = iter(items)
     while batch := list(itertools.islice(iterator, size)):
         yield batch
+
+
+def _check(image: Features, number: int) -> None:
+    """Of one's own image `[N, ...]`."""
+    count = len(image.mask)
+    shapes = {name: np.shape(getattr(image, name)) for name in _PER_KEYPOINT}
+    expected = {
+        "keypoints": (count, 2),
+        "descriptors": (count, *shapes["descriptors"][1:]),
+        "scores": (count,),
+        "mask": (count,),
+    }
+    if shapes != expected or len(shapes["descriptors"]) != 2 or np.asarray(image.mask).dtype != bool:
+        raise InputError(
+            f"features of image {number}: expected keypoints [N, 2], descriptors [N, D], scores [N] and mask [N] bool, "
+            f"got shapes {', '.join(str(shape) for shape in shapes.values())}; transpose descriptors that are [D, N]"
+        )
+    lengths = np.linalg.norm(np.asarray(image.descriptors, np.float32)[image.mask], axis=1)
+    if (wrong := np.abs(lengths - 1) > 0.01).any():
+        raise InputError(
+            f"features of image {number}: expected descriptors of unit length, got {lengths[wrong][0]:.4g}; "
+            "divide them by their Euclidean length"
+        )
 
 
 def _finite(features: Features) -> bool:

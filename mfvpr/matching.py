@@ -11,6 +11,7 @@ from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mfvpr.neighbors import nearest, nearest_two
 from mfvpr.numerics import as_float, at_least_single, compiled, masked, platform, positive, safe_sqrt
@@ -112,6 +113,9 @@ def match_candidates(
     Returns:
         Matches with leading axis C and K = N0 slots.
     """
+    if np.ndim(query.mask) != 1 or np.ndim(candidates.mask) != 2:
+        shapes = f"{np.shape(query.mask)} and {np.shape(candidates.mask)}"
+        raise ValueError(f"expected one query [N0] and candidates [C, N1], got masks of shapes {shapes}; see match")
     chunk_size = _chunk_size(chunk_size, query, candidates)
     return _match_candidates(query, candidates, cross_check=cross_check, with_ratio=with_ratio, chunk_size=chunk_size)
 
@@ -210,9 +214,11 @@ def compact(matches: Matches, capacity: int) -> Matches:
 
 
 def _ready(features: Features) -> Features:
-    """On the device, with descriptors of at least single precision: products of half ones in half flip near-ties."""
-    features = jax.tree.map(jnp.asarray, features)
-    return replace(features, descriptors=at_least_single(features.descriptors))
+    """On the device, in at least single precision: products of half ones flip near-ties, sums of points overflow."""
+    wide = {
+        name: at_least_single(getattr(features, name)) for name in ("keypoints", "descriptors", "scores", "image_size")
+    }
+    return replace(features, **wide, mask=jnp.asarray(features.mask))
 
 
 def _at_least_one(features: Features) -> Features:

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial, wraps
 from typing import Any, TypeVar
 
@@ -61,6 +62,11 @@ def masked_median(values: Array, mask: Array) -> Array:
     return jnp.where(real > 0, middle, 0.0)
 
 
+def where_finite(score: Array, *inputs: Array) -> Array:
+    """`score` where all inputs are finite, else NaN, which ranks last: of NaN or infinity no score says anything."""
+    return jnp.where(jnp.all(jnp.stack([jnp.all(jnp.isfinite(values)) for values in inputs])), score, jnp.nan)
+
+
 def safe_sqrt(squared: Array) -> Array:
     """Square root of max(x, 0) whose gradient at 0 is 0 instead of infinite."""
     positive = squared > 0
@@ -82,7 +88,8 @@ def compiled(function: Function, **options: Any) -> Function:
     """`jax.jit` of what is plural, where it is defined; under a caller's `jit` it is inlined.
 
     With a plain function among the arguments, such as a user's scorer, or the weight of one, it runs op by op: a kept
-    program would go on with what the function's closure held at the first call. `held` is for many calls in a row.
+    program would go on with what the function's closure held at the first call (as it does where a function stands in a
+    static field). `held` is for many calls in a row.
     """
     program = jax.jit(function, **options)
 
@@ -102,6 +109,12 @@ def held(tree: Tree) -> Tree:
 def is_concrete(tree: Any) -> bool:
     """True where no leaf is traced, so that Python may look at the values."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def knows_own_context() -> bool:
+    """Whether other threads compute as this one: not below `with jax.enable_x64(True)` and its like."""
+    with ThreadPoolExecutor(1) as fresh:
+        return dict(jax.config.values) == fresh.submit(lambda: dict(jax.config.values)).result()
 
 
 def available_cpus() -> int:

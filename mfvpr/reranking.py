@@ -4,7 +4,7 @@ Scorers know one pair; here is where `vmap` (over candidates) and `lax.map` (ove
 """
 
 import difflib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mfvpr.matching import filter_matches
-from mfvpr.numerics import available_cpus, compiled, is_concrete, masked, masked_std, platform
+from mfvpr.numerics import available_cpus, compiled, held, is_concrete, knows_own_context, masked, masked_std, platform
 from mfvpr.scoring import HistogramOfShifts, Scorer
 from mfvpr.scoring.parameters import fit, numbers, with_parameters
 from mfvpr.types import Array, Matches, Ranking
@@ -32,7 +32,15 @@ def score_candidates(scorer: Scorer, matches: Matches) -> Array:
     one, runs op by op. What needs a capacity gets that of the images: under a caller's `jit`, where these are traced,
     it must have one before (`max_bins` of the histogram).
     """
+    _check_candidates(matches)
     return _score_candidates(fit_candidates(scorer, matches, multiple=2 * BIN_STEP), matches)
+
+
+def _check_candidates(matches: Matches) -> None:
+    if np.ndim(matches.mask) != 2:
+        shape = np.shape(matches.mask)
+        raise ValueError(f"expected matches [C, K, ...] of candidates, got a mask of shape {shape}; of one pair "
+                         "[K] the score is scorer(matches)")  # fmt: skip
 
 
 @compiled
@@ -104,7 +112,8 @@ def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> 
     """Scores of every combination of parameter values, `[len(axis1), len(axis2), ..., C]`.
 
     The grid is one traced computation for each capacity of bins that its values ask for, so that fine bins do not
-    slow coarse ones down: other values cost no compilation within them, other lengths do.
+    slow coarse ones down: other values cost no compilation within them, other lengths do. With a plain function as the
+    scorer, or in it, every call compiles.
 
     Args:
         scorer: the scorer whose other parameters stay.
@@ -118,8 +127,12 @@ def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> 
     """
     if not axes:
         raise ValueError("score_grid: expected at least one axis, such as sigma=[10.0, 22.5]")
-    if weights := _weights(scorer, axes):
+    _check_candidates(matches)
+    refuse_own_names(scorer, axes)
+    weights = _weights(scorer, axes)
+    if weights:
         scorer, axes["weight"] = replace(scorer, weight=ChosenWeight(weights, 0)), np.arange(len(weights))
+    scorer = held(scorer)
     values = {name: _axis(scorer, name, axis) for name, axis in axes.items()}
     inner = [name for name in values if name in WEIGHTINGS]
     outer = [name for name in values if name not in WEIGHTINGS]
@@ -141,14 +154,19 @@ def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> 
     return jnp.moveaxis(found, range(len(names)), [list(axes).index(name) for name in names])
 
 
+def refuse_own_names(scorer: Any, names: Iterable[str], reserved: Iterable[str] = WEIGHTINGS) -> None:
+    """Raise a ValueError where a number of the scorer is called as what is varied beside its parameters."""
+    for name in {*names} & {*numbers(scorer)} & {*reserved}:
+        raise ValueError(f"{type(scorer).__name__}.{name}: a grid means something else by {name}; rename the field")
+
+
 def _on_every_core(function: Callable[[Matches], Array], matches: Matches) -> Array:
     """`function` of matches `[C, K, ...]`, with the candidates along its last axis: a part of them on every core.
 
     Elsewhere than on a CPU, with settings of JAX's that other threads would not know, or few candidates: at once.
     """
     cores, count = available_cpus(), len(matches.mask)
-    own = jnp.zeros(0).dtype != jnp.float32 or jax.config.values["jax_default_device"] is not None
-    if cores == 1 or count < 4 * cores or own or platform(matches) != "cpu":
+    if cores == 1 or count < 4 * cores or platform(matches) != "cpu" or not knows_own_context():
         return function(matches)
     size = -(-count // cores)
     starts = [min(core * size, count - size) for core in range(cores)]  # of one size, hence one program: some overlap
@@ -225,7 +243,8 @@ def rank(scores: Array, mask: Array | None = None, *, tie_break: Array | None = 
     present = jnp.ones(scores.shape, bool) if mask is None else mask
     number = present & ~jnp.isnan(scores)
     group = jnp.where(present, jnp.where(number, 0, 1), 2)
-    keys = (-masked(scores, number), group) if tie_break is None else (tie_break, -masked(scores, number), group)
+    descending = -masked(jnp.asarray(scores), number, 0)  # whole numbers stay what they are
+    keys = (descending, group) if tie_break is None else (tie_break, descending, group)
     return jnp.lexsort(keys, axis=-1).astype(jnp.int32)
 
 

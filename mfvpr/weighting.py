@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 
-from mfvpr.numerics import as_float, masked
+from mfvpr.numerics import as_float, at_least_single, masked
 from mfvpr.types import Array, Matches, per_match, value
 
 Weight = Callable[[Matches], Array]
@@ -19,7 +19,7 @@ class FeatureScoreWeight:
     """FS-weight: w = scores0 + scores1, in units of the detector's scores."""
 
     def __call__(self, matches: Matches) -> Array:
-        return matches.scores0 + matches.scores1
+        return as_float(matches.scores0) + as_float(matches.scores1)
 
 
 @value
@@ -52,12 +52,12 @@ class ChosenWeight:
 def match_weights(weight: Weight, matches: Matches) -> Array:
     """`[K]` weights times the matches' confidence, 0 on padding."""
     # Padding is 1 before any arithmetic of the weight: else its NaN would return in the gradients.
-    clean = {name: masked(jnp.asarray(values), matches.mask, 1) for name, values in per_match(matches).items()}
-    weights = masked(as_float(weight(replace(matches, **clean))), matches.mask)
+    clean = {name: masked(at_least_single(values), matches.mask, 1) for name, values in per_match(matches).items()}
+    weights = masked(at_least_single(weight(replace(matches, **clean))), matches.mask)
     return weights if matches.confidence is None else weights * match_confidence(matches)
 
 
 def match_confidence(matches: Matches) -> Array:
     """`[K]` the matches' confidence, 1 where nobody gave one, 0 on padding; a match of confidence 0 is none."""
     confidence = jnp.ones_like(matches.distance) if matches.confidence is None else matches.confidence
-    return masked(as_float(confidence), matches.mask)
+    return masked(at_least_single(confidence), matches.mask)

@@ -10,6 +10,7 @@ from PIL import Image
 from mfvpr import match, pipeline
 from mfvpr.data.datasets import image_folder
 from mfvpr.data.feature_store import forecast_bytes, open_store
+from mfvpr.errors import InputError
 from mfvpr.features.sift import Sift
 from mfvpr.types import Features
 from tests.builders import make_features
@@ -195,3 +196,19 @@ def test_features_of_ones_own_are_matched_as_they_are():
         alone = match(images[query], images[row])
         place = candidates.indices[query].tolist().index(row)
         assert matches.counts[query, place] == alone.mask.sum()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"descriptors": np.ones((16, 5), np.float32)}, r"image 0: expected keypoints .* transpose descriptors"),
+        ({"mask": np.ones(5)}, r"mask \[N\] bool"),
+        ({"descriptors": np.full((5, 16), 7.0, np.float32)}, "unit length, got 28; divide"),
+    ],
+)
+def test_features_of_ones_own_that_do_not_fit_are_told(change, words):
+    image = replace(make_features(np.random.default_rng(0), 5), **change)
+    with pytest.raises(InputError, match=words):
+        pipeline.FeatureSet.of([image])
+    with pytest.raises(InputError, match="at least one image"):
+        pipeline.FeatureSet.of([])

@@ -254,3 +254,13 @@ def test_a_chunk_is_what_fits_where_the_data_are(monkeypatch, platform, expected
     assert matching._chunk_size(7, make_features(rng, 20), batch) == 7
     with pytest.raises(ValueError, match="chunk_size=0: expected a whole number above 0"):
         match_candidates(make_features(rng, 20), batch, chunk_size=0)
+
+
+def test_all_fields_of_half_precision_are_matched_in_single():
+    rng = np.random.default_rng(9)
+    pair = [make_features(rng, 20) for _ in range(2)]
+    half = [jax.tree.map(lambda leaf: leaf if leaf.dtype == bool else leaf.astype(np.float16), one) for one in pair]
+    for name in ("points0", "points1", "distance", "scores0", "scores1", "image_size0"):
+        assert getattr(match_once(*half), name).dtype == jnp.float32
+    with pytest.raises(ValueError, match=r"expected one query \[N0\] and candidates \[C, N1\]"):
+        match_candidates(*pair)

@@ -221,3 +221,7 @@ def test_fusion_and_ranking_compile_once_for_all_callers(compilations):
         rank(fuse(scores, scores, mask, 0.5), mask)
         compiled, compilations.count = compilations.count, 0
     assert compiled == 0
+
+
+def test_whole_numbers_are_ranked_as_they_are():
+    np.testing.assert_array_equal(rank(jnp.array([2**24, 2**24 + 1, 7])), [1, 0, 2])

@@ -20,7 +20,7 @@ from mfvpr.data.datasets import ImageFolder
 from mfvpr.data.files import write_text
 from mfvpr.data.images import ordered_map, read_header
 
-FORMAT = 1  # of the records: raise it when they change
+FORMAT = 2  # of the records: raise it when they change
 SETTLED = 2_000_000_000  # ns; the coarsest clock of a file system (FAT) ticks every two seconds
 
 

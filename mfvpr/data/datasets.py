@@ -87,6 +87,8 @@ def image_folder(root: Path, *, orient: bool = True, bits: int | None = 16) -> I
     names = [path.relative_to(root).as_posix() for path in _images_below(root)]
     if not names:
         raise InputError(f"{root}: expected images ({', '.join(sorted(SUFFIXES))}), found none; check the path")
+    if bits is not None and not 8 <= bits <= 16:
+        raise InputError(f"bits={bits}: expected from 8 to 16 bits in use, or none")
     return ImageFolder(root, tuple(sorted(names, key=_natural)), orient, bits)
 
 

@@ -42,6 +42,10 @@ class Truth(ABC):
     def positives(self, threshold: float) -> np.ndarray:
         """`[Q, N]` bool, what counts as right at a threshold, inclusive."""
 
+    def shows_place(self, threshold: float) -> np.ndarray:
+        """`[Q, N]` bool, database images of the query's place, also those that may not answer it."""
+        return self.positives(threshold)
+
     @abstractmethod
     def distance(self, query: int) -> np.ndarray:
         """`[N]` from each database image to the query's place, in the unit; infinite where it is never right."""
@@ -148,6 +152,10 @@ class AllowedTruth(Truth):
     def positives(self, threshold: float) -> np.ndarray:
         """`[Q, N]` bool, the other's that are allowed."""
         return self.truth.positives(threshold) & self.allowed
+
+    def shows_place(self, threshold: float) -> np.ndarray:
+        """`[Q, N]` bool, the other's, and what is not allowed: the query itself, and its neighbors."""
+        return self.truth.shows_place(threshold) | ~self.allowed
 
     def distance(self, query: int) -> np.ndarray:
         """`[N]` the other's; infinite where an image is not allowed."""

@@ -54,7 +54,7 @@ class Header:
     Attributes:
         orientation: EXIF's, 1 .. 8; 1 = as stored.
         largest: of the values of 16 bits a channel, not all of which need be in use; 0 where the file itself states its
-            range, or cannot be decoded; None = no such image.
+            range, cannot be decoded, or has 32 bits; None = no such image.
     """
 
     orientation: int
@@ -112,8 +112,8 @@ def read_header(content: bytes) -> Header:
             used = _bits_in_use(image, 16) if image.width * image.height <= MAX_PIXELS else None
             may_be_turned = image.format != "PNG" or any(mark in content for mark in _MAY_BE_TURNED)
             orientation = _orientation(image) if may_be_turned else 1  # of a PNG file, this decodes all
-            if used is None:
-                return Header(orientation, None)
+            if used is None:  # of 32 bits nobody knows the range
+                return Header(orientation, 0 if image.mode in ("I", "F") and image.format != "PPM" else None)
             own_range = used != 16 or image.format == "PPM"
             return Header(orientation, 0 if own_range else _largest(image, content))
     except Exception:  # whoever reads the image will tell

@@ -46,18 +46,18 @@ def claimed(folder: Path, *, numbered: bool = False) -> Iterator[Path]:
     above = [parent for parent in folder.absolute().parents if not parent.exists()]
     with _telling_why(folder):
         folder = _made(folder, numbered)
+    with _telling_why(folder):
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        with _telling_why(folder):
-            handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        _take(handle, folder)  # until then it may be another's, and must stay
         try:
-            _take(handle, folder)
             yield folder
         finally:
-            os.close(handle)
+            with suppress(OSError):  # not empty
+                for one in (folder, *above):
+                    one.rmdir()
     finally:
-        with suppress(OSError):  # not empty
-            for one in (folder, *above):
-                one.rmdir()
+        os.close(handle)
 
 
 def _made(folder: Path, numbered: bool) -> Path:
@@ -105,7 +105,7 @@ def writing(folder: Path) -> Iterator[Path]:
     `results.json` comes last: where it is, everything is.
     """
     temporary = folder / _UNFINISHED
-    temporary.mkdir()
+    temporary.mkdir(parents=True)  # should somebody have removed the empty folder meanwhile
     try:
         yield temporary
         for path in sorted(temporary.iterdir(), key=lambda path: path.name == _LAST):

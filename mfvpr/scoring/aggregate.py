@@ -5,7 +5,7 @@ from dataclasses import field
 import jax
 import jax.numpy as jnp
 
-from mfvpr.numerics import masked, masked_mean, masked_median, positive, safe_sqrt
+from mfvpr.numerics import masked, masked_mean, masked_median, positive, safe_sqrt, where_finite
 from mfvpr.scoring.choices import check_choices, choice
 from mfvpr.scoring.shifts import image_sizes, match_shifts
 from mfvpr.types import Array, Matches, value
@@ -43,7 +43,8 @@ class AggregatedScore:
         else:
             center = masked_mean(shifts, matches.mask, weights if self.mean == "weighted" else confidence)
         closeness = self._closeness(shifts - center[None], image_sizes(matches)[0][None])
-        return jnp.sum(weights * jnp.sum(masked(closeness, matches.mask) ** 2, axis=-1))
+        score = jnp.sum(weights * jnp.sum(masked(closeness, matches.mask) ** 2, axis=-1))
+        return where_finite(score, weights, shifts)
 
     def _closeness(self, offsets: Array, size: Array) -> Array:
         """`[K, 2]` how much closer to the center than the image is wide and high, px."""

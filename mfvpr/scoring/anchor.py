@@ -10,12 +10,13 @@ from dataclasses import field
 import jax
 import jax.numpy as jnp
 
-from mfvpr.numerics import as_float, masked, positive, safe_sqrt
+from mfvpr.numerics import at_least_single, masked, positive, safe_sqrt, where_finite
 from mfvpr.scoring.choices import check_choices, choice
 from mfvpr.scoring.shifts import image_sizes
 from mfvpr.types import Array, Matches, value
 from mfvpr.weighting import FeatureScoreWeight, Weight, match_confidence, match_weights
 
+MAX_BINS = 215  # per side: pairs of cells are then still numbers of 32 bits
 _LEAST_SHARE = 1e-12  # of the winner's votes, below which a target has none: keeps the logarithm's gradient finite
 
 
@@ -60,6 +61,8 @@ class AnchorPoints:
 
     def __post_init__(self) -> None:
         check_choices(self)
+        if not 0 < self.num_bins <= MAX_BINS:
+            raise ValueError(f"AnchorPoints(num_bins={self.num_bins}): expected from 1 to {MAX_BINS} cells per side")
 
     def __call__(self, matches: Matches) -> Array:
         """Score of one pair, `[]` float32."""
@@ -68,7 +71,8 @@ class AnchorPoints:
         # Two [cells, cells] planes, not one array with a trailing axis of 2, which costs nine times as much on a CPU.
         distance = safe_sqrt((rows[:, None] - rows[None]) ** 2 + (columns[:, None] - columns[None]) ** 2)
         support = masked(jnp.maximum(self.tolerance - distance, 0.0), self._neighbors(index)) * occupancy[None]
-        return jnp.sum(weights * jnp.sum(support, axis=1))
+        score = jnp.sum(weights * jnp.sum(support, axis=1))
+        return where_finite(score, match_weights(self.weight, matches), *self._positions(matches))
 
     def _cells(self, matches: Matches) -> tuple[Array, Array, Array, Array, Array]:
         """Row-major number of some cells of the first image, all that are occupied among them, and of each of them:
@@ -134,8 +138,8 @@ class AnchorPoints:
     def _positions(self, matches: Matches) -> tuple[Array, Array]:
         """`[K, 2]` (x, y) of all points of the anchors' image and of the other, in cells; 0 on padding."""
         size0, size1 = image_sizes(matches)
-        query = masked(as_float(matches.points0), matches.mask) * self.num_bins / size0[None]
-        candidate = masked(as_float(matches.points1), matches.mask) * self.num_bins / size1[None]
+        query = masked(at_least_single(matches.points0), matches.mask) * self.num_bins / size0[None]
+        candidate = masked(at_least_single(matches.points1), matches.mask) * self.num_bins / size1[None]
         return (query, candidate) if self.first == "query" else (candidate, query)
 
     def _cell(self, position: Array) -> Array:

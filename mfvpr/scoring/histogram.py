@@ -95,7 +95,8 @@ class HistogramOfShifts:
             return _smooth_max(scores, inside, largest, positive(self.temperature, scores.dtype))
 
         found = score(weights[0])[None] if len(weights) == 1 else jax.lax.map(score, weights)
-        return jnp.where(jnp.any(matches.mask), jnp.where(fits, found, jnp.nan), 0.0)
+        usable = fits & _usable(self._shifts(matches), weights)
+        return jnp.where(jnp.any(matches.mask), jnp.where(usable, found, jnp.nan), 0.0)
 
     def all_reweighted(self, matches: Matches, weights: Array) -> Array:
         """`reweighted` of pairs `[C, K, ...]` by weights `[C, W, K]`: scores `[C, W]`, quick where there are many.
@@ -112,8 +113,8 @@ class HistogramOfShifts:
         capacity, shifts = self._capacity(matches), jax.vmap(self._planes)(matches)
         lattice = jax.vmap(self._lattice_of)(matches)
         found = jax.lax.map(lambda pair: tallest_bins(*pair, capacity), (shifts, weights, lattice))
-        fits = jnp.all(lattice.num_bins <= capacity, axis=1)[:, None]
-        return jnp.where(jnp.any(matches.mask, axis=1)[:, None], jnp.where(fits, found, jnp.nan), 0.0)
+        usable = jnp.all(lattice.num_bins <= capacity, axis=1)[:, None] & jax.vmap(_usable)(shifts, weights)
+        return jnp.where(jnp.any(matches.mask, axis=1)[:, None], jnp.where(usable, found, jnp.nan), 0.0)
 
     def histogram(self, matches: Matches) -> ShiftHistogram:
         """All bins of one pair with their centers."""
@@ -254,10 +255,11 @@ def _dominant_shift(scorer: HistogramOfShifts, matches: Matches, *, refine: bool
     scores = jnp.where(inside, scores, -jnp.inf)
     row, column = jnp.unravel_index(jnp.argmax(scores), scores.shape)
     shift = jnp.stack([centers[column, 0], centers[row, 1]])
+    shifts, weights = scorer._shifts(matches), match_weights(scorer.weight, matches)
     if refine:
-        shifts = scorer._shifts(matches)
-        shift = _climb(shift, shifts, match_weights(scorer.weight, matches), scorer._deviation(shifts.dtype))
-    return jnp.where(jnp.max(scores) > 0, jnp.where(fits, shift, jnp.nan), 0.0)
+        shift = _climb(shift, shifts, weights, scorer._deviation(shifts.dtype))
+    usable = fits & _usable(shifts, weights[None])[0]
+    return jnp.where(usable, jnp.where(jnp.max(scores) > 0, shift, 0.0), jnp.where(jnp.any(matches.mask), jnp.nan, 0.0))
 
 
 def _climb(start: Array, shifts: Array, weights: Array, deviation: Array) -> Array:
@@ -270,6 +272,11 @@ def _climb(start: Array, shifts: Array, weights: Array, deviation: Array) -> Arr
         return jnp.where(total > 0, pull @ shifts / jnp.where(total > 0, total, 1.0), shift)
 
     return jax.lax.fori_loop(0, _MEAN_SHIFT_STEPS, step, start)
+
+
+def _usable(shifts: Array, weights: Array) -> Array:
+    """`[W]` whether all shifts and the weights `[W, K]` are numbers: else the tallest bin would be anything."""
+    return jnp.all(jnp.isfinite(shifts)) & jnp.all(jnp.isfinite(weights), axis=1)
 
 
 def _bins(votes_x: Array, votes_y: Array, weights: Array) -> Array:

@@ -54,7 +54,7 @@ def fit(scorer: Any, image_size0: Array, image_size1: Array, *, multiple: int = 
         image_size1: `[..., 2]` px, of candidates.
         multiple: capacities are multiples of it, so that few programs serve many values.
     """
-    fits = lambda part: hasattr(part, "fitted")  # noqa: E731
+    fits = lambda part: callable(getattr(part, "fitted", None))  # noqa: E731
     size = lambda part: part.fitted(image_size0, image_size1, multiple) if fits(part) else part  # noqa: E731
     return jax.tree.map(size, scorer, is_leaf=fits)
 

@@ -14,7 +14,8 @@ Why nothing is lost. With w+ = max(w, 0), every bin c of a block holds at most
 The first is used where blocks are wider than the deviation s, the second elsewhere, where it is the closer one. Bounds
 are raised by a relative 2^-10 + K 2^-22, more than float32 rounds off sums of K votes (down to 1e-35 of a weight), and
 a block is left out only where its raised bound does not exceed a bin that was evaluated. So no vote is neglected: the
-result is the maximum over all bins, as exact as their float32 sums, whatever the weights, the deviation or `truncate`.
+result is the maximum over all bins, as exact as their float32 sums, whatever the weights, and as long as the deviation
+is many times what float32 rounds a position to.
 """
 
 from functools import partial
@@ -155,7 +156,8 @@ def _block_votes(shifts: Array, axis: int, start: Array, lattice: Lattice, side:
     nearest = jnp.minimum(*(jnp.abs(shifts - center) for center in neighbors))  # of all bins
     distance = jnp.maximum(jnp.maximum(lower - shifts[None], shifts[None] - upper), nearest[None])
     distance = jnp.where(narrow, lower - shifts[None], distance)
-    return gaussian(distance, lattice.deviation, jnp.where(narrow, jnp.inf, lattice.truncate))
+    truncate = lattice.truncate * (1 + _SLACK)  # a match on the edge may be rounded to either side
+    return gaussian(distance, lattice.deviation, jnp.where(narrow, jnp.inf, truncate))
 
 
 def _evaluate(blocks: Array, shifts: Array, weights: Array, lattice: Lattice, side: int, count: int) -> Array:

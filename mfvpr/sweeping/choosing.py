@@ -25,7 +25,8 @@ def halves(positives: np.ndarray) -> tuple[Half, Half]:
     allowed, and queries for which such a row is right are left out (they are neighbors across the cut).
 
     Args:
-        positives: `[Q, N]` bool, what is right within the widest tolerance.
+        positives: `[Q, N]` bool, what shows a query's place within the widest tolerance, also where that is no answer
+            to it (an image that is the query itself).
     """
     first, second = np.split(np.arange(len(positives)), [len(positives) // 2])
     return separated(positives, first, second), separated(positives, second, first)

@@ -119,9 +119,15 @@ def _arrays(settings: Sequence[Setting], weights: Sequence[Any], *, without: set
     return {
         name: np.array([number[id(setting[name])] for setting in settings])
         if name == "weight"
-        else np.array([setting[name] for setting in settings], np.float32)
+        else _numbers([setting[name] for setting in settings])
         for name in names
     }
+
+
+def _numbers(values: Sequence[Any]) -> np.ndarray:
+    """float32, but for whole numbers, which may be indices."""
+    found = np.array(values)
+    return found if np.issubdtype(found.dtype, np.integer) else found.astype(np.float32)
 
 
 def _key(setting: Setting) -> tuple:

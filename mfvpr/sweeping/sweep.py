@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mfvpr import reranking
 from mfvpr.data.arrays import read_arrays, write_arrays
 from mfvpr.data.images import ordered_map
 from mfvpr.errors import InputError
-from mfvpr.numerics import available_cpus, compiled
+from mfvpr.numerics import available_cpus, compiled, knows_own_context
 from mfvpr.pipeline import FilterScore, MatchSet, Ties, Track, filter_scores, untracked
 from mfvpr.sweeping.batches import BYTES_PER_SLOT, batches, slots
 from mfvpr.sweeping.settings import FUSION, Group, Setting, distinct, groups
@@ -91,12 +92,15 @@ def sweep(
         settings_per_block: by default 64. The result does not depend on it, nor on the next.
         queries_per_block: by default what 256 MB hold.
         folder: where finished blocks are kept, to be read instead of being computed again; None = nowhere. Blocks of
-            other matches, shortlists, values or scorers, by what their code computes, may lie there as well.
+            other matches, shortlists, values or scorers, by what their code computes, may lie there as well. A scorer
+            that calls back to Python is computed anew, since nobody sees what that does.
         track: progress over blocks.
 
     Returns:
         `[V, S, Q, depth]` int32 database rows, best first, -1 where there is none.
     """
+    names = {name for setting in settings for name in setting}
+    reranking.refuse_own_names(scorer, names, reserved=(*reranking.WEIGHTINGS, FUSION))
     num_queries, num_candidates = candidates.mask.shape
     views = [candidates.mask] if views is None else views
     scored, places = distinct(settings)
@@ -105,7 +109,8 @@ def sweep(
     work = Work(match_set, range(num_queries), candidates, views, depth, ties, filter_score)
     found_groups = list(groups(scorer, scored, match_set.image_sizes))
     if folder is not None:
-        found_groups = [replace(group, program=_program(group, match_set.matches[0])) for group in found_groups]
+        sizes = sorted({*slots(match_set).reshape(-1).tolist()})
+        found_groups = [replace(group, program=_program(group, match_set.matches[0], sizes)) for group in found_groups]
     blocks = [one for group in found_groups for one in group.blocks(per_block)]
     found = np.full((len(views), len(settings), num_queries, depth), -1, np.int32)
     steps = ((part, block) for part in work.parts(queries) for block in blocks)
@@ -162,9 +167,9 @@ def _scores(block: Group, held: Sequence[tuple[np.ndarray, Matches]], shape: tup
     first = {matches.mask.shape: number for number, (_, matches) in reversed(list(enumerate(held)))}
     order = sorted(range(len(held)), key=lambda number: number not in first.values())
     alone, together = order[: len(first)], order[len(first) :]
+    spread = partial(ordered_map, workers=available_cpus()) if knows_own_context() else map
     found = itertools.chain(
-        (score(held[number]) for number in alone),
-        ordered_map(score, [held[number] for number in together], workers=available_cpus()),
+        (score(held[number]) for number in alone), spread(score, [held[number] for number in together])
     )
     for number, values in zip(order, found, strict=True):
         places, _ = held[number]
@@ -207,7 +212,7 @@ def _kept(
     folder: Path | None, part: Work, block: Group, cs: Sequence[Any], compute: Callable[[], np.ndarray]
 ) -> np.ndarray:
     """A block's rows, from its file where that is there and whole; else computed and written."""
-    if folder is None:
+    if folder is None or "callback" in block.program:
         return compute()
     key = _fingerprint(part, block, cs)
     path = folder / f"{key}.npz"
@@ -234,19 +239,26 @@ def _fingerprint(part: Work, block: Group, cs: Sequence[Any]) -> str:
     return _digest(repr(options), block.program, part.digest, numbers)
 
 
-def _program(group: Group, matches: Matches) -> str:
-    """What the scorer computes, for one pair: a user's code may change while its class keeps its name."""
-    example = {name: np.zeros((1, 8, *values.shape[1:]), values.dtype) for name, values in per_match(matches).items()}
-    sizes = np.ones((1, 2), np.float32)
-    pair = Matches(**example, mask=np.ones((1, 8), bool), image_size0=sizes, image_size1=sizes)
-    values = [{name: axis[:1] for name, axis in found.items()} for found in (group.settings, group.weightings)]
-    return jax.jit(reranking.score_settings).lower(group.scorer, pair, *values).as_text()
+def _program(group: Group, matches: Matches, sizes: Sequence[int]) -> str:
+    """What the scorer computes of pairs of these `sizes`: a user's code may change while its class keeps its name."""
+
+    def text(size: int) -> str:
+        entries = per_match(matches).items()
+        example = {name: np.zeros((1, size, *values.shape[1:]), values.dtype) for name, values in entries}
+        image_size = np.ones((1, 2), np.float32)
+        pair = Matches(**example, mask=np.ones((1, size), bool), image_size0=image_size, image_size1=image_size)
+        settings = {name: axis[:1] for name, axis in group.settings.items()}
+        return jax.jit(reranking.score_settings).lower(group.scorer, pair, settings, group.weightings).as_text()
+
+    return "".join(map(text, sizes))
 
 
 def _digest(*parts: Any) -> str:
     """Of texts, and of the types, shapes and bytes of the arrays in pytrees."""
     digest = hashlib.sha256()
     for leaf in jax.tree.leaves(parts):
+        if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            leaf = jax.random.key_data(leaf)
         array = np.frombuffer(leaf.encode(), np.uint8) if isinstance(leaf, str) else np.asarray(leaf)
         digest.update(f"{array.dtype}{array.shape};".encode() + array.tobytes())
     return digest.hexdigest()[:24]

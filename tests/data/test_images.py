@@ -13,6 +13,8 @@ import pytest
 from PIL import Image
 
 from mfvpr import InputError
+from mfvpr.data.contents import contents
+from mfvpr.data.datasets import image_folder
 from mfvpr.data.images import MAX_PIXELS, Header, ordered_map, read_header, read_image, resize
 from mfvpr.features.sift import Sift
 from tests.golden import make_resize
@@ -265,3 +267,13 @@ def test_16_bit_copies_have_the_same_features(tmp_path, small_street):
 def test_an_image_of_one_pixel_fills_any_size(tmp_path):
     Image.new("RGB", (1, 1), (10, 20, 30)).save(tmp_path / "a.png")
     np.testing.assert_array_equal(resize(read_image(tmp_path / "a.png"), (8, 4)), np.full((4, 8, 3), (10, 20, 30)))
+
+
+def test_what_reading_does_to_32_bits_is_part_of_the_fingerprint(tmp_path):
+    """Without a number of bits they are cut off, with one they are refused: never the features of the other."""
+    Image.fromarray(np.arange(64, dtype=np.int32).reshape(8, 8) * 99).save(tmp_path / "a.tiff")
+    prints = {bits: contents(image_folder(tmp_path, bits=bits)).fingerprint for bits in (None, 16)}
+    assert prints[None] != prints[16]
+    for bits in (7, 17, 0):
+        with pytest.raises(InputError, match="expected from 8 to 16 bits"):
+            image_folder(tmp_path, bits=bits)

@@ -35,6 +35,6 @@ def school(settings=None, *, sizes=SIZES, half=0):
     matches = MatchSet([one for one, _ in found], np.array([counts for _, counts in found]), 16)
     apart = np.abs(np.arange(QUERIES)[:, None] - np.arange(QUERIES))
     positives = [apart <= tolerance for tolerance in TOLERANCES]
-    judge = Judge(TOLERANCES, "frames", positives, sweeping.halves(positives[-1]), [])
+    judge = Judge(TOLERANCES, "frames", positives, positives[-1], sweeping.halves(positives[-1]), [])
     settings = {"split": "both", "ties": "filter", "seed": 0, "batch": 4, "hidden": 5} | (settings or {})
     return list(lessons._schools(settings, matches, candidates, judge))[half]

@@ -7,7 +7,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, MatchCount, Matches, UnitWeight, score_candidates
+import mfvpr
+from mfvpr import (
+    AggregatedScore,
+    AnchorPoints,
+    DescriptorDistanceWeight,
+    FeatureScoreWeight,
+    HistogramOfShifts,
+    MatchCount,
+    Matches,
+    UnitWeight,
+    score_candidates,
+    score_grid,
+)
 from mfvpr.errors import InputError
 from mfvpr.numerics import held
 from mfvpr.scoring.parameters import fit
@@ -235,3 +247,73 @@ def test_a_function_that_changes_is_not_taken_for_what_it_was():
     held_by_closure["factor"] = 2.0
     for one, before in zip((scorer, weighted), first, strict=True):
         np.testing.assert_allclose(score_candidates(one, matches), 2 * before, rtol=2e-6)
+
+
+@pytest.mark.parametrize("broken", [np.nan, np.inf])
+@pytest.mark.parametrize("field", ["points1", "scores0", "distance"])
+def test_one_match_that_is_no_number_leaves_no_score(field, broken):
+    """Whoever asks: eager, one by one, in a batch, and in a grid; else such a pair would rank somewhere."""
+    pair = random_matches(np.random.default_rng(15), 20, capacity=24)
+    getattr(pair, field)[3] = broken
+    batch = stack([pair, random_matches(np.random.default_rng(16), 20, capacity=24)])
+    weight = DescriptorDistanceWeight() if field == "distance" else FeatureScoreWeight()
+    few, many = AnchorPoints(weight=weight), AnchorPoints(num_bins=3, weight=weight)
+    for scorer, axis in (
+        (HistogramOfShifts(weight=weight), {"sigma": [22.5]}),
+        (few, {"tolerance": [3.0]}),
+        (many, {"tolerance": [3.0]}),
+    ):
+        assert np.isnan(scorer(pair))
+        for scores in (score_candidates(scorer, batch), score_grid(scorer, batch, **axis)[0]):
+            assert np.isnan(scores[0])
+            assert np.isfinite(scores[1])
+    assert np.isnan(AggregatedScore(weight=weight)(pair))
+    assert np.isnan(HistogramOfShifts(weight=weight).dominant_shift(pair)).all()
+
+
+@own
+def test_small_types_score_as_the_same_values_in_single_precision(scorer):
+    """Half precision overflows at 65504, and bytes at 255."""
+    matches = random_matches(np.random.default_rng(17), 40)
+    halves = jax.tree.map(lambda leaf: leaf if leaf.dtype == bool else leaf.astype(np.float16), matches)
+    halves = replace(halves, scores0=np.full(40, 200, np.uint8), scores1=np.full(40, 100, np.uint8))
+    single = jax.tree.map(lambda leaf: leaf if leaf.dtype == bool else leaf.astype(np.float32), halves)
+    got = score(scorer, halves)
+    assert got.dtype == jnp.float32
+    np.testing.assert_allclose(got, score(scorer, single), rtol=2e-6)
+
+
+def test_what_would_be_ambiguous_or_too_large_is_refused():
+    @mfvpr.value
+    class Near:
+        max_distance: float = 20.0
+        fitted: float = 1.0
+
+        def __call__(self, matches):
+            return self.max_distance * self.fitted * jnp.any(matches.mask).astype(jnp.float32)
+
+    batch = stack([random_matches(np.random.default_rng(18), 20)])
+    np.testing.assert_allclose(score_candidates(Near(), batch), 20.0)
+    with pytest.raises(ValueError, match=r"Near.max_distance: a grid means something else by max_distance; rename"):
+        score_grid(Near(), batch, max_distance=[1.0])
+    with pytest.raises(ValueError, match="num_bins=216"):
+        AnchorPoints(num_bins=216)
+    for wrong in (lambda pair: score_candidates(plain, pair), lambda pair: score_grid(plain, pair, max_distance=[1.0])):
+        with pytest.raises(ValueError, match=r"expected matches \[C, K, ...\] of candidates"):
+            wrong(jax.tree.map(lambda leaf: leaf[0], batch))
+
+
+def test_threads_of_a_grid_know_the_callers_context():
+    @mfvpr.value
+    class Random:
+        seed: int = 3
+
+        def __call__(self, matches):
+            drawn = jax.random.uniform(jax.random.key(self.seed), matches.mask.shape)
+            return jnp.sum(mfvpr.masked(drawn, matches.mask))
+
+    batch = stack([random_matches(np.random.default_rng(count), 20) for count in range(16)])
+    with jax.threefry_partitionable(False):
+        expected = score_candidates(Random(), batch)
+        np.testing.assert_allclose(score_grid(Random(), batch, max_distance=[3.0])[0], expected, rtol=1e-6)
+    assert (expected != score_candidates(Random(), batch)).any()

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from mfvpr import frame_positives
+from mfvpr.data.ground_truth import AllowedTruth, FrameTruth, LabelTruth
 from mfvpr.sweeping import best_setting, halves, hits, neighbors
 
 
@@ -47,3 +48,13 @@ def test_equals_are_told_apart_by_their_neighbors():
     assert best_setting(np.array([0.9, 0.1, 0.8, 0.9, 0.8]), axes) == 3
     assert best_setting(np.array([0.9, 0.1, 0.8, 0.9, 0.8])) == 0
     assert best_setting(np.array([0.2, 0.1, 0.8, 0.4, 0.7]), axes) == 2
+
+
+def test_a_query_that_is_a_database_image_is_seen_where_it_is_reported():
+    """A place that is passed twice, in one sequence: what may not answer a query still shows its place."""
+    labels = np.r_[np.arange(50), np.arange(50)]
+    itself = FrameTruth(tuple((row,) for row in range(100)), 100)
+    truth = AllowedTruth(LabelTruth(labels, labels), ~itself.positives(3))
+    assert (truth.positives(0).sum(axis=1) == 1).all()
+    for half in halves(truth.shows_place(0)):
+        assert len(half.tune) == 0

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 
@@ -13,7 +14,7 @@ from mfvpr.sweeping.batches import slots
 from mfvpr.sweeping.settings import groups
 from mfvpr.types import Shortlist, per_match
 from tests.builders import random_matches
-from tests.scorers import FOREIGN, Wrapped, title
+from tests.scorers import FOREIGN, Sampled, Strongest, Wrapped, title
 
 FS, DMF = mfvpr.FeatureScoreWeight(), mfvpr.DescriptorDistanceWeight()
 QUERIES, CANDIDATES, DATABASE = 7, 5, 9
@@ -267,3 +268,36 @@ def test_nor_are_those_of_other_views_options_or_scorers_of_one_name(data, tmp_p
         expected = sweeping.sweep(mfvpr.MatchCount(), fused, *data, filter_score=kind)
         kept = sweeping.sweep(mfvpr.MatchCount(), fused, *data, filter_score=kind, folder=tmp_path)
         np.testing.assert_array_equal(kept, expected)
+
+
+def test_whole_numbers_and_keys_are_swept_and_kept(data, tmp_path):
+    settings = [{"place": 0}, {"place": 2}]
+    got = sweeping.sweep(Strongest(), settings, *data, folder=tmp_path)
+    for rows, setting in zip(got[0], settings, strict=True):
+        np.testing.assert_array_equal(rows[:, :CANDIDATES], one_by_one(Strongest(), setting, *data))
+    sampled, settings = Sampled(jax.random.key(3)), [{"scale": 10.0}]
+    for _ in range(2):
+        got = sweeping.sweep(sampled, settings, *data, folder=tmp_path)
+        np.testing.assert_array_equal(got[0, 0, :, :CANDIDATES], one_by_one(sampled, settings[0], *data))
+
+
+def test_code_that_depends_on_the_shape_is_told_apart(data, tmp_path):
+    def scorer(sign):
+        return lambda matches: mfvpr.MatchCount()(matches) * (1.0 if len(matches.mask) <= 8 else sign)
+
+    for sign in (1.0, -1.0):
+        expected = sweeping.sweep(scorer(sign), [{"max_distance": 2.0}], *data)
+        got = sweeping.sweep(scorer(sign), [{"max_distance": 2.0}], *data, folder=tmp_path)
+        np.testing.assert_array_equal(got, expected)
+
+
+def test_a_number_named_as_the_filters_share_is_refused(data):
+    @mfvpr.value
+    class Score:
+        c: float = 1.0
+
+        def __call__(self, matches):
+            return self.c * mfvpr.MatchCount()(matches)
+
+    with pytest.raises(ValueError, match=r"Score\.c: a grid means something else by c"):
+        sweeping.sweep(Score(), [{"c": 0.5}], *data)
