@@ -29,7 +29,8 @@ def in_words(settings: Mapping[str, Any], dataset: Dataset) -> str:
     if dataset.truth is None:
         return "no ground truth: rankings only"
     found = described(settings, dataset)
-    source = ", ".join(found["files"]) or _WORDS.get(found["kind"], found["kind"])
+    files = ", ".join(dict.fromkeys(found["files"]))
+    source = ("labels in " if found["kind"] == "label" else "") + files or _WORDS.get(found["kind"], found["kind"])
     if found["unit"] == "exact":
         return f"recall in %, ground truth: {source}"
     within = ", ".join(f"{threshold:g}" for threshold in found["thresholds"])
