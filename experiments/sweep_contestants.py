@@ -1,6 +1,5 @@
 """Who takes part in the benchmark of sweeps: grids of the scores' parameters, mfvpr's and NumPy's."""
 
-import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -14,6 +13,7 @@ import mfvpr
 from experiments import contestants
 from experiments.contestants import CANDIDATES, SIZE, Entry, Lineup
 from experiments.numpy_sweeps import Workers, flush_denormals
+from mfvpr.numerics import available_cpus
 from mfvpr.types import Matches
 from mfvpr.weighting import match_weights
 
@@ -28,8 +28,8 @@ SAME, OTHER = "same place", "other place"  # nearly all matches agree, none do
 
 def lineup() -> Lineup:
     """Everyone, on the same pairs."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    teams = {f"NumPy, {count} process{'es' * (count > 1)}": Workers(count) for count in sorted({1, cores})}
+    counts = sorted({1, available_cpus()})
+    teams = {f"NumPy, {count} process{'es' * (count > 1)}": Workers(count) for count in counts}
     same = _matches()
     places = {SAME: same, OTHER: _shuffled(same)}
     flushed = "flushed for all" if flush_denormals() else "flushed for mfvpr only (NumPy needs torch for it)"
