@@ -135,7 +135,8 @@ def _schools(settings: dict[str, Any], matches: MatchSet, candidates: Shortlist,
         apart = sweeping.separated(judgment.places, half.tune[:cut], half.tune[cut:])
         seen = candidates.mask & half.allowed[np.maximum(candidates.indices, 0)]
         school = School(settings, matches, candidates, judgment, half, apart.tune, apart.report, seen, name)
-        teaches = np.asarray((school.right & school.usable).any(axis=1))
+        right, wrong = school.right & school.usable, ~school.right & school.usable
+        teaches = np.asarray(right.any(axis=1) & wrong.any(axis=1))  # the loss of others is 0, whatever the scores
         school = replace(
             school, learning=apart.tune[teaches[apart.tune]], validating=apart.report[teaches[apart.report]]
         )

@@ -220,7 +220,11 @@ def _draw(path: Path, outcome: Outcome, query: int, verdict: str) -> None:
     if verdict == "wrong":
         answers += _right_answer(outcome, query)
     image = _image(outcome, outcome.dataset.queries, query)
-    title = f"{outcome.headline}, {verdict}: {names[query]} -> {outcome.dataset.database.names[system.rows[query, 0]]}"
+    truth, thresholds = outcome.dataset.truth, outcome.thresholds
+    within = threshold_words(truth.unit, thresholds[len(thresholds) // 2]) if truth is not None else ""
+    verdict += " at" * bool(within) + within
+    answer = outcome.dataset.database.names[system.rows[query, 0]]
+    title = f"{outcome.headline}, {verdict}: {names[query]} -> {answer}"
     histogram_figure(path, image, answers, title=title)
 
 

@@ -25,12 +25,13 @@ def matches_of(query, candidates, rng, sizes):
     return Matches(**flat), [len(pair.mask) for pair in pairs]
 
 
-def school(settings=None, *, sizes=SIZES, half=0):
-    """The school of one half; every query has all frames as candidates, in an order of its own."""
+def school(settings=None, *, sizes=SIZES, half=0, only_right=()):
+    """The school of one half; all frames are candidates of every query, in an order of its own; of some, one is."""
     rng = np.random.default_rng(0)
     indices = np.stack([rng.permutation(QUERIES) for _ in range(QUERIES)]).astype(np.int32)
+    mask = ~np.isin(np.arange(QUERIES), only_right)[:, None] | (indices == np.arange(QUERIES)[:, None])
     scores = -np.sort(-rng.random(indices.shape).astype(np.float32), axis=1)
-    candidates = Shortlist(indices=indices, scores=scores, mask=np.ones(indices.shape, bool))
+    candidates = Shortlist(indices=indices, scores=scores, mask=mask)
     found = [matches_of(query, indices[query], rng, sizes) for query in range(QUERIES)]
     matches = MatchSet([one for one, _ in found], np.array([counts for _, counts in found]), 16)
     apart = np.abs(np.arange(QUERIES)[:, None] - np.arange(QUERIES))

@@ -99,3 +99,12 @@ def test_anchors_start_near_the_hard_score():
     soft = scores_of_one(start.scorer_of(start.start), matches)
     hard = scores_of_one(AnchorPoints(temperature=None), matches)
     assert np.median(np.abs(soft / hard - 1)) < 0.08
+
+
+def test_queries_without_a_wrong_candidate_teach_nothing_and_judge_nothing():
+    """Their loss is 0 from the start: as a validation it would stop every training at once."""
+    alone = range(0, QUERIES, 3)
+    every, rest = school(), school(only_right=alone)
+    for chosen, before in ((rest.learning, every.learning), (rest.validating, every.validating)):
+        assert list(chosen) == [query for query in before if query not in alone]
+        assert len(chosen) < len(before)
