@@ -17,7 +17,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from experiments import build, outputs
+from experiments import build, outputs, run_folder
 from experiments import run as evaluation
 from experiments.settings import SettingsError
 from mfvpr.data.ground_truth import AllowedTruth
@@ -265,18 +265,20 @@ def test_run_folders_of_one_second_differ(tmp_path, monkeypatch):
 
 @pytest.fixture
 def limited(monkeypatch):
-    """From the writing of the results on, files cannot grow beyond so many bytes, as on a full disk."""
-    before, text = resource.getrlimit(resource.RLIMIT_FSIZE), outputs.text
+    """While results are written, files cannot grow beyond so many bytes, as on a full disk."""
+    before, leave = resource.getrlimit(resource.RLIMIT_FSIZE), run_folder.leave
 
     def limit(size):
-        def then(outcome):
+        def limited(*arguments, **named):
             resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-            return text(outcome)
+            try:
+                leave(*arguments, **named)
+            finally:  # at once: the log of the tests is a file, too
+                resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
-        monkeypatch.setattr(outputs, "text", then)
+        monkeypatch.setattr(run_folder, "leave", limited)
 
-    yield limit
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    return limit
 
 
 def test_a_full_disk_costs_no_table(root, evaluated, tmp_path, monkeypatch, capsys, limited):

@@ -73,6 +73,7 @@ def groups(scorer: Any, settings: Sequence[Setting], image_sizes: tuple[np.ndarr
         image_sizes: all that occur, `[n, 2]` of queries and of database images.
     """
     static = parameters.choices(scorer)
+    whole = {name for name, number in parameters.numbers(scorer).items() if _is_whole(number)}
     weights = list({id(s["weight"]): s["weight"] for s in settings if "weight" in s}.values())
     for choices, members in _grouped(
         settings, range(len(settings)), lambda name, value: name in static or value is None
@@ -82,9 +83,11 @@ def groups(scorer: Any, settings: Sequence[Setting], image_sizes: tuple[np.ndarr
             chosen = replace(chosen, weight=ChosenWeight(tuple(weights), 0))
         chosen = held(chosen)
         for rows in _products(settings, members):
-            values = _arrays([settings[row] for row in rows[:, 0]], weights, without={*choices, *WEIGHTINGS})
+            values = _arrays(
+                [settings[row] for row in rows[:, 0]], weights, whole=whole, without={*choices, *WEIGHTINGS}
+            )
             weightings = _arrays(
-                [settings[row] for row in rows[0]], weights, without=set(settings[0]) - set(WEIGHTINGS)
+                [settings[row] for row in rows[0]], weights, whole=whole, without=set(settings[0]) - set(WEIGHTINGS)
             )
             for fitted, part in reranking.by_capacity(chosen, values, len(rows), *image_sizes):
                 yield Group(fitted, {name: axis[part] for name, axis in values.items()}, weightings, rows[part])
@@ -112,22 +115,18 @@ def _grouped(
     return list(found.values())
 
 
-def _arrays(settings: Sequence[Setting], weights: Sequence[Any], *, without: set[str]) -> dict[str, np.ndarray]:
-    """`[n]` values by name; a kind of weight is its number among `weights`."""
+def _arrays(
+    settings: Sequence[Setting], weights: Sequence[Any], *, whole: set[str], without: set[str]
+) -> dict[str, np.ndarray]:
+    """`[n]` values by name, int where `whole`; a kind of weight is its number among `weights`."""
     number = {id(weight): place for place, weight in enumerate(weights)}
     names = [name for name in settings[0] if name not in without]
     return {
         name: np.array([number[id(setting[name])] for setting in settings])
         if name == "weight"
-        else _numbers([setting[name] for setting in settings])
+        else np.array([setting[name] for setting in settings], int if name in whole else np.float32)
         for name in names
     }
-
-
-def _numbers(values: Sequence[Any]) -> np.ndarray:
-    """float32, but for whole numbers, which may be indices."""
-    found = np.array(values)
-    return found if np.issubdtype(found.dtype, np.integer) else found.astype(np.float32)
 
 
 def _key(setting: Setting) -> tuple:
@@ -138,3 +137,8 @@ def _parts(total: int, size: int) -> list[np.ndarray]:
     """Even parts of range(total), none longer than `size`, all of one length: the last repeats its last."""
     length = -(-total // -(-total // size))
     return [np.minimum(np.arange(start, start + length), total - 1) for start in range(0, total, length)]
+
+
+def _is_whole(number: Any) -> bool:
+    """Of a scorer's own value: then others are, too, and may be indices."""
+    return isinstance(number, int | np.integer) and not isinstance(number, bool)
