@@ -331,7 +331,7 @@ def test_ctrl_c_keeps_what_is_finished_and_the_next_run_does_the_rest(root, swee
     command = [sys.executable, "-m", "experiments.sweep", *arguments]
     process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
     kept = root / "store"
-    while len(done := list(kept.glob("folder_sweep-*/[!.]*.npy"))) < 5:
+    while len(done := list(kept.glob("folder_sweep-*/[!.]*.npz"))) < 5:
         assert process.poll() is None, process.stderr.read()
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)
@@ -341,7 +341,7 @@ def test_ctrl_c_keeps_what_is_finished_and_the_next_run_does_the_rest(root, swee
     assert "Traceback" not in stderr
     assert list(tmp_path.iterdir()) == []
 
-    done, computed = list(kept.glob("folder_sweep-*/[!.]*.npy")), []
+    done, computed = list(kept.glob("folder_sweep-*/[!.]*.npz")), []
     assert 5 <= len(done) < 6 * QUERIES
     sweep(tmp_path / "other", SIGMA)  # takes nothing of another sweep away
     scores = SWEEP._scores
