@@ -19,11 +19,11 @@ is many times what float32 rounds a position to.
 """
 
 from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from mfvpr.scoring.lattice import Lattice, gaussian, of_all_bins
 from mfvpr.types import Array
 
 BLOCKS_AT_ONCE = 4
@@ -31,29 +31,6 @@ MOST_ROUNDS = 16  # after them all bins cost less
 WORTHWHILE = 2**13  # bins times weightings from which on a bound costs less than all bins
 _SLACK = 2**-10  # of a bound: rounded positions and exponentials
 _SLACK_PER_MATCH = 2**-22  # of a bound: rounded sums
-
-
-class Lattice(NamedTuple):
-    """Where the bins are, and how votes fall off.
-
-    first, num_bins: `[2]` (x, y) center of the first bin, and how many there are.  bin_size, deviation, truncate: `[]`.
-    """
-
-    first: Array
-    num_bins: Array
-    bin_size: Array
-    deviation: Array
-    truncate: Array
-
-    def centers(self, axis: int, index: Array) -> Array:
-        """Of bins by their (whole) number along an axis."""
-        return self.first[axis] + index * self.bin_size
-
-
-def gaussian(distance: Array, deviation: Array, truncate: Array) -> Array:
-    """Votes of matches at a distance along one axis."""
-    sigmas = distance / deviation
-    return jnp.where(jnp.abs(sigmas) > truncate, 0.0, jnp.exp(-0.5 * sigmas**2))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(3,))
@@ -68,28 +45,13 @@ def tallest_bins(shifts: Array, weights: Array, lattice: Lattice, capacity: int)
         lattice: of at most `capacity` bins along each axis.
         capacity: static.
     """
-    find = _search if capacity**2 * len(weights) > WORTHWHILE else _all_bins
+    find = _search if capacity**2 * len(weights) > WORTHWHILE else of_all_bins
     return find(shifts, weights, lattice, capacity)
 
 
 @tallest_bins.defjvp
 def _derivative(capacity: int, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    return jax.jvp(partial(_all_bins, capacity=capacity), primals, tangents)
-
-
-def _all_bins(shifts: Array, weights: Array, lattice: Lattice, capacity: int) -> Array:
-    index = jnp.arange(capacity, dtype=shifts.dtype)
-    votes_x, votes_y = (
-        gaussian(lattice.centers(axis, index)[:, None] - shifts[axis][None], lattice.deviation, lattice.truncate)
-        for axis in (0, 1)
-    )
-    inside = (index < lattice.num_bins[1])[:, None] & (index < lattice.num_bins[0])[None]
-
-    def tallest(weights: Array) -> Array:
-        bins = jnp.matmul(votes_y * weights[None], votes_x.T, precision=jax.lax.Precision.HIGHEST)
-        return jnp.max(bins, where=inside, initial=-jnp.inf)
-
-    return tallest(weights[0])[None] if len(weights) == 1 else jax.lax.map(tallest, weights)
+    return jax.jvp(partial(of_all_bins, capacity=capacity), primals, tangents)
 
 
 def _search(shifts: Array, weights: Array, lattice: Lattice, capacity: int) -> Array:
@@ -118,7 +80,7 @@ def _search(shifts: Array, weights: Array, lattice: Lattice, capacity: int) -> A
     _, tallest, _, factors, _ = state
     return jax.lax.cond(
         factors[0] > 1,  # a field so flat that all bins are nearly as tall
-        lambda: _all_bins(shifts, weights, lattice, capacity),
+        lambda: of_all_bins(shifts, weights, lattice, capacity),
         lambda: jnp.where(usable, tallest, jnp.nan),
     )
 

@@ -132,7 +132,8 @@ def _arrays(content: Any, order: Order, values: Callable[[Storage], bytes]) -> d
     arrays = {}
     for key, tensor in content.items():
         if not isinstance(key, str):
-            raise InputError(f"expected tensors by name, got number {excerpt(str(key))}; use the official one")
+            number = excerpt(str(key))
+            raise InputError(f"expected tensors by name, got one by the number {number}; use the official file")
         where = f" at {excerpt(key)}"
         if not isinstance(tensor, Tensor):
             raise InputError(f"expected tensors only, got {type(tensor).__name__}{where}")

@@ -82,7 +82,7 @@ except SystemExit:
         (["lst"], "invalid choice: 'lst'"),
         (["convert"], "arguments are required: FILE"),
         (["list", "3"], "unrecognized arguments: 3"),
-        (["convert", "some.pth"], "some.pth: no official file name; say what it is with --as NAME, one of d2_tf"),
+        (["convert", "some.pth"], "some.pth: no such file"),
         (["convert", "some.pth", "--as", "d2_tff"], "d2_tff: no weights of this name; the nearest is d2_tf"),
         (["convert", "nowhere/d2_tf.pth"], "nowhere/d2_tf.pth: expected a checkpoint file, got: No such file"),
         (
@@ -144,7 +144,7 @@ def test_missing_weights_are_answered_with_a_command(program, folder, capfd):
 
 def test_convert_under_another_name(program, refused, folder, tiny_checkpoint):
     other = tiny_checkpoint.rename(tiny_checkpoint.with_name("it's (1).pth"))
-    refused("it's (1).pth: no official file name", "convert", other)
+    refused("it's (1).pth: no official file name; say what it is with --as NAME, one of d2_tf", "convert", other)
     refused("expected the sha256 of aliked-t16", "convert", other, "--as", "aliked-t16")
     assert not folder.exists()
     assert program("convert", other, "--as", "tiny")[0] == 0

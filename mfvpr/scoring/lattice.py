@@ -1,0 +1,82 @@
+"""The bins of a histogram of shifts, and the votes of matches for them. Lengths are pixels."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from mfvpr.types import Array
+
+
+class Lattice(NamedTuple):
+    """Where the bins are, and how votes fall off.
+
+    first, num_bins: `[2]` (x, y) center of the first bin, and how many there are.  bin_size, deviation, truncate: `[]`.
+    """
+
+    first: Array
+    num_bins: Array
+    bin_size: Array
+    deviation: Array
+    truncate: Array
+
+    def centers(self, axis: int, index: Array) -> Array:
+        """Of bins by their (whole) number along an axis."""
+        return self.first[axis] + index * self.bin_size
+
+    def index(self, capacity: int) -> Array:
+        """`[B]` numbers of as many bins as there is room for."""
+        return jnp.arange(capacity, dtype=self.first.dtype)
+
+    def inside(self, capacity: int) -> Array:
+        """`[B, B]` (y, x) bool, the bins that there are."""
+        index = self.index(capacity)
+        return (index < self.num_bins[1])[:, None] & (index < self.num_bins[0])[None]
+
+    def fits(self, capacity: int) -> Array:
+        """`[]` bool, whether there is room for all."""
+        return jnp.all(self.num_bins <= capacity)
+
+
+def gaussian(distance: Array, deviation: Array, truncate: Array) -> Array:
+    """Votes of matches at a distance along one axis."""
+    sigmas = distance / deviation
+    return jnp.where(jnp.abs(sigmas) > truncate, 0.0, jnp.exp(-0.5 * sigmas**2))
+
+
+def votes(shifts: Array, lattice: Lattice, capacity: int) -> tuple[Array, Array]:
+    """Votes `[B, K]` of shifts `[2, K]` along x and along y, without weights."""
+    # Bins along rows: the exponentials then run along K, which is longer and contiguous (1.8x faster).
+    x, y = (lattice.centers(axis, lattice.index(capacity))[:, None] - shifts[axis][None] for axis in (0, 1))
+    return gaussian(x, lattice.deviation, lattice.truncate), gaussian(y, lattice.deviation, lattice.truncate)
+
+
+def bins(votes_x: Array, votes_y: Array, weights: Array) -> Array:
+    """`[B, B]` (y, x) sums of the weighted votes `[B, K]`."""
+    return jnp.matmul(votes_y * weights[None], votes_x.T, precision=jax.lax.Precision.HIGHEST)
+
+
+def tallest(scores: Array, inside: Array) -> Array:
+    """The largest of the bins that there are, -inf of none."""
+    return jnp.max(scores, where=inside, initial=-jnp.inf)
+
+
+def of_all_bins(
+    shifts: Array,
+    weights: Array,
+    lattice: Lattice,
+    capacity: int,
+    pool: Callable[[Array, Array], Array] = tallest,
+) -> Array:
+    """What `pool(scores, inside)` makes of all bins, `[W]`, by several weights `[W, K]` of one pair's matches.
+
+    The Gaussians, which do not depend on the weights, are evaluated once.
+    """
+    votes_x, votes_y = votes(shifts, lattice, capacity)
+    inside = lattice.inside(capacity)
+
+    def one(weights: Array) -> Array:
+        return pool(bins(votes_x, votes_y, weights), inside)
+
+    return one(weights[0])[None] if len(weights) == 1 else jax.lax.map(one, weights)
