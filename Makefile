@@ -9,7 +9,7 @@ demo: setup
 	$(BIN)/python -m experiments.evaluate
 
 test: .venv/.test
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
 setup: .venv/.setup
 

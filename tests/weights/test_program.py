@@ -20,7 +20,7 @@ from tests.checkpoints import ALIKED, d2net_shapes, random_checkpoint, write_leg
 from tests.weights.conftest import PARAMETERS, SOURCE_SHAPES, tiny_entry
 
 ROOT = Path(__file__).parent.parent.parent
-CONTENT = os.urandom(1 << 20)
+CONTENT = bytes(range(256)) * 4096
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
 
 
