@@ -138,20 +138,23 @@ def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> 
     outer = [name for name in values if name not in WEIGHTINGS]
     settings, weightings = _product(values, outer), _product(values, inner)
     rows = int(np.prod([len(values[name]) for name in outer]))
-    parts = by_capacity(scorer, settings, rows, *_sizes(matches))
+    parts = [
+        (fitted, part, {name: axis[part] for name, axis in settings.items()})
+        for fitted, part in by_capacity(scorer, settings, rows, *_sizes(matches))
+    ]
 
-    def score(matches: Matches) -> Array:
-        scores = [
-            score_settings(fitted, matches, {name: axis[part] for name, axis in settings.items()}, weightings)
-            for fitted, part in parts
-        ]
-        return jnp.concatenate(scores)
+    concrete = is_concrete((scorer, matches, values))
+    settled = jax.block_until_ready if concrete else lambda scores: scores  # programs side by side share no cache
 
-    scores = _on_every_core(score, matches) if is_concrete((scorer, matches, values)) else score(matches)
-    order = np.argsort(np.concatenate([part for _, part in parts]))
+    def score(matches: Matches) -> list[Array]:
+        return [settled(score_settings(fitted, matches, values, weightings)) for fitted, _, values in parts]
+
+    scores = _on_every_core(score, matches) if concrete else score(matches)
+    xp: Any = np if concrete else jnp  # what JAX does one by one waits for its own turn
+    order = np.argsort(np.concatenate([part for _, part, _ in parts]))
     names = outer + inner
-    found = scores[order].reshape(*(len(values[name]) for name in names), -1)
-    return jnp.moveaxis(found, range(len(names)), [list(axes).index(name) for name in names])
+    found = xp.concatenate(scores)[order].reshape(*(len(values[name]) for name in names), -1)
+    return jnp.asarray(xp.moveaxis(found, range(len(names)), [list(axes).index(name) for name in names]))
 
 
 def refuse_own_names(scorer: Any, names: Iterable[str], reserved: Iterable[str] = WEIGHTINGS) -> None:
@@ -160,8 +163,8 @@ def refuse_own_names(scorer: Any, names: Iterable[str], reserved: Iterable[str] 
         raise ValueError(f"{type(scorer).__name__}.{name}: a grid means something else by {name}; rename the field")
 
 
-def _on_every_core(function: Callable[[Matches], Array], matches: Matches) -> Array:
-    """`function` of matches `[C, K, ...]`, with the candidates along its last axis: a part of them on every core.
+def _on_every_core(function: Callable[[Matches], Any], matches: Matches) -> Any:
+    """`function` of matches `[C, K, ...]`, a part of them on every core; candidates are the last axis of what it gives.
 
     Elsewhere than on a CPU, with settings of JAX's that other threads would not know, or few candidates: at once.
     """
@@ -170,19 +173,25 @@ def _on_every_core(function: Callable[[Matches], Array], matches: Matches) -> Ar
         return function(matches)
     size = -(-count // cores)
     starts = [min(core * size, count - size) for core in range(cores)]  # of one size, hence one program: some overlap
+    host = jax.tree.map(np.asarray, matches)
 
-    def part(start: int) -> Array:
-        return jax.block_until_ready(function(jax.tree.map(lambda leaf: leaf[start : start + size], matches)))
+    def part(start: int) -> Any:
+        found = function(jax.tree.map(lambda leaf: leaf[start : start + size], host))
+        return jax.tree.map(np.asarray, found)
 
     with ThreadPoolExecutor(cores) as pool:
         found = list(pool.map(part, starts))
     new = [core * size - start for core, start in enumerate(starts)]
-    return jnp.concatenate([scores[..., skip:] for scores, skip in zip(found, new, strict=True)], axis=-1)
+    return jax.tree.map(
+        lambda *parts: np.concatenate([scores[..., skip:] for scores, skip in zip(parts, new, strict=True)], axis=-1),
+        *found,
+    )
 
 
 def _product(values: Mapping[str, Array], names: Sequence[str]) -> dict[str, Array]:
     """Every combination of some axes' values, by axis."""
-    points = jnp.meshgrid(*(values[name] for name in names), indexing="ij")
+    xp = np if is_concrete(dict(values)) else jnp
+    points = xp.meshgrid(*(values[name] for name in names), indexing="ij")
     return {name: point.reshape(-1) for name, point in zip(names, points, strict=True)}
 
 

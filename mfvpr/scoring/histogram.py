@@ -88,8 +88,7 @@ class HistogramOfShifts:
         if self.temperature is not None:
             pool = partial(_smooth_max, temperature=positive(self.temperature, shifts.dtype))
         found = of_all_bins(shifts, weights, lattice, capacity, pool)
-        usable = lattice.fits(capacity) & _usable(shifts, weights)
-        return jnp.where(jnp.any(matches.mask), jnp.where(usable, found, jnp.nan), 0.0)
+        return _where_usable(found, matches, shifts, weights, lattice.usable(capacity))
 
     def all_reweighted(self, matches: Matches, weights: Array) -> Array:
         """`reweighted` of pairs `[C, K, ...]` by weights `[C, W, K]`: scores `[C, W]`, quick where there are many.
@@ -105,16 +104,15 @@ class HistogramOfShifts:
     def _pair_by_pair(self, matches: Matches, weights: Array) -> Array:
         capacity, shifts = self._capacity(matches), jax.vmap(self._planes)(matches)
         lattice = jax.vmap(self._lattice_of)(matches)
-        found = jax.lax.map(lambda pair: tallest_bins(*pair, capacity), (shifts, weights, lattice))
-        fits = jax.vmap(lambda lattice: lattice.fits(capacity))(lattice)[:, None]
-        usable = fits & jax.vmap(_usable)(shifts, weights)
-        return jnp.where(jnp.any(matches.mask, axis=1)[:, None], jnp.where(usable, found, jnp.nan), 0.0)
+        found = tallest_bins(shifts, weights, lattice, capacity)
+        usable = jax.vmap(lambda lattice: lattice.usable(capacity))(lattice)
+        return jax.vmap(_where_usable)(found, matches, shifts, weights, usable)
 
     def histogram(self, matches: Matches) -> ShiftHistogram:
         """All bins of one pair with their centers."""
-        scores, lattice, fits = self._vote(matches)
-        x, y = (lattice.centers(axis, lattice.index(len(scores))) for axis in (0, 1))
-        return ShiftHistogram(jnp.where(fits, scores, jnp.nan), x, y)
+        scores, lattice, usable = self._vote(matches)
+        x, y = (lattice.centers(axis, jnp.arange(len(scores), dtype=scores.dtype)) for axis in (0, 1))
+        return ShiftHistogram(jnp.where(usable, scores, jnp.nan), x, y)
 
     def dominant_shift(self, matches: Matches, *, refine: bool = False) -> Array:
         """`[2]` (x, y) px: where the query's points lie in the candidate; (0, 0) where nothing votes.
@@ -176,10 +174,10 @@ class HistogramOfShifts:
         return self.fitted(matches.image_size0, matches.image_size1)
 
     def _vote(self, matches: Matches) -> tuple[Array, Lattice, Array]:
-        """Scores `[B, B]` (y, x), -inf of bins that there are not; the lattice, and whether all of it fits `[]`."""
+        """Scores `[B, B]` (y, x), -inf of bins that there are not; the lattice, and whether it is usable `[]`."""
         lattice, capacity = self._lattice_of(matches), self._capacity(matches)
         scores = bins(*votes(self._planes(matches), lattice, capacity), match_weights(self.weight, matches))
-        return jnp.where(lattice.inside(capacity), scores, -jnp.inf), lattice, lattice.fits(capacity)
+        return jnp.where(lattice.inside(capacity), scores, -jnp.inf), lattice, lattice.usable(capacity)
 
     def _lattice_of(self, matches: Matches) -> Lattice:
         """Of one pair."""
@@ -230,14 +228,14 @@ class HistogramOfShifts:
 
 @partial(compiled, static_argnames="refine")  # or the loop would be compiled at every call
 def _dominant_shift(scorer: HistogramOfShifts, matches: Matches, *, refine: bool) -> Array:
-    scores, lattice, fits = scorer._vote(matches)
+    scores, lattice, usable = scorer._vote(matches)
     row, column = jnp.unravel_index(jnp.argmax(scores), scores.shape)
     shift = jnp.stack([lattice.centers(axis, bin.astype(scores.dtype)) for axis, bin in enumerate((column, row))])
     shifts, weights = scorer._shifts(matches), match_weights(scorer.weight, matches)
     if refine:
         shift = _climb(shift, shifts, weights, scorer._deviation(shifts.dtype))
-    usable = fits & _usable(shifts, weights[None])[0]
-    return jnp.where(usable, jnp.where(jnp.max(scores) > 0, shift, 0.0), jnp.where(jnp.any(matches.mask), jnp.nan, 0.0))
+    shift = jnp.where(jnp.max(scores) > 0, shift, 0.0)
+    return _where_usable(shift, matches, shifts, weights[None], usable)
 
 
 def _climb(start: Array, shifts: Array, weights: Array, deviation: Array) -> Array:
@@ -252,14 +250,16 @@ def _climb(start: Array, shifts: Array, weights: Array, deviation: Array) -> Arr
     return jax.lax.fori_loop(0, _MEAN_SHIFT_STEPS, step, start)
 
 
-def _usable(shifts: Array, weights: Array) -> Array:
-    """`[W]` whether all shifts and the weights `[W, K]` are numbers: else the tallest bin would be anything."""
-    return jnp.all(jnp.isfinite(shifts)) & jnp.all(jnp.isfinite(weights), axis=1)
+def _where_usable(found: Array, matches: Matches, shifts: Array, weights: Array, usable: Array) -> Array:
+    """What was `found` by weights `[W, K]` of one pair, `[W]` or of the only one; 0 without matches, and NaN where the
+    lattice is not usable, a shift or a weight no number: else the tallest bin would be anything."""
+    usable = usable & jnp.all(jnp.isfinite(shifts)) & jnp.all(jnp.isfinite(weights), axis=1)
+    return jnp.where(jnp.any(matches.mask), jnp.where(usable, found, jnp.nan), 0.0)
 
 
 def _smooth_max(values: Array, mask: Array, *, temperature: Array) -> Array:
     """T log(mean of e^(v / T)) of the values where `mask`."""
     # Relative to the maximum nothing overflows or cancels; its own gradient would be 0, since it drops out.
-    largest = jax.lax.stop_gradient(tallest(values, mask))
+    largest = jax.lax.stop_gradient(jnp.max(values))
     below = (masked(values, mask, largest) - largest) / temperature
     return largest + temperature * jnp.log(jnp.mean(jnp.exp(below), where=mask))

@@ -25,18 +25,20 @@ class Lattice(NamedTuple):
         """Of bins by their (whole) number along an axis."""
         return self.first[axis] + index * self.bin_size
 
-    def index(self, capacity: int) -> Array:
-        """`[B]` numbers of as many bins as there is room for."""
-        return jnp.arange(capacity, dtype=self.first.dtype)
+    def real(self, axis: int, index: Array) -> Array:
+        """Of a bin's number, the bin itself; beyond the last the last again, which no maximum notices."""
+        return jnp.minimum(index, self.num_bins[axis] - 1)
 
     def inside(self, capacity: int) -> Array:
         """`[B, B]` (y, x) bool, the bins that there are."""
-        index = self.index(capacity)
+        index = jnp.arange(capacity, dtype=self.num_bins.dtype)
         return (index < self.num_bins[1])[:, None] & (index < self.num_bins[0])[None]
 
-    def fits(self, capacity: int) -> Array:
-        """`[]` bool, whether there is room for all."""
-        return jnp.all(self.num_bins <= capacity)
+    def usable(self, capacity: int) -> Array:
+        """`[]` bool, whether there is room for all bins, and a width of the votes."""
+        # Told beforehand: XLA's maximum over thousands of values on a CPU passes over NaN.
+        room = jnp.all((self.num_bins >= 1) & (self.num_bins <= capacity))
+        return room & ~jnp.isnan(self.deviation)
 
 
 def gaussian(distance: Array, deviation: Array, truncate: Array) -> Array:
@@ -46,10 +48,17 @@ def gaussian(distance: Array, deviation: Array, truncate: Array) -> Array:
 
 
 def votes(shifts: Array, lattice: Lattice, capacity: int) -> tuple[Array, Array]:
-    """Votes `[B, K]` of shifts `[2, K]` along x and along y, without weights."""
+    """Votes `[B, K]` of shifts `[2, K]` along x and along y, without weights; beyond the last bin as for the last."""
+    index = jnp.arange(capacity, dtype=shifts.dtype)
+    x, y = (votes_along(axis, index, shifts, lattice) for axis in (0, 1))
+    return x, y
+
+
+def votes_along(axis: int, index: Array, shifts: Array, lattice: Lattice) -> Array:
+    """Votes `[..., K]` of shifts `[2, K]` along one axis for bins by their number `[...]`."""
     # Bins along rows: the exponentials then run along K, which is longer and contiguous (1.8x faster).
-    x, y = (lattice.centers(axis, lattice.index(capacity))[:, None] - shifts[axis][None] for axis in (0, 1))
-    return gaussian(x, lattice.deviation, lattice.truncate), gaussian(y, lattice.deviation, lattice.truncate)
+    distance = lattice.centers(axis, lattice.real(axis, index))[..., None] - shifts[axis][(None,) * index.ndim]
+    return gaussian(distance, lattice.deviation, lattice.truncate)
 
 
 def bins(votes_x: Array, votes_y: Array, weights: Array) -> Array:
@@ -57,9 +66,9 @@ def bins(votes_x: Array, votes_y: Array, weights: Array) -> Array:
     return jnp.matmul(votes_y * weights[None], votes_x.T, precision=jax.lax.Precision.HIGHEST)
 
 
-def tallest(scores: Array, inside: Array) -> Array:
-    """The largest of the bins that there are, -inf of none."""
-    return jnp.max(scores, where=inside, initial=-jnp.inf)
+def tallest(scores: Array, _: Array) -> Array:
+    """The largest of all bins."""
+    return jnp.max(scores)  # without a mask, which would cost as much as the product and is not needed
 
 
 def of_all_bins(

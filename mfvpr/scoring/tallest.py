@@ -19,42 +19,56 @@ is many times what float32 rounds a position to.
 """
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from mfvpr.scoring.lattice import Lattice, gaussian, of_all_bins
+from mfvpr.scoring.lattice import Lattice, gaussian, of_all_bins, votes_along
 from mfvpr.types import Array
 
 BLOCKS_AT_ONCE = 4
 MOST_ROUNDS = 16  # after them all bins cost less
 WORTHWHILE = 2**13  # bins times weightings from which on a bound costs less than all bins
+PAIRS_AT_ONCE = 8  # times weightings: few and long operations, that still stay in the cache
 _SLACK = 2**-10  # of a bound: rounded positions and exponentials
 _SLACK_PER_MATCH = 2**-22  # of a bound: rounded sums
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(3,))
 def tallest_bins(shifts: Array, weights: Array, lattice: Lattice, capacity: int) -> Array:
-    """Maximum over the bins in range `[W]`, by several weights `[W, K]` of one pair's matches.
+    """Maximum over the bins in range `[C, W]`, by several weights of the matches of each pair.
 
     Its derivative is that of the maximum over all bins.
 
     Args:
-        shifts: `[2, K]` along x and along y.
-        weights: `[W, K]`, 0 on padding; if one of them is not finite, their maximum is NaN.
-        lattice: of at most `capacity` bins along each axis.
+        shifts: `[C, 2, K]` along x and along y.
+        weights: `[C, W, K]`, 0 on padding; if one of them is not finite, their maximum is NaN.
+        lattice: `[C, ...]`, of at most `capacity` bins along each axis.
         capacity: static.
     """
-    find = _search if capacity**2 * len(weights) > WORTHWHILE else of_all_bins
-    return find(shifts, weights, lattice, capacity)
+    pairs, num_weights = (shifts, weights, lattice), weights.shape[1]
+    if capacity**2 * num_weights <= WORTHWHILE:
+        return _all_bins(pairs, capacity, batch_size=max(1, PAIRS_AT_ONCE // num_weights))
+
+    def one(pair: Any) -> Array:
+        found, done = _search(*pair, capacity=capacity)
+        return jax.lax.cond(done, lambda: found, lambda: of_all_bins(*pair, capacity=capacity))
+
+    return jax.lax.map(one, pairs)
 
 
 @tallest_bins.defjvp
 def _derivative(capacity: int, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    return jax.jvp(partial(of_all_bins, capacity=capacity), primals, tangents)
+    return jax.jvp(lambda *pairs: _all_bins(pairs, capacity), primals, tangents)
 
 
-def _search(shifts: Array, weights: Array, lattice: Lattice, capacity: int) -> Array:
+def _all_bins(pairs: Any, capacity: int, *, batch_size: int | None = None) -> Array:
+    return jax.lax.map(lambda pair: of_all_bins(*pair, capacity=capacity), pairs, batch_size=batch_size)
+
+
+def _search(shifts: Array, weights: Array, lattice: Lattice, capacity: int) -> tuple[Array, Array]:
+    """Of one pair the tallest bins `[W]`, and whether they are: no block that is left can hold a taller one."""
     side = _side(capacity)
     count = -(-capacity // side)
     usable = jnp.all(jnp.isfinite(weights), axis=1)
@@ -70,19 +84,15 @@ def _search(shifts: Array, weights: Array, lattice: Lattice, capacity: int) -> A
     def step(state: tuple) -> tuple:
         rounds, tallest, left, _, blocks = state
         tallest = jnp.maximum(tallest, _evaluate(blocks, shifts, weights, lattice, side, count))
-        left &= jnp.all(numbers[:, None] != blocks[None], axis=1)
+        left = left.at[blocks].set(False)
         return rounds + 1, tallest, left, *promise(tallest, left)
 
-    numbers, left = jnp.arange(count**2, dtype=jnp.int32), jnp.ones(count**2, bool)
-    nothing = jnp.full(len(weights), -jnp.inf, bounds.dtype)
+    left, nothing = jnp.ones(count**2, bool), jnp.full(len(weights), -jnp.inf, bounds.dtype)
     start = step((0, nothing, left, *promise(jnp.max(bounds, axis=(0, 2)), left)))
     state = jax.lax.while_loop(lambda state: (state[3][0] > 1) & (state[0] < MOST_ROUNDS), step, start)
     _, tallest, _, factors, _ = state
-    return jax.lax.cond(
-        factors[0] > 1,  # a field so flat that all bins are nearly as tall
-        lambda: of_all_bins(shifts, weights, lattice, capacity),
-        lambda: jnp.where(usable, tallest, jnp.nan),
-    )
+    # Those that are left are many where a field is so flat that all bins are nearly as tall.
+    return jnp.where(usable, tallest, jnp.nan), factors[0] <= 1
 
 
 def _side(capacity: int) -> int:
@@ -125,13 +135,12 @@ def _block_votes(shifts: Array, axis: int, start: Array, lattice: Lattice, side:
 def _evaluate(blocks: Array, shifts: Array, weights: Array, lattice: Lattice, side: int, count: int) -> Array:
     """`[W]` tallest bin in range of some blocks `[n]`."""
 
-    def along(axis: int, block: Array) -> tuple[Array, Array]:
-        index = block.astype(shifts.dtype)[:, None] * side + jnp.arange(side, dtype=shifts.dtype)[None]
-        distance = lattice.centers(axis, index)[..., None] - shifts[axis][None, None]
-        return gaussian(distance, lattice.deviation, lattice.truncate), index < lattice.num_bins[axis]
+    inner = jnp.arange(side, dtype=shifts.dtype)[None]
 
-    (votes_x, inside_x), (votes_y, inside_y) = along(0, blocks % count), along(1, blocks // count)
-    votes = (votes_y[:, :, None] * votes_x[:, None]).reshape(-1, weights.shape[1])
-    inside = (inside_y[:, :, None] & inside_x[:, None]).reshape(-1)
-    bins = jnp.matmul(weights, votes.T, precision=jax.lax.Precision.HIGHEST)
-    return jnp.max(bins, axis=1, where=inside[None], initial=-jnp.inf)
+    def along(axis: int, block: Array) -> Array:
+        return votes_along(axis, block.astype(shifts.dtype)[:, None] * side + inner, shifts, lattice)
+
+    votes_x, votes_y = along(0, blocks % count), along(1, blocks // count)
+    weighted = (weights[None, :, None] * votes_y[:, None]).reshape(len(blocks), -1, weights.shape[1])
+    bins = jnp.matmul(weighted, jnp.swapaxes(votes_x, 1, 2), precision=jax.lax.Precision.HIGHEST)
+    return jnp.max(bins.reshape(len(blocks), len(weights), -1), axis=(0, 2))

@@ -21,18 +21,24 @@ from mfvpr import (
     score_grid,
 )
 from mfvpr.scoring import tallest
-from mfvpr.scoring.tallest import Lattice, tallest_bins
+from mfvpr.scoring.lattice import Lattice
+from mfvpr.scoring.tallest import tallest_bins
 from tests.builders import random_matches
 
 SLOTS, WEIGHTINGS = 64, 8  # a search with every one of the capacities
 CAPACITIES = {20.0: 40, 10.0: 72, 5.0: 136, 3.0: 296}  # by bin size, with blocks of 2, 3, 4 and 8 bins
 SLOTTED = ("points0", "points1", "distance", "scores0", "scores1", "ratio", "confidence", "mask")
-search = jax.jit(tallest_bins, static_argnums=3)
+pairs = jax.jit(tallest_bins, static_argnums=3)
 bounds = jax.jit(tallest._bounds, static_argnums=(3, 4))
 
 
-def stack(pairs):
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *pairs)
+def stack(trees):
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
+
+
+def search(shifts, weights, lattice, capacity):
+    """Of one pair."""
+    return pairs(*stack([(shifts, weights, lattice)]), capacity)[0]
 
 
 @pytest.fixture(scope="module")
@@ -248,3 +254,10 @@ def test_anchors_do_not_depend_on_the_slots(cell_weight, first):
     for count in (0, 1, 60):
         few, many = (random_matches(np.random.default_rng(2), count, capacity=slots) for slots in (60, 100))
         np.testing.assert_allclose(scorer(few), scorer(many), rtol=1e-6)
+
+
+@pytest.mark.parametrize("bin_size", [0.0, -5.0, np.nan])
+def test_no_bins_no_score(matches, bin_size):
+    """Traced, so that nobody could refuse it; of thousands of bins XLA's maximum on a CPU would pass over NaN."""
+    got = jax.jit(lambda size: score_candidates(HistogramOfShifts(bin_size=size, max_bins=136), matches))(bin_size)
+    np.testing.assert_array_equal(np.isnan(got), matches.mask.any(1))
