@@ -4,7 +4,7 @@ import math
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,8 @@ from experiments import build
 from experiments.settings import SettingsError
 from mfvpr import sweeping
 from mfvpr.pipeline import MatchSet
-from mfvpr.scoring import HistogramOfShifts, Scorer
-from mfvpr.scoring.histogram import MAX_BINS
+from mfvpr.scoring import Scorer
+from mfvpr.scoring.parameters import fit, with_parameters
 
 OF_MATCHES = ("max_distance", "c")  # what is no parameter of a scorer
 BYTES_PER_SETTING = 2000  # of Python's own, about
@@ -112,23 +112,10 @@ def _free_memory() -> int:
 
 
 def require_bins(settings: dict[str, Any], varied: Axes, matches: MatchSet) -> None:
-    """Refuse histograms that an evaluation refuses: too many bins, or more than `scorer.max_bins`."""
-    own = scorer(settings)
-    if not isinstance(own, HistogramOfShifts):
-        return
-    finest = min(varied.values.get("bin_size", [own.bin_size]))
-    needed = max(
-        replace(own, bin_size=finest, align=align).with_capacity(*matches.image_sizes).max_bins or 1
-        for align in varied.values.get("align", [own.align])
-    )
-    if needed > MAX_BINS:
-        raise SettingsError(
-            f"bin_size={finest}: expected at most {MAX_BINS} bins per axis, these images need {needed}; use larger bins"
-        )
-    if own.max_bins is not None and own.max_bins < needed:
-        raise SettingsError(
-            f"scorer.max_bins={own.max_bins}: expected null, or at least {needed}, which bin_size={finest} needs here"
-        )
+    """Refuse before any work what would be refused when its turn comes: histograms of more bins than there may be."""
+    sizes = {name: varied.values[name] for name in ("bin_size", "align") if name in varied.values}
+    for setting in sweeping.grid(sizes):
+        fit(with_parameters(scorer(settings), setting), *matches.image_sizes)
 
 
 def shown(value: Any) -> str:

@@ -2,13 +2,10 @@
 
 import math
 import os
-import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
-
-from tqdm import tqdm
 
 import mfvpr
 from experiments.settings import SettingsError
@@ -18,7 +15,6 @@ from mfvpr.data.streets import streets_folder
 from mfvpr.features import GlobalExtractor, LocalExtractor
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import fit_vlad
-from mfvpr.pipeline import Track
 from mfvpr.scoring import Scorer
 from mfvpr.types import Features
 
@@ -105,33 +101,6 @@ def scorers(settings: dict[str, Any]) -> dict[str, Scorer]:
         if values["method"] != name:
             raise SettingsError(f"scorer.{name}.method={values['method']}: expected {name}; choose with scorer={name}")
     return {name: _scorer(values) for name, values in chosen.items()}
-
-
-def track(label: str) -> Track:
-    """A progress bar with the time left."""
-    return lambda items, total: bar(label, total, items)
-
-
-def bar(label: str, total: int, items: Iterable[Any] | None = None) -> tqdm:
-    """The one look of all progress bars; none where there is nothing to do."""
-    shown = tqdm if sys.stderr.isatty() else _Lines
-    return shown(items, total=total, desc=f"{label:<20}", unit="", dynamic_ncols=True, disable=total == 0)
-
-
-class _Lines(tqdm):
-    """Progress without a terminal, in a file or a log: a line per 10 %."""
-
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        self._tenths = -1
-        super().__init__(*arguments, mininterval=0, miniters=1, leave=False, **options)
-
-    def display(self, msg: str | None = None, pos: int | None = None) -> None:
-        """What tqdm calls wherever a bar would be drawn."""
-        tenths = 10 * self.n // self.total
-        if tenths > self._tenths:
-            self._tenths = tenths
-            print(f"{self.desc} {10 * tenths:3d} %  {self.n} of {self.total}  {self.format_dict['elapsed']:.0f} s",
-                  file=sys.stderr)  # fmt: skip
 
 
 def _scorer(settings: dict[str, Any]) -> Scorer:

@@ -18,6 +18,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from experiments.console import tell
 from experiments.errors import on_interrupt, one_line
 from experiments.groups import PROGRAMS, check_choice, groups
 from experiments.launch import CONF, Program
@@ -78,7 +79,7 @@ def _one_of_many() -> Iterator[None]:
     """A job of a multirun: what is wrong with it is told at once, and again by Hydra when the others are done."""
     job = HydraConfig.get()
     chosen = [override for override in job.overrides.task if override.partition("=")[0] not in PATHS]
-    print(f"job {job.job.num}: {' '.join(chosen)}", file=sys.stderr)
+    tell(f"job {job.job.num}: {' '.join(chosen)}")
     try:
         with one_line():
             yield

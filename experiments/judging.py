@@ -11,7 +11,6 @@ from experiments.settings import SettingsError
 from mfvpr import sweeping
 from mfvpr.data.datasets import Dataset
 from mfvpr.data.ground_truth import Unit, threshold_words
-from mfvpr.statistics import recall_interval
 from mfvpr.sweeping import Half
 from mfvpr.types import Shortlist
 
@@ -73,10 +72,6 @@ class Judge:
             for setting, half in zip(chosen, self.halves, strict=True)
         ]
         return np.concatenate([np.array(part) for part in parts], axis=1)
-
-    def interval(self, hits: np.ndarray) -> tuple[float, float]:
-        """Of the recall `[R]`, 95 %."""
-        return recall_interval(hits)
 
 
 def judge(settings: dict[str, Any], dataset: Dataset) -> Judge:

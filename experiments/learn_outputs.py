@@ -23,7 +23,7 @@ from mfvpr.pipeline import MatchSet
 from mfvpr.report import runs
 from mfvpr.report.learning_figures import curves_figure, weights_figure
 from mfvpr.report.tables import Table
-from mfvpr.statistics import mcnemar
+from mfvpr.statistics import mcnemar, recall_interval
 from mfvpr.types import Shortlist
 
 SHOWN_QUERIES = 20  # whose matches the figure of the weights counts
@@ -113,7 +113,7 @@ def _table(outcome: Outcome) -> Table:
     lines, first = [], None
     for name, hits, _ in outcome.rows():
         first = hits if first is None else first
-        low, high = judge.interval(hits[judge.main])
+        low, high = recall_interval(hits[judge.main])
         test = mcnemar(hits[judge.main], first[judge.main])
         compared = "" if hits is first else f"+{test.only_first} -{test.only_second}"
         lines.append([
@@ -143,7 +143,7 @@ def _results(outcome: Outcome) -> dict[str, Any]:
         {
             "score": name,
             "recall_at_1": dict(zip(labels, hits.mean(axis=1).tolist(), strict=True)),
-            "interval": dict(zip(labels, map(judge.interval, hits), strict=True)),
+            "interval": dict(zip(labels, map(recall_interval, hits), strict=True)),
             "halves": {one.half: _half(one) for one in found},
         }
         for name, hits, found in outcome.rows()

@@ -12,7 +12,7 @@ import numpy as np
 import optax
 
 import mfvpr
-from experiments import axes, build, learn_outputs, prepare, run_folder, stores, truth
+from experiments import axes, build, console, learn_outputs, prepare, run_folder, stores, truth
 from experiments.judging import Judge, judge
 from experiments.models import LOSSES, NUMBERS, Lesson, Model, model
 from experiments.settings import SettingsError
@@ -209,7 +209,7 @@ def _fit(school: School, start: Model, folder: Path | None, recipe: dict[str, An
     return fit(
         start.start, objective, batches, optimizer=optax.adam(settings["learning_rate"]), steps=settings["steps"],
         validate=validate, every=settings["every"], patience=settings["patience"], folder=folder, recipe=recipe,
-        track=build.track(f"{school.name}: {start.name}"),
+        track=console.track(f"{school.name}: {start.name}"),
     )  # fmt: skip
 
 
@@ -246,7 +246,7 @@ def _ranked(
 ) -> np.ndarray:
     """`[S, q, 1]` the first row of some queries' rankings of the candidates that are seen, by every setting."""
     matches, candidates = school.part(queries)
-    track = build.track(f"{school.name}: {name}") if len(settings) > 1 else pipeline.untracked
+    track = console.track(f"{school.name}: {name}") if len(settings) > 1 else pipeline.untracked
     views, ties = [seen[queries]], school.settings["ties"]
     return sweeping.sweep(scorer, settings, matches, candidates, views=views, depth=1, ties=ties, track=track)[0]
 

@@ -61,11 +61,16 @@ class Outcome:
         """What counts as right, in the unit of the ground truth; none without ground truth."""
         return truth.thresholds(self.settings, self.dataset.truth)
 
+    @property
+    def threshold(self) -> float:
+        """The one in the middle, which predictions, failures and figures go by."""
+        return self.thresholds[len(self.thresholds) // 2]
+
     @cached_property
     def right(self) -> np.ndarray | None:
-        """`[Q, N]` bool by the threshold in the middle, which predictions, failures and figures go by."""
+        """`[Q, N]` bool by `threshold`."""
         found = self.dataset.truth
-        return None if found is None else found.positives(self.thresholds[len(self.thresholds) // 2])
+        return None if found is None else found.positives(self.threshold)
 
     def is_right(self, system: "System") -> np.ndarray | None:
         """`[Q, C]` bool in the order of a ranking."""
@@ -220,8 +225,8 @@ def _draw(path: Path, outcome: Outcome, query: int, verdict: str) -> None:
     if verdict == "wrong":
         answers += _right_answer(outcome, query)
     image = _image(outcome, outcome.dataset.queries, query)
-    truth, thresholds = outcome.dataset.truth, outcome.thresholds
-    within = threshold_words(truth.unit, thresholds[len(thresholds) // 2]) if truth is not None else ""
+    found = outcome.dataset.truth
+    within = "" if found is None else threshold_words(found.unit, outcome.threshold)
     verdict += " at" * bool(within) + within
     answer = outcome.dataset.database.names[system.rows[query, 0]]
     title = f"{outcome.headline}, {verdict}: {names[query]} -> {answer}"
@@ -242,12 +247,12 @@ def _answer(outcome: Outcome, query: int, rank: int, verdict: str) -> Answer:
 
 def _right_answer(outcome: Outcome, query: int) -> list[Answer]:
     """The first right candidate; else the right image, which the filter missed; nothing where there is none."""
-    ranked, truth = outcome.is_right(outcome.systems[outcome.headline]), outcome.dataset.truth
-    if ranked is None or outcome.right is None or truth is None or not outcome.right[query].any():
+    ranked, found = outcome.is_right(outcome.systems[outcome.headline]), outcome.dataset.truth
+    if ranked is None or outcome.right is None or found is None or not outcome.right[query].any():
         return []
     if ranked[query].any():
         return [_answer(outcome, query, int(np.argmax(ranked[query])), "right")]
-    nearest = truth.place(query)
+    nearest = found.place(query)
     row = nearest if nearest is not None and outcome.right[query, nearest] else int(np.argmax(outcome.right[query]))
     database, num_candidates = outcome.dataset.database, outcome.candidates.indices.shape[1]
     caption = f"right: {database.names[row]}, not among the {num_candidates} candidates"

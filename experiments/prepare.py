@@ -1,16 +1,17 @@
 """Images -> features -> shortlist and matches: the stages that every program begins with."""
 
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-from experiments import build, stores
+from experiments import build, stores, truth
+from experiments.console import bar, tell, track
 from mfvpr import pipeline
 from mfvpr.data.contents import Contents, contents
 from mfvpr.data.datasets import Dataset, ImageFolder
@@ -145,7 +146,7 @@ def matched(
 def match(settings: dict[str, Any], made: Extracted, **options: Any) -> MatchSet:
     """Matches of all queries with their candidates."""
     return pipeline.match(
-        made.queries, made.database, made.candidates, **settings["matching"], **options, track=build.track("matching")
+        made.queries, made.database, made.candidates, **settings["matching"], **options, track=track("matching")
     )
 
 
@@ -160,17 +161,17 @@ def _num_candidates(settings: dict[str, Any], found: Images) -> int:
 
 
 def _dataset(settings: dict[str, Any]) -> Dataset:
-    bar: list[tqdm] = []
+    bars: list[tqdm] = []
 
     def progress(done: int, total: int) -> None:
-        if not bar:
-            bar.append(build.bar("drawing streets", total))
-        bar[0].update(done - bar[0].n)
+        if not bars:
+            bars.append(bar("drawing streets", total))
+        bars[0].update(done - bars[0].n)
 
     try:
         return build.dataset(settings, progress)
     finally:
-        for one in bar:
+        for one in bars:
             one.close()
 
 
@@ -178,48 +179,49 @@ def _warn_of_images(settings: dict[str, Any], found: Images, own: OwnRows) -> No
     """What is in the data set that may give wrong numbers, and what was done about it."""
     dataset, among = found.dataset, sum(map(bool, own))
     if among and dataset.allowed is None:
-        _tell(f"warning: {among} of {len(own)} queries are database images themselves, so that each finds itself; set "
+        tell(f"warning: {among} of {len(own)} queries are database images themselves, so that each finds itself; set "
               "dataset.exclude_neighbors=N to leave out what is within N frames of it (0 = itself alone)")  # fmt: skip
     if dataset.allowed is not None and among < len(own):
-        _tell(f"note: {len(own) - among} of {len(own)} queries are no database images; nothing is left out for them")
+        tell(f"note: {len(own) - among} of {len(own)} queries are no database images; nothing is left out for them")
     for side, did in found.reading.items():
         if did["turned"]:
-            _tell(f"note: {did['turned']} {side} images are turned as their EXIF orientation says")
+            tell(f"note: {did['turned']} {side} images are turned as their EXIF orientation says")
         if did["scaled_16bit"]:
-            _tell(f"note: {did['scaled_16bit']} 16-bit {side} images are scaled to 8 bits")
+            tell(f"note: {did['scaled_16bit']} 16-bit {side} images are scaled to 8 bits")
     bits, largest = dataset.database.bits, max(did["largest_16bit"] or 0 for did in found.reading.values())
     used = max(largest.bit_length(), 8)
     if largest and bits is not None and not bits - 1 <= used <= bits:
         look = "dark" if used < bits else "cut off"
-        _tell(f"warning: the largest value of all 16-bit images is {largest}, so that they come out {look}; "
+        tell(f"warning: the largest value of all 16-bit images is {largest}, so that they come out {look}; "
               f"dataset.bits={used} would use their range")  # fmt: skip
-    recall, truth = settings["recall"], dataset.truth
-    if truth is not None:
-        thresholds = truth.thresholds(tolerances=recall["tolerances"], radius=recall["radius"])
-        without = [threshold for threshold in thresholds if not truth.positives(threshold).any()]
-        if without == thresholds:
-            _tell("warning: the ground truth gives no query a right answer; every recall will be 0")
-        elif without:
-            words = ", ".join(threshold_words(truth.unit, threshold).strip() for threshold in without)
-            mend = "larger recall.tolerances" + ", or fewer dataset.exclude_neighbors" * (dataset.allowed is not None)
-            _tell(f"warning: no query has a right answer within {words}, so that recall will be 0 there; use {mend}")
-    deepest, available = max(recall["ks"]), _num_candidates(settings, found)
+    _warn_of_truth(settings, dataset)
+    deepest, available = max(settings["recall"]["ks"]), _num_candidates(settings, found)
     if deepest > available:
-        _tell(f"note: R@{deepest} is R@{available}, of the filter too: no more candidates are looked at")
+        tell(f"note: R@{deepest} is R@{available}, of the filter too: no more candidates are looked at")
 
 
-def _tell(text: str) -> None:
-    print(text, file=sys.stderr)
+def _warn_of_truth(settings: dict[str, Any], dataset: Dataset) -> None:
+    """Thresholds, from the lowest on, at which no query has a right answer."""
+    found, asked = dataset.truth, truth.thresholds(settings, dataset.truth)
+    if found is None:
+        return
+    without = list(takewhile(lambda threshold: not found.positives(threshold).any(), asked))
+    if without == asked:
+        tell("warning: the ground truth gives no query a right answer; every recall will be 0")
+    elif without:
+        words = ", ".join(threshold_words(found.unit, threshold).strip() for threshold in without)
+        mend = "larger recall.tolerances" + ", or fewer dataset.exclude_neighbors" * (dataset.allowed is not None)
+        tell(f"warning: no query has a right answer within {words}, so that recall will be 0 there; use {mend}")
 
 
 def _warn(dataset: Dataset, database: FeatureSet, queries: FeatureSet) -> None:
     for found, images in ((database, dataset.database), (queries, dataset.queries)):
         for reason in found.bad.values():
-            print(f"warning: {reason}", file=sys.stderr)
+            tell(f"warning: {reason}")
         empty = [row for row in np.flatnonzero(~found.features.mask.any(axis=1)) if row not in found.bad]
         if empty:
-            print(f"warning: {images.paths[empty[0]]}: no keypoints, so no matches ({len(empty)} such images of "
-                  f"{len(images)}); scores are 0", file=sys.stderr)  # fmt: skip
+            tell(f"warning: {images.paths[empty[0]]}: no keypoints, so no matches ({len(empty)} such images of "
+                 f"{len(images)}); scores are 0")  # fmt: skip
 
 
 def _features(
@@ -230,7 +232,7 @@ def _features(
     wait = _is_one_of_many(settings)
     with stores.opened(settings["store"], name, folder, extractor, chosen, images, wait=wait) as store:
         skip_bad = settings["on_bad_image"] == "skip"
-        return pipeline.extract(folder, extractor, store=store, skip_bad=skip_bad, track=build.track(label))
+        return pipeline.extract(folder, extractor, store=store, skip_bad=skip_bad, track=track(label))
 
 
 def _described(
@@ -242,10 +244,7 @@ def _described(
     """Global descriptors by side."""
     asked, available = settings["candidates"], len(found.dataset.database)
     if asked != "all" and asked > available:
-        print(
-            f"note: candidates={asked}, but the database has {available} images; all of them are re-ranked",
-            file=sys.stderr,
-        )
+        tell(f"note: candidates={asked}, but the database has {available} images; all of them are re-ranked")
     chosen, database = settings["retrieval"], features["database"]
     extractor = describer([database[row] for row in range(len(database))])
     root = settings["store"] if extractor.image_size is not None else None  # VLAD takes no time
@@ -255,8 +254,8 @@ def _described(
         with stores.opened(root, name, folder, extractor, chosen, found.fingerprints[side], wait=wait) as store:
             described[side] = pipeline.describe(
                 folder, features[side], extractor, store=store, skip_bad=skip_bad,
-                track=build.track(f"{side} descriptors"),
+                track=track(f"{side} descriptors"),
             )  # fmt: skip
         for row in described[side].bad.keys() - features[side].bad.keys():
-            print(f"warning: {described[side].bad[row]}", file=sys.stderr)
+            tell(f"warning: {described[side].bad[row]}")
     return described

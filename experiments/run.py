@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments import build, outputs, prepare, run_folder, truth
+from experiments import build, console, outputs, prepare, run_folder, truth
 from experiments.outputs import Outcome, System
 from mfvpr import pipeline
 from mfvpr.pipeline import MatchSet
@@ -41,7 +41,7 @@ def _outcome(settings: dict[str, Any]) -> Outcome:
 
 def _systems(settings: dict[str, Any], scorers: dict, matches: MatchSet, candidates: Shortlist) -> dict[str, System]:
     """The filter alone, each scorer, and the best of them (the paper: histogram) combined with the filter."""
-    scores = pipeline.score(scorers, matches, candidates, track=build.track("scores"))
+    scores = pipeline.score(scorers, matches, candidates, track=console.track("scores"))
     group = settings["scorer"]
     parameters = {name: group if "method" in group else group[name] for name in scorers}
     combined = "histogram" if "histogram" in scorers else next(iter(scorers))

@@ -1,12 +1,11 @@
 """The folder of a run: claimed before the work and filled after it, the tables before any figure."""
 
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from experiments import build
+from experiments import build, console
 from experiments.settings import SettingsError
 from mfvpr.errors import InputError
 from mfvpr.report import runs
@@ -58,11 +57,11 @@ def leave(
         ) from error
     finally:
         print(f"\n{text}", flush=True)
-    for name, draw in build.track("figures")(figures, len(figures)):
+    for name, draw in console.track("figures")(figures, len(figures)):
         try:
             draw(folder / "figures" / name)
         except Exception as error:
-            print(f"warning: {folder}/figures/{name}: not drawn ({error})", file=sys.stderr)
+            console.tell(f"warning: {folder}/figures/{name}: not drawn ({error})")
     print(f"results: {folder}")
 
 

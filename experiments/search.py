@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments import build, prepare, run_folder, stores, sweep_outputs, truth
+from experiments import build, console, prepare, run_folder, stores, sweep_outputs, truth
 from experiments.axes import BYTES_PER_SETTING, Axes, as_setting, axes, require_bins, require_memory, scorer
 from experiments.judging import Judge, judge
 from mfvpr import sweeping
@@ -72,7 +72,7 @@ def _search(
             views=judgment.views, depth=max(settings["recall"]["ks"]), ties=settings["ties"],
             filter_score=settings["fusion"]["filter_score"],
             settings_per_block=settings["chunk"]["settings"], queries_per_block=settings["chunk"]["queries"],
-            folder=kept, track=build.track(label),
+            folder=kept, track=console.track(label),
         )  # fmt: skip
 
     own = dict(varied.own)

@@ -1,12 +1,12 @@
 """Features and matches on disk: which store belongs to a run, what it will take, and what it took."""
 
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from experiments import build
+from experiments.console import tell
 from mfvpr.data import feature_store, match_store
 from mfvpr.data.datasets import ImageFolder
 from mfvpr.data.feature_store import FeatureStore, open_store, require_space
@@ -44,22 +44,22 @@ def opened(
     if root is None:
         yield None
         return
-    recipe, waiting = features_recipe(settings, images), _tell if wait else None
+    recipe, waiting = features_recipe(settings, images), tell if wait else None
     path = store_path(build.expanded(root), settings["name"], recipe)
     with open_store(path, recipe, num_images=len(folder), waiting=waiting) as store:
         missing = len(folder) - int(store.done.sum())
         if missing:
             needed = feature_store.forecast_bytes(missing, extractor.typical_count, extractor.dimension)
             require_space(store.folder, needed)
-            _tell(
+            tell(
                 f"{name}: {missing} of {len(folder)} images to do, about {extractor.typical_count} features of "
                 f"{extractor.dimension} dimensions each: about {needed / MB:.1f} MB in {store.folder}"
             )
         else:
-            _tell(f"{name}: all {len(folder)} images from {store.folder}")
+            tell(f"{name}: all {len(folder)} images from {store.folder}")
         yield store
         if missing:
-            _tell(_account(name, store, settings))
+            tell(_account(name, store, settings))
 
 
 @contextmanager
@@ -84,17 +84,17 @@ def opened_matches(
         typical_matches: of a pair, about.
         wait: for another process that has the store open, instead of refusing it.
     """
-    path, waiting = matches_path(root, recipe), _tell if wait else None
+    path, waiting = matches_path(root, recipe), tell if wait else None
     sizes = {"num_queries": num_queries, "num_candidates": num_candidates}
     with open_match_store(path, recipe, **sizes, waiting=waiting) as store:
         missing = num_queries - int(store.done.sum())
         if missing:
             needed = match_store.forecast_bytes(missing, num_candidates, typical_matches)
             require_space(store.folder, needed)
-            _tell(f"{name}: {missing} of {num_queries} queries to match with {num_candidates} candidates: about "
+            tell(f"{name}: {missing} of {num_queries} queries to match with {num_candidates} candidates: about "
                   f"{needed / MB:.1f} MB in {store.folder}")  # fmt: skip
         else:
-            _tell(f"{name}: all {num_queries} queries from {store.folder}")
+            tell(f"{name}: all {num_queries} queries from {store.folder}")
         yield store
 
 
@@ -137,7 +137,3 @@ def _account(name: str, store: FeatureStore, settings: dict[str, Any]) -> str:
         return text
     paper = features * PAPER_FEATURE
     return f"{text}; as the paper stores them, in float32, {paper / MB:.1f} MB: {size / paper:.2f}x"
-
-
-def _tell(text: str) -> None:
-    print(text, file=sys.stderr)

@@ -19,7 +19,7 @@ from mfvpr.data.files import write_text
 from mfvpr.report import runs
 from mfvpr.report.heat_maps import heat_map_figure
 from mfvpr.report.tables import Table
-from mfvpr.statistics import mcnemar
+from mfvpr.statistics import mcnemar, recall_interval
 
 TOP = 10
 MAX_HEAT_MAPS = 6
@@ -148,7 +148,7 @@ def _report(found: Found) -> Iterator[dict[str, Any]]:
     own = judge.reported(found.rows, [found.own] * max(1, len(judge.halves)))
     for place, threshold in enumerate(judge.thresholds):
         values = {
-            name: {"recall": float(hits.mean()), "interval": list(judge.interval(hits))}
+            name: {"recall": float(hits.mean()), "interval": list(recall_interval(hits))}
             for name, hits in (("chosen", chosen[place]), ("own", own[place]))
         }
         test = mcnemar(chosen[place], own[place])

@@ -27,9 +27,8 @@ def radius_positives(query_xy: np.ndarray, database_xy: np.ndarray, *, radius: f
     positives = np.zeros((len(query_xy), len(database_xy)), bool)
     if positives.size:
         tree = KDTree(database_xy)
-        for row, xy in zip(
-            positives, query_xy, strict=True
-        ):  # one by one: as lists, all neighbors take eight times that
+        for row, xy in zip(positives, query_xy, strict=True):
+            # One by one: the lists of all neighbors would take eight times the memory of `positives`.
             row[tree.query_ball_point(xy, radius)] = True
     return positives
 

@@ -14,15 +14,13 @@ from mfvpr.data.images import Interpolation, ordered_map, resize
 from mfvpr.errors import InputError
 from mfvpr.features import GlobalExtractor, LocalExtractor
 from mfvpr.numerics import available_cpus, round_up
-from mfvpr.types import Features
+from mfvpr.types import Features, per_keypoint
 
 if TYPE_CHECKING:
     from mfvpr.data.feature_store import FeatureStore
 
 Item = TypeVar("Item")
 Track = Callable[[Iterable[Any], int], Iterable[Any]]
-
-_PER_KEYPOINT = ("keypoints", "descriptors", "scores", "mask")
 
 
 def untracked(items: Iterable[Item], total: int) -> Iterable[Item]:
@@ -55,7 +53,7 @@ class FeatureSet:
         for number, image in enumerate(images):
             _check(image, number)
         real = [
-            replace(image, **{name: np.asarray(getattr(image, name))[np.asarray(image.mask)] for name in _PER_KEYPOINT})
+            replace(image, **{n: np.asarray(v)[np.asarray(image.mask)] for n, v in per_keypoint(image).items()})
             for image in images
         ]
         return cls(_stack(enumerate(real), np.array([len(image.mask) for image in real])), {})
@@ -241,7 +239,7 @@ def _batches(items: Iterable[Item], size: int) -> Iterator[list[Item]]:
 def _check(image: Features, number: int) -> None:
     """Of one's own image `[N, ...]`."""
     count = len(image.mask)
-    shapes = {name: np.shape(getattr(image, name)) for name in _PER_KEYPOINT}
+    shapes = {name: np.shape(values) for name, values in per_keypoint(image).items()}
     expected = {
         "keypoints": (count, 2),
         "descriptors": (count, *shapes["descriptors"][1:]),
@@ -272,12 +270,12 @@ def _stack(found: Iterable[tuple[int, Features]], counts: np.ndarray) -> Feature
     arrays: dict[str, np.ndarray] = {}
     for row, features in found:
         if not arrays:
-            shapes = {
-                name: (getattr(features, name).shape[1:], getattr(features, name).dtype) for name in _PER_KEYPOINT
+            arrays = {
+                name: np.zeros((len(counts), capacity, *values.shape[1:]), values.dtype)
+                for name, values in per_keypoint(features).items()
             }
-            arrays = {name: np.zeros((len(counts), capacity, *shape), dtype) for name, (shape, dtype) in shapes.items()}
             arrays["image_size"] = np.tile(features.image_size, (len(counts), 1))
-        for name in _PER_KEYPOINT:
-            arrays[name][row, : counts[row]] = getattr(features, name)
+        for name, values in per_keypoint(features).items():
+            arrays[name][row, : counts[row]] = values
         arrays["image_size"][row] = features.image_size
     return Features(**arrays)

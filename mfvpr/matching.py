@@ -15,7 +15,7 @@ import numpy as np
 
 from mfvpr.neighbors import nearest, nearest_two
 from mfvpr.numerics import as_float, at_least_single, compiled, masked, platform, positive, safe_sqrt
-from mfvpr.types import Array, Features, Matches, per_match
+from mfvpr.types import Array, Features, Matches, per_keypoint, per_match
 
 CrossCheck = Literal["mutual", "opencv_legacy", "none"]
 CHUNK_BYTES = 2**28  # of the similarities that exist at the same time, elsewhere than on a CPU
@@ -215,21 +215,16 @@ def compact(matches: Matches, capacity: int) -> Matches:
 
 def _ready(features: Features) -> Features:
     """On the device, in at least single precision: products of half ones flip near-ties, sums of points overflow."""
-    wide = {
-        name: at_least_single(getattr(features, name)) for name in ("keypoints", "descriptors", "scores", "image_size")
-    }
-    return replace(features, **wide, mask=jnp.asarray(features.mask))
+    wide = {name: at_least_single(values) for name, values in per_keypoint(features).items() if name != "mask"}
+    return replace(features, **wide, mask=jnp.asarray(features.mask), image_size=at_least_single(features.image_size))
 
 
 def _at_least_one(features: Features) -> Features:
     """An image without a single slot gets one of padding, so that there is something to index."""
     if features.mask.shape[-1] > 0:
         return features
-    per_keypoint = {
-        name: jnp.zeros((1, *getattr(features, name).shape[1:]), getattr(features, name).dtype)
-        for name in ("keypoints", "descriptors", "scores", "mask")
-    }
-    return replace(features, **per_keypoint)
+    padding = {name: jnp.zeros((1, *values.shape[1:]), values.dtype) for name, values in per_keypoint(features).items()}
+    return replace(features, **padding)
 
 
 def _similarity(features0: Features, features1: Features) -> Array:

@@ -17,7 +17,7 @@ import numpy as np
 from mfvpr.matching import filter_matches
 from mfvpr.numerics import available_cpus, compiled, held, is_concrete, knows_own_context, masked, masked_std, platform
 from mfvpr.scoring import HistogramOfShifts, Scorer
-from mfvpr.scoring.parameters import fit, numbers, with_parameters
+from mfvpr.scoring.parameters import fit, numbers, whole_numbers, with_parameters
 from mfvpr.types import Array, Matches, Ranking
 from mfvpr.weighting import ChosenWeight, Weight, match_weights
 
@@ -297,12 +297,8 @@ def _axis(scorer: Any, name: str, axis: Sequence[float] | Array) -> Array:
             f"(nearest: {nearest[0]})"
         )
     points = jnp.asarray(axis)
-    if not (jnp.issubdtype(points.dtype, jnp.integer) and (name == "weight" or _is_whole(values.get(name)))):
+    if not (jnp.issubdtype(points.dtype, jnp.integer) and (name == "weight" or name in whole_numbers(scorer))):
         points = points.astype(float)
     if points.ndim != 1 or points.size == 0:
         raise ValueError(f"grid axis {name}: expected at least one value in one dimension, got shape {points.shape}")
     return points
-
-
-def _is_whole(number: Any) -> bool:
-    return number is not None and jnp.issubdtype(jnp.result_type(number), jnp.integer)

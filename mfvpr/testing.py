@@ -197,12 +197,12 @@ def _made_up(rng: np.random.Generator, count: int, image_size: tuple[int, int]) 
 
 def _padded(pair: Matches, garbage: float, slots: int) -> Matches:
     """The real matches in `slots` slots, `garbage` in the others."""
-    real: Callable[[np.ndarray], np.ndarray] = lambda values: values[np.asarray(pair.mask)]  # noqa: E731
-    count = int(np.sum(pair.mask))
+    real = np.asarray(pair.mask)
+    count = int(real.sum())
 
     def padded(values: np.ndarray) -> np.ndarray:
         rows = np.full((slots, *values.shape[1:]), garbage, np.float32)
-        rows[:count] = real(values)
+        rows[:count] = values[real]
         return rows
 
     return replace(pair, mask=np.arange(slots) < count, **{n: padded(values) for n, values in per_match(pair).items()})

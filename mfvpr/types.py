@@ -73,7 +73,12 @@ class Features:
     descriptors: Array  # [..., N, D]
     scores: Array  # [..., N]
     mask: Array  # [..., N]
-    image_size: Array  # [..., 2]
+    image_size: Array = field(metadata={"per_image": True})  # [..., 2]
+
+
+def per_keypoint(features: Features) -> dict[str, Array]:
+    """The fields with a value for every keypoint, `[..., N, ...]` by name, the mask among them."""
+    return {f.name: getattr(features, f.name) for f in fields(features) if not f.metadata.get("per_image")}
 
 
 @value

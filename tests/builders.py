@@ -5,6 +5,7 @@ from dataclasses import fields, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+from PIL import Image
 
 from mfvpr import Features, Matches
 
@@ -101,3 +102,12 @@ def double(tree):
     """Every floating point leaf, and Python number, as float64 of JAX: only below `jax.enable_x64(True)`."""
     wide = lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf  # noqa: E731
     return jax.tree.map(lambda leaf: wide(jnp.asarray(leaf)), tree)
+
+
+def fill(folder, names):
+    """Small images by name, below a folder."""
+    for name in names:
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (4, 4)).save(path)
+    return folder

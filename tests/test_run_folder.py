@@ -17,7 +17,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from experiments import build, outputs, run_folder
+from experiments import console, outputs, run_folder
 from experiments import run as evaluation
 from experiments.settings import SettingsError
 from mfvpr.data.ground_truth import AllowedTruth
@@ -341,22 +341,22 @@ def test_names_that_are_no_utf8_cost_nothing(root, tmp_path, monkeypatch, capsys
 
 
 def test_progress_without_a_terminal_is_a_line_per_tenth(capsys):
-    assert list(build.track("matching")(range(234), 234)) == list(range(234))
+    assert list(console.track("matching")(range(234), 234)) == list(range(234))
     lines = capsys.readouterr().err.splitlines()
     assert [line.split()[1] for line in lines] == [f"{percent}" for percent in range(0, 101, 10)]
     assert lines[5].startswith("matching              50 %  117 of 234  ")
-    bar = build.bar("drawing", 3)
+    bar = console.bar("drawing", 3)
     bar.update(3)
     bar.close()
     assert [line.split()[1] for line in capsys.readouterr().err.splitlines()] == ["0", "100"]
 
 
 def test_no_progress_is_shown_of_nothing(capsys):
-    assert list(build.track("features")([], 0)) == []
+    assert list(console.track("features")([], 0)) == []
     assert capsys.readouterr().err == ""
 
 
 def test_progress_in_a_terminal_is_a_bar(monkeypatch, capsys):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    assert list(build.track("matching")(range(9), 9)) == list(range(9))
+    assert list(console.track("matching")(range(9), 9)) == list(range(9))
     assert "\rmatching            : 100%|" in capsys.readouterr().err

@@ -258,7 +258,7 @@ def test_mistakes_are_one_line_and_exit_code_2(root, tmp_path, monkeypatch, caps
             ["grid.bin_size=[15,0.01]"],
             "bin_size=0.01: expected at most 1024 bins per axis, images of this size need 32000",
         ),
-        ([SIGMA, "scorer.max_bins=3"], "scorer.max_bins=3: expected null, or at least 22"),
+        ([SIGMA, "scorer.max_bins=3"], "max_bins=3: expected at least 22, which images of this size need"),
         (["search=optuna", "grid.bin_size=[0.1,5]"], "bin_size=0.1: expected at most 1024 bins"),
     ],
 )

@@ -8,16 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mfvpr.data.ground_truth import (
-    CHOICES,
-    KINDS,
-    Truth,
-    truth_by_order,
-    truth_from_file,
-    truth_from_labels,
-    truth_from_names,
-)
+from mfvpr.data.ground_truth import CHOICES, KINDS, Truth, truth_by_order, truth_from_names
 from mfvpr.data.images import SUFFIXES, read_image
+from mfvpr.data.truth_files import truth_from_file, truth_from_labels
 from mfvpr.errors import InputError
 
 
@@ -112,9 +105,9 @@ def folder_dataset(
         queries: folder of query images.
         ground_truth: one of `ground_truth.KINDS`, which says what each means. Nothing is assumed.
         name: what results call it.
-        index_file: for `index`, see `ground_truth.truth_from_file`.
+        index_file: for `index`, see `truth_files.truth_from_file`.
         widen_index: for `index`, whether database images within a tolerance in frames count as well.
-        database_labels: for `label`, see `ground_truth.truth_from_labels`.
+        database_labels: for `label`, see `truth_files.truth_from_labels`.
         query_labels: likewise.
         orient: how the images are read, see `mfvpr.data.images.read_image`.
         bits: likewise.

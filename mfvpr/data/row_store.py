@@ -143,7 +143,7 @@ class RowStore(Generic[Item]):
 
     def _check_layouts(self, rows: Mapping[int, Parts]) -> None:
         """What one row has, all have: nothing is lost, or made up, where rows are put together."""
-        layouts = {row: layout_of(parts) for row, parts in rows.items()}
+        layouts = {row: _layout_of(parts) for row, parts in rows.items()}
         expected = self._layout or self._stored_layout() or next(iter(layouts.values()))
         for row, layout in layouts.items():
             if differs := difference(layout, expected):
@@ -155,7 +155,7 @@ class RowStore(Generic[Item]):
 
     def _stored_layout(self) -> dict[str, str] | None:
         found = (self._read_parts(self._path(row, self.counts[row])) for row in np.flatnonzero(self.done).tolist())
-        return next((layout_of(parts) for parts in found if parts), None)
+        return next((_layout_of(parts) for parts in found if parts), None)
 
     def _remove(self, damaged: Mapping[int, Path]) -> str:
         """What is told of damaged rows, which are no longer done."""
@@ -244,6 +244,6 @@ def _counts(folder: Path, num_rows: int, *, known: bool = True) -> np.ndarray:
     return counts
 
 
-def layout_of(parts: Parts) -> dict[str, str]:
+def _layout_of(parts: Parts) -> dict[str, str]:
     """What rows have in common: names, types and lengths of axes but for the first."""
     return {name: f"{part.dtype}{list(part.shape[1:])}" for name, part in parts.items()}

@@ -23,10 +23,8 @@ Preprocessing = Literal["caffe", "torch"]
 
 STRIDE = 4  # px between positions of the map
 SCALES = (0.5, 1.0, 2.0)  # of the multi-scale detection, in this order
-_FIELD = (
-    -10,
-    11,
-)  # cells of 4 x 4 px that lie within what a position of the map sees (92 x 92 px), from its own cell on
+# Cells of 4 x 4 px that lie within what a position of the map sees (92 x 92 px), from its own cell on.
+_FIELD = (-10, 11)
 _EDGE_THRESHOLD = 5  # largest ratio of the principal curvatures
 _EPSILON = 1e-12  # of the normalization, where a descriptor is zero
 

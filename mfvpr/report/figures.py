@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
 
-from mfvpr.data.files import replacing
+from mfvpr.data.files import printable, replacing
 from mfvpr.pipeline import Explanation
 from mfvpr.types import Matches
 
@@ -52,7 +52,7 @@ def histogram_figure(
     """
     figure = Figure(figsize=(12, 0.2 + 4.4 * len(answers)), layout="constrained")
     FigureCanvasAgg(figure)
-    figure.suptitle(_drawable(title), fontsize=11, parse_math=False)  # a file's name may hold a $
+    figure.suptitle(printable(title), fontsize=11, parse_math=False)  # a file's name may hold a $
     top = max(1e-9, *(float(answer.explanation.score) for answer in answers if answer.explanation))
     for (pair, heat), answer in zip(
         figure.subplots(len(answers), 2, width_ratios=(2, 1.15), squeeze=False), answers, strict=True
@@ -67,11 +67,6 @@ def histogram_figure(
         figure.savefig(temporary, dpi=110, bbox_inches="tight", pad_inches=0.15)
 
 
-def _drawable(text: str) -> str:
-    """Without the bytes of a file name that are no UTF-8."""
-    return text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
-
-
 def _draw_pair(axes: Axes, query: np.ndarray, answer: Answer, max_lines: int) -> None:
     offset = query.shape[1] + _GAP
     height = max(len(query), len(answer.image))
@@ -83,7 +78,7 @@ def _draw_pair(axes: Axes, query: np.ndarray, answer: Answer, max_lines: int) ->
     words = "query | candidate"
     if answer.matches is not None and answer.explanation is not None:
         words = _draw_matches(axes, offset, answer.matches, answer.explanation, max_lines)
-    axes.set_title(f"{_drawable(answer.caption)}\n{words}", fontsize=9, parse_math=False)
+    axes.set_title(f"{printable(answer.caption)}\n{words}", fontsize=9, parse_math=False)
 
 
 def _draw_matches(axes: Axes, offset: int, matches: Matches, explanation: Explanation, max_lines: int) -> str:

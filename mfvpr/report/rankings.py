@@ -72,5 +72,6 @@ def _written(value: Any) -> str:
 
 
 def _write_csv(path: Path, header: Sequence[str], lines: Iterable[Sequence[str | int]]) -> None:
+    # Names as the very bytes that the file system has, so that they can be looked up again.
     with replacing(path) as temporary, temporary.open("w", encoding="utf-8", errors="surrogateescape") as file:
         csv.writer(file, lineterminator="\n").writerows([header, *lines])

@@ -28,8 +28,8 @@ class AnchorPoints:
     tolerance 1 and unit cell weights it counts exact agreements, as SSM-VPR does.
 
     Attributes:
-        num_bins: cells per side; memory grows with the square of their number, or of the
-            matches' where these are fewer.
+        num_bins: cells per side; memory grows with the square of the number of cells, or of matches where these are
+            fewer, and that of the soft form with the fourth power of num_bins.
         window: width of the square window around an anchor, cells.
         tolerance: largest distance of two displacements that still counts, cells.
         weight: match weight, FS by default as in the paper.
@@ -100,14 +100,11 @@ class AnchorPoints:
             occupied = winner < num_cells
         won = jnp.where(occupied, winner[cells], cells)
         rows, columns = won // self.num_bins - cells // self.num_bins, won % self.num_bins - cells % self.num_bins
-        counted = {
-            "winner_sum": lambda: jnp.where(target == winner[anchor], weights, 0.0),
-            "cell_sum": lambda: weights,
-            "ones": lambda: None,
-        }[self.cell_weight]()
-        if counted is None:
+        if self.cell_weight == "ones":
             cell_weights = jnp.ones_like(occupied, weights.dtype)
         else:
+            won_votes = target == winner[anchor]
+            counted = jnp.where(won_votes, weights, 0.0) if self.cell_weight == "winner_sum" else weights
             cell_weights = jnp.zeros(num_cells, weights.dtype).at[anchor].add(counted)[cells]
         rows, columns, occupancy = (values.astype(weights.dtype) for values in (rows, columns, occupied))
         return cells, rows, columns, occupancy, masked(cell_weights, occupied)

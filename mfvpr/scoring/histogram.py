@@ -163,7 +163,7 @@ class HistogramOfShifts:
         if needed > most:
             raise InputError(
                 f"bin_size={finest.bin_size:g}: expected at most {most} bins per axis, images of this size need "
-                f"{needed}; use larger bins, or set max_bins"
+                f"{needed}; use larger bins"
             )
         return needed
 

@@ -6,6 +6,7 @@ from functools import reduce
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import GetAttrKey
 
@@ -25,6 +26,11 @@ def numbers(scorer: Any) -> dict[str, Any]:
         for name, leaf in named.items()
         if _is_number(leaf) or (leaf is None and name.rpartition(".")[2] == "temperature")
     }
+
+
+def whole_numbers(scorer: Any) -> set[str]:
+    """Names of those `numbers` that are whole: others in their place are, too, and may be indices."""
+    return {name for name, number in numbers(scorer).items() if number is not None and _is_whole(number)}
 
 
 def choices(scorer: Any) -> set[str]:
@@ -65,4 +71,9 @@ def _with(scorer: Any, name: str, value: Any) -> Any:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float | np.ndarray | np.generic | jax.Array) and np.ndim(value) == 0
+    scalar = isinstance(value, int | float | np.ndarray | np.generic | jax.Array) and np.ndim(value) == 0
+    return scalar and (jnp.issubdtype(jnp.result_type(value), jnp.number) or isinstance(value, bool | np.bool_))
+
+
+def _is_whole(number: Any) -> bool:
+    return jnp.issubdtype(jnp.result_type(number), jnp.integer)

@@ -73,7 +73,7 @@ def groups(scorer: Any, settings: Sequence[Setting], image_sizes: tuple[np.ndarr
         image_sizes: all that occur, `[n, 2]` of queries and of database images.
     """
     static = parameters.choices(scorer)
-    whole = {name for name, number in parameters.numbers(scorer).items() if _is_whole(number)}
+    whole = parameters.whole_numbers(scorer)
     weights = list({id(s["weight"]): s["weight"] for s in settings if "weight" in s}.values())
     for choices, members in _grouped(
         settings, range(len(settings)), lambda name, value: name in static or value is None
@@ -137,8 +137,3 @@ def _parts(total: int, size: int) -> list[np.ndarray]:
     """Even parts of range(total), none longer than `size`, all of one length: the last repeats its last."""
     length = -(-total // -(-total // size))
     return [np.minimum(np.arange(start, start + length), total - 1) for start in range(0, total, length)]
-
-
-def _is_whole(number: Any) -> bool:
-    """Of a scorer's own value: then others are, too, and may be indices."""
-    return isinstance(number, int | np.integer) and not isinstance(number, bool)

@@ -1,0 +1,41 @@
+"""What programs tell while they work, on stderr: notes, warnings, and how far they are."""
+
+import sys
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+from tqdm import tqdm
+
+if TYPE_CHECKING:  # or the command line would wait for JAX
+    from mfvpr.pipeline import Track
+
+
+def tell(text: str) -> None:
+    """A line that is no result."""
+    print(text, file=sys.stderr)
+
+
+def track(label: str) -> "Track":
+    """A progress bar with the time left."""
+    return lambda items, total: bar(label, total, items)
+
+
+def bar(label: str, total: int, items: Iterable[Any] | None = None) -> tqdm:
+    """The one look of all progress bars; none where there is nothing to do."""
+    shown = tqdm if sys.stderr.isatty() else _Lines
+    return shown(items, total=total, desc=f"{label:<20}", unit="", dynamic_ncols=True, disable=total == 0)
+
+
+class _Lines(tqdm):
+    """Progress without a terminal, in a file or a log: a line per 10 %."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        self._tenths = -1
+        super().__init__(*arguments, mininterval=0, miniters=1, leave=False, **options)
+
+    def display(self, msg: str | None = None, pos: int | None = None) -> None:
+        """What tqdm calls wherever a bar would be drawn."""
+        tenths = 10 * self.n // self.total
+        if tenths > self._tenths:
+            self._tenths = tenths
+            tell(f"{self.desc} {10 * tenths:3d} %  {self.n} of {self.total}  {self.format_dict['elapsed']:.0f} s")

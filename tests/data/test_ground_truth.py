@@ -1,0 +1,277 @@
+"""Ground truth of every kind, right and wrong."""
+
+import json
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from mfvpr import InputError, frame_positives
+from mfvpr.data.datasets import folder_dataset
+from mfvpr.data.files import write_text
+from mfvpr.data.ground_truth import (
+    AllowedTruth,
+    FrameTruth,
+    LabelTruth,
+    RadiusTruth,
+    threshold_words,
+)
+from mfvpr.data.truth_files import truth_from_labels
+from tests.builders import fill
+
+
+@pytest.fixture
+def folders(tmp_path):
+    return fill(tmp_path / "db", ["0.png", "1.png", "2.png"]), fill(tmp_path / "q", ["a.png", "b.png"])
+
+
+def test_order(folders):
+    database, queries = folders
+    with pytest.raises(
+        InputError, match="ground_truth=order: expected as many queries as database images, got 2 and 3"
+    ):
+        folder_dataset(database, queries, ground_truth="order")
+    truth = folder_dataset(database, database, ground_truth="order").truth
+    np.testing.assert_array_equal(truth.positives(0), np.eye(3, dtype=bool))
+    assert truth.positives(1).sum() == 7
+    assert folder_dataset(database, queries, ground_truth="none").truth is None
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "query,database\na.png,2.png\nb.png,\na.png,0.png\n",
+        "Reference,Live\n2,0\n,1\n0,0\n",
+        "database,extra,query\n2.png,x,a.png\n,x,b.png\n0,x,a.png\n",
+        "\ufeffquery,database\r\n0,2\r\n1,\r\n0,0\r\n",
+    ],
+)
+def test_csv(folders, tmp_path, text):
+    write_text(tmp_path / "gt.csv", text)
+    truth = folder_dataset(*folders, ground_truth="index", index_file=tmp_path / "gt.csv").truth
+    np.testing.assert_array_equal(truth.positives(0), [[True, False, True], [False, False, False]])
+
+
+def test_json_and_npz(folders, tmp_path):
+    write_text(tmp_path / "gt.json", json.dumps([[0, [2, 0]], [1, []]]))
+    np.savez(tmp_path / "gt.npz", query=np.array([0, 1, 0]), database=np.array(["2", "", "0.png"]))
+    for name in ("gt.json", "gt.npz"):
+        truth = folder_dataset(*folders, ground_truth="index", index_file=tmp_path / name).truth
+        np.testing.assert_array_equal(truth.positives(0), [[True, False, True], [False, False, False]])
+    np.savez(tmp_path / "utm.npz", utmQ=np.array([[0, 0], [50, 0]]), utmDb=np.array([[0, 25], [0, 26], [50, 1]]))
+    truth = folder_dataset(*folders, ground_truth="index", index_file=tmp_path / "utm.npz").truth
+    np.testing.assert_array_equal(truth.positives(25), [[True, False, False], [False, False, True]])
+
+
+def test_utm_reads_the_file_name_only(tmp_path):
+    database = fill(tmp_path / "at@home@1@" / "db", ["@0500000.00@4400000.00@.png", "x/@0500030.00@4400000.00@y@.png"])
+    queries = fill(tmp_path / "at@home@1@" / "q", ["@0500010.00@4400000.00@@@@.png"])
+    truth = folder_dataset(database, queries, ground_truth="utm").truth
+    assert truth.unit == "m"
+    np.testing.assert_array_equal(truth.positives(15), [[True, False]])
+    np.testing.assert_array_equal(truth.positives(25), [[True, True]])
+
+
+def test_nothing_is_assumed(folders):
+    """Not even where the counts agree."""
+    database, _ = folders
+    for kind in (None, "names"):
+        with pytest.raises(InputError) as caught:
+            folder_dataset(database, database, ground_truth=kind)
+        for choice in ("order (query i shows", "index (a file", "utm (positions", "label (two", "none (rankings"):
+            assert choice in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+def test_an_index_file_says_all_that_is_right_unless_neighbors_count(folders, tmp_path):
+    write_text(tmp_path / "gt.csv", "query,database\na.png,2.png\nb.png,\n")
+    index = {"ground_truth": "index", "index_file": tmp_path / "gt.csv"}
+    exact = folder_dataset(*folders, **index).truth
+    widened = folder_dataset(*folders, **index, widen_index=True).truth
+    for tolerance in (0, 1, 5):
+        np.testing.assert_array_equal(exact.positives(tolerance), [[False, False, True], [False] * 3])
+    np.testing.assert_array_equal(widened.positives(1), [[False, True, True], [False] * 3])
+    assert exact.thresholds(tolerances=[5, 1, 2, 1], radius=25.0) == [0]
+    assert widened.thresholds(tolerances=[5, 1, 2, 1], radius=25.0) == [1, 2, 5]
+    assert (exact.place(0), exact.place(1), widened.place(0), widened.place(1)) == (2, None, 2, None)
+    assert [threshold_words(truth.unit, 2) for truth in (exact, widened)] == ["", " ±2"]
+
+
+def labels(tmp_path, database, queries):
+    write_text(tmp_path / "db.csv", "name,label\n" + database)
+    write_text(tmp_path / "q.csv", "name,label\n" + queries)
+    return {"ground_truth": "label", "database_labels": tmp_path / "db.csv", "query_labels": tmp_path / "q.csv"}
+
+
+def test_labels(folders, tmp_path):
+    files = labels(tmp_path, "2.png, hall\n0.png,kitchen\n1.png,hall \n", "b.png,attic\na.png,hall\n")
+    truth = folder_dataset(*folders, **files).truth
+    np.testing.assert_array_equal(truth.positives(5), [[False, True, True], [False, False, False]])
+    assert (truth.place(0), truth.place(1)) == (1, None)
+    assert truth.thresholds(tolerances=[1, 2], radius=25.0) == [0]
+
+
+def test_no_label_is_nobodys(folders, tmp_path):
+    truth = folder_dataset(*folders, **labels(tmp_path, "0.png,\n1.png,\n2.png,x\n", "a.png,\nb.png,x\n")).truth
+    np.testing.assert_array_equal(truth.positives(0), [[False, False, False], [False, False, True]])
+
+
+@pytest.mark.parametrize(
+    ("database", "words"),
+    [
+        ("0.png,x\n1.png,x\n", "expected labels of all 3 images, got 2; the first without is 2.png"),
+        ("0.png,x\n1.png,x\n0.png,x\n2.png,x\n", "entry 3: '0.png' has a label already"),
+        ("0.png,x\n1.png,x\n2.png,x\n9.png,x\n", "entry 4: got '9.png'; no image has this name"),
+        ("0.png,x\n" + 5000 * "9" + ",x\n", "(5000 characters)'; no image has this name"),
+    ],
+)
+def test_wrong_labels_are_named_in_one_line(folders, tmp_path, database, words):
+    with pytest.raises(InputError) as caught:
+        folder_dataset(*folders, **labels(tmp_path, database, "a.png,x\nb.png,x\n"))
+    assert words in str(caught.value)
+    assert str(tmp_path / "db.csv") in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400
+
+
+def test_a_name_in_two_folders_needs_its_path(tmp_path):
+    both = fill(tmp_path / "both", ["left/0.png", "right/0.png"])
+    with pytest.raises(InputError, match=r"got '0\.png'; several images have this name, give their paths"):
+        folder_dataset(both, both, **labels(tmp_path, "0.png,x\n", "left/0.png,x\nright/0.png,y\n"))
+    full = "left/0.png,x\nright/0.png,y\n"
+    truth = folder_dataset(both, both, **labels(tmp_path, full, full)).truth
+    np.testing.assert_array_equal(truth.positives(0), np.eye(2, dtype=bool))
+
+
+def test_files_are_given_for_the_ground_truth_that_reads_them(folders, tmp_path):
+    files = labels(tmp_path, "", "")
+    for options, words in (
+        ({"ground_truth": "order", "index_file": tmp_path / "db.csv"}, "given as index_file, but ground_truth=order"),
+        (files | {"ground_truth": "none"}, "given as database_labels, but ground_truth=none; set it to label"),
+        (files | {"query_labels": None}, "ground_truth=label: expected a file; give query_labels as well"),
+        (files | {"query_labels": tmp_path / "no.csv"}, "no.csv: expected a ground truth file, got nothing"),
+    ):
+        with pytest.raises(InputError, match=words):
+            folder_dataset(*folders, **options)
+
+
+def test_as_many_labels_as_anyone_has():
+    rng = np.random.default_rng(0)
+    truth = LabelTruth(rng.integers(-1, 60, 2000), rng.integers(-1, 60, 3000))
+    positives = truth.positives(0)
+    for query in (0, 7, 1999):
+        right = (truth.database_labels == truth.query_labels[query]) & (truth.query_labels[query] >= 0)
+        np.testing.assert_array_equal(positives[query], right)
+        np.testing.assert_array_equal(np.isfinite(truth.distance(query)), right)
+
+
+def test_a_long_file_of_labels_is_read_in_seconds(tmp_path):
+    names = [f"{number}.png" for number in range(30_000)]
+    write_text(tmp_path / "l.csv", "name,label\n" + "".join(f"{name},{len(name)}\n" for name in reversed(names)))
+    truth = truth_from_labels(tmp_path / "l.csv", tmp_path / "l.csv", names, names)
+    np.testing.assert_array_equal(truth.query_labels, np.repeat(range(5), [10, 90, 900, 9000, 20_000]))
+
+
+def test_positives_take_little_more_than_themselves():
+    """Nordland has 27,592 frames on each side: eight bytes for each pair would be 6 GB, of which there were two."""
+    number = 600
+    rows = FrameTruth(tuple((row,) for row in range(number)), number)
+    places = RadiusTruth(*2 * [np.stack([np.arange(number), np.zeros(number)], axis=1)])
+    for positives, expected in (
+        (lambda: rows.positives(2), 5 * number - 6),
+        (lambda: frame_positives(np.arange(number), np.arange(number), tolerance=2), 5 * number - 6),
+        (lambda: places.positives(1e6), number**2),
+    ):
+        tracemalloc.start()
+        try:
+            found = positives()
+            peak = tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+        assert peak < 1.5 * number**2
+        assert found.sum() == expected
+
+
+@pytest.mark.parametrize("tolerance", [0, 1, 4, 10**6])
+def test_frames_are_a_loop_over_all_pairs(tolerance):
+    truth = FrameTruth(((3, 7), (), (0,), (9,)), 10)
+    for query, rows in enumerate(truth.rows):
+        expected = [any(abs(row - one) <= tolerance for one in rows) for row in range(10)]
+        np.testing.assert_array_equal(truth.positives(tolerance)[query], expected)
+        np.testing.assert_array_equal(truth.distance(query) <= tolerance, expected)
+
+
+def test_what_is_not_allowed_is_not_right():
+    allowed = np.array([[True, False, False, True], [False, True, True, True]])
+    truth = AllowedTruth(FrameTruth(((1,), (0,)), 4), allowed)
+    np.testing.assert_array_equal(truth.positives(1), [[True, False, False, False], [False, True, False, False]])
+    assert not truth.positives(0).any()
+    assert (truth.place(0), truth.place(1), truth.unit) == (0, 1, "frames")
+    assert AllowedTruth(truth, np.zeros_like(allowed)).place(0) is None
+
+
+def bad_npz(path):
+    np.savez(path, query=np.array([{"a": 1}], dtype=object), database=np.array([0]))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("missing.csv", None, "got nothing"),
+        ("gt.csv", f"query,database\n0,0\n1,{5000 * '1'}\n", "(5000 characters)'"),
+        ("gt.csv", f"query,database\n0,0\n1,{5000 * '0'}1\n", "(5001 characters)'"),
+        ("gt.json", f"[[0, [{5000 * '1'}]], [1, []]]", "cannot be read as .json"),
+        ("gt.json", f"[[0, [{4000 * '1'}]], [1, []]]", "(4000 characters)'"),
+        ("gt.json", 100_000 * "[", "cannot be read as .json"),
+        (
+            "gt.npz",
+            lambda p: np.savez(p, utmQ=np.full((2, 2), 1e308), utmDb=np.zeros((3, 2))),
+            "utmQ: expected positions of at most 1e+09 m",
+        ),
+        ("gt.txt", "x", "named .csv, .npz or .json"),
+        ("gt.csv", "", "no header"),
+        ("gt.csv", "a,b\n0,0\n", "got a,b"),
+        ("gt.csv", "query,database\n0,0\n", "all 2 queries, got it for 1; the first without is b.png"),
+        (
+            "gt.csv",
+            "query,database\n0,0\n1,3\n",
+            "pair 2: expected the name of a database image or a number from 0 to 2",
+        ),
+        ("gt.csv", "query,database\n0,0\n1,-1\n", "got '-1'"),
+        ("gt.csv", "query,database\n0,0\nzz.png,0\n", "got 'zz.png'"),
+        ("gt.json", "[[0", "cannot be read as .json"),
+        ("gt.npz", "no archive", "cannot be read as .npz"),
+        ("gt.npz", bad_npz, "Python objects, which are never loaded"),
+        ("gt.json", '{"00": 1, "11": 1}', "expected [[query, [database, ...]], ...]"),
+        ("gt.json", '[[0, "12"], [1, "0"]]', "expected [[query, [database, ...]], ...]"),
+        (
+            "gt.npz",
+            lambda p: np.savez(p, utmQ=np.full((2, 2), np.nan), utmDb=np.zeros((3, 2))),
+            "utmQ: expected positions of at most",
+        ),
+        ("gt.npz", lambda p: np.savez(p, utmQ=np.zeros(()), utmDb=np.zeros((3, 2))), "utmQ: expected positions [n, 2]"),
+        ("gt.npz", lambda p: np.savez(p, query=np.arange(2), database=np.arange(3)), "of one length"),
+        ("gt.npz", lambda p: np.savez(p, other=np.zeros(2)), "got other"),
+        ("gt.npz", lambda p: np.savez(p, utmQ=np.zeros((5, 2)), utmDb=np.zeros((3, 2))), "expected 2 query positions"),
+    ],
+)
+def test_wrong_index_files_are_named_in_one_line(folders, tmp_path, name, content, words):
+    path = tmp_path / name
+    if callable(content):
+        content(path)
+    elif content is not None:
+        path.write_text(content)
+    with pytest.raises(InputError) as caught:
+        folder_dataset(*folders, ground_truth="index", index_file=path)
+    assert words in str(caught.value)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "name", ["plain.png", "@a@b@.png", "@1.png", "@nan@1@.png", "@inf@1@.png", "@1e308@1e308@.png", "@5@-1e10@.png"]
+)
+def test_names_without_coordinates_are_named(tmp_path, name):
+    folder = fill(tmp_path / "db", [name])
+    with pytest.raises(InputError, match=r"easting"):
+        folder_dataset(folder, folder, ground_truth="utm")
