@@ -6,6 +6,7 @@ The file is NumPy's own `.npz` (`numpy.load` reads it) that ends with a digest o
 import hashlib
 import io
 import os
+import threading
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,6 +17,9 @@ from mfvpr.data.files import replacing
 from mfvpr.errors import InputError
 
 _DIGEST = hashlib.sha256().digest_size
+# NumPy reads the headers of arrays by `ast.parse`, which fails now and then where several threads call it at the same
+# time (SystemError: AST constructor recursion depth mismatch; Python 3.11).
+_PARSING = threading.Lock()
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: str = "", *, compress: bool = False) -> None:
@@ -56,8 +60,10 @@ def read_arrays(path: Path, about: str = "") -> dict[str, np.ndarray]:
     content = memoryview(path.read_bytes())
     if content[-_DIGEST:] != _digest(content[:-_DIGEST], about):
         raise InputError(f"{path}: expected arrays as they were written here, got others or damaged ones; delete it")
-    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-        return dict(archive)
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        members = {name.removesuffix(".npy"): io.BytesIO(archive.read(name)) for name in archive.namelist()}
+    with _PARSING:
+        return {name: np.lib.format.read_array(member, allow_pickle=False) for name, member in members.items()}
 
 
 def _digest(content: memoryview, about: str) -> bytes:

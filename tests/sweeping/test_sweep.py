@@ -26,7 +26,7 @@ def make_set():
     rng = np.random.default_rng(4)
     flat, counts = [], []
     for query in range(QUERIES):
-        sizes = [((336, 336), (640, 480))[query % 2], *[((336, 336), (400, 300))[row % 2] for row in range(CANDIDATES)]]
+        sizes = [((168, 168), (320, 240))[query % 2], *[((168, 168), (200, 150))[row % 2] for row in range(CANDIDATES)]]
         pairs = [
             random_matches(rng, count, sizes=(sizes[0], size))
             for count, size in zip(rng.permutation([0, 3, 20, 33, 70]), sizes[1:], strict=True)
