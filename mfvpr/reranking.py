@@ -132,6 +132,7 @@ def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> 
     weights = _weights(scorer, axes)
     if weights:
         scorer, axes["weight"] = replace(scorer, weight=ChosenWeight(weights, 0)), np.arange(len(weights))
+    plain = any(callable(leaf) for leaf in jax.tree.leaves(scorer))
     scorer = held(scorer)
     values = {name: _axis(scorer, name, axis) for name, axis in axes.items()}
     inner = [name for name in values if name in WEIGHTINGS]
@@ -143,14 +144,14 @@ def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> 
         for fitted, part in by_capacity(scorer, settings, rows, *_sizes(matches))
     ]
 
-    concrete = is_concrete((scorer, matches, values))
-    settled = jax.block_until_ready if concrete else lambda scores: scores  # programs side by side share no cache
-
     def score(matches: Matches) -> list[Array]:
-        return [settled(score_settings(fitted, matches, values, weightings)) for fitted, _, values in parts]
+        # One after the other: programs side by side would share the cache.
+        return [jax.block_until_ready(score_settings(one, matches, values, weightings)) for one, _, values in parts]
 
-    scores = _on_every_core(score, matches) if concrete else score(matches)
-    xp: Any = np if concrete else jnp  # what JAX does one by one waits for its own turn
+    # What a plain function closes over may be traced, which only its own thread understands.
+    elsewhere = is_concrete((scorer, matches, values)) and not plain
+    scores = _on_every_core(score, matches) if elsewhere else score(matches)
+    xp: Any = np if is_concrete(scores) else jnp  # what JAX does one by one waits for its own turn
     order = np.argsort(np.concatenate([part for _, part, _ in parts]))
     names = outer + inner
     found = xp.concatenate(scores)[order].reshape(*(len(values[name]) for name in names), -1)

@@ -1,5 +1,6 @@
 """Grids, fusion and ranking."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -225,3 +226,24 @@ def test_fusion_and_ranking_compile_once_for_all_callers(compilations):
 
 def test_whole_numbers_are_ranked_as_they_are():
     np.testing.assert_array_equal(rank(jnp.array([2**24, 2**24 + 1, 7])), [1, 0, 2])
+
+
+@pytest.mark.parametrize("count", [4, 20])
+def test_what_a_plain_function_closes_over_may_be_traced(count):
+    """Few candidates at once, or as many as would be shared by the cores."""
+    rng = np.random.default_rng(0)
+    pairs = jax.tree.map(lambda *leaves: np.stack(leaves), *[random_matches(rng, 30) for _ in range(count)])
+    scaled = HistogramOfShifts()
+    expected = np.sum(score_grid(scaled, pairs, sigma=[10.0, 20.0]))
+
+    def total(t, **axes):
+        weight = lambda matches: t * scaled.weight(matches)  # noqa: E731
+        scorer = scaled if axes else replace(scaled, weight=weight)
+        return jnp.sum(score_grid(scorer, pairs, sigma=[10.0, 20.0], **{name: [weight] for name in axes}))
+
+    for axes in ({}, {"weight": None}):
+        np.testing.assert_allclose(jax.grad(partial(total, **axes))(2.0), expected, rtol=1e-5)
+        np.testing.assert_allclose(jax.vmap(partial(total, **axes))(jnp.ones(2)), [expected] * 2, rtol=1e-5)
+    sigmas = jnp.array([10.0, 20.0])
+    twice = jax.jit(lambda t: t * score_grid(scaled, pairs, sigma=sigmas))(2.0)
+    np.testing.assert_allclose(jnp.sum(twice), 2 * expected, rtol=1e-5)

@@ -111,6 +111,7 @@ class HistogramOfShifts:
     def histogram(self, matches: Matches) -> ShiftHistogram:
         """All bins of one pair with their centers."""
         scores, lattice, usable = self._vote(matches)
+        usable &= _are_numbers(self._shifts(matches), match_weights(self.weight, matches)[None])[0]
         x, y = (lattice.centers(axis, jnp.arange(len(scores), dtype=scores.dtype)) for axis in (0, 1))
         return ShiftHistogram(jnp.where(usable, scores, jnp.nan), x, y)
 
@@ -163,7 +164,7 @@ class HistogramOfShifts:
         if needed > most:
             raise InputError(
                 f"bin_size={finest.bin_size:g}: expected at most {most} bins per axis, images of this size need "
-                f"{needed}; use larger bins"
+                f"{needed}; use larger bins, or set max_bins"
             )
         return needed
 
@@ -210,7 +211,8 @@ class HistogramOfShifts:
             edge = (xp.floor(lower / bin_size + 0.5 + slack) - 0.5) * bin_size
         else:
             edge = xp.floor(lower / bin_size + slack) * bin_size
-        return edge + bin_size / 2, xp.ceil((upper - edge) / bin_size - slack)
+        num_bins = xp.maximum(xp.ceil((upper - edge) / bin_size - slack), 1)
+        return edge + bin_size / 2, xp.where((bin_size > 0) & (lower <= upper), num_bins, 0)
 
     def _shifts(self, matches: Matches) -> Array:
         shifts = match_shifts(matches)
@@ -253,8 +255,13 @@ def _climb(start: Array, shifts: Array, weights: Array, deviation: Array) -> Arr
 def _where_usable(found: Array, matches: Matches, shifts: Array, weights: Array, usable: Array) -> Array:
     """What was `found` by weights `[W, K]` of one pair, `[W]` or of the only one; 0 without matches, and NaN where the
     lattice is not usable, a shift or a weight no number: else the tallest bin would be anything."""
-    usable = usable & jnp.all(jnp.isfinite(shifts)) & jnp.all(jnp.isfinite(weights), axis=1)
+    usable = usable & _are_numbers(shifts, weights)
     return jnp.where(jnp.any(matches.mask), jnp.where(usable, found, jnp.nan), 0.0)
+
+
+def _are_numbers(shifts: Array, weights: Array) -> Array:
+    """`[W]` whether all shifts and the weights `[W, K]` are finite."""
+    return jnp.all(jnp.isfinite(shifts)) & jnp.all(jnp.isfinite(weights), axis=1)
 
 
 def _smooth_max(values: Array, mask: Array, *, temperature: Array) -> Array:

@@ -35,10 +35,10 @@ class Lattice(NamedTuple):
         return (index < self.num_bins[1])[:, None] & (index < self.num_bins[0])[None]
 
     def usable(self, capacity: int) -> Array:
-        """`[]` bool, whether there is room for all bins, and a width of the votes."""
+        """`[]` bool, whether there is room for all bins, and a width and a reach of the votes."""
         # Told beforehand: XLA's maximum over thousands of values on a CPU passes over NaN.
         room = jnp.all((self.num_bins >= 1) & (self.num_bins <= capacity))
-        return room & ~jnp.isnan(self.deviation)
+        return room & ~jnp.isnan(self.deviation) & ~jnp.isnan(self.truncate)
 
 
 def gaussian(distance: Array, deviation: Array, truncate: Array) -> Array:

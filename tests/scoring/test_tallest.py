@@ -261,3 +261,28 @@ def test_no_bins_no_score(matches, bin_size):
     """Traced, so that nobody could refuse it; of thousands of bins XLA's maximum on a CPU would pass over NaN."""
     got = jax.jit(lambda size: score_candidates(HistogramOfShifts(bin_size=size, max_bins=136), matches))(bin_size)
     np.testing.assert_array_equal(np.isnan(got), matches.mask.any(1))
+
+
+@pytest.mark.parametrize(
+    ("scorer", "bins"),
+    [
+        (HistogramOfShifts(bin_size=1e8), (1, 1)),
+        (HistogramOfShifts(shift_range=(0.0, 30.0)), (1, 4)),
+        (HistogramOfShifts(shift_range=(-5.0, 5.0), align="zero_center"), None),
+        (HistogramOfShifts(truncate=np.nan), None),
+    ],
+)
+def test_there_is_always_a_bin_but_not_for_what_has_no_meaning(matches, scorer, bins):
+    got = score_candidates(scorer, matches)
+    np.testing.assert_array_equal(np.isnan(got), matches.mask.any(1) if bins is None else False)
+    if bins is not None:
+        found = scorer.histogram(jax.tree.map(lambda leaf: leaf[0], matches))
+        assert (len(found.centers_x), len(found.centers_y)) == (max(bins), max(bins))
+        assert np.isfinite(found.scores).sum() == bins[0] * bins[1]
+
+
+def test_bins_of_an_infinite_shift_are_no_numbers(matches):
+    pair = jax.tree.map(lambda leaf: leaf[0], matches)
+    points = pair.points1.copy()
+    points[np.flatnonzero(pair.mask)[0]] = np.inf
+    assert np.isnan(HistogramOfShifts().histogram(replace(pair, points1=points)).scores).all()
