@@ -1,16 +1,44 @@
-"""A small data set, and the programs on it: called, or as command lines of this process."""
+"""The programs, and a small data set for them: called, as command lines of this process, or in one of their own."""
 
 import json
 import logging
+import os
 import signal
+import subprocess
 import sys
 from importlib import import_module
+from pathlib import Path
 
-from experiments.launch import launch
+import hydra
+from omegaconf import OmegaConf
+
+from experiments.launch import CONF, launch
 from mfvpr.data.streets import streets_folder
-from tests.test_experiments import folder
 
-QUERIES, CANDIDATES = 24, 8
+ROOT = Path(__file__).parent.parent
+QUICK = ("figures=1", "features.max_keypoints=100", "retrieval.num_words=8")
+QUERIES, CANDIDATES = 24, 8  # of the small data set
+
+
+def run(*arguments, program="evaluate", cwd=ROOT, **environment):
+    """A command line in a process of its own, which takes seconds to import what it needs: see `typed`."""
+    return subprocess.run(
+        [sys.executable, "-m", f"experiments.{program}", *map(str, arguments)],
+        cwd=cwd, capture_output=True, text=True, timeout=280,
+        env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
+    )  # fmt: skip
+
+
+def composed(*overrides, config="config"):
+    """The settings of a command line, not yet checked."""
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        return OmegaConf.to_container(hydra.compose(config, list(overrides)), resolve=True)
+
+
+def folder(street, *more):
+    """Settings of a drawn street's folder."""
+    index = ("dataset.ground_truth=index", f"dataset.index_file={street}/ground_truth.csv", "dataset.widen_index=true")
+    return ("dataset=folder", f"dataset.database={street}/database", f"dataset.queries={street}/queries", *index, *more)
 
 
 def shared(tmp_path_factory):

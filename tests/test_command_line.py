@@ -10,9 +10,9 @@ import pytest
 from experiments import groups, settings
 from experiments.launch import CONF, version
 from mfvpr.scoring import histogram
-from tests.programs import typed
-from tests.test_experiments import ROOT, composed, run
+from tests.programs import ROOT, composed, run, typed
 
+OWN = ("dataset=folder", "dataset.database=a", "dataset.queries=b")
 PROGRAMS = {program: config for config, program in groups.PROGRAMS.items()}
 
 
@@ -97,6 +97,32 @@ def test_version(monkeypatch, capsys, program):
         ("sweep", ["grid=[1]"], "grid=[1]: this is a group of settings"),
         ("evaluate", ["figures=[1.5]"], "figures=[1.5]: expected how many"),
         ("evaluate", ["features=aliked", "features.weights=d2_tf"], "weights=d2_tf: expected weights of aliked"),
+        ("evaluate", ["scorer.sgma=3"], "scorer.sgma: unknown setting; the nearest is scorer.histogram.sigma"),
+        ("evaluate", ["scorer=histogram", "scorer.sgma=3"], "the nearest is scorer.sigma"),
+        ("evaluate", ["candidats=3"], "the nearest is candidates"),
+        ("evaluate", ["scorer=histogram", "scorer.sigma=nan"], "scorer.sigma=nan: expected a number above 0"),
+        ("evaluate", ["candidates=0"], "candidates=0: expected a whole number above 0 (at most 1000000), or all"),
+        ("evaluate", ["features.image_size=[336]"], "features.image_size=[336]: expected a list of 2"),
+        ("evaluate", ["dataset=folder"], "dataset.database: this setting has no default; give dataset.database=VALUE"),
+        ("evaluate", ["dataset=grief_season"], "dataset.root: this setting has no default"),
+        ("evaluate", ["scorer=histgram"], "count, histogram, sum; the nearest is histogram"),
+        ("evaluate", [*OWN], "dataset.ground_truth: nothing is assumed of your"),
+        ("evaluate", [*OWN, "dataset.bits=7"], "whole number from 8 to 16, or"),
+        ("evaluate", [*OWN, "dataset.ground_truth=none"], "a: expected a folder of images"),
+        ("evaluate", ["+new=1"], "+new=1: settings can be set, not added"),
+        ("evaluate", ["word"], "word: expected name=value"),
+        ("evaluate", ["scorer=[count,sum]"], "expected one of all"),
+        ("evaluate", ["features=null"], "features=null: expected one of aliked, d2net, sift"),
+        ("evaluate", ["scorer.count.method=histogram"], "scorer.count.method=histogram: expected count"),
+        ("evaluate", ["scorer=histogram", "scorer.bin_size=[1,2"], "scorer.bin_size=[1,2: expected a number above 0"),
+        ("evaluate", ["scorer.histogram=3"], "scorer.histogram=3: this is a group of settings"),
+        ("evaluate", ["features.name=superpoint"], "features.name=superpoint: expected one of sift"),
+        ("evaluate", ["dataset.name=../up"], "dataset.name=../up: expected letters"),
+        ("evaluate", ["scorer=histogram", "scorer.method=sum"], "scorer=sum has no setting"),
+        ("evaluate", ["hydra.foo=1"], "hydra.foo: unknown setting; see --help"),
+        ("evaluate", ["scorer.histogram.sigma=1e-46"], "expected a number above 0 (1e-6 to 1e12)"),
+        ("evaluate", [f"out={ROOT}/README.md/x"], "cannot be written to"),
+        ("evaluate", [f"out={ROOT}/README.md"], "README.md: expected a new or empty run folder"),
         ("evaluate", ["out=/"], "/: expected a new or empty run folder"),
         ("evaluate", ["out=/dev/null"], "/dev/null: expected a new or empty run folder, got a link or a file"),
         ("evaluate", ["out=/dev/null/x"], "/x: cannot be written to (Not a directory); name another run folder"),

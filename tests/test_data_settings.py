@@ -16,7 +16,7 @@ from experiments.launch import launch
 from experiments.run import evaluate
 from mfvpr import InputError
 from mfvpr.data.images import read_image
-from tests.test_experiments import composed, folder
+from tests.programs import composed, folder
 
 QUICK = ("figures=0", "features.max_keypoints=60", "features.image_size=[160,120]", "retrieval.num_words=8",
          "scorer=sum", "candidates=4")  # fmt: skip

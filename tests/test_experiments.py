@@ -2,13 +2,10 @@
 
 import csv
 import json
-import os
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
-import hydra
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
@@ -17,29 +14,8 @@ from PIL import Image
 from experiments import settings
 from experiments.launch import CONF
 from experiments.settings import SettingsError
+from tests.programs import QUICK, ROOT, composed, folder, run, typed
 
-ROOT = Path(__file__).parent.parent
-
-
-def run(*arguments, program="evaluate", cwd=ROOT, **environment):
-    return subprocess.run(
-        [sys.executable, "-m", f"experiments.{program}", *map(str, arguments)],
-        cwd=cwd, capture_output=True, text=True, timeout=280,
-        env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
-    )  # fmt: skip
-
-
-def composed(*overrides, config="config"):
-    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        return OmegaConf.to_container(hydra.compose(config, list(overrides)), resolve=True)
-
-
-def folder(street, *more):
-    index = ("dataset.ground_truth=index", f"dataset.index_file={street}/ground_truth.csv", "dataset.widen_index=true")
-    return ("dataset=folder", f"dataset.database={street}/database", f"dataset.queries={street}/queries", *index, *more)
-
-
-QUICK = ("figures=1", "features.max_keypoints=100", "retrieval.num_words=8")
 CHOICES = [
     (group.name, choice.stem)
     for group in sorted(CONF.iterdir())
@@ -77,57 +53,6 @@ def test_values_without_meaning_are_refused(name, value):
     OmegaConf.update(config, name, value)
     with pytest.raises(SettingsError, match=f"{name}=.*expected a number above 0"):
         settings.check(OmegaConf.to_container(config))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["scorer.sgma=3"], "scorer.sgma: unknown setting; the nearest is scorer.histogram.sigma"),
-        (["scorer=histogram", "scorer.sgma=3"], "the nearest is scorer.sigma"),
-        (["candidats=3"], "the nearest is candidates"),
-        (
-            ["scorer=histgram"],
-            "scorer=histgram: expected one of all, anchor, count, histogram, sum; the nearest is histogram",
-        ),
-        (["scorer=histogram", "scorer.sigma=nan"], "scorer.sigma=nan: expected a number above 0"),
-        (["candidates=0"], "candidates=0: expected a whole number above 0 (at most 1000000), or all"),
-        (["features.image_size=[336]"], "features.image_size=[336]: expected a list of 2"),
-        (["dataset=folder"], "dataset.database: this setting has no default; give dataset.database=VALUE"),
-        (["dataset=grief_season"], "dataset.root: this setting has no default"),
-        (
-            ["dataset=folder", "dataset.database=a", "dataset.queries=b"],
-            "dataset.ground_truth: nothing is assumed of your",
-        ),
-        (
-            ["dataset=folder", "dataset.database=a", "dataset.queries=b", "dataset.bits=7"],
-            "whole number from 8 to 16, or",
-        ),
-        (["+new=1"], "+new=1: settings can be set, not added"),
-        (
-            ["dataset=folder", "dataset.database=nope", "dataset.queries=nope", "dataset.ground_truth=none"],
-            "nope: expected a folder of images",
-        ),
-        (["word"], "word: expected name=value"),
-        (["scorer=[count,sum]"], "expected one of all"),
-        (["features=null"], "features=null: expected one of aliked, d2net, sift"),
-        (["scorer.count.method=histogram"], "scorer.count.method=histogram: expected count"),
-        (["scorer=histogram", "scorer.bin_size=[1,2"], "scorer.bin_size=[1,2: expected a number above 0"),
-        (["scorer.histogram=3"], "scorer.histogram=3: this is a group of settings"),
-        (["features.name=superpoint"], "features.name=superpoint: expected one of sift"),
-        (["dataset.name=../up"], "dataset.name=../up: expected letters"),
-        (["scorer=histogram", "scorer.method=sum"], "scorer=sum has no setting"),
-        (["hydra.foo=1"], "hydra.foo: unknown setting; see --help"),
-        (["scorer.histogram.sigma=1e-46"], "expected a number above 0 (1e-6 to 1e12)"),
-        (["out=README.md/x"], "cannot be written to"),
-        (["out=README.md"], "README.md: expected a new or empty run folder"),
-    ],
-)
-def test_mistakes_are_one_line_and_exit_code_2(arguments, words):
-    done = run(*arguments)
-    assert done.returncode == 2
-    assert words in done.stderr
-    assert done.stderr.count("\n") == 1
-    assert done.stdout == ""
 
 
 def test_bad_images_by_policy(small_street, tmp_path):
@@ -201,14 +126,16 @@ def test_ctrl_c_leaves_nothing(small_street, tmp_path, stage):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_bins_that_do_not_fit_are_refused(small_street):
+def test_bins_that_do_not_fit_are_refused(small_street, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
     for setting, words in (
         ("scorer.max_bins=3", "at least 45"),
         ("scorer.bin_size=0.01", "at most 1024 bins per axis"),
     ):
-        done = run(*folder(small_street, "scorer=histogram", *QUICK, setting))
-        assert done.returncode == 2
-        assert words in done.stderr.splitlines()[-1]
+        arguments = folder(small_street, "scorer=histogram", *QUICK, setting)
+        code, _, stderr = typed(monkeypatch, capsys, "evaluate", *arguments)
+        assert code == 2
+        assert words in stderr.splitlines()[-1]
 
 
 def test_one_evaluation_compiles_at_most_six_programs(small_street, tmp_path, monkeypatch, compilations, capsys):

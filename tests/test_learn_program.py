@@ -12,8 +12,7 @@ from experiments import lessons, search
 from experiments import run as evaluation
 from mfvpr.learning import checkpoints
 from mfvpr.learning.training import Fit, Record
-from tests.programs import QUERIES, results, shared, small, snapshot, typed
-from tests.test_experiments import composed
+from tests.programs import QUERIES, composed, results, shared, small, snapshot, typed
 
 SUM = ("scorer=sum",)
 SHORT = (*SUM, "split=first_half", "steps=4", "every=2", "batch=4", "learning_rate=0.05")

@@ -1,23 +1,11 @@
 """The main job with networks: systems, stores and mistakes. D2-Net and MixVPR have random weights here."""
 
 import json
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
 from tests import checkpoints
-
-ROOT = Path(__file__).parent.parent
-
-
-def evaluate(*arguments, **environment):
-    return subprocess.run(
-        [sys.executable, "-m", "experiments.evaluate", *map(str, arguments)],
-        cwd=ROOT, capture_output=True, text=True, timeout=280, env=os.environ | environment,
-    )  # fmt: skip
+from tests.programs import ROOT, run, typed
 
 
 def system(name, street, out, *more):
@@ -28,7 +16,7 @@ def system(name, street, out, *more):
 
 def test_the_papers_system_runs_and_is_read_from_its_stores_ever_after(weights, small_street, tmp_path):
     environment = {"MFVPR_WEIGHTS": str(weights), "MFVPR_CACHE": str(tmp_path / "cache")}
-    first = evaluate(*system("mix_hist_comb_10", small_street, tmp_path / "first"), **environment)
+    first = run(*system("mix_hist_comb_10", small_street, tmp_path / "first"), **environment)
     assert first.returncode == 0, first.stderr
     stores = sorted(path.name.rpartition("-")[0] for path in (tmp_path / "cache" / "features").glob("*-*"))
     assert stores == ["d2net", "d2net", "mixvpr", "mixvpr"]
@@ -42,7 +30,7 @@ def test_the_papers_system_runs_and_is_read_from_its_stores_ever_after(weights, 
                    for name in ("predictions.csv", "predictions/histogram_filter.csv")]  # fmt: skip
     assert predictions[0] == predictions[1]
 
-    again = evaluate(*system("mix_hist_comb_10", small_street, tmp_path / "again"), **environment)
+    again = run(*system("mix_hist_comb_10", small_street, tmp_path / "again"), **environment)
     assert again.stderr.count("all 10 images from") == 4
     for name in ("filter", "histogram", "histogram_filter"):
         one, two = (tmp_path / out / "predictions" / f"{name}.csv" for out in ("first", "again"))
@@ -51,12 +39,26 @@ def test_the_papers_system_runs_and_is_read_from_its_stores_ever_after(weights, 
 
 @pytest.mark.skipif(not checkpoints.ALIKED.is_dir(), reason="no ../shared/weights: ALIKED's are not shipped")
 def test_aliked_recognizes_the_street(weights, small_street, tmp_path):
-    done = evaluate(*system("mix_hist_aliked_50", small_street, tmp_path / "out", "features.image_size=[320,320]"),
+    done = run(*system("mix_hist_aliked_50", small_street, tmp_path / "out", "features.image_size=[320,320]"),
                     MFVPR_WEIGHTS=str(weights))  # fmt: skip
     assert done.returncode == 0, done.stderr
     rows = json.loads((tmp_path / "out" / "results.json").read_text())
     (recall,) = (row["recall_at"]["1"] for row in rows if (row["system"], row.get("tolerance")) == ("histogram", 1))
     assert recall >= 0.8
+
+
+@pytest.fixture
+def refused(tmp_path, monkeypatch, capsys):
+    """What a command line is answered with, one line, by the weights in a folder."""
+
+    def refused(weights, *arguments):
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setenv("MFVPR_WEIGHTS", str(weights))
+        code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *arguments)
+        assert (code, stdout, stderr.count("\n")) == (2, "", 1), stderr
+        return stderr
+
+    return refused
 
 
 @pytest.mark.parametrize(
@@ -74,26 +76,18 @@ def test_aliked_recognizes_the_street(weights, small_street, tmp_path):
         (["features=d2net", "features.preprocessing=vgg"], "expected one of caffe, torch"),
     ],
 )
-def test_mistakes_are_one_line(arguments, words, tmp_path):
-    done = evaluate(*arguments, "dataset=folder", f"dataset.database={ROOT}", "dataset.queries=x",
-                    MFVPR_WEIGHTS=str(tmp_path / "none"))  # fmt: skip
-    assert done.returncode == 2
-    assert words.replace("NOWHERE", str(tmp_path / "none")) in done.stderr
-    assert done.stderr.count("\n") == 1
+def test_mistakes_are_one_line(arguments, words, refused, tmp_path):
+    places = ("dataset=folder", f"dataset.database={ROOT}", "dataset.queries=x")
+    assert words.replace("NOWHERE", str(tmp_path / "none")) in refused(tmp_path / "none", *arguments, *places)
 
 
-def test_a_store_that_is_a_file_is_refused(small_street):
-    done = evaluate("dataset=folder", f"dataset.database={small_street}/database", "store=README.md",
-                    f"dataset.queries={small_street}/queries", "dataset.ground_truth=order")  # fmt: skip
-    assert done.returncode == 2
-    assert done.stderr.startswith("error: ")
-    assert "README.md" in done.stderr
-    assert done.stderr.count("\n") == 1
+def test_a_store_that_is_a_file_is_refused(refused, small_street, weights):
+    places = (f"dataset.database={small_street}/database", f"dataset.queries={small_street}/queries")
+    error = refused(weights, "dataset=folder", *places, "dataset.ground_truth=order", f"store={ROOT}/README.md")
+    assert error.startswith("error: ")
+    assert "README.md" in error
 
 
-def test_sizes_that_networks_cannot_take_are_refused_with_those_they_can(weights):
-    done = evaluate("features=d2net", "features.multiscale=true", "features.image_size=[16,100]",
-                    MFVPR_WEIGHTS=str(weights))  # fmt: skip
-    assert done.returncode == 2
-    assert "expected images of 24 x 24 px or more, got 16 x 100" in done.stderr
-    assert done.stderr.count("\n") == 1
+def test_sizes_that_networks_cannot_take_are_refused_with_those_they_can(refused, weights):
+    error = refused(weights, "features=d2net", "features.multiscale=true", "features.image_size=[16,100]")
+    assert "expected images of 24 x 24 px or more, got 16 x 100" in error

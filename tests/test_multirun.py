@@ -10,8 +10,7 @@ import pytest
 
 from experiments import prepare, stores
 from mfvpr.data import match_store
-from tests.programs import CANDIDATES, QUERIES, results, shared, small, typed
-from tests.test_experiments import ROOT, composed
+from tests.programs import CANDIDATES, QUERIES, ROOT, composed, results, shared, small, typed
 
 SIGMA = "grid.sigma=[10]"
 
@@ -70,8 +69,8 @@ def test_a_job_waits_for_the_matches_of_another_and_a_single_run_does_not(root, 
             taken.set()
             told.wait(timeout=60)
 
-    other, tell = threading.Thread(target=another), stores._tell
-    monkeypatch.setattr(stores, "_tell", lambda text: (tell(text), "waiting until" in text and told.set()))
+    other, tell = threading.Thread(target=another), stores.tell
+    monkeypatch.setattr(stores, "tell", lambda text: (tell(text), "waiting until" in text and told.set()))
     other.start()
     assert taken.wait(timeout=60)
     code, _, stderr = typed(monkeypatch, capsys, "sweep", *overrides, f"out={tmp_path}/single")

@@ -14,7 +14,7 @@ from experiments.launch import CONF
 from experiments.settings import RULES, check
 from tests import checkpoints
 from tests.builders import make_matches
-from tests.test_experiments import QUICK, ROOT, composed, run
+from tests.programs import QUICK, ROOT, composed, run
 
 README = (ROOT / "README.md").read_text()
 BESIDE = [(ROOT / place).read_text() for place in ("experiments/results.md", "conf/README.md")]
@@ -106,7 +106,7 @@ def test_a_scorer_of_your_own_keeps_the_contract():
 
 
 def test_settings_that_the_text_names_exist():
-    names = re.findall(r"`(?:[\w.]+\.)?(\w+)=[^`(]*`", "".join([README, *BESIDE]))
+    names = re.findall(r"`(?:[\w.]+\.)?([a-z]\w*)=[^`(]*`", "".join([README, *BESIDE]))  # capitals: environment
     assert len(names) > 20
     groups = {path.name for path in CONF.iterdir() if path.is_dir()}
     assert set(names) <= {rule.rpartition(".")[2] for rule in RULES} | groups

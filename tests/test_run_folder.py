@@ -25,8 +25,7 @@ from mfvpr.data.images import read_image
 from mfvpr.data.streets import streets_folder
 from mfvpr.errors import InputError
 from mfvpr.report import runs
-from tests.programs import CANDIDATES, QUERIES, shared, small, typed
-from tests.test_experiments import ROOT, composed
+from tests.programs import CANDIDATES, QUERIES, ROOT, composed, shared, small, typed
 
 LINES = ("scorer=histogram", "figures=4")
 

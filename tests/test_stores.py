@@ -16,7 +16,7 @@ from mfvpr.features.sift import Sift
 from mfvpr.types import Matches
 from mfvpr.weights import files
 from tests.data.stores import digests, features_of
-from tests.test_experiments import composed
+from tests.programs import composed
 
 # Matches of another shortlist
 

@@ -16,8 +16,7 @@ from PIL import Image
 from experiments import axes, launch, prepare, search, stores
 from experiments import run as evaluation
 from mfvpr.data import match_store
-from tests.programs import CANDIDATES, QUERIES, results, shared, small, snapshot, typed
-from tests.test_experiments import ROOT, composed
+from tests.programs import CANDIDATES, QUERIES, ROOT, composed, results, shared, small, snapshot, typed
 
 SWEEP = sys.modules["mfvpr.sweeping.sweep"]
 

@@ -28,6 +28,15 @@ def slots(match_set: MatchSet) -> np.ndarray:
     return sizes[np.searchsorted(sizes, match_set.counts)]
 
 
+def shapes(match_set: MatchSet) -> dict[int, int]:
+    """Pairs of a batch by their slots: as many as BATCH_SLOTS hold, but no more than there are."""
+    sizes, counts = np.unique(slots(match_set)[match_set.counts > 0], return_counts=True)
+    return {
+        size: round_up(min(BATCH_SLOTS // size, count), PAIRS_STEP)
+        for size, count in zip(sizes.tolist(), counts.tolist(), strict=True)
+    }
+
+
 def batches(match_set: MatchSet, queries: range) -> Iterator[tuple[np.ndarray, Matches]]:
     """All pairs that have matches.
 
@@ -38,9 +47,8 @@ def batches(match_set: MatchSet, queries: range) -> Iterator[tuple[np.ndarray, M
     starts = np.cumsum(counts) - counts
     flat, sizes0, sizes1 = _flattened(match_set, queries)
     sizes = slots(match_set)[queries.start : queries.stop].reshape(-1)
-    for size in np.unique(sizes[counts > 0]):
+    for size, pairs in shapes(match_set).items():
         places = np.flatnonzero((sizes == size) & (counts > 0))
-        pairs = round_up(BATCH_SLOTS // int(size), PAIRS_STEP)
         for start in range(0, len(places), pairs):
             part = places[start : start + pairs]
             mask = np.zeros((pairs, size), bool)

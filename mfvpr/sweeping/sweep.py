@@ -6,7 +6,7 @@ block by block (some settings, some queries), which bounds the memory and is whe
 
 import hashlib
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -22,7 +22,7 @@ from mfvpr.data.images import ordered_map
 from mfvpr.errors import InputError
 from mfvpr.numerics import available_cpus, compiled, knows_own_context
 from mfvpr.pipeline import FilterScore, MatchSet, Ties, Track, filter_scores, untracked
-from mfvpr.sweeping.batches import BYTES_PER_SLOT, batches, slots
+from mfvpr.sweeping.batches import BYTES_PER_SLOT, batches, shapes, slots
 from mfvpr.sweeping.settings import FUSION, Group, Setting, distinct, groups
 from mfvpr.types import Array, Matches, Shortlist, per_match
 
@@ -109,8 +109,8 @@ def sweep(
     work = Work(match_set, range(num_queries), candidates, views, depth, ties, filter_score)
     found_groups = list(groups(scorer, scored, match_set.image_sizes))
     if folder is not None:
-        sizes = sorted({*slots(match_set).reshape(-1).tolist()})
-        found_groups = [replace(group, program=_program(group, match_set.matches[0], sizes)) for group in found_groups]
+        batch = shapes(match_set)
+        found_groups = [replace(group, program=_program(group, match_set.matches[0], batch)) for group in found_groups]
     blocks = [one for group in found_groups for one in group.blocks(per_block)]
     found = np.full((len(views), len(settings), num_queries, depth), -1, np.int32)
     steps = ((part, block) for part in work.parts(queries) for block in blocks)
@@ -239,18 +239,18 @@ def _fingerprint(part: Work, block: Group, cs: Sequence[Any]) -> str:
     return _digest(repr(options), block.program, part.digest, numbers)
 
 
-def _program(group: Group, matches: Matches, sizes: Sequence[int]) -> str:
-    """What the scorer computes of pairs of these `sizes`: a user's code may change while its class keeps its name."""
+def _program(group: Group, matches: Matches, shapes: Mapping[int, int]) -> str:
+    """What the scorer computes of batches of these `shapes`: code may change while its class keeps its name."""
 
-    def text(size: int) -> str:
+    def text(size: int, pairs: int) -> str:
         entries = per_match(matches).items()
-        example = {name: np.zeros((1, size, *values.shape[1:]), values.dtype) for name, values in entries}
-        image_size = np.ones((1, 2), np.float32)
-        pair = Matches(**example, mask=np.ones((1, size), bool), image_size0=image_size, image_size1=image_size)
+        example = {name: np.zeros((pairs, size, *values.shape[1:]), values.dtype) for name, values in entries}
+        image_size = np.ones((pairs, 2), np.float32)
+        pair = Matches(**example, mask=np.ones((pairs, size), bool), image_size0=image_size, image_size1=image_size)
         settings = {name: axis[:1] for name, axis in group.settings.items()}
         return jax.jit(reranking.score_settings).lower(group.scorer, pair, settings, group.weightings).as_text()
 
-    return "".join(map(text, sizes))
+    return "".join(itertools.starmap(text, shapes.items()))
 
 
 def _digest(*parts: Any) -> str:

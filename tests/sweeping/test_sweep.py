@@ -29,7 +29,7 @@ def make_set():
         sizes = [((168, 168), (320, 240))[query % 2], *[((168, 168), (200, 150))[row % 2] for row in range(CANDIDATES)]]
         pairs = [
             random_matches(rng, count, sizes=(sizes[0], size))
-            for count, size in zip(rng.permutation([0, 3, 20, 33, 70]), sizes[1:], strict=True)
+            for count, size in zip(rng.permutation([0, 3, 20, 33, 60]), sizes[1:], strict=True)
         ]
         counts.append([int(pair.mask.sum()) for pair in pairs])
         joined = {
