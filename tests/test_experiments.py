@@ -55,7 +55,7 @@ def test_values_without_meaning_are_refused(name, value):
         settings.check(OmegaConf.to_container(config))
 
 
-def test_bad_images_by_policy(small_street, tmp_path):
+def test_bad_images_by_policy(small_street, tmp_path, monkeypatch, capsys):
     """Names with spaces, unicode and '@' in a parent folder; one image broken, one without keypoints."""
     root = tmp_path / "a@b, c's" / "ü"
     for name in ("database", "queries"):
@@ -74,9 +74,9 @@ def test_bad_images_by_policy(small_street, tmp_path):
     assert "Traceback" not in failed.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a@b, c's"]
 
-    passed = run(*arguments, "on_bad_image=skip")
-    assert passed.returncode == 0, passed.stderr
-    assert "candidates=99, but the database has 10 images" in passed.stderr
+    code, _, stderr = typed(monkeypatch, capsys, "evaluate", *arguments, "on_bad_image=skip")
+    assert code == 0, stderr
+    assert "candidates=99, but the database has 10 images" in stderr
     with (tmp_path / "out" / "skipped.csv").open() as file:
         assert [(row["folder"], row["image"]) for row in csv.DictReader(file)] == [("database", "é 0003.png")]
     with (tmp_path / "out" / "predictions.csv").open() as file:
@@ -85,24 +85,17 @@ def test_bad_images_by_policy(small_street, tmp_path):
     assert "é 0003.png" not in {row["database"] for row in rows}
     assert {row["score"] for row in rows if row["query"] == "é 0005.png"} == {"0"}
 
-    again = run(*arguments, "on_bad_image=skip")
-    assert again.returncode == 2
-    assert "expected a new or empty run folder" in again.stderr
+    code, _, stderr = typed(monkeypatch, capsys, "evaluate", *arguments, "on_bad_image=skip")
+    assert code == 2
+    assert "expected a new or empty run folder" in stderr
 
 
-def test_rankings_without_ground_truth(small_street, tmp_path):
-    done = run(
-        *folder(
-            small_street,
-            "dataset.ground_truth=none",
-            "dataset.index_file=null",
-            "scorer=anchor",
-            *QUICK,
-            f"out={tmp_path}/out",
-        )
-    )
-    assert done.returncode == 0, done.stderr
-    assert "no ground truth: rankings only" in done.stdout
+def test_rankings_without_ground_truth(small_street, tmp_path, monkeypatch, capsys):
+    none = ("dataset.ground_truth=none", "dataset.index_file=null")
+    arguments = folder(small_street, *none, "scorer=anchor", *QUICK, f"out={tmp_path}/out")
+    code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *arguments)
+    assert code == 0, stderr
+    assert "no ground truth: rankings only" in stdout
     rows = json.loads((tmp_path / "out" / "results.json").read_text())
     assert [row["system"] for row in rows] == ["filter", "anchor", "anchor + filter"]
     assert all(row["recall_at"] == {} for row in rows)

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from tests import checkpoints
-from tests.programs import ROOT, run, typed
+from tests.programs import ROOT, typed
 
 
 def system(name, street, out, *more):
@@ -14,14 +14,26 @@ def system(name, street, out, *more):
             "figures=2", f"out={out}", *more)  # fmt: skip
 
 
-def test_the_papers_system_runs_and_is_read_from_its_stores_ever_after(weights, small_street, tmp_path):
-    environment = {"MFVPR_WEIGHTS": str(weights), "MFVPR_CACHE": str(tmp_path / "cache")}
-    first = run(*system("mix_hist_comb_10", small_street, tmp_path / "first"), **environment)
-    assert first.returncode == 0, first.stderr
+@pytest.fixture
+def evaluate(weights, monkeypatch, capsys):
+    """Evaluates by the weights at hand; what was told comes back."""
+    monkeypatch.setenv("MFVPR_WEIGHTS", str(weights))
+
+    def evaluate(*arguments):
+        code, _, stderr = typed(monkeypatch, capsys, "evaluate", *arguments)
+        assert code == 0, stderr
+        return stderr
+
+    return evaluate
+
+
+def test_the_papers_system_runs_and_is_read_from_its_stores_ever_after(evaluate, small_street, tmp_path, monkeypatch):
+    monkeypatch.setenv("MFVPR_CACHE", str(tmp_path / "cache"))
+    first = evaluate(*system("mix_hist_comb_10", small_street, tmp_path / "first"))
     stores = sorted(path.name.rpartition("-")[0] for path in (tmp_path / "cache" / "features").glob("*-*"))
     assert stores == ["d2net", "d2net", "mixvpr", "mixvpr"]
-    assert "10 of 10 images to do, about 163 features of 512 dimensions each" in first.stderr
-    assert "as the paper stores them" in first.stderr
+    assert "10 of 10 images to do, about 163 features of 512 dimensions each" in first
+    assert "as the paper stores them" in first
     rows = json.loads((tmp_path / "first" / "results.json").read_text())
     assert list(dict.fromkeys(row["system"] for row in rows)) == ["filter", "histogram", "histogram + filter"]
     assert rows[0]["features"]["weights"] == "d2_tf"
@@ -30,18 +42,16 @@ def test_the_papers_system_runs_and_is_read_from_its_stores_ever_after(weights, 
                    for name in ("predictions.csv", "predictions/histogram_filter.csv")]  # fmt: skip
     assert predictions[0] == predictions[1]
 
-    again = run(*system("mix_hist_comb_10", small_street, tmp_path / "again"), **environment)
-    assert again.stderr.count("all 10 images from") == 4
+    again = evaluate(*system("mix_hist_comb_10", small_street, tmp_path / "again"))
+    assert again.count("all 10 images from") == 4
     for name in ("filter", "histogram", "histogram_filter"):
         one, two = (tmp_path / out / "predictions" / f"{name}.csv" for out in ("first", "again"))
         assert one.read_text() == two.read_text()
 
 
 @pytest.mark.skipif(not checkpoints.ALIKED.is_dir(), reason="no ../shared/weights: ALIKED's are not shipped")
-def test_aliked_recognizes_the_street(weights, small_street, tmp_path):
-    done = run(*system("mix_hist_aliked_50", small_street, tmp_path / "out", "features.image_size=[320,320]"),
-                    MFVPR_WEIGHTS=str(weights))  # fmt: skip
-    assert done.returncode == 0, done.stderr
+def test_aliked_recognizes_the_street(evaluate, small_street, tmp_path):
+    evaluate(*system("mix_hist_aliked_50", small_street, tmp_path / "out", "features.image_size=[320,320]"))
     rows = json.loads((tmp_path / "out" / "results.json").read_text())
     (recall,) = (row["recall_at"]["1"] for row in rows if (row["system"], row.get("tolerance")) == ("histogram", 1))
     assert recall >= 0.8

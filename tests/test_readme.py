@@ -14,7 +14,7 @@ from experiments.launch import CONF
 from experiments.settings import RULES, check
 from tests import checkpoints
 from tests.builders import make_matches
-from tests.programs import QUICK, ROOT, composed, run
+from tests.programs import QUICK, ROOT, composed, typed
 
 README = (ROOT / "README.md").read_text()
 BESIDE = [(ROOT / place).read_text() for place in ("experiments/results.md", "conf/README.md")]
@@ -33,7 +33,7 @@ def test_make_targets_exist(target):
 
 
 @pytest.mark.parametrize("command", [line for line in COMMANDS if "experiments.evaluate" in line])
-def test_commands_run(command, small_street, weights, tmp_path):
+def test_commands_run(command, small_street, weights, tmp_path, monkeypatch, capsys):
     if "aliked" in command and not checkpoints.ALIKED.is_dir():
         pytest.skip("no ../shared/weights: ALIKED's are not shipped")
     root = tmp_path / "root"
@@ -48,9 +48,11 @@ def test_commands_run(command, small_street, weights, tmp_path):
         arguments += ["dataset=folder", "dataset.ground_truth=order", *list(folders.values())[:2]]
     known = "vlad" if "mixvpr" not in command and "system" not in command else "mixvpr"
     quick = [setting for setting in QUICK if known == "vlad" or not setting.startswith("retrieval.")]
-    done = run("--help") if "--help" in arguments else run(*arguments, *quick, cwd=tmp_path, MFVPR_WEIGHTS=str(weights))
-    assert done.returncode == 0, done.stderr
-    assert "Settings" in done.stdout or "histogram" in done.stdout or "anchor" in done.stdout
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MFVPR_WEIGHTS", str(weights))
+    code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *arguments, *quick)
+    assert code == 0, stderr
+    assert "Settings" in stdout or "histogram" in stdout or "anchor" in stdout
 
 
 @pytest.mark.parametrize("program", ["sweep", "learn"])
