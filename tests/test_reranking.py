@@ -241,9 +241,8 @@ def test_what_a_plain_function_closes_over_may_be_traced(count):
         scorer = scaled if axes else replace(scaled, weight=weight)
         return jnp.sum(score_grid(scorer, pairs, sigma=[10.0, 20.0], **{name: [weight] for name in axes}))
 
-    for axes in ({}, {"weight": None}):
-        np.testing.assert_allclose(jax.grad(partial(total, **axes))(2.0), expected, rtol=1e-5)
-        np.testing.assert_allclose(jax.vmap(partial(total, **axes))(jnp.ones(2)), [expected] * 2, rtol=1e-5)
+    np.testing.assert_allclose(jax.grad(total)(2.0), expected, rtol=1e-5)
+    np.testing.assert_allclose(jax.vmap(partial(total, weight=None))(jnp.ones(2)), [expected] * 2, rtol=1e-5)
     sigmas = jnp.array([10.0, 20.0])
     twice = jax.jit(lambda t: t * score_grid(scaled, pairs, sigma=sigmas))(2.0)
     np.testing.assert_allclose(jnp.sum(twice), 2 * expected, rtol=1e-5)

@@ -1,6 +1,6 @@
 """What every scorer promises, whatever it computes, beside what `mfvpr.testing` checks (test_testing.py)."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,6 @@ from mfvpr import (
     FeatureScoreWeight,
     HistogramOfShifts,
     MatchCount,
-    Matches,
     UnitWeight,
     score_candidates,
     score_grid,
@@ -30,7 +29,6 @@ everyone = pytest.mark.parametrize("scorer", [*OWN, *FOREIGN], ids=title)
 own = pytest.mark.parametrize("scorer", OWN, ids=title)
 _score = jax.jit(lambda scorer, matches: scorer(matches))  # compiled once per shape: hence 60 slots, 5 pairs
 _score_all = jax.jit(score_candidates)
-gradients = jax.jit(jax.grad(lambda scorer, inputs, mask: scorer(Matches(mask=mask, **inputs)), argnums=(0, 1)))
 SIZES = np.array([SIZE, SIZE], np.float32)
 
 
@@ -49,49 +47,6 @@ def score_all(scorer, matches):
 
 def stack(items):
     return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *items)
-
-
-@everyone
-def test_scalar_float32_and_exactly_zero_without_matches(scorer):
-    nothing = score(scorer, random_matches(np.random.default_rng(0), 0, capacity=60))
-    assert nothing.shape == ()
-    assert nothing.dtype == jnp.float32
-    assert nothing == 0.0
-    assert score(scorer, random_matches(np.random.default_rng(0), 40, capacity=60)) > 0
-
-
-@everyone
-@pytest.mark.parametrize("garbage", [np.nan, np.inf, -1e30, 7.0])
-def test_padding_never_matters(scorer, garbage):
-    tight = random_matches(np.random.default_rng(1), 60)
-    loose = random_matches(np.random.default_rng(1), 60, capacity=90, garbage=garbage)
-    np.testing.assert_allclose(score(scorer, loose), score(scorer, tight), rtol=2e-6)
-
-
-@everyone
-def test_order_of_matches_does_not_matter(scorer):
-    matches = random_matches(np.random.default_rng(2), 60)
-    order = np.random.default_rng(3).permutation(60)
-    shuffled = per_match(matches, lambda rows: rows[order])
-    np.testing.assert_allclose(score(scorer, shuffled), score(scorer, matches), rtol=2e-6)
-
-
-@everyone
-@pytest.mark.parametrize("batch", [1, 5])
-def test_batch_equals_loop_and_neighbors_do_not_matter(scorer, batch):
-    rng = np.random.default_rng(4)
-    pairs = [random_matches(rng, count, capacity=60) for count in (0, 1, 60, 13, 37)[-batch:]]
-    loop = [score(scorer, pair) for pair in pairs]
-    np.testing.assert_allclose(score_all(scorer, stack(pairs)), loop, rtol=2e-6, atol=0)
-
-
-@own
-@pytest.mark.parametrize("count", [0, 1, 25])
-def test_gradients_are_finite(scorer, count):
-    matches = random_matches(np.random.default_rng(6), count, capacity=60)
-    inputs = {f.name: getattr(matches, f.name) for f in fields(matches) if f.name != "mask"}
-    for gradient in jax.tree.leaves(gradients(fitted(scorer), inputs, matches.mask)):
-        assert np.isfinite(gradient).all()
 
 
 @own
