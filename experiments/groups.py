@@ -1,6 +1,7 @@
 """The groups of conf/ that a program takes, and their choices; without Hydra, which takes a while to import."""
 
 import difflib
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ def defaults(file: Path) -> list[Any]:
     return _read(file).get("defaults", [])
 
 
+@cache
 def _read(file: Path) -> dict[str, Any]:
     return yaml.safe_load(file.read_text(encoding="utf-8")) or {}
 

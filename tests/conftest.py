@@ -26,7 +26,7 @@ for name, value in (
 ):
     jax.config.update(name, value)
     os.environ[name.upper()] = str(value)
-settings.register_profile("mfvpr", deadline=None, derandomize=True, max_examples=60)
+settings.register_profile("mfvpr", deadline=None, derandomize=True, max_examples=40)
 settings.load_profile("mfvpr")
 
 

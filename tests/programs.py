@@ -16,7 +16,7 @@ from experiments.launch import CONF, launch
 from mfvpr.data.streets import streets_folder
 
 ROOT = Path(__file__).parent.parent
-QUICK = ("figures=1", "features.max_keypoints=100", "retrieval.num_words=8")
+QUICK = ("figures=0", "features.max_keypoints=100", "retrieval.num_words=8")
 QUERIES, CANDIDATES = 24, 8  # of the small data set
 
 

@@ -45,6 +45,7 @@ def peers(results):
     return ours, others.values()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", ["D2-Net", "aliked-n16"])
 def test_keypoints_are_the_same(contest, step):
     ours, others = peers(contest[0][f"{step} features, batch 2"])
@@ -62,6 +63,7 @@ def test_keypoints_are_the_same(contest, step):
             np.testing.assert_allclose(one.scores[same], found[1], rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_dense_maps_are_the_same(contest):
     ours, others = peers(contest[0]["D2-Net dense map, batch 2"])
     ours = np.concatenate([np.asarray(one) for one in ours]).transpose(0, 3, 1, 2)
@@ -69,12 +71,14 @@ def test_dense_maps_are_the_same(contest):
         np.testing.assert_allclose(ours, np.stack([np.asarray(one) for one in theirs]), atol=1e-4 * ours.max())
 
 
+@pytest.mark.slow
 def test_descriptors_are_the_same(contest):
     ours, others = peers(contest[0]["MixVPR descriptor, batch 2"])
     for theirs in others:
         np.testing.assert_allclose(ours, theirs, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_report_has_everyone(contest):
     by_step, written = contest
     names = {(entry["step"], entry["name"]) for entry in written["results"]}

@@ -92,7 +92,7 @@ def test_bad_images_by_policy(small_street, tmp_path, monkeypatch, capsys):
 
 def test_rankings_without_ground_truth(small_street, tmp_path, monkeypatch, capsys):
     none = ("dataset.ground_truth=none", "dataset.index_file=null")
-    arguments = folder(small_street, *none, "scorer=anchor", *QUICK, f"out={tmp_path}/out")
+    arguments = folder(small_street, *none, "scorer=anchor", *QUICK, "figures=1", f"out={tmp_path}/out")
     code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *arguments)
     assert code == 0, stderr
     assert "no ground truth: rankings only" in stdout
@@ -135,7 +135,7 @@ def test_one_evaluation_compiles_at_most_six_programs(small_street, tmp_path, mo
     from experiments import run as program
 
     monkeypatch.chdir(tmp_path)
-    common = folder(small_street, "figures=4", "features.max_keypoints=120", "retrieval.num_words=8", "candidates=7")
+    common = folder(small_street, "figures=2", "features.max_keypoints=120", "retrieval.num_words=8", "candidates=7")
     program.evaluate(composed(*common))
     assert 1 <= compilations.count <= 6
     compilations.reset()
@@ -156,6 +156,7 @@ def demo(tmp_path_factory):
     return done, folder
 
 
+@pytest.mark.slow
 def test_demo_ranks_histogram_above_count_above_filter(demo):
     _, folder = demo
     rows = json.loads((folder / "results.json").read_text())
@@ -166,6 +167,7 @@ def test_demo_ranks_histogram_above_count_above_filter(demo):
         assert recall["count", tolerance] > recall["filter", tolerance]
 
 
+@pytest.mark.slow
 def test_demo_prints_its_table_and_leaves_a_run_folder(demo):
     done, folder = demo
     systems = ["filter", "count", "sum", "anchor", "histogram", "histogram + filter"]
@@ -194,6 +196,7 @@ def test_demo_prints_its_table_and_leaves_a_run_folder(demo):
     assert scores == sorted(scores, reverse=True)
 
 
+@pytest.mark.slow
 def test_results_say_what_made_them(demo):
     _, folder = demo
     text = (folder / "results.json").read_text()

@@ -30,8 +30,11 @@ def root(tmp_path_factory):
 def learn(root):
     """Learns into a folder, in this process; what results.json holds comes back."""
 
-    def call(out, *overrides):
-        lessons.learn(composed(*small(root), f"out={out}", *overrides, config="learn"))
+    def call(out, *overrides, pictures=False):
+        with pytest.MonkeyPatch.context() as patch:
+            if not pictures:
+                patch.setattr(lessons.learn_outputs, "figures", lambda *_: [])
+            lessons.learn(composed(*small(root), f"out={out}", *overrides, config="learn"))
         return results(out)
 
     return call
@@ -40,7 +43,7 @@ def learn(root):
 @pytest.fixture(scope="session")
 def learned(learn, tmp_path_factory):
     out = tmp_path_factory.mktemp("learned") / "out"
-    return out, learn(out, *SHORT)
+    return out, learn(out, *SHORT, pictures=True)
 
 
 @pytest.fixture

@@ -27,6 +27,7 @@ def evaluate(weights, monkeypatch, capsys):
     return evaluate
 
 
+@pytest.mark.slow
 def test_the_papers_system_runs_and_is_read_from_its_stores_ever_after(evaluate, small_street, tmp_path, monkeypatch):
     monkeypatch.setenv("MFVPR_CACHE", str(tmp_path / "cache"))
     first = evaluate(*system("mix_hist_comb_10", small_street, tmp_path / "first"))
@@ -49,6 +50,7 @@ def test_the_papers_system_runs_and_is_read_from_its_stores_ever_after(evaluate,
         assert one.read_text() == two.read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not checkpoints.ALIKED.is_dir(), reason="no ../shared/weights: ALIKED's are not shipped")
 def test_aliked_recognizes_the_street(evaluate, small_street, tmp_path):
     evaluate(*system("mix_hist_aliked_50", small_street, tmp_path / "out", "features.image_size=[320,320]"))

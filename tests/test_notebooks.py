@@ -69,6 +69,7 @@ def test_cells_are_short_and_need_the_library_alone(path, tmp_path):
     assert {name.partition(".")[0] for name in imports(script)} <= LIBRARIES | sys.stdlib_module_names
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", PATHS, ids=lambda path: path.stem)
 def test_they_run_and_show_pictures(path, executed):
     result = executed[0][path]
@@ -79,6 +80,7 @@ def test_they_run_and_show_pictures(path, executed):
     assert sum("image/png" in output.get("data", {}) for output in outputs) >= 3
 
 
+@pytest.mark.slow
 def test_they_leave_no_files(executed):
     assert not list(executed[1].iterdir())
     assert {path.suffix for path in FOLDER.iterdir()} == {".ipynb"}

@@ -32,7 +32,14 @@ def test_make_targets_exist(target):
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("command", [line for line in COMMANDS if "experiments.evaluate" in line])
+@pytest.mark.parametrize(
+    "command",
+    [
+        pytest.param(line, marks=[pytest.mark.slow] if "system=" in line else [])
+        for line in COMMANDS
+        if "experiments.evaluate" in line
+    ],
+)
 def test_commands_run(command, small_street, weights, tmp_path, monkeypatch, capsys):
     if "aliked" in command and not checkpoints.ALIKED.is_dir():
         pytest.skip("no ../shared/weights: ALIKED's are not shipped")
@@ -67,6 +74,7 @@ def test_commands_of_sweeps_and_learning_are_settings(program):
         check(composed(*chosen, config=program))
 
 
+@pytest.mark.slow
 def test_benchmark_runs(tmp_path):
     out = tmp_path / "benchmark.json"
     done = subprocess.run(

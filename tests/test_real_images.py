@@ -1,24 +1,24 @@
 """The README's numbers on real images, where those images are."""
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+from tests.programs import ROOT, typed
+
 DATA = ROOT.parent / "shared" / "data"
 
-pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="no ../shared/data: the images have no license to ship with")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not DATA.is_dir(), reason="no ../shared/data: the images have no license to ship with"),
+]
 
 
 @pytest.mark.parametrize(("name", "histogram_at_2"), [("grief_season", 0.50), ("corridor", 0.70)])
-def test_histogram_recognizes_real_places(name, histogram_at_2, tmp_path):
-    command = [sys.executable, "-m", "experiments.evaluate", f"dataset={name}", f"dataset.root={DATA / name}",
-               "candidates=50", "figures=1", f"out={tmp_path / 'out'}"]  # fmt: skip
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=280)
-    assert done.returncode == 0, done.stderr
+def test_histogram_recognizes_real_places(name, histogram_at_2, tmp_path, monkeypatch, capsys):
+    arguments = (f"dataset={name}", f"dataset.root={DATA / name}", "candidates=50", "figures=0", f"out={tmp_path}/out")
+    code, _, stderr = typed(monkeypatch, capsys, "evaluate", *arguments)
+    assert code == 0, stderr
     rows = json.loads((tmp_path / "out" / "results.json").read_text())
     recall = {row["system"]: row["recall_at"]["1"] for row in rows if row["tolerance"] == 2}
     assert recall["histogram"] >= histogram_at_2

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import match, match_candidates, soft_match
@@ -47,7 +47,6 @@ def usable(features):
 
 
 @given(feature_pairs(), st.sampled_from([0.01, 0.1, 2.0]))
-@settings(max_examples=40)
 def test_soft_matches_agree_with_the_loop(pair, temperature):
     features0, features1 = pair
     rows0, rows1 = usable(features0), usable(features1)
@@ -138,7 +137,6 @@ def test_a_temperature_not_above_zero_gives_no_number():
 
 
 @given(feature_pairs(), st.sampled_from(["mutual", "opencv_legacy", "none"]))
-@settings(max_examples=40)
 def test_ratios_agree_with_the_loop(pair, mode):
     features0, features1 = pair
     rows0 = usable(features0)

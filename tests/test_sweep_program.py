@@ -30,8 +30,11 @@ def root(tmp_path_factory):
 def sweep(root):
     """Sweeps into a folder, in this process; what results.json holds comes back."""
 
-    def call(out, *overrides):
-        search.sweep(composed(*small(root), f"out={out}", *overrides, config="sweep"))
+    def call(out, *overrides, pictures=False):
+        with pytest.MonkeyPatch.context() as patch:
+            if not pictures:
+                patch.setattr(search.sweep_outputs, "figures", lambda *_: [])
+            search.sweep(composed(*small(root), f"out={out}", *overrides, config="sweep"))
         return results(out)
 
     return call
@@ -44,7 +47,7 @@ GRID = ("grid.sigma=[10,22.5]", "grid.weight=[fs,unit]", "grid.c=[0,2]", "fusion
 def swept(sweep, tmp_path_factory):
     """The sweep that fills the store."""
     out = tmp_path_factory.mktemp("swept") / "out"
-    return out, sweep(out, *GRID)
+    return out, sweep(out, *GRID, pictures=True)
 
 
 def recall_of(found, **parameters):
@@ -192,7 +195,7 @@ def test_other_scores_and_their_axes(sweep, swept, tmp_path):
     ],
 )
 def test_experiments_of_conf_run(sweep, swept, tmp_path, experiment, changes, count):
-    found = sweep(tmp_path / "out", f"experiment={experiment}", *changes)
+    found = sweep(tmp_path / "out", f"experiment={experiment}", *changes, pictures=True)
     assert len(found["settings"]) == count
     assert (tmp_path / "out" / "figures").is_dir()
 

@@ -118,7 +118,7 @@ def test_anchor(matches, weight, parameters, window_mode, first, include_self, c
 
 
 @given(pairs(), st.sampled_from(list(WEIGHTS)), st.sampled_from(["unweighted", "weighted", "median"]), st.booleans())
-@settings(max_examples=150)
+@settings(max_examples=100)
 def test_aggregate(matches, weight, mean, clamp):
     points0, points1, weights = oracle_inputs(matches, weight)
     confidence = certainty(matches)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import (
@@ -76,7 +76,6 @@ def draws(scorers, temperatures):
 
 
 @draws(HISTOGRAMS, [0.01, 0.3, 10.0])
-@settings(max_examples=40)
 def test_histogram_agrees_with_the_loop(matches, scorer, temperature):
     points0, points1, weights, _ = oracle_inputs(scorer, matches)
     names = ("bin_size", "sigma", "sigma_is_variance", "truncate", "align", "shift_range")
@@ -90,7 +89,6 @@ def test_histogram_agrees_with_the_loop(matches, scorer, temperature):
 
 
 @draws(ANCHORS, [0.02, 0.3, 1.0, 3.0])
-@settings(max_examples=40)
 def test_anchor_agrees_with_the_loop(matches, scorer, temperature):
     names = ("num_bins", "window", "tolerance", "window_mode", "first", "include_self", "cell_weight")
     options = {name: getattr(scorer, name) for name in names}
@@ -101,7 +99,6 @@ def test_anchor_agrees_with_the_loop(matches, scorer, temperature):
 
 
 @draws([scorer for scorer in SUMS if scorer.mean != "median"], [0.5, 20.0, 300.0])
-@settings(max_examples=40)
 def test_aggregate_agrees_with_the_loop(matches, scorer, temperature):
     points0, points1, weights, confidence = oracle_inputs(scorer, matches)
     if confidence.sum() == 0:
@@ -115,7 +112,6 @@ def test_aggregate_agrees_with_the_loop(matches, scorer, temperature):
 
 
 @draws(HISTOGRAMS, [1e-30, 1e-3, 0.5, 1e3])
-@settings(max_examples=40)
 def test_the_smooth_maximum_lies_below_the_maximum_by_at_most_t_log_n(matches, scorer, temperature):
     bins = int((histogram(scorer, matches).scores > -np.inf).sum())
     hard, soft = score(scorer, matches), score(replace(scorer, temperature=temperature), matches)
