@@ -6,6 +6,8 @@ import os
 import signal
 import subprocess
 import sys
+from copy import deepcopy
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 
@@ -31,6 +33,11 @@ def run(*arguments, program="evaluate", cwd=ROOT, **environment):
 
 def composed(*overrides, config="config"):
     """The settings of a command line, not yet checked."""
+    return deepcopy(_composed(config, overrides))
+
+
+@cache
+def _composed(config, overrides):
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
         return OmegaConf.to_container(hydra.compose(config, list(overrides)), resolve=True)
 
