@@ -5,14 +5,12 @@ What is checked is what the library relies on when it pads, batches, sweeps and 
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mfvpr.numerics import held
 from mfvpr.reranking import score_candidates
 from mfvpr.scoring import Scorer
 from mfvpr.scoring.parameters import fit
@@ -53,14 +51,13 @@ def _check(scorer: Scorer, image_size: tuple[int, int], seed: int) -> None:
     scorer = fit(scorer, pairs[0].image_size0, pairs[0].image_size1)
     scores = np.array([_check_scalar(scorer, pair, count) for pair, count in zip(pairs, COUNTS, strict=True)])
     close = _Close(TOLERANCE * float(np.abs(scores).max()))
-    program = _Program()
-    score_of = partial(program, held(scorer))
+    score_of = jax.jit(lambda pair: scorer(pair))
     for pair, score in zip(pairs, scores, strict=True):
         close(score_of(pair), score, "jit scores otherwise than without; use jax.numpy on matches")
         _check_padding(score_of, pair, score, close)
         _check_order(score_of, pair, score, close)
     _check_batch(scorer, pairs, scores, close)
-    _check_one_trace(scorer, program, pairs[-1], close)
+    _check_one_trace(scorer, pairs[-1], close)
     gradients = jax.jit(_gradients(scorer))
     for pair in pairs:
         _check_gradients(type(scorer).__name__, gradients, pair)
@@ -115,30 +112,21 @@ def _check_batch(scorer: Scorer, pairs: list[Matches], scores: np.ndarray, close
     close(score_candidates(scorer, batch), scores, "vmap over a batch of pairs does not score as the pairs one by one")
 
 
-class _Program:
-    """A scorer under jit, with the shapes for which it was traced."""
+def _check_one_trace(scorer: Scorer, pair: Matches, close: "_Close") -> None:
+    traces = []
 
-    def __init__(self) -> None:
-        self.traces: list[tuple[int, ...]] = []
-        self._score = jax.jit(self._traced)
-
-    def _traced(self, scorer: Any, pair: Matches) -> Array:
-        self.traces.append(pair.mask.shape)
+    @jax.jit
+    def score(scorer: Any, pair: Matches) -> Array:
+        traces.append(1)
         return scorer(pair)
 
-    def __call__(self, scorer: Any, pair: Matches) -> Array:
-        return self._score(scorer, pair)
-
-
-def _check_one_trace(scorer: Scorer, program: _Program, pair: Matches, close: "_Close") -> None:
     if any(callable(leaf) for leaf in jax.tree.leaves(scorer)):
         return  # what holds a function has a program for it alone
     for changed in _with_other_numbers(scorer):
         expected = changed(pair)
-        close(program(changed, pair), expected, "jit scores other numbers otherwise than without; use jax.numpy on "
-              "them")  # fmt: skip
-    if (traces := program.traces.count(pair.mask.shape)) > 1:
-        raise AssertionError(f"{traces} traces for three sets of numbers, expected one: keep numbers as they are "
+        close(score(changed, pair), expected, "jit scores other numbers otherwise than without; use jax.numpy on them")
+    if len(traces) > 1:
+        raise AssertionError(f"{len(traces)} traces for three sets of numbers, expected one: keep numbers as they are "
                              "given, and what changes shapes in static fields")  # fmt: skip
 
 

@@ -29,12 +29,8 @@ def slots(match_set: MatchSet) -> np.ndarray:
 
 
 def shapes(match_set: MatchSet) -> dict[int, int]:
-    """Pairs of a batch by their slots: as many as BATCH_SLOTS hold, but no more than there are."""
-    sizes, counts = np.unique(slots(match_set)[match_set.counts > 0], return_counts=True)
-    return {
-        size: round_up(min(BATCH_SLOTS // size, count), PAIRS_STEP)
-        for size, count in zip(sizes.tolist(), counts.tolist(), strict=True)
-    }
+    """Pairs of a batch by their slots; not by how many there are, so that a larger set scores them as a smaller one."""
+    return {size: round_up(BATCH_SLOTS // size, PAIRS_STEP) for size in np.unique(slots(match_set)).tolist()}
 
 
 def batches(match_set: MatchSet, queries: range) -> Iterator[tuple[np.ndarray, Matches]]:

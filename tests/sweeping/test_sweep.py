@@ -10,7 +10,7 @@ import mfvpr
 from mfvpr import pipeline, sweeping
 from mfvpr.pipeline import MatchSet
 from mfvpr.scoring.parameters import with_parameters
-from mfvpr.sweeping.batches import slots
+from mfvpr.sweeping.batches import shapes, slots
 from mfvpr.sweeping.settings import groups
 from mfvpr.types import Shortlist, per_match
 from tests.builders import random_matches
@@ -301,3 +301,38 @@ def test_a_number_named_as_the_filters_share_is_refused(data):
 
     with pytest.raises(ValueError, match=r"Score\.c: a grid means something else by c"):
         sweeping.sweep(Score(), [{"c": 0.5}], *data)
+
+
+def test_code_that_depends_on_the_number_of_pairs_is_told_apart(data, tmp_path):
+    def scorer(sign):
+        @jax.custom_batching.custom_vmap
+        def signed(count):
+            return count
+
+        @signed.def_vmap
+        def _(pairs, _, count):
+            return count * (1.0 if pairs == 1 else sign), True
+
+        return lambda matches: signed(mfvpr.MatchCount()(matches))
+
+    for sign in (1.0, -1.0):
+        expected = sweeping.sweep(scorer(sign), [{"max_distance": 2.0}], *data)
+        got = sweeping.sweep(scorer(sign), [{"max_distance": 2.0}], *data, folder=tmp_path)
+        np.testing.assert_array_equal(got, expected)
+
+
+@pytest.mark.parametrize(
+    "scorer", [mfvpr.AnchorPoints(), mfvpr.AggregatedScore(), Sampled(jax.random.key(3))], ids=title
+)
+def test_pairs_score_the_same_in_a_smaller_set(data, scorer, monkeypatch):
+    """To the bit: else near ties would go another way."""
+    match_set, candidates = data
+    few = replace(match_set, matches=match_set.matches[:2], counts=match_set.counts[:2])
+    assert shapes(few) == shapes(match_set)
+    found, module = [], sweeping.sweep.__globals__
+    scores = module["_scores"]
+    monkeypatch.setitem(module, "_scores", lambda *inputs: found.append(scores(*inputs)) or found[-1])
+    for one in (match_set, few):
+        listed = jax.tree.map(lambda rows: rows[: len(one.matches)], candidates)  # noqa: B023
+        sweeping.sweep(scorer, [{"max_distance": 2.0}], one, listed)
+    np.testing.assert_array_equal(found[0][:, :, :2], found[1])
