@@ -95,10 +95,14 @@ def compiled(function: Function, **options: Any) -> Function:
 
     @wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:
-        plain = any(callable(leaf) for leaf in jax.tree.leaves((arguments, named)))
-        return (function if plain else program)(*arguments, **named)
+        return (function if holds_function((arguments, named)) else program)(*arguments, **named)
 
     return call  # pyright: ignore[reportReturnType]
+
+
+def holds_function(tree: Any) -> bool:
+    """Whether a leaf is a plain function, as a user's scorer may be, or the weight of one."""
+    return any(callable(leaf) for leaf in jax.tree.leaves(tree))
 
 
 def held(tree: Tree) -> Tree:

@@ -15,7 +15,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from mfvpr.matching import filter_matches
-from mfvpr.numerics import available_cpus, compiled, held, is_concrete, knows_own_context, masked, masked_std, platform
+from mfvpr.numerics import (
+    available_cpus,
+    compiled,
+    held,
+    holds_function,
+    is_concrete,
+    knows_own_context,
+    masked,
+    masked_std,
+    platform,
+)
 from mfvpr.scoring import HistogramOfShifts, Scorer
 from mfvpr.scoring.parameters import fit, numbers, whole_numbers, with_parameters
 from mfvpr.types import Array, Matches, Ranking
@@ -132,8 +142,7 @@ def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> 
     weights = _weights(scorer, axes)
     if weights:
         scorer, axes["weight"] = replace(scorer, weight=ChosenWeight(weights, 0)), np.arange(len(weights))
-    plain = any(callable(leaf) for leaf in jax.tree.leaves(scorer))
-    scorer = held(scorer)
+    plain, scorer = holds_function(scorer), held(scorer)
     values = {name: _axis(scorer, name, axis) for name, axis in axes.items()}
     inner = [name for name in values if name in WEIGHTINGS]
     outer = [name for name in values if name not in WEIGHTINGS]

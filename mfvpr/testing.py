@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mfvpr.numerics import holds_function
 from mfvpr.reranking import score_candidates
 from mfvpr.scoring import Scorer
 from mfvpr.scoring.parameters import fit
@@ -120,7 +121,7 @@ def _check_one_trace(scorer: Scorer, pair: Matches, close: "_Close") -> None:
         traces.append(1)
         return scorer(pair)
 
-    if any(callable(leaf) for leaf in jax.tree.leaves(scorer)):
+    if holds_function(scorer):
         return  # what holds a function has a program for it alone
     for changed in _with_other_numbers(scorer):
         expected = changed(pair)

@@ -143,10 +143,11 @@ def test_bins_have_the_library_s_limit():
 
 
 def test_a_device_that_is_not_there_is_one_line():
-    done = run("candidates=3", JAX_PLATFORMS="nonsense")
-    assert done.returncode == 2
-    assert "error: JAX_PLATFORMS=nonsense: expected a device that JAX can use here" in done.stderr
-    assert done.stderr.count("\n") == 1
+    for name in ("cuda", "nonsense"):
+        done = run("candidates=3", JAX_PLATFORMS=name)
+        assert done.returncode == 2
+        assert f"error: JAX_PLATFORMS={name}: expected a device that JAX can use here" in done.stderr
+        assert done.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize("module", ["yaml", "omegaconf", "jaxlib", "jax"])

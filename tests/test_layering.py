@@ -34,7 +34,7 @@ ALLOWED = {
     "features": {"errors", "types", "numerics", "data", "models", "features"},
     "extraction": {"errors", "types", "numerics", "data", "features"},
     "statistics": set(),
-    "testing": {"reranking", "scoring", "types"},
+    "testing": {"numerics", "reranking", "scoring", "types"},
     "report": {"errors", "types", "data", "pipeline", "report"},
 }
 HOMES = {

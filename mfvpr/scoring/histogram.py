@@ -111,7 +111,6 @@ class HistogramOfShifts:
     def histogram(self, matches: Matches) -> ShiftHistogram:
         """All bins of one pair with their centers."""
         scores, lattice, usable = self._vote(matches)
-        usable &= _are_numbers(self._shifts(matches), match_weights(self.weight, matches)[None])[0]
         x, y = (lattice.centers(axis, jnp.arange(len(scores), dtype=scores.dtype)) for axis in (0, 1))
         return ShiftHistogram(jnp.where(usable, scores, jnp.nan), x, y)
 
@@ -175,10 +174,12 @@ class HistogramOfShifts:
         return self.fitted(matches.image_size0, matches.image_size1)
 
     def _vote(self, matches: Matches) -> tuple[Array, Lattice, Array]:
-        """Scores `[B, B]` (y, x), -inf of bins that there are not; the lattice, and whether it is usable `[]`."""
+        """Scores `[B, B]` (y, x), -inf of bins that there are not; the lattice, and whether they are usable `[]`."""
         lattice, capacity = self._lattice_of(matches), self._capacity(matches)
-        scores = bins(*votes(self._planes(matches), lattice, capacity), match_weights(self.weight, matches))
-        return jnp.where(lattice.inside(capacity), scores, -jnp.inf), lattice, lattice.usable(capacity)
+        shifts, weights = self._planes(matches), match_weights(self.weight, matches)
+        scores = bins(*votes(shifts, lattice, capacity), weights)
+        usable = lattice.usable(capacity) & _are_numbers(shifts, weights[None])[0]
+        return jnp.where(lattice.inside(capacity), scores, -jnp.inf), lattice, usable
 
     def _lattice_of(self, matches: Matches) -> Lattice:
         """Of one pair."""

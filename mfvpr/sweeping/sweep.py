@@ -109,8 +109,8 @@ def sweep(
     work = Work(match_set, range(num_queries), candidates, views, depth, ties, filter_score)
     found_groups = list(groups(scorer, scored, match_set.image_sizes))
     if folder is not None:
-        batch = shapes(match_set)
-        found_groups = [replace(group, program=_program(group, match_set.matches[0], batch)) for group in found_groups]
+        program = partial(_program, match_set.matches[0], shapes(match_set))
+        found_groups = [replace(group, program=program(group)) for group in found_groups]
     blocks = [one for group in found_groups for one in group.blocks(per_block)]
     found = np.full((len(views), len(settings), num_queries, depth), -1, np.int32)
     steps = ((part, block) for part in work.parts(queries) for block in blocks)
@@ -239,18 +239,18 @@ def _fingerprint(part: Work, block: Group, cs: Sequence[Any]) -> str:
     return _digest(repr(options), block.program, part.digest, numbers)
 
 
-def _program(group: Group, matches: Matches, shapes: Mapping[int, int]) -> str:
-    """What the scorer computes of batches of these `shapes`: code may change while its class keeps its name."""
+def _program(matches: Matches, pairs_by_slots: Mapping[int, int], group: Group) -> str:
+    """What the scorer computes of batches of these shapes: a user's code may change while its class keeps its name."""
 
     def text(size: int, pairs: int) -> str:
         entries = per_match(matches).items()
         example = {name: np.zeros((pairs, size, *values.shape[1:]), values.dtype) for name, values in entries}
         image_size = np.ones((pairs, 2), np.float32)
-        pair = Matches(**example, mask=np.ones((pairs, size), bool), image_size0=image_size, image_size1=image_size)
+        batch = Matches(**example, mask=np.ones((pairs, size), bool), image_size0=image_size, image_size1=image_size)
         settings = {name: axis[:1] for name, axis in group.settings.items()}
-        return jax.jit(reranking.score_settings).lower(group.scorer, pair, settings, group.weightings).as_text()
+        return jax.jit(reranking.score_settings).lower(group.scorer, batch, settings, group.weightings).as_text()
 
-    return "".join(itertools.starmap(text, shapes.items()))
+    return "".join(itertools.starmap(text, pairs_by_slots.items()))
 
 
 def _digest(*parts: Any) -> str:

@@ -49,6 +49,22 @@ def stack(items):
     return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *items)
 
 
+@everyone
+def test_neither_company_nor_order_nor_padding_matters(scorer):
+    """Each score within rounding of itself, however small beside those of others."""
+    order = np.random.default_rng(3).permutation(60)
+
+    def pairs(**padding):
+        counts = (0, 1, 60, 13, 37)
+        return [random_matches(np.random.default_rng(count), count, capacity=60, **padding) for count in counts]
+
+    expected = [score(scorer, pair) for pair in pairs()]
+    np.testing.assert_allclose(score_all(scorer, stack(pairs())), expected, rtol=2e-6, atol=0)
+    for garbage in (np.inf, -1e30, 7.0):
+        shuffled = [per_match(pair, lambda rows: rows[order]) for pair in pairs(garbage=garbage)]
+        np.testing.assert_allclose(score_all(scorer, stack(shuffled)), expected, rtol=2e-6, atol=0)
+
+
 @own
 def test_gradients_agree_with_finite_differences(scorer):
     """Along a random direction of weights and distances, where every score is smooth."""
