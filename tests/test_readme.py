@@ -116,7 +116,7 @@ def test_a_scorer_of_your_own_keeps_the_contract():
 
 
 def test_settings_that_the_text_names_exist():
-    names = re.findall(r"`(?:[\w.]+\.)?([a-z]\w*)=[^`(]*`", "".join([README, *BESIDE]))  # capitals: environment
+    names = re.findall(r"`(?:[\w.]+\.)?(\w+)=[^`(]*`", "".join([README, *BESIDE]))
     assert len(names) > 20
     groups = {path.name for path in CONF.iterdir() if path.is_dir()}
     assert set(names) <= {rule.rpartition(".")[2] for rule in RULES} | groups
