@@ -13,12 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mfvpr import ragged
 from mfvpr.neighbors import nearest, nearest_two
-from mfvpr.numerics import as_float, at_least_single, compiled, masked, platform, positive, safe_sqrt
+from mfvpr.numerics import as_float, at_least_single, compiled, device_bytes, masked, positive, safe_sqrt
 from mfvpr.types import Array, Features, Matches, per_keypoint, per_match
 
 CrossCheck = Literal["mutual", "opencv_legacy", "none"]
-CHUNK_BYTES = 2**28  # of the similarities that exist at the same time, elsewhere than on a CPU
+MEMORY_SHARE = 1 / 256  # of a device's own memory, for the similarities that exist at the same time
 
 
 def match(
@@ -55,6 +56,10 @@ def match(
         image_size0=features0.image_size,
         image_size1=features1.image_size,
         ratio=_ratio(features0, features1, similarity) if with_ratio else None,
+        index0=_slots(features0),
+        index1=nearest1,
+        count0=_count(features0),
+        count1=_count(features1),
     )
 
 
@@ -89,6 +94,9 @@ def soft_match(features0: Features, features1: Features, *, temperature: float |
         image_size0=features0.image_size,
         image_size1=features1.image_size,
         confidence=jnp.minimum(jnp.sum(rows * columns, axis=1), 1.0),  # rounding may exceed 1
+        index0=_slots(features0),
+        count0=_count(features0),
+        count1=_count(features1),
     )
 
 
@@ -107,8 +115,8 @@ def match_candidates(
         candidates: keypoints `[C, N1, 2]`.
         cross_check: as in `match`.
         with_ratio: as in `match`.
-        chunk_size: candidates whose similarity matrices exist at the same time; by default 1 on a CPU, where the
-            matrix then stays in cache, and elsewhere as many as take 256 MB.
+        chunk_size: candidates whose similarity matrices exist at the same time; by default as many as fit a
+            processor's own cache, or a small part of an accelerator's memory.
 
     Returns:
         Matches with leading axis C and K = N0 slots.
@@ -125,10 +133,11 @@ def _match_candidates(query: Features, candidates: Features, *, chunk_size: int,
     return _chunked_map(lambda candidate: match(query, candidate, **options), candidates, chunk_size)
 
 
-def match_shortlist(
-    query: Features,
-    database: Features,
-    indices: Array,
+def match_pairs(
+    queries: Features,
+    candidates: Features,
+    pairs: Array,
+    count: int | Array,
     *,
     cross_check: CrossCheck = "mutual",
     max_distance: float | Array | None = None,
@@ -136,42 +145,65 @@ def match_shortlist(
     with_ratio: bool = False,
     chunk_size: int | None = None,
 ) -> Matches:
-    """`match` of one query with the rows `indices` `[C]` of a database `[M, N1, ...]`; -1 gives no matches.
+    """`match` of pairs, whatever query they belong to; how many is no shape, so it costs neither time nor a program.
 
-    The same as `match_candidates` of the rows gathered, without the copy of their descriptors; with `max_distance` or
-    `max_matches` only what `filter_matches` keeps of each pair.
+    Args:
+        queries: keypoints `[B, N0, 2]`.
+        candidates: keypoints `[S, N1, 2]`.
+        pairs: `[P, 2]` int32 rows of both.
+        count: the first so many of the pairs are matched.
+        cross_check: as in `match`.
+        max_distance: as in `filter_matches`.
+        max_matches: as in `filter_matches`.
+        with_ratio: as in `match`.
+        chunk_size: as in `match_candidates`.
+
+    Returns:
+        Matches with leading axis P and K = N0 slots; pairs beyond `count` have none.
     """
-    return _match_shortlist(
-        query, database, indices, max_distance, cross_check=cross_check, max_matches=max_matches,
-        with_ratio=with_ratio, chunk_size=_chunk_size(chunk_size, query, database),
+    return _match_pairs(
+        queries, candidates, pairs, count, max_distance, cross_check=cross_check, max_matches=max_matches,
+        with_ratio=with_ratio, chunk_size=min(_chunk_size(chunk_size, queries, candidates), len(pairs)),
     )  # fmt: skip
 
 
 @partial(compiled, static_argnames=("cross_check", "max_matches", "with_ratio", "chunk_size"))
-def _match_shortlist(
-    query: Features,
-    database: Features,
-    indices: Array,
+def _match_pairs(
+    queries: Features,
+    candidates: Features,
+    pairs: Array,
+    count: Array,
     max_distance: Array | None,
     *,
     max_matches: int | None,
     chunk_size: int,
     **options: Any,
 ) -> Matches:
-    def one(index: Array) -> Matches:
-        candidate = jax.tree.map(lambda field: jnp.asarray(field)[jnp.maximum(index, 0)], database)
-        candidate = replace(candidate, mask=candidate.mask & (index >= 0))
+    def one(pair: Array) -> Matches:
+        query, candidate = (
+            jax.tree.map(lambda field: jnp.asarray(field)[row], features)  # noqa: B023
+            for features, row in ((queries, pair[0]), (candidates, pair[1]))
+        )
         return filter_matches(match(query, candidate, **options), max_distance=max_distance, max_matches=max_matches)
 
-    return _chunked_map(one, indices, chunk_size)
+    def chunk(number: Array, matches: Matches) -> Matches:
+        start = jnp.minimum(number * chunk_size, len(pairs) - chunk_size)  # the last may do some again
+        part = jax.lax.dynamic_slice_in_dim(jnp.asarray(pairs), start, chunk_size)
+        new = jax.vmap(one)(part) if chunk_size > 1 else jax.tree.map(lambda leaf: leaf[None], one(part[0]))
+        return jax.tree.map(partial(jax.lax.dynamic_update_slice_in_dim, start_index=start, axis=0), matches, new)
+
+    shapes = jax.eval_shape(jax.vmap(one), pairs)
+    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    matches = jax.lax.fori_loop(0, -(-count // chunk_size), chunk, nothing)
+    return replace(matches, mask=matches.mask & (jnp.arange(len(pairs)) < count)[:, None])
 
 
 def _chunk_size(asked: int | None, query: Features, candidates: Features) -> int:
-    """Candidates at a time: one on a CPU, where its matrix then stays in cache; elsewhere what CHUNK_BYTES hold."""
+    """Pairs at a time: one where its similarities then stay in a processor's cache; else what MEMORY_SHARE holds."""
     if asked is None:
-        if platform((query, candidates)) == "cpu":
-            return 1
-        return max(1, CHUNK_BYTES // (4 * query.mask.shape[-1] * candidates.mask.shape[-1] + 1))
+        available = device_bytes((query, candidates))
+        matrix = 4 * query.mask.shape[-1] * candidates.mask.shape[-1] + 1
+        return 1 if available is None else max(1, int(MEMORY_SHARE * available) // matrix)
     if asked < 1:
         raise ValueError(f"chunk_size={asked}: expected a whole number above 0")
     return asked
@@ -203,13 +235,7 @@ def compact(matches: Matches, capacity: int) -> Matches:
     Everything after matching costs in proportion to K or to its square, so slots should be few. Matches beyond the
     capacity are dropped: compare `matches.mask.sum()` with it.
     """
-    slots = jnp.nonzero(matches.mask, size=capacity, fill_value=0)[0]
-
-    def packed(values: Array) -> Array:
-        values = jnp.asarray(values)
-        return values[slots] if len(values) else jnp.zeros((capacity, *values.shape[1:]), values.dtype)
-
-    entries = jax.tree.map(packed, per_match(matches))
+    entries = ragged.in_front(per_match(matches), jnp.asarray(matches.mask), capacity)
     return replace(matches, mask=jnp.arange(capacity) < jnp.sum(matches.mask), **entries)
 
 
@@ -219,12 +245,17 @@ def _ready(features: Features) -> Features:
     return replace(features, **wide, mask=jnp.asarray(features.mask), image_size=at_least_single(features.image_size))
 
 
+def _slots(features: Features) -> Array:
+    return jnp.arange(features.mask.shape[-1], dtype=jnp.int32)
+
+
+def _count(features: Features) -> Array:
+    return jnp.sum(features.mask, dtype=jnp.int32)
+
+
 def _at_least_one(features: Features) -> Features:
-    """An image without a single slot gets one of padding, so that there is something to index."""
-    if features.mask.shape[-1] > 0:
-        return features
-    padding = {name: jnp.zeros((1, *values.shape[1:]), values.dtype) for name, values in per_keypoint(features).items()}
-    return replace(features, **padding)
+    """An image without a single slot gets one of padding."""
+    return replace(features, **ragged.at_least_one(per_keypoint(features)))
 
 
 def _similarity(features0: Features, features1: Features) -> Array:

@@ -1,14 +1,16 @@
 """The few array idioms that every room shares: masked reductions, safe roots, capacities, and where `jit` begins."""
 
 import os
+import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial, wraps
+from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, Device
 from jax.core import Tracer
 from jax.tree_util import Partial
 from jax.typing import ArrayLike
@@ -128,10 +130,31 @@ def available_cpus() -> int:
     return os.cpu_count() or 1
 
 
+def device_bytes(tree: Any) -> int | None:
+    """Memory of the device where the first array is; None where it has none of its own, but a processor's caches."""
+    stats = device_of(tree).memory_stats()
+    return stats["bytes_limit"] if stats else None
+
+
+def free_bytes(device: Device) -> int:
+    """Bytes that may still be taken where a device keeps its arrays: its own memory, or the machine's."""
+    if stats := device.memory_stats():
+        return stats["bytes_limit"] - stats["bytes_in_use"]
+    try:  # what caches of files take is free
+        return 1024 * int(re.findall(r"MemAvailable: *(\d+)", Path("/proc/meminfo").read_text())[0])
+    except (OSError, IndexError):
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
 def platform(tree: Any) -> str:
     """Where the first array on a device is, "cpu" or "gpu"; where there is none, JAX's default."""
+    return device_of(tree).platform
+
+
+def device_of(tree: Any) -> Device:
+    """That of the first array that is on one; where there is none, JAX's default."""
     for leaf in jax.tree.leaves(tree):
         if isinstance(leaf, Array) and not isinstance(leaf, Tracer):
-            return next(iter(leaf.devices())).platform
+            return next(iter(leaf.devices()))
     default = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
-    return getattr(default, "platform", default) or jax.default_backend()
+    return default if isinstance(default, Device) else jax.local_devices(backend=default)[0]

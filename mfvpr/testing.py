@@ -148,7 +148,8 @@ def _gradients(scorer: Any) -> Callable[[Matches], tuple[list[Array], dict[str, 
             return jax.tree.unflatten(structure, changed.values())(replace(pair, **entries))
 
         numbers = [jnp.asarray(leaves[place], jnp.float32) for place in places]
-        return jax.grad(score, argnums=(0, 1))(numbers, per_match(pair))
+        entries = {name: values for name, values in per_match(pair).items() if _is_floating(values)}
+        return jax.grad(score, argnums=(0, 1))(numbers, entries)
 
     return gradients
 
@@ -192,7 +193,10 @@ def _made_up(rng: np.random.Generator, count: int, image_size: tuple[int, int]) 
     unit = (rng.uniform(0.05, 0.95, count) for _ in range(5))
     entries = [np.asarray(values, np.float32) for values in (points0, points1, *unit)]
     points0, points1, distance, scores0, scores1, ratio, confidence = entries
-    pair = Matches(points0, points1, distance, scores0, scores1, np.ones(count, bool), size, size, ratio, confidence)
+    indices = (rng.permutation(3 * count)[:count].astype(np.int32) for _ in range(2))
+    counts = np.full(2, 3 * count, np.int32)
+    real = np.ones(count, bool)
+    pair = Matches(points0, points1, distance, scores0, scores1, real, size, size, ratio, confidence, *indices, *counts)
     return _padded(pair, np.nan, SLOTS)
 
 
@@ -202,7 +206,8 @@ def _padded(pair: Matches, garbage: float, slots: int) -> Matches:
     count = int(real.sum())
 
     def padded(values: np.ndarray) -> np.ndarray:
-        rows = np.full((slots, *values.shape[1:]), garbage, np.float32)
+        whole = np.issubdtype(values.dtype, np.integer)
+        rows = np.full((slots, *values.shape[1:]), np.int32(-1) if whole else np.float32(garbage))
         rows[:count] = values[real]
         return rows
 

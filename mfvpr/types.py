@@ -5,7 +5,8 @@ Points are (x, y) in pixels of the image that the detector saw. `mask` is True o
 never matters, NaN included. Every field may carry leading batch axes. Arrays may be NumPy's or JAX's.
 """
 
-from dataclasses import dataclass, field, fields, is_dataclass
+from collections.abc import Callable
+from dataclasses import Field, dataclass, field, fields, is_dataclass
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
@@ -63,7 +64,7 @@ class Features:
 
     Attributes:
         keypoints: `[..., N, 2]` (x, y), px.
-        descriptors: `[..., N, D]`, unit Euclidean length.
+        descriptors: `[..., N, D]`, of any length; those of this library's networks and of RootSIFT are of unit length.
         scores: `[..., N]` detection scores, larger = better.
         mask: `[..., N]` bool.
         image_size: `[..., 2]` (width, height), px.
@@ -88,7 +89,7 @@ class Matches:
     Attributes:
         points0: `[..., K, 2]` (x, y) in the query, px.
         points1: `[..., K, 2]` (x, y) in the candidate, px.
-        distance: `[..., K]` Euclidean distance of the unit descriptors, in [0, 2].
+        distance: `[..., K]` Euclidean distance of the descriptors, in [0, 2] where these are of unit length.
         scores0: `[..., K]` detection scores in the query.
         scores1: `[..., K]` detection scores in the candidate.
         mask: `[..., K]` bool.
@@ -97,6 +98,10 @@ class Matches:
         ratio: `[..., K]` distance to the nearest descriptor of the candidate over that to the second nearest, in
             [0, 1]; None where nobody asked for it.
         confidence: `[..., K]` in [0, 1], how surely a match is one: it counts so much of its weight. None = 1.
+        index0: `[..., K]` int32, the match's keypoint among those of the query; None = unknown.
+        index1: `[..., K]` int32, the same of the candidate.
+        count0: `[...]` int32, keypoints of the query, matched or not; None = unknown.
+        count1: `[...]` int32, keypoints of the candidate.
     """
 
     points0: Array  # [..., K, 2]
@@ -109,12 +114,27 @@ class Matches:
     image_size1: Array = field(metadata={"per_pair": True})  # [..., 2]
     ratio: Array | None = None  # [..., K]
     confidence: Array | None = None  # [..., K]
+    index0: Array | None = None  # [..., K]
+    index1: Array | None = None  # [..., K]
+    count0: Array | None = field(default=None, metadata={"per_pair": True})  # [...]
+    count1: Array | None = field(default=None, metadata={"per_pair": True})  # [...]
+
+
+INDICES = ("index0", "index1")  # whole numbers, of which nobody computes anything
 
 
 def per_match(matches: Matches) -> dict[str, Array]:
     """The fields with a value for every match, `[..., K, ...]` by name: those that are there, but for the mask."""
-    names = [f.name for f in fields(matches) if f.name != "mask" and not f.metadata.get("per_pair")]
-    return {name: found for name in names if (found := getattr(matches, name)) is not None}
+    return _present(matches, lambda f: f.name != "mask" and not f.metadata.get("per_pair"))
+
+
+def per_pair(matches: Matches) -> dict[str, Array]:
+    """The fields with one value for a pair of images, `[..., ...]` by name: those that are there."""
+    return _present(matches, lambda f: bool(f.metadata.get("per_pair")))
+
+
+def _present(matches: Matches, chosen: Callable[[Field[Any]], bool]) -> dict[str, Array]:
+    return {f.name: values for f in fields(matches) if chosen(f) and (values := getattr(matches, f.name)) is not None}
 
 
 @value

@@ -9,7 +9,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 
 from mfvpr.numerics import as_float, at_least_single, masked
-from mfvpr.types import Array, Matches, per_match, value
+from mfvpr.types import INDICES, Array, Matches, per_match, value
 
 Weight = Callable[[Matches], Array]
 
@@ -52,7 +52,10 @@ class ChosenWeight:
 def match_weights(weight: Weight, matches: Matches) -> Array:
     """`[K]` weights times the matches' confidence, 0 on padding."""
     # Padding is 1 before any arithmetic of the weight: else its NaN would return in the gradients.
-    clean = {name: masked(at_least_single(values), matches.mask, 1) for name, values in per_match(matches).items()}
+    clean = {
+        name: masked(values if name in INDICES else at_least_single(values), matches.mask, 1)
+        for name, values in per_match(matches).items()
+    }
     weights = masked(at_least_single(weight(replace(matches, **clean))), matches.mask)
     return weights if matches.confidence is None else weights * match_confidence(matches)
 

@@ -1,13 +1,14 @@
 """Random and hand-made Features and Matches for the tests, NumPy but where said."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
-from mfvpr import Features, Matches
+from mfvpr import Features, Matches, types
 
 SIZE = 336
 
@@ -36,18 +37,20 @@ def make_features(rng, count, *, capacity=None, dimension=16, size=SIZE, garbage
 
 
 def make_matches(points0, points1, *, distance=None, scores0=None, scores1=None, ratio=None, confidence=None,
-                 capacity=None, garbage=np.nan, sizes=((SIZE, SIZE), (SIZE, SIZE))):  # fmt: skip
+                 index0=None, index1=None, count0=None, count1=None, capacity=None, garbage=np.nan, sizes=((SIZE, SIZE), (SIZE, SIZE))):  # fmt: skip
     """Matches of one pair from real entries; the padding holds `garbage`."""
     points0 = np.asarray(points0, np.float32).reshape(-1, 2)
     points1 = np.asarray(points1, np.float32).reshape(-1, 2)
     count = len(points0)
     capacity = capacity or max(count, 1)
 
-    def padded(real, default=0.5):
+    def padded(real, default=0.5, fill=np.float32(garbage)):
         real = np.full(count, default) if real is None else np.asarray(real)
-        rows = np.full((capacity, *real.shape[1:]), garbage, np.float32)
+        rows = np.full((capacity, *real.shape[1:]), fill)
         rows[:count] = real
         return rows
+
+    whole = partial(padded, fill=np.int32(-7))
 
     return Matches(
         points0=padded(points0),
@@ -60,6 +63,10 @@ def make_matches(points0, points1, *, distance=None, scores0=None, scores1=None,
         image_size1=np.array(sizes[1], np.float32),
         ratio=None if ratio is None else padded(ratio),
         confidence=None if confidence is None else padded(confidence),
+        index0=None if index0 is None else whole(index0),
+        index1=None if index1 is None else whole(index1),
+        count0=None if count0 is None else np.int32(count0),
+        count1=None if count1 is None else np.int32(count1),
     )
 
 
@@ -79,6 +86,10 @@ def random_matches(rng, count, *, capacity=None, garbage=np.nan, sizes=((SIZE, S
         scores1=rng.uniform(0.1, 1, count),
         ratio=rng.uniform(0, 1, count),
         confidence=np.clip(rng.uniform(-1, 3, count), 0, 1),
+        index0=rng.permutation(3 * count)[:count],
+        index1=rng.permutation(2 * count)[:count],
+        count0=3 * count,
+        count1=2 * count,
         capacity=capacity,
         garbage=garbage,
         sizes=sizes,
@@ -94,7 +105,7 @@ def real(matches):
 
 def per_match(matches, function):
     """`function` of every field that has a row per match, and of no other."""
-    rows = {f.name: getattr(matches, f.name) for f in fields(matches) if "size" not in f.name}
+    rows = types.per_match(matches) | {"mask": matches.mask}
     return replace(matches, **jax.tree.map(function, rows))
 
 

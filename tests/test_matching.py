@@ -10,15 +10,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import Features, compact, filter_matches, match, match_candidates, matching, retrieve
-from mfvpr.matching import match_shortlist
+from mfvpr.matching import match_pairs
+from mfvpr.types import per_match, per_pair
 from tests import oracles
 from tests.builders import make_features, random_matches, unit
 
 MODES = ["mutual", "opencv_legacy", "none"]
 # Compiled as a whole, not operation by operation: seconds, where every test has its own shapes.
-match_once = jax.jit(match, static_argnames="cross_check")
+match_once = jax.jit(match, static_argnames=("cross_check", "with_ratio"))
 match_candidates_once = jax.jit(match_candidates, static_argnames=("cross_check", "chunk_size"))
-match_shortlist_once = jax.jit(match_shortlist, static_argnames="cross_check")
+match_pairs_once = jax.jit(match_pairs, static_argnames="cross_check")
+PAIRS = np.array([(0, 1), (0, 0)], np.int32)
 compact_once = jax.jit(compact, static_argnames="capacity")
 
 
@@ -142,7 +144,7 @@ def test_images_without_a_single_slot(mode, counts):
     for matches in (
         match_once(features0, features1, cross_check=mode),
         match_candidates_once(features0, batch, cross_check=mode),
-        match_shortlist_once(features0, batch, jnp.array([1, -1]), cross_check=mode),
+        match_pairs_once(jax.tree.map(lambda leaf: leaf[None], features0), batch, PAIRS, 2, cross_check=mode),
     ):
         assert matches.mask.shape[-1] == counts[0]
         assert not matches.mask.any()
@@ -223,7 +225,7 @@ def test_whoever_calls_it_matching_compiles_once(compilations):
     calls = [
         lambda limit: match_candidates(query, batch),
         lambda limit: match_candidates(query, batch, with_ratio=True),
-        lambda limit: match_shortlist(query, batch, np.array([2, -1, 0]), max_distance=limit, max_matches=7),
+        lambda limit: match_pairs(batch, batch, PAIRS, int(limit) + 1, max_distance=limit, max_matches=7),
         lambda limit: retrieve(query.descriptors, batch.descriptors[0], num_candidates=3),
     ]
     for call in calls:
@@ -234,24 +236,51 @@ def test_whoever_calls_it_matching_compiles_once(compilations):
     assert compilations.count == 0
 
 
-def test_a_shortlist_keeps_what_the_filter_of_every_pair_keeps():
+@pytest.mark.parametrize("chunk_size", [None, 1, 2, 3, 9])
+def test_pairs_are_matched_as_each_of_them(chunk_size):
+    """Whatever their number, and the number of those that are done at a time; pairs beyond the count have none."""
     rng = np.random.default_rng(7)
-    query, *others = (make_features(rng, 20) for _ in range(4))
-    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *others)
-    got = match_shortlist(query, batch, np.array([2, -1, 0]), max_distance=1.1, max_matches=3)
-    assert not got.mask[1].any()
-    for place, row in ((0, 2), (2, 0)):
-        expected = filter_matches(match_once(query, others[row]), max_distance=1.1, max_matches=3)
-        np.testing.assert_array_equal(got.mask[place], expected.mask)
+    queries, candidates = (
+        [make_features(rng, count, capacity=20) for count in counts] for counts in ((20, 7), (18, 0, 20))
+    )
+    pairs = np.array([(0, 0), (1, 2), (0, 1), (1, 0), (0, 2), (0, 0), (1, 1)], np.int32)
+    stacks = [jax.tree.map(lambda *leaves: np.stack(leaves), *side) for side in (queries, candidates)]
+    for count in (0, 1, 5, 7):
+        got = match_pairs(*stacks, pairs, count, with_ratio=True, max_distance=1.1, max_matches=3, chunk_size=chunk_size)
+        for place, (query, candidate) in enumerate(pairs[:count]):
+            alone = match_once(queries[query], candidates[candidate], with_ratio=True)
+            expected = filter_matches(alone, max_distance=1.1, max_matches=3)
+            mask = np.asarray(expected.mask)
+            np.testing.assert_array_equal(got.mask[place], mask)
+            for name, values in per_match(expected).items():
+                np.testing.assert_array_equal(np.asarray(getattr(got, name))[place][mask], np.asarray(values)[mask])
+            for name, value in per_pair(expected).items():
+                np.testing.assert_array_equal(getattr(got, name)[place], value)
+        assert not got.mask[count:].any()
 
 
-@pytest.mark.parametrize(("platform", "expected"), [("cpu", 1), ("gpu", 2**28 // (4 * 20 * 30 + 1))])
-def test_a_chunk_is_what_fits_where_the_data_are(monkeypatch, platform, expected):
+def test_matches_know_their_keypoints_and_how_many_there_were():
+    rng = np.random.default_rng(11)
+    query, candidate = make_features(rng, 9, capacity=12), make_features(rng, 7, capacity=30)
+    matches = match_once(query, candidate)
+    real = np.asarray(matches.mask)
+    assert real.any()
+    for side, features in enumerate((query, candidate)):
+        index = np.asarray(getattr(matches, f"index{side}"))[real]
+        assert index.dtype == np.int32
+        np.testing.assert_array_equal(features.keypoints[index], np.asarray(getattr(matches, f"points{side}"))[real])
+        np.testing.assert_array_equal(features.scores[index], np.asarray(getattr(matches, f"scores{side}"))[real])
+    assert (matches.count0, matches.count1) == (9, 7)
+
+
+def test_a_chunk_is_what_fits_where_the_data_are(monkeypatch):
+    """On a processor one pair, whose matrix stays in its cache; elsewhere a share of the device's memory."""
     rng = np.random.default_rng(8)
     batch = jax.tree.map(lambda leaf: leaf[None], make_features(rng, 30))
-    monkeypatch.setattr(matching, "platform", lambda tree: platform)
-    assert matching._chunk_size(None, make_features(rng, 20), batch) == expected
-    assert matching._chunk_size(7, make_features(rng, 20), batch) == 7
+    for memory, expected in ((None, 1), (80 * 2**30, 80 * 2**30 // 256 // (4 * 20 * 30 + 1)), (10**5, 1)):
+        monkeypatch.setattr(matching, "device_bytes", lambda tree: memory)  # noqa: B023
+        assert matching._chunk_size(None, make_features(rng, 20), batch) == expected
+        assert matching._chunk_size(7, make_features(rng, 20), batch) == 7
     with pytest.raises(ValueError, match="chunk_size=0: expected a whole number above 0"):
         match_candidates(make_features(rng, 20), batch, chunk_size=0)
 

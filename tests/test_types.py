@@ -9,7 +9,7 @@ import pytest
 from jax.extend.core import jaxpr_as_fun
 
 import mfvpr
-from mfvpr.types import per_match
+from mfvpr.types import per_match, per_pair
 from tests.builders import random_matches
 
 
@@ -100,8 +100,9 @@ def test_a_dataclass_may_be_registered_as_it_is():
 def test_every_field_of_matches_is_of_a_match_or_of_the_pair():
     """A field that is added must not be lost by stores and batches, which go by `per_match`."""
     matches = random_matches(np.random.default_rng(0), 5, capacity=8)
-    sizes = {"image_size0", "image_size1"}
-    assert set(per_match(matches)) == {f.name for f in fields(matches)} - sizes - {"mask"}
+    of_pair = {"image_size0", "image_size1", "count0", "count1"}
+    assert set(per_pair(matches)) == of_pair
+    assert set(per_match(matches)) == {f.name for f in fields(matches)} - of_pair - {"mask"}
     assert all(len(values) == 8 for values in per_match(matches).values())
     without = mfvpr.Matches(**{f.name: getattr(matches, f.name) for f in fields(matches) if f.name != "ratio"})
     assert "ratio" not in per_match(without)

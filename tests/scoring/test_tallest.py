@@ -23,11 +23,10 @@ from mfvpr import (
 from mfvpr.scoring import tallest
 from mfvpr.scoring.lattice import Lattice
 from mfvpr.scoring.tallest import tallest_bins
-from tests.builders import random_matches
+from tests.builders import per_match, random_matches
 
 SLOTS, WEIGHTINGS = 64, 8  # a search with every one of the capacities
 CAPACITIES = {20.0: 40, 10.0: 72, 5.0: 136, 3.0: 296}  # by bin size, with blocks of 2, 3, 4 and 8 bins
-SLOTTED = ("points0", "points1", "distance", "scores0", "scores1", "ratio", "confidence", "mask")
 pairs = jax.jit(tallest_bins, static_argnums=3)
 score = jax.jit(lambda scorer, matches: scorer(matches))
 bounds = jax.jit(tallest._bounds, static_argnums=(3, 4))
@@ -179,7 +178,7 @@ def test_neither_padding_nor_company_matters(matches):
     """More slots, fewer pairs than cores, none at all."""
     grid = partial(score_grid, HistogramOfShifts(), sigma=[10.0], bin_size=[5.0])
     alone = jax.tree.map(lambda leaf: leaf[3:], matches)
-    loose = replace(alone, **{name: np.repeat(getattr(alone, name), 2, axis=1) for name in SLOTTED})
+    loose = per_match(alone, lambda rows: np.repeat(rows, 2, axis=1))
     loose = replace(loose, mask=loose.mask & (np.arange(120) % 2 == 0)[None])
     expected = grid(matches)[..., 3:]
     np.testing.assert_allclose(grid(alone), expected, rtol=2e-7)
