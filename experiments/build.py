@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from mfvpr.features import GlobalExtractor, LocalExtractor
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import fit_vlad
 from mfvpr.scoring import Scorer
-from mfvpr.types import Features
+from mfvpr.sources import FeatureSet
 
 WEIGHTS = {
     "fs": mfvpr.FeatureScoreWeight(),
@@ -69,7 +69,7 @@ def local_extractor(settings: dict[str, Any]) -> LocalExtractor:
     return extractor(_network("features", name, weights), **_only(options, extractor, f"features={name}"))
 
 
-def global_extractor(settings: dict[str, Any]) -> Callable[[Sequence[Features]], GlobalExtractor]:
+def global_extractor(settings: dict[str, Any]) -> Callable[[FeatureSet], GlobalExtractor]:
     """What describes whole images, once the database's features are there, of which VLAD learns its vocabulary."""
     options = {name: value for name, value in settings.items() if name != "name"}
     if settings["name"] == "vlad":

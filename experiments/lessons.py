@@ -17,13 +17,13 @@ from experiments.judging import Judge, judge
 from experiments.models import LOSSES, NUMBERS, Lesson, Model, model
 from experiments.settings import SettingsError
 from mfvpr import pipeline, sweeping
-from mfvpr.data.store_manifest import recipe_fingerprint
 from mfvpr.learning.match_weight import LearnedWeight
 from mfvpr.learning.training import Fit, fit
 from mfvpr.numerics import round_up
 from mfvpr.pipeline import MatchSet
 from mfvpr.report import runs
 from mfvpr.scoring import parameters
+from mfvpr.stores.manifest import recipe_fingerprint
 from mfvpr.sweeping import Half
 from mfvpr.types import Matches, Shortlist
 

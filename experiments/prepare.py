@@ -1,7 +1,7 @@
 """Images -> features -> shortlist and matches: the stages that every program begins with."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import takewhile
@@ -20,7 +20,7 @@ from mfvpr.data.sequences import OwnRows, own_rows, without_neighbors
 from mfvpr.extraction import Descriptors
 from mfvpr.features import GlobalExtractor, LocalExtractor
 from mfvpr.pipeline import FeatureSet, MatchSet
-from mfvpr.types import Features, Shortlist
+from mfvpr.types import Shortlist
 
 
 @dataclass
@@ -64,7 +64,7 @@ class Extractors:
     """What features and global descriptors come from."""
 
     local: LocalExtractor
-    describer: Callable[[Sequence[Features]], GlobalExtractor]
+    describer: Callable[[FeatureSet], GlobalExtractor]
 
 
 @dataclass(frozen=True)
@@ -218,7 +218,7 @@ def _warn(dataset: Dataset, database: FeatureSet, queries: FeatureSet) -> None:
     for found, images in ((database, dataset.database), (queries, dataset.queries)):
         for reason in found.bad.values():
             tell(f"warning: {reason}")
-        empty = [row for row in np.flatnonzero(~found.features.mask.any(axis=1)) if row not in found.bad]
+        empty = [row for row in np.flatnonzero(found.counts == 0) if row not in found.bad]
         if empty:
             tell(f"warning: {images.paths[empty[0]]}: no keypoints, so no matches ({len(empty)} such images of "
                  f"{len(images)}); scores are 0")  # fmt: skip
@@ -237,7 +237,7 @@ def _features(
 
 def _described(
     settings: dict[str, Any],
-    describer: Callable[[Sequence[Features]], GlobalExtractor],
+    describer: Callable[[FeatureSet], GlobalExtractor],
     found: Images,
     features: dict[str, FeatureSet],
 ) -> dict[str, Descriptors]:
@@ -246,7 +246,7 @@ def _described(
     if asked != "all" and asked > available:
         tell(f"note: candidates={asked}, but the database has {available} images; all of them are re-ranked")
     chosen, database = settings["retrieval"], features["database"]
-    extractor = describer([database[row] for row in range(len(database))])
+    extractor = describer(database)
     root = settings["store"] if extractor.image_size is not None else None  # VLAD takes no time
     skip_bad, wait, described = settings["on_bad_image"] == "skip", _is_one_of_many(settings), {}
     for side, folder in found.sides.items():

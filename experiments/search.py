@@ -10,9 +10,9 @@ from experiments import build, console, prepare, run_folder, stores, sweep_outpu
 from experiments.axes import BYTES_PER_SETTING, Axes, as_setting, axes, require_bins, require_memory, scorer
 from experiments.judging import Judge, judge
 from mfvpr import sweeping
-from mfvpr.data.store_manifest import recipe_fingerprint
 from mfvpr.pipeline import MatchSet
 from mfvpr.report import runs
+from mfvpr.stores.manifest import recipe_fingerprint
 from mfvpr.types import Shortlist
 
 

@@ -7,13 +7,14 @@ from typing import Any
 
 from experiments import build
 from experiments.console import tell
-from mfvpr.data import feature_store, match_store
 from mfvpr.data.datasets import ImageFolder
-from mfvpr.data.feature_store import FeatureStore, open_store, require_space
-from mfvpr.data.match_store import MatchStore, open_match_store
-from mfvpr.data.store_manifest import MATCHES, store_path
 from mfvpr.features import GlobalExtractor, LocalExtractor
 from mfvpr.report.runs import versions
+from mfvpr.stores import features as feature_store
+from mfvpr.stores import matches as match_store
+from mfvpr.stores.features import FeatureStore, open_store, require_space
+from mfvpr.stores.manifest import MATCHES, store_path
+from mfvpr.stores.matches import MatchStore, open_match_store
 
 MB = 1e6
 PAPER_FEATURE = 2064  # bytes of one feature of D2-Net there: float32 descriptor, keypoint and score

@@ -2,22 +2,23 @@
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from contextlib import nullcontext
+from dataclasses import dataclass, fields
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import jax
 import numpy as np
 
 from mfvpr.data.datasets import ImageFolder
 from mfvpr.data.images import Interpolation, ordered_map, resize
 from mfvpr.errors import InputError
 from mfvpr.features import GlobalExtractor, LocalExtractor
-from mfvpr.numerics import available_cpus, round_up
-from mfvpr.types import Features, per_keypoint
+from mfvpr.numerics import available_cpus
+from mfvpr.sources import FeatureSet, InMemory
+from mfvpr.types import Features
 
 if TYPE_CHECKING:
-    from mfvpr.data.feature_store import FeatureStore
+    from mfvpr.stores.features import FeatureStore
 
 Item = TypeVar("Item")
 Track = Callable[[Iterable[Any], int], Iterable[Any]]
@@ -26,44 +27,6 @@ Track = Callable[[Iterable[Any], int], Iterable[Any]]
 def untracked(items: Iterable[Item], total: int) -> Iterable[Item]:
     """No progress bar."""
     return items
-
-
-@dataclass(frozen=True)
-class FeatureSet:
-    """Local features of all images of a folder.
-
-    Attributes:
-        features: `[M, N, ...]`, padded, NumPy.
-        bad: reason by row, for images that are not used: they gave no usable features (their masks are all False), or
-            no usable global descriptor.
-    """
-
-    features: Features
-    bad: Mapping[int, str]
-
-    @classmethod
-    def of(cls, images: Sequence[Features]) -> "FeatureSet":
-        """Features of your own, image by image `[N_i, ...]`, of as many keypoints as each has; padding is dropped.
-
-        Raises:
-            InputError: there are none, their arrays do not fit, or descriptors are not of unit length.
-        """
-        if not images:
-            raise InputError("FeatureSet.of: expected the features of at least one image, got none")
-        for number, image in enumerate(images):
-            _check(image, number)
-        real = [
-            replace(image, **{n: np.asarray(v)[np.asarray(image.mask)] for n, v in per_keypoint(image).items()})
-            for image in images
-        ]
-        return cls(_stack(enumerate(real), np.array([len(image.mask) for image in real])), {})
-
-    def __len__(self) -> int:
-        return len(self.features.mask)
-
-    def __getitem__(self, row: int) -> Features:
-        """Features `[N, ...]` of one image."""
-        return jax.tree.map(lambda field: field[row], self.features)
 
 
 @dataclass(frozen=True)
@@ -93,7 +56,7 @@ def extract(
         folder: the images.
         extractor: what turns images into Features.
         store: of this folder and extractor. Only images that it lacks are read; each batch is on disk before the next
-            is begun; and what comes back was read from it, so that a later run gets the same numbers (descriptors as
+            is begun; and what comes back reads from it, so that a later run gets the same numbers (descriptors as
             float16 keeps them).
         skip_bad: list unreadable images in `bad` and go on, instead of raising. An image whose features are not
             finite is always listed.
@@ -102,25 +65,22 @@ def extract(
     Raises:
         InputError: an image cannot be read (unless `skip_bad`), or none can; or the store cannot be used.
     """
-    found: dict[int, Features] = {}
     bad: dict[int, str] = {}
-    missing = range(len(folder)) if store is None else np.flatnonzero(~store.done).tolist()
-    for rows, images in _image_batches(folder, missing, extractor, skip_bad, bad, track):
-        batch = dict(zip(rows, extractor(images), strict=True))
-        for row in [row for row, features in batch.items() if not _finite(features)]:
-            del batch[row]
-            bad[row] = f"{folder.paths[row]}: features are not finite (NaN or infinite); the image ranks last"
-        if store is None:
-            found |= batch
-        else:
-            store.write(batch)
+    with nullcontext() if store is None else store:
+        images: dict[int, Features] = {}
+        missing = range(len(folder)) if store is None else np.flatnonzero(~store.done).tolist()
+        for rows, pixels in _image_batches(folder, missing, extractor, skip_bad, bad, track):
+            batch = dict(zip(rows, extractor(pixels), strict=True))
+            for row in [row for row, features in batch.items() if not _finite(features)]:
+                del batch[row]
+                bad[row] = f"{folder.paths[row]}: features are not finite (NaN or infinite); the image ranks last"
+            if store is None:
+                images |= batch
+            else:
+                store.write(batch)
     if len(bad) == len(folder):
         raise InputError(f"{folder.root}: none of {len(folder)} images can be used; the first: {bad[min(bad)]}")
-    if store is not None:
-        return FeatureSet(_stack(store.read(), store.counts), bad)
-    counts = np.zeros(len(folder), int)
-    counts[list(found)] = [len(features.mask) for features in found.values()]
-    return FeatureSet(_stack(found.items(), counts), bad)
+    return FeatureSet(InMemory(images, len(folder)) if store is None else store, bad)
 
 
 def describe(
@@ -146,15 +106,17 @@ def describe(
         InputError: as `extract`.
     """
     bad = dict(feature_set.bad)
+    descriptors = np.zeros((len(folder), extractor.dimension), np.float32)
     if extractor.image_size is None:
-        rows = track(range(len(folder)), len(folder))
-        batches = (
-            extractor(None, [feature_set[row] for row in batch]) for batch in _batches(rows, extractor.batch_size)
-        )
-        descriptors = np.concatenate(list(batches))
+        for batch in _batches(track(range(len(folder)), len(folder)), extractor.batch_size):
+            features = dict(feature_set.read(batch))
+            if features:
+                descriptors[list(features)] = extractor(None, list(features.values()))
     else:
         whole = extract(folder, _WholeImage(extractor), store=store, skip_bad=skip_bad, track=track)
-        bad, descriptors = {**whole.bad, **bad}, whole.features.descriptors[:, 0]
+        bad = {**whole.bad, **bad}
+        for row, image in whole.read(range(len(folder))):
+            descriptors[row] = image.descriptors[0]
     descriptors[list(bad)] = np.nan
     return Descriptors(descriptors, bad)
 
@@ -236,46 +198,5 @@ def _batches(items: Iterable[Item], size: int) -> Iterator[list[Item]]:
         yield batch
 
 
-def _check(image: Features, number: int) -> None:
-    """Of one's own image `[N, ...]`."""
-    count = len(image.mask)
-    shapes = {name: np.shape(values) for name, values in per_keypoint(image).items()}
-    expected = {
-        "keypoints": (count, 2),
-        "descriptors": (count, *shapes["descriptors"][1:]),
-        "scores": (count,),
-        "mask": (count,),
-    }
-    if shapes != expected or len(shapes["descriptors"]) != 2 or np.asarray(image.mask).dtype != bool:
-        raise InputError(
-            f"features of image {number}: expected keypoints [N, 2], descriptors [N, D], scores [N] and mask [N] bool, "
-            f"got shapes {', '.join(str(shape) for shape in shapes.values())}; transpose descriptors that are [D, N]"
-        )
-    lengths = np.linalg.norm(np.asarray(image.descriptors, np.float32)[image.mask], axis=1)
-    if (wrong := np.abs(lengths - 1) > 0.01).any():
-        raise InputError(
-            f"features of image {number}: expected descriptors of unit length, got {lengths[wrong][0]:.4g}; "
-            "divide them by their Euclidean length"
-        )
-
-
 def _finite(features: Features) -> bool:
     return all(np.isfinite(getattr(features, field.name)).all() for field in fields(features))
-
-
-def _stack(found: Iterable[tuple[int, Features]], counts: np.ndarray) -> Features:
-    """Padded features `[M, N, ...]` of all rows, from (row, Features); rows that are not among them are empty."""
-    most = int(counts.max())
-    capacity = 1 if most == 1 else round_up(most, 32)  # a global descriptor takes one slot
-    arrays: dict[str, np.ndarray] = {}
-    for row, features in found:
-        if not arrays:
-            arrays = {
-                name: np.zeros((len(counts), capacity, *values.shape[1:]), values.dtype)
-                for name, values in per_keypoint(features).items()
-            }
-            arrays["image_size"] = np.tile(features.image_size, (len(counts), 1))
-        for name, values in per_keypoint(features).items():
-            arrays[name][row, : counts[row]] = values
-        arrays["image_size"][row] = features.image_size
-    return Features(**arrays)

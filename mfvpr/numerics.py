@@ -6,14 +6,19 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial, wraps
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jax import Array, Device
+from jax import Array
 from jax.core import Tracer
 from jax.tree_util import Partial
 from jax.typing import ArrayLike
+
+if TYPE_CHECKING:  # which of jax's names is a class for whoever checks types
+    from jaxlib._jax import Device
+else:
+    Device = jax.Device
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 Tree = TypeVar("Tree")

@@ -5,22 +5,24 @@ wraps the iterable of a stage: a progress bar, or nothing.
 """
 
 import itertools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import jax
 import numpy as np
 
-from mfvpr import reranking, retrieval
-from mfvpr.data.match_store import MatchStore, QueryMatches
+from mfvpr import pair_matching, reranking, retrieval
 from mfvpr.errors import InputError
-from mfvpr.extraction import FeatureSet, Track, describe, extract, untracked
-from mfvpr.matching import CrossCheck, match_shortlist
-from mfvpr.numerics import compiled, held, round_up
+from mfvpr.extraction import Track, describe, extract, untracked
+from mfvpr.match_sets import MatchSet, QueryMatches
+from mfvpr.matching import CrossCheck
+from mfvpr.numerics import Device, compiled, device_of, held
 from mfvpr.scoring import HistogramOfShifts, Scorer, ShiftHistogram
 from mfvpr.scoring.parameters import fit
-from mfvpr.types import Array, Matches, Shortlist, per_match
+from mfvpr.sources import FeatureSet
+from mfvpr.stores.matches import MatchStore
+from mfvpr.types import Array, Matches, Shortlist
 from mfvpr.weighting import match_weights
 
 __all__ = ["Explanation", "FeatureSet", "MatchSet", "Track", "describe", "explain", "extract", "fuse", "match", "rank",
@@ -31,45 +33,6 @@ FilterScore = Literal["cosine", "negative_euclidean"]
 
 BIN_STEP = 16  # capacities of histograms are multiples of it
 STORE_BATCH = 8  # queries whose matches may be lost when a run is killed
-
-
-@dataclass(frozen=True)
-class MatchSet:
-    """Matches of every query with its candidates, without padding.
-
-    Attributes:
-        matches: per query, the real matches `[n, ...]` of all candidates one after the other; `image_size0` `[2]`,
-            `image_size1` `[C, 2]`.
-        counts: `[Q, C]` matches of each candidate.
-        capacity: slots that hold every pair's matches.
-    """
-
-    matches: Sequence[Matches]
-    counts: np.ndarray
-    capacity: int
-
-    def __getitem__(self, query: int) -> Matches:
-        """Matches `[C, K, ...]` of one query, padded with zeros to the capacity."""
-        mask = np.arange(self.capacity) < self.counts[query][:, None]
-        flat = self.matches[query]
-
-        def padded(values: np.ndarray) -> np.ndarray:
-            slots = np.zeros((*mask.shape, *values.shape[1:]), values.dtype)
-            slots[mask] = values
-            return slots
-
-        slots = {name: padded(values) for name, values in per_match(flat).items()}
-        sizes = np.broadcast_to(flat.image_size0, flat.image_size1.shape)
-        return replace(flat, mask=mask, image_size0=sizes, **slots)
-
-    @property
-    def image_sizes(self) -> tuple[np.ndarray, np.ndarray]:
-        """All combinations of sizes of query and database images, `[n, 2]` each."""
-        sizes0, sizes1 = (
-            np.unique(np.concatenate([np.reshape(getattr(one, name), (-1, 2)) for one in self.matches]), axis=0)
-            for name in ("image_size0", "image_size1")
-        )
-        return np.repeat(sizes0, len(sizes1), 0), np.tile(sizes1, (len(sizes0), 1))
 
 
 def shortlist(
@@ -94,6 +57,8 @@ def match(
     max_matches: int | None = None,
     chunk_size: int | None = None,
     with_ratio: bool = False,
+    memory: float | None = None,
+    devices: Sequence[Device] | None = None,
     store: MatchStore | None = None,
     track: Track = untracked,
 ) -> MatchSet:
@@ -108,23 +73,27 @@ def match(
         max_matches: see there.
         chunk_size: see there.
         with_ratio: see there; a store always has the ratio.
+        memory: GB that features of the database may take on the devices; None = a third of what is free.
+        devices: that share the queries; None = the one that JAX takes.
         store: of these features, candidates and options. Only queries that it lacks are matched; some at a time are on
             disk before the next are begun; and what comes back was read from it.
-        track: progress.
+        track: progress, over queries.
 
     Raises:
         InputError: the store cannot be used, or is of other candidates: then nothing is written.
     """
-    options = {"cross_check": cross_check, "max_matches": max_matches, "chunk_size": chunk_size}
+    options = {"cross_check": cross_check, "max_distance": max_distance, "max_matches": max_matches}
+    where = {"memory": memory, "devices": devices or [device_of(())], "chunk_size": chunk_size}
     found = {} if store is None else _stored(store, candidates)
     if missing := [row for row in range(len(queries)) if row not in found]:
-        options["with_ratio"] = with_ratio or store is not None
-        made = _matched(queries, database, candidates, track(missing, len(missing)), max_distance, **options)
-        while batch := dict(itertools.islice(made, STORE_BATCH)):
+        ratio = with_ratio or store is not None
+        made = pair_matching.matched(queries, database, candidates, missing, **options, **where, with_ratio=ratio)
+        tracked = iter(track(made, len(missing)))
+        while batch := dict(itertools.islice(tracked, STORE_BATCH)):
             if store is not None:
                 store.write(batch)
             found |= batch if store is None else store.read(batch)
-    return _match_set([found[row] for row in range(len(queries))])
+    return MatchSet.of([found[row] for row in range(len(queries))])
 
 
 def _stored(store: MatchStore, candidates: Shortlist) -> dict[int, QueryMatches]:
@@ -152,7 +121,7 @@ def stored_matches(store: MatchStore) -> tuple[MatchSet, Shortlist]:
         )
     found = [one for _, one in store.read()]
     indices, scores = np.array([one.indices for one in found]), np.array([one.filter_scores for one in found])
-    return _match_set(found), Shortlist(indices=indices, scores=scores, mask=indices >= 0)
+    return MatchSet.of(found), Shortlist(indices=indices, scores=scores, mask=indices >= 0)
 
 
 def score(
@@ -223,32 +192,6 @@ def rank(candidates: Shortlist, scores: np.ndarray, *, ties: Ties = "filter") ->
     """
     tie_break = candidates.indices if ties == "index" else None
     return np.asarray(reranking.rank(scores, candidates.mask, tie_break=tie_break))
-
-
-def _matched(
-    queries: FeatureSet,
-    database: FeatureSet,
-    candidates: Shortlist,
-    rows: Iterable[int],
-    max_distance: float | None,
-    **options: Any,
-) -> Iterator[tuple[int, QueryMatches]]:
-    """(row, all of that query), one after the other, NumPy."""
-    device_database = jax.device_put(database.features)
-    for row in rows:
-        indices = candidates.indices[row]
-        found = match_shortlist(queries[row], device_database, indices, max_distance=max_distance, **options)
-        found = jax.tree.map(np.asarray, found)
-        counts = found.mask.sum(axis=1, dtype=np.int32)
-        entries = {name: values[found.mask] for name, values in per_match(found).items()}
-        real, size0 = np.ones(counts.sum(), bool), queries.features.image_size[row]
-        flat = replace(found, mask=real, image_size0=size0, **entries)
-        yield row, QueryMatches(flat, counts, candidates.indices[row], candidates.scores[row])
-
-
-def _match_set(found: Sequence[QueryMatches]) -> MatchSet:
-    counts = np.array([one.counts for one in found])
-    return MatchSet([one.matches for one in found], counts, round_up(int(counts.max(initial=0)), 64))
 
 
 @compiled

@@ -24,9 +24,7 @@ def padded(rows: Sequence[Row], capacity: int, *, total: int | None = None) -> t
         total: R; those beyond `rows` are empty. By default as many as there are.
     """
     total = len(rows) if total is None else total
-    arrays = {
-        name: np.zeros((total, capacity, *values.shape[1:]), values.dtype) for name, values in rows[0].items()
-    }
+    arrays = {name: np.zeros((total, capacity, *values.shape[1:]), values.dtype) for name, values in rows[0].items()}
     counts = np.zeros(total, int)
     for place, row in enumerate(rows):
         counts[place] = len(next(iter(row.values())))

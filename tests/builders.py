@@ -37,20 +37,21 @@ def make_features(rng, count, *, capacity=None, dimension=16, size=SIZE, garbage
 
 
 def make_matches(points0, points1, *, distance=None, scores0=None, scores1=None, ratio=None, confidence=None,
-                 index0=None, index1=None, count0=None, count1=None, capacity=None, garbage=np.nan, sizes=((SIZE, SIZE), (SIZE, SIZE))):  # fmt: skip
+                 index0=None, index1=None, count0=None, count1=None,
+                 capacity=None, garbage=np.nan, sizes=((SIZE, SIZE), (SIZE, SIZE))):  # fmt: skip
     """Matches of one pair from real entries; the padding holds `garbage`."""
     points0 = np.asarray(points0, np.float32).reshape(-1, 2)
     points1 = np.asarray(points1, np.float32).reshape(-1, 2)
     count = len(points0)
     capacity = capacity or max(count, 1)
 
-    def padded(real, default=0.5, fill=np.float32(garbage)):
+    def padded(real, default=0.5, fill=garbage, dtype=np.float32):
         real = np.full(count, default) if real is None else np.asarray(real)
-        rows = np.full((capacity, *real.shape[1:]), fill)
+        rows = np.full((capacity, *real.shape[1:]), fill, dtype)
         rows[:count] = real
         return rows
 
-    whole = partial(padded, fill=np.int32(-7))
+    whole = partial(padded, fill=-7, dtype=np.int32)
 
     return Matches(
         points0=padded(points0),
@@ -122,3 +123,17 @@ def fill(folder, names):
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.new("RGB", (4, 4)).save(path)
     return folder
+
+
+def of_query(pairs):
+    """The real matches of one query's pairs, one after the other, as `MatchSet` keeps them; and their counts."""
+    joined = {
+        name: np.concatenate([getattr(pair, name)[pair.mask] for pair in pairs])
+        for name in (*types.per_match(pairs[0]), "mask")
+    }
+    of_candidates = {
+        name: np.stack([getattr(pair, name) for pair in pairs])
+        for name in types.per_pair(pairs[0])
+        if name.endswith("1")
+    }
+    return replace(pairs[0], **joined, **of_candidates), [int(pair.mask.sum()) for pair in pairs]

@@ -9,11 +9,12 @@ from PIL import Image
 
 from mfvpr import match, pipeline
 from mfvpr.data.datasets import image_folder
-from mfvpr.data.feature_store import forecast_bytes, open_store
 from mfvpr.errors import InputError
 from mfvpr.features.sift import Sift
+from mfvpr.stores.features import forecast_bytes, open_store
 from mfvpr.types import Features
 from tests.builders import make_features
+from tests.stores.made_up import assert_same
 
 SIFT = Sift(max_keypoints=60, batch_size=3)
 
@@ -70,11 +71,12 @@ def test_a_store_gives_what_was_extracted_and_is_read_ever_after(folder, opened)
         with opened(folder) as store:
             found.append(pipeline.extract(folder, extractor, store=store))
     assert extractor.seen == len(folder)
-    first, again = (one.features for one in found)
-    for name in ("keypoints", "descriptors", "scores", "mask", "image_size"):
-        np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
-        exact = name != "descriptors"
-        np.testing.assert_allclose(getattr(first, name), getattr(plain.features, name), atol=0 if exact else 2e-4)
+    for row in range(len(folder)):
+        first, again, exact = (one[row] for one in (*found, plain))
+        assert_same(first, again)
+        for name in ("keypoints", "descriptors", "scores", "mask", "image_size"):
+            tolerance = 2e-4 if name == "descriptors" else 0
+            np.testing.assert_allclose(getattr(first, name), getattr(exact, name), atol=tolerance)
 
 
 def test_an_interrupted_extraction_goes_on_where_it_was(folder, opened):
@@ -87,7 +89,8 @@ def test_an_interrupted_extraction_goes_on_where_it_was(folder, opened):
     assert resumed.seen == len(folder) - 6
     with opened(folder, "uninterrupted") as store:
         expected = pipeline.extract(folder, SIFT, store=store)
-    np.testing.assert_array_equal(found.features.descriptors, expected.features.descriptors)
+    for row in range(len(folder)):
+        assert_same(found[row], expected[row])
 
 
 def test_bad_images_are_tried_again(tmp_path, opened):
@@ -102,7 +105,7 @@ def test_bad_images_are_tried_again(tmp_path, opened):
     with opened(folder) as store:
         found = pipeline.extract(folder, SIFT, store=store, skip_bad=True)
     assert found.bad == {}
-    assert found.features.mask.any(axis=1).all()
+    assert found.counts.all()
 
 
 def test_global_descriptors_are_stored_as_well(tmp_path, opened):
@@ -189,7 +192,7 @@ def test_features_of_ones_own_are_matched_as_they_are():
     images[2] = replace(images[2], descriptors=images[2].descriptors.astype(np.float16).astype(np.float32))
     found = pipeline.FeatureSet.of(images)
     assert len(found) == 4
-    assert found.features.mask.sum(axis=1).tolist() == [7, 0, 40, 33]
+    assert found.counts.tolist() == [7, 0, 40, 33]
     candidates = pipeline.shortlist(np.eye(4, dtype=np.float32), np.ones((4, 4), np.float32) / 2, 4)
     matches = pipeline.match(found, found, candidates)
     for query, row in ((0, 2), (2, 3), (3, 0), (1, 2)):
@@ -212,3 +215,10 @@ def test_features_of_ones_own_that_do_not_fit_are_told(change, words):
         pipeline.FeatureSet.of([image])
     with pytest.raises(InputError, match="at least one image"):
         pipeline.FeatureSet.of([])
+
+
+def test_descriptors_are_of_unit_length_only_where_that_is_asked():
+    image = make_features(np.random.default_rng(0), 5)
+    longer = replace(image, descriptors=3 * image.descriptors)
+    found = pipeline.FeatureSet.of([longer], unit_length=False)
+    np.testing.assert_array_equal(found[0].descriptors, longer.descriptors)

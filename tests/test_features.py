@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from mfvpr import InputError
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import Vlad, fit_vlad
+from mfvpr.sources import FeatureSet
 from tests import oracles
 from tests.builders import make_features, unit
 
@@ -66,7 +67,7 @@ def test_vocabulary_is_reproducible_and_finds_clusters():
     members = unit(np.repeat(true, 50, axis=0) + 0.01 * rng.normal(size=(200, 16)))
     features = make_features(rng, 200)
     features.descriptors[:] = members
-    one, two = (fit_vlad([features], num_words=4, seed=0) for _ in range(2))
+    one, two = (fit_vlad(FeatureSet.of([features]), num_words=4, seed=0) for _ in range(2))
     np.testing.assert_array_equal(one.centers, two.centers)
     found = np.linalg.norm(one.centers[:, None] - true, axis=-1).min(axis=0) < 0.05
     assert found.sum() >= 2  # a start at random may put two words into one cluster
@@ -76,24 +77,24 @@ def test_last_bits_and_one_keypoint_less_hardly_move_the_words():
     """Descriptors anywhere on the sphere, where k-means is as unstable as it can be."""
     rng = np.random.default_rng(2)
     images = [make_features(rng, 60) for _ in range(40)]
-    before = fit_vlad(images, num_words=12, seed=3).centers
+    before = fit_vlad(FeatureSet.of(images), num_words=12, seed=3).centers
     assert np.linalg.norm(before[:, None] - before, axis=-1)[np.triu_indices(12, 1)].min() > 0.02
     for features in images:
         features.descriptors[:] = np.nextafter(features.descriptors, rng.choice([-2, 2], features.descriptors.shape))
-    np.testing.assert_allclose(fit_vlad(images, num_words=12, seed=3).centers, before, atol=1e-5)
+    np.testing.assert_allclose(fit_vlad(FeatureSet.of(images), num_words=12, seed=3).centers, before, atol=1e-5)
     images[7].mask[5] = False
-    np.testing.assert_allclose(fit_vlad(images, num_words=12, seed=3).centers, before, atol=0.02)
+    np.testing.assert_allclose(fit_vlad(FeatureSet.of(images), num_words=12, seed=3).centers, before, atol=0.02)
 
 
 def test_a_vocabulary_of_some_images_knows_no_others():
     rng = np.random.default_rng(3)
     images = [make_features(rng, 20) for _ in range(5)]
-    before = fit_vlad(images, num_words=4, max_samples=30).centers
+    before = fit_vlad(FeatureSet.of(images), num_words=4, max_samples=30).centers
     unseen = 0
     for features in images:
         kept = features.descriptors.copy()
         features.descriptors[:] = kept[0]
-        unseen += np.array_equal(fit_vlad(images, num_words=4, max_samples=30).centers, before)
+        unseen += np.array_equal(fit_vlad(FeatureSet.of(images), num_words=4, max_samples=30).centers, before)
         features.descriptors[:] = kept
     assert unseen == 3
 
@@ -102,16 +103,18 @@ def test_identical_features_and_single_ones_have_words():
     alike = make_features(np.random.default_rng(4), 9)
     alike.descriptors[:] = alike.descriptors[0]
     for images in ([alike], [make_features(np.random.default_rng(5), 1)] * 9):
-        np.testing.assert_allclose(np.linalg.norm(fit_vlad(images, num_words=9).centers, axis=1), 1, atol=1e-3)
+        np.testing.assert_allclose(
+            np.linalg.norm(fit_vlad(FeatureSet.of(images), num_words=9).centers, axis=1), 1, atol=1e-3
+        )
 
 
 def test_fewer_features_than_words_is_the_users_to_mend():
     with pytest.raises(
         InputError, match="10 local features in 1 database images: expected at least one for each of the 64 words"
     ):
-        fit_vlad([make_features(np.random.default_rng(2), 10)])
+        fit_vlad(FeatureSet.of([make_features(np.random.default_rng(2), 10)]))
 
 
 def test_fewer_samples_than_words_are_the_users_to_mend():
     with pytest.raises(InputError, match=r"^max_samples=10: expected at least one for each of num_words=64 words$"):
-        fit_vlad([make_features(np.random.default_rng(2), 100)], max_samples=10)
+        fit_vlad(FeatureSet.of([make_features(np.random.default_rng(2), 100)]), max_samples=10)

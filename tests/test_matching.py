@@ -246,7 +246,9 @@ def test_pairs_are_matched_as_each_of_them(chunk_size):
     pairs = np.array([(0, 0), (1, 2), (0, 1), (1, 0), (0, 2), (0, 0), (1, 1)], np.int32)
     stacks = [jax.tree.map(lambda *leaves: np.stack(leaves), *side) for side in (queries, candidates)]
     for count in (0, 1, 5, 7):
-        got = match_pairs(*stacks, pairs, count, with_ratio=True, max_distance=1.1, max_matches=3, chunk_size=chunk_size)
+        got = match_pairs(
+            *stacks, pairs, count, with_ratio=True, max_distance=1.1, max_matches=3, chunk_size=chunk_size
+        )
         for place, (query, candidate) in enumerate(pairs[:count]):
             alone = match_once(queries[query], candidates[candidate], with_ratio=True)
             expected = filter_matches(alone, max_distance=1.1, max_matches=3)

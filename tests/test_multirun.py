@@ -9,7 +9,7 @@ import time
 import pytest
 
 from experiments import prepare, stores
-from mfvpr.data import match_store
+from mfvpr.stores import matches as match_store
 from tests.programs import CANDIDATES, QUERIES, ROOT, composed, results, shared, small, typed
 
 SIGMA = "grid.sigma=[10]"

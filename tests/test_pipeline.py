@@ -1,5 +1,6 @@
 """The way over a data set, stage by stage, on a drawn street and on broken images."""
 
+import itertools
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -11,14 +12,14 @@ from PIL import Image
 import mfvpr
 from mfvpr import pipeline
 from mfvpr.data.datasets import folder_dataset, image_folder
-from mfvpr.data.match_store import open_match_store
 from mfvpr.errors import InputError
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import fit_vlad
-from mfvpr.pipeline import MatchSet
-from mfvpr.types import Shortlist, per_match
+from mfvpr.match_sets import MatchSet
+from mfvpr.stores.matches import open_match_store
+from mfvpr.types import Shortlist
 from tests import oracles
-from tests.builders import random_matches, real
+from tests.builders import of_query, random_matches, real
 from tests.scorers import FOREIGN, OWN, plain, title
 
 SIFT = Sift(max_keypoints=400)
@@ -37,7 +38,7 @@ def features(street):
 @pytest.fixture(scope="module")
 def candidates(street, features):
     database, queries = features
-    vlad = fit_vlad([database[row] for row in range(len(database))], num_words=8)
+    vlad = fit_vlad(database, num_words=8)
     described = [pipeline.describe(f, s, vlad) for f, s in ((street.queries, queries), (street.database, database))]
     return pipeline.shortlist(*(one.values for one in described), 6)
 
@@ -114,42 +115,35 @@ def opened(tmp_path):
     return opened
 
 
-class Counted:
-    """A function that counts its calls; a limit stands for a kill."""
+def killed_after(number):
+    """Progress that ends in a kill after so many queries."""
 
-    def __init__(self, function):
-        self.function, self.count, self.limit = function, 0, None
+    def track(items, _):
+        yield from itertools.islice(items, number)
+        raise KeyboardInterrupt
 
-    def __call__(self, *args, **options):
-        if self.count == self.limit:
-            raise KeyboardInterrupt
-        self.count += 1
-        return self.function(*args, **options)
+    return track
 
 
-@pytest.fixture
-def matched(monkeypatch):
-    """Counts the queries that are matched."""
-    counted = Counted(pipeline.match_shortlist)
-    monkeypatch.setattr(pipeline, "match_shortlist", counted)
-    return counted
+def nothing_done(items, total):
+    """Progress of what is not to be done."""
+    raise AssertionError(f"{total} queries are matched again")
 
 
 def assert_same_matches(got, expected, names=(*PER_MATCH, "ratio")):
     np.testing.assert_array_equal(got.counts, expected.counts)
     assert got.capacity == expected.capacity
     for query in range(len(expected.counts)):
-        for name in (*names, "mask", "image_size0", "image_size1"):
+        for name in (*names, "mask", "image_size0", "image_size1", "index0", "index1", "count0", "count1"):
             np.testing.assert_array_equal(getattr(got[query], name), getattr(expected[query], name))
 
 
-def test_a_store_gives_what_was_matched_and_is_read_ever_after(features, candidates, matches, opened, matched):
+def test_a_store_gives_what_was_matched_and_is_read_ever_after(features, candidates, matches, opened):
     with opened() as store:
         first = pipeline.match(features[1], features[0], candidates, store=store)
     with opened() as store:
-        again = pipeline.match(features[1], features[0], candidates, store=store)
+        again = pipeline.match(features[1], features[0], candidates, store=store, track=nothing_done)
         alone, stored = pipeline.stored_matches(store)
-    assert matched.count == 10
     assert_same_matches(first, matches, PER_MATCH)
     assert matches[0].ratio is None
     assert ((first[0].ratio > 0) == first[0].mask).all()
@@ -163,18 +157,14 @@ def test_a_store_gives_what_was_matched_and_is_read_ever_after(features, candida
         np.testing.assert_array_equal(fresh[name], swept[name])
 
 
-def test_an_interrupted_matching_goes_on_where_it_was(features, candidates, opened, matched, compilations):
-    matched.limit = 9
+def test_an_interrupted_matching_goes_on_where_it_was(features, candidates, opened):
     with opened() as store, pytest.raises(KeyboardInterrupt):
-        pipeline.match(features[1], features[0], candidates, store=store)
-    matched.limit = None
+        pipeline.match(features[1], features[0], candidates, store=store, track=killed_after(9))
     with opened() as store:
         assert store.done.tolist() == [True] * pipeline.STORE_BATCH + [False] * 2
         with pytest.raises(InputError, match=r"store: expected the matches of all 10 queries, got 8; finish"):
             pipeline.stored_matches(store)
         resumed = pipeline.match(features[1], features[0], candidates, store=store)
-    assert matched.count == 9 + 2
-    assert compilations.count <= 1
     with opened(name="uninterrupted") as store:
         assert_same_matches(resumed, pipeline.match(features[1], features[0], candidates, store=store))
 
@@ -208,8 +198,8 @@ def test_bad_images_fail_by_default_with_the_mend(mixed):
 def test_skipped_images_are_listed_and_never_shortlisted(mixed, opened):
     found = pipeline.extract(mixed, SIFT, skip_bad=True)
     assert sorted(found.bad) == [1, 2]
-    assert not found.features.mask[[1, 2, 3]].any()
-    descriptors = pipeline.describe(mixed, found, fit_vlad([found[0]], num_words=4)).values
+    assert not found.counts[[1, 2, 3]].any()
+    descriptors = pipeline.describe(mixed, found, fit_vlad(pipeline.FeatureSet.of([found[0]]), num_words=4)).values
     candidates = pipeline.shortlist(descriptors, descriptors, 5)
     np.testing.assert_array_equal(candidates.indices[0], [0, 4, 3, -1, -1])
     np.testing.assert_array_equal(candidates.indices[1], [-1] * 5)
@@ -247,7 +237,9 @@ def test_features_that_are_not_finite_are_named_and_rank_last(street, value):
     found = pipeline.extract(street.database, Broken())
     assert list(found.bad) == [1]
     assert "0001.png" in found.bad[1]
-    descriptors = pipeline.describe(street.database, found, fit_vlad([found[0]], num_words=4)).values
+    descriptors = pipeline.describe(
+        street.database, found, fit_vlad(pipeline.FeatureSet.of([found[0]]), num_words=4)
+    ).values
     candidates = pipeline.shortlist(descriptors, descriptors, 10)
     assert (candidates.indices != 1).all()
 
@@ -280,12 +272,8 @@ def mixed_sizes():
     for query in range(queries):
         sizes = [SIZES[query % 2], *(SIZES[place % 2] for place in range(pairs_each))]
         pairs = [random_matches(rng, 30, sizes=(sizes[0], size)) for size in sizes[1:]]
-        joined = {
-            field: np.concatenate([getattr(pair, field)[pair.mask] for pair in pairs])
-            for field in (*per_match(pairs[0]), "mask")
-        }
-        flat.append(replace(pairs[0], **joined, image_size1=np.stack([pair.image_size1 for pair in pairs])))
-        counts.append([30] * pairs_each)
+        for part, of_one in zip((flat, counts), of_query(pairs), strict=True):
+            part.append(of_one)
     indices = np.tile(np.arange(pairs_each, dtype=np.int32), (queries, 1))
     listed = Shortlist(indices, rng.random(indices.shape).astype(np.float32), indices >= 0)
     return MatchSet(flat, np.array(counts), 64), listed

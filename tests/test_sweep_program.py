@@ -15,7 +15,7 @@ from PIL import Image
 
 from experiments import axes, launch, prepare, search, stores
 from experiments import run as evaluation
-from mfvpr.data import match_store
+from mfvpr.stores import matches as match_store
 from tests.programs import CANDIDATES, QUERIES, ROOT, composed, results, shared, small, snapshot, typed
 
 SWEEP = sys.modules["mfvpr.sweeping.sweep"]

@@ -9,6 +9,7 @@ import os
 import threading
 import zipfile
 from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -61,9 +62,29 @@ def read_arrays(path: Path, about: str = "") -> dict[str, np.ndarray]:
     if content[-_DIGEST:] != _digest(content[:-_DIGEST], about):
         raise InputError(f"{path}: expected arrays as they were written here, got others or damaged ones; delete it")
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        members = {name.removesuffix(".npy"): io.BytesIO(archive.read(name)) for name in archive.namelist()}
+        return {name.removesuffix(".npy"): _array(archive.read(name)) for name in archive.namelist()}
+
+
+def _array(member: bytes) -> np.ndarray:
+    start = 10 + int.from_bytes(member[8:10], "little")  # of the values, in the format's version 1
+    shape, fortran_order, dtype = _header(member[:start])
+    return np.frombuffer(member, dtype, offset=start).reshape(shape, order="F" if fortran_order else "C").copy()
+
+
+@lru_cache(256)
+def _header(header: bytes) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """What stands before an array's values: rows of one store have few different ones, and NumPy is slow to read them.
+
+    Raises:
+        ValueError: another version of the format, or an array of Python objects.
+    """
+    if header[6:8] != b"\x01\x00":
+        raise ValueError(f"expected an array in version 1.0 of NumPy's format, got {header[6]}.{header[7]}")
     with _PARSING:
-        return {name: np.lib.format.read_array(member, allow_pickle=False) for name, member in members.items()}
+        shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(io.BytesIO(header[8:]))
+    if dtype.hasobject:
+        raise ValueError("an array of Python objects")
+    return shape, fortran_order, dtype
 
 
 def _digest(content: memoryview, about: str) -> bytes:

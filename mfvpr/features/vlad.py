@@ -12,6 +12,7 @@ from scipy.special import softmax
 
 from mfvpr.data.images import Interpolation
 from mfvpr.errors import InputError
+from mfvpr.sources import FeatureSet
 from mfvpr.types import Features
 
 # Chosen so that R@1 hardly depends on the input's last bits, with SIFT and with ALIKED, summer against snow.
@@ -56,7 +57,7 @@ class Vlad:
 
 
 def fit_vlad(
-    database: Sequence[Features], *, num_words: int = 64, power: float = 0.5, max_samples: int = 100_000, seed: int = 0
+    database: FeatureSet, *, num_words: int = 64, power: float = 0.5, max_samples: int = 100_000, seed: int = 0
 ) -> Vlad:
     """Vocabulary of the database: the centers of a mixture of round Gaussians of equal size, by a few steps of EM.
 
@@ -75,7 +76,7 @@ def fit_vlad(
     """
     if max_samples < num_words:
         raise InputError(f"max_samples={max_samples}: expected at least one for each of num_words={num_words} words")
-    counts = np.array([np.count_nonzero(features.mask) for features in database], int)
+    counts = database.counts
     if counts.sum() < num_words:
         raise InputError(
             f"{counts.sum()} local features in {len(database)} database images: expected at least one for each of the "
@@ -84,7 +85,7 @@ def fit_vlad(
     rng = np.random.default_rng(seed)
     drawn = rng.permutation(len(database))  # whole images: one feature more in one of them changes no other's part
     enough = 1 + np.searchsorted(np.cumsum(counts[drawn]), max_samples)
-    real = [database[row].descriptors[database[row].mask] for row in drawn[:enough]]
+    real = [image.descriptors for _, image in database.read(drawn[:enough].tolist())]
     centers = _mixture(np.concatenate(real)[:max_samples], num_words, rng)
     return Vlad(centers.astype(np.float32), power)
 

@@ -20,9 +20,9 @@ from mfvpr import reranking
 from mfvpr.data.arrays import read_arrays, write_arrays
 from mfvpr.data.images import ordered_map
 from mfvpr.errors import InputError
+from mfvpr.match_sets import BYTES_PER_SLOT, MatchSet, batches, shapes, slots
 from mfvpr.numerics import available_cpus, compiled, knows_own_context
-from mfvpr.pipeline import FilterScore, MatchSet, Ties, Track, filter_scores, untracked
-from mfvpr.sweeping.batches import BYTES_PER_SLOT, batches, shapes, slots
+from mfvpr.pipeline import FilterScore, Ties, Track, filter_scores, untracked
 from mfvpr.sweeping.settings import FUSION, Group, Setting, distinct, groups
 from mfvpr.types import Array, Matches, Shortlist, per_match
 

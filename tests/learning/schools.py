@@ -1,14 +1,12 @@
 """A small path with its matches, as the lessons of experiments.learn see it."""
 
-from dataclasses import fields
-
 import numpy as np
 
 from experiments import lessons
 from experiments.judging import Judge
-from mfvpr import Matches, Shortlist, sweeping
-from mfvpr.pipeline import MatchSet
-from tests.builders import random_matches
+from mfvpr import Shortlist, sweeping
+from mfvpr.match_sets import MatchSet
+from tests.builders import of_query, random_matches
 
 QUERIES = 32
 TOLERANCES = (0, 1, 2)  # frames; the middle one decides
@@ -19,10 +17,7 @@ def matches_of(query, candidates, rng, sizes):
     """Matches of one query with its candidates one after the other, and their counts; the right ones share a shift."""
     pairs = [random_matches(rng, int(rng.integers(4, 12)), sizes=((sizes[query % 2],) * 2, (sizes[c % 2],) * 2))
              for c in candidates]  # fmt: skip
-    joined = {f.name: [getattr(pair, f.name) for pair in pairs] for f in fields(Matches)}
-    flat = {name: np.concatenate(parts) for name, parts in joined.items() if "size" not in name}
-    flat |= {"image_size0": pairs[0].image_size0, "image_size1": np.stack(joined["image_size1"])}
-    return Matches(**flat), [len(pair.mask) for pair in pairs]
+    return of_query(pairs)
 
 
 def school(settings=None, *, sizes=SIZES, half=0, only_right=()):

@@ -8,12 +8,11 @@ import pytest
 
 import mfvpr
 from mfvpr import pipeline, sweeping
-from mfvpr.pipeline import MatchSet
+from mfvpr.match_sets import MatchSet, shapes, slots
 from mfvpr.scoring.parameters import with_parameters
-from mfvpr.sweeping.batches import shapes, slots
 from mfvpr.sweeping.settings import groups
-from mfvpr.types import Shortlist, per_match
-from tests.builders import random_matches
+from mfvpr.types import Shortlist
+from tests.builders import of_query, random_matches
 from tests.scorers import FOREIGN, Sampled, Strongest, Wrapped, title
 
 FS, DMF = mfvpr.FeatureScoreWeight(), mfvpr.DescriptorDistanceWeight()
@@ -31,12 +30,8 @@ def make_set():
             random_matches(rng, count, sizes=(sizes[0], size))
             for count, size in zip(rng.permutation([0, 3, 20, 33, 60]), sizes[1:], strict=True)
         ]
-        counts.append([int(pair.mask.sum()) for pair in pairs])
-        joined = {
-            name: np.concatenate([getattr(pair, name)[pair.mask] for pair in pairs])
-            for name in (*per_match(pairs[0]), "mask")
-        }
-        flat.append(replace(pairs[0], **joined, image_size1=np.stack([pair.image_size1 for pair in pairs])))
+        for part, of_one in zip((flat, counts), of_query(pairs), strict=True):
+            part.append(of_one)
     indices = np.stack([rng.permutation(DATABASE)[:CANDIDATES] for _ in range(QUERIES)]).astype(np.int32)
     indices[2, 3:] = -1
     scores = np.sort(rng.random((QUERIES, CANDIDATES)).astype(np.float32))[:, ::-1]

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from mfvpr import Features, InputError
-from mfvpr.data.feature_store import forecast_bytes, open_store, require_space
-from mfvpr.data.store_manifest import recipe_fingerprint, store_path
+from mfvpr.stores.features import forecast_bytes, open_store, require_space
+from mfvpr.stores.manifest import recipe_fingerprint, store_path
 from tests.builders import make_features
-from tests.data.stores import RECIPE, assert_same, digests, features_of, fill, read_all
+from tests.stores.made_up import RECIPE, assert_same, digests, features_of, fill, read_all
 
 # What comes back
 

@@ -6,15 +6,17 @@ import numpy as np
 import pytest
 
 from mfvpr import InputError, Matches
-from mfvpr.data.match_store import forecast_bytes, open_match_store
-from mfvpr.data.store_manifest import MATCHES as KIND
-from mfvpr.data.store_manifest import recipe_fingerprint, store_path
-from tests.data.stores import MATCH_RECIPE, MATCHES, digests, fill, matches_of, read_all
+from mfvpr.stores.manifest import MATCHES as KIND
+from mfvpr.stores.manifest import recipe_fingerprint, store_path
+from mfvpr.stores.matches import forecast_bytes, open_match_store
+from mfvpr.types import per_match, per_pair
+from tests.stores.made_up import MATCH_RECIPE, MATCHES, digests, fill, matches_of, read_all
 
 
 def with_all(row, counts=(30, 0, 25, 5)):
     """Every field that Matches may have, those that it will gain included."""
-    rng, optional = np.random.default_rng(row), [part.name for part in fields(Matches) if part.default is None]
+    rng, present = np.random.default_rng(row), {*per_match(matches_of(row).matches), *per_pair(matches_of(row).matches)}
+    optional = [part.name for part in fields(Matches) if part.default is None and part.name not in present]
     return matches_of(row, counts, **{name: rng.random(sum(counts), np.float32) for name in optional})
 
 
@@ -57,8 +59,8 @@ def test_any_float_survives(tmp_path):
         bits.flat[: len(special)] = special[: bits.size]
         return bits.view(np.float32)
 
-    per_match = [part.name for part in fields(Matches) if part.name not in ("mask", "image_size0", "image_size1")]
-    flat = replace(query.matches, **{name: anything(getattr(query.matches, name)) for name in per_match})
+    floats = {n: v for n, v in per_match(query.matches).items() if np.issubdtype(v.dtype, np.floating)}
+    flat = replace(query.matches, **{name: anything(values) for name, values in floats.items()})
     original = replace(query, matches=flat, filter_scores=np.full(4, np.nan, np.float32))
     with MATCHES.open(tmp_path / "s", 1) as store:
         store.write({0: original})
@@ -133,13 +135,13 @@ def test_size_on_disk(tmp_path):
     rng, points = np.random.default_rng(0), np.random.default_rng(1).uniform(0, 336, (800, 3)).astype(np.float32)
     chosen = np.concatenate([np.flatnonzero(rng.random(800) < 0.25) for _ in range(40)])
     query = matches_of(0, (len(chosen), 0, 0, 0))
-    query = _flat(query, points0=points[chosen, :2], scores0=points[chosen, 2])
+    query = _flat(query, points0=points[chosen, :2], scores0=points[chosen, 2], index0=chosen.astype(np.int32))
     with MATCHES.open(tmp_path / "s", 5) as store:
         empty = store.size_bytes
         store.write(dict.fromkeys(range(5), query))
         size = store.size_bytes - empty
-    assert size < 24 * 5 * len(chosen)
-    assert size < forecast_bytes(5, 4, len(chosen) / 4) < 1.15 * 32 * 5 * len(chosen)
+    assert size < 27 * 5 * len(chosen)
+    assert size < forecast_bytes(5, 4, len(chosen) / 4) < 1.15 * 40 * 5 * len(chosen)
 
 
 # What a store is of

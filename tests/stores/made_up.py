@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from mfvpr import Features, Matches
-from mfvpr.data import store_manifest
-from mfvpr.data.feature_store import open_store
-from mfvpr.data.match_store import QueryMatches, open_match_store
+from mfvpr.stores import manifest as store_manifest
+from mfvpr.stores.features import open_store
+from mfvpr.stores.matches import QueryMatches, open_match_store
 from tests.builders import make_features
 
 ROOT = Path(__file__).parents[2]
@@ -49,6 +49,10 @@ def matches_of(row: int, counts: tuple[int, ...] = (30, 0, 25, 5), **more: Any) 
         image_size0=numbers(2),
         image_size1=numbers(len(counts), 2),
         ratio=numbers(total),
+        index0=rng.integers(0, 800, total, np.int32),
+        index1=rng.integers(0, 800, total, np.int32),
+        count0=np.array(800, np.int32),
+        count1=np.full(len(counts), 700, np.int32),
     )
     indices = np.where(np.array(counts) > 0, rng.permutation(len(counts)), -1).astype(np.int32)
     return QueryMatches(Matches(**flat | more), np.array(counts, np.int32), indices, numbers(len(counts)))
@@ -116,7 +120,7 @@ def digests(folder: Path) -> dict[str, str]:
 
 def run_here(call: str, *, prefix: tuple[str, ...] = ()) -> str:
     """Standard output of a call of test_store_faults' functions in a process of its own."""
-    command = [*prefix, sys.executable, "-c", f"from tests.data.test_store_faults import *; {call}"]
+    command = [*prefix, sys.executable, "-c", f"from tests.stores.test_faults import *; {call}"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     return done.stdout

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from mfvpr import InputError
-from mfvpr.data.feature_store import forecast_bytes, open_store
-from tests.data.stores import (
+from mfvpr.stores.features import forecast_bytes, open_store
+from tests.stores.made_up import (
     DAMAGE,
     FEATURES,
     MATCHES,
@@ -43,7 +43,7 @@ def hold(folder: str) -> None:
 
 
 def test_a_second_process_is_told_and_a_killed_one_leaves_no_lock(tmp_path):
-    call = f"from tests.data.test_store_faults import *; hold({str(tmp_path / 's')!r})"
+    call = f"from tests.stores.test_faults import *; hold({str(tmp_path / 's')!r})"
     with subprocess.Popen([sys.executable, "-c", call], cwd=ROOT, stdout=subprocess.PIPE) as holder:
         try:
             assert holder.stdout is not None
@@ -95,7 +95,7 @@ def test_a_complete_store_is_not_written(tmp_path):
     with open_store(tmp_path / "s", RECIPE, num_images=3) as store:
         with pytest.raises(InputError, match="damaged"):
             list(store.read())
-        with pytest.raises(ValueError, match="open for reading; open it again to write"):
+        with pytest.raises(ValueError, match="read only, or was complete"):
             store.write({1: features_of(1)})
     assert fill(tmp_path / "s") == [1]
 

@@ -5,21 +5,20 @@
         for row, features in store.read():
             ...
 
-A row store (`mfvpr.data.row_store`), whose rows are `keypoints` float32 `[N, 2]` (px), `descriptors` float16 `[N, D]`,
+A row store (`mfvpr.stores.rows`), whose rows are `keypoints` float32 `[N, 2]` (px), `descriptors` float16 `[N, D]`,
 all of unit length, `lengths` float32 `[N]` that they had, `scores` float32 `[N]` and `image_size` float32 `[2]` (px).
 Padding is left out. What comes back is float32; a descriptor has its length, and its direction to 5e-4, all else is as
 it was.
 """
 
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mfvpr.data.row_store import RowStore, open_rows, require_space, row_bytes
-from mfvpr.data.store_manifest import FEATURES
+from mfvpr.stores.manifest import FEATURES
+from mfvpr.stores.rows import RowStore, open_rows, require_space, row_bytes
 from mfvpr.types import Features
 
 __all__ = ["FeatureStore", "forecast_bytes", "open_store", "require_space"]
@@ -30,17 +29,17 @@ _NUM_ARRAYS = 5
 
 def open_store(
     folder: Path, recipe: Mapping[str, Any], *, num_images: int, waiting: Callable[[str], None] | None = None
-) -> AbstractContextManager[FeatureStore]:
-    """The store in `folder`, made if it is not there; while it lacks images, no other process can open it.
+) -> FeatureStore:
+    """The store in `folder`; `with` it, rows are written, and while it lacks images no other process can do so.
 
     Args:
-        folder: see `store_manifest.store_path`.
+        folder: see `manifest.store_path`.
         recipe: what the features are made from (JSON values only): weights, settings, images. Kept in plain text.
         num_images: M.
-        waiting: is told, in one line, which process this waits for; None = refuse a store that is in use.
+        waiting: see `rows.open_rows`.
 
     Raises:
-        InputError: made from something else, in use, no store at all, or the folder cannot be written.
+        InputError: made from something else, or no store at all.
     """
     return open_rows(folder, FEATURES, recipe, {"num_images": num_images}, pack=_pack, unpack=_unpack, waiting=waiting)
 
@@ -70,7 +69,7 @@ def _pack(features: Features) -> dict[str, np.ndarray]:
 
 def _unpack(parts: Mapping[str, np.ndarray]) -> Features:
     directions = parts["descriptors"].astype(np.float32)
-    norms = np.linalg.norm(directions, axis=1)
+    norms = np.sqrt(np.einsum("nd,nd->n", directions, directions))
     directions *= (parts["lengths"] / np.where(norms > 0, norms, 1))[:, None]
     return Features(
         keypoints=parts["keypoints"],

@@ -8,26 +8,25 @@ ones.
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 
-from mfvpr.data._store_disk import free_bytes, locked, told, too_full
 from mfvpr.data.arrays import read_arrays, write_arrays
 from mfvpr.data.images import ordered_map
-from mfvpr.data.store_manifest import (
+from mfvpr.errors import InputError
+from mfvpr.stores._disk import free_bytes, locked, told, too_full
+from mfvpr.stores.manifest import (
     Kind,
     check_owned,
     difference,
     is_settled,
     manifest_of,
-    recipe_fingerprint,
     settle_manifest,
 )
-from mfvpr.errors import InputError
 
 THREADS = 4  # that read ahead, or write the rows of a batch
 BLOCK = 4096  # bytes that a file system hands out at a time
@@ -39,24 +38,52 @@ Parts = Mapping[str, np.ndarray]
 
 @dataclass(eq=False)
 class RowStore(Generic[Item]):
-    """An open store; made by `open_rows`.
+    """A store; made by `open_rows`.
+
+    Anybody reads it, also while another process adds to it. Rows are written `with store:`, which holds it alone where
+    some are not done.
 
     Attributes:
         folder: where it is, absolute.
         kind: what it holds.
         sizes: lengths of axes by name, first M.
-        counts: `[M]` int32 entries of each row, -1 = not done. To be read only.
+        counts: `[M]` int32 entries of each row, -1 = not done, as they were when the store was opened or last entered.
+            To be read only.
     """
 
     folder: Path
     kind: Kind
     sizes: Mapping[str, int]
     counts: np.ndarray
-    _fingerprint: str = field(repr=False)
-    _writable: bool = field(repr=False)
+    _manifest: Mapping[str, Any] = field(repr=False)
+    _waiting: Callable[[str], None] | None = field(repr=False)
     _pack: Callable[[Item], Parts] = field(repr=False)
     _unpack: Callable[[Parts], Item] = field(repr=False)
     _layout: dict[str, str] | None = field(default=None, repr=False)
+    _is_writable: bool = field(default=False, repr=False)
+    _held: list[ExitStack] = field(default_factory=list, repr=False)  # of the blocks that are entered
+
+    def __enter__(self) -> Self:
+        """Hold the store alone, unless all rows are done; what another process made meanwhile is done as well.
+
+        Raises:
+            InputError: in use by another process, or the folder cannot be written.
+        """
+        with ExitStack() as held, told(self.folder, self.kind.content):
+            if not self._held:
+                self.counts = self._counts()
+            if not self._is_writable and not self.done.all():
+                self.folder.mkdir(parents=True, exist_ok=True)
+                held.enter_context(locked(self.folder, self.kind.content, self._waiting))
+                settle_manifest(self.folder, self.kind, self._manifest)
+                self.counts = self._counts()
+                held.callback(setattr, self, "_is_writable", False)
+                self._is_writable = True
+            self._held.append(held.pop_all())
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._held.pop().close()
 
     @property
     def done(self) -> np.ndarray:
@@ -77,15 +104,14 @@ class RowStore(Generic[Item]):
         Raises:
             InputError: the disk is full, or cannot be written: rows done before stay intact. Or a row has other arrays
                 than those before it.
-            ValueError: a row that is done or does not exist, what cannot be stored, or a store that was complete when
-                it was opened.
+            ValueError: a row that is done or does not exist, what cannot be stored, or a store that is not held.
         """
         if not items:
             return
         if refused := [row for row in items if not 0 <= row < len(self.counts) or self.counts[row] >= 0]:
             raise ValueError(f"{self.folder}: row {refused[0]} is done or does not exist")
-        if not self._writable:
-            raise ValueError(f"{self.folder}: was complete, so it is open for reading; open it again to write")
+        if not self._is_writable:
+            raise ValueError(f"{self.folder}: is read only, or was complete; write `with store:`")
         rows = {row: self._packed(row, item) for row, item in items.items()}
         self._check_layouts(rows)
         taken = [row_bytes(sum(part.nbytes for part in parts.values()), len(parts)) for parts in rows.values()]
@@ -106,11 +132,11 @@ class RowStore(Generic[Item]):
             raise ValueError(f"{self.folder}: row {missing[0]} is not done")
         paths = [self._path(row, self.counts[row]) for row in rows]
         damaged: dict[int, Path] = {}
-        for row, path, parts in zip(rows, paths, ordered_map(self._read_parts, paths, workers=THREADS), strict=True):
-            if parts is None:
+        for row, path, item in zip(rows, paths, ordered_map(self._read_item, paths, workers=THREADS), strict=True):
+            if item is None:
                 damaged[row] = path
             else:
-                yield row, self._unpack(parts)
+                yield row, item
         if damaged:
             raise InputError(self._remove(damaged))
 
@@ -118,7 +144,11 @@ class RowStore(Generic[Item]):
         return self.folder / f"{row}-{count}.npz"
 
     def _about(self, path: Path) -> str:
-        return f"{self._fingerprint} {path.name}"
+        return f"{self._manifest['fingerprint']} {path.name}"
+
+    def _counts(self) -> np.ndarray:
+        """`[M]` int32 entries of each row, as the names of the files tell; -1 = not done."""
+        return _counts(self.folder, len(self.counts), known=is_settled(self.folder, self.kind, self._manifest))
 
     def _packed(self, row: int, item: Item) -> Parts:
         try:
@@ -132,6 +162,10 @@ class RowStore(Generic[Item]):
         path = self._path(row, count)
         write_arrays(path, parts, self._about(path), compress=self.kind.compress)
         self.counts[row] = count
+
+    def _read_item(self, path: Path) -> Item | None:
+        parts = self._read_parts(path)
+        return None if parts is None else self._unpack(parts)
 
     def _read_parts(self, path: Path) -> Parts | None:
         """None where the file is damaged, or another's, or gone."""
@@ -173,7 +207,6 @@ class RowStore(Generic[Item]):
         )
 
 
-@contextmanager
 def open_rows(
     folder: Path,
     kind: Kind,
@@ -183,38 +216,30 @@ def open_rows(
     pack: Callable[[Item], Parts],
     unpack: Callable[[Parts], Item],
     waiting: Callable[[str], None] | None = None,
-) -> Iterator[RowStore[Item]]:
-    """The store in `folder`, made if it is not there.
-
-    One that lacks rows is held alone; a complete one is read by any number of processes, and may be on a disk that
-    cannot be written.
+) -> RowStore[Item]:
+    """The store in `folder`, which need not be there before the first row is written, nor be writable when all are.
 
     Args:
-        folder: see `store_manifest.store_path`.
+        folder: see `manifest.store_path`.
         kind: what it holds.
         recipe: what the rows are made from (JSON values only). Kept in plain text.
         sizes: lengths of axes by name, first that of the rows.
         pack: what is stored of an item, arrays by name; the first has a value for each of the row's entries.
         unpack: the item again.
-        waiting: is told, in one line, which process this waits for; None = refuse a store that is in use.
+        waiting: whoever writes waits for a process that does, and is told, in one line, for which; None = refuses.
 
     Raises:
-        InputError: made from something else, in use, no store at all, or the folder cannot be written.
+        InputError: made from something else, or no store at all.
     """
     folder = folder.absolute()  # the working directory may change
-    manifest, num_rows = manifest_of(kind, recipe, sizes), next(iter(sizes.values()))
-    with ExitStack() as stack:
-        with told(folder, kind.content):
-            check_owned(folder, kind)
-            counts = _counts(folder, num_rows, known=is_settled(folder, kind, manifest))
-        if writable := bool((counts < 0).any()):
-            with told(folder, kind.content):
-                folder.mkdir(parents=True, exist_ok=True)
-            stack.enter_context(locked(folder, kind.content, waiting))
-            with told(folder, kind.content):
-                settle_manifest(folder, kind, manifest)
-                counts = _counts(folder, num_rows)  # another process may have made some
-        yield RowStore(folder, kind, sizes, counts, recipe_fingerprint(recipe, kind), writable, pack, unpack)
+    manifest = manifest_of(kind, recipe, sizes)
+    store = RowStore(
+        folder, kind, sizes, np.zeros(next(iter(sizes.values())), np.int32), manifest, waiting, pack, unpack
+    )
+    with told(folder, kind.content):
+        check_owned(folder, kind)
+        store.counts = store._counts()
+    return store
 
 
 def row_bytes(num_bytes: float, num_arrays: int) -> int:

@@ -5,45 +5,27 @@
         for row, query_matches in store.read():
             ...
 
-A row store (`mfvpr.data.row_store`) that gives back the very same bits. Its rows are the fields of QueryMatches, and
+A row store (`mfvpr.stores.rows`) that gives back the very same bits. Its rows are the fields of QueryMatches, and
 those of its Matches that are there, by their names. They are compressed, since points of the query come again with
 every candidate: a match takes about 23 bytes of the 32 that it has.
 """
 
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mfvpr.data.row_store import RowStore, open_rows, row_bytes
-from mfvpr.data.store_manifest import MATCHES
+from mfvpr.match_sets import QueryMatches
+from mfvpr.stores.manifest import MATCHES
+from mfvpr.stores.rows import RowStore, open_rows, row_bytes
 from mfvpr.types import Matches
 
 _OF_QUERY = ("counts", "indices", "filter_scores")
 _OF_MATCHES = tuple(part.name for part in fields(Matches) if part.name != "mask")  # there is no padding
 _NUM_ARRAYS = len(_OF_QUERY + _OF_MATCHES)
-
-
-@dataclass(frozen=True)
-class QueryMatches:
-    """All of one query: its candidates, and their real matches one after the other. NumPy.
-
-    Attributes:
-        matches: Matches `[n, ...]` of all candidates, best candidate first, without padding; `image_size0` `[2]`,
-            `image_size1` `[C, 2]`.
-        counts: `[C]` int32 matches of each candidate; their sum is n.
-        indices: `[C]` int32 database rows, best first, -1 = none.
-        filter_scores: `[C]` float32.
-    """
-
-    matches: Matches
-    counts: np.ndarray
-    indices: np.ndarray
-    filter_scores: np.ndarray
 
 
 MatchStore = RowStore[QueryMatches]
@@ -56,18 +38,18 @@ def open_match_store(
     num_queries: int,
     num_candidates: int,
     waiting: Callable[[str], None] | None = None,
-) -> AbstractContextManager[MatchStore]:
-    """The store in `folder`, made if it is not there; while it lacks queries, no other process can open it.
+) -> MatchStore:
+    """The store in `folder`; `with` it, rows are written, and while it lacks queries no other process can do so.
 
     Args:
-        folder: see `store_manifest.store_path`, with the kind `MATCHES`.
+        folder: see `manifest.store_path`, with the kind `MATCHES`.
         recipe: what the matches are made from (JSON values only): features, shortlist, settings. Kept in plain text.
         num_queries: Q.
         num_candidates: C.
-        waiting: is told, in one line, which process this waits for; None = refuse a store that is in use.
+        waiting: see `rows.open_rows`.
 
     Raises:
-        InputError: made from something else, in use, no store at all, or the folder cannot be written.
+        InputError: made from something else, or no store at all.
     """
     sizes, pack = {"num_queries": num_queries, "num_candidates": num_candidates}, partial(_pack, num_candidates)
     return open_rows(folder, MATCHES, recipe, sizes, pack=pack, unpack=_unpack, waiting=waiting)
@@ -75,7 +57,7 @@ def open_match_store(
 
 def forecast_bytes(num_queries: int, num_candidates: int, matches_per_candidate: float) -> int:
     """Bytes on disk that queries with so many matches take at most."""
-    return num_queries * row_bytes(num_candidates * (32 * matches_per_candidate + 20) + 8, _NUM_ARRAYS)
+    return num_queries * row_bytes(num_candidates * (40 * matches_per_candidate + 24) + 8, _NUM_ARRAYS)
 
 
 def _pack(num_candidates: int, query: QueryMatches) -> dict[str, np.ndarray]:

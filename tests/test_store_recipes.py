@@ -9,14 +9,14 @@ from experiments import prepare, stores
 from mfvpr import InputError, Shortlist, pipeline
 from mfvpr.data.contents import contents
 from mfvpr.data.datasets import image_folder
-from mfvpr.data.match_store import open_match_store
-from mfvpr.data.store_manifest import store_path
-from mfvpr.extraction import FeatureSet, _stack
 from mfvpr.features.sift import Sift
+from mfvpr.sources import FeatureSet
+from mfvpr.stores.manifest import store_path
+from mfvpr.stores.matches import open_match_store
 from mfvpr.types import Matches
 from mfvpr.weights import files
-from tests.data.stores import digests, features_of
 from tests.programs import composed
+from tests.stores.made_up import digests, features_of
 
 # Matches of another shortlist
 
@@ -26,7 +26,7 @@ QUERIES, CANDIDATES = 6, 4
 @pytest.fixture(scope="module")
 def drawn():
     """Features of a few images by chance, as queries and as database."""
-    return FeatureSet(_stack(((row, features_of(row)) for row in range(QUERIES)), np.full(QUERIES, 40)), {})
+    return FeatureSet.of([features_of(row) for row in range(QUERIES)])
 
 
 @pytest.fixture(scope="module")

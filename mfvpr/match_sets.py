@@ -1,0 +1,137 @@
+"""Matches of many queries with their candidates, ragged; in batches of pairs for whatever scores them."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from mfvpr import ragged
+from mfvpr.numerics import round_up
+from mfvpr.types import Matches, per_match, per_pair
+
+BATCH_SLOTS = 2**14  # matches of a batch of pairs: its votes stay in cache
+PAIRS_STEP = 8
+SLOTS_STEP = 32
+QUANTILES = (0.25, 0.5, 0.75, 0.95, 1.0)
+BYTES_PER_SLOT = 41
+
+
+@dataclass(frozen=True)
+class QueryMatches:
+    """All of one query: its candidates, and their real matches one after the other. NumPy.
+
+    Attributes:
+        matches: Matches `[n, ...]` of all candidates, best candidate first, without padding; `image_size0` `[2]` and
+            `count0` `[]` are the query's, `image_size1` `[C, 2]` and `count1` `[C]` the candidates'.
+        counts: `[C]` int32 matches of each candidate; their sum is n.
+        indices: `[C]` int32 database rows, best first, -1 = none.
+        filter_scores: `[C]` float32.
+    """
+
+    matches: Matches
+    counts: np.ndarray
+    indices: np.ndarray
+    filter_scores: np.ndarray
+
+
+@dataclass(frozen=True)
+class MatchSet:
+    """Matches of every query with its candidates, of one scale, without padding.
+
+    Attributes:
+        matches: per query, as in QueryMatches.
+        counts: `[Q, C]` matches of each candidate.
+        capacity: slots that hold every pair's matches.
+    """
+
+    matches: Sequence[Matches]
+    counts: np.ndarray
+    capacity: int
+
+    @classmethod
+    def of(cls, queries: Sequence[QueryMatches]) -> "MatchSet":
+        """Of all queries, at least one."""
+        counts = np.array([query.counts for query in queries])
+        return cls([query.matches for query in queries], counts, round_up(int(counts.max(initial=0)), 64))
+
+    def __getitem__(self, query: int) -> Matches:
+        """Matches `[C, K, ...]` of one query, padded with zeros to the capacity."""
+        return self.pairs(np.full(self.counts.shape[1], query), np.arange(self.counts.shape[1]), self.capacity)
+
+    def __len__(self) -> int:
+        return len(self.matches)
+
+    def take(self, queries: Sequence[int] | np.ndarray) -> "MatchSet":
+        """Of some queries."""
+        return MatchSet([self.matches[query] for query in queries], self.counts[queries], self.capacity)
+
+    def pairs(self, queries: np.ndarray, places: np.ndarray, capacity: int, *, total: int | None = None) -> Matches:
+        """Matches `[P, K, ...]` of pairs, padded with zeros.
+
+        Args:
+            queries: `[P]`.
+            places: `[P]` of the candidates in their shortlists.
+            capacity: K, no less than the matches of any of the pairs.
+            total: so many pairs in all; those beyond have no matches, and the images of the last.
+        """
+        rows = [self._rows[query][place] for query, place in zip(queries.tolist(), places.tolist(), strict=True)]
+        entries, mask = ragged.padded(rows, capacity, total=total)
+        of_pair = {
+            name: np.stack([self._of_pair(name, query, place) for query, place in zip(queries, places, strict=True)])
+            for name in per_pair(self.matches[queries[0]])
+        }
+        if total is not None:
+            of_pair = {name: ragged.filled(values, total) for name, values in of_pair.items()}
+        return Matches(**entries, mask=mask, **of_pair)
+
+    @cached_property
+    def _rows(self) -> list[list[dict[str, np.ndarray]]]:
+        """By query and candidate: views."""
+        return [ragged.split(per_match(one), counts) for one, counts in zip(self.matches, self.counts, strict=True)]
+
+    def _of_pair(self, name: str, query: int, place: int) -> np.ndarray:
+        values = getattr(self.matches[query], name)
+        return values if name.endswith("0") else values[place]
+
+    @property
+    def image_sizes(self) -> tuple[np.ndarray, np.ndarray]:
+        """All combinations of sizes of query and database images, `[n, 2]` each."""
+        sizes0, sizes1 = (
+            np.unique(np.concatenate([np.reshape(getattr(one, name), (-1, 2)) for one in self.matches]), axis=0)
+            for name in ("image_size0", "image_size1")
+        )
+        return np.repeat(sizes0, len(sizes1), 0), np.tile(sizes1, (len(sizes0), 1))
+
+
+def slots(match_set: MatchSet) -> np.ndarray:
+    """`[Q, C]` slots of the batch that each pair belongs to: few sizes, each a shape to compile, of little padding."""
+    return ragged.fitting(ragged.sizes(match_set.counts, QUANTILES, SLOTS_STEP), match_set.counts)
+
+
+def shapes(match_set: MatchSet) -> dict[int, int]:
+    """Pairs of a batch by their slots; not by how many there are, so that a larger set scores them as a smaller one."""
+    return {size: round_up(BATCH_SLOTS // size, PAIRS_STEP) for size in np.unique(slots(match_set)).tolist()}
+
+
+def batches(match_set: MatchSet, queries: range) -> Iterator[tuple[np.ndarray, Matches]]:
+    """All pairs of some queries that have matches, those of about as many together.
+
+    Returns:
+        (places `[n]` in the flattened `[queries, C]`, Matches `[P, K, ...]` of P >= n pairs; padding has no matches).
+    """
+    part = slice(queries.start, queries.stop)
+    counts, sizes = match_set.counts[part].reshape(-1), slots(match_set)[part].reshape(-1)
+    for size, pairs in shapes(match_set).items():
+        places = np.flatnonzero((sizes == size) & (counts > 0))
+        for start in range(0, len(places), pairs):
+            some = places[start : start + pairs]
+            query, place = np.divmod(some, match_set.counts.shape[1])
+            yield some, match_set.pairs(query + queries.start, place, size, total=pairs)
+
+
+def compacted(found: Matches) -> list[dict[str, np.ndarray]]:
+    """Matches `[P, K, ...]` as rows: the real ones of each pair, by field. NumPy."""
+    mask = np.asarray(found.mask)
+    flat = {name: np.asarray(values)[mask] for name, values in per_match(found).items()}
+    return ragged.split(flat, mask.sum(axis=1))
