@@ -16,7 +16,8 @@ ALLOWED = {
     "matching": {"neighbors", "numerics", "types"},
     "scoring": {"errors", "numerics", "types", "weighting", "scoring"},
     "retrieval": {"numerics", "types"},
-    "reranking": {"matching", "numerics", "types", "scoring", "weighting"},
+    "reranking": {"numerics", "types", "scoring"},
+    "parameter_grids": {"matching", "numerics", "types", "scoring", "weighting", "reranking"},
     "learning": {
         "errors",
         "numerics",
