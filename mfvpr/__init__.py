@@ -10,7 +10,8 @@ from mfvpr.errors import InputError
 from mfvpr.evaluation import frame_positives, radius_positives, recall_at_k
 from mfvpr.matching import compact, filter_matches, match, match_candidates, soft_match
 from mfvpr.numerics import masked, masked_mean, masked_median, safe_sqrt
-from mfvpr.reranking import balancing_c, combine, rank, rerank, score_candidates, score_grid
+from mfvpr.parameter_grids import score_grid
+from mfvpr.reranking import balancing_c, combine, rank, rerank, score_candidates
 from mfvpr.retrieval import retrieve
 from mfvpr.scoring import (
     AggregatedScore,

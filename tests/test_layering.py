@@ -21,7 +21,8 @@ ALLOWED = {
     "pair_matching": {"data", "match_sets", "matching", "numerics", "ragged", "sources", "types"},
     "scoring": {"errors", "numerics", "types", "weighting", "scoring"},
     "retrieval": {"numerics", "types"},
-    "reranking": {"matching", "numerics", "types", "scoring", "weighting"},
+    "reranking": {"numerics", "types", "scoring"},
+    "parameter_grids": {"matching", "numerics", "types", "scoring", "weighting", "reranking"},
     "learning": {
         "errors",
         "numerics",

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from mfvpr import reranking
+from mfvpr import parameter_grids
 from mfvpr.numerics import held
-from mfvpr.reranking import WEIGHTINGS
+from mfvpr.parameter_grids import WEIGHTINGS
 from mfvpr.scoring import parameters
 from mfvpr.scoring.parameters import with_parameters
 from mfvpr.weighting import ChosenWeight
@@ -89,7 +89,7 @@ def groups(scorer: Any, settings: Sequence[Setting], image_sizes: tuple[np.ndarr
             weightings = _arrays(
                 [settings[row] for row in rows[0]], weights, whole=whole, without=set(settings[0]) - set(WEIGHTINGS)
             )
-            for fitted, part in reranking.by_capacity(chosen, values, len(rows), *image_sizes):
+            for fitted, part in parameter_grids.by_capacity(chosen, values, len(rows), *image_sizes):
                 yield Group(fitted, {name: axis[part] for name, axis in values.items()}, weightings, rows[part])
 
 

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mfvpr import reranking
+from mfvpr import parameter_grids, reranking
 from mfvpr.data.arrays import read_arrays, write_arrays
 from mfvpr.data.images import ordered_map
 from mfvpr.errors import InputError
@@ -100,7 +100,7 @@ def sweep(
         `[V, S, Q, depth]` int32 database rows, best first, -1 where there is none.
     """
     names = {name for setting in settings for name in setting}
-    reranking.refuse_own_names(scorer, names, reserved=(*reranking.WEIGHTINGS, FUSION))
+    parameter_grids.refuse_own_names(scorer, names, reserved=(*parameter_grids.WEIGHTINGS, FUSION))
     num_queries, num_candidates = candidates.mask.shape
     views = [candidates.mask] if views is None else views
     scored, places = distinct(settings)
@@ -160,7 +160,7 @@ def _scores(block: Group, held: Sequence[tuple[np.ndarray, Matches]], shape: tup
     scores = np.zeros((*block.rows.shape, shape[0] * shape[1]), np.float32)
 
     def score(batch: tuple[np.ndarray, Matches]) -> np.ndarray:
-        return np.asarray(reranking.score_settings(block.scorer, batch[1], block.settings, block.weightings))
+        return np.asarray(parameter_grids.score_settings(block.scorer, batch[1], block.settings, block.weightings))
 
     # Products this small keep one core busy: as many batches at a time as there are cores; but first one of each shape
     # alone, which compiles.
@@ -248,7 +248,7 @@ def _program(matches: Matches, pairs_by_slots: Mapping[int, int], group: Group) 
         image_size = np.ones((pairs, 2), np.float32)
         batch = Matches(**example, mask=np.ones((pairs, size), bool), image_size0=image_size, image_size1=image_size)
         settings = {name: axis[:1] for name, axis in group.settings.items()}
-        return jax.jit(reranking.score_settings).lower(group.scorer, batch, settings, group.weightings).as_text()
+        return jax.jit(parameter_grids.score_settings).lower(group.scorer, batch, settings, group.weightings).as_text()
 
     return "".join(itertools.starmap(text, pairs_by_slots.items()))
 

@@ -8,15 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from mfvpr.data.streets import (
-    Camera,
-    Facade,
-    draw_streets,
-    image_shift,
-    plan_drives,
-    streets_folder,
-    visible_points,
-)
+from mfvpr.data.streets import draw_streets, streets_folder
+from mfvpr.data.streets.camera import Camera
+from mfvpr.data.streets.drives import plan_drives
+from mfvpr.data.streets.exposure import expose
+from mfvpr.data.streets.ground_truth import Facade, image_shift, visible_points
+from mfvpr.data.streets.sheets import Sheet, texture
+from mfvpr.data.streets.weather import WEATHERS, Exposure
 
 FRAMES = 4
 SIZE = (96, 72)
@@ -74,6 +72,35 @@ def test_queries_are_dark_at_night_and_bright_in_snow(drawn: Path) -> None:
     )
     assert night < 0.7 * day
     assert night < 0.7 * snow
+
+
+@pytest.mark.parametrize(
+    "effect, size",
+    [("noise", 3), ("motion", 50), ("bloom", 1), ("defocus", 1), ("defocus_spread", 2), ("drops", 20), ("flakes", 50)],
+)
+def test_without_effects_the_image_stays_and_each_effect_changes_it(effect: str, size: float) -> None:
+    image = np.zeros((72, 96, 3), np.uint8)
+    image[20:50, 30:60] = 240
+    quiet = Exposure(noise=0.0)
+
+    def exposed(exposure: Exposure) -> np.ndarray:
+        return expose(image, replace(WEATHERS["day"], exposure=exposure), np.random.default_rng(0))
+
+    np.testing.assert_array_equal(exposed(quiet), image)
+    assert (exposed(replace(quiet, **{effect: size})) != image).any()
+
+
+def test_light_and_snow_of_a_weather_follow_its_row() -> None:
+    sheet = Sheet(1.0, 1.0, (100, 80, 60))
+    sheet.rect(0, 0, 1.0, 0.5, (100, 80, 60), glow=(200, 150, 90), snow=255)
+    day = replace(WEATHERS["day"], horizon=(100, 100, 100))
+    seen = texture(sheet, lamp_light=0.5, sun=1.2)
+    upper, lower = (0, 0, slice(3)), (-1, -1, slice(3))
+    np.testing.assert_array_equal(seen(day)[lower], (120, 96, 72))
+    np.testing.assert_array_equal(seen(replace(day, sun=0.5))[lower], (110, 88, 66))
+    np.testing.assert_array_equal(seen(replace(day, sun=0.0, lamp=(1, 0.5, 0)))[lower], (150, 100, 60))
+    np.testing.assert_array_equal(seen(replace(day, sun=0.0, glow=1.0))[upper], (200, 150, 90))
+    np.testing.assert_array_equal(seen(replace(day, snow=1.0))[upper], (114, 114, 114))  # 1.15 times the horizon
 
 
 def test_existing_folder_is_refused(tmp_path: Path) -> None:

@@ -1,133 +1,13 @@
-"""Flat drawings the street is built from: how a sheet is drawn and dressed, and the parts of a house.
-
-Every drawing is a `Sheet` measured in meters (x to the right, y down, origin at the top left corner). Besides
-its summer-day colors (RGB) it knows where it glows at night and where snow settles, so that `dress` can turn
-the same sheet into its day, night and snow textures.
-"""
-
-from __future__ import annotations
+"""What a house looks like from the street: windows, walls, shops, gable and roof."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-Image = NDArray[Any]  # uint8: the annotations of cv2 do not tell
-Color = tuple[int, int, int]
-Rng = np.random.Generator
-
-WALLS = ((226, 205, 160), (214, 170, 130), (196, 120, 96), (170, 184, 160), (176, 188, 200), (232, 224, 208),
-         (205, 150, 140), (186, 160, 120), (150, 92, 78), (216, 190, 190))  # fmt: skip
-TRIMS = ((245, 240, 230), (230, 222, 205), (120, 110, 104))
-ACCENTS = ((150, 48, 44), (38, 84, 124), (40, 96, 74), (196, 148, 48), (92, 60, 110), (48, 52, 60), (208, 96, 48))
-ROOFS = ((158, 82, 62), (132, 74, 62), (92, 92, 102), (112, 84, 76))
-CARS = ((186, 44, 40), (40, 72, 130), (228, 228, 226), (60, 64, 70), (150, 156, 160), (64, 104, 84), (214, 178, 70))
-GLASS, WARM, DARK = (62, 76, 92), (255, 196, 110), (0, 0, 0)
-
-
-@dataclass(frozen=True)
-class Weather:
-    """How a sheet looks at one hour and season; colors are RGB gains or RGB values 0..255."""
-
-    ambient: tuple[float, float, float]  # gain on the day colors
-    lamp: tuple[float, float, float]  # further gain right under a street lamp
-    glow: float  # how much of the glowing parts shows
-    snow: float  # how much of the snow shows
-    zenith: Color
-    horizon: Color  # also the color of the haze
-    haze: float  # distance at which the haze has taken 63 %, meters
-
-
-DAY = Weather((1.0, 1.0, 1.0), (0, 0, 0), 0.0, 0.0, (92, 148, 214), (214, 226, 234), 160.0)
-NIGHT = Weather((0.26, 0.30, 0.45), (0.72, 0.52, 0.26), 1.0, 0.0, (8, 12, 34), (44, 40, 62), 110.0)
-SNOW = Weather((0.56, 0.60, 0.70), (0.3, 0.22, 0.1), 0.8, 0.95, (128, 138, 164), (184, 188, 204), 75.0)
-WEATHERS = (DAY, NIGHT, SNOW)
-Textures = dict[Weather, Image]
-
-
-class Sheet:
-    """A drawing of `width` by `height` meters at `scale` px per meter; transparent where `color` is None."""
-
-    def __init__(self, width: float, height: float, color: Color | None, scale: int = 32) -> None:
-        shape = (max(2, round(height * scale)), max(2, round(width * scale)), 4)
-        self.width, self.height, self.scale = width, height, scale
-        self.day = np.zeros(shape, np.uint8)  # RGB and opacity
-        self.extra = np.zeros(shape, np.uint8)  # RGB of the glow at night, and how much snow settles
-        if color is not None:
-            self.day[:] = (*color, 255)
-
-    def rect(
-        self, x: float, y: float, width: float, height: float, color: Color, glow: Color = DARK, snow: int = 0
-    ) -> None:
-        """A rectangle with its upper left corner at (x, y)."""
-        x0, y0, x1, y1 = (max(0, round(a * self.scale)) for a in (x, y, x + width, y + height))
-        self.day[y0:y1, x0:x1] = (*color, 255)
-        self.extra[y0:y1, x0:x1] = (*glow, snow)
-
-    def polygon(self, points: ArrayLike, color: Color, glow: Color = DARK, snow: int = 0) -> None:
-        """A filled polygon with corners (n, 2)."""
-        corners = np.rint(np.asarray(points, float) * self.scale * 16).astype(np.int32)
-        cv2.fillPoly(self.day, [corners], (*color, 255), shift=4)
-        cv2.fillPoly(self.extra, [corners], (*glow, snow), shift=4)
-
-    def ellipse(
-        self, x: float, y: float, rx: float, ry: float, color: Color, glow: Color = DARK, snow: int = 0
-    ) -> None:
-        """An ellipse around (x, y) with half axes rx and ry."""
-        angles = np.linspace(0, 2 * np.pi, 20, endpoint=False)
-        points = np.stack([x + rx * np.cos(angles), y + ry * np.sin(angles)], 1)
-        self.polygon(points, color, glow, snow)
-
-    def line(self, points: ArrayLike, width: float, color: Color) -> None:
-        """An open line through points (n, 2); it neither glows nor takes snow."""
-        corners = np.rint(np.asarray(points, float) * self.scale * 16).astype(np.int32)
-        cv2.polylines(self.day, [corners], False, (*color, 255), max(1, round(width * self.scale)), shift=4)
-
-    def shade(self, gain: NDArray[np.floating]) -> None:
-        """Multiply the colors by `gain`, broadcast over rows, columns and channels."""
-        self.day[..., :3] = np.clip(self.day[..., :3] * gain, 0, 255)
-
-
-def dress(sheet: Sheet, lit: NDArray[np.floating] | float = 0.0, sun: float = 1.0) -> Textures:
-    """The textures (RGB and opacity) of a sheet in every weather.
-
-    `lit` (0..1, broadcast over rows and columns) is the lamp light that falls on it, `sun` a gain on the day.
-    """
-    light = np.broadcast_to(np.asarray(lit, np.float32), sheet.day.shape[:2])[..., None]
-    color = sheet.day[..., :3].astype(np.float32)
-    glow, cover = sheet.extra[..., :3].astype(np.float32), sheet.extra[..., 3:].astype(np.float32) / 255
-    textures = {}
-    for weather in WEATHERS:
-        ambient = np.multiply(weather.ambient, sun if weather is DAY else 1, dtype=np.float32)
-        gain = ambient + light * as_array(weather.lamp)
-        seen = np.maximum(color * gain, weather.glow * glow)
-        seen += weather.snow * cover * (as_array(tone(weather.horizon, 1.15)) - seen)
-        textures[weather] = np.dstack([np.clip(seen, 0, 255).astype(np.uint8), sheet.day[..., 3]])
-    return textures
-
-
-def as_array(color: tuple[float, float, float]) -> NDArray[np.float32]:
-    """The color as floats, ready for arithmetic."""
-    return np.array(color, np.float32)
-
-
-def blotches(rng: Rng, shape: tuple[int, int], cell: float) -> NDArray[Any]:
-    """Smooth noise of about unit spread whose spots are `cell` px wide."""
-    rows, columns = (max(2, round(n / cell)) for n in shape)
-    return cv2.resize(rng.standard_normal((rows, columns), np.float32), shape[::-1], interpolation=cv2.INTER_CUBIC)
-
-
-def pick(rng: Rng, colors: tuple[Color, ...]) -> Color:
-    """One of the colors."""
-    return colors[int(rng.integers(len(colors)))]
-
-
-def tone(color: Color, gain: float) -> Color:
-    """The color, lighter or darker."""
-    red, green, blue = (min(255, int(c * gain)) for c in color)
-    return red, green, blue
+from mfvpr.data.streets.colors import ACCENTS, DARK, GLASS, ROOFS, TRIMS, WALLS, WARM, pick, tone
+from mfvpr.data.streets.sheets import Sheet, blotches, draw_glyphs
+from mfvpr.data.streets.types import Color, Rng
 
 
 @dataclass(frozen=True)
@@ -188,14 +68,6 @@ def draw_ornament(sheet: Sheet, rng: Rng, left: float, y: float, motif: Motif, t
     if rng.random() < 0.3:  # flowers on the sill
         for x in rng.uniform(left, left + w, 7):
             sheet.ellipse(x, y + h + 0.02, 0.1, 0.1, pick(rng, ((70, 110, 60), (190, 60, 70), (220, 160, 60))))
-
-
-def draw_glyphs(sheet: Sheet, rng: Rng, x: float, y: float, width: float, height: float, color: Color) -> None:
-    """A word in no alphabet: glyphs of random strokes between the corners of a small grid."""
-    step = height * 0.85
-    for left in np.arange(x, x + width - 0.6 * step, step):
-        nodes = rng.integers(0, (3, 4), (5, 2)) / (2, 3) * (0.6 * step, height)
-        sheet.line(nodes + (left, y), height * 0.14, color)
 
 
 def draw_poster(sheet: Sheet, rng: Rng, x: float, y: float) -> None:
@@ -306,7 +178,7 @@ def draw_gable(rng: Rng, color: Color, depth: float, height: float, rise: float)
 def draw_roof(rng: Rng, width: float, slope: float) -> Sheet:
     """One tiled slope of a roof."""
     sheet = Sheet(width, slope, pick(rng, ROOFS), scale=16)
-    sheet.extra[..., 3] = np.clip(225 + 20 * blotches(rng, sheet.day.shape[:2], 12), 0, 250)
+    sheet.settle_snow(np.clip(225 + 20 * blotches(rng, sheet.day.shape[:2], 12), 0, 250))
     tiles = 1 - 0.18 * (np.arange(sheet.day.shape[0]) % 5 == 0)[:, None]
     sheet.shade((tiles * (1 + 0.08 * blotches(rng, sheet.day.shape[:2], 4)))[..., None])
     return sheet

@@ -1,0 +1,171 @@
+"""Grids of parameters against scores of their combinations, one by one."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mfvpr import (
+    AggregatedScore,
+    AnchorPoints,
+    DescriptorDistanceWeight,
+    FeatureScoreWeight,
+    HistogramOfShifts,
+    MatchCount,
+    UnitWeight,
+    filter_matches,
+    score_candidates,
+    score_grid,
+)
+from mfvpr.parameter_grids import by_capacity
+from mfvpr.weighting import ChosenWeight
+from tests.builders import random_matches
+from tests.scorers import FOREIGN, Strongest, Wrapped, plain, title
+
+
+@pytest.fixture
+def matches():
+    rng = np.random.default_rng(0)
+    pairs = [random_matches(rng, count, capacity=40) for count in (40, 0, 12)]
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *pairs)
+
+
+def test_histogram_grid_equals_the_loop(matches):
+    sigmas, bin_sizes = [10.0, 22.5, 40.0], [8.0, 15.0]
+    got = score_grid(HistogramOfShifts(), matches, sigma=sigmas, bin_size=bin_sizes)
+    assert got.shape == (3, 2, 3)
+    for i, sigma in enumerate(sigmas):
+        for j, bin_size in enumerate(bin_sizes):
+            expected = score_candidates(HistogramOfShifts(sigma=sigma, bin_size=bin_size), matches)
+            np.testing.assert_allclose(got[i, j], expected, rtol=2e-6)
+
+
+def test_anchor_grid_equals_the_loop(matches):
+    got = score_grid(AnchorPoints(), matches, window=[2, 10], tolerance=[1.0, 3.0, 4.5])
+    expected = [
+        [score_candidates(AnchorPoints(window=w, tolerance=t), matches) for t in (1.0, 3.0, 4.5)] for w in (2, 10)
+    ]
+    np.testing.assert_allclose(got, expected, rtol=2e-6)
+
+
+def test_kinds_of_weights_and_distances_are_axes_too(matches):
+    weights = [FeatureScoreWeight(), DescriptorDistanceWeight(), UnitWeight()]
+    got = score_grid(AggregatedScore(), matches, max_distance=[0.7, 1.5], weight=weights)
+    for i, limit in enumerate((0.7, 1.5)):
+        near = jax.vmap(partial(filter_matches, max_distance=limit))(matches)
+        for j, weight in enumerate(weights):
+            expected = score_candidates(AggregatedScore(weight=weight), near)
+            np.testing.assert_allclose(got[i, j], expected, rtol=2e-6)
+
+
+def test_no_program_is_mistaken_for_that_of_another_weight():
+    """Pytrees that `jit` cannot tell apart share a program now and then, by the luck of their hashes."""
+    weights = [FeatureScoreWeight(), DescriptorDistanceWeight(), UnitWeight()]
+    made = [HistogramOfShifts, AnchorPoints, AggregatedScore]
+    values = [MatchCount(), *weights, *(scorer(weight=weight) for scorer in made for weight in weights)]
+    values += [ChosenWeight((first, second), 0) for first in weights for second in weights]
+    structures = [jax.tree.structure(value) for value in values]
+    for place, one in enumerate(structures):
+        assert [other == one for other in structures].index(True) == place
+
+
+def test_temperature_is_an_axis_of_a_hard_scorer(matches):
+    got = score_grid(AnchorPoints(), matches, temperature=[0.1, 0.5])
+    expected = [score_candidates(AnchorPoints(temperature=t), matches) for t in (0.1, 0.5)]
+    np.testing.assert_allclose(got, expected, rtol=2e-6)
+
+
+def test_fine_bins_do_not_tax_coarse_ones(matches):
+    """One program per capacity, each no larger than its bins ask for."""
+    sizes = matches.image_size0, matches.image_size1
+    groups = by_capacity(HistogramOfShifts(), {"bin_size": np.array([6.0, 14.0, 15.0])}, 3, *sizes)
+    needed = [HistogramOfShifts(bin_size=size).with_capacity(*sizes).max_bins for size in (6.0, 14.0, 15.0)]
+    assert [list(rows) for _, rows in groups] == [[0], [1, 2]]
+    for scorer, rows in groups:
+        worst = max(needed[row] for row in rows)
+        assert worst <= scorer.max_bins < worst + 8
+
+
+def test_other_grid_values_cost_no_trace(matches):
+    traces = []
+
+    @jax.jit
+    def grid(sigma, bin_size):
+        traces.append(1)
+        return score_grid(HistogramOfShifts(max_bins=96), matches, sigma=sigma, bin_size=bin_size)
+
+    for shift in (0.0, 3.0):
+        grid(jnp.array([10.0, 20.0]) + shift, jnp.array([8.0]) + shift)
+    assert len(traces) == 1
+
+
+@pytest.mark.parametrize(
+    "scorer, axes, words",
+    [
+        (HistogramOfShifts(), {"sgma": [1.0]}, "sigma"),
+        (HistogramOfShifts(), {"max_bins": [1]}, "no numeric parameter"),
+        (HistogramOfShifts(), {}, "at least one axis"),
+        (HistogramOfShifts(), {"sigma": []}, "at least one value"),
+        (AnchorPoints(), {"sigma": [1.0]}, "window, tolerance"),
+        (AnchorPoints(), {"weight": [1.0]}, "expected weights such as UnitWeight"),
+        (MatchCount(), {"weight": [UnitWeight()]}, "no numeric parameter 'weight'; expected one of max_distance"),
+        (AggregatedScore(), {"sigma": [1.0]}, "no numeric parameter"),
+    ],
+)
+def test_wrong_axes_are_named(matches, scorer, axes, words):
+    with pytest.raises(ValueError, match=words):
+        score_grid(scorer, matches, **axes)
+
+
+def test_parameters_of_parts_are_axes_by_dotted_names(matches):
+    got = score_grid(
+        Wrapped(), matches, **{"inner.sigma": [10.0, 30.0], "share": [0.0, 1.0, 2.0], "inner.bin_size": [8.0, 15.0]}
+    )
+    assert got.shape == (2, 3, 2, 3)
+    for i, sigma in enumerate((10.0, 30.0)):
+        for j, share in enumerate((0.0, 1.0, 2.0)):
+            for k, bin_size in enumerate((8.0, 15.0)):
+                scorer = Wrapped(HistogramOfShifts(sigma=sigma, bin_size=bin_size), share)
+                np.testing.assert_allclose(got[i, j, k], score_candidates(scorer, matches), rtol=2e-6)
+
+
+def test_whole_numbers_stay_whole_where_they_are_meant_to(matches):
+    got = score_grid(Strongest(), matches, place=[0, 1, 3])
+    expected = [score_candidates(Strongest(place), matches) for place in (0, 1, 3)]
+    np.testing.assert_allclose(got, expected)
+
+
+def test_a_plain_function_has_the_axis_of_distances(matches):
+    got = score_grid(plain, matches, max_distance=[0.7, 1.5])
+    for row, limit in zip(got, (0.7, 1.5), strict=True):
+        near = jax.vmap(partial(filter_matches, max_distance=limit))(matches)
+        np.testing.assert_allclose(row, score_candidates(plain, near), rtol=2e-6)
+
+
+@pytest.mark.parametrize("scorer", FOREIGN, ids=title)
+def test_foreign_scorers_are_gridded_as_they_score(matches, scorer):
+    got = score_grid(scorer, matches, max_distance=[2.0, 3.0])
+    np.testing.assert_allclose(got, [score_candidates(scorer, matches)] * 2, rtol=2e-6)
+
+
+@pytest.mark.parametrize("count", [4, 20])
+def test_what_a_plain_function_closes_over_may_be_traced(count):
+    """Few candidates at once, or as many as would be shared by the cores."""
+    rng = np.random.default_rng(0)
+    pairs = jax.tree.map(lambda *leaves: np.stack(leaves), *[random_matches(rng, 30) for _ in range(count)])
+    scaled = HistogramOfShifts()
+    expected = np.sum(score_grid(scaled, pairs, sigma=[10.0, 20.0]))
+
+    def total(t, **axes):
+        weight = lambda matches: t * scaled.weight(matches)  # noqa: E731
+        scorer = scaled if axes else replace(scaled, weight=weight)
+        return jnp.sum(score_grid(scorer, pairs, sigma=[10.0, 20.0], **{name: [weight] for name in axes}))
+
+    np.testing.assert_allclose(jax.grad(total)(2.0), expected, rtol=1e-5)
+    np.testing.assert_allclose(jax.vmap(partial(total, weight=None))(jnp.ones(2)), [expected] * 2, rtol=1e-5)
+    sigmas = jnp.array([10.0, 20.0])
+    twice = jax.jit(lambda t: t * score_grid(scaled, pairs, sigma=sigmas))(2.0)
+    np.testing.assert_allclose(jnp.sum(twice), 2 * expected, rtol=1e-5)
