@@ -51,7 +51,7 @@ def main(clone: str) -> None:
 def _computed(clone: str, channels: int, rows: int, checkpoint: Mapping) -> dict[str, np.ndarray]:
     import torch
 
-    from experiments.torch_networks import MixVPR
+    from experiments.benchmark.torch_networks import MixVPR
 
     sys.path.insert(0, clone)
     from models.aggregators.mixvpr import MixVPR as Aggregator

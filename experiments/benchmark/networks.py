@@ -1,4 +1,4 @@
-"""The networks in the benchmark: mfvpr's, and the same in torch, with the same weights and images."""
+"""The networks: mfvpr's, and the same in torch, with the same weights and images."""
 
 import math
 import re
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from experiments.contestants import Entry, Lineup
+from experiments.benchmark.harness import Entry, Lineup, Results, Seconds, compete
 from mfvpr.data.images import read_image, resize
 from mfvpr.data.streets import draw_streets
 from mfvpr.features.aliked import AlikedFeatures
@@ -22,7 +22,6 @@ from mfvpr.features.d2net import D2NetFeatures
 from mfvpr.features.mixvpr import MixVprDescriptor
 from mfvpr.features.network import compiled
 from mfvpr.models.d2net import extract, preprocess
-from mfvpr.weights.conversion import Table
 from mfvpr.weights.files import is_installed, load
 from mfvpr.weights.networks import blueprint, network_of
 from mfvpr.weights.registry import entry_of
@@ -38,8 +37,13 @@ THRESHOLD = 0.1  # of the detection score: the paper's
 PAPER = "paper, RTX 2080 Ti: features 0.03 s (D2-Net at 320), matching and score of 50 candidates 0.07 s"
 
 
-def lineup() -> Lineup:
+def run(rounds: int | None, out: Path) -> None:
     """Everyone, on images of the drawn street."""
+    compete(lineup(), rounds, out)
+
+
+def lineup() -> Lineup:
+    """mfvpr's networks and torch's, where it is installed."""
     images = make_images(D2NET_SIZE)
     entries = [*of_d2net(images), *of_mixvpr(_resized(images, MIXVPR_SIZE))]
     for name in ALIKED:
@@ -52,8 +56,23 @@ def lineup() -> Lineup:
         setting={"batches": BATCHES, "sizes": sizes, "weights": weights},
         entries=entries,
         rounds=5,
-        remarks=remarks,
+        remarks=_remarks,
     )
+
+
+def _remarks(seconds: Seconds, results: Results) -> Iterator[str]:
+    """The share of D2-Net's detection, and how many keypoints each side finds."""
+    for count in BATCHES:
+        pairs = zip(*(seconds[f"{step}, batch {count}", "mfvpr"] for step in (ON_DEVICE, MAP)), strict=True)
+        share = np.median([full / dense - 1 for full, dense in pairs])
+        yield f"D2-Net, batch {count}: detection adds {100 * share:.1f} % to the dense map"
+    counts: dict[str, list[str]] = {}
+    for (step, name), result in results.items():
+        if hasattr(result[0], "keypoints"):
+            mean = np.mean([len(features.keypoints) for features in result])
+            counts.setdefault(step, []).append(f"{name} {mean:.1f}")
+    yield from (f"{step}: keypoints per image: {'; '.join(means)}" for step, means in counts.items())
+    yield PAPER
 
 
 def make_images(size: int) -> np.ndarray:
@@ -62,6 +81,10 @@ def make_images(size: int) -> np.ndarray:
         folder = Path(temporary) / "street"
         draw_streets(folder, num_frames=math.ceil(max(BATCHES) / 2), image_size=(size, size))
         return np.stack([read_image(path) for path in sorted(folder.rglob("*.png"))[: max(BATCHES)]])
+
+
+def _resized(images: np.ndarray, size: int) -> np.ndarray:
+    return np.stack([resize(image, (size, size)) for image in images])
 
 
 def make_network(name: str) -> tuple[Any, dict[str, np.ndarray]]:
@@ -89,58 +112,53 @@ def of_d2net(images: np.ndarray) -> list[Entry]:
     model, arrays = make_network(D2NET)
     dense = compiled(model, lambda model, batch: model(preprocess(batch)))
     on_device = compiled(model, partial(extract, share=0.3))
-    entries: list[Entry] = []
-    for count in BATCHES:
-        batch = images[:count]
-        features = D2NetFeatures(model, image_size=images.shape[2:0:-1], batch_size=count)
-        entries += [
-            (f"{MAP}, batch {count}", "mfvpr", partial(_on_device, dense, batch)),
-            (f"{ON_DEVICE}, batch {count}", "mfvpr", partial(_on_device, on_device, batch)),
-            (f"{FEATURES}, batch {count}", "mfvpr", partial(features, batch)),
-        ]
-    if find_spec("torch") is None:
-        return entries
-    from experiments.torch_networks import D2Net
+    extractor = partial(D2NetFeatures, model, image_size=images.shape[2:0:-1])
+    steps = {
+        MAP: lambda _: partial(_on_device, dense),
+        ON_DEVICE: lambda _: partial(_on_device, on_device),
+        FEATURES: lambda count: extractor(batch_size=count),
+    }
+    entries = of_mfvpr(steps, images)
+    if find_spec("torch"):
+        from experiments.benchmark.torch_networks import D2Net
 
-    module = load_torch(D2Net(), arrays, network_of(entry_of(D2NET)).table)
-    entries += of_torch(MAP, module, images)
-    return entries + of_torch(FEATURES, module, images, D2Net.extract)
+        entries += of_torch({MAP: D2Net.forward, FEATURES: D2Net.extract}, loaded(D2Net(), D2NET, arrays), images)
+    return entries
 
 
 def of_mixvpr(images: np.ndarray) -> list[Entry]:
     """Descriptors on the host."""
     model, arrays = make_network(MIXVPR)
     step = "MixVPR descriptor"
-    entries: list[Entry] = []
-    for count in BATCHES:
-        describe = MixVprDescriptor(model, batch_size=count)
-        entries.append((f"{step}, batch {count}", "mfvpr", partial(describe, images[:count], ())))
-    if find_spec("torch") is None:
-        return entries
-    from experiments.torch_networks import MixVPR
+    entries = of_mfvpr({step: lambda count: partial(MixVprDescriptor(model, batch_size=count), features=())}, images)
+    if find_spec("torch"):
+        from experiments.benchmark.torch_networks import MixVPR
 
-    module = load_torch(MixVPR(), arrays, network_of(entry_of(MIXVPR)).table)
-    return entries + of_torch(step, module, images, lambda model, batch: model(batch).cpu().numpy())
+        entries += of_torch({step: MixVPR.describe}, loaded(MixVPR(), MIXVPR, arrays), images)
+    return entries
 
 
 def of_aliked(name: str, images: np.ndarray) -> list[Entry]:
     """Keypoints from host to host."""
     model, arrays = make_network(name)
     step = f"{name} features"
-    entries: list[Entry] = []
-    for count in BATCHES:
-        features = AlikedFeatures(model, image_size=images.shape[2:0:-1], threshold=THRESHOLD, batch_size=count)
-        entries.append((f"{step}, batch {count}", "mfvpr", partial(features, images[:count])))
-    if find_spec("torch") is None:
-        return entries
-    from experiments.torch_aliked import Aliked
+    extractor = partial(AlikedFeatures, model, image_size=images.shape[2:0:-1], threshold=THRESHOLD)
+    entries = of_mfvpr({step: lambda count: extractor(batch_size=count)}, images)
+    if find_spec("torch"):
+        from experiments.benchmark.torch_aliked import Aliked
 
-    module = load_torch(Aliked(name, THRESHOLD), arrays, network_of(entry_of(name)).table)
-    return entries + of_torch(step, module, images, Aliked.extract, note=" (deformable convolution in Python)")
+        module, note = loaded(Aliked(name, THRESHOLD), name, arrays), " (deformable convolution in Python)"
+        entries += of_torch({step: Aliked.extract}, module, images, note)
+    return entries
 
 
-def _resized(images: np.ndarray, size: int) -> np.ndarray:
-    return np.stack([resize(image, (size, size)) for image in images])
+def of_mfvpr(steps: Mapping[str, Callable[[int], Callable]], images: np.ndarray) -> list[Entry]:
+    """Each step of every batch; a step is given the batch's size, and returns what takes such a batch."""
+    return [
+        (f"{step}, batch {count}", "mfvpr", partial(make(count), images[:count]))
+        for count in BATCHES
+        for step, make in steps.items()
+    ]
 
 
 def _on_device(program: Callable[[Any], Any], batch: np.ndarray) -> Any:
@@ -149,13 +167,13 @@ def _on_device(program: Callable[[Any], Any], batch: np.ndarray) -> Any:
     return jax.block_until_ready([program(batch[start : start + size]) for start in range(0, len(batch), size)])
 
 
-def load_torch(module: Any, arrays: Mapping[str, np.ndarray], table: Table) -> Any:
+def loaded(module: Any, name: str, arrays: Mapping[str, np.ndarray]) -> Any:
     """The torch network with our arrays under the published keys, conversion backwards; ready for inference."""
     import torch
 
     state = module.state_dict()
     for key in state:
-        for rule in table.rules:
+        for rule in network_of(entry_of(name)).table.rules:
             if match := re.fullmatch(rule.source, key):
                 array, axes = arrays[match.expand(rule.target)], rule.layout.value
                 state[key] = torch.from_numpy(np.array(array if axes is None else array.transpose(np.argsort(axes))))
@@ -163,7 +181,7 @@ def load_torch(module: Any, arrays: Mapping[str, np.ndarray], table: Table) -> A
     return module.eval()
 
 
-def of_torch(step: str, module: Any, images: np.ndarray, method: Callable | None = None, note: str = "") -> list[Entry]:
+def of_torch(steps: Mapping[str, Callable], module: Any, images: np.ndarray, note: str = "") -> list[Entry]:
     """In both memory layouts; on a CPU one by one as well, as mfvpr does it. As precise as mfvpr on a GPU."""
     import torch
 
@@ -171,45 +189,30 @@ def of_torch(step: str, module: Any, images: np.ndarray, method: Callable | None
     torch.backends.cudnn.benchmark = True
     device = "cuda" if torch.cuda.is_available() else "cpu"
     default, channels_last = (
-        partial(_in_torch, deepcopy(module).to(device, memory_format=layout), method or type(module).forward, layout)
+        partial(_in_torch, deepcopy(module).to(device, memory_format=layout), layout)
         for layout in (torch.contiguous_format, torch.channels_last)
     )
     entries: list[Entry] = []
-    for count in BATCHES:
-        batch, where = images[:count], f"{step}, batch {count}"
-        entries.append((where, f"torch{note}", partial(default, batch)))
-        entries.append((where, f"torch, channels last{note}", partial(channels_last, batch)))
-        if count > 1 and device == "cpu":
-            one_by_one = partial(_each, channels_last, np.split(batch, count))
-            entries.append((where, f"torch, channels last, one by one{note}", one_by_one))
+    for step, method in steps.items():
+        for count in BATCHES:
+            batch, where = images[:count], f"{step}, batch {count}"
+            entries.append((where, f"torch{note}", partial(default, method, [batch])))
+            entries.append((where, f"torch, channels last{note}", partial(channels_last, method, [batch])))
+            if count > 1 and device == "cpu":
+                one_by_one = partial(channels_last, method, np.split(batch, count))
+                entries.append((where, f"torch, channels last, one by one{note}", one_by_one))
     return entries
 
 
-def _in_torch(model: Any, method: Callable, layout: "torch.memory_format", batch: np.ndarray) -> Any:
+def _in_torch(model: Any, layout: "torch.memory_format", method: Callable, batches: list[np.ndarray]) -> list[Any]:
+    """What `method` gives for each image."""
     import torch
 
+    results = []
     with torch.inference_mode():
-        on_device = torch.from_numpy(batch).to(next(model.parameters()).device)
-        result = method(model, model.prepared(on_device).contiguous(memory_format=layout))
-        if on_device.is_cuda:
-            torch.cuda.synchronize()
-        return result
-
-
-def _each(run: Callable[[np.ndarray], Any], batches: list[np.ndarray]) -> list[Any]:
-    return [one for batch in batches for one in run(batch)]
-
-
-def remarks(seconds: Mapping[tuple[str, str], list[float]], results: Mapping[tuple[str, str], Any]) -> Iterator[str]:
-    """What the medians do not say: the share of D2-Net's detection, and how many keypoints each side finds."""
-    for count in BATCHES:
-        pairs = zip(*(seconds[f"{step}, batch {count}", "mfvpr"] for step in (ON_DEVICE, MAP)), strict=True)
-        share = np.median([full / dense - 1 for full, dense in pairs])
-        yield f"D2-Net, batch {count}: detection adds {100 * share:.1f} % to the dense map"
-    counts: dict[str, list[str]] = {}
-    for (step, name), result in results.items():
-        if hasattr(result[0], "keypoints"):
-            mean = np.mean([len(one.keypoints) for one in result])
-            counts.setdefault(step, []).append(f"{name} {mean:.1f}")
-    yield from (f"{step}: keypoints per image: {'; '.join(found)}" for step, found in counts.items())
-    yield PAPER
+        for batch in batches:
+            on_device = torch.from_numpy(batch).to(next(model.parameters()).device)
+            results += method(model, model.prepared(on_device).contiguous(memory_format=layout))
+            if on_device.is_cuda:
+                torch.cuda.synchronize()
+    return results

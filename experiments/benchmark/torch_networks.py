@@ -7,13 +7,20 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from mfvpr.models.imagenet import DEVIATION, MEAN
 
-class Found(NamedTuple):
-    """Local features of one image, on the host."""
+
+class LocalFeatures(NamedTuple):
+    """Of one image, on the host."""
 
     keypoints: np.ndarray  # [n, 2] (x, y), px
     descriptors: np.ndarray  # [n, D]
     scores: np.ndarray  # [n]
+
+
+def on_host(*tensors: Tensor) -> LocalFeatures:
+    """Keypoints, descriptors and scores as arrays."""
+    return LocalFeatures(*(tensor.cpu().numpy() for tensor in tensors))
 
 
 class D2Net(nn.Module):
@@ -25,15 +32,9 @@ class D2Net(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.dense_feature_extraction = nn.ModuleDict({"model": nn.Sequential(*_vgg_layers())})
-        taps = torch.tensor(
-            [
-                [[0, -0.5, 0], [0, 0, 0], [0, 0.5, 0]],  # di
-                [[0, 0, 0], [-0.5, 0, 0.5], [0, 0, 0]],  # dj
-                [[0, 1, 0], [0, -2, 0], [0, 1, 0]],  # dii
-                [[0, 0, 0], [1, -2, 1], [0, 0, 0]],  # djj
-                [[0.25, 0, -0.25], [0, 0, 0], [-0.25, 0, 0.25]],  # dij
-            ]
-        )
+        slope, curve, here = torch.tensor([[-0.5, 0, 0.5], [1, -2, 1], [0, 1, 0]])
+        factors = (slope, here), (here, slope), (curve, here), (here, curve), (slope, slope)  # di, dj, dii, djj, dij
+        taps = torch.stack([torch.outer(down, right) for down, right in factors])
         self.register_buffer("_taps", taps[:, None], persistent=False)
 
     def prepared(self, images: Tensor) -> Tensor:
@@ -45,7 +46,7 @@ class D2Net(nn.Module):
         """Dense maps `[B, 512, h, w]`."""
         return F.relu(self.dense_feature_extraction["model"](images))
 
-    def extract(self, images: Tensor) -> list[Found]:
+    def extract(self, images: Tensor) -> list[LocalFeatures]:
         """Keypoints with their descriptors, from images as `prepared` makes them."""
         dense = self(images).contiguous()
         di, dj, dii, djj, dij = (_derivative(dense, taps) for taps in self.get_buffer("_taps").split(1))
@@ -54,7 +55,7 @@ class D2Net(nn.Module):
         highest = dense == F.max_pool2d(dense, 3, stride=1, padding=1)
         detected = strongest & highest & (det > 0) & (trace * trace / det <= self._EDGE)
         steps = torch.stack([(dij * dj - djj * di) / det, (dij * di - dii * dj) / det], -1)
-        return [_described(*one) for one in zip(dense, detected, steps, strict=True)]
+        return [_described(*image) for image in zip(dense, detected, steps, strict=True)]
 
 
 def _vgg_layers() -> list[nn.Module]:
@@ -71,11 +72,10 @@ def _vgg_layers() -> list[nn.Module]:
 
 def _derivative(dense: Tensor, taps: Tensor) -> Tensor:
     """Of every channel `[B, C, h, w]` by itself, zeros outside."""
-    height, width = dense.shape[2:]
-    return F.conv2d(dense.reshape(-1, 1, height, width), taps, padding=1).reshape(dense.shape)
+    return F.conv2d(dense.flatten(0, 1)[:, None], taps, padding=1).reshape(dense.shape)
 
 
-def _described(dense: Tensor, detected: Tensor, steps: Tensor) -> Found:
+def _described(dense: Tensor, detected: Tensor, steps: Tensor) -> LocalFeatures:
     """Features of one map `[C, h, w]`: refined positions, and the map interpolated there."""
     channel, row, column = detected.nonzero(as_tuple=True)
     step = steps[channel, row, column]
@@ -84,26 +84,19 @@ def _described(dense: Tensor, detected: Tensor, steps: Tensor) -> Found:
     low, high = position.floor().long(), position.ceil().long()
     kept = (step.abs() < 0.5).all(1) & (low >= 0).all(1) & (high < size).all(1)
     scores = dense[channel, row, column][kept]
-    position, low, high = position[kept], low[kept], high[kept]
-    below, right = (position - low).T
+    position, (top, left), (bottom, right) = position[kept], low[kept].T, high[kept].T
+    below, beside = (position - low[kept]).T
     descriptors = (
-        dense[:, low[:, 0], low[:, 1]] * ((1 - below) * (1 - right))
-        + dense[:, low[:, 0], high[:, 1]] * ((1 - below) * right)
-        + dense[:, high[:, 0], low[:, 1]] * (below * (1 - right))
-        + dense[:, high[:, 0], high[:, 1]] * (below * right)
+        dense[:, top, left] * ((1 - below) * (1 - beside))
+        + dense[:, top, right] * ((1 - below) * beside)
+        + dense[:, bottom, left] * (below * (1 - beside))
+        + dense[:, bottom, right] * (below * beside)
     )
     return on_host((4 * position + 1.5).flip(1), F.normalize(descriptors, dim=0).T, scores)
 
 
-def on_host(*tensors: Tensor) -> Found:
-    """Keypoints, descriptors and scores as arrays."""
-    return Found(*(tensor.cpu().numpy() for tensor in tensors))
-
-
 class MixVPR(nn.Module):
     """ResNet-50 to its third layer, four mixers over the positions, two projections."""
-
-    _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
     def __init__(self, out_channels: int = 1024, out_rows: int = 4) -> None:
         super().__init__()
@@ -119,7 +112,7 @@ class MixVPR(nn.Module):
 
     def prepared(self, images: Tensor) -> Tensor:
         """`[B, H, W, 3]` uint8 RGB -> what the network takes."""
-        mean, deviation = (torch.tensor(values, device=images.device) for values in (self._MEAN, self._DEVIATION))
+        mean, deviation = (torch.tensor(values, device=images.device) for values in (MEAN, DEVIATION))
         return ((images / 255 - mean) / deviation).permute(0, 3, 1, 2)
 
     def forward(self, images: Tensor) -> Tensor:
@@ -127,6 +120,10 @@ class MixVPR(nn.Module):
         mixed = self.aggregator["mix"](self.backbone["model"](images).flatten(2))  # [B, 1024, positions]
         projected = self.aggregator["channel_proj"](mixed.transpose(1, 2)).transpose(1, 2)
         return F.normalize(self.aggregator["row_proj"](projected).flatten(1))
+
+    def describe(self, images: Tensor) -> np.ndarray:
+        """`forward` on the host."""
+        return self(images).cpu().numpy()
 
 
 class _Mixer(nn.Module):
@@ -141,8 +138,7 @@ class _Mixer(nn.Module):
 class _ResNet(nn.Module):
     def __init__(self) -> None:
         super().__init__()
-        self.conv1 = nn.Conv2d(3, 64, 7, stride=2, padding=3, bias=False)
-        self.bn1 = nn.BatchNorm2d(64)
+        self.conv1, self.bn1 = nn.Conv2d(3, 64, 7, stride=2, padding=3, bias=False), nn.BatchNorm2d(64)
         self.layer1 = _layer(3, 64, 64, stride=1)
         self.layer2 = _layer(4, 256, 128, stride=2)
         self.layer3 = _layer(6, 512, 256, stride=2)
@@ -160,12 +156,10 @@ def _layer(blocks: int, inputs: int, width: int, stride: int) -> nn.Sequential:
 class _Bottleneck(nn.Module):
     def __init__(self, inputs: int, width: int, stride: int, shortcut: bool = False) -> None:
         super().__init__()
-        self.conv1 = nn.Conv2d(inputs, width, 1, bias=False)
-        self.bn1 = nn.BatchNorm2d(width)
+        self.conv1, self.bn1 = nn.Conv2d(inputs, width, 1, bias=False), nn.BatchNorm2d(width)
         self.conv2 = nn.Conv2d(width, width, 3, stride=stride, padding=1, bias=False)
         self.bn2 = nn.BatchNorm2d(width)
-        self.conv3 = nn.Conv2d(width, 4 * width, 1, bias=False)
-        self.bn3 = nn.BatchNorm2d(4 * width)
+        self.conv3, self.bn3 = nn.Conv2d(width, 4 * width, 1, bias=False), nn.BatchNorm2d(4 * width)
         projection = nn.Conv2d(inputs, 4 * width, 1, stride=stride, bias=False)
         self.downsample = nn.Sequential(projection, nn.BatchNorm2d(4 * width)) if shortcut else nn.Identity()
 
