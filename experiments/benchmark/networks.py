@@ -1,15 +1,13 @@
 """The networks: mfvpr's, and the same in torch, with the same weights and images."""
 
 import math
-import re
 import tempfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
-from copy import deepcopy
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
@@ -25,9 +23,6 @@ from mfvpr.models.d2net import extract, preprocess
 from mfvpr.weights.files import is_installed, load
 from mfvpr.weights.networks import blueprint, network_of
 from mfvpr.weights.registry import entry_of
-
-if TYPE_CHECKING:
-    import torch
 
 BATCHES = (1, 8)
 D2NET_SIZE, MIXVPR_SIZE, ALIKED_SIZE = 336, 320, 320  # px
@@ -120,9 +115,9 @@ def of_d2net(images: np.ndarray) -> list[Entry]:
     }
     entries = of_mfvpr(steps, images)
     if find_spec("torch"):
-        from experiments.benchmark.torch_networks import D2Net
+        from experiments.benchmark.torch_networks import d2net, d2net_map
 
-        entries += of_torch({MAP: D2Net.forward, FEATURES: D2Net.extract}, loaded(D2Net(), D2NET, arrays), images)
+        entries += of_torch({MAP: d2net_map, FEATURES: d2net}, D2NET, arrays, images)
     return entries
 
 
@@ -132,9 +127,9 @@ def of_mixvpr(images: np.ndarray) -> list[Entry]:
     step = "MixVPR descriptor"
     entries = of_mfvpr({step: lambda count: partial(MixVprDescriptor(model, batch_size=count), features=())}, images)
     if find_spec("torch"):
-        from experiments.benchmark.torch_networks import MixVPR
+        from experiments.benchmark.torch_networks import mixvpr
 
-        entries += of_torch({step: MixVPR.describe}, loaded(MixVPR(), MIXVPR, arrays), images)
+        entries += of_torch({step: mixvpr}, MIXVPR, arrays, images)
     return entries
 
 
@@ -145,10 +140,10 @@ def of_aliked(name: str, images: np.ndarray) -> list[Entry]:
     extractor = partial(AlikedFeatures, model, image_size=images.shape[2:0:-1], threshold=THRESHOLD)
     entries = of_mfvpr({step: lambda count: extractor(batch_size=count)}, images)
     if find_spec("torch"):
-        from experiments.benchmark.torch_aliked import Aliked
+        from experiments.benchmark.torch_aliked import aliked
 
-        module, note = loaded(Aliked(name, THRESHOLD), name, arrays), " (deformable convolution in Python)"
-        entries += of_torch({step: Aliked.extract}, module, images, note)
+        note = " (deformable convolution in Python)"
+        entries += of_torch({step: partial(aliked, threshold=THRESHOLD)}, name, arrays, images, note)
     return entries
 
 
@@ -167,52 +162,28 @@ def _on_device(program: Callable[[Any], Any], batch: np.ndarray) -> Any:
     return jax.block_until_ready([program(batch[start : start + size]) for start in range(0, len(batch), size)])
 
 
-def loaded(module: Any, name: str, arrays: Mapping[str, np.ndarray]) -> Any:
-    """The torch network with our arrays under the published keys, conversion backwards; ready for inference."""
-    import torch
-
-    state = module.state_dict()
-    for key in state:
-        for rule in network_of(entry_of(name)).table.rules:
-            if match := re.fullmatch(rule.source, key):
-                array, axes = arrays[match.expand(rule.target)], rule.layout.value
-                state[key] = torch.from_numpy(np.array(array if axes is None else array.transpose(np.argsort(axes))))
-    module.load_state_dict(state)
-    return module.eval()
-
-
-def of_torch(steps: Mapping[str, Callable], module: Any, images: np.ndarray, note: str = "") -> list[Entry]:
+def of_torch(
+    steps: Mapping[str, Callable], name: str, arrays: Mapping[str, np.ndarray], images: np.ndarray, note: str = ""
+) -> list[Entry]:
     """In both memory layouts; on a CPU one by one as well, as mfvpr does it. As precise as mfvpr on a GPU."""
     import torch
 
+    from experiments.benchmark.torch_networks import each, published
+
     torch.backends.cudnn.allow_tf32 = False
     torch.backends.cudnn.benchmark = True
-    device = "cuda" if torch.cuda.is_available() else "cpu"
+    device, table = "cuda" if torch.cuda.is_available() else "cpu", network_of(entry_of(name)).table
     default, channels_last = (
-        partial(_in_torch, deepcopy(module).to(device, memory_format=layout), layout)
+        partial(each, weights=published(arrays, table, device, layout), device=device, layout=layout)
         for layout in (torch.contiguous_format, torch.channels_last)
     )
     entries: list[Entry] = []
-    for step, method in steps.items():
+    for step, network in steps.items():
         for count in BATCHES:
             batch, where = images[:count], f"{step}, batch {count}"
-            entries.append((where, f"torch{note}", partial(default, method, [batch])))
-            entries.append((where, f"torch, channels last{note}", partial(channels_last, method, [batch])))
+            entries.append((where, f"torch{note}", partial(default, network, [batch])))
+            entries.append((where, f"torch, channels last{note}", partial(channels_last, network, [batch])))
             if count > 1 and device == "cpu":
-                one_by_one = partial(channels_last, method, np.split(batch, count))
+                one_by_one = partial(channels_last, network, np.split(batch, count))
                 entries.append((where, f"torch, channels last, one by one{note}", one_by_one))
     return entries
-
-
-def _in_torch(model: Any, layout: "torch.memory_format", method: Callable, batches: list[np.ndarray]) -> list[Any]:
-    """What `method` gives for each image."""
-    import torch
-
-    results = []
-    with torch.inference_mode():
-        for batch in batches:
-            on_device = torch.from_numpy(batch).to(next(model.parameters()).device)
-            results += method(model, model.prepared(on_device).contiguous(memory_format=layout))
-            if on_device.is_cuda:
-                torch.cuda.synchronize()
-    return results

@@ -1,13 +1,49 @@
-"""D2-Net and MixVPR in plain torch, with the keys of the published weights: what mfvpr's are timed against."""
+"""D2-Net and MixVPR in plain torch, with the keys of the published weights: what mfvpr's are timed against.
 
-from typing import NamedTuple
+A network is a function of its weights and of images `[B, 3, H, W]`, RGB, 0 .. 255.
+"""
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from mfvpr.models.imagenet import DEVIATION, MEAN
+from mfvpr.weights.conversion import Table
+
+Weights = Callable[[str], Tensor]  # by published keys
+
+
+def published(arrays: Mapping[str, np.ndarray], table: Table, device: str, layout: torch.memory_format) -> Weights:
+    """Our arrays by their published keys, conversion backwards."""
+
+    @cache
+    def weight(key: str) -> Tensor:
+        rule, match = next((rule, match) for rule in table.rules if (match := re.fullmatch(rule.source, key)))
+        array, axes = arrays[match.expand(rule.target)], rule.layout.value
+        tensor = torch.from_numpy(np.array(array if axes is None else array.transpose(np.argsort(axes)))).to(device)
+        return tensor.contiguous(memory_format=layout) if tensor.ndim == 4 else tensor
+
+    return weight
+
+
+def each(
+    network: Callable, batches: Iterable[np.ndarray], *, weights: Weights, device: str, layout: torch.memory_format
+) -> list[Any]:
+    """What the network gives for each image of batches `[B, H, W, 3]` uint8 RGB."""
+    results = []
+    with torch.inference_mode():
+        for batch in batches:
+            images = torch.from_numpy(batch).to(device).permute(0, 3, 1, 2).contiguous(memory_format=layout)
+            results.extend(network(weights, images))
+    if device == "cuda":
+        torch.cuda.synchronize()
+    return results
 
 
 class LocalFeatures(NamedTuple):
@@ -23,51 +59,56 @@ def on_host(*tensors: Tensor) -> LocalFeatures:
     return LocalFeatures(*(tensor.cpu().numpy() for tensor in tensors))
 
 
-class D2Net(nn.Module):
-    """VGG16 to conv4_3 with stride 4, then the maxima of its map over channels and neighborhoods."""
-
-    _MEAN = (103.939, 116.779, 123.68)  # BGR
-    _EDGE = (5 + 1) ** 2 / 5
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.dense_feature_extraction = nn.ModuleDict({"model": nn.Sequential(*_vgg_layers())})
-        slope, curve, here = torch.tensor([[-0.5, 0, 0.5], [1, -2, 1], [0, 1, 0]])
-        factors = (slope, here), (here, slope), (curve, here), (here, curve), (slope, slope)  # di, dj, dii, djj, dij
-        taps = torch.stack([torch.outer(down, right) for down, right in factors])
-        self.register_buffer("_taps", taps[:, None], persistent=False)
-
-    def prepared(self, images: Tensor) -> Tensor:
-        """`[B, H, W, 3]` uint8 RGB -> what the network takes; the mean is subtracted in float64, as published."""
-        mean = torch.tensor(self._MEAN, dtype=torch.float64, device=images.device)
-        return (images.flip(-1) - mean).float().permute(0, 3, 1, 2)
-
-    def forward(self, images: Tensor) -> Tensor:
-        """Dense maps `[B, 512, h, w]`."""
-        return F.relu(self.dense_feature_extraction["model"](images))
-
-    def extract(self, images: Tensor) -> list[LocalFeatures]:
-        """Keypoints with their descriptors, from images as `prepared` makes them."""
-        dense = self(images).contiguous()
-        di, dj, dii, djj, dij = (_derivative(dense, taps) for taps in self.get_buffer("_taps").split(1))
-        det, trace = dii * djj - dij * dij, dii + djj
-        strongest = dense == dense.amax(1, keepdim=True)
-        highest = dense == F.max_pool2d(dense, 3, stride=1, padding=1)
-        detected = strongest & highest & (det > 0) & (trace * trace / det <= self._EDGE)
-        steps = torch.stack([(dij * dj - djj * di) / det, (dij * di - dii * dj) / det], -1)
-        return [_described(*image) for image in zip(dense, detected, steps, strict=True)]
+def conv(w: Weights, name: str, x: Tensor, *, bias: bool = False, **options: int) -> Tensor:
+    """Convolution with the weights of this name."""
+    return F.conv2d(x, w(f"{name}.weight"), w(f"{name}.bias") if bias else None, **options)
 
 
-def _vgg_layers() -> list[nn.Module]:
-    layers: list[nn.Module] = []
-    inputs = 3
-    for block, widths in enumerate(((64, 64), (128, 128), (256, 256, 256), (512, 512, 512)), start=1):
-        dilation = 2 if block == 4 else 1
-        for width in widths:
-            layers += [nn.Conv2d(inputs, width, 3, padding=dilation, dilation=dilation), nn.ReLU(inplace=True)]
-            inputs = width
-        layers.append(nn.AvgPool2d(2, stride=1) if block == 3 else nn.MaxPool2d(2))
-    return layers[:-2]  # ends with conv4_3
+def batch_norm(w: Weights, name: str, x: Tensor) -> Tensor:
+    """By the running statistics."""
+    mean, variance, weight, bias = (w(f"{name}.{key}") for key in ("running_mean", "running_var", "weight", "bias"))
+    return F.batch_norm(x, mean, variance, weight, bias)
+
+
+def _linear(w: Weights, name: str, x: Tensor) -> Tensor:
+    return F.linear(x, w(f"{name}.weight"), w(f"{name}.bias"))
+
+
+_BGR_MEAN = (103.939, 116.779, 123.68)
+_EDGE = (5 + 1) ** 2 / 5
+_SLOPE, _CURVE, _HERE = torch.tensor([[-0.5, 0, 0.5], [1, -2, 1], [0, 1, 0]])
+_TAPS = [  # di, dj, dii, djj, dij
+    torch.outer(down, right)[None, None]
+    for down, right in ((_SLOPE, _HERE), (_HERE, _SLOPE), (_CURVE, _HERE), (_HERE, _CURVE), (_SLOPE, _SLOPE))
+]
+
+
+def d2net_map(w: Weights, images: Tensor) -> Tensor:
+    """Dense maps `[B, 512, h, w]`: VGG16 to conv4_3 with stride 4; the mean is subtracted in float64, as published."""
+    mean = torch.tensor(_BGR_MEAN, dtype=torch.float64, device=images.device)
+    x = (images.flip(1) - mean[:, None, None]).float()
+    for position in (0, 2, 4, 5, 7, 9, 10, 12, 14, 16, 17, 19, 21):  # in the published order of layers
+        if position in (4, 9):
+            x = F.max_pool2d(x, 2)
+        elif position == 16:
+            x = F.avg_pool2d(x, 2, stride=1)
+        else:
+            reach = 1 if position < 16 else 2
+            name = f"dense_feature_extraction.model.{position}"
+            x = F.relu(conv(w, name, x, bias=True, padding=reach, dilation=reach), inplace=True)
+    return x
+
+
+def d2net(w: Weights, images: Tensor) -> list[LocalFeatures]:
+    """Features at the maxima of the dense map over channels and neighborhoods."""
+    dense = d2net_map(w, images).contiguous()
+    di, dj, dii, djj, dij = (_derivative(dense, taps.to(dense.device)) for taps in _TAPS)
+    det, trace = dii * djj - dij * dij, dii + djj
+    strongest = dense == dense.amax(1, keepdim=True)
+    highest = dense == F.max_pool2d(dense, 3, stride=1, padding=1)
+    detected = strongest & highest & (det > 0) & (trace * trace / det <= _EDGE)
+    steps = torch.stack([(dij * dj - djj * di) / det, (dij * di - dii * dj) / det], -1)
+    return [_described(*image) for image in zip(dense, detected, steps, strict=True)]
 
 
 def _derivative(dense: Tensor, taps: Tensor) -> Tensor:
@@ -95,75 +136,35 @@ def _described(dense: Tensor, detected: Tensor, steps: Tensor) -> LocalFeatures:
     return on_host((4 * position + 1.5).flip(1), F.normalize(descriptors, dim=0).T, scores)
 
 
-class MixVPR(nn.Module):
-    """ResNet-50 to its third layer, four mixers over the positions, two projections."""
-
-    def __init__(self, out_channels: int = 1024, out_rows: int = 4) -> None:
-        super().__init__()
-        positions = (320 // 16) ** 2
-        self.backbone = nn.ModuleDict({"model": _ResNet()})
-        self.aggregator = nn.ModuleDict(
-            {
-                "mix": nn.Sequential(*(_Mixer(positions) for _ in range(4))),
-                "channel_proj": nn.Linear(1024, out_channels),
-                "row_proj": nn.Linear(positions, out_rows),
-            }
-        )
-
-    def prepared(self, images: Tensor) -> Tensor:
-        """`[B, H, W, 3]` uint8 RGB -> what the network takes."""
-        mean, deviation = (torch.tensor(values, device=images.device) for values in (MEAN, DEVIATION))
-        return ((images / 255 - mean) / deviation).permute(0, 3, 1, 2)
-
-    def forward(self, images: Tensor) -> Tensor:
-        """Descriptors `[B, D]` of unit length."""
-        mixed = self.aggregator["mix"](self.backbone["model"](images).flatten(2))  # [B, 1024, positions]
-        projected = self.aggregator["channel_proj"](mixed.transpose(1, 2)).transpose(1, 2)
-        return F.normalize(self.aggregator["row_proj"](projected).flatten(1))
-
-    def describe(self, images: Tensor) -> np.ndarray:
-        """`forward` on the host."""
-        return self(images).cpu().numpy()
+def mixvpr(w: Weights, images: Tensor) -> np.ndarray:
+    """Descriptors `[B, D]` of unit length, on the host: four mixers over the positions, two projections."""
+    x = resnet(w, images).flatten(2)  # [B, 1024, positions]
+    for place in range(4):
+        name = f"aggregator.mix.{place}.mix"
+        normal = F.layer_norm(x, x.shape[2:], w(f"{name}.0.weight"), w(f"{name}.0.bias"))
+        x = x + _linear(w, f"{name}.3", F.relu(_linear(w, f"{name}.1", normal)))
+    x = _linear(w, "aggregator.channel_proj", x.transpose(1, 2)).transpose(1, 2)
+    return F.normalize(_linear(w, "aggregator.row_proj", x).flatten(1)).cpu().numpy()
 
 
-class _Mixer(nn.Module):
-    def __init__(self, size: int) -> None:
-        super().__init__()
-        self.mix = nn.Sequential(nn.LayerNorm(size), nn.Linear(size, size), nn.ReLU(), nn.Linear(size, size))
-
-    def forward(self, x: Tensor) -> Tensor:
-        return x + self.mix(x)
-
-
-class _ResNet(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.conv1, self.bn1 = nn.Conv2d(3, 64, 7, stride=2, padding=3, bias=False), nn.BatchNorm2d(64)
-        self.layer1 = _layer(3, 64, 64, stride=1)
-        self.layer2 = _layer(4, 256, 128, stride=2)
-        self.layer3 = _layer(6, 512, 256, stride=2)
-
-    def forward(self, x: Tensor) -> Tensor:
-        x = F.max_pool2d(F.relu(self.bn1(self.conv1(x)), inplace=True), 3, stride=2, padding=1)
-        return self.layer3(self.layer2(self.layer1(x)))
+def resnet(w: Weights, images: Tensor) -> Tensor:
+    """Maps `[B, 1024, h, w]` of MixVPR's backbone: ResNet-50 to its third layer."""
+    mean, deviation = (torch.tensor(values, device=images.device)[:, None, None] for values in (MEAN, DEVIATION))
+    name = "backbone.model"
+    x = conv(w, f"{name}.conv1", (images / 255 - mean) / deviation, stride=2, padding=3)
+    x = F.max_pool2d(F.relu(batch_norm(w, f"{name}.bn1", x), inplace=True), 3, stride=2, padding=1)
+    for layer, blocks in ((1, 3), (2, 4), (3, 6)):
+        for block in range(blocks):
+            stride = 2 if layer > 1 and block == 0 else 1
+            x = _bottleneck(w, f"{name}.layer{layer}.{block}", x, stride, shortcut=block == 0)
+    return x
 
 
-def _layer(blocks: int, inputs: int, width: int, stride: int) -> nn.Sequential:
-    others = (_Bottleneck(4 * width, width, 1) for _ in range(blocks - 1))
-    return nn.Sequential(_Bottleneck(inputs, width, stride, shortcut=True), *others)
-
-
-class _Bottleneck(nn.Module):
-    def __init__(self, inputs: int, width: int, stride: int, shortcut: bool = False) -> None:
-        super().__init__()
-        self.conv1, self.bn1 = nn.Conv2d(inputs, width, 1, bias=False), nn.BatchNorm2d(width)
-        self.conv2 = nn.Conv2d(width, width, 3, stride=stride, padding=1, bias=False)
-        self.bn2 = nn.BatchNorm2d(width)
-        self.conv3, self.bn3 = nn.Conv2d(width, 4 * width, 1, bias=False), nn.BatchNorm2d(4 * width)
-        projection = nn.Conv2d(inputs, 4 * width, 1, stride=stride, bias=False)
-        self.downsample = nn.Sequential(projection, nn.BatchNorm2d(4 * width)) if shortcut else nn.Identity()
-
-    def forward(self, x: Tensor) -> Tensor:
-        out = F.relu(self.bn1(self.conv1(x)), inplace=True)
-        out = F.relu(self.bn2(self.conv2(out)), inplace=True)
-        return F.relu(self.bn3(self.conv3(out)).add_(self.downsample(x)), inplace=True)
+def _bottleneck(w: Weights, name: str, x: Tensor, stride: int, shortcut: bool) -> Tensor:
+    out = F.relu(batch_norm(w, f"{name}.bn1", conv(w, f"{name}.conv1", x)), inplace=True)
+    out = conv(w, f"{name}.conv2", out, stride=stride, padding=1)
+    out = F.relu(batch_norm(w, f"{name}.bn2", out), inplace=True)
+    out = batch_norm(w, f"{name}.bn3", conv(w, f"{name}.conv3", out))
+    if shortcut:
+        x = batch_norm(w, f"{name}.downsample.1", conv(w, f"{name}.downsample.0", x, stride=stride))
+    return F.relu(out.add_(x), inplace=True)
