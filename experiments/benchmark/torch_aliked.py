@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from experiments.benchmark.torch_networks import LocalFeatures, Weights, batch_norm, conv, on_host
+from experiments.benchmark.torch_networks import LocalFeatures, Weights, batch_norm, conv, on_host, sampled
 
 RADIUS = 2  # of the detector, px
 LEVELS = ((1, 1), (2, 2), (4, 8), (4, 32))  # pooled before each block, and how much smaller than the image it is then
@@ -19,7 +19,7 @@ def aliked(w: Weights, images: Tensor, threshold: float) -> list[LocalFeatures]:
     extracted = []
     for dense, score, peaks in zip(features, scores, _maxima(scores) > threshold, strict=True):
         points = _refined(score[0], *peaks[0].nonzero(as_tuple=True))
-        values = _sampled(score[None], points[None, None])[0, 0, 0]
+        values = sampled(score[None], points[None, None])[0, 0, 0]
         extracted.append(on_host(points, _descriptors(w, dense, points), values))
     return extracted
 
@@ -61,7 +61,7 @@ def _deformable(w: Weights, name: str, x: Tensor) -> Tensor:
     down, right = (step.reshape(9, 1, 1) for step in _neighborhood(1, x.device))
     vertical = offsets[:, :, 0] + (rows[:, None] + down)  # [B, 9, h, w]
     horizontal = offsets[:, :, 1] + (columns + right)
-    taps = _sampled(x, torch.stack([horizontal, vertical], -1).flatten(1, 2)).unflatten(2, (9, height))
+    taps = sampled(x, torch.stack([horizontal, vertical], -1).flatten(1, 2)).unflatten(2, (9, height))
     products = w(f"{name}.regular_conv.weight").flatten(1) @ taps.flatten(3).flatten(1, 2)
     return products.unflatten(2, (height, width))
 
@@ -100,15 +100,8 @@ def _descriptors(w: Weights, features: Tensor, points: Tensor) -> Tensor:
     offsets = F.selu(conv(w, "desc_head.offset_conv.0", patches.transpose(0, 1), bias=True), inplace=True)
     offsets = conv(w, "desc_head.offset_conv.2", offsets, bias=True).clamp(-limit, limit)
     places = points[:, None] + offsets.flatten(1).unflatten(1, (2, -1)).transpose(1, 2)  # [n, M, 2]
-    sampled = conv(w, "desc_head.sf_conv", _sampled(features[None], places[None]))[0]  # [D, n, M]
-    return F.normalize(torch.einsum("cnp,pcd->nd", F.selu(sampled, inplace=True), w("desc_head.agg_weights")))
-
-
-def _sampled(x: Tensor, points: Tensor) -> Tensor:
-    """`[B, C, h, w]` of maps `[B, C, H, W]` at `[B, h, w, 2]` (x, y) px, zeros outside."""
-    height, width = x.shape[2:]
-    grid = 2 * points / torch.tensor([width - 1, height - 1], device=x.device) - 1
-    return F.grid_sample(x, grid, align_corners=True)
+    mixed = conv(w, "desc_head.sf_conv", sampled(features[None], places[None]))[0]  # [D, n, M]
+    return F.normalize(torch.einsum("cnp,pcd->nd", F.selu(mixed, inplace=True), w("desc_head.agg_weights")))
 
 
 def _neighborhood(radius: int, device: torch.device) -> tuple[Tensor, Tensor]:

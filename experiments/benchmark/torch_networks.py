@@ -70,6 +70,13 @@ def batch_norm(w: Weights, name: str, x: Tensor) -> Tensor:
     return F.batch_norm(x, mean, variance, weight, bias)
 
 
+def sampled(x: Tensor, points: Tensor) -> Tensor:
+    """`[B, C, h, w]` of maps `[B, C, H, W]` at `[B, h, w, 2]` (x, y) px, zeros outside."""
+    height, width = x.shape[2:]
+    grid = 2 * points / torch.tensor([width - 1, height - 1], device=x.device) - 1
+    return F.grid_sample(x, grid, align_corners=True)
+
+
 def _linear(w: Weights, name: str, x: Tensor) -> Tensor:
     return F.linear(x, w(f"{name}.weight"), w(f"{name}.bias"))
 
@@ -121,19 +128,11 @@ def _described(dense: Tensor, detected: Tensor, steps: Tensor) -> LocalFeatures:
     channel, row, column = detected.nonzero(as_tuple=True)
     step = steps[channel, row, column]
     position = torch.stack([row, column], 1) + step
-    size = torch.tensor(dense.shape[1:], device=dense.device)
-    low, high = position.floor().long(), position.ceil().long()
-    kept = (step.abs() < 0.5).all(1) & (low >= 0).all(1) & (high < size).all(1)
-    scores = dense[channel, row, column][kept]
-    position, (top, left), (bottom, right) = position[kept], low[kept].T, high[kept].T
-    below, beside = (position - low[kept]).T
-    descriptors = (
-        dense[:, top, left] * ((1 - below) * (1 - beside))
-        + dense[:, top, right] * ((1 - below) * beside)
-        + dense[:, bottom, left] * (below * (1 - beside))
-        + dense[:, bottom, right] * (below * beside)
-    )
-    return on_host((4 * position + 1.5).flip(1), F.normalize(descriptors, dim=0).T, scores)
+    last = torch.tensor(dense.shape[1:], device=dense.device) - 1
+    kept = ((step.abs() < 0.5) & (position >= 0) & (position <= last)).all(1)
+    position, scores = position[kept].flip(1), dense[channel, row, column][kept]
+    descriptors = sampled(dense[None], position[None, None])[0, :, 0]
+    return on_host(4 * position + 1.5, F.normalize(descriptors, dim=0).T, scores)
 
 
 def mixvpr(w: Weights, images: Tensor) -> np.ndarray:
