@@ -16,11 +16,13 @@ LEVELS = ((1, 1), (2, 2), (4, 8), (4, 32))  # pooled before each block, and how 
 def aliked(w: Weights, images: Tensor, threshold: float) -> list[LocalFeatures]:
     """Keypoints with sub-pixel positions and their descriptors, of images `[B, 3, H, W]`; sides divisible by 32."""
     features, scores = dense_features(w, images)
+    corner = torch.tensor(scores.shape[:1:-1], device=scores.device) - 1  # (width, height) - 1
     extracted = []
     for dense, score, peaks in zip(features, scores, _maxima(scores) > threshold, strict=True):
-        points = _refined(score[0], *peaks[0].nonzero(as_tuple=True))
-        values = sampled(score[None], points[None, None])[0, 0, 0]
-        extracted.append(on_host(points, _descriptors(w, dense, points), values))
+        points = _refined(score[0], *peaks[0].nonzero(as_tuple=True)) / corner * 2 - 1  # and back, rounded as published
+        values = F.grid_sample(score[None], points[None, None], align_corners=True)[0, 0, 0]
+        descriptors = _descriptors(w, dense, (points / 2 + 0.5) * corner)
+        extracted.append(on_host((points + 1) / 2 * corner, descriptors, values))
     return extracted
 
 
