@@ -3,12 +3,13 @@
 import json
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from experiments import benchmark
+from experiments.benchmark.__main__ import BENCHMARKS
 
 ROOT = Path(__file__).parent.parent
 
@@ -17,7 +18,7 @@ ROOT = Path(__file__).parent.parent
 def contest(tmp_path_factory):
     """Small images and random weights; everyone's results after one round."""
     torch = pytest.importorskip("torch", reason="torch is what the networks are compared with")
-    from experiments import network_contestants
+    from experiments.benchmark import harness, networks
 
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # several wait for each other when other processes take their cores
@@ -25,11 +26,11 @@ def contest(tmp_path_factory):
         patch.setenv("MFVPR_WEIGHTS", str(tmp_path_factory.mktemp("weights")))
         small = {"BATCHES": (2,), "D2NET_SIZE": 96, "ALIKED_SIZE": 96, "ALIKED": ("aliked-n16",)}
         for name, value in small.items():
-            patch.setattr(network_contestants, name, value)
-        lineup = network_contestants.lineup()
-        seconds, results = benchmark.take_turns([run for _, _, run in lineup.entries], rounds=1)
+            patch.setattr(networks, name, value)
+        lineup = networks.lineup()
+        seconds, results = harness.take_turns([run for _, _, run in lineup.entries], rounds=1)
         out = tmp_path_factory.mktemp("benchmark") / "networks.json"
-        benchmark.report(lineup, seconds, results, out)
+        harness.report(lineup, seconds, results, out)
     torch.set_num_threads(threads)
     by_step = {}
     for (step, name, _), result in zip(lineup.entries, results, strict=True):
@@ -89,11 +90,16 @@ def test_report_has_everyone(contest):
         assert wanted in remarks
 
 
+@pytest.mark.parametrize("name", BENCHMARKS)
+def test_every_benchmark_is_a_module(name):
+    assert callable(import_module(f"experiments.benchmark.{name}").run)
+
+
 def test_help_needs_no_jax():
     done = subprocess.run(
         [sys.executable, "-X", "importtime", "-m", "experiments.benchmark", "--help"],
         cwd=ROOT, capture_output=True, text=True, timeout=60,
     )  # fmt: skip
     assert done.returncode == 0
-    assert "networks" in done.stdout
+    assert all(f"{name} " in done.stdout and about in done.stdout for name, about in BENCHMARKS.items())
     assert " jax\n" not in done.stderr

@@ -51,25 +51,23 @@ def main(clone: str) -> None:
 def _computed(clone: str, channels: int, rows: int, checkpoint: Mapping) -> dict[str, np.ndarray]:
     import torch
 
-    from experiments.torch_networks import MixVPR
+    from experiments.benchmark.torch_networks import resnet
 
     sys.path.insert(0, clone)
     from models.aggregators.mixvpr import MixVPR as Aggregator
 
-    network = MixVPR()
-    network.aggregator = Aggregator(
-        in_channels=1024, in_h=20, in_w=20, out_channels=channels, mix_depth=4, out_rows=rows
-    )
-    network.load_state_dict(checkpoint)
-    network.double().eval()
-    maps = network.backbone["model"](network.prepared(torch.from_numpy(images()).double()))
+    aggregator = Aggregator(in_channels=1024, in_h=20, in_w=20, out_channels=channels, mix_depth=4, out_rows=rows)
+    prefix = "aggregator."
+    aggregator.load_state_dict({key.removeprefix(prefix): checkpoint[key] for key in checkpoint if prefix in key})
+    aggregator.double().eval()
+    maps = resnet(lambda key: checkpoint[key].double(), torch.from_numpy(images()).double().permute(0, 3, 1, 2))
     faint = torch.from_numpy(faint_maps()).double().permute(0, 3, 1, 2)
     width = channels * rows
-    golden = {f"{width}/descriptors": network.aggregator(maps), f"{width}/faint": network.aggregator(faint)}
+    golden = {f"{width}/descriptors": aggregator(maps), f"{width}/faint": aggregator(faint)}
     if channels == SIZES[0][0]:
         mixed = maps.flatten(2)
         golden |= {"backbone": samples(maps.permute(0, 2, 3, 1).numpy()), "backbone/means": maps.mean((2, 3))}
-        for place, mixer in enumerate(network.aggregator.mix):
+        for place, mixer in enumerate(aggregator.mix):
             mixed = mixer(mixed)
             golden[f"mixer{place}"] = samples(mixed.numpy())
     return {name: np.asarray(array) for name, array in golden.items()}

@@ -1,12 +1,13 @@
-"""Who takes part in the benchmark: mfvpr, and its peers written as their users would write them.
+"""Matching and scoring: mfvpr, and its peers written as their users would write them.
 
-Each maker returns (step, name, function) triples, none where its library is not installed.
+Each `of_` returns its contestants, none where its library is not installed.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -15,32 +16,18 @@ import jax.numpy as jnp
 import numpy as np
 
 import mfvpr
+from experiments.benchmark.harness import Entry, Lineup, Results, Seconds, compete
 from mfvpr.types import Features, Matches
 
 CANDIDATES, KEYPOINTS, DIMENSION = 50, 700, 512
 COMMON = 300  # keypoints that a candidate shares with the query
 SIZE, BIN, SIGMA = 336, 15.0, 22.5  # px
-
-Entry = tuple[str, str, Callable[[], Any]]
-
-
-@dataclass(frozen=True)
-class Lineup:
-    """Those who are timed together."""
-
-    title: str
-    setting: dict[str, Any]  # for the JSON file
-    entries: list[Entry]
-    rounds: int  # unless asked for others
-    # What the table does not say, from seconds and results by (step, name).
-    remarks: Callable[[Mapping[tuple[str, str], list[float]], Mapping[tuple[str, str], Any]], Iterable[str]]
-
-
 MATCHING, HISTOGRAM, ANCHOR, SUM = "matching", "histogram", "anchor", "sum"
 SHIFT = "refined shift of a pair"
 BOTH = "matching + histogram"
 SLOTS = 384  # of 700: `compact` to what these pairs need
 CENTERS = np.arange(-SIZE + BIN / 2, SIZE, BIN, dtype=np.float32)
+BIN_X, BIN_Y = np.meshgrid(CENTERS, CENTERS)
 
 
 @dataclass(frozen=True)
@@ -51,30 +38,29 @@ class Data:
     candidates: Features  # [C, N, ...]
     matches: Matches  # [C, SLOTS, ...]
 
-    def pairs(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """(shifts [n, 2], weights [n]) of each pair, without padding."""
-        m = self.matches
-        shifts, weights = np.asarray(m.points1) - np.asarray(m.points0), np.asarray(m.scores0) + np.asarray(m.scores1)
-        return [(shifts[k][mask], weights[k][mask]) for k, mask in enumerate(np.asarray(m.mask))]
+    def arrays(self, convert: Callable[[Any], Any] = np.asarray) -> tuple[Features, Features]:
+        """Query and candidates as another library's arrays."""
+        return jax.tree.map(convert, self.query), jax.tree.map(convert, self.candidates)
 
 
-def lineup() -> Lineup:
+def run(rounds: int | None, out: Path) -> None:
     """Everyone, on one query and its candidates."""
     data = make_data()
     matches = float(np.asarray(data.matches.mask).sum(1).mean())
     sizes = f"1 query x {CANDIDATES} candidates, {KEYPOINTS} features of {DIMENSION} dimensions"
-    return Lineup(
+    lineup = Lineup(
         title=f"{sizes}, {matches:.0f} matches a pair",
         setting={
             "candidates": CANDIDATES, "keypoints": KEYPOINTS, "dimension": DIMENSION, "matches_per_pair": matches,
         },
-        entries=[entry for make in ALL for entry in make(data)],
+        entries=[entry for make in (of_mfvpr, of_opencv, of_faiss, of_torch, of_numpy) for entry in make(data)],
         rounds=15,
         remarks=_remarks,
     )  # fmt: skip
+    compete(lineup, rounds, out)
 
 
-def _remarks(seconds: Mapping[tuple[str, str], list[float]], results: Mapping[tuple[str, str], Any]) -> list[str]:
+def _remarks(seconds: Seconds, _: Results) -> list[str]:
     anchor, histogram = (np.median(seconds[step, "mfvpr"]) for step in (ANCHOR, HISTOGRAM))
     return [f"anchor / histogram: {anchor / histogram:.2f}"]
 
@@ -82,6 +68,7 @@ def _remarks(seconds: Mapping[tuple[str, str], list[float]], results: Mapping[tu
 def make_data(seed: int = 0) -> Data:
     """COMMON keypoints of the query reappear in every candidate, shifted and noisy; the others are its own."""
     rng = np.random.default_rng(seed)
+    own = KEYPOINTS - COMMON
 
     def descriptors(count: int) -> np.ndarray:
         return np.maximum(rng.normal(size=(count, DIMENSION)), 0)
@@ -89,11 +76,9 @@ def make_data(seed: int = 0) -> Data:
     def features(points: np.ndarray, values: np.ndarray) -> Features:
         values = np.maximum(values, 0)
         values /= np.linalg.norm(values, axis=1, keepdims=True)
-        scores = rng.uniform(100, 1000, KEYPOINTS)
-        size = np.full(2, SIZE)
-        arrays = (a.astype(np.float32) for a in (points, values, scores))
-        keypoints, unit, scores = arrays
-        return Features(keypoints, unit, scores, np.ones(KEYPOINTS, bool), size.astype(np.float32))
+        arrays = points, values, rng.uniform(100, 1000, KEYPOINTS), np.ones(KEYPOINTS), np.full(2, SIZE)
+        keypoints, values, scores, mask, size = (array.astype(np.float32) for array in arrays)
+        return Features(keypoints, values, scores, mask > 0, size)
 
     points, values = rng.uniform(40, SIZE - 40, (KEYPOINTS, 2)), descriptors(KEYPOINTS)
     candidates = []
@@ -101,14 +86,9 @@ def make_data(seed: int = 0) -> Data:
         common = rng.permutation(KEYPOINTS)[:COMMON]
         moved = points[common] + rng.uniform(-30, 30, 2) + rng.normal(0, 5, (COMMON, 2))
         noisy = values[common] + 0.3 * rng.normal(size=(COMMON, DIMENSION))
-        own = KEYPOINTS - COMMON
         order = rng.permutation(KEYPOINTS)
-        candidates.append(
-            features(
-                np.concatenate([moved, rng.uniform(0, SIZE, (own, 2))])[order],
-                np.concatenate([noisy, descriptors(own)])[order],
-            )
-        )
+        all_points = np.concatenate([moved, rng.uniform(0, SIZE, (own, 2))])
+        candidates.append(features(all_points[order], np.concatenate([noisy, descriptors(own)])[order]))
     query = jax.device_put(features(points, values))
     batch = jax.device_put(jax.tree.map(lambda *leaves: np.stack(leaves), *candidates))
     return Data(query, batch, jax.jit(_matched)(query, batch))
@@ -152,20 +132,15 @@ def of_mfvpr(data: Data) -> list[Entry]:
 
 def of_opencv(data: Data) -> list[Entry]:
     """BFMatcher with cross-check, one pair at a time; the score in NumPy, one match at a time."""
-    query, candidates = np.asarray(data.query.descriptors), np.asarray(data.candidates.descriptors)
+    query, candidates = data.arrays()
     matcher = cv2.BFMatcher(cv2.NORM_L2, crossCheck=True)
-    points0, points1 = np.asarray(data.query.keypoints), np.asarray(data.candidates.keypoints)
-    scores0, scores1 = np.asarray(data.query.scores), np.asarray(data.candidates.scores)
 
     def match() -> list:
-        return [matcher.match(query, candidate) for candidate in candidates]
+        return [matcher.match(query.descriptors, descriptors) for descriptors in candidates.descriptors]
 
     def both() -> list[float]:
-        scores = []
-        for k, found in enumerate(match()):
-            i, j = np.array([(one.queryIdx, one.trainIdx) for one in found]).T
-            scores.append(_histogram_loop(points1[k][j] - points0[i], scores0[i] + scores1[k][j]))
-        return scores
+        pairs = (np.array([(match.queryIdx, match.trainIdx) for match in matches]).T for matches in match())
+        return _scores(_histogram_loop, query, candidates, pairs)
 
     return [(MATCHING, "OpenCV BFMatcher(crossCheck)", match), (BOTH, "OpenCV + NumPy loop", both)]
 
@@ -176,42 +151,28 @@ def of_faiss(data: Data) -> list[Entry]:
         return []
     import faiss
 
-    query, candidates = np.asarray(data.query.descriptors), np.asarray(data.candidates.descriptors)
-    points0, points1 = np.asarray(data.query.keypoints), np.asarray(data.candidates.keypoints)
-    scores0, scores1 = np.asarray(data.query.scores), np.asarray(data.candidates.scores)
+    query, candidates = data.arrays()
 
     def index(descriptors: np.ndarray) -> Any:
         built = faiss.IndexFlatIP(DIMENSION)
         built.add(descriptors)  # pyright: ignore[reportCallIssue]
         return built
 
-    of_query = index(query)
+    of_query = index(query.descriptors)
 
     def match() -> list[tuple[np.ndarray, np.ndarray]]:
-        found = []
-        for candidate in candidates:
-            nearest1 = index(candidate).search(query, 1)[1][:, 0]
-            nearest0 = of_query.search(candidate, 1)[1][:, 0]
+        pairs = []
+        for descriptors in candidates.descriptors:
+            nearest1 = index(descriptors).search(query.descriptors, 1)[1][:, 0]
+            nearest0 = of_query.search(descriptors, 1)[1][:, 0]
             i = np.flatnonzero(nearest0[nearest1] == np.arange(KEYPOINTS))
-            found.append((i, nearest1[i]))
-        return found
+            pairs.append((i, nearest1[i]))
+        return pairs
 
     def both() -> list[float]:
-        return [
-            _histogram_broadcast(points1[k][j] - points0[i], scores0[i] + scores1[k][j])
-            for k, (i, j) in enumerate(match())
-        ]
+        return _scores(_histogram_broadcast, query, candidates, match())
 
     return [(MATCHING, "FAISS both ways", match), (BOTH, "FAISS + NumPy", both)]
-
-
-def of_numpy(data: Data) -> list[Entry]:
-    """Scores of one pair after the other."""
-    pairs = data.pairs()
-    return [
-        (HISTOGRAM, "NumPy, loop over matches", lambda: [_histogram_loop(*pair) for pair in pairs]),
-        (HISTOGRAM, "NumPy, broadcast", lambda: [_histogram_broadcast(*pair) for pair in pairs]),
-    ]
 
 
 def of_torch(data: Data) -> list[Entry]:
@@ -219,6 +180,7 @@ def of_torch(data: Data) -> list[Entry]:
     if find_spec("torch") is None:
         return []
     import torch
+    from torch import Tensor
 
     # Far bins get votes too small for normal floats, which makes torch four times as slow. XLA flushes them to zero,
     # so torch may too: its threads inherit the flag from the one that starts them. NumPy has no such switch.
@@ -226,24 +188,22 @@ def of_torch(data: Data) -> list[Entry]:
     torch.ones(10**7).exp()
     torch.set_flush_denormal(False)
 
-    def tensor(array: Any) -> "torch.Tensor":
+    def tensor(array: Any) -> Tensor:
         return torch.from_numpy(np.array(array))
 
-    query, candidates = tensor(data.query.descriptors), tensor(data.candidates.descriptors)
-    points0, points1 = tensor(data.query.keypoints), tensor(data.candidates.keypoints)
-    scores0, scores1 = tensor(data.query.scores), tensor(data.candidates.scores)
+    query, candidates = data.arrays(tensor)
     m, centers, rows = data.matches, tensor(CENTERS), torch.arange(KEYPOINTS)
     weights = torch.where(tensor(m.mask), tensor(m.scores0) + tensor(m.scores1), 0.0)
     shifts = tensor(jnp.nan_to_num(m.points1 - m.points0))
 
     @torch.inference_mode()
-    def match() -> tuple["torch.Tensor", "torch.Tensor"]:
-        similarity = torch.matmul(query, candidates.transpose(1, 2))
+    def match() -> tuple[Tensor, Tensor]:
+        similarity = torch.matmul(query.descriptors, candidates.descriptors.mT)
         nearest1, nearest0 = similarity.argmax(2), similarity.argmax(1)
         return nearest1, torch.gather(nearest0, 1, nearest1) == rows
 
     @torch.inference_mode()
-    def histogram(shifts: "torch.Tensor", weights: "torch.Tensor") -> "torch.Tensor":
+    def histogram(shifts: Tensor, weights: Tensor) -> Tensor:
         torch.set_flush_denormal(True)
         votes_x = torch.exp(-0.5 * ((shifts[:, :, 0, None] - centers) / SIGMA) ** 2)  # [C, K, B]
         votes_y = torch.exp(-0.5 * ((shifts[:, :, 1, None] - centers) / SIGMA) ** 2) * weights[:, :, None]
@@ -252,10 +212,11 @@ def of_torch(data: Data) -> list[Entry]:
         return scores
 
     @torch.inference_mode()
-    def both() -> "torch.Tensor":
+    def both() -> Tensor:
         nearest1, mutual = match()
-        found = torch.gather(points1, 1, nearest1[..., None].expand(-1, -1, 2)) - points0
-        return histogram(found, torch.where(mutual, scores0 + torch.gather(scores1, 1, nearest1), 0.0))
+        moved = torch.gather(candidates.keypoints, 1, nearest1[..., None].expand(-1, -1, 2)) - query.keypoints
+        summed = query.scores + torch.gather(candidates.scores, 1, nearest1)
+        return histogram(moved, torch.where(mutual, summed, 0.0))
 
     return [
         (MATCHING, "torch, batched", match),
@@ -264,18 +225,32 @@ def of_torch(data: Data) -> list[Entry]:
     ]
 
 
-ALL = (of_mfvpr, of_opencv, of_faiss, of_torch, of_numpy)
+def of_numpy(data: Data) -> list[Entry]:
+    """Scores of one pair after the other, without padding."""
+    m = jax.tree.map(np.asarray, data.matches)
+    shifts, weights = m.points1 - m.points0, m.scores0 + m.scores1
+    pairs = [(shifts[k][mask], weights[k][mask]) for k, mask in enumerate(m.mask)]
+    return [
+        (HISTOGRAM, "NumPy, loop over matches", lambda: [_histogram_loop(*pair) for pair in pairs]),
+        (HISTOGRAM, "NumPy, broadcast", lambda: [_histogram_broadcast(*pair) for pair in pairs]),
+    ]
 
-_BIN_X, _BIN_Y = np.meshgrid(CENTERS, CENTERS)
+
+def _scores(score: Callable, query: Features, candidates: Features, pairs: Iterable[Any]) -> list[float]:
+    """Of each candidate, from its pairs of features (i of the query, j of the candidate)."""
+    return [
+        score(candidates.keypoints[k][j] - query.keypoints[i], query.scores[i] + candidates.scores[k][j])
+        for k, (i, j) in enumerate(pairs)
+    ]
 
 
 def _histogram_loop(shifts: np.ndarray, weights: np.ndarray) -> float:
-    histogram = np.zeros_like(_BIN_X)
+    histogram = np.zeros_like(BIN_X)
     for (x, y), weight in zip(shifts, weights, strict=True):
-        histogram += weight * np.exp(-((_BIN_X - x) ** 2 + (_BIN_Y - y) ** 2) / (2 * SIGMA**2))
+        histogram += weight * np.exp(-((BIN_X - x) ** 2 + (BIN_Y - y) ** 2) / (2 * SIGMA**2))
     return float(histogram.max())
 
 
 def _histogram_broadcast(shifts: np.ndarray, weights: np.ndarray) -> float:
-    squared = (_BIN_X - shifts[:, 0, None, None]) ** 2 + (_BIN_Y - shifts[:, 1, None, None]) ** 2
+    squared = (BIN_X - shifts[:, 0, None, None]) ** 2 + (BIN_Y - shifts[:, 1, None, None]) ** 2
     return float((weights[:, None, None] * np.exp(-squared / (2 * SIGMA**2))).sum(0).max())

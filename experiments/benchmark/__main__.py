@@ -1,0 +1,49 @@
+"""Times mfvpr against the peers of the field, in one run.
+
+Everything is warm; the contestants take turns, round by round, so that a noisy machine disturbs all alike.
+"""
+
+import argparse
+import os
+from importlib import import_module
+from pathlib import Path
+
+from experiments.errors import one_line
+from experiments.launch import version
+
+# Each is the module of this name, whose `run(rounds, out)` prints a table and writes it as JSON.
+BENCHMARKS = {
+    "scores": "matching and scoring of one query with 50 candidates (15 rounds)",
+    "sweeps": "grids of a score's parameters on cached matches (7 rounds)",
+    "networks": "D2-Net, MixVPR and ALIKED (5 rounds)",
+}
+
+
+def main() -> None:
+    """Run the chosen benchmark; only then is its module imported, so that --help need not wait for JAX."""
+    parser = argparse.ArgumentParser(
+        prog="python -m experiments.benchmark",
+        description=__doc__,
+        epilog="\n".join(["benchmarks:", *(f"  {name:<9} {about}" for name, about in BENCHMARKS.items())]),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("what", nargs="?", choices=BENCHMARKS, default="scores", help="default: scores")
+    parser.add_argument("--rounds", type=positive, help="timed calls of each contestant (default: see below)")
+    parser.add_argument("--out", type=Path, help="JSON file to write (default runs/benchmark_WHAT.json)")
+    parser.add_argument("--version", action="version", version=version(), help="print it and exit")
+    arguments = parser.parse_args()
+    with one_line():
+        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # leaves torch its part of a GPU
+        benchmark = import_module(f"experiments.benchmark.{arguments.what}")
+        benchmark.run(arguments.rounds, arguments.out or Path(f"runs/benchmark_{arguments.what}.json"))
+
+
+def positive(text: str) -> int:
+    """A whole number above 0, of an option."""
+    if not text.isascii() or not text.isdigit() or not int(text[:9]) > 0:
+        raise argparse.ArgumentTypeError(f"expected a whole number above 0, got {text}")
+    return int(text[:9])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,169 @@
+"""D2-Net and MixVPR in plain torch, with the keys of the published weights: what mfvpr's are timed against.
+
+A network is a function of its weights and of images `[B, 3, H, W]`, RGB, 0 .. 255.
+"""
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from mfvpr.models.imagenet import DEVIATION, MEAN
+from mfvpr.weights.conversion import Table
+
+Weights = Callable[[str], Tensor]  # by published keys
+
+
+def published(arrays: Mapping[str, np.ndarray], table: Table, device: str, layout: torch.memory_format) -> Weights:
+    """Our arrays by their published keys, conversion backwards."""
+
+    @cache
+    def weight(key: str) -> Tensor:
+        rule, match = next((rule, match) for rule in table.rules if (match := re.fullmatch(rule.source, key)))
+        array, axes = arrays[match.expand(rule.target)], rule.layout.value
+        tensor = torch.from_numpy(np.array(array if axes is None else array.transpose(np.argsort(axes)))).to(device)
+        return tensor.contiguous(memory_format=layout) if tensor.ndim == 4 else tensor
+
+    return weight
+
+
+def each(
+    network: Callable, batches: Iterable[np.ndarray], *, weights: Weights, device: str, layout: torch.memory_format
+) -> list[Any]:
+    """What the network gives for each image of batches `[B, H, W, 3]` uint8 RGB."""
+    results = []
+    with torch.inference_mode():
+        for batch in batches:
+            images = torch.from_numpy(batch).to(device).permute(0, 3, 1, 2).contiguous(memory_format=layout)
+            results.extend(network(weights, images))
+    if device == "cuda":
+        torch.cuda.synchronize()
+    return results
+
+
+class LocalFeatures(NamedTuple):
+    """Of one image, on the host."""
+
+    keypoints: np.ndarray  # [n, 2] (x, y), px
+    descriptors: np.ndarray  # [n, D]
+    scores: np.ndarray  # [n]
+
+
+def on_host(*tensors: Tensor) -> LocalFeatures:
+    """Keypoints, descriptors and scores as arrays."""
+    return LocalFeatures(*(tensor.cpu().numpy() for tensor in tensors))
+
+
+def conv(w: Weights, name: str, x: Tensor, *, bias: bool = False, **options: int) -> Tensor:
+    """Convolution with the weights of this name."""
+    return F.conv2d(x, w(f"{name}.weight"), w(f"{name}.bias") if bias else None, **options)
+
+
+def batch_norm(w: Weights, name: str, x: Tensor) -> Tensor:
+    """By the running statistics."""
+    mean, variance, weight, bias = (w(f"{name}.{key}") for key in ("running_mean", "running_var", "weight", "bias"))
+    return F.batch_norm(x, mean, variance, weight, bias)
+
+
+def sampled(x: Tensor, points: Tensor) -> Tensor:
+    """`[B, C, h, w]` of maps `[B, C, H, W]` at `[B, h, w, 2]` (x, y) px, zeros outside."""
+    height, width = x.shape[2:]
+    grid = 2 * points / torch.tensor([width - 1, height - 1], device=x.device) - 1
+    return F.grid_sample(x, grid, align_corners=True)
+
+
+def _linear(w: Weights, name: str, x: Tensor) -> Tensor:
+    return F.linear(x, w(f"{name}.weight"), w(f"{name}.bias"))
+
+
+_BGR_MEAN = (103.939, 116.779, 123.68)
+_EDGE = (5 + 1) ** 2 / 5
+_SLOPE, _CURVE, _HERE = torch.tensor([[-0.5, 0, 0.5], [1, -2, 1], [0, 1, 0]])
+_TAPS = [  # di, dj, dii, djj, dij
+    torch.outer(down, right)[None, None]
+    for down, right in ((_SLOPE, _HERE), (_HERE, _SLOPE), (_CURVE, _HERE), (_HERE, _CURVE), (_SLOPE, _SLOPE))
+]
+
+
+def d2net_map(w: Weights, images: Tensor) -> Tensor:
+    """Dense maps `[B, 512, h, w]`: VGG16 to conv4_3 with stride 4; the mean is subtracted in float64, as published."""
+    mean = torch.tensor(_BGR_MEAN, dtype=torch.float64, device=images.device)
+    x = (images.flip(1) - mean[:, None, None]).float()
+    for position in (0, 2, 4, 5, 7, 9, 10, 12, 14, 16, 17, 19, 21):  # in the published order of layers
+        if position in (4, 9):
+            x = F.max_pool2d(x, 2)
+        elif position == 16:
+            x = F.avg_pool2d(x, 2, stride=1)
+        else:
+            reach = 1 if position < 16 else 2
+            name = f"dense_feature_extraction.model.{position}"
+            x = F.relu(conv(w, name, x, bias=True, padding=reach, dilation=reach), inplace=True)
+    return x
+
+
+def d2net(w: Weights, images: Tensor) -> list[LocalFeatures]:
+    """Features at the maxima of the dense map over channels and neighborhoods."""
+    dense = d2net_map(w, images).contiguous()
+    di, dj, dii, djj, dij = (_derivative(dense, taps.to(dense.device)) for taps in _TAPS)
+    det, trace = dii * djj - dij * dij, dii + djj
+    strongest = dense == dense.amax(1, keepdim=True)
+    highest = dense == F.max_pool2d(dense, 3, stride=1, padding=1)
+    detected = strongest & highest & (det > 0) & (trace * trace / det <= _EDGE)
+    steps = torch.stack([(dij * dj - djj * di) / det, (dij * di - dii * dj) / det], -1)
+    return [_described(*image) for image in zip(dense, detected, steps, strict=True)]
+
+
+def _derivative(dense: Tensor, taps: Tensor) -> Tensor:
+    """Of every channel `[B, C, h, w]` by itself, zeros outside."""
+    return F.conv2d(dense.flatten(0, 1)[:, None], taps, padding=1).reshape(dense.shape)
+
+
+def _described(dense: Tensor, detected: Tensor, steps: Tensor) -> LocalFeatures:
+    """Features of one map `[C, h, w]`: refined positions, and the map interpolated there."""
+    channel, row, column = detected.nonzero(as_tuple=True)
+    step = steps[channel, row, column]
+    position = torch.stack([row, column], 1) + step
+    last = torch.tensor(dense.shape[1:], device=dense.device) - 1
+    kept = ((step.abs() < 0.5) & (position >= 0) & (position <= last)).all(1)
+    position, scores = position[kept].flip(1), dense[channel, row, column][kept]
+    descriptors = sampled(dense[None], position[None, None])[0, :, 0]
+    return on_host(4 * position + 1.5, F.normalize(descriptors, dim=0).T, scores)
+
+
+def mixvpr(w: Weights, images: Tensor) -> np.ndarray:
+    """Descriptors `[B, D]` of unit length, on the host: four mixers over the positions, two projections."""
+    x = resnet(w, images).flatten(2)  # [B, 1024, positions]
+    for place in range(4):
+        name = f"aggregator.mix.{place}.mix"
+        normal = F.layer_norm(x, x.shape[2:], w(f"{name}.0.weight"), w(f"{name}.0.bias"))
+        x = x + _linear(w, f"{name}.3", F.relu(_linear(w, f"{name}.1", normal)))
+    x = _linear(w, "aggregator.channel_proj", x.transpose(1, 2)).transpose(1, 2)
+    return F.normalize(_linear(w, "aggregator.row_proj", x).flatten(1)).cpu().numpy()
+
+
+def resnet(w: Weights, images: Tensor) -> Tensor:
+    """Maps `[B, 1024, h, w]` of MixVPR's backbone: ResNet-50 to its third layer."""
+    mean, deviation = (torch.tensor(values, device=images.device)[:, None, None] for values in (MEAN, DEVIATION))
+    name = "backbone.model"
+    x = conv(w, f"{name}.conv1", (images / 255 - mean) / deviation, stride=2, padding=3)
+    x = F.max_pool2d(F.relu(batch_norm(w, f"{name}.bn1", x), inplace=True), 3, stride=2, padding=1)
+    for layer, blocks in ((1, 3), (2, 4), (3, 6)):
+        for block in range(blocks):
+            stride = 2 if layer > 1 and block == 0 else 1
+            x = _bottleneck(w, f"{name}.layer{layer}.{block}", x, stride, shortcut=block == 0)
+    return x
+
+
+def _bottleneck(w: Weights, name: str, x: Tensor, stride: int, shortcut: bool) -> Tensor:
+    out = F.relu(batch_norm(w, f"{name}.bn1", conv(w, f"{name}.conv1", x)), inplace=True)
+    out = conv(w, f"{name}.conv2", out, stride=stride, padding=1)
+    out = F.relu(batch_norm(w, f"{name}.bn2", out), inplace=True)
+    out = batch_norm(w, f"{name}.bn3", conv(w, f"{name}.conv3", out))
+    if shortcut:
+        x = batch_norm(w, f"{name}.downsample.1", conv(w, f"{name}.downsample.0", x, stride=stride))
+    return F.relu(out.add_(x), inplace=True)
