@@ -99,5 +99,5 @@ def judge(truth: Truth, thresholds: Iterable[float], split: Split | None = None)
     for half in chosen:
         if not positives[-1].take(half.tune).any():
             raise InputError(f"split={split}: no query of one half has a place far enough from the other half; "
-                             "use more queries or smaller thresholds (tolerances, radius)")  # fmt: skip
+                             "use more queries, or smaller tolerances or radius")  # fmt: skip
     return Judge(thresholds, truth.unit, positives, places, chosen)
