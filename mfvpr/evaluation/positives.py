@@ -36,14 +36,16 @@ class Positives:
         """From the rows of each query, in any order.
 
         Raises:
-            InputError: a row that is none of the database.
+            InputError: a row that is none of the database, or no whole number.
         """
         per_query = [np.asarray(some) for some in rows]
         flat = np.concatenate([some for some in per_query if len(some)] or [np.zeros(0, np.int32)])
+        if flat.dtype.kind not in "iu":
+            raise InputError(f"positives: expected rows as whole numbers, got {flat.dtype}; from_matrix takes matrices")
         if flat.size and not 0 <= flat.min() <= flat.max() < num_database:
             raise InputError(f"positives: expected rows of a database of {num_database} images, got {flat.min()} to "
                              f"{flat.max()}; check the ground truth")  # fmt: skip
-        flat, offsets = flat.astype(np.int32, casting="same_kind", copy=False), _offsets(list(map(len, per_query)))
+        flat, offsets = flat.astype(np.int32, copy=False), _offsets(list(map(len, per_query)))
         positives, ascending = cls(flat, offsets, num_database), flat[1:] > flat[:-1]
         starts = offsets[(offsets > 0) & (offsets < len(flat))]  # of another query: its rows begin anew
         ascending[starts - 1] = True

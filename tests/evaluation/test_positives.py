@@ -110,8 +110,9 @@ def test_what_does_not_fit_is_refused():
     for rows in ([[4]], [[0], [-1]], [[2**32]]):
         with pytest.raises(InputError, match="positives: expected rows of a database of 4 images, got"):
             Positives.from_rows(rows, 4)
-    with pytest.raises(TypeError):
-        Positives.from_rows([[0.5]], 4)
+    for rows in ([[0.5]], np.eye(2, dtype=bool)):
+        with pytest.raises(InputError, match=r"expected rows as whole numbers, got .* from_matrix takes matrices"):
+            Positives.from_rows(rows, 4)
     with pytest.raises(InputError, match=r"expected two of one size .*, got \(2, 4\) and \(2, 5\)"):
         found | Positives.from_rows([[0], [0]], 5)
     with pytest.raises(InputError, match="allowed: expected shape"):
