@@ -12,18 +12,17 @@ import numpy as np
 
 from experiments import truth
 from experiments.axes import shown
-from experiments.judging import Judge
 from experiments.prepare import Images
 from experiments.run_folder import Figure
 from mfvpr.data.files import replacing, write_text
-from mfvpr.data.ground_truth import threshold_words
+from mfvpr.evaluation import Judge, threshold_words
+from mfvpr.evaluation.statistics import mcnemar, recall_interval
 from mfvpr.learning.match_weight import FEATURE_NAMES, LearnedWeight
 from mfvpr.learning.training import Fit
 from mfvpr.pipeline import MatchSet
 from mfvpr.report import runs
 from mfvpr.report.learning_figures import curves_figure, weights_figure
 from mfvpr.report.tables import Table
-from mfvpr.statistics import mcnemar, recall_interval
 from mfvpr.types import Shortlist
 
 SHOWN_QUERIES = 20  # whose matches the figure of the weights counts
@@ -168,14 +167,15 @@ def _weights_figure(path: Path, outcome: Outcome, weights: Mapping[str, LearnedW
     """What the weights look at, on queries that are reported on."""
     judge, queries = outcome.judge, np.concatenate([half.report for half in outcome.judge.halves])
     shown_queries = queries[np.linspace(0, len(queries) - 1, min(SHOWN_QUERIES, len(queries))).astype(int)]
+    answers = judge.positives[judge.main].take(shown_queries).contains(outcome.candidates.indices[shown_queries])
     inputs, right = [], []
     found: dict[str, list[np.ndarray]] = {name: [] for name in weights}
-    for query in shown_queries:
-        matches, indices = outcome.matches[query], np.maximum(outcome.candidates.indices[query], 0)
+    for query, answer in zip(shown_queries, answers, strict=True):
+        matches = outcome.matches[query]
         real = matches.mask
         first = next(iter(weights.values()))
         inputs.append(np.asarray(_raw(first, matches))[real])
-        right.append(np.broadcast_to(judge.positives[judge.main][query][indices][:, None], real.shape)[real])
+        right.append(np.broadcast_to(answer[:, None], real.shape)[real])
         for name, weight in weights.items():
             found[name].append(np.asarray(_weigh(weight, matches))[real])
     joined = {name: np.concatenate(values) for name, values in found.items()}

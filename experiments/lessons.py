@@ -13,10 +13,10 @@ import optax
 
 import mfvpr
 from experiments import axes, build, console, learn_outputs, prepare, run_folder, stores, truth
-from experiments.judging import Judge, judge
 from experiments.models import LOSSES, NUMBERS, Lesson, Model, model
 from experiments.settings import SettingsError
 from mfvpr import pipeline, sweeping
+from mfvpr.evaluation import Half, Judge, Positives, best_setting, hits, separated
 from mfvpr.learning.match_weight import LearnedWeight
 from mfvpr.learning.training import Fit, fit
 from mfvpr.numerics import round_up
@@ -24,7 +24,6 @@ from mfvpr.pipeline import MatchSet
 from mfvpr.report import runs
 from mfvpr.scoring import parameters
 from mfvpr.stores.manifest import recipe_fingerprint
-from mfvpr.sweeping import Half
 from mfvpr.types import Matches, Shortlist
 
 VALIDATION = 0.25  # of the queries to learn on, the end of their block
@@ -72,9 +71,8 @@ class School:
         """`[Q, C]` bool, candidates of the losses: seen, and not right by the widest threshold alone."""
         return self.seen & ~(self._positive(self.judge.positives[-1]) & ~self.right)
 
-    def _positive(self, positives: np.ndarray) -> np.ndarray:
-        indices = np.maximum(self.candidates.indices, 0)
-        return np.take_along_axis(positives, indices, axis=1) & self.candidates.mask
+    def _positive(self, positives: Positives) -> np.ndarray:
+        return positives.contains(self.candidates.indices) & self.candidates.mask
 
     @cached_property
     def width(self) -> int:
@@ -116,7 +114,7 @@ def _outcome(settings: dict[str, Any]) -> "learn_outputs.Outcome":
     watch = prepare.Stopwatch()
     with watch("data"):
         images = prepare.images(settings)
-    judgment = judge(settings, images.dataset)
+    judgment = truth.judge(settings, images.dataset)
     matches, candidates = prepare.matched(settings, tools, images, watch, with_ratio=True)
     axes.require_bins(settings, varied, matches)
     candidates = replace(candidates, scores=pipeline.filter_scores(candidates, settings["fusion"]["filter_score"]))
@@ -132,7 +130,7 @@ def _schools(settings: dict[str, Any], matches: MatchSet, candidates: Shortlist,
     names = ["first_half", "second_half"] if settings["split"] == "both" else [settings["split"]]
     for name, half in zip(names, judgment.halves, strict=True):
         cut = len(half.tune) - round(VALIDATION * len(half.tune))
-        apart = sweeping.separated(judgment.places, half.tune[:cut], half.tune[cut:])
+        apart = separated(judgment.places, half.tune[:cut], half.tune[cut:])
         seen = candidates.mask & half.allowed[np.maximum(candidates.indices, 0)]
         school = School(settings, matches, candidates, judgment, half, apart.tune, apart.report, seen, name)
         right, wrong = school.right & school.usable, ~school.right & school.usable
@@ -216,8 +214,8 @@ def _fit(school: School, start: Model, folder: Path | None, recipe: dict[str, An
 def _reported(school: School, name: str, scorer: Any, setting: dict[str, Any]) -> "learn_outputs.Result":
     """A scorer with the values of a setting, on the half that is reported on, with all candidates."""
     [rows] = _ranked(school, name, scorer, [setting], school.half.report, school.candidates.mask)
-    hits = np.stack([sweeping.hits(rows, right[school.half.report]) for right in school.judge.positives])
-    return learn_outputs.Result(school.name, name, hits, {}, None)
+    right = [hits(rows, positives.take(school.half.report)) for positives in school.judge.positives]
+    return learn_outputs.Result(school.name, name, np.stack(right), {}, None)
 
 
 def _searched(
@@ -236,8 +234,8 @@ def _searched(
     settings, tune = [setting(one) for one in written], school.half.tune
     own = axes.scorer(school.settings)
     rows = _ranked(school, "grid search" + " + filter" * fused, own, settings, tune, school.seen)
-    right = school.judge.positives[school.judge.main][tune]
-    best = sweeping.best_setting(sweeping.hits(rows, right).mean(axis=-1), values)
+    right = school.judge.positives[school.judge.main].take(tune)
+    best = best_setting(hits(rows, right).mean(axis=-1), values)
     return settings[best], written[best]
 
 
@@ -280,7 +278,8 @@ def _checkpoints(
     names = ("scorer", "loss", "every", "patience", "batch", "learning_rate", "hidden", "seed")
     recipe = {"matches": data, "tolerances": settings["recall"]} | {name: settings[name] for name in names}
     recipe["filter_score"] = settings["fusion"]["filter_score"]
-    recipe["positives"] = hashlib.sha256(np.stack(judgment.positives).tobytes()).hexdigest()[:16]
+    flat = [array.tobytes() for right in judgment.positives for array in (right.offsets, right.rows)]
+    recipe["positives"] = hashlib.sha256(b"".join(flat)).hexdigest()[:16]
     recipe["versions"] = {name: runs.versions()[name] for name in ("mfvpr", "jax", "numpy")}
     root = settings["checkpoints"] or settings["store"]
     own = "" if settings["checkpoints"] else f"{settings['dataset']['name']}_learning-{recipe_fingerprint(recipe)}"

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from experiments.axes import Axes
-from experiments.judging import Judge
 from experiments.settings import SettingsError
+from mfvpr.evaluation import Judge
 
 if TYPE_CHECKING:
     import optuna

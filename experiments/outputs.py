@@ -13,9 +13,8 @@ from experiments.run_folder import Figure
 from experiments.settings import SettingsError
 from mfvpr.data.datasets import Dataset, ImageFolder
 from mfvpr.data.files import write_text
-from mfvpr.data.ground_truth import Unit, threshold_words
 from mfvpr.data.images import resize
-from mfvpr.evaluation import recall_at_k
+from mfvpr.evaluation import Positives, Unit, recall_at_k, threshold_words
 from mfvpr.features import LocalExtractor
 from mfvpr.pipeline import FeatureSet, MatchSet, explain
 from mfvpr.report import runs
@@ -67,16 +66,14 @@ class Outcome:
         return self.thresholds[len(self.thresholds) // 2]
 
     @cached_property
-    def right(self) -> np.ndarray | None:
-        """`[Q, N]` bool by `threshold`."""
+    def right(self) -> Positives | None:
+        """By `threshold`."""
         found = self.dataset.truth
         return None if found is None else found.positives(self.threshold)
 
     def is_right(self, system: "System") -> np.ndarray | None:
         """`[Q, C]` bool in the order of a ranking."""
-        if self.right is None:
-            return None
-        return np.take_along_axis(self.right, np.maximum(system.rows, 0), axis=1) & (system.rows >= 0)
+        return None if self.right is None else self.right.contains(system.rows)
 
     @property
     def headline(self) -> str:
@@ -143,7 +140,7 @@ def result_rows(outcome: Outcome) -> list[dict[str, Any]]:
     ]  # fmt: skip
 
 
-def _recall(outcome: Outcome, positives: np.ndarray) -> dict[str, dict[str, float]]:
+def _recall(outcome: Outcome, positives: Positives) -> dict[str, dict[str, float]]:
     """Recall@K by system and K."""
     ks = sorted(set(outcome.settings["recall"]["ks"]))
 
@@ -248,12 +245,12 @@ def _answer(outcome: Outcome, query: int, rank: int, verdict: str) -> Answer:
 def _right_answer(outcome: Outcome, query: int) -> list[Answer]:
     """The first right candidate; else the right image, which the filter missed; nothing where there is none."""
     ranked, found = outcome.is_right(outcome.systems[outcome.headline]), outcome.dataset.truth
-    if ranked is None or outcome.right is None or found is None or not outcome.right[query].any():
+    if ranked is None or outcome.right is None or found is None or not len(right := outcome.right.of(query)):
         return []
     if ranked[query].any():
         return [_answer(outcome, query, int(np.argmax(ranked[query])), "right")]
     nearest = found.place(query)
-    row = nearest if nearest is not None and outcome.right[query, nearest] else int(np.argmax(outcome.right[query]))
+    row = nearest if nearest is not None and nearest in right else int(right[0])
     database, num_candidates = outcome.dataset.database, outcome.candidates.indices.shape[1]
     caption = f"right: {database.names[row]}, not among the {num_candidates} candidates"
     return [Answer(_image(outcome, database, row), caption, None, None)]

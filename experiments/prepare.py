@@ -15,8 +15,8 @@ from experiments.console import bar, tell, track
 from mfvpr import pipeline
 from mfvpr.data.contents import Contents, contents
 from mfvpr.data.datasets import Dataset, ImageFolder
-from mfvpr.data.ground_truth import threshold_words
 from mfvpr.data.sequences import OwnRows, own_rows, without_neighbors
+from mfvpr.evaluation import threshold_words
 from mfvpr.extraction import Descriptors
 from mfvpr.features import GlobalExtractor, LocalExtractor
 from mfvpr.pipeline import FeatureSet, MatchSet
@@ -103,13 +103,14 @@ def extracted(settings: dict[str, Any], tools: Extractors, found: Images, watch:
             for side, folder in found.sides.items()
         )
     _warn(found.dataset, database, queries)
+    excluded = found.dataset.excluded
     with watch("filter"):
         described = _described(settings, tools.describer, found, {"database": database, "query": queries})
         candidates = pipeline.shortlist(
             described["query"].values,
             described["database"].values,
             _num_candidates(settings, found),
-            allowed=found.dataset.allowed,
+            allowed=None if excluded is None else ~excluded.dense(),
         )
     database, queries = (
         replace(one, bad=described[side].bad) for side, one in (("database", database), ("query", queries))
@@ -178,10 +179,10 @@ def _dataset(settings: dict[str, Any]) -> Dataset:
 def _warn_of_images(settings: dict[str, Any], found: Images, own: OwnRows) -> None:
     """What is in the data set that may give wrong numbers, and what was done about it."""
     dataset, among = found.dataset, sum(map(bool, own))
-    if among and dataset.allowed is None:
+    if among and dataset.excluded is None:
         tell(f"warning: {among} of {len(own)} queries are database images themselves, so that each finds itself; set "
               "dataset.exclude_neighbors=N to leave out what is within N frames of it (0 = itself alone)")  # fmt: skip
-    if dataset.allowed is not None and among < len(own):
+    if dataset.excluded is not None and among < len(own):
         tell(f"note: {len(own) - among} of {len(own)} queries are no database images; nothing is left out for them")
     for side, did in found.reading.items():
         if did["turned"]:
@@ -210,7 +211,7 @@ def _warn_of_truth(settings: dict[str, Any], dataset: Dataset) -> None:
         tell("warning: the ground truth gives no query a right answer; every recall will be 0")
     elif without:
         words = ", ".join(threshold_words(found.unit, threshold).strip() for threshold in without)
-        mend = "larger recall.tolerances" + ", or fewer dataset.exclude_neighbors" * (dataset.allowed is not None)
+        mend = "larger recall.tolerances" + ", or fewer dataset.exclude_neighbors" * (dataset.excluded is not None)
         tell(f"warning: no query has a right answer within {words}, so that recall will be 0 there; use {mend}")
 
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from experiments import build, console, prepare, run_folder, stores, sweep_outputs, truth
 from experiments.axes import BYTES_PER_SETTING, Axes, as_setting, axes, require_bins, require_memory, scorer
-from experiments.judging import Judge, judge
 from mfvpr import sweeping
+from mfvpr.evaluation import Judge
 from mfvpr.pipeline import MatchSet
 from mfvpr.report import runs
 from mfvpr.stores.manifest import recipe_fingerprint
@@ -51,7 +51,7 @@ def _found(settings: dict[str, Any]) -> tuple[sweep_outputs.Found, Path | None]:
     watch = prepare.Stopwatch()
     with watch("data"):
         images = prepare.images(settings)
-    judgment = judge(settings, images.dataset)
+    judgment = truth.judge(settings, images.dataset)
     matches, candidates = prepare.matched(settings, tools, images, watch)
     require_bins(settings, varied, matches)
     judgment = judgment.of(candidates)

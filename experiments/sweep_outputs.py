@@ -11,15 +11,15 @@ import numpy as np
 
 from experiments import truth
 from experiments.axes import Axes, shown
-from experiments.judging import Judge
 from experiments.prepare import Images
 from experiments.run_folder import Figure
-from mfvpr import sweeping
+from mfvpr import evaluation
 from mfvpr.data.files import write_text
+from mfvpr.evaluation import Judge
+from mfvpr.evaluation.statistics import mcnemar, recall_interval
 from mfvpr.report import runs
 from mfvpr.report.heat_maps import heat_map_figure
 from mfvpr.report.tables import Table
-from mfvpr.statistics import mcnemar, recall_interval
 
 TOP = 10
 MAX_HEAT_MAPS = 6
@@ -57,7 +57,7 @@ class Found:
         """The number of the best setting, for each half."""
         size = self.axes.size if self.is_grid else len(self.written)
         axes = self.axes.values if self.is_grid else None
-        return [sweeping.best_setting(one[:size, self.judge.main], axes) for one in self.judge.tuning(self.rows)]
+        return [evaluation.best_setting(one[:size, self.judge.main], axes) for one in self.judge.tuning(self.rows)]
 
 
 def text(found: Found) -> str:
@@ -107,7 +107,7 @@ def _summary(found: Found) -> Iterator[str]:
     yield _table(found, list(dict.fromkeys([*best, found.own]))).text()
     if found.is_grid and not judge.halves:
         best = found.chosen[0]
-        around = sweeping.neighbors(found.axes.values, best)
+        around = evaluation.neighbors(found.axes.values, best)
         if around:
             yield "The best, and its neighbors in the grid:"
             yield _table(found, [best, *around]).text()
@@ -193,7 +193,7 @@ def _heat_maps(found: Found) -> Iterator[Figure]:
     recall = found.recall[: found.axes.size, found.judge.main].reshape(*map(len, values.values()))
     names = [name for name, axis in values.items() if len(axis) > 1]
     pairs = list(itertools.combinations(names, 2)) or [(name, name) for name in names]
-    flat_best = sweeping.best_setting(recall.reshape(-1), found.axes.values)
+    flat_best = evaluation.best_setting(recall.reshape(-1), found.axes.values)
     best = dict(zip(values, map(int, np.unravel_index(flat_best, recall.shape)), strict=True))
     own = {name: values[name].index(shown(value)) if shown(value) in values[name] else None
            for name, value in found.axes.own.items()}  # fmt: skip

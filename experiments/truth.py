@@ -3,8 +3,10 @@
 from collections.abc import Mapping
 from typing import Any
 
+from experiments.settings import SettingsError
+from mfvpr import evaluation
 from mfvpr.data.datasets import Dataset
-from mfvpr.data.ground_truth import Truth
+from mfvpr.evaluation import Judge, Truth
 
 _FILES = ("index_file", "query_labels", "database_labels")
 _WORDS = {"order": "file order", "utm": "positions in the names", "drawn": "drawn with the images"}
@@ -14,6 +16,15 @@ def thresholds(settings: Mapping[str, Any], truth: Truth | None) -> list[float]:
     """What counts as right, in the unit of the ground truth, ascending; none without ground truth."""
     recall = settings["recall"]
     return [] if truth is None else truth.thresholds(tolerances=recall["tolerances"], radius=recall["radius"])
+
+
+def judge(settings: Mapping[str, Any], dataset: Dataset) -> Judge:
+    """What a search or a learning judges rankings by."""
+    if dataset.truth is None:
+        raise SettingsError(
+            "dataset.ground_truth=none: choosing settings needs a ground truth; set order, index, utm or label"
+        )
+    return evaluation.judge(dataset.truth, thresholds(settings, dataset.truth), settings["split"])
 
 
 def described(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, Any]:

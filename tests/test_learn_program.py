@@ -268,7 +268,7 @@ def test_a_loss_that_turns_infinite_is_told(root, tmp_path, monkeypatch, capsys,
         (["learning_rat=1"], "the nearest is learning_rate"),
         (["grid.sigma=[]"], "grid.sigma=[]: expected a list of one or more"),
         (["dataset.ground_truth=none", "dataset.index_file=null"], "choosing settings needs a ground truth"),
-        (["recall.tolerances=[30]"], "far enough from the other half; use more queries or smaller tolerances\n"),
+        (["recall.tolerances=[30]"], "from the other half; use more queries, or smaller tolerances or radius\n"),
     ],
 )
 def test_mistakes_are_one_line_and_exit_code_2(root, tmp_path, monkeypatch, capsys, arguments, words):

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import frame_positives, radius_positives, recall_at_k, retrieve
+from mfvpr.evaluation import Positives
 from tests import oracles
 from tests.builders import unit
 
@@ -60,7 +61,9 @@ def test_recall(seed, depth):
     order[rng.random(order.shape) < 0.2] = -1
     positives = rng.random((5, 9)) < 0.2
     ks = [1, 2, 5, 100]
-    np.testing.assert_allclose(recall_at_k(order, positives, ks), oracles.recall_at_k(order, positives, ks))
+    expected = oracles.recall_at_k(order, positives, ks)
+    np.testing.assert_allclose(recall_at_k(order, positives, ks), expected)
+    np.testing.assert_array_equal(recall_at_k(order, Positives.from_matrix(positives), ks), expected)
 
 
 def test_a_query_without_positives_counts_as_a_failure():

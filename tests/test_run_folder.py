@@ -24,6 +24,7 @@ from mfvpr.data.ground_truth import AllowedTruth
 from mfvpr.data.images import read_image
 from mfvpr.data.streets import streets_folder
 from mfvpr.errors import InputError
+from mfvpr.evaluation import Positives
 from mfvpr.report import runs
 from tests.programs import CANDIDATES, QUERIES, ROOT, composed, shared, small, typed
 
@@ -164,16 +165,16 @@ def test_what_does_not_count_is_never_shown_as_right(outcome):
     right = outcome.is_right(outcome.systems["histogram"])
     query = int(np.flatnonzero(~right.any(axis=1))[0])
     names, truth = outcome.dataset.database.names, outcome.dataset.truth
-    allowed = np.ones((len(outcome.dataset.queries), len(names)), bool)
-    allowed[query, truth.place(query)] = False
+    excluded = np.zeros((len(outcome.dataset.queries), len(names)), bool)
+    excluded[query, truth.place(query)] = True
 
-    def answers(allowed):
-        dataset = replace(outcome.dataset, truth=AllowedTruth(truth, allowed))
+    def answers(excluded):
+        dataset = replace(outcome.dataset, truth=AllowedTruth(truth, Positives.from_matrix(excluded)))
         return [answer.caption for answer in outputs._right_answer(replace(outcome, dataset=dataset), query)]
 
-    other = int(np.argmax(outcome.right[query] & allowed[query]))
-    assert answers(allowed) == [f"right: {names[other]}, not among the 3 candidates"]
-    assert answers(np.zeros_like(allowed)) == []
+    other = int(np.argmax(outcome.right.dense()[query] & ~excluded[query]))
+    assert answers(excluded) == [f"right: {names[other]}, not among the 3 candidates"]
+    assert answers(np.ones_like(excluded)) == []
 
 
 def test_figures_of_chosen_queries(outcome):

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from mfvpr.data.ground_truth import CHOICES, KINDS, Truth, truth_by_order, truth_from_names
+from mfvpr.data.ground_truth import CHOICES, KINDS, truth_by_order, truth_from_names
 from mfvpr.data.images import SUFFIXES, read_image
 from mfvpr.data.truth_files import truth_from_file, truth_from_labels
 from mfvpr.errors import InputError
+from mfvpr.evaluation import Positives, Truth
 
 
 @dataclass(frozen=True)
@@ -52,14 +53,14 @@ class Dataset:
         database: images to find.
         queries: images to find them for.
         truth: which are right; None = only rankings can be told.
-        allowed: `[Q, N]` bool, which database images a query may find; None = all.
+        excluded: the database images that each query may not find; None = it may find all.
     """
 
     name: str
     database: ImageFolder
     queries: ImageFolder
     truth: Truth | None
-    allowed: np.ndarray | None = None
+    excluded: Positives | None = None
 
 
 def image_folder(root: Path, *, orient: bool = True, bits: int | None = 16) -> ImageFolder:

@@ -4,16 +4,15 @@ Truth comes in three kinds. Two have a threshold that decides what still counts:
 radius in meters. The third is exact: a database image is right or it is not.
 """
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 
 from mfvpr.errors import InputError
-from mfvpr.evaluation import radius_positives
+from mfvpr.evaluation import Positives, Truth, Unit, rows_within
 
 KINDS = {
     "order": "query i shows database image i",
@@ -23,44 +22,8 @@ KINDS = {
     "none": "rankings only",
 }
 CHOICES = "; ".join(f"{kind} ({meaning})" for kind, meaning in KINDS.items())
+_NONE = np.zeros(0, np.int32)
 FARTHEST = 1e9  # meters; beyond, distances lose their centimeters, and at last their meaning
-Unit = Literal["frames", "m", "exact"]
-
-
-class Truth(ABC):
-    """Which database images are right for each query."""
-
-    @property
-    @abstractmethod
-    def unit(self) -> Unit:
-        """Of thresholds; "exact" = they do not matter."""
-
-    @abstractmethod
-    def positives(self, threshold: float) -> np.ndarray:
-        """`[Q, N]` bool, what counts as right at a threshold, inclusive."""
-
-    def shows_place(self, threshold: float) -> np.ndarray:
-        """`[Q, N]` bool, database images of the query's place, also those that may not answer it."""
-        return self.positives(threshold)
-
-    @abstractmethod
-    def distance(self, query: int) -> np.ndarray:
-        """`[N]` from each database image to the query's place, in the unit; infinite where it is never right."""
-
-    def place(self, query: int) -> int | None:
-        """The database row that shows the query's place best, None if there is none."""
-        distance = self.distance(query)
-        best = int(np.argmin(distance)) if distance.size else None
-        return best if best is not None and np.isfinite(distance[best]) else None
-
-    def thresholds(self, *, tolerances: Iterable[int], radius: float) -> list[float]:
-        """Those of the unit, ascending: tolerances in frames, or the radius in meters; 0 alone where truth is exact."""
-        return {"frames": sorted(set(tolerances)), "m": [radius], "exact": [0]}[self.unit]
-
-
-def threshold_words(unit: Unit, threshold: float) -> str:
-    """What stands behind R@K in a table."""
-    return {"frames": f" ±{threshold:g}", "m": f" {threshold:g} m", "exact": ""}[unit]
 
 
 @dataclass(frozen=True)
@@ -82,14 +45,14 @@ class FrameTruth(Truth):
         """Frames, where there are tolerances."""
         return "frames" if self.widened else "exact"
 
-    def positives(self, threshold: float) -> np.ndarray:
-        """`[Q, N]` bool for a tolerance in frames, inclusive."""
-        tolerance = int(threshold) if self.widened else 0
-        positives = np.zeros((len(self.rows), self.num_database), bool)
-        for right, rows in zip(positives, self.rows, strict=True):
-            for row in rows:
-                right[max(row - tolerance, 0) : row + tolerance + 1] = True
-        return positives
+    def positives(self, threshold: float) -> Positives:
+        """Those for a tolerance in frames, inclusive."""
+        tolerance, last = int(threshold) if self.widened else 0, self.num_database
+
+        def around(row: int) -> np.ndarray:
+            return np.arange(max(row - tolerance, 0), min(row + tolerance + 1, last), dtype=np.int32)
+
+        return Positives.from_rows((np.concatenate([_NONE, *map(around, rows)]) for rows in self.rows), last)
 
     def distance(self, query: int) -> np.ndarray:
         """`[N]` frames to the nearest of the query's rows."""
@@ -107,9 +70,9 @@ class RadiusTruth(Truth):
     query_xy: np.ndarray  # [Q, 2]
     database_xy: np.ndarray  # [N, 2]
 
-    def positives(self, threshold: float) -> np.ndarray:
-        """`[Q, N]` bool for a radius in meters, inclusive."""
-        return radius_positives(self.query_xy, self.database_xy, radius=threshold)
+    def positives(self, threshold: float) -> Positives:
+        """Those within a radius in meters, inclusive."""
+        return Positives.from_rows(rows_within(self.query_xy, self.database_xy, threshold), len(self.database_xy))
 
     def distance(self, query: int) -> np.ndarray:
         """`[N]` meters."""
@@ -124,9 +87,13 @@ class LabelTruth(Truth):
     query_labels: np.ndarray  # [Q]
     database_labels: np.ndarray  # [N]
 
-    def positives(self, threshold: float = 0) -> np.ndarray:
-        """`[Q, N]` bool, at any threshold."""
-        return (self.query_labels[:, None] == self.database_labels) & (self.query_labels >= 0)[:, None]
+    def positives(self, threshold: float = 0) -> Positives:
+        """Those of the same label, at any threshold."""
+        order = np.argsort(self.database_labels, kind="stable").astype(np.int32)
+        labels, starts = np.unique(self.database_labels[order], return_index=True)
+        alike = zip(labels.tolist(), np.split(order, starts[1:]), strict=False)  # no labels: no images, in one part
+        rows = {label: some for label, some in alike if label >= 0}
+        return Positives.from_rows((rows.get(label, _NONE) for label in self.query_labels.tolist()), len(order))
 
     def distance(self, query: int) -> np.ndarray:
         """`[N]` 0 or infinite."""
@@ -136,27 +103,34 @@ class LabelTruth(Truth):
 
 @dataclass(frozen=True)
 class AllowedTruth(Truth):
-    """Another truth, of which some database images are no answer to some queries."""
+    """Another truth, of which some database images are no answer to some queries.
+
+    Attributes:
+        truth: the other.
+        excluded: which images, by query.
+    """
 
     truth: Truth
-    allowed: np.ndarray  # [Q, N] bool
+    excluded: Positives
 
     @property
     def unit(self) -> Unit:
         """The other's."""
         return self.truth.unit
 
-    def positives(self, threshold: float) -> np.ndarray:
-        """`[Q, N]` bool, the other's that are allowed."""
-        return self.truth.positives(threshold) & self.allowed
+    def positives(self, threshold: float) -> Positives:
+        """The other's that are not excluded."""
+        return self.truth.positives(threshold) - self.excluded
 
-    def shows_place(self, threshold: float) -> np.ndarray:
-        """`[Q, N]` bool, the other's, and what is not allowed: the query itself, and its neighbors."""
-        return self.truth.shows_place(threshold) | ~self.allowed
+    def shows_place(self, threshold: float) -> Positives:
+        """The other's, and what is excluded: the query itself, and its neighbors."""
+        return self.truth.shows_place(threshold) | self.excluded
 
     def distance(self, query: int) -> np.ndarray:
-        """`[N]` the other's; infinite where an image is not allowed."""
-        return np.where(self.allowed[query], self.truth.distance(query), np.inf)
+        """`[N]` the other's; infinite where an image is excluded."""
+        distance = np.array(self.truth.distance(query), np.float64)
+        distance[self.excluded.of(query)] = np.inf
+        return distance
 
 
 def truth_by_order(num_queries: int, num_database: int) -> FrameTruth:

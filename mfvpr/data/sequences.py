@@ -38,6 +38,6 @@ def without_neighbors(dataset: Dataset, own: OwnRows, neighbors: int) -> Dataset
             f"exclude_neighbors={neighbors}: expected queries that are among the database images, got none in "
             f"{dataset.queries.root}; leave it out for two different sequences"
         )
-    allowed = ~FrameTruth(own, len(dataset.database)).positives(neighbors)
-    truth = None if dataset.truth is None else AllowedTruth(dataset.truth, allowed)
-    return replace(dataset, truth=truth, allowed=allowed)
+    excluded = FrameTruth(own, len(dataset.database)).positives(neighbors)
+    truth = None if dataset.truth is None else AllowedTruth(dataset.truth, excluded)
+    return replace(dataset, truth=truth, excluded=excluded)

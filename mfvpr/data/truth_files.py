@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from mfvpr.data.ground_truth import FARTHEST, FrameTruth, LabelTruth, RadiusTruth, Truth
+from mfvpr.data.ground_truth import FARTHEST, FrameTruth, LabelTruth, RadiusTruth
 from mfvpr.errors import InputError
+from mfvpr.evaluation import Truth
 
 MAX_DIGITS = 20  # of a row number
 

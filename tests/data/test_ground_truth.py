@@ -5,6 +5,8 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from mfvpr import InputError, frame_positives
 from mfvpr.data.datasets import folder_dataset
@@ -14,9 +16,10 @@ from mfvpr.data.ground_truth import (
     FrameTruth,
     LabelTruth,
     RadiusTruth,
-    threshold_words,
 )
 from mfvpr.data.truth_files import truth_from_labels
+from mfvpr.evaluation import Positives, judge, threshold_words
+from tests import oracles
 from tests.builders import fill
 
 
@@ -32,8 +35,8 @@ def test_order(folders):
     ):
         folder_dataset(database, queries, ground_truth="order")
     truth = folder_dataset(database, database, ground_truth="order").truth
-    np.testing.assert_array_equal(truth.positives(0), np.eye(3, dtype=bool))
-    assert truth.positives(1).sum() == 7
+    np.testing.assert_array_equal(truth.positives(0).dense(), np.eye(3, dtype=bool))
+    assert truth.positives(1).counts.sum() == 7
     assert folder_dataset(database, queries, ground_truth="none").truth is None
 
 
@@ -49,7 +52,7 @@ def test_order(folders):
 def test_csv(folders, tmp_path, text):
     write_text(tmp_path / "gt.csv", text)
     truth = folder_dataset(*folders, ground_truth="index", index_file=tmp_path / "gt.csv").truth
-    np.testing.assert_array_equal(truth.positives(0), [[True, False, True], [False, False, False]])
+    np.testing.assert_array_equal(truth.positives(0).dense(), [[True, False, True], [False, False, False]])
 
 
 def test_json_and_npz(folders, tmp_path):
@@ -57,10 +60,10 @@ def test_json_and_npz(folders, tmp_path):
     np.savez(tmp_path / "gt.npz", query=np.array([0, 1, 0]), database=np.array(["2", "", "0.png"]))
     for name in ("gt.json", "gt.npz"):
         truth = folder_dataset(*folders, ground_truth="index", index_file=tmp_path / name).truth
-        np.testing.assert_array_equal(truth.positives(0), [[True, False, True], [False, False, False]])
+        np.testing.assert_array_equal(truth.positives(0).dense(), [[True, False, True], [False, False, False]])
     np.savez(tmp_path / "utm.npz", utmQ=np.array([[0, 0], [50, 0]]), utmDb=np.array([[0, 25], [0, 26], [50, 1]]))
     truth = folder_dataset(*folders, ground_truth="index", index_file=tmp_path / "utm.npz").truth
-    np.testing.assert_array_equal(truth.positives(25), [[True, False, False], [False, False, True]])
+    np.testing.assert_array_equal(truth.positives(25).dense(), [[True, False, False], [False, False, True]])
 
 
 def test_utm_reads_the_file_name_only(tmp_path):
@@ -68,8 +71,8 @@ def test_utm_reads_the_file_name_only(tmp_path):
     queries = fill(tmp_path / "at@home@1@" / "q", ["@0500010.00@4400000.00@@@@.png"])
     truth = folder_dataset(database, queries, ground_truth="utm").truth
     assert truth.unit == "m"
-    np.testing.assert_array_equal(truth.positives(15), [[True, False]])
-    np.testing.assert_array_equal(truth.positives(25), [[True, True]])
+    np.testing.assert_array_equal(truth.positives(15).dense(), [[True, False]])
+    np.testing.assert_array_equal(truth.positives(25).dense(), [[True, True]])
 
 
 def test_nothing_is_assumed(folders):
@@ -89,8 +92,8 @@ def test_an_index_file_says_all_that_is_right_unless_neighbors_count(folders, tm
     exact = folder_dataset(*folders, **index).truth
     widened = folder_dataset(*folders, **index, widen_index=True).truth
     for tolerance in (0, 1, 5):
-        np.testing.assert_array_equal(exact.positives(tolerance), [[False, False, True], [False] * 3])
-    np.testing.assert_array_equal(widened.positives(1), [[False, True, True], [False] * 3])
+        np.testing.assert_array_equal(exact.positives(tolerance).dense(), [[False, False, True], [False] * 3])
+    np.testing.assert_array_equal(widened.positives(1).dense(), [[False, True, True], [False] * 3])
     assert exact.thresholds(tolerances=[5, 1, 2, 1], radius=25.0) == [0]
     assert widened.thresholds(tolerances=[5, 1, 2, 1], radius=25.0) == [1, 2, 5]
     assert (exact.place(0), exact.place(1), widened.place(0), widened.place(1)) == (2, None, 2, None)
@@ -106,14 +109,14 @@ def labels(tmp_path, database, queries):
 def test_labels(folders, tmp_path):
     files = labels(tmp_path, "2.png, hall\n0.png,kitchen\n1.png,hall \n", "b.png,attic\na.png,hall\n")
     truth = folder_dataset(*folders, **files).truth
-    np.testing.assert_array_equal(truth.positives(5), [[False, True, True], [False, False, False]])
+    np.testing.assert_array_equal(truth.positives(5).dense(), [[False, True, True], [False, False, False]])
     assert (truth.place(0), truth.place(1)) == (1, None)
     assert truth.thresholds(tolerances=[1, 2], radius=25.0) == [0]
 
 
 def test_no_label_is_nobodys(folders, tmp_path):
     truth = folder_dataset(*folders, **labels(tmp_path, "0.png,\n1.png,\n2.png,x\n", "a.png,\nb.png,x\n")).truth
-    np.testing.assert_array_equal(truth.positives(0), [[False, False, False], [False, False, True]])
+    np.testing.assert_array_equal(truth.positives(0).dense(), [[False, False, False], [False, False, True]])
 
 
 @pytest.mark.parametrize(
@@ -140,7 +143,7 @@ def test_a_name_in_two_folders_needs_its_path(tmp_path):
         folder_dataset(both, both, **labels(tmp_path, "0.png,x\n", "left/0.png,x\nright/0.png,y\n"))
     full = "left/0.png,x\nright/0.png,y\n"
     truth = folder_dataset(both, both, **labels(tmp_path, full, full)).truth
-    np.testing.assert_array_equal(truth.positives(0), np.eye(2, dtype=bool))
+    np.testing.assert_array_equal(truth.positives(0).dense(), np.eye(2, dtype=bool))
 
 
 def test_files_are_given_for_the_ground_truth_that_reads_them(folders, tmp_path):
@@ -161,7 +164,7 @@ def test_as_many_labels_as_anyone_has():
     positives = truth.positives(0)
     for query in (0, 7, 1999):
         right = (truth.database_labels == truth.query_labels[query]) & (truth.query_labels[query] >= 0)
-        np.testing.assert_array_equal(positives[query], right)
+        np.testing.assert_array_equal(positives.of(query), np.flatnonzero(right))
         np.testing.assert_array_equal(np.isfinite(truth.distance(query)), right)
 
 
@@ -172,24 +175,59 @@ def test_a_long_file_of_labels_is_read_in_seconds(tmp_path):
     np.testing.assert_array_equal(truth.query_labels, np.repeat(range(5), [10, 90, 900, 9000, 20_000]))
 
 
-def test_positives_take_little_more_than_themselves():
-    """Nordland has 27,592 frames on each side: eight bytes for each pair would be 6 GB, of which there were two."""
-    number = 600
-    rows = FrameTruth(tuple((row,) for row in range(number)), number)
-    places = RadiusTruth(*2 * [np.stack([np.arange(number), np.zeros(number)], axis=1)])
-    for positives, expected in (
-        (lambda: rows.positives(2), 5 * number - 6),
-        (lambda: frame_positives(np.arange(number), np.arange(number), tolerance=2), 5 * number - 6),
-        (lambda: places.positives(1e6), number**2),
-    ):
-        tracemalloc.start()
-        try:
-            found = positives()
-            peak = tracemalloc.get_traced_memory()[1]
-        finally:
-            tracemalloc.stop()
-        assert peak < 1.5 * number**2
-        assert found.sum() == expected
+def peak_of(work):
+    """The most memory that Python and NumPy held, in bytes, and what came of it."""
+    tracemalloc.start()
+    try:
+        return work(), tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def test_nordland_takes_a_few_megabytes():
+    """27,592 frames on each side, of which a matrix is 761 MB: what is right, both halves, and recall."""
+    number, tolerance = 27_592, 10
+    truth = FrameTruth(tuple((row,) for row in range(number)), number)
+    own = np.arange(number)[:, None]
+    rankings = np.stack([own, own - tolerance, own - tolerance - 1])
+
+    def protocol():
+        found = judge(truth, [tolerance], "both")
+        return found, found.recall(rankings), found.positives[0] - found.places
+
+    (found, recall, nothing), peak = peak_of(protocol)
+    assert peak < 60e6
+    [positives] = found.positives
+    assert positives.counts.sum() == number * (2 * tolerance + 1) - tolerance * (tolerance + 1)
+    np.testing.assert_array_equal(positives.of(5000), np.arange(4990, 5011))
+    assert [len(half.tune) for half in found.halves] == [number // 2 - 2 * tolerance] * 2
+    np.testing.assert_array_equal(recall, [[1], [1 - tolerance / number], [0]])
+    assert not nothing.any()
+
+
+def test_a_radius_takes_no_more_than_its_neighbors():
+    """A street of 10,000 places 1 m apart: 100 MB as a matrix."""
+    xy = np.stack([np.arange(10_000.0), np.zeros(10_000)], axis=1)
+    positives, peak = peak_of(lambda: RadiusTruth(xy, xy).positives(10))
+    assert peak < 10e6
+    assert positives.counts.sum() == 10_000 * 21 - 110
+    np.testing.assert_array_equal(positives.of(7777), np.arange(7767, 7788))
+
+
+def test_a_matrix_of_frames_takes_little_more_than_itself():
+    frames = np.arange(600)
+    matrix, peak = peak_of(lambda: frame_positives(frames, frames, tolerance=2))
+    assert peak < 1.5 * 600**2
+    assert matrix.sum() == 5 * 600 - 6
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 3.0, 25.0, 1e6]))
+def test_a_radius_is_a_loop_over_all_pairs(seed, radius):
+    rng = np.random.default_rng(seed)
+    queries, database = (rng.uniform(0, 100, (count, 2)) for count in (rng.integers(300), rng.integers(20)))
+    database[: len(queries) // 2] = queries[: len(database)][: len(queries) // 2]  # some at distance 0
+    truth = RadiusTruth(queries, database)
+    np.testing.assert_array_equal(truth.positives(radius).dense(), oracles.radius_positives(queries, database, radius))
 
 
 @pytest.mark.parametrize("tolerance", [0, 1, 4, 10**6])
@@ -197,17 +235,24 @@ def test_frames_are_a_loop_over_all_pairs(tolerance):
     truth = FrameTruth(((3, 7), (), (0,), (9,)), 10)
     for query, rows in enumerate(truth.rows):
         expected = [any(abs(row - one) <= tolerance for one in rows) for row in range(10)]
-        np.testing.assert_array_equal(truth.positives(tolerance)[query], expected)
+        np.testing.assert_array_equal(truth.positives(tolerance).dense()[query], expected)
         np.testing.assert_array_equal(truth.distance(query) <= tolerance, expected)
 
 
-def test_what_is_not_allowed_is_not_right():
-    allowed = np.array([[True, False, False, True], [False, True, True, True]])
-    truth = AllowedTruth(FrameTruth(((1,), (0,)), 4), allowed)
-    np.testing.assert_array_equal(truth.positives(1), [[True, False, False, False], [False, True, False, False]])
+def test_a_place_that_is_named_twice_counts_once():
+    truth = FrameTruth(((7, 3, 7, 4), (0, 0)), 10)
+    assert [truth.positives(tolerance).counts.tolist() for tolerance in (0, 1, 9)] == [[3, 1], [7, 2], [10, 10]]
+
+
+def test_what_is_excluded_is_not_right():
+    excluded = np.array([[False, True, True, False], [True, False, False, False]])
+    truth = AllowedTruth(FrameTruth(((1,), (0,)), 4), Positives.from_matrix(excluded))
+    np.testing.assert_array_equal(truth.positives(1).dense(), [[True] + [False] * 3, [False, True, False, False]])
+    np.testing.assert_array_equal(truth.shows_place(1).dense(), [[True] * 3 + [False], [True, True, False, False]])
     assert not truth.positives(0).any()
     assert (truth.place(0), truth.place(1), truth.unit) == (0, 1, "frames")
-    assert AllowedTruth(truth, np.zeros_like(allowed)).place(0) is None
+    everything = Positives.from_matrix(np.ones_like(excluded))
+    assert AllowedTruth(truth, everything).place(0) is None
 
 
 def bad_npz(path):

@@ -48,8 +48,9 @@ def test_neighbors_are_neither_found_nor_right(sequence):
     for neighbors in (0, 1):
         allowed = np.abs(np.arange(6)[:, None] - np.arange(6)) > neighbors
         found = without_neighbors(dataset, own, neighbors)
-        np.testing.assert_array_equal(found.allowed, allowed)
-        np.testing.assert_array_equal(found.truth.positives(2), dataset.truth.positives(2) & allowed)
+        np.testing.assert_array_equal(found.excluded.dense(), ~allowed)
+        expected = dataset.truth.positives(2).dense() & allowed
+        np.testing.assert_array_equal(found.truth.positives(2).dense(), expected)
     assert not found.truth.positives(1).any()  # a query whose right answers are all left out has none
     assert without_neighbors(owned(sequence, sequence)[0], own, 0).truth is None
 

@@ -3,8 +3,8 @@
 import numpy as np
 
 from experiments import lessons
-from experiments.judging import Judge
-from mfvpr import Shortlist, sweeping
+from mfvpr import Shortlist
+from mfvpr.evaluation import Judge, Positives, halves
 from mfvpr.match_sets import MatchSet
 from tests.builders import of_query, random_matches
 
@@ -30,7 +30,7 @@ def school(settings=None, *, sizes=SIZES, half=0, only_right=()):
     found = [matches_of(query, indices[query], rng, sizes) for query in range(QUERIES)]
     matches = MatchSet([one for one, _ in found], np.array([counts for _, counts in found]), 16)
     apart = np.abs(np.arange(QUERIES)[:, None] - np.arange(QUERIES))
-    positives = [apart <= tolerance for tolerance in TOLERANCES]
-    judge = Judge(TOLERANCES, "frames", positives, positives[-1], sweeping.halves(positives[-1]), [])
+    positives = [Positives.from_matrix(apart <= tolerance) for tolerance in TOLERANCES]
+    judge = Judge(TOLERANCES, "frames", positives, positives[-1], halves(positives[-1]))
     settings = {"split": "both", "ties": "filter", "seed": 0, "batch": 4, "hidden": 5} | (settings or {})
     return list(lessons._schools(settings, matches, candidates, judge))[half]

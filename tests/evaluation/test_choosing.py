@@ -5,17 +5,18 @@ import pytest
 
 from mfvpr import frame_positives
 from mfvpr.data.ground_truth import AllowedTruth, FrameTruth, LabelTruth
-from mfvpr.sweeping import best_setting, halves, hits, neighbors
+from mfvpr.evaluation import Positives, best_setting, halves, hits, neighbors
 
 
 @pytest.mark.parametrize("tolerance", [0, 1, 3])
 def test_halves_never_share_a_place(tolerance):
     places = np.arange(20)
-    positives = frame_positives(places, places, tolerance=tolerance)
+    matrix = frame_positives(places, places, tolerance=tolerance)
+    positives = Positives.from_matrix(matrix)
     for half in halves(positives):
         near = {place for query in half.report for place in range(query - tolerance, query + tolerance + 1)}
         assert set(np.flatnonzero(~half.allowed)) == near & set(range(20))
-        assert all(set(np.flatnonzero(positives[query])) & near == set() for query in half.tune)
+        assert all(set(np.flatnonzero(matrix[query])) & near == set() for query in half.tune)
         assert list(half.report) == list(range(half.report[0], half.report[-1] + 1))
     reported = np.concatenate([half.report for half in halves(positives)])
     assert sorted(reported) == list(range(20))
@@ -24,13 +25,13 @@ def test_halves_never_share_a_place(tolerance):
 
 
 def test_queries_without_a_place_may_be_tuned_on():
-    positives = frame_positives(np.array([0, -1, 8, 9]), np.arange(10), tolerance=1)
+    positives = Positives.from_matrix(frame_positives(np.array([0, -1, 8, 9]), np.arange(10), tolerance=1))
     first, _ = halves(positives)
     assert list(first.tune) == [0, 1]
 
 
 def test_hits_look_at_the_first_k_and_never_at_nothing():
-    positives = np.array([[True, False, False], [False, False, True]])
+    positives = Positives.from_rows([[0], [2]], 3)
     rows = np.array([[[1, 0], [0, 2]], [[-1, -1], [2, -1]]])  # [settings, queries, depth]
     np.testing.assert_array_equal(hits(rows, positives), [[False, False], [False, True]])
     np.testing.assert_array_equal(hits(rows, positives, k=2), [[True, True], [False, True]])
@@ -54,7 +55,7 @@ def test_a_query_that_is_a_database_image_is_seen_where_it_is_reported():
     """A place that is passed twice, in one sequence: what may not answer a query still shows its place."""
     labels = np.r_[np.arange(50), np.arange(50)]
     itself = FrameTruth(tuple((row,) for row in range(100)), 100)
-    truth = AllowedTruth(LabelTruth(labels, labels), ~itself.positives(3))
-    assert (truth.positives(0).sum(axis=1) == 1).all()
+    truth = AllowedTruth(LabelTruth(labels, labels), itself.positives(3))
+    assert (truth.positives(0).counts == 1).all()
     for half in halves(truth.shows_place(0)):
         assert len(half.tune) == 0

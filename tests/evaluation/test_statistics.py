@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mfvpr.statistics import design_effect, mcnemar, recall_interval
+from mfvpr.evaluation.statistics import design_effect, mcnemar, recall_interval
 
 
 def paths(recall, correlation, queries, count=200, seed=0):

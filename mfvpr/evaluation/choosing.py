@@ -5,6 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mfvpr.evaluation.positives import Positives
+
 
 class Half(NamedTuple):
     """A path cut in two: what is chosen or learned on one part, and reported on the other.
@@ -18,31 +20,24 @@ class Half(NamedTuple):
     allowed: np.ndarray
 
 
-def halves(positives: np.ndarray) -> tuple[Half, Half]:
+def halves(positives: Positives) -> tuple[Half, Half]:
     """The queries in two contiguous blocks, either of which is reported on once.
 
     While choosing, nothing of the reported places is seen: database rows that are right for a reported query are not
     allowed, and queries for which such a row is right are left out (they are neighbors across the cut).
 
     Args:
-        positives: `[Q, N]` bool, what shows a query's place within the widest tolerance, also where that is no answer
-            to it (an image that is the query itself).
+        positives: what shows a query's place within the widest threshold, also where that is no answer to it (an image
+            that is the query itself).
     """
     first, second = np.split(np.arange(len(positives)), [len(positives) // 2])
     return separated(positives, first, second), separated(positives, second, first)
 
 
-def separated(positives: np.ndarray, tune: np.ndarray, report: np.ndarray) -> Half:
+def separated(positives: Positives, tune: np.ndarray, report: np.ndarray) -> Half:
     """Query rows to choose on and to report on, without those that share a place; see `halves`."""
-    allowed = np.logical_not(positives[report].any(axis=0))
-    return Half(tune[~(positives[tune] & ~allowed[None]).any(axis=1)], report, allowed)
-
-
-def hits(rows: np.ndarray, positives: np.ndarray, k: int = 1) -> np.ndarray:
-    """`[..., Q]` bool, whether one of the first k `rows` `[..., Q, depth]` is right; -1 never is."""
-    rows = rows[..., :k]
-    query = np.arange(len(positives)).reshape(-1, 1)
-    return np.any(positives[query, np.maximum(rows, 0)] & (rows >= 0), axis=-1)
+    reported = positives.take(report).union()
+    return Half(tune[positives.take(tune).among(reported).counts == 0], report, ~reported)
 
 
 def neighbors(axes: Mapping[str, Sequence[Any]], setting: int) -> list[int]:

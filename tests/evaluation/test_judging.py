@@ -1,0 +1,83 @@
+"""The protocol of choosing and reporting, against loops over queries."""
+
+import numpy as np
+import pytest
+
+from mfvpr import InputError, Shortlist
+from mfvpr.data.ground_truth import FrameTruth, RadiusTruth
+from mfvpr.evaluation import judge
+
+QUERIES, TOLERANCES, SETTINGS = 20, (0, 1, 3), 4
+TRUTH = FrameTruth(tuple((row,) for row in range(QUERIES)), QUERIES)
+
+
+@pytest.fixture
+def rows():
+    """Rankings `[V, S, Q, depth]`, not far from the truth; some end early."""
+    rng = np.random.default_rng(0)
+    rows = np.arange(QUERIES)[:, None] + rng.integers(-4, 5, (3, SETTINGS, QUERIES, 2))
+    return np.where(rows < QUERIES, np.maximum(rows, -1), -1).astype(np.int32)
+
+
+def recall_of(rows, queries, tolerance, k=1):
+    """Of one ranking `[Q, depth]`, by a loop."""
+    right = [any(row >= 0 and abs(row - query) <= tolerance for row in rows[query][:k]) for query in queries]
+    return sum(right) / len(right)
+
+
+def test_recall_is_of_all_queries(rows):
+    found = judge(TRUTH, TOLERANCES)
+    for k in (1, 2):
+        expected = [[recall_of(one, range(QUERIES), tolerance, k) for tolerance in TOLERANCES] for one in rows[0]]
+        np.testing.assert_allclose(found.recall(rows[0], k), expected)
+    np.testing.assert_array_equal(found.tuning(rows), [found.recall(rows[0])])
+    np.testing.assert_allclose(found.reported(rows, [2]).mean(axis=1), found.recall(rows[0])[2])
+
+
+@pytest.mark.parametrize(("split", "numbers"), [("both", [0, 1]), ("first_half", [0]), ("second_half", [1])])
+def test_each_half_chooses_by_its_own_view_and_is_reported_on_by_the_other(rows, split, numbers):
+    found, half = judge(TRUTH, TOLERANCES, split), QUERIES // 2
+    blocks = [range(half), range(half, QUERIES)]
+    inner = [range(half - 2 * TOLERANCES[-1]), range(half + 2 * TOLERANCES[-1], QUERIES)]
+    expected = [
+        [[recall_of(one, inner[number], tolerance) for tolerance in TOLERANCES] for one in rows[view]]
+        for view, number in enumerate(numbers, start=1)
+    ]
+    np.testing.assert_allclose(found.tuning(rows), expected)
+    chosen = [3, 1][: len(numbers)]
+    parts = [
+        [[bool(recall_of(rows[0][setting], [query], tolerance)) for query in blocks[1 - number]]
+         for tolerance in TOLERANCES]
+        for setting, number in zip(chosen, numbers, strict=True)
+    ]  # fmt: skip
+    np.testing.assert_array_equal(found.reported(rows, chosen), np.concatenate(parts, axis=1))
+
+
+def test_choosing_sees_no_candidate_of_a_reported_place():
+    indices = np.tile(np.arange(-1, QUERIES, dtype=np.int32), (QUERIES, 1))
+    shortlist = Shortlist(indices=indices, scores=np.zeros(indices.shape, np.float32), mask=indices >= 0)
+    everything, first, second = judge(TRUTH, TOLERANCES, "both").of(shortlist).views
+    np.testing.assert_array_equal(everything, indices >= 0)
+    np.testing.assert_array_equal(first, (indices >= 0) & (indices < QUERIES // 2 - TOLERANCES[-1]))
+    np.testing.assert_array_equal(second, indices >= QUERIES // 2 + TOLERANCES[-1])
+
+
+def test_thresholds_ascend_and_the_middle_one_decides():
+    found = judge(TRUTH, [3, 0, 1, 3])
+    assert (found.thresholds, found.main, found.label(5, 1)) == ([0, 1, 3], 1, "R@5 ±1")
+    np.testing.assert_array_equal(found.places.dense(), TRUTH.positives(3).dense())
+    meters = judge(RadiusTruth(np.zeros((2, 2)), np.zeros((2, 2))), [25.0])
+    assert meters.label(1, 25.0) == "R@1 25 m"
+
+
+@pytest.mark.parametrize(
+    ("thresholds", "split", "words"),
+    [
+        ([], None, "thresholds: expected at least one"),
+        ([1], "half", "split=half: expected one of None, first_half, second_half, both"),
+        ([1, QUERIES], "both", "split=both: no query of one half has a place far enough from the other half"),
+    ],
+)
+def test_what_cannot_be_judged_is_said_before_anything_is_ranked(thresholds, split, words):
+    with pytest.raises(InputError, match=words):
+        judge(TRUTH, thresholds, split)

@@ -1,0 +1,131 @@
+"""Rows per query answer as the matrix `[Q, N]` bool of the same does."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from mfvpr import InputError
+from mfvpr.evaluation import Positives, positives
+from tests.oracles import radius_positives
+
+sizes = st.tuples(st.integers(0, 7), st.integers(0, 9))
+matrices = sizes.flatmap(lambda shape: arrays(bool, shape))
+pairs = sizes.flatmap(lambda shape: st.tuples(arrays(bool, shape), arrays(bool, shape)))
+seeds = st.integers(0, 2**32 - 1)
+
+
+def same(found, matrix):
+    """Every attribute, as loops over the matrix have it: there is one form of the same positives, which is hashed."""
+    rows = [row for right in matrix.tolist() for row, is_right in enumerate(right) if is_right]
+    assert (found.rows.dtype, found.offsets.dtype) == (np.int32, np.int64)
+    assert (found.rows.tolist(), found.num_database, len(found)) == (rows, matrix.shape[1], len(matrix))
+    assert found.offsets.tolist() == [sum(map(sum, matrix.tolist()[:query])) for query in range(len(matrix) + 1)]
+
+
+@given(matrices)
+def test_they_are_the_matrix(matrix):
+    found = Positives.from_matrix(matrix)
+    same(found, matrix)
+    np.testing.assert_array_equal(found.dense(), matrix)
+    np.testing.assert_array_equal(found.counts, matrix.sum(axis=1))
+    np.testing.assert_array_equal(found.union(), matrix.any(axis=0))
+    assert found.any() is bool(matrix.any())
+    for query in range(-len(matrix), len(matrix)):
+        np.testing.assert_array_equal(found.of(query), np.flatnonzero(matrix[query]))
+    for beyond in (len(matrix), -len(matrix) - 1):
+        with pytest.raises(IndexError):
+            found.of(beyond)
+
+
+@given(matrices, seeds)
+def test_rows_come_in_any_order_and_any_number_of_times(matrix, seed):
+    rng = np.random.default_rng(seed)
+    rows = [np.repeat(right.nonzero()[0], rng.integers(1, 3)) for right in matrix]
+    shuffled = [rng.permutation(some).tolist() for some in rows]
+    same(Positives.from_rows(shuffled, matrix.shape[1]), matrix)
+    same(Positives.from_rows(map(np.uint64, shuffled), matrix.shape[1]), matrix)
+
+
+@given(matrices, seeds)
+def test_of_some_queries(matrix, seed):
+    rng, found = np.random.default_rng(seed), Positives.from_matrix(matrix)
+    mask = rng.random(len(matrix)) < 0.5
+    numbers = rng.integers(0, max(len(matrix), 1), 9 * bool(len(matrix)))
+    for queries in (mask, numbers, slice(1, 4), slice(None, None, -2), []):
+        chosen = matrix[queries] if len(np.shape(queries)) == 0 or len(queries) else matrix[:0]
+        same(found.take(queries), chosen)
+        np.testing.assert_array_equal(found.dense(queries), chosen)
+    allowed = rng.random(matrix.shape[1]) < 0.5
+    same(found.among(allowed), matrix & allowed)
+
+
+@given(pairs)
+def test_union_and_difference(pair):
+    first, second = map(Positives.from_matrix, pair)
+    same(first | second, pair[0] | pair[1])
+    same(first - second, pair[0] & ~pair[1])
+
+
+@given(matrices, seeds, st.sampled_from([(), (1,), (2, 3), (0,)]), st.sampled_from([1, 7, 1 << 20]))
+def test_rankings_are_looked_up(matrix, seed, several, at_a_time):
+    """Also cut into pieces, from which nothing of another query is to be seen."""
+    rng = np.random.default_rng(seed)
+    rows = rng.integers(-2, matrix.shape[1], (*several, len(matrix), 4)).astype(rng.choice(["i4", "i8"]))
+    query = np.arange(len(matrix))[:, None]
+    expected = matrix[query, rows] & (rows >= 0) if matrix.size else np.zeros(rows.shape, bool)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(positives, "_AT_A_TIME", at_a_time)
+        found = Positives.from_matrix(matrix).contains(rows)
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_more_rankings_than_are_looked_up_at_once():
+    rng = np.random.default_rng(0)
+    matrix = rng.random((1500, 1000)) < 0.05
+    rows = rng.integers(-1, 1000, (2, 1500, 400)).astype(np.int32)
+    found = Positives.from_matrix(matrix)
+    np.testing.assert_array_equal(found.contains(rows), matrix[np.arange(1500)[:, None], rows] & (rows >= 0))
+    assert len(found._cuts(800)) > 2
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        (np.zeros((3, 1), int), r"rows: expected shape \[..., 2 queries, k\], got \[3, 1\]"),
+        (np.zeros(2, int), r"got \[2\]"),
+        (np.array([[0], [4]]), "rows: expected whole numbers below 4, got int64 up to 4"),
+        (np.zeros((2, 1)), "got float64"),
+    ],
+)
+def test_rankings_of_others_are_refused(rows, words):
+    """A row beyond the database would be one of the next query."""
+    with pytest.raises(InputError, match=words):
+        Positives.from_rows([[0], [0, 1]], 4).contains(rows)
+
+
+def test_what_does_not_fit_is_refused():
+    found = Positives.from_rows([[0], [0, 1]], 4)
+    for rows in ([[4]], [[0], [-1]], [[2**32]]):
+        with pytest.raises(InputError, match="positives: expected rows of a database of 4 images, got"):
+            Positives.from_rows(rows, 4)
+    for rows in ([[0.5]], np.eye(2, dtype=bool)):
+        with pytest.raises(InputError, match=r"expected rows as whole numbers, got .* from_matrix takes matrices"):
+            Positives.from_rows(rows, 4)
+    with pytest.raises(InputError, match=r"expected two of one size .*, got \(2, 4\) and \(2, 5\)"):
+        found | Positives.from_rows([[0], [0]], 5)
+    with pytest.raises(InputError, match="allowed: expected shape"):
+        found.among(np.ones(5, bool))
+    with pytest.raises(InputError, match="expected a matrix"):
+        Positives.from_matrix(np.ones(3, bool))
+
+
+def test_neighbors_within_a_radius_across_the_pieces(monkeypatch):
+    monkeypatch.setattr(positives, "_QUERIES_AT_A_TIME", 3)
+    rng = np.random.default_rng(0)
+    queries, database = rng.uniform(0, 100, (10, 2)), rng.uniform(0, 100, (30, 2))
+    same(
+        Positives.from_rows(positives.rows_within(queries, database, 25.0), 30), radius_positives(queries, database, 25)
+    )
+    assert [list(rows) for rows in positives.rows_within(queries[:2], database[:0], 25.0)] == [[], []]
