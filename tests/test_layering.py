@@ -31,6 +31,7 @@ ALLOWED = {
     "data": {"errors", "evaluation", "numerics", "types", "data"},
     "models": {"errors", "numerics", "types", "models"},
     "weights": {"errors", "data", "models", "weights"},
+    "exchange": {"errors", "types", "data", "exchange"},
     "features": {"errors", "types", "numerics", "data", "models", "features"},
     "extraction": {"errors", "types", "numerics", "data", "features"},
     "statistics": set(),
@@ -49,6 +50,7 @@ HOMES = {
     "tqdm": set(),
     "optax": {"learning"},
     "orbax": {"learning"},
+    "h5py": {"exchange"},
 }
 MODULES = sorted((ROOT / "mfvpr").rglob("*.py"))
 

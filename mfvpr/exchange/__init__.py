@@ -1,0 +1,1 @@
+"""Features, global descriptors and shortlists of other programs: read, checked, and written back."""
