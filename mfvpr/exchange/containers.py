@@ -1,6 +1,6 @@
 """Arrays by image and name in files of other programs: hloc's h5, npz, folders of npz. Read as data, never executed."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple, Protocol
@@ -10,11 +10,11 @@ import numpy as np
 from mfvpr.errors import InputError
 
 
-class Header(NamedTuple):
-    """What is known of an array before it is read."""
+class Contents(NamedTuple):
+    """What there is of an image: the names of its arrays, and the shapes of some."""
 
-    shape: tuple[int, ...]
-    dtype: np.dtype
+    names: Set[str]
+    shapes: Mapping[str, tuple[int, ...]]
 
 
 class Container(Protocol):
@@ -30,8 +30,8 @@ class Container(Protocol):
     images: tuple[str, ...]
     transposed: bool
 
-    def headers(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, Header]]:
-        """For each image, the headers of those of its `parts` that are there."""
+    def contents(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Contents]:
+        """For each image, what there is, and the shapes of those of its `parts` that are there; no values are read."""
         ...
 
     def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:

@@ -14,7 +14,7 @@ Where the file has no scores, every keypoint has the score 1. float16 becomes fl
 float16 are off by up to 0.25 px beyond 512 px and 0.5 px beyond 1024 px.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ import numpy as np
 
 from mfvpr.errors import InputError
 from mfvpr.exchange.checks import Lengths, as_float32, require_lengths, with_length
-from mfvpr.exchange.containers import Container, Header, require_file, shortened
+from mfvpr.exchange.containers import Container, Contents, require_file, shortened
 from mfvpr.exchange.h5 import H5File
 from mfvpr.exchange.names import match_names, require_all
 from mfvpr.exchange.npz import NpzFile, NpzFolder
@@ -33,7 +33,7 @@ SCORES = ("scores", "keypoint_scores")
 PARTS = ("keypoints", "descriptors", *SCORES, "image_size")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ImportedFeatures:
     """Features of M images in files of another program, made by `open_features`.
 
@@ -87,12 +87,14 @@ class ImportedFeatures:
         descriptors = as_float32(f"{where}: descriptors", parts["descriptors"])
         descriptors = descriptors.T if self._transposed else descriptors
         scores = np.ones(count, np.float32)
-        if found := _score_part(parts):
-            scores = as_float32(f"{where}: {found}", parts[found]).reshape(-1)
-        if len(keypoints) != count or (count and descriptors.shape != shape) or len(scores) != count:
+        if part := _score_part(parts):
+            scores = as_float32(f"{where}: {part}", parts[part]).reshape(-1)
+        fit = descriptors.shape == shape if count else not descriptors.size  # [D, 0], [0, D], [0]: all are none
+        if len(keypoints) != count or len(scores) != count or not fit or self.scored != (part is not None):
             raise InputError(
-                f"{where}: expected {count} keypoints with scores and descriptors of {self.dimension} numbers, got "
-                f"{len(keypoints)}, {len(scores)} and {descriptors.shape}; has the file changed since it was opened?"
+                f"{where}: expected {count} keypoints with scores and descriptors of "
+                f"{self.dimension} numbers, got {len(keypoints)}, {len(scores)} and {list(descriptors.shape)}; is the "
+                "file damaged, or has it changed since it was opened?"
             )
         size = _image_size(where, parts.get("image_size"), None if self._sizes is None else self._sizes[row])
         _require_inside(where, keypoints, size)
@@ -115,7 +117,7 @@ def open_features(
     lengths: Lengths = "unit",
     partial: bool = False,
 ) -> ImportedFeatures:
-    """Features of the images `names`. Only the headers of their arrays are read.
+    """Features of the images `names`. Only the headers of their arrays are read here.
 
     Args:
         path: `.h5` or `.hdf5` of hloc, `.npz` of all images, or a folder of `.npz` and `.d2-net`.
@@ -138,17 +140,17 @@ def open_features(
         require_all(path, names, images, "features")
     there = [row for row, image in enumerate(images) if image is not None]
     matched = [image for image in images if image is not None]
-    headers = dict(zip(matched, container.headers(matched, PARTS), strict=True))
+    contents = dict(zip(matched, container.contents(matched, ("keypoints", "descriptors")), strict=True))
     counts = np.full(len(names), -1, np.int32)
-    for row, (image, parts) in zip(there, headers.items(), strict=True):
-        counts[row] = _count(f"{path}: {shortened(image)}", parts, given_size=sizes is not None)
-    transposed, dimension = _layout(path, headers, container.transposed)
+    for row, (image, held) in zip(there, contents.items(), strict=True):
+        counts[row] = _count(f"{path}: {shortened(image)}", held, given_size=sizes is not None)
+    transposed, dimension = _layout(path, contents, container.transposed)
     return ImportedFeatures(
         path=path,
         paths=container.files(matched),
         counts=counts,
         dimension=dimension,
-        scored=_scored(path, headers),
+        scored=_scored(path, contents),
         _container=container,
         _images=tuple(images),
         _transposed=transposed,
@@ -168,35 +170,31 @@ def open_container(path: Path) -> Container:
     return readers[path.suffix.lower()](path)
 
 
-def _require_parts(where: str, parts: Mapping[str, Any]) -> None:
+def _require_parts(where: str, parts: Collection[str]) -> None:
     if missing := [part for part in ("keypoints", "descriptors") if part not in parts]:
         raise InputError(f"{where}: expected keypoints and descriptors, got no {' and no '.join(missing)}")
 
 
-def _count(where: str, parts: Mapping[str, Header], *, given_size: bool) -> int:
-    """How many keypoints the headers tell of."""
-    _require_parts(where, parts)
-    shape = parts["keypoints"].shape
+def _count(where: str, held: Contents, *, given_size: bool) -> int:
+    """How many keypoints there are."""
+    _require_parts(where, held.names)
+    shape = held.shapes["keypoints"]
     if len(shape) != 2 or not 2 <= shape[1] <= 4 or shape[0] > np.iinfo(np.int32).max:
         raise InputError(
             f"{where}: keypoints: expected [N, 2], (x, y), with at most scale and angle, got {list(shape)}"
         )
-    if (scores := _score_part(parts)) and int(np.prod(parts[scores].shape)) != shape[0]:
-        raise InputError(
-            f"{where}: {scores}: expected {shape[0]} as there are keypoints, got {list(parts[scores].shape)}"
-        )
-    if "image_size" not in parts and not given_size:
+    if "image_size" not in held.names and not given_size:
         raise InputError(f"{where}: expected image_size (width, height) in the file, got none; give it as image_size=")
     return shape[0]
 
 
-def _layout(path: Path, headers: Mapping[str, Mapping[str, Header]], default: bool) -> tuple[bool, int]:
+def _layout(path: Path, contents: Mapping[str, Contents], default: bool) -> tuple[bool, int]:
     """Whether descriptors are `[D, N]`, and D: the same for all images.
 
     An image with N = D could be read both ways; the others of its file decide, or what the program is known to write.
     """
     votes: dict[bool, str] = {}
-    shapes = {image: (parts["keypoints"].shape[0], parts["descriptors"].shape) for image, parts in headers.items()}
+    shapes = {image: (held.shapes["keypoints"][0], held.shapes["descriptors"]) for image, held in contents.items()}
     shapes = {image: (count, shape) for image, (count, shape) in shapes.items() if count}
     for image, (count, shape) in shapes.items():
         if len(shape) != 2 or count not in shape:
@@ -221,14 +219,14 @@ def _layout(path: Path, headers: Mapping[str, Mapping[str, Header]], default: bo
     return transposed, dimension
 
 
-def _score_part(parts: Mapping[str, Any]) -> str | None:
+def _score_part(parts: Collection[str]) -> str | None:
     return next((part for part in SCORES if part in parts), None)
 
 
-def _scored(path: Path, headers: Mapping[str, Mapping[str, Header]]) -> bool:
+def _scored(path: Path, contents: Mapping[str, Contents]) -> bool:
     """Whether the images have scores: all or none, as scores of 1 beside others would mean something."""
-    without = [image for image, parts in headers.items() if _score_part(parts) is None]
-    if without and len(without) < len(headers):
+    without = [image for image, held in contents.items() if _score_part(held.names) is None]
+    if without and len(without) < len(contents):
         raise InputError(f"{path}: expected scores of all images or of none, got none of {shortened(without[0])}")
     return not without
 

@@ -3,6 +3,7 @@
 Only what is in the file itself is read: no links, no storage in other files.
 """
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 
 from mfvpr.data.files import printable, replacing
 from mfvpr.errors import InputError
-from mfvpr.exchange.containers import Header, reading, require_file, require_plain, shortened
+from mfvpr.exchange.containers import Contents, reading, require_file, require_plain, shortened
 
 
 class H5File:
@@ -28,21 +29,22 @@ class H5File:
         if not self.images:
             raise InputError(f"{path}: expected a group for every image, as hloc writes them, got no datasets")
 
-    def headers(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, Header]]:
+    def contents(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Contents]:
         h5py = _h5py(self.path)
         with reading(self.path), h5py.File(self.path, "r") as file:
             for image in images:  # by HDF5's own calls, which take a fifth of the time
                 group = h5py.h5g.open(file.id, _encoded(image))
-                opened = ((part, _opened(self.path, image, group, part)) for part in parts)
-                yield {part: Header(data.shape, data.dtype) for part, data in opened if data is not None}
+                names = {name.decode("utf-8", "surrogateescape") for name in group}
+                opened = ((part, _opened(self.path, image, group, part)) for part in parts if part in names)
+                yield Contents(names, {part: data.shape for part, data in opened})
 
     def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:
         h5py = _h5py(self.path)
         with reading(self.path), h5py.File(self.path, "r") as file:
             for image in images:
                 group = h5py.h5g.open(file.id, _encoded(image))
-                opened = ((part, _opened(self.path, image, group, part)) for part in parts)
-                yield {part: _read(self.path, image, part, data) for part, data in opened if data is not None}
+                there = (part for part in parts if _encoded(part) in group)
+                yield {part: _read(self.path, image, group, part) for part in there}
 
     def files(self, images: Iterable[str]) -> tuple[Path, ...]:
         return (self.path,)
@@ -89,35 +91,39 @@ def _images(path: Path, file: Any) -> Iterator[str]:
                 break
 
 
-def _opened(path: Path, image: str, group: Any, part: str) -> Any | None:
-    """The dataset of this name, if there is one."""
-    h5py, name = _h5py(path), _encoded(part)
-    if name not in group:
-        return None
-    where = f"{image}/{part}"
+def _opened(path: Path, image: str, group: Any, part: str) -> Any:
+    """The dataset of this name, as HDF5 has it."""
+    name, where = _encoded(part), f"{image}/{part}"
     if not _is_hard(path, group, name):
         raise _linked(path, _encoded(where))
     try:
-        data = h5py.h5d.open(group, name)
+        data = _h5py(path).h5d.open(group, name)
     except (KeyError, ValueError, OSError):
         raise InputError(f"{path}: {shortened(where)}: expected a dataset, got a group or damaged bytes") from None
-    require_plain(f"{path}: {shortened(where)}", data.dtype)
     if data.shape is None:
         raise InputError(f"{path}: {shortened(where)}: expected values, got a dataset without any")
     return data
 
 
-def _read(path: Path, image: str, part: str, data: Any) -> np.ndarray:
+def _read(path: Path, image: str, group: Any, part: str) -> np.ndarray:
     """All values, which must be in this very file."""
-    h5py = _h5py(path)
-    where, dataset = f"{path}: {shortened(image)}/{part}", h5py.Dataset(data)
+    where, dataset = f"{path}: {shortened(image)}/{part}", _h5py(path).Dataset(_opened(path, image, group, part))
+    require_plain(where, dataset.dtype)
     if dataset.external or dataset.is_virtual:
         raise InputError(
             f"{where}: expected data in this file, got storage in others, which is not read; copy the data"
         )
-    if dataset.size and not data.get_storage_size():
-        raise InputError(f"{where}: expected data, got a dataset that was never written; extract this image again")
+    if dataset.size and not _is_written(dataset):
+        raise InputError(f"{where}: expected data, got a dataset that was not written; extract this image again")
     return dataset[()]
+
+
+def _is_written(dataset: Any) -> bool:
+    """Whether all values are in the file; HDF5 makes up those that are not."""
+    if dataset.chunks is None:
+        return dataset.id.get_storage_size() > 0
+    chunks = (-(-length // chunk) for length, chunk in zip(dataset.shape, dataset.chunks, strict=True))
+    return dataset.id.get_num_chunks() == math.prod(chunks)
 
 
 def _is_hard(path: Path, group: Any, name: bytes) -> bool:

@@ -1,8 +1,10 @@
 """Features and descriptors in NumPy's archives: one file for all images, or one for each in a folder."""
 
 import io
+import math
 import os
 import zipfile
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO
@@ -11,7 +13,7 @@ import numpy as np
 
 from mfvpr.data.files import printable, replacing
 from mfvpr.errors import InputError
-from mfvpr.exchange.containers import Header, reading, require_file, require_plain, shortened
+from mfvpr.exchange.containers import Contents, reading, require_file, require_plain, shortened
 
 SUFFIXES = (".npz", ".d2-net")  # of the files of images; D2-Net names its own so
 
@@ -34,11 +36,14 @@ class NpzFile:
                 "of its own, give their folder"
             )
 
-    def headers(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, Header]]:
+    def contents(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Contents]:
         with reading(self.path), zipfile.ZipFile(self.path) as archive:
-            members = set(archive.namelist())
+            members: dict[str, set[str]] = defaultdict(set)
+            for name in archive.namelist():
+                image, _, part = name.rpartition("/")
+                members[image].add(part)
             for image in images:
-                yield {part: _header(archive, name) for part, name in _members(members, f"{image}/", parts)}
+                yield _contents(archive, members[image], f"{image}/", parts)
 
     def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:
         with reading(self.path), zipfile.ZipFile(self.path) as archive:
@@ -69,11 +74,10 @@ class NpzFolder:
         if not self.images:
             raise InputError(f"{path}: expected files named {' or '.join(SUFFIXES)}, got none; check the path")
 
-    def headers(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, Header]]:
+    def contents(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Contents]:
         for image in images:
             with reading(self._paths[image]), zipfile.ZipFile(self._paths[image]) as archive:
-                members = set(archive.namelist())
-                yield {part: _header(archive, name) for part, name in _members(members, "", parts)}
+                yield _contents(archive, set(archive.namelist()), "", parts)
 
     def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:
         for image in images:
@@ -106,19 +110,24 @@ def _members(members: set[str], prefix: str, parts: Sequence[str]) -> Iterator[t
     return ((part, name) for part in parts if (name := f"{prefix}{part}.npy") in members)
 
 
-def _header(archive: zipfile.ZipFile, member: str) -> Header:
+def _contents(archive: zipfile.ZipFile, members: set[str], prefix: str, parts: Sequence[str]) -> Contents:
+    names = {name.removesuffix(".npy") for name in members}
+    return Contents(names, {part: _shape(archive, f"{prefix}{part}.npy") for part in parts if part in names})
+
+
+def _shape(archive: zipfile.ZipFile, member: str) -> tuple[int, ...]:
     with archive.open(member) as file:
-        return _read_header(f"{archive.filename}: {shortened(member)}", file)
+        return _read_header(f"{archive.filename}: {shortened(member)}", file)[0]
 
 
-def _read_header(where: str, file: IO[bytes]) -> Header:
+def _read_header(where: str, file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     version = np.lib.format.read_magic(file)
     if version not in readers:
         raise InputError(f"{where}: expected an array of NumPy's format 1.0 or 2.0, got {version}")
     shape, _, dtype = readers[version](file)
     require_plain(where, dtype)
-    return Header(shape, dtype)
+    return shape, dtype
 
 
 def _array(archive: zipfile.ZipFile, member: str) -> np.ndarray:
@@ -129,8 +138,8 @@ def _array(archive: zipfile.ZipFile, member: str) -> np.ndarray:
 def parse_npy(where: str, content: bytes) -> np.ndarray:
     """The array in the bytes of a `.npy`; there must be all of it, and nothing else."""
     file = io.BytesIO(content)
-    header = _read_header(where, file)
-    expected = int(np.prod(header.shape, dtype=object)) * header.dtype.itemsize
+    shape, dtype = _read_header(where, file)
+    expected = math.prod(shape) * dtype.itemsize
     if expected != len(content) - file.tell():
         raise InputError(f"{where}: expected {expected} bytes of values, got {len(content) - file.tell()}")
     file.seek(0)

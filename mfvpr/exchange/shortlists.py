@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -69,6 +69,9 @@ def write_shortlist(
         query_names: `[Q]`.
         database_names: `[N]`.
         layout: of lines. `hloc`: no scores; `kapture`: with them, to float32's last digit.
+
+    Raises:
+        InputError: names that are missing or no line can have; scores to write that are not finite, or ascending.
     """
     if layout not in ("hloc", "kapture"):
         raise InputError(f"layout={layout}: expected hloc or kapture")
@@ -77,7 +80,10 @@ def write_shortlist(
         raise InputError(f"{path}: expected the names of {len(indices)} queries, got {len(query_names)}")
     if indices.max(initial=-1) >= len(database_names):
         raise InputError(f"{path}: expected database rows below {len(database_names)}, got {indices.max()}")
-    if path.suffix.lower() == ".npz":
+    packed = path.suffix.lower() == ".npz"
+    for query in range(len(indices)) if packed or layout == "kapture" else ():
+        _descending(f"{path}: {shortened(query_names[query])}", scores[query][mask[query]])
+    if packed:
         predictions = np.where(mask, indices, -1).astype(np.int32)
         write_npz(path, {"predictions": predictions, "scores": np.where(mask, scores, 0).astype(np.float32)}.items())
         return
@@ -175,7 +181,7 @@ def _shortlist(path: Path, candidates: list[Candidates], names: Sequence[str], n
     return Shortlist(indices=indices, scores=scores, mask=indices >= 0)
 
 
-def _descending(where: str, scores: Sequence[float | None]) -> np.ndarray:
+def _descending(where: str, scores: Any) -> np.ndarray:
     """Finite float32, best first: distances would turn the ranking around without a word."""
     with np.errstate(over="ignore"):
         values = np.array(scores, np.float32)

@@ -101,6 +101,22 @@ def test_a_space_without_values(path):
     refused(path, r"a\.jpg/scores: expected values, got a dataset without any")
 
 
+def test_values_that_were_not_all_written(path):
+    """HDF5 would make them up."""
+    parts = hloc_parts(feature(0))
+    append_hloc(path, "a.jpg", parts)
+    with h5py.File(path, "a") as file:
+        for name in ("b.jpg", "c.jpg"):
+            for part, array in parts.items():
+                chunked = {"chunks": (1,) * array.ndim} if name == "b.jpg" else {"compression": "gzip", "chunks": True}
+                file.create_dataset(f"{name}/{part}", data=array, **chunked)
+        del file["b.jpg/scores"]
+        file["b.jpg"].create_dataset("scores", shape=(30,), dtype="f2", chunks=(10,))[:20] = 1
+    [_, (_, found)] = open_features(path, ["a.jpg", "c.jpg"]).read()
+    np.testing.assert_array_equal(found.scores, parts["scores"])
+    refused(path, r"b\.jpg/scores: expected data, got a dataset that was not written", ["b.jpg"])
+
+
 def test_no_images(path):
     with h5py.File(path, "w") as file:
         file.create_group("a.jpg")

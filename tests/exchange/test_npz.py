@@ -102,7 +102,7 @@ def test_pickles_are_never_loaded(tmp_path):
     np.savez(tmp_path / "1.jpg.npz", **(parts | {"scores": records}))
     (tmp_path / "all.npz").unlink()
     with pytest.raises(InputError, match="got objects or records"):
-        open_features(tmp_path, ["1.jpg"])
+        list(open_features(tmp_path, ["1.jpg"]).read())
 
 
 def test_truncated_at_any_place(tmp_path):

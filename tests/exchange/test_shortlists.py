@@ -208,4 +208,12 @@ def test_what_cannot_be_written(tmp_path):
             write_shortlist(path, shortlist, *names)
     with pytest.raises(InputError, match="layout=csv: expected hloc or kapture"):
         write_shortlist(path, shortlist, QUERIES[:1], DATABASE, layout="csv")  # type: ignore[arg-type]
+    wrong = Shortlist(indices=np.array([[0, 1]]), scores=np.array([[0.5, np.nan]]), mask=np.ones((1, 2), bool))
+    ascending = Shortlist(indices=np.array([[0, 1]]), scores=np.array([[0.5, 0.7]]), mask=np.ones((1, 2), bool))
+    for shortlist, message in ((wrong, "finite scores"), (ascending, "scores, larger = better, that descend")):
+        for file, layout in (("p.txt", "kapture"), ("p.npz", "hloc")):
+            with pytest.raises(InputError, match=rf"q/1\.jpg: expected {message}"):
+                write_shortlist(tmp_path / file, shortlist, QUERIES[:1], DATABASE, layout=layout)
     assert not list(tmp_path.iterdir())
+    write_shortlist(path, ascending, QUERIES[:1], DATABASE)
+    assert read_shortlist(path, QUERIES[:1], DATABASE).scores.tolist() == [[2, 1]]
