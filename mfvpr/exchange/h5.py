@@ -72,9 +72,10 @@ def _images(path: Path, file: Any) -> Iterator[str]:
     """Names of the groups that hold datasets; a group with one holds no other images."""
     h5py = _h5py(path)
     seen: set[int] = set()
-    waiting: list[tuple[bytes, Any]] = [(b"", file.id)]
+    waiting = [b""]
     while waiting:
-        name, group = waiting.pop()
+        name = waiting.pop()
+        group = h5py.h5g.open(file.id, name) if name else file.id
         address = h5py.h5o.get_info(group).addr
         if address in seen:  # or a group that holds itself would never end
             raise InputError(f"{path}: {_decoded(name)}: expected a group with one name, got one with several; copy it")
@@ -85,7 +86,7 @@ def _images(path: Path, file: Any) -> Iterator[str]:
                 raise _linked(path, where)
             kind = h5py.h5o.get_info(group, child).type
             if kind == h5py.h5o.TYPE_GROUP:
-                waiting.append((where, h5py.h5g.open(group, child)))
+                waiting.append(where)
             elif kind == h5py.h5o.TYPE_DATASET and name:
                 yield name.decode("utf-8", "surrogateescape")
                 break
