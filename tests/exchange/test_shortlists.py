@@ -69,6 +69,8 @@ def test_as_many_candidates_as_asked_for(tmp_path):
 def test_a_candidate_twice_counts_where_it_comes_first(tmp_path):
     found = read(tmp_path, "q/1.jpg d/2.jpg\nq/1.jpg d/1.jpg\nq/1.jpg d/2.jpg")
     assert found.indices.tolist() == [[1, 0], [-1, -1], [-1, -1]]
+    scored = read(tmp_path, "q/1.jpg, d/2.jpg, 0.75\nq/1.jpg, d/1.jpg, 0.5\nq/1.jpg, d/2.jpg, 0.25")
+    assert scored.scores.tolist() == [[0.75, 0.5], [0, 0], [0, 0]]
     np.savez(tmp_path / "p.npz", predictions=[[1, -1, 1, 0], [-1, -1, -1, -1], [0, 2, 2, 0]])
     found = read_shortlist(tmp_path / "p.npz", QUERIES, DATABASE)
     assert found.indices.tolist() == [[1, 0], [-1, -1], [0, 2]]
