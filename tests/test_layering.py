@@ -39,6 +39,7 @@ ALLOWED = {
     "weights": {"errors", "data", "models", "weights"},
     "features": {"errors", "types", "numerics", "data", "models", "sources", "features"},
     "extraction": {"errors", "types", "numerics", "data", "features", "sources", "stores"},
+    "exchange": {"errors", "types", "data", "exchange"},
     "testing": {"numerics", "reranking", "scoring", "types"},
     "report": {"errors", "types", "data", "pipeline", "report"},
 }
@@ -54,6 +55,7 @@ HOMES = {
     "tqdm": set(),
     "optax": {"learning"},
     "orbax": {"learning"},
+    "h5py": {"exchange"},
 }
 MODULES = sorted((ROOT / "mfvpr").rglob("*.py"))
 

@@ -1,0 +1,144 @@
+"""Global descriptors: rows in the data set's order, whatever the file's."""
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mfvpr import InputError
+from mfvpr.exchange import read_global_descriptors, write_global_descriptors
+from tests.builders import unit
+
+NAMES = ["image2.jpg", "image10.jpg", "sub/image 1.jpg"]  # in natural order; Python sorts 10 before 2
+
+
+@pytest.fixture
+def descriptors():
+    return unit(np.random.default_rng(0).normal(size=(3, 8)))
+
+
+def test_npy_is_in_sorted_order(tmp_path, descriptors):
+    np.save(tmp_path / "g.npy", descriptors)  # of image10, image2, sub/image 1
+    np.testing.assert_array_equal(read_global_descriptors(tmp_path / "g.npy", NAMES), descriptors[[1, 0, 2]])
+    np.savez(tmp_path / "g.npz", descriptors=descriptors)
+    np.testing.assert_array_equal(read_global_descriptors(tmp_path / "g.npz", NAMES), descriptors[[1, 0, 2]])
+
+
+def test_npz_with_names(tmp_path, descriptors):
+    foreign = ["/data/sub/image 1.jpg", "other.jpg", "image10.jpg", "image2.jpg"]
+    np.savez(tmp_path / "g.npz", names=foreign, descriptors=np.r_[descriptors, descriptors[:1]][[2, 0, 1, 3]])
+    np.testing.assert_array_equal(read_global_descriptors(tmp_path / "g.npz", NAMES), descriptors[[0, 1, 2]])
+
+
+def hloc(path, names, descriptors):
+    """As hloc writes global features: float16, with the size of the image."""
+    for name, one in zip(names, descriptors, strict=True):
+        with h5py.File(path, "a", libver="latest") as file:
+            group = file.create_group(name)
+            group.create_dataset("global_descriptor", data=one.astype(np.float16))
+            group.create_dataset("image_size", data=np.array([640, 480]))
+    return path
+
+
+def test_hloc(tmp_path, descriptors):
+    path = hloc(tmp_path / "global-feats-netvlad.h5", [*NAMES[::-1], "z"], np.r_[descriptors[::-1], descriptors[:1]])
+    found = read_global_descriptors(path, NAMES)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, descriptors, atol=5e-4)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1.2e-6)
+
+
+@pytest.mark.parametrize("suffix", ["npy", "npz", "h5", "hdf5"])
+@pytest.mark.parametrize("half", [False, True])
+def test_written_and_read(tmp_path, descriptors, suffix, half):
+    path = tmp_path / "new" / f"g.{suffix}"
+    write_global_descriptors(path, NAMES, descriptors, half=half)
+    found = read_global_descriptors(path, NAMES, lengths="keep")
+    expected = descriptors.astype(np.float16).astype(np.float32) if half else descriptors
+    np.testing.assert_array_equal(found, expected)
+    assert [file.name for file in path.parent.iterdir()] == [path.name]
+
+
+@given(st.permutations(["a/1", "a/10", "a/2", "b", "é"]))
+def test_every_order_comes_back(tmp_path_factory, names):
+    folder = tmp_path_factory.mktemp("g")
+    values = np.eye(5, dtype=np.float32)
+    for suffix in ("npy", "npz"):
+        write_global_descriptors(folder / f"g.{suffix}", names, values)
+        np.testing.assert_array_equal(read_global_descriptors(folder / f"g.{suffix}", names), values)
+
+
+def test_lengths(tmp_path, descriptors):
+    path = tmp_path / "g.npy"
+    np.save(path, descriptors * 3)
+    with pytest.raises(InputError, match=r"g\.npy: expected descriptors of unit length, got length 3 at"):
+        read_global_descriptors(path, NAMES)
+    np.testing.assert_allclose(
+        read_global_descriptors(path, NAMES, lengths="normalize"), descriptors[[1, 0, 2]], atol=1e-6
+    )
+
+
+@pytest.mark.parametrize(
+    "file, arrays, message",
+    [
+        ("g.npy", np.ones((2, 8)), r"expected descriptors \[3, D\] of the images, got \[2, 8\]"),
+        ("g.npy", np.ones(3), r"expected descriptors \[3, D\] of the images, got \[3\]"),
+        ("g.npy", np.ones((3, 0)), r"expected descriptors \[3, D\] of the images, got \[3, 0\]"),
+        ("g.npy", np.ones((3, 8), int), "expected floating-point numbers, got int64"),
+        ("g.npy", np.full((3, 8), np.nan), r"expected finite float32, got nan at \[0, 0\]"),
+        ("g.npy", np.array([[{}]], object), "got objects or records; they are never loaded"),
+        ("g.npz", {"names": NAMES}, "got no descriptors"),
+        ("g.npz", {"descriptors": np.ones((3, 8)), "names": NAMES[:2]}, r"expected names as text \[M\]"),
+        ("g.npz", {"descriptors": np.ones((3, 8)), "names": np.arange(3)}, r"got int64\[3\] and \[3, 8\]"),
+        ("g.npz", {"descriptors": np.ones((3, 8)), "names": ["a", "a", "b"]}, "expected different names, got 1 again"),
+        ("g.npz", {"descriptors": np.ones((3, 8)), "names": [*NAMES[:2], "x"]}, r"first without is sub/image 1\.jpg"),
+        ("g.npz", {"descriptors": np.ones(3), "names": NAMES}, r"expected descriptors \[3, D\] .* got \[3\]"),
+        ("g.npz", {"descriptors": np.array([{}, 1, 2], object)}, "got objects or records"),
+        ("g.csv", None, r"expected a file named \.npy, \.npz, \.h5, \.hdf5, got \.csv"),
+    ],
+)  # fmt: skip
+def test_what_is_refused(tmp_path, file, arrays, message):
+    path = tmp_path / file
+    if arrays is None:
+        path.write_text("")
+    elif isinstance(arrays, dict):
+        np.savez(path, **arrays)
+    else:
+        np.save(path, arrays)
+    with pytest.raises(InputError, match=message) as error:
+        read_global_descriptors(path, NAMES)
+    assert file in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_what_is_refused_of_hloc(tmp_path, descriptors):
+    path = hloc(tmp_path / "g.h5", NAMES, descriptors)
+    with pytest.raises(InputError, match=r"expected descriptors of all 4 images, got 3; the first without is x\.jpg"):
+        read_global_descriptors(path, [*NAMES, "x.jpg"])
+    with h5py.File(path, "a") as file:
+        file.create_group("x.jpg")["global_descriptor"] = np.ones(9, np.float16)
+        file.create_group("y.jpg")["keypoints"] = np.ones((9, 2), np.float16)
+    with pytest.raises(InputError, match=r"x\.jpg: expected global_descriptor \[D\], the same D for all, got \[9\]"):
+        read_global_descriptors(path, [*NAMES, "x.jpg"])
+    with pytest.raises(InputError, match=r"y\.jpg: expected global_descriptor \[D\], .* got none"):
+        read_global_descriptors(path, [*NAMES, "y.jpg"])
+
+
+def test_truncated(tmp_path, descriptors):
+    for suffix in ("npy", "npz", "h5"):
+        path = tmp_path / f"g.{suffix}"
+        write_global_descriptors(path, NAMES, descriptors)
+        path.write_bytes(path.read_bytes()[:-5])
+        with pytest.raises(InputError, match=rf"g\.{suffix}: "):
+            read_global_descriptors(path, NAMES)
+
+
+def test_what_cannot_be_written(tmp_path, descriptors):
+    with pytest.raises(InputError, match=r"expected descriptors \[2, D\] to write, got \[3, 8\]"):
+        write_global_descriptors(tmp_path / "g.npy", NAMES[:2], descriptors)
+    with pytest.raises(InputError, match="expected values that float16 holds"):
+        write_global_descriptors(tmp_path / "g.npy", NAMES, descriptors * 1e6, half=True)
+    with pytest.raises(InputError, match=r"a name that ends with \.npy, \.npz, \.h5 or \.hdf5"):
+        write_global_descriptors(tmp_path / "g", NAMES, descriptors)
+    assert not list(tmp_path.iterdir())

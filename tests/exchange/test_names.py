@@ -1,0 +1,81 @@
+"""What a file calls an image: its path, the end of it, or the same without suffix; never a guess."""
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mfvpr import InputError
+from mfvpr.exchange.names import match_names, require_all
+
+FILE = Path("feats.h5")
+
+
+@pytest.mark.parametrize(
+    "names, foreign, expected",
+    [
+        (["a/1.jpg", "b/1.jpg"], ["b/1.jpg", "a/1.jpg"], ["a/1.jpg", "b/1.jpg"]),
+        (["1.jpg", "2.jpg"], ["db/2.jpg", "db/1.jpg"], ["db/1.jpg", "db/2.jpg"]),
+        (["a/1.jpg", "a/2.jpg"], ["2.jpg", "1.jpg"], ["1.jpg", "2.jpg"]),
+        (["a/1.jpg", "b/1.jpg"], ["/data/db/a/1.jpg", "/data/db/b/1.jpg"], ["/data/db/a/1.jpg", "/data/db/b/1.jpg"]),
+        (["a/1.jpg"], ["a/1", "a/2"], ["a/1"]),
+        (["a/1.jpg"], ["a/1.png", "1.jpg"], ["1.jpg"]),  # the suffix as well, before without
+        (["a/1.jpg"], ["a/1.png"], ["a/1.png"]),
+        (["@5.25@4.50@.jpg"], ["@5.25@4.50@", "@5.25@4.50"], ["@5.25@4.50@"]),
+        (["a/1.jpg"], ["b/1.jpg"], [None]),  # another folder is another image
+        (["a/1.jpg", "b/1.jpg"], ["a/1.jpg", "1.png.h5"], ["a/1.jpg", None]),
+        (["1.jpg", "x/1.jpg"], ["1.jpg"], ["1.jpg", None]),  # what is matched whole is not matched again
+        (["a.jpg"], ["queries/b.jpg"], [None]),
+        (["a\udce9.jpg"], ["a\udce9.jpg"], ["a\udce9.jpg"]),  # bytes that are no UTF-8 ...
+        (["a\udce9.jpg"], [r"a\udce9.jpg"], [r"a\udce9.jpg"]),  # ... as text can hold them
+        ([], ["a.jpg"], []),
+    ],
+)
+def test_matches(names, foreign, expected):
+    assert match_names(FILE, names, foreign) == expected
+
+
+@pytest.mark.parametrize(
+    "names, foreign, several",
+    [
+        (["1.jpg"], ["db/1.jpg", "query/1.jpg"], r"1\.jpg: expected .* got db/1\.jpg and query/1\.jpg"),
+        (["a/1.jpg", "b/1.jpg"], ["1.jpg"], r"a/1\.jpg: expected .* got 1\.jpg, which may mean other images"),
+        (["1.jpg", "1.png"], ["1"], r"1\.jpg: expected .* got 1, which may mean other images"),
+        (["1.jpg"], ["1.png", "1"], r"1\.jpg: expected .* got 1 and 1\.png"),
+    ],
+)
+def test_nothing_is_guessed(names, foreign, several):
+    with pytest.raises(InputError, match=several) as error:
+        match_names(FILE, names, foreign)
+    assert "\n" not in str(error.value)
+
+
+def test_a_name_twice():
+    with pytest.raises(InputError, match=r"feats\.h5: expected images with different names, got a\.jpg twice"):
+        match_names(FILE, ["a.jpg", "b.jpg", "a.jpg"], [])
+
+
+def test_missing_images_are_counted():
+    with pytest.raises(InputError, match=r"expected features of all 3 images, got 1; the first without is b\.jpg"):
+        require_all(FILE, ["a.jpg", "b.jpg", "c.jpg"], ["a.jpg", None, None], "features")
+
+
+paths = st.lists(st.sampled_from(["a", "b", "1.x", "1.y", "2"]), min_size=1, max_size=3).map("/".join)
+
+
+@given(st.lists(paths, unique=True, max_size=5), st.lists(paths, unique=True, max_size=5))
+def test_whatever_is_matched_is_called_so_alone(names, foreign):
+    try:
+        matched = match_names(FILE, names, foreign)
+    except InputError:
+        return
+    found = [name for name in matched if name is not None]
+    assert len(set(found)) == len(found)
+    for name, other in zip(names, matched, strict=True):
+        assert (other == name) if name in foreign else True
+        if other is not None:
+            ours, theirs = (text.rpartition(".")[0] or text for text in (name, other))
+            shorter = min(len(ours.split("/")), len(theirs.split("/")))
+            tails = [text.split("/")[-shorter:] for text in (ours, theirs)]
+            assert tails[0] == tails[1] or name.split("/")[-shorter:] == other.split("/")[-shorter:]

@@ -1,0 +1,221 @@
+"""Shortlists: pairs of hloc and kapture, predictions in npz."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mfvpr import InputError, Ranking, Shortlist
+from mfvpr.exchange import read_shortlist, reranked, write_shortlist
+
+QUERIES = ["q/1.jpg", "q/2.jpg", "q/my query.jpg"]
+DATABASE = ["d/1.jpg", "d/2.jpg", "d/my place.jpg", "d/x, y.jpg"]
+HLOC = ["q/1.jpg d/2.jpg", "q/1.jpg d/1.jpg", "q/my query.jpg d/my place.jpg"]
+EXPECTED = [[1, 0], [-1, -1], [2, -1]]
+
+
+def read(tmp_path, text, queries=QUERIES, database=DATABASE, **settings):
+    path = tmp_path / "pairs.txt"
+    path.write_text(text, encoding="utf-8", newline="")
+    return read_shortlist(path, queries, database, **settings)
+
+
+@pytest.mark.parametrize("text", ["\n".join(HLOC), "\r\n".join(HLOC) + "\r\n\r\n", "\ufeff" + "\n\n".join(HLOC)])
+def test_pairs_of_hloc(tmp_path, text):
+    """Without scores, the places in the list tell: C, C - 1, ..."""
+    found = read(tmp_path, text)
+    assert found.indices.tolist() == EXPECTED
+    assert found.scores.tolist() == [[2, 1], [0, 0], [2, 0]]
+    assert found.mask.tolist() == [[True, True], [False, False], [True, False]]
+    assert (found.indices.dtype, found.scores.dtype, found.mask.dtype) == (np.int32, np.float32, bool)
+
+
+def test_pairs_of_kapture(tmp_path):
+    lines = ["# kapture format: 1.0", "# query_image, map_image, score"]
+    lines += ["q/1.jpg, d/2.jpg, 0.75", "q/my query.jpg, d/my place.jpg, -1e-3", "q/1.jpg,d/x, y.jpg,0.5"]
+    found = read(tmp_path, "\n".join(lines))
+    assert found.indices.tolist() == [[1, 3], [-1, -1], [2, -1]]
+    np.testing.assert_array_equal(found.scores, np.float32([[0.75, 0.5], [0, 0], [-1e-3, 0]]))
+
+
+def test_predictions_of_patch_netvlad(tmp_path):
+    """Full paths, no scores, two lines of comments."""
+    lines = ["# kapture format: 1.0", "# query_image, map_image"]
+    lines += ["/data/set/q/1.jpg, /data/set/d/2.jpg", "/data/set/q/1.jpg, /data/set/d/1.jpg"]
+    found = read(tmp_path, "\n".join(lines) + "\n")
+    assert found.indices.tolist() == [[1, 0], [-1, -1], [-1, -1]]
+
+
+def test_names_are_told_apart_by_those_that_there_are(tmp_path):
+    queries, database = ["a", "a b", "#c"], ["c", "b c d", "d"]
+    found = read(tmp_path, "a b c d\n#c d\na b d", queries, database)
+    assert found.indices.tolist() == [[1], [2], [2]]
+    with pytest.raises(InputError, match=r"line 1: .*got several ways to read 'a b c d'"):
+        read(tmp_path, "a b c d", queries, [*database, "c d"])
+
+
+def test_as_many_candidates_as_asked_for(tmp_path):
+    pairs = "q/1.jpg d/2.jpg\nq/1.jpg d/1.jpg\nq/2.jpg d/1.jpg"
+    found = read(tmp_path, pairs, num_candidates=1)
+    assert found.indices.tolist() == [[1], [0], [-1]]
+    assert found.scores.tolist() == [[1], [1], [0]]
+    found = read(tmp_path, pairs, num_candidates=3)
+    assert found.indices.tolist() == [[1, 0, -1], [0, -1, -1], [-1, -1, -1]]
+    assert found.scores.tolist() == [[3, 2, 0], [3, 0, 0], [0, 0, 0]]
+    with pytest.raises(InputError, match="num_candidates=0: expected at least 1"):
+        read(tmp_path, pairs, num_candidates=0)
+
+
+def test_a_candidate_twice_counts_where_it_comes_first(tmp_path):
+    found = read(tmp_path, "q/1.jpg d/2.jpg\nq/1.jpg d/1.jpg\nq/1.jpg d/2.jpg")
+    assert found.indices.tolist() == [[1, 0], [-1, -1], [-1, -1]]
+    scored = read(tmp_path, "q/1.jpg, d/2.jpg, 0.75\nq/1.jpg, d/1.jpg, 0.5\nq/1.jpg, d/2.jpg, 0.25")
+    assert scored.scores.tolist() == [[0.75, 0.5], [0, 0], [0, 0]]
+    np.savez(tmp_path / "p.npz", predictions=[[1, -1, 1, 0], [-1, -1, -1, -1], [0, 2, 2, 0]])
+    found = read_shortlist(tmp_path / "p.npz", QUERIES, DATABASE)
+    assert found.indices.tolist() == [[1, 0], [-1, -1], [0, 2]]
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("q/1.jpg d/9.jpg", r"line 1: expected the names of a query and a database image, got names of none in 'q/1"),
+        (
+            "q/1.jpg d/1.jpg\nd/1.jpg q/1.jpg",
+            r"expected the relative path of a query image, got 'd/1\.jpg', which none",
+        ),
+        ("q/1.jpg", "line 1: expected the names"),
+        ("q/1.jpg d/1.jpg 0.5", "line 1: expected the names"),
+        ("q/1.jpg, d/1.jpg, high", "line 1: expected the names"),
+        ("q/1.jpg, d/1.jpg, 0.5\nq/2.jpg, d/2.jpg", "expected scores of all pairs or of none"),
+        ("q/1.jpg, d/1.jpg, 0.5\nq/1.jpg, d/2.jpg, 0.6", r"q/1\.jpg: expected scores, .* descend .* negate distances"),
+        ("q/1.jpg, d/1.jpg, nan", r"q/1\.jpg: expected finite scores"),
+        ("q/1.jpg, d/1.jpg, 1e99", r"q/1\.jpg: expected finite scores"),
+        (
+            "other/1.jpg d/1.jpg",
+            r"expected the relative path of a query image, got 'other/1\.jpg', which none of the 3",
+        ),
+        ("1.jpg d/1.jpg\nq/1.jpg d/2.jpg", r"got '1\.jpg', which none of the 3 has, or one has by its full path"),
+        ("# nothing but a comment", "expected candidates of 3 queries, got none at all"),
+        ("", "got none at all"),
+        ("x" * 500, r"got names of none in 'x{40}\.\.\. \(500 characters\)'"),
+    ],
+)
+def test_lines_that_are_no_pairs(tmp_path, text, message):
+    with pytest.raises(InputError, match=message) as error:
+        read(tmp_path, text)
+    assert "pairs.txt" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "arrays, message",
+    [
+        ({}, r"expected predictions \[2, K\], whole numbers, got none"),
+        ({"predictions": np.zeros((2, 2))}, r"got float64\[2, 2\]"),
+        ({"predictions": np.zeros(2, int)}, r"got int64\[2\]"),
+        ({"predictions": np.zeros((3, 2), int)}, "expected predictions of 2 queries, got 3"),
+        ({"predictions": [[0, 1], [4, 0]]}, "query 1: expected database rows from 0 to 3, or -1 for none, got 4"),
+        ({"predictions": [[0, -2], [0, 0]]}, "query 0: expected .* got -2"),
+        ({"predictions": np.array([[2**63], [0]], np.uint64)}, "query 0: expected .* got 9223372036854775808"),
+        ({"predictions": [[0], [1]], "scores": [[1.0, 2], [1, 2]]}, r"expected scores \[2, 1\] .* got float64\[2, 2\]"),
+        ({"predictions": [[0], [1]], "scores": [["a"], ["b"]]}, r"expected scores \[2, 1\] of numbers, got <U1"),
+        ({"predictions": [[0, 1], [1, 0]], "scores": [[1.0, 2], [1, 2]]}, r"q/1\.jpg: expected scores, .* descend"),
+        ({"predictions": [[0, 1], [1, 0]], "scores": [[1.0, np.nan], [1, 2]]}, "expected finite scores"),
+        ({"predictions": np.full((2, 3), -1)}, "got none at all"),
+        ({"predictions": np.zeros((2, 0), int)}, "got none at all"),
+        ({"predictions": np.array([[{}], [1]], object)}, "got objects or records; they are never loaded"),
+    ],
+)
+def test_predictions_that_cannot_be_used(tmp_path, arrays, message):
+    np.savez(tmp_path / "p.npz", **arrays)
+    with pytest.raises(InputError, match=message) as error:
+        read_shortlist(tmp_path / "p.npz", QUERIES[:2], DATABASE)
+    assert "p.npz" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_not_a_file(tmp_path):
+    for name, got in (("p.txt", "nothing"), ("p.npz", "nothing"), (".", "a folder")):
+        with pytest.raises(InputError, match=f"expected a file, got {got}"):
+            read_shortlist(tmp_path / name, QUERIES, DATABASE)
+
+
+def shortlists():
+    """Candidates of 3 queries among 4 images, in any order, some with none."""
+    rows = st.lists(st.lists(st.integers(0, 3), unique=True, max_size=4), min_size=3, max_size=3).filter(any)
+    return st.tuples(rows, st.integers(0, 2**32 - 1))
+
+
+@pytest.mark.parametrize("file, layout", [("p.txt", "hloc"), ("p.txt", "kapture"), ("p.npz", "hloc")])
+@given(shortlists())
+def test_written_and_read(tmp_path_factory, file, layout, drawn):
+    rows, seed = drawn
+    depth = max(map(len, rows))
+    indices = np.array([row + [-1] * (depth - len(row)) for row in rows], np.int32)
+    scores = -np.sort(-np.random.default_rng(seed).normal(size=indices.shape).astype(np.float32) * 1e-3)
+    mask = indices >= 0
+    path = tmp_path_factory.mktemp("p") / file
+    written = Shortlist(indices=indices, scores=np.where(mask, scores, np.nan), mask=mask)
+    write_shortlist(path, written, QUERIES, DATABASE, layout=layout)
+    found = read_shortlist(path, QUERIES, DATABASE)
+    np.testing.assert_array_equal(found.indices, indices)
+    np.testing.assert_array_equal(found.mask, mask)
+    ranks = np.where(mask, depth - np.arange(depth), 0)
+    np.testing.assert_array_equal(
+        found.scores, ranks if (file, layout) == ("p.txt", "hloc") else np.where(mask, scores, 0)
+    )
+    assert [one.name for one in path.parent.iterdir()] == [file]
+
+
+def test_hloc_reads_what_is_written(tmp_path):
+    """Its own reading, `q, r = line.split()`, of names without spaces."""
+    shortlist = Shortlist(
+        indices=np.array([[1, 0], [0, -1]]), scores=np.ones((2, 2)), mask=np.array([[1, 1], [1, 0]]) > 0
+    )
+    write_shortlist(tmp_path / "p.txt", shortlist, QUERIES[:2], DATABASE[:2])
+    pairs = [tuple(line.split()) for line in (tmp_path / "p.txt").read_text().rstrip("\n").split("\n")]
+    assert pairs == [("q/1.jpg", "d/2.jpg"), ("q/1.jpg", "d/1.jpg"), ("q/2.jpg", "d/1.jpg")]
+
+
+def test_a_ranking_is_written_as_a_shortlist(tmp_path):
+    shortlist = Shortlist(
+        indices=np.array([[3, 1, 0], [2, -1, -1]]), scores=np.zeros((2, 3)), mask=np.array([[1, 1, 1], [1, 0, 0]]) > 0
+    )
+    ranking = Ranking(order=np.array([[2, 0, 1], [0, 1, 2]]), scores=np.float32([[5, 3, 9], [1, 0, 0]]))
+    found = reranked(shortlist, ranking)
+    assert found.indices.tolist() == [[0, 3, 1], [2, -1, -1]]
+    assert found.scores.tolist() == [[9, 5, 3], [1, 0, 0]]
+    write_shortlist(tmp_path / "p.npz", found, QUERIES[:2], DATABASE)
+    read_again = read_shortlist(tmp_path / "p.npz", QUERIES[:2], DATABASE)
+    np.testing.assert_array_equal(read_again.indices, found.indices)
+    np.testing.assert_array_equal(read_again.scores, found.scores)
+    with np.load(tmp_path / "p.npz") as arrays:
+        assert {name: array.dtype.name for name, array in arrays.items()} == {
+            "predictions": "int32",
+            "scores": "float32",
+        }
+
+
+def test_what_cannot_be_written(tmp_path):
+    shortlist = Shortlist(indices=np.array([[3]]), scores=np.ones((1, 1)), mask=np.ones((1, 1), bool))
+    path = tmp_path / "p.txt"
+    for names, message in (
+        ((QUERIES, DATABASE), "expected the names of 1 queries, got 3"),
+        ((QUERIES[:1], DATABASE[:3]), "expected database rows below 3, got 3"),
+        ((["a\nb"], DATABASE), r"expected names of one line without spaces around, got 'a\\nb'; write \.npz"),
+        ((["a "], DATABASE), "without spaces around"),
+    ):
+        with pytest.raises(InputError, match=message):
+            write_shortlist(path, shortlist, *names)
+    with pytest.raises(InputError, match="layout=csv: expected hloc or kapture"):
+        write_shortlist(path, shortlist, QUERIES[:1], DATABASE, layout="csv")  # type: ignore[arg-type]
+    wrong = Shortlist(indices=np.array([[0, 1]]), scores=np.array([[0.5, np.nan]]), mask=np.ones((1, 2), bool))
+    ascending = Shortlist(indices=np.array([[0, 1]]), scores=np.array([[0.5, 0.7]]), mask=np.ones((1, 2), bool))
+    for shortlist, message in ((wrong, "finite scores"), (ascending, "scores, larger = better, that descend")):
+        for file, layout in (("p.txt", "kapture"), ("p.npz", "hloc")):
+            with pytest.raises(InputError, match=rf"q/1\.jpg: expected {message}"):
+                write_shortlist(tmp_path / file, shortlist, QUERIES[:1], DATABASE, layout=layout)
+    assert not list(tmp_path.iterdir())
+    write_shortlist(path, ascending, QUERIES[:1], DATABASE)
+    assert read_shortlist(path, QUERIES[:1], DATABASE).scores.tolist() == [[2, 1]]
