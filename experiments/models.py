@@ -9,15 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import mfvpr
+from mfvpr.declaration import SCORE, Parameter, declared
 from mfvpr.learning import losses
 from mfvpr.learning.match_weight import LearnedWeight
 from mfvpr.learning.parameters import from_logarithms, to_logarithms
 from mfvpr.types import Array, Matches, value
 
-NUMBERS = {"histogram": ("sigma",), "anchor": ("tolerance",), "sum": ()}  # learned besides the temperature
-# The histogram's in units of the scores' spread. Anchors then score within 3 % (median) of the hard form, on matches of
-# SIFT and of ALIKED across seasons; at 0.3 they are 43 % below it.
-START_TEMPERATURE = {"histogram": 0.1, "anchor": 0.03, "sum": 1.0}
 LOSSES: dict[str, losses.Loss] = {
     "cross_entropy": losses.cross_entropy,
     "recall": lambda *query: losses.smooth_recall_at_1(*query, temperature=1.0),
@@ -77,22 +74,25 @@ class Model:
         return mean
 
 
-def model(
-    name: str, method: str, scorer: Any, unit: float, *, fused: float | None, weight: LearnedWeight | None
-) -> Model:
+def learned(scorer: Any) -> dict[str, Parameter]:
+    """The numbers of a scorer, or of a class of them, that are learned."""
+    return {name: parameter for name, parameter in declared(scorer).items() if parameter.learned}
+
+
+def model(name: str, scorer: Any, unit: float, *, fused: float | None, weight: LearnedWeight | None) -> Model:
     """A model that starts from a hard scorer's values.
 
     Args:
         name: for tables.
-        method: the scorer's name.
         scorer: the hand-set one.
         unit: spread of its scores.
         fused: the filter's weight to start with, in units of the score; None = not fused.
         weight: the match weight to start with; None = the scorer's own, not learned.
     """
-    scale = unit if method == "histogram" else 1.0
-    numbers = {name: float(getattr(scorer, name)) for name in NUMBERS[method]}
-    numbers["temperature"] = START_TEMPERATURE[method] * scale
+    numbers = {}
+    for field, parameter in learned(scorer).items():
+        begin = parameter.start * (unit if parameter.unit == SCORE else 1.0)
+        numbers[field] = float(begin if getattr(scorer, field) is None else getattr(scorer, field))
     start: dict[str, Any] = {"numbers": to_logarithms(numbers), "sharpness": jnp.log(jnp.asarray(2.0))}
     if fused is not None:
         start["c"] = jnp.log(jnp.asarray(max(fused, 1e-3 * unit) / unit))
