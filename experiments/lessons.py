@@ -14,11 +14,12 @@ import optax
 import mfvpr
 from experiments import axes, build, console, learn_outputs, prepare, run_folder, stores, truth
 from experiments.judging import Judge, judge
-from experiments.models import LOSSES, Lesson, Model, learned, model
+from experiments.models import LOSSES, Lesson, Model, model
 from experiments.settings import SettingsError
 from mfvpr import pipeline, sweeping
 from mfvpr.data.store_manifest import recipe_fingerprint
 from mfvpr.learning.match_weight import LearnedWeight
+from mfvpr.learning.parameters import can_learn
 from mfvpr.learning.training import Fit, fit
 from mfvpr.numerics import round_up
 from mfvpr.pipeline import MatchSet
@@ -106,7 +107,7 @@ def learn(settings: dict[str, Any]) -> None:
 
 def _outcome(settings: dict[str, Any]) -> "learn_outputs.Outcome":
     method = settings["scorer"].get("method", "all")
-    known = [name for name, scorer in SCORERS.items() if learned(scorer)]
+    known = [name for name, scorer in SCORERS.items() if can_learn(scorer)]
     if method not in known:
         raise SettingsError(f"scorer={method}: expected one to learn, of {', '.join(known)}")
     varied = axes.axes(settings)

@@ -9,10 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import mfvpr
-from mfvpr.declaration import SCORE, Parameter, declared
 from mfvpr.learning import losses
 from mfvpr.learning.match_weight import LearnedWeight
-from mfvpr.learning.parameters import from_logarithms, to_logarithms
+from mfvpr.learning.parameters import from_logarithms, starts, to_logarithms
 from mfvpr.types import Array, Matches, value
 
 LOSSES: dict[str, losses.Loss] = {
@@ -74,11 +73,6 @@ class Model:
         return mean
 
 
-def learned(scorer: Any) -> dict[str, Parameter]:
-    """The numbers of a scorer, or of a class of them, that are learned."""
-    return {name: parameter for name, parameter in declared(scorer).items() if parameter.learned}
-
-
 def model(name: str, scorer: Any, unit: float, *, fused: float | None, weight: LearnedWeight | None) -> Model:
     """A model that starts from a hard scorer's values.
 
@@ -89,11 +83,8 @@ def model(name: str, scorer: Any, unit: float, *, fused: float | None, weight: L
         fused: the filter's weight to start with, in units of the score; None = not fused.
         weight: the match weight to start with; None = the scorer's own, not learned.
     """
-    numbers = {}
-    for field, parameter in learned(scorer).items():
-        begin = parameter.start * (unit if parameter.unit == SCORE else 1.0)
-        numbers[field] = float(begin if getattr(scorer, field) is None else getattr(scorer, field))
-    start: dict[str, Any] = {"numbers": to_logarithms(numbers), "sharpness": jnp.log(jnp.asarray(2.0))}
+    numbers = to_logarithms(starts(scorer, unit))
+    start: dict[str, Any] = {"numbers": numbers, "sharpness": jnp.log(jnp.asarray(2.0))}
     if fused is not None:
         start["c"] = jnp.log(jnp.asarray(max(fused, 1e-3 * unit) / unit))
     if weight is not None:

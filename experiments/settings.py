@@ -172,8 +172,11 @@ RULES: dict[str, Rule] = {
 
 def check(settings: Mapping[str, Any]) -> None:
     """Raise a SettingsError for the first value that its rule does not allow."""
+    method = settings.get("scorer", {}).get("method", "")  # none of all
     for path, value in _leaves(settings, ""):
-        rule = _rule(path, settings.get("scorer", {}))
+        rule = _rule(path, method)
+        if rule is None and method and path.startswith("scorer."):
+            raise SettingsError(f"scorer={method} has no setting {path.removeprefix('scorer.')}; see --help")
         if rule is None:
             raise SettingsError(f"{path}={value}: this is a group of settings; set one of its members (see --help)")
         if not rule.holds(value):
@@ -181,48 +184,37 @@ def check(settings: Mapping[str, Any]) -> None:
     _check_vocabulary(settings.get("retrieval", {}))
 
 
-def scorer_rules() -> dict[str, dict[str, Rule]]:
-    """Rules by scorer and parameter."""
-    return _read_rules(CONF / "rules.yaml")
+def _rule(path: str, method: str) -> Rule | None:
+    """Of a setting; None for a group of settings."""
+    *_, group, name = f".{path}".split(".")
+    scorers = scorer_rules(CONF / "rules.yaml")
+    own = scorers.get(method if group == "scorer" else group, {})
+    if path.startswith("scorer."):
+        return own.get(name) or (_one_of(*scorers) if path == "scorer.method" else None)
+    if group == "grid":
+        known = (rules[name] for rules in (scorers.get(method, {}), *scorers.values(), RULES) if name in rules)
+        return next(map(_axis, known), None)
+    return RULES.get(f"{group}.{name}") or RULES.get(name)
 
 
 @cache
-def _read_rules(file: Path) -> dict[str, dict[str, Rule]]:
-    """Of a file that `experiments.declare` wrote."""
+def scorer_rules(file: Path) -> dict[str, dict[str, Rule]]:
+    """Rules by scorer and parameter, of what `experiments.declare` wrote."""
     import yaml  # here, since Ctrl-C is not yet answered above
 
-    declared = yaml.safe_load(file.read_text(encoding="utf-8"))
-    return {scorer: {name: _as_rule(**one) for name, one in rules.items()} for scorer, rules in declared.items()}
+    found = {}
+    for scorer, limits in yaml.safe_load(file.read_text(encoding="utf-8")).items():
+        method = Rule(_one_of(scorer).holds, f"{scorer}; choose with scorer={scorer}")
+        found[scorer] = {"method": method} | {name: _within(**one) for name, one in limits.items()}
+    return found
 
 
-def _as_rule(*, length: int = 0, optional: bool = False, **kind: list[Any]) -> Rule:
-    [(name, values)] = kind.items()
-    rule = {"choices": _one_of, "whole": _between, "number": _number}[name](*values)
+def _within(*, length: int = 0, optional: bool = False, **limits: list[Any]) -> Rule:
+    """The rule of `mfvpr.declaration.Parameter.limits`."""
+    [(kind, values)] = limits.items()
+    rule = {"choices": _one_of, "whole": _between, "number": _number}[kind](*values)
     rule = _list_of(rule, length) if length else rule
     return _or(rule, None) if optional else rule
-
-
-def _rule(path: str, scorer: Mapping[str, Any]) -> Rule | None:
-    """Of a setting; None for a group of settings."""
-    *_, group, name = f".{path}".split(".")
-    known = RULES.get(f"{group}.{name}") or RULES.get(name)
-    if path.startswith("scorer."):
-        return _scorer_rule(group, name, scorer.get("method"))
-    if group == "grid":
-        every = [scorer_rules().get(scorer.get("method", ""), {}), *scorer_rules().values(), RULES]
-        return next((_axis(rules[name]) for rules in every if name in rules), None)
-    return known
-
-
-def _scorer_rule(group: str, name: str, method: Any) -> Rule | None:
-    if group == "scorer" and name == "method":
-        return _one_of(*scorer_rules())
-    method = method if group == "scorer" else group
-    if name == "method":
-        return Rule(method.__eq__, f"{method}; choose with scorer={method}")
-    if method and name not in scorer_rules()[method]:
-        raise SettingsError(f"scorer={method} has no setting {name}; see --help")
-    return scorer_rules()[method][name] if method else None
 
 
 def _check_vocabulary(settings: Mapping[str, Any]) -> None:

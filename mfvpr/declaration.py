@@ -7,6 +7,7 @@ plain values (numbers, words, lists, None), `Parameter.value` makes the field's 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from inspect import getmodule
 from typing import Any
 
 POSITIVE = (1e-6, 1e12)  # beyond these bounds float32 would fail, without a word
@@ -47,6 +48,18 @@ class Parameter:
     swept: bool = True
     learned: bool = False
     start: float = 1.0
+
+    @property
+    def words(self) -> str:
+        """The choices that are words, in a row."""
+        return ", ".join(one for one in self.choices if isinstance(one, str))
+
+    @property
+    def limits(self) -> dict[str, Any]:
+        """What checks a plain value, itself plain: `choices`, `whole` or `number`; `length` and `optional` if given."""
+        kind = "choices" if self.choices else "whole" if self.whole else "number"
+        limits = {kind: list(self.choices or self.bounds), "length": self.length, "optional": self.optional}
+        return {name: limit for name, limit in limits.items() if limit}
 
     def value(self, plain: Any) -> Any:
         """The field's value of a plain one."""
@@ -106,6 +119,11 @@ def made(method: type, values: Mapping[str, Any]) -> Any:
     """An instance of plain values, by field."""
     known = declared(method)
     return method(**{name: known[name].value(plain) for name, plain in values.items()})
+
+
+def summary(method: type) -> str:
+    """What it is: the first line of its module."""
+    return (getmodule(method).__doc__ or method.__name__).splitlines()[0]
 
 
 def check_choices(method: Any) -> None:

@@ -11,8 +11,9 @@ import pytest
 
 from experiments import build, command_line, declare, groups, help_text, settings
 from experiments.settings import CONF
-from mfvpr import value
-from mfvpr.declaration import SCORE, check_choices, choice, declared, flag, made, named, number, numbers, whole
+from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, value
+from mfvpr.declaration import check_choices, choice, declared, flag, made, named, number, numbers, whole
+from mfvpr.learning.parameters import can_learn, starts
 from mfvpr.scoring import SCORERS, match_shifts
 from mfvpr.types import Array, Matches
 from mfvpr.weighting import WEIGHTS, UnitWeight, Weight, match_weights
@@ -159,7 +160,14 @@ def test_plain_values_become_the_fields(near):
     assert made(Nearness, plain) == Nearness(3.0, None, size=(1.0, 2.0), weight=UnitWeight(), strict=True)
     with pytest.raises(ValueError, match=r"Nearness\(norm='both'\): expected one of sum, largest"):
         Nearness(norm="both")
-    assert declared(SCORERS["histogram"])["temperature"].unit == SCORE
+
+
+def test_where_learning_starts_follows_from_the_fields():
+    assert [name for name, scorer in SCORERS.items() if can_learn(scorer)] == ["sum", "anchor", "histogram"]
+    assert starts(HistogramOfShifts(sigma=7.0), 2.0) == {"sigma": 7.0, "temperature": 0.2}  # of the spread
+    assert starts(AnchorPoints(temperature=0.5), 2.0) == {"tolerance": 3.0, "temperature": 0.5}
+    assert starts(AnchorPoints(), 2.0) == {"tolerance": 3.0, "temperature": 0.03}
+    assert starts(AggregatedScore(), 2.0) == {"temperature": 1.0}
 
 
 def test_a_wrong_setting_is_refused_without_jax():

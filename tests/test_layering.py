@@ -19,6 +19,7 @@ ALLOWED = {
     "retrieval": {"numerics", "types"},
     "reranking": {"matching", "numerics", "types", "scoring", "weighting"},
     "learning": {
+        "declaration",
         "errors",
         "numerics",
         "types",

@@ -118,7 +118,7 @@ def test_settings_that_the_text_names_exist():
     names = re.findall(r"`(?:[\w.]+\.)?(\w+)=[^`(]*`", "".join([README, *BESIDE]))
     assert len(names) > 20
     groups = {path.name for path in CONF.iterdir() if path.is_dir()}
-    rules = [*RULES, *(name for scorer in scorer_rules().values() for name in scorer)]
+    rules = [*RULES, *(name for scorer in scorer_rules(CONF / "rules.yaml").values() for name in scorer)]
     assert set(names) <= {rule.rpartition(".")[2] for rule in rules} | groups
 
 
