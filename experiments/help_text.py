@@ -78,7 +78,7 @@ def _is_file(entry: object) -> bool:
 
 
 def _header(file: Path) -> list[str]:
-    """The comment that a file begins with, without what Hydra and editors of the file read."""
+    """The comment that a file begins with, without what is for Hydra or for who edits the file."""
     text = file.read_text(encoding="utf-8")
     found = re.match(r"(?:#.*\n)*", text)
     return [line for line in (found[0] if found else "").splitlines() if not line.startswith(("# @", "# Made by "))]

@@ -172,7 +172,7 @@ RULES: dict[str, Rule] = {
 
 def check(settings: Mapping[str, Any]) -> None:
     """Raise a SettingsError for the first value that its rule does not allow."""
-    method = settings.get("scorer", {}).get("method", "")  # none of all
+    method = str(settings.get("scorer", {}).get("method") or "")  # "" of all
     for path, value in _leaves(settings, ""):
         rule = _rule(path, method)
         if rule is None and method and path.startswith("scorer."):

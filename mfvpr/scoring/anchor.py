@@ -47,7 +47,7 @@ class AnchorPoints:
     % of pairs within 7 %) at T = 0.03, some 11 % below it at 0.1 and 43 % at 0.3.
     """
 
-    num_bins: int = whole(15, "cells per side", bounds=(1, 32))  # programs stop where memory would
+    num_bins: int = whole(15, "cells per side", bounds=(1, 32))  # the soft form's memory
     window: float | Array = number(10.0, "cells")
     tolerance: float | Array = number(3.0, "cells", learned=True)
     weight: Weight = named(WEIGHTS, "fs")
