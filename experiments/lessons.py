@@ -12,11 +12,12 @@ import numpy as np
 import optax
 
 import mfvpr
-from experiments import axes, build, console, learn_outputs, prepare, run_folder, stores, truth
+from experiments import axes, build, console, learn_outputs, prepare, run_folder, truth
 from experiments.models import LOSSES, Lesson, Model, model
 from experiments.settings import SettingsError
 from mfvpr import pipeline, sweeping
 from mfvpr.evaluation import Half, Judge, Positives, best_setting, hits, separated
+from mfvpr.fingerprints import fingerprint
 from mfvpr.learning.match_weight import LearnedWeight
 from mfvpr.learning.parameters import can_learn
 from mfvpr.learning.training import Fit, fit
@@ -24,7 +25,6 @@ from mfvpr.numerics import round_up
 from mfvpr.pipeline import MatchSet
 from mfvpr.report import runs
 from mfvpr.scoring import SCORERS, parameters
-from mfvpr.stores.manifest import recipe_fingerprint
 from mfvpr.types import Matches, Shortlist
 
 VALIDATION = 0.25  # of the queries to learn on, the end of their block
@@ -112,15 +112,15 @@ def _outcome(settings: dict[str, Any]) -> "learn_outputs.Outcome":
     if settings["split"] is None:
         raise SettingsError("split=null: what is learned is never reported on the same queries; expected first_half, "
                             "second_half or both")  # fmt: skip
-    tools = prepare.extractors(settings)
+    tools = prepare.tools(settings)
     watch = prepare.Stopwatch()
     with watch("data"):
-        images = prepare.images(settings)
+        images = prepare.images(settings, tools.archive)
     judgment = truth.judge(settings, images.dataset)
     matches, candidates = prepare.matched(settings, tools, images, watch, with_ratio=True)
     axes.require_bins(settings, varied, matches)
     candidates = replace(candidates, scores=pipeline.filter_scores(candidates, settings["fusion"]["filter_score"]))
-    checkpoints = _checkpoints(settings, images, candidates, judgment)
+    checkpoints = _checkpoints(settings, prepare.recipe(tools, images, candidates.mask.shape[1]), judgment)
     results = []
     with watch("learning"):
         for school in _schools(settings, matches, candidates, judgment):
@@ -273,10 +273,9 @@ def _values(start: Model, fitted: Fit) -> dict[str, Any]:
 
 
 def _checkpoints(
-    settings: dict[str, Any], images: prepare.Images, candidates: Shortlist, judgment: Judge
+    settings: dict[str, Any], data: dict[str, Any], judgment: Judge
 ) -> Callable[[str, str], tuple[Path | None, dict[str, Any]]]:
     """Where the training of a half's model is kept, and what identifies it."""
-    data = stores.matches_recipe(settings, images.fingerprints, candidates.mask.shape[1])
     names = ("scorer", "loss", "every", "patience", "batch", "learning_rate", "hidden", "seed")
     recipe = {"matches": data, "tolerances": settings["recall"]} | {name: settings[name] for name in names}
     recipe["filter_score"] = settings["fusion"]["filter_score"]
@@ -284,7 +283,7 @@ def _checkpoints(
     recipe["positives"] = hashlib.sha256(b"".join(flat)).hexdigest()[:16]
     recipe["versions"] = {name: runs.versions()[name] for name in ("mfvpr", "jax", "numpy")}
     root = settings["checkpoints"] or settings["store"]
-    own = "" if settings["checkpoints"] else f"{settings['dataset']['name']}_learning-{recipe_fingerprint(recipe)}"
+    own = "" if settings["checkpoints"] else f"{settings['dataset']['name']}_learning-{fingerprint(recipe)}"
 
     def of(half: str, name: str) -> tuple[Path | None, dict[str, Any]]:
         place = f"{half}-{name}".replace(" ", "_").replace("_+_", "_")

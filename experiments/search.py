@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from experiments import build, console, prepare, run_folder, stores, sweep_outputs, truth
+from experiments import build, console, prepare, run_folder, sweep_outputs, truth
 from experiments.axes import BYTES_PER_SETTING, Axes, axes, require_bins, require_memory, scorer
 from mfvpr import sweeping
 from mfvpr.evaluation import Judge
+from mfvpr.fingerprints import fingerprint
 from mfvpr.pipeline import MatchSet
 from mfvpr.report import runs
-from mfvpr.stores.manifest import recipe_fingerprint
 from mfvpr.types import Shortlist
 
 
@@ -47,15 +47,15 @@ def _found(settings: dict[str, Any]) -> tuple[sweep_outputs.Found, Path | None]:
         from experiments import optuna_search
 
         optuna_search.require()
-    tools = prepare.extractors(settings)
+    tools = prepare.tools(settings)
     watch = prepare.Stopwatch()
     with watch("data"):
-        images = prepare.images(settings)
+        images = prepare.images(settings, tools.archive)
     judgment = truth.judge(settings, images.dataset)
     matches, candidates = prepare.matched(settings, tools, images, watch)
     require_bins(settings, varied, matches)
     judgment = judgment.of(candidates)
-    kept = _kept(settings, images, candidates)
+    kept = _kept(settings, tools, images, candidates)
     with watch("sweep"):
         written, rows = _search(settings, varied, judgment, matches, candidates, kept)
     return sweep_outputs.Found(settings, images, varied, judgment, written, rows, watch.seconds), kept
@@ -104,13 +104,13 @@ def _require_memory(settings: dict[str, Any], judgment: Judge, matches: MatchSet
         )
 
 
-def _kept(settings: dict[str, Any], images: prepare.Images, candidates: Shortlist) -> Path | None:
+def _kept(settings: dict[str, Any], tools: prepare.Tools, images: prepare.Images, candidates: Shortlist) -> Path | None:
     """Where an interrupted sweep goes on: its finished blocks on these matches, by this version."""
     if settings["store"] is None:
         return None
-    recipe = stores.matches_recipe(settings, images.fingerprints, candidates.mask.shape[1])
+    recipe = prepare.recipe(tools, images, candidates.mask.shape[1])
     names = ("scorer", "grid", "search", "trials", "seed", "split", "recall", "ties", "fusion")
     own = {name: settings[name] for name in names}  # or another sweep that ends would take away what this one needs
     versions = {name: runs.versions()[name] for name in ("mfvpr", "jax", "numpy")}
-    name = recipe_fingerprint({"matches": recipe, "sweep": own, "versions": versions})
+    name = fingerprint({"matches": recipe, "sweep": own, "versions": versions})
     return build.expanded(settings["store"]) / f"{settings['dataset']['name']}_sweep-{name}"

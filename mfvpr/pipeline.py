@@ -1,4 +1,4 @@
-"""The whole way over a data set: extract and describe (`mfvpr.extraction`), shortlist, match, score, rank.
+"""The stages of re-ranking a data set: match, score, fuse, rank.
 
 Files and threads stay on the host; each computation is one compiled program per shape, called for every query. `track`
 wraps the iterable of a stage: a progress bar, or nothing.
@@ -12,12 +12,12 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from mfvpr import pair_matching, reranking, retrieval
+from mfvpr import pair_matching, reranking
 from mfvpr.errors import InputError
-from mfvpr.extraction import Track, describe, extract, untracked
 from mfvpr.match_sets import MatchSet, QueryMatches
 from mfvpr.matching import CrossCheck
 from mfvpr.numerics import Device, compiled, device_of, held
+from mfvpr.progress import Track, untracked
 from mfvpr.scoring import HistogramOfShifts, Scorer, ShiftHistogram
 from mfvpr.scoring.parameters import fit
 from mfvpr.sources import FeatureSet
@@ -25,26 +25,11 @@ from mfvpr.stores.matches import MatchStore
 from mfvpr.types import Array, Matches, Shortlist
 from mfvpr.weighting import match_weights
 
-__all__ = ["Explanation", "FeatureSet", "MatchSet", "Track", "describe", "explain", "extract", "fuse", "match", "rank",
-           "score", "shortlist", "stored_matches", "untracked"]  # fmt: skip
-
 Ties = Literal["filter", "index"]
 FilterScore = Literal["cosine", "negative_euclidean"]
 
 BIN_STEP = 16  # capacities of histograms are multiples of it
 STORE_BATCH = 8  # queries whose matches may be lost when a run is killed
-
-
-def shortlist(
-    query_descriptors: np.ndarray,
-    database_descriptors: np.ndarray,
-    num_candidates: int,
-    *,
-    allowed: np.ndarray | None = None,
-) -> Shortlist:
-    """The filter's candidates of all queries `[Q, C]`, NumPy, among database images `allowed` `[Q, N]`; None = all."""
-    found = retrieval.retrieve(query_descriptors, database_descriptors, num_candidates=num_candidates, mask=allowed)
-    return jax.tree.map(np.asarray, found)
 
 
 def match(

@@ -18,10 +18,12 @@ ALLOWED = {
     "matching": {"neighbors", "numerics", "ragged", "types"},
     "match_sets": {"numerics", "ragged", "types"},
     "sources": {"errors", "numerics", "ragged", "types"},
-    "stores": {"data", "errors", "match_sets", "stores", "types"},
+    "fingerprints": set(),
+    "progress": set(),
+    "stores": {"data", "errors", "fingerprints", "match_sets", "stores", "types"},
     "pair_matching": {"data", "match_sets", "matching", "numerics", "ragged", "sources", "types"},
     "scoring": {"declaration", "errors", "numerics", "types", "weighting", "scoring"},
-    "retrieval": {"numerics", "types"},
+    "retrieval": {"errors", "evaluation", "numerics", "types"},
     "reranking": {"numerics", "types", "scoring"},
     "parameter_grids": {"matching", "numerics", "types", "scoring", "weighting", "reranking"},
     "learning": {
@@ -39,11 +41,10 @@ ALLOWED = {
     "data": {"errors", "evaluation", "numerics", "types", "data"},
     "models": {"errors", "numerics", "types", "models"},
     "weights": {"errors", "data", "models", "weights"},
-    "features": {"errors", "types", "numerics", "data", "models", "sources", "features"},
-    "extraction": {"errors", "types", "numerics", "data", "features", "sources", "stores"},
+    "features": {"errors", "types", "numerics", "data", "models", "ragged", "sources", "features"},
+    "extraction": {"errors", "types", "numerics", "data", "features", "progress"},
     "exchange": {"errors", "types", "data", "exchange"},
     "testing": {"numerics", "reranking", "scoring", "types"},
-    "report": {"errors", "types", "data", "pipeline", "report"},
 }
 HOMES = {
     "cv2": {"data", "features"},

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments import lessons, search
-from experiments import run as evaluation
+from experiments import evaluation, lessons, search
 from mfvpr.learning import checkpoints
 from mfvpr.learning.training import Fit, Record
 from tests.programs import QUERIES, composed, results, shared, small, snapshot, typed
