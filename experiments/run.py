@@ -6,7 +6,7 @@ import numpy as np
 
 from experiments import build, console, outputs, prepare, run_folder, truth
 from experiments.outputs import Outcome, System
-from mfvpr import pipeline
+from mfvpr import pipeline, reranking
 from mfvpr.pipeline import MatchSet
 from mfvpr.types import Shortlist
 
@@ -48,13 +48,15 @@ def _systems(settings: dict[str, Any], scorers: dict, matches: MatchSet, candida
     c, filter_score = settings["fusion"]["c"], settings["fusion"]["filter_score"]
     found = {"filter": ("none", {}, candidates.scores)}
     found |= {name: (name, parameters[name], scores[name]) for name in scorers}
-    fused = pipeline.fuse(candidates, scores[combined], None if c == "auto" else c, filter_score=filter_score)
+    fused = reranking.fuse_shortlist(
+        candidates, scores[combined], None if c == "auto" else c, filter_score=filter_score
+    )
     found[f"{combined} + filter"] = (combined, parameters[combined] | settings["fusion"], fused)
     return {name: _system(candidates, settings["ties"], *values) for name, values in found.items()}
 
 
 def _system(candidates: Shortlist, ties: Any, scorer: str, parameters: dict[str, Any], scores: np.ndarray) -> System:
-    order = pipeline.rank(candidates, scores, ties=ties)
+    order = reranking.rank_shortlist(candidates, scores, ties=ties)
     return System(
         scorer=scorer,
         parameters=parameters,

@@ -1,11 +1,11 @@
 """Images -> features of a whole folder: threads decode while the device works, and a store keeps what is done."""
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, fields
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from mfvpr.data.images import Interpolation, ordered_map, resize
 from mfvpr.errors import InputError
 from mfvpr.features import GlobalExtractor, LocalExtractor
 from mfvpr.numerics import available_cpus
+from mfvpr.progress import Track, untracked
 from mfvpr.sources import FeatureSet, InMemory
 from mfvpr.types import Features
 
@@ -21,12 +22,6 @@ if TYPE_CHECKING:
     from mfvpr.stores.features import FeatureStore
 
 Item = TypeVar("Item")
-Track = Callable[[Iterable[Any], int], Iterable[Any]]
-
-
-def untracked(items: Iterable[Item], total: int) -> Iterable[Item]:
-    """No progress bar."""
-    return items
 
 
 @dataclass(frozen=True)

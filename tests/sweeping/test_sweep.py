@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr import pipeline, sweeping
+from mfvpr import reranking, sweeping
 from mfvpr.match_sets import MatchSet, shapes, slots
 from mfvpr.scoring.parameters import with_parameters
 from mfvpr.sweeping.settings import groups
@@ -56,8 +56,8 @@ def one_by_one(scorer, setting, match_set, candidates, view=None, **options):
     view = candidates.mask if view is None else view
     seen = replace(candidates, mask=candidates.mask & view)
     scores = np.array(scores, np.float32)
-    scores = pipeline.fuse(seen, scores, c) if fused else scores
-    order = pipeline.rank(seen, scores, **options)
+    scores = reranking.fuse_shortlist(seen, scores, c) if fused else scores
+    order = reranking.rank_shortlist(seen, scores, **options)
     return np.where(np.take_along_axis(seen.mask, order, 1), np.take_along_axis(candidates.indices, order, 1), -1)
 
 
@@ -330,4 +330,4 @@ def test_pairs_score_the_same_in_a_smaller_set(data, scorer, monkeypatch):
     for one in (match_set, few):
         listed = jax.tree.map(lambda rows: rows[: len(one.matches)], candidates)  # noqa: B023
         sweeping.sweep(scorer, [{"max_distance": 2.0}], one, listed)
-    np.testing.assert_array_equal(found[0][:, :, :2], found[1])
+    np.testing.assert_array_equal(found[0][..., :2, :], found[1])
