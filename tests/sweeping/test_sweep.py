@@ -1,5 +1,6 @@
 """Sweeps against one evaluation after the other."""
 
+import itertools
 from dataclasses import replace
 
 import jax
@@ -8,7 +9,7 @@ import pytest
 
 import mfvpr
 from mfvpr import reranking, sweeping
-from mfvpr.match_sets import MatchSet, shapes, slots
+from mfvpr.match_sets import PROGRAM_SLOTS, MatchSet, shapes, slots
 from mfvpr.scoring.parameters import with_parameters
 from mfvpr.sweeping.settings import groups
 from mfvpr.types import Shortlist
@@ -185,6 +186,23 @@ def test_slots_hold_every_match_in_few_sizes_with_little_padding(high):
     assert (counts <= sizes).all()
     assert len(np.unique(sizes)) <= 5
     assert sizes.sum() <= counts.sum() + counts.size * (32 + 0.15 * high)
+
+
+@pytest.mark.parametrize("pairs", [50, 5_000, 500_000])
+def test_a_shape_is_compiled_where_that_costs_less_than_padding(pairs):
+    """The fewer settings there are to score, and the fewer pairs, the fewer shapes."""
+    counts = np.random.default_rng(0).integers(0, 321, (pairs // 50, 50))
+    found = MatchSet([], counts, 320)
+    of_settings = [slots(found, settings=settings) for settings in (1, 8, 64, 10_000)]
+    for few, many in itertools.pairwise(of_settings):
+        assert (counts <= many).all()
+        assert (many <= few).all()
+    numbers = [len(np.unique(sizes)) for sizes in of_settings]
+    assert numbers == {50: [1, 1, 1, 4], 5_000: [1, 1, 4, 5], 500_000: [5, 5, 5, 5]}[pairs]
+    least = slots(found, settings=10_000_000)
+    for settings, sizes in zip((1, 8, 64), of_settings, strict=False):
+        padding = sizes.sum() - least.sum()
+        assert settings * padding <= 4 * PROGRAM_SLOTS
 
 
 def test_slots_of_no_matches():
