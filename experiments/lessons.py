@@ -15,7 +15,7 @@ import mfvpr
 from experiments import axes, build, console, learn_outputs, prepare, run_folder, truth
 from experiments.models import LOSSES, Lesson, Model, model
 from experiments.settings import SettingsError
-from mfvpr import pipeline, sweeping
+from mfvpr import pipeline, progress, reranking, sweeping
 from mfvpr.evaluation import Half, Judge, Positives, best_setting, hits, separated
 from mfvpr.fingerprints import fingerprint
 from mfvpr.learning.match_weight import LearnedWeight
@@ -119,7 +119,7 @@ def _outcome(settings: dict[str, Any]) -> "learn_outputs.Outcome":
     judgment = truth.judge(settings, images.dataset)
     matches, candidates = prepare.matched(settings, tools, images, watch, with_ratio=True)
     axes.require_bins(settings, varied, matches)
-    candidates = replace(candidates, scores=pipeline.filter_scores(candidates, settings["fusion"]["filter_score"]))
+    candidates = replace(candidates, scores=reranking.filter_scores(candidates, settings["fusion"]["filter_score"]))
     checkpoints = _checkpoints(settings, prepare.recipe(tools, images, candidates.mask.shape[1]), judgment)
     results = []
     with watch("learning"):
@@ -246,7 +246,7 @@ def _ranked(
 ) -> np.ndarray:
     """`[S, q, 1]` the first row of some queries' rankings of the candidates that are seen, by every setting."""
     matches, candidates = school.part(queries)
-    track = console.track(f"{school.name}: {name}") if len(settings) > 1 else pipeline.untracked
+    track = console.track(f"{school.name}: {name}") if len(settings) > 1 else progress.untracked
     views, ties = [seen[queries]], school.settings["ties"]
     return sweeping.sweep(scorer, settings, matches, candidates, views=views, depth=1, ties=ties, track=track)[0]
 

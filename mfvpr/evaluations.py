@@ -20,11 +20,11 @@ from mfvpr.evaluation import Positives, hits
 from mfvpr.features import Extractor
 from mfvpr.filters import Filter
 from mfvpr.fingerprints import recipe_of
-from mfvpr.match_sets import MatchSet
+from mfvpr.match_sets import MatchSet, Scales
 from mfvpr.matching import CrossCheck
 from mfvpr.numerics import Device
-from mfvpr.pipeline import FilterScore, Ties
 from mfvpr.progress import Track, untracked
+from mfvpr.reranking import FilterScore, Ties, fuse_shortlist, rank_shortlist
 from mfvpr.scoring import Scorer
 from mfvpr.sources import FeatureSet
 from mfvpr.stores.matches import MatchStore
@@ -60,6 +60,11 @@ class Matched:
     matches: tuple[MatchSet, ...]
     bad_queries: Mapping[int, str]
     bad_database: Mapping[int, str]
+
+    @property
+    def by_scale(self) -> MatchSet | Scales:
+        """What is scored: several scales are fused, each standardized over a query's candidates."""
+        return self.matches[0] if len(self.matches) == 1 else Scales(self.matches)
 
 
 @dataclass(frozen=True)
@@ -188,7 +193,8 @@ def evaluate(
         for sequence in dataset.sequences
     ]
     with watch("scores"):
-        ranked = [rank_sequence(one, scorers, fused or {}, ties, archive.track("scores")) for one in matched]
+        options = {"devices": devices, "track": archive.track("scores")}
+        ranked = [rank_sequence(one, scorers, fused or {}, ties, **options) for one in matched]
     systems = {name: [one[name] for one in ranked] for name in ranked[0]}
     return Result(dataset, matched, systems, watch.seconds)
 
@@ -251,13 +257,19 @@ def match_sequence(
 
 
 def rank_sequence(
-    matched: Matched, scorers: Mapping[str, Scorer], fused: Mapping[str, Fusion], ties: Ties, track: Track = untracked
+    matched: Matched,
+    scorers: Mapping[str, Scorer],
+    fused: Mapping[str, Fusion],
+    ties: Ties,
+    *,
+    devices: Sequence[Device] | None = None,
+    track: Track = untracked,
 ) -> dict[str, Ranked]:
     """Rankings of a sequence by name of the system: the filter alone, each scorer, and those that are fused with it."""
     candidates = matched.candidates
-    scores = pipeline.score(scorers, matched.matches[0], candidates, track=track)
+    scores = pipeline.score(scorers, matched.by_scale, candidates, devices=devices, track=track)
     combined = {
-        f"{name} + {FILTER}": pipeline.fuse(candidates, scores[name], how.c, filter_score=how.filter_score)
+        f"{name} + {FILTER}": fuse_shortlist(candidates, scores[name], how.c, filter_score=how.filter_score)
         for name, how in fused.items()
     }
     return {
@@ -267,7 +279,7 @@ def rank_sequence(
 
 
 def _ranked(candidates: Shortlist, scores: np.ndarray, ties: Ties) -> Ranked:
-    order = pipeline.rank(candidates, scores, ties=ties)
+    order = rank_shortlist(candidates, scores, ties=ties)
     return Ranked(*(np.take_along_axis(values, order, axis=1) for values in (candidates.indices, scores)))
 
 

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 import mfvpr
-from mfvpr import pipeline
+from mfvpr import pipeline, reranking
 from mfvpr.archive import Aggregated, Archive
 from mfvpr.data.datasets import folder_dataset, image_folder
 from mfvpr.errors import InputError
@@ -80,19 +80,23 @@ def test_scores_are_those_of_the_oracle(candidates, matches):
 
 def test_the_street_is_recognized(street, candidates, matches):
     scores = pipeline.score({"h": mfvpr.HistogramOfShifts()}, matches, candidates)["h"]
-    rows = np.take_along_axis(candidates.indices, pipeline.rank(candidates, scores), axis=1)
+    rows = np.take_along_axis(candidates.indices, reranking.rank_shortlist(candidates, scores), axis=1)
     assert mfvpr.recall_at_k(rows, street.truth.positives(1), [1])[0] >= 0.8
 
 
 def test_fusion_with_a_constant_and_balanced(candidates, matches):
     scores = pipeline.score({"count": mfvpr.MatchCount()}, matches, candidates)["count"]
-    np.testing.assert_allclose(pipeline.fuse(candidates, scores, 10.0), 10 * candidates.scores + scores, rtol=1e-5)
+    np.testing.assert_allclose(
+        reranking.fuse_shortlist(candidates, scores, 10.0), 10 * candidates.scores + scores, rtol=1e-5
+    )
     distance = np.sqrt(2 - 2 * candidates.scores)
-    euclidean = pipeline.fuse(candidates, scores, 10.0, filter_score="negative_euclidean")
+    euclidean = reranking.fuse_shortlist(candidates, scores, 10.0, filter_score="negative_euclidean")
     np.testing.assert_allclose(euclidean, scores - 10 * distance, rtol=1e-5)
-    by_index = np.take_along_axis(candidates.indices, pipeline.rank(candidates, 0 * scores, ties="index"), axis=1)
+    by_index = np.take_along_axis(
+        candidates.indices, reranking.rank_shortlist(candidates, 0 * scores, ties="index"), axis=1
+    )
     np.testing.assert_array_equal(by_index, np.sort(candidates.indices, axis=1))
-    added = pipeline.fuse(candidates, scores, None) - scores
+    added = reranking.fuse_shortlist(candidates, scores, None) - scores
     np.testing.assert_allclose(added.std(axis=1), scores.std(axis=1), rtol=1e-3)
 
 
@@ -211,7 +215,7 @@ def test_skipped_images_are_listed_and_never_shortlisted(mixed, opened):
         assert values[0, 0] == values[0, 1] > 0
         assert values[0, 2] == 0.0  # no keypoints, no matches
         assert np.isnan(values[0, 3:]).all()
-        np.testing.assert_array_equal(pipeline.rank(candidates, values)[0], range(5))
+        np.testing.assert_array_equal(reranking.rank_shortlist(candidates, values)[0], range(5))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
