@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: demo test setup check benchmark clean
+.PHONY: demo test setup check conf benchmark clean
 
 demo: setup
 	$(BIN)/python -m experiments.evaluate
@@ -15,6 +15,9 @@ setup: .venv/.setup
 
 check: .venv/.check  ## style and types
 	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright
+
+conf: setup  ## the files of conf/ that follow from the scores' classes
+	$(BIN)/python -m experiments.declare
 
 benchmark: .venv/.benchmark
 	$(BIN)/python -m experiments.benchmark

@@ -4,7 +4,7 @@ import math
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,9 @@ import numpy as np
 from experiments import build
 from experiments.settings import SettingsError
 from mfvpr import sweeping
+from mfvpr.declaration import Parameter, declared
 from mfvpr.pipeline import MatchSet
-from mfvpr.scoring import Scorer
+from mfvpr.scoring import SCORERS, Scorer
 from mfvpr.scoring.parameters import fit, with_parameters
 
 OF_MATCHES = ("max_distance", "c")  # what is no parameter of a scorer
@@ -45,6 +46,22 @@ class Axes:
         """Every combination, as written."""
         return sweeping.grid(self.values)
 
+    @property
+    def parameters(self) -> dict[str, Parameter]:
+        """The scorer's."""
+        return declared(SCORERS[self.method])
+
+    def setting(self, written: Mapping[str, Any]) -> sweeping.Setting:
+        """The values that `mfvpr.sweeping` takes."""
+        return {name: self._value(name, value) for name, value in written.items()}
+
+    def _value(self, name: str, value: Any) -> Any:
+        if name == "c":
+            return None if value == "auto" else float(value)
+        if name == "max_distance":
+            return math.inf if value is None else value
+        return self.parameters[name].value(value)
+
 
 def axes(settings: dict[str, Any]) -> Axes:
     """The checked axes of one scorer."""
@@ -53,7 +70,7 @@ def axes(settings: dict[str, Any]) -> Axes:
         raise SettingsError("scorer=all: a sweep takes one scorer at a time; choose with scorer=histogram, or several "
                             "with -m scorer=sum,anchor,histogram")  # fmt: skip
     method = group["method"]
-    known = {field.name for field in fields(build.SCORERS[method])} | set(OF_MATCHES)
+    known = {*declared(SCORERS[method]), *OF_MATCHES}
     values = {name: axis for name, axis in settings["grid"].items() if axis is not None}
     for name, axis in values.items():
         if name not in known:
@@ -72,21 +89,6 @@ def _own(settings: dict[str, Any], name: str) -> Any:
     if name == "c":
         return settings["fusion"]["c"]
     return settings["matching"]["max_distance"] if name == "max_distance" else settings["scorer"].get(name)
-
-
-def as_setting(written: Mapping[str, Any]) -> sweeping.Setting:
-    """The values that `mfvpr.sweeping` takes."""
-    return {name: _value(name, value) for name, value in written.items()}
-
-
-def _value(name: str, value: Any) -> Any:
-    if name == "weight":
-        return build.WEIGHTS[value]
-    if name == "c":
-        return None if value == "auto" else float(value)
-    if value is None and name in ("max_distance", "truncate"):  # no limit
-        return math.inf
-    return value
 
 
 def scorer(settings: dict[str, Any]) -> Scorer:

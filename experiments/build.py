@@ -1,34 +1,21 @@
 """Checked settings -> the library's values. Plain tables of names; nothing of a user's YAML is ever called."""
 
-import math
 import os
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-import mfvpr
 from experiments.settings import SettingsError
 from mfvpr.data.datasets import Dataset, folder_dataset
 from mfvpr.data.ground_truth import CHOICES
 from mfvpr.data.streets import streets_folder
+from mfvpr.declaration import made
 from mfvpr.features import GlobalExtractor, LocalExtractor
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import fit_vlad
-from mfvpr.scoring import Scorer
+from mfvpr.scoring import SCORERS, Scorer
 from mfvpr.sources import FeatureSet
-
-WEIGHTS = {
-    "fs": mfvpr.FeatureScoreWeight(),
-    "dmf": mfvpr.DescriptorDistanceWeight(),
-    "unit": mfvpr.UnitWeight(),
-}
-SCORERS: dict[str, type] = {
-    "count": mfvpr.MatchCount,
-    "sum": mfvpr.AggregatedScore,
-    "anchor": mfvpr.AnchorPoints,
-    "histogram": mfvpr.HistogramOfShifts,
-}
 
 
 def expanded(path: str) -> Path:
@@ -97,27 +84,15 @@ def _network(group: str, name: str, weights: str | None) -> Any:
 def scorers(settings: dict[str, Any]) -> dict[str, Scorer]:
     """The chosen scorer, or all of a group, by name."""
     chosen = {settings["method"]: settings} if "method" in settings else settings
-    for name, values in chosen.items():
-        if values["method"] != name:
-            raise SettingsError(f"scorer.{name}.method={values['method']}: expected {name}; choose with scorer={name}")
-    return {name: _scorer(values) for name, values in chosen.items()}
+    return {
+        name: made(SCORERS[name], {field: plain for field, plain in values.items() if field != "method"})
+        for name, values in chosen.items()
+    }
 
 
-def _scorer(settings: dict[str, Any]) -> Scorer:
-    options = {name: value for name, value in settings.items() if name != "method"}
-    if "weight" in options:
-        options["weight"] = WEIGHTS[options["weight"]]
-    if options.get("shift_range"):
-        options["shift_range"] = tuple(map(float, options["shift_range"]))
-    if options.get("truncate", 0) is None:
-        options["truncate"] = math.inf
-    scorer = SCORERS[settings["method"]]
-    return scorer(**_only(options, scorer, f"scorer={settings['method']}"))
-
-
-def _only(options: dict[str, Any], made: type, choice: str) -> dict[str, Any]:
-    """The options, which `made` must all know: a mixture of two choices has others."""
-    foreign = options.keys() - {field.name for field in fields(made)}
+def _only(options: dict[str, Any], extractor: type, choice: str) -> dict[str, Any]:
+    """The options, which the extractor must all know: a mixture of two choices has others."""
+    foreign = options.keys() - {field.name for field in fields(extractor)}
     if foreign:
         raise SettingsError(f"{choice} has no setting {', '.join(sorted(foreign))}; see --help")
     return options

@@ -7,8 +7,7 @@ from typing import Any
 
 import yaml
 
-from experiments.launch import CONF
-from experiments.settings import SettingsError
+from experiments.settings import CONF, SettingsError
 
 PROGRAMS = {"config": "evaluate", "sweep": "sweep", "learn": "learn"}  # by their file in conf/
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from experiments.groups import check_choice, choices, defaults, groups
-from experiments.launch import CONF
+from experiments.settings import CONF
 
 _WHOLE = ("system", "experiment")  # groups whose choices set values of all others
 
@@ -78,10 +78,10 @@ def _is_file(entry: object) -> bool:
 
 
 def _header(file: Path) -> list[str]:
-    """The comment that a file begins with."""
+    """The comment that a file begins with, without what is for Hydra or for who edits the file."""
     text = file.read_text(encoding="utf-8")
     found = re.match(r"(?:#.*\n)*", text)
-    return [line for line in (found[0] if found else "").splitlines() if not line.startswith("# @")]
+    return [line for line in (found[0] if found else "").splitlines() if not line.startswith(("# @", "# Made by "))]
 
 
 def _body(file: Path) -> list[str]:

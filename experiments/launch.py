@@ -10,13 +10,11 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from experiments.errors import leave, on_interrupt, one_line, unwind_on_sigterm
 
 Program = Callable[[], Callable[[dict[str, Any]], None]]  # imports the job, which takes a while, and returns it
-CONF = Path(__file__).parent.parent / "conf"
 
 
 def launch(program: Program, config: str = "config") -> None:

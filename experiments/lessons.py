@@ -13,16 +13,17 @@ import optax
 
 import mfvpr
 from experiments import axes, build, console, learn_outputs, prepare, run_folder, stores, truth
-from experiments.models import LOSSES, NUMBERS, Lesson, Model, model
+from experiments.models import LOSSES, Lesson, Model, model
 from experiments.settings import SettingsError
 from mfvpr import pipeline, sweeping
 from mfvpr.evaluation import Half, Judge, Positives, best_setting, hits, separated
 from mfvpr.learning.match_weight import LearnedWeight
+from mfvpr.learning.parameters import can_learn
 from mfvpr.learning.training import Fit, fit
 from mfvpr.numerics import round_up
 from mfvpr.pipeline import MatchSet
 from mfvpr.report import runs
-from mfvpr.scoring import parameters
+from mfvpr.scoring import SCORERS, parameters
 from mfvpr.stores.manifest import recipe_fingerprint
 from mfvpr.types import Matches, Shortlist
 
@@ -104,8 +105,9 @@ def learn(settings: dict[str, Any]) -> None:
 
 def _outcome(settings: dict[str, Any]) -> "learn_outputs.Outcome":
     method = settings["scorer"].get("method", "all")
-    if method not in NUMBERS:
-        raise SettingsError(f"scorer={method}: expected one to learn, of {', '.join(NUMBERS)}")
+    known = [name for name, scorer in SCORERS.items() if can_learn(scorer)]
+    if method not in known:
+        raise SettingsError(f"scorer={method}: expected one to learn, of {', '.join(known)}")
     varied = axes.axes(settings)
     if settings["split"] is None:
         raise SettingsError("split=null: what is learned is never reported on the same queries; expected first_half, "
@@ -160,7 +162,7 @@ def _lessons(
     for learned_weight in (False, True):
         for fused in (False, True):
             name = ("match weights" if learned_weight else "gradient") + " + filter" * fused
-            start = _start(school, name, varied.method, own, fused=fused, learned_weight=learned_weight)
+            start = _start(school, name, own, fused=fused, learned_weight=learned_weight)
             fitted = _fit(school, start, *checkpoints(school.name, name))
             values = _values(start, fitted)
             setting = {"c": values["c"]} if fused else {}
@@ -174,7 +176,7 @@ def _own_c(settings: dict[str, Any]) -> float | None:
     return None if c == "auto" else float(c)
 
 
-def _start(school: School, name: str, method: str, own: Any, *, fused: bool, learned_weight: bool) -> Model:
+def _start(school: School, name: str, own: Any, *, fused: bool, learned_weight: bool) -> Model:
     weight = None
     if learned_weight:
         own = replace(own, weight=mfvpr.UnitWeight())  # what a learned weight starts as
@@ -183,7 +185,7 @@ def _start(school: School, name: str, method: str, own: Any, *, fused: bool, lea
         weight = LearnedWeight.create(seed, sample.matches, school.settings["hidden"])
     spread = _spread(school, own)
     start = 0.3 * _balance(school, spread) if fused else None
-    return model(name, method, parameters.fit(own, *school.matches.image_sizes), spread, fused=start, weight=weight)
+    return model(name, parameters.fit(own, *school.matches.image_sizes), spread, fused=start, weight=weight)
 
 
 def _fit(school: School, start: Model, folder: Path | None, recipe: dict[str, Any]) -> Fit:
@@ -226,7 +228,7 @@ def _searched(
     written, balance = sweeping.grid(values), _balance(school, spread)
 
     def setting(one: dict[str, Any]) -> dict[str, Any]:
-        chosen = dict(axes.as_setting(one))
+        chosen = dict(varied.setting(one))
         if fused and "c" not in chosen:
             return chosen | {"c": _own_c(school.settings)}
         return chosen | ({"c": chosen["c"] * balance} if chosen.get("c") is not None else {})

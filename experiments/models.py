@@ -11,13 +11,9 @@ import numpy as np
 import mfvpr
 from mfvpr.learning import losses
 from mfvpr.learning.match_weight import LearnedWeight
-from mfvpr.learning.parameters import from_logarithms, to_logarithms
+from mfvpr.learning.parameters import from_logarithms, starts, to_logarithms
 from mfvpr.types import Array, Matches, value
 
-NUMBERS = {"histogram": ("sigma",), "anchor": ("tolerance",), "sum": ()}  # learned besides the temperature
-# The histogram's in units of the scores' spread. Anchors then score within 3 % (median) of the hard form, on matches of
-# SIFT and of ALIKED across seasons; at 0.3 they are 43 % below it.
-START_TEMPERATURE = {"histogram": 0.1, "anchor": 0.03, "sum": 1.0}
 LOSSES: dict[str, losses.Loss] = {
     "cross_entropy": losses.cross_entropy,
     "recall": lambda *query: losses.smooth_recall_at_1(*query, temperature=1.0),
@@ -77,23 +73,18 @@ class Model:
         return mean
 
 
-def model(
-    name: str, method: str, scorer: Any, unit: float, *, fused: float | None, weight: LearnedWeight | None
-) -> Model:
+def model(name: str, scorer: Any, unit: float, *, fused: float | None, weight: LearnedWeight | None) -> Model:
     """A model that starts from a hard scorer's values.
 
     Args:
         name: for tables.
-        method: the scorer's name.
         scorer: the hand-set one.
         unit: spread of its scores.
         fused: the filter's weight to start with, in units of the score; None = not fused.
         weight: the match weight to start with; None = the scorer's own, not learned.
     """
-    scale = unit if method == "histogram" else 1.0
-    numbers = {name: float(getattr(scorer, name)) for name in NUMBERS[method]}
-    numbers["temperature"] = START_TEMPERATURE[method] * scale
-    start: dict[str, Any] = {"numbers": to_logarithms(numbers), "sharpness": jnp.log(jnp.asarray(2.0))}
+    numbers = to_logarithms(starts(scorer, unit))
+    start: dict[str, Any] = {"numbers": numbers, "sharpness": jnp.log(jnp.asarray(2.0))}
     if fused is not None:
         start["c"] = jnp.log(jnp.asarray(max(fused, 1e-3 * unit) / unit))
     if weight is not None:

@@ -38,7 +38,7 @@ def search(
     rows = [rows_of(written, "own values")]
     for start in range(0, settings["trials"], BATCH):
         trials = [study.ask() for _ in range(min(BATCH, settings["trials"] - start))]
-        asked = [{name: _suggested(trial, name, axis) for name, axis in axes.values.items()} for trial in trials]
+        asked = [{name: _suggested(trial, axes, name, axis) for name, axis in axes.values.items()} for trial in trials]
         found = rows_of(asked, f"trials {start + 1} to {start + len(trials)}")
         recall = judge.tuning(found)[..., judge.main].mean(axis=0)
         for trial, value in zip(trials, recall, strict=True):
@@ -48,10 +48,10 @@ def search(
     return written, np.concatenate(rows, axis=1)
 
 
-def _suggested(trial: "optuna.Trial", name: str, axis: Any) -> Any:
+def _suggested(trial: "optuna.Trial", axes: Axes, name: str, axis: Any) -> Any:
     numbers = [value for value in axis if isinstance(value, int | float) and not isinstance(value, bool)]
     if len(numbers) < len(axis) or len(axis) == 1:
         return trial.suggest_categorical(name, axis)
-    if name == "num_bins":
+    if name in axes.parameters and axes.parameters[name].whole:
         return trial.suggest_int(name, min(axis), max(axis))
     return trial.suggest_float(name, min(axis), max(axis))

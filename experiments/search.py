@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from experiments import build, console, prepare, run_folder, stores, sweep_outputs, truth
-from experiments.axes import BYTES_PER_SETTING, Axes, as_setting, axes, require_bins, require_memory, scorer
+from experiments.axes import BYTES_PER_SETTING, Axes, axes, require_bins, require_memory, scorer
 from mfvpr import sweeping
 from mfvpr.evaluation import Judge
 from mfvpr.pipeline import MatchSet
@@ -68,7 +68,7 @@ def _search(
 
     def rows_of(written: list[dict[str, Any]], label: str) -> np.ndarray:
         return sweeping.sweep(
-            scorer(settings), list(map(as_setting, written)), matches, candidates,
+            scorer(settings), list(map(varied.setting, written)), matches, candidates,
             views=judgment.views, depth=max(settings["recall"]["ks"]), ties=settings["ties"],
             filter_score=settings["fusion"]["filter_score"],
             settings_per_block=settings["chunk"]["settings"], queries_per_block=settings["chunk"]["queries"],

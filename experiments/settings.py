@@ -7,7 +7,11 @@ import math
 import numbers
 import re
 from collections.abc import Callable, Iterator, Mapping
+from functools import cache
+from pathlib import Path
 from typing import Any, NamedTuple
+
+CONF = Path(__file__).parent.parent / "conf"
 
 
 class SettingsError(Exception):
@@ -54,19 +58,27 @@ def _list_of(rule: Rule, length: int | None = None) -> Rule:
     return Rule(holds, f"a list of {length or 'one or more'}, each {rule.expected}")
 
 
+def _number(low: float, high: float) -> Rule:
+    words = {
+        (1e-6, 1e12): "a number above 0 (1e-6 to 1e12)",
+        (1e-6, 2): "a number above 0 and at most 2",
+        (0, 1e12): "a number not below 0 (at most 1e12)",
+    }.get((low, high), f"a number from {low:g} to {high:g}")
+    return Rule(lambda value: _is_number(value) and low <= value <= high, words)
+
+
 def _between(low: int, high: int) -> Rule:
     return Rule(lambda value: _is_count(value) and low <= value <= high, f"a whole number from {low} to {high}")
 
 
-MAX_BINS = 1024  # of a histogram per axis: the library's limit, which is slow to import
 MAX_SHOWN = 200  # characters of a value that is refused
 # Beyond these bounds float32 and int32 would fail, without a word.
-_POSITIVE = Rule(lambda value: _is_number(value) and 1e-6 <= value <= 1e12, "a number above 0 (1e-6 to 1e12)")
-_NOT_NEGATIVE = Rule(lambda value: _is_number(value) and 0 <= value <= 1e12, "a number not below 0 (at most 1e12)")
+_POSITIVE = _number(1e-6, 1e12)
+_NOT_NEGATIVE = _number(0, 1e12)
 _COUNT = Rule(lambda value: _is_count(value) and 0 < value <= 10**6, "a whole number above 0 (at most 1000000)")
 _INDEX = Rule(lambda value: _is_count(value) and 0 <= value <= 10**6, "a whole number not below 0 (at most 1000000)")
 _SIDE = _between(16, 4096)
-_DISTANCE = Rule(lambda value: _is_number(value) and 1e-6 <= value <= 2, "a number above 0 and at most 2")
+_DISTANCE = _number(1e-6, 2)
 _TEXT = Rule(lambda value: isinstance(value, str) and bool(value), "text")
 _PATH = Rule(
     lambda value: isinstance(value, str) and bool(value) and "${" not in value,
@@ -78,7 +90,6 @@ _FIGURES = Rule(
     "how many (at most 1000000), or a list of rows or names of queries",
 )
 _FLAG = _one_of(True, False)
-_WEIGHT = _one_of("fs", "dmf", "unit")
 
 
 def _axis(rule: Rule) -> Rule:
@@ -128,26 +139,7 @@ RULES: dict[str, Rule] = {
     "max_distance": _or(_DISTANCE, None),
     "max_matches": _or(_COUNT, None),
     "chunk_size": _or(_COUNT, None),
-    # scores
-    "method": _one_of("count", "sum", "anchor", "histogram"),
-    "weight": _WEIGHT,
-    "mean": _one_of("unweighted", "weighted", "median"),
-    "clamp": _FLAG,
-    "num_bins": _between(1, 32),  # memory grows with the fourth power
-    "window": _POSITIVE,
-    "tolerance": _POSITIVE,
-    "window_mode": _one_of("half_floor", "asymmetric", "odd_down", "radius"),
-    "first": _one_of("query", "candidate"),
-    "include_self": _FLAG,
-    "cell_weight": _one_of("winner_sum", "cell_sum", "ones"),
-    "bin_size": _POSITIVE,
-    "sigma": _POSITIVE,
-    "truncate": _or(_POSITIVE, None),
-    "shift_range": _or(_list_of(_POSITIVE, 2), None),
-    "align": _one_of("min_edge", "zero_center", "zero_edge"),
-    "sigma_is_variance": _FLAG,
-    "direction": _one_of("candidate_minus_query", "query_minus_candidate"),
-    "max_bins": _or(_between(1, MAX_BINS), None),
+    # scores, besides those of each scorer
     "filter_score": _one_of("cosine", "negative_euclidean"),
     "ties": _one_of("filter", "index"),
     "c": _or(_NOT_NEGATIVE, "auto"),
@@ -161,7 +153,6 @@ RULES: dict[str, Rule] = {
     "figures": _FIGURES,
     "out": _or(_PATH, None),
     # sweeps
-    "temperature": _or(_POSITIVE, None),
     "search": _one_of("grid", "optuna"),
     "trials": _between(1, 100_000),
     "split": _one_of(None, "first_half", "second_half", "both"),
@@ -181,15 +172,49 @@ RULES: dict[str, Rule] = {
 
 def check(settings: Mapping[str, Any]) -> None:
     """Raise a SettingsError for the first value that its rule does not allow."""
+    method = str(settings.get("scorer", {}).get("method") or "")  # "" of all
     for path, value in _leaves(settings, ""):
-        *_, group, name = f".{path}".split(".")
-        rule = RULES.get(f"{group}.{name}") or RULES.get(name)
-        rule = _axis(rule) if group == "grid" and rule else rule
+        rule = _rule(path, method)
+        if rule is None and method and path.startswith("scorer."):
+            raise SettingsError(f"scorer={method} has no setting {path.removeprefix('scorer.')}; see --help")
         if rule is None:
             raise SettingsError(f"{path}={value}: this is a group of settings; set one of its members (see --help)")
         if not rule.holds(value):
             raise SettingsError(f"{path}={_shown(value)}: expected {rule.expected}")
     _check_vocabulary(settings.get("retrieval", {}))
+
+
+def _rule(path: str, method: str) -> Rule | None:
+    """Of a setting; None for a group of settings."""
+    *_, group, name = f".{path}".split(".")
+    scorers = scorer_rules(CONF / "rules.yaml")
+    own = scorers.get(method if group == "scorer" else group, {})
+    if path.startswith("scorer."):
+        return own.get(name) or (_one_of(*scorers) if path == "scorer.method" else None)
+    if group == "grid":
+        known = (rules[name] for rules in (scorers.get(method, {}), *scorers.values(), RULES) if name in rules)
+        return next(map(_axis, known), None)
+    return RULES.get(f"{group}.{name}") or RULES.get(name)
+
+
+@cache
+def scorer_rules(file: Path) -> dict[str, dict[str, Rule]]:
+    """Rules by scorer and parameter, of what `experiments.declare` wrote."""
+    import yaml  # here, since Ctrl-C is not yet answered above
+
+    found = {}
+    for scorer, limits in yaml.safe_load(file.read_text(encoding="utf-8")).items():
+        method = Rule(_one_of(scorer).holds, f"{scorer}; choose with scorer={scorer}")
+        found[scorer] = {"method": method} | {name: _within(**one) for name, one in limits.items()}
+    return found
+
+
+def _within(*, length: int = 0, optional: bool = False, **limits: list[Any]) -> Rule:
+    """The rule of `mfvpr.declaration.Parameter.limits`."""
+    [(kind, values)] = limits.items()
+    rule = {"choices": _one_of, "whole": _between, "number": _number}[kind](*values)
+    rule = _list_of(rule, length) if length else rule
+    return _or(rule, None) if optional else rule
 
 
 def _check_vocabulary(settings: Mapping[str, Any]) -> None:

@@ -49,6 +49,13 @@ class ChosenWeight:
         return jnp.stack([as_float(weight(matches)) for weight in self.options])[self.index]
 
 
+WEIGHTS: dict[str, Weight] = {
+    "fs": FeatureScoreWeight(),
+    "dmf": DescriptorDistanceWeight(),
+    "unit": UnitWeight(),
+}
+
+
 def match_weights(weight: Weight, matches: Matches) -> Array:
     """`[K]` weights times the matches' confidence, 0 on padding."""
     # Padding is 1 before any arithmetic of the weight: else its NaN would return in the gradients.

@@ -14,7 +14,8 @@ from pathlib import Path
 import hydra
 from omegaconf import OmegaConf
 
-from experiments.launch import CONF, launch
+from experiments.launch import launch
+from experiments.settings import CONF
 from mfvpr.data.streets import streets_folder
 
 ROOT = Path(__file__).parent.parent

@@ -12,8 +12,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from experiments import settings
-from experiments.launch import CONF
-from experiments.settings import SettingsError
+from experiments.settings import CONF, SettingsError
 from tests.programs import QUICK, ROOT, composed, folder, run, typed
 
 CHOICES = [

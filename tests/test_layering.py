@@ -9,6 +9,7 @@ ROOT = Path(__file__).parent.parent
 # What each room may import of mfvpr. Rooms not named stand on everything.
 ALLOWED = {
     "errors": set(),
+    "declaration": set(),
     "numerics": set(),
     "types": set(),
     "weighting": {"numerics", "types"},
@@ -19,11 +20,12 @@ ALLOWED = {
     "sources": {"errors", "numerics", "ragged", "types"},
     "stores": {"data", "errors", "match_sets", "stores", "types"},
     "pair_matching": {"data", "match_sets", "matching", "numerics", "ragged", "sources", "types"},
-    "scoring": {"errors", "numerics", "types", "weighting", "scoring"},
+    "scoring": {"declaration", "errors", "numerics", "types", "weighting", "scoring"},
     "retrieval": {"numerics", "types"},
     "reranking": {"numerics", "types", "scoring"},
     "parameter_grids": {"matching", "numerics", "types", "scoring", "weighting", "reranking"},
     "learning": {
+        "declaration",
         "errors",
         "numerics",
         "types",

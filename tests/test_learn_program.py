@@ -256,11 +256,11 @@ def test_a_loss_that_turns_infinite_is_told(root, tmp_path, monkeypatch, capsys,
     ("arguments", "words"),
     [
         (["split=null"], "split=null: what is learned is never reported on the same queries"),
-        (["scorer=count"], "scorer=count: expected one to learn, of histogram, anchor, sum"),
+        (["scorer=count"], "scorer=count: expected one to learn, of sum, anchor, histogram"),
         (["scorer=all"], "scorer=all: expected one to learn"),
         (
             ["scorer=anchor", "grid.sigma=[10]"],
-            "grid.sigma: scorer=anchor has no such parameter; it has window, tolerance, ",
+            "grid.sigma: scorer=anchor has no such parameter; it has num_bins, window, tolerance, ",
         ),
         (["loss=hinge"], "loss=hinge: expected one of cross_entropy, recall, average_precision"),
         (["steps=0"], "steps=0: expected a whole number above 0"),

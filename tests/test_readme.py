@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.launch import CONF
-from experiments.settings import RULES, check
+from experiments.settings import CONF, RULES, check, scorer_rules
 from tests import checkpoints
 from tests.builders import make_matches
 from tests.programs import QUICK, ROOT, composed, typed
@@ -119,7 +118,8 @@ def test_settings_that_the_text_names_exist():
     names = re.findall(r"`(?:[\w.]+\.)?(\w+)=[^`(]*`", "".join([README, *BESIDE]))
     assert len(names) > 20
     groups = {path.name for path in CONF.iterdir() if path.is_dir()}
-    assert set(names) <= {rule.rpartition(".")[2] for rule in RULES} | groups
+    rules = [*RULES, *(name for scorer in scorer_rules(CONF / "rules.yaml").values() for name in scorer)]
+    assert set(names) <= {rule.rpartition(".")[2] for rule in rules} | groups
 
 
 def test_readme_names_no_machine_path():

@@ -225,7 +225,7 @@ SIGMA = "grid.sigma=[10]"
         ([], "grid: expected at least one axis"),
         (["grid.sigma=[]"], "grid.sigma=[]: expected a list of one or more"),
         (["grid.sgma=[1]"], "grid.sgma: unknown setting; the nearest is grid.sigma"),
-        (["grid.window=[3]"], "grid.window: scorer=histogram has no such parameter; it has sigma, bin_size"),
+        (["grid.window=[3]"], "grid.window: scorer=histogram has no such parameter; it has bin_size, sigma"),
         (["grid.sigma=[10,nan]"], "grid.sigma=[10, nan]: expected a list of one or more, each a number above 0"),
         (["grid.sigma=[-1]"], "grid.sigma=[-1]: expected"),
         (["grid.sigma=3"], "grid.sigma=3: expected a list"),

@@ -1,13 +1,33 @@
 """Positive numbers (sigma, temperature, tolerance, ...) are learned through their logarithm."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
+from mfvpr.declaration import SCORE, declared
 from mfvpr.errors import InputError
 from mfvpr.numerics import as_float
 from mfvpr.types import Array
+
+
+def can_learn(scorer: Any) -> bool:
+    """Whether a scorer, or a class of them, has numbers that are declared to be learned."""
+    return any(parameter.learned for parameter in declared(scorer).values())
+
+
+def starts(scorer: Any, spread: float) -> dict[str, float]:
+    """Where learning starts, by the fields that are learned: its own values, or those declared where it has none.
+
+    Args:
+        scorer: a value.
+        spread: of its scores.
+    """
+    learned = {name: parameter for name, parameter in declared(scorer).items() if parameter.learned}
+    own = {name: getattr(scorer, name) for name in learned}
+    begin = {name: one.start * (spread if one.unit == SCORE else 1.0) for name, one in learned.items()}
+    return {name: float(begin[name] if value is None else value) for name, value in own.items()}
 
 
 def to_logarithms(values: Mapping[str, float | Array]) -> dict[str, Array]:

@@ -17,7 +17,16 @@ Any callable will do. A class decorated with `mfvpr.value` gets more than a plai
 traced and learned, and its programs are kept. `mfvpr.testing.check_scorer` checks all of this.
 """
 
+SCORERS: dict[str, type] = {
+    "count": MatchCount,
+    "sum": AggregatedScore,
+    "anchor": AnchorPoints,
+    "histogram": HistogramOfShifts,
+}
+"""The scores that programs know, by name. Their settings follow from their fields (`mfvpr.declaration`)."""
+
 __all__ = [
+    "SCORERS",
     "AggregatedScore",
     "AnchorPoints",
     "HistogramOfShifts",

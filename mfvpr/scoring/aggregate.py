@@ -1,15 +1,13 @@
 """Aggregated score (paper, section III-C): every match counts, less so the further its shift is from the mean."""
 
-from dataclasses import field
-
 import jax
 import jax.numpy as jnp
 
+from mfvpr.declaration import check_choices, choice, flag, named, number
 from mfvpr.numerics import masked, masked_mean, masked_median, positive, safe_sqrt, where_finite
-from mfvpr.scoring.choices import check_choices, choice
 from mfvpr.scoring.shifts import image_sizes, match_shifts
 from mfvpr.types import Array, Matches, value
-from mfvpr.weighting import DescriptorDistanceWeight, Weight, match_confidence, match_weights
+from mfvpr.weighting import WEIGHTS, Weight, match_confidence, match_weights
 
 
 @value
@@ -25,10 +23,10 @@ class AggregatedScore:
             the score is smooth in the points but for the median's. None is the paper's; not above 0 scores NaN.
     """
 
-    weight: Weight = DescriptorDistanceWeight()
+    weight: Weight = named(WEIGHTS, "dmf")
     mean: str = choice("unweighted", "weighted", "median")
-    clamp: bool = field(default=False, metadata={"static": True})
-    temperature: float | Array | None = None
+    clamp: bool = flag(False)
+    temperature: float | Array | None = number(None, "px", "above 0 is smooth; None = the paper's", learned=True)
 
     def __post_init__(self) -> None:
         check_choices(self)

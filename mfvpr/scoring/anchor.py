@@ -5,16 +5,14 @@ for cells of the second; the winner is the cell's match. A cell's displacement i
 paper's ||((i, j) - (k, l)) - (m_ij - m_kl)|| is the distance of two displacements. Lengths are cells.
 """
 
-from dataclasses import field
-
 import jax
 import jax.numpy as jnp
 
+from mfvpr.declaration import check_choices, choice, flag, named, number, whole
 from mfvpr.numerics import at_least_single, masked, positive, safe_sqrt, where_finite
-from mfvpr.scoring.choices import check_choices, choice
 from mfvpr.scoring.shifts import image_sizes
 from mfvpr.types import Array, Matches, value
-from mfvpr.weighting import FeatureScoreWeight, Weight, match_confidence, match_weights
+from mfvpr.weighting import WEIGHTS, Weight, match_confidence, match_weights
 
 MAX_BINS = 215  # per side: pairs of cells are then still numbers of 32 bits
 _LEAST_SHARE = 1e-12  # of the winner's votes, below which a target has none: keeps the logarithm's gradient finite
@@ -49,15 +47,17 @@ class AnchorPoints:
     % of pairs within 7 %) at T = 0.03, some 11 % below it at 0.1 and 43 % at 0.3.
     """
 
-    num_bins: int = field(default=15, metadata={"static": True})
-    window: float | Array = 10.0
-    tolerance: float | Array = 3.0
-    weight: Weight = FeatureScoreWeight()
+    num_bins: int = whole(15, "cells per side", bounds=(1, 32))  # the soft form's memory
+    window: float | Array = number(10.0, "cells")
+    tolerance: float | Array = number(3.0, "cells", learned=True)
+    weight: Weight = named(WEIGHTS, "fs")
     window_mode: str = choice("half_floor", "asymmetric", "odd_down", "radius")
     first: str = choice("query", "candidate")
-    include_self: bool = field(default=True, metadata={"static": True})
+    include_self: bool = flag(True)
     cell_weight: str = choice("winner_sum", "cell_sum", "ones")
-    temperature: float | Array | None = None
+    temperature: float | Array | None = number(
+        None, note="above 0 is smooth; None = the paper's", learned=True, start=0.03
+    )
 
     def __post_init__(self) -> None:
         check_choices(self)

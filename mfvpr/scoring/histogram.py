@@ -5,7 +5,7 @@ product, `votes_y [By, K] @ votes_x [Bx, K]^T`, instead of K x By x Bx exponenti
 """
 
 import math
-from dataclasses import field, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -13,14 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mfvpr.declaration import SCORE, check_choices, choice, flag, named, number, numbers, whole
 from mfvpr.errors import InputError
 from mfvpr.numerics import compiled, is_concrete, masked, positive, round_up
-from mfvpr.scoring.choices import check_choices, choice
 from mfvpr.scoring.lattice import Lattice, bins, of_all_bins, tallest, votes
 from mfvpr.scoring.shifts import image_sizes, match_shifts
 from mfvpr.scoring.tallest import tallest_bins
 from mfvpr.types import Array, Matches, value
-from mfvpr.weighting import FeatureScoreWeight, Weight, match_weights
+from mfvpr.weighting import WEIGHTS, Weight, match_weights
 
 MAX_BINS = 1024  # per axis, where nobody asks for more: the histograms of 50 pairs then take 200 MB
 _MEAN_SHIFT_STEPS = 30
@@ -63,16 +63,20 @@ class HistogramOfShifts:
             and smooth in everything but the number of bins. None is the paper's maximum; not above 0 scores NaN.
     """
 
-    bin_size: float | Array = 15.0
-    sigma: float | Array = 22.5
-    weight: Weight = FeatureScoreWeight()
-    truncate: float | Array = math.inf
-    shift_range: tuple[float, float] | None = None
+    bin_size: float | Array = number(15.0, "px")
+    sigma: float | Array = number(22.5, "px", learned=True)
+    weight: Weight = named(WEIGHTS, "fs")
+    truncate: float | Array = number(math.inf, "sigmas", "vote only within so many; None = for all bins")
+    shift_range: tuple[float, float] | None = numbers(None, 2, "[x, y] px", "None = all possible shifts")
     align: str = choice("min_edge", "zero_center", "zero_edge")
-    sigma_is_variance: bool = field(default=False, metadata={"static": True})
+    sigma_is_variance: bool = flag(False)
     direction: str = choice("candidate_minus_query", "query_minus_candidate")
-    max_bins: int | None = field(default=None, metadata={"static": True})
-    temperature: float | Array | None = None
+    max_bins: int | None = whole(
+        None, "capacity per axis", "None = what the image size needs", bounds=(1, MAX_BINS), swept=False
+    )
+    temperature: float | Array | None = number(
+        None, SCORE, "above 0 is smooth; None = the paper's", learned=True, start=0.1
+    )
 
     def __post_init__(self) -> None:
         check_choices(self)

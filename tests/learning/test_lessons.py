@@ -46,7 +46,7 @@ def test_statistics_of_a_learned_weight_are_of_nothing_hidden():
     """Distances of hidden candidates, and of candidates of no account, are moved out of range: nothing changes."""
 
     def start(at):
-        return lessons._start(at, "it", "sum", AggregatedScore(), fused=False, learned_weight=True).start["weight"]
+        return lessons._start(at, "it", AggregatedScore(), fused=False, learned_weight=True).start["weight"]
 
     at = school()
     moved = []
@@ -83,7 +83,7 @@ def test_images_of_two_sizes_are_reported_on_as_one_by_one():
 def test_images_of_two_sizes_are_learned_from_as_one_by_one():
     """The loss of a lesson is that of its queries' scores, which are finite."""
     at = school()
-    start = lessons._start(at, "it", "histogram", HISTOGRAM, fused=False, learned_weight=False)
+    start = lessons._start(at, "it", HISTOGRAM, fused=False, learned_weight=False)
     lesson = at.lesson(at.learning, len(at.learning))
     found = jax.jit(start.objective(LOSSES["cross_entropy"]))(start.start, lesson)
     scores = np.stack([scores_of(start.scorer_of(start.start), at, query) for query in at.learning])
@@ -95,7 +95,7 @@ def test_images_of_two_sizes_are_learned_from_as_one_by_one():
 def test_anchors_start_near_the_hard_score():
     matches = [random_matches(np.random.default_rng(seed), 200) for seed in range(10)]
     matches = jax.tree.map(lambda *leaves: np.stack(leaves), *matches)
-    start = model("it", "anchor", AnchorPoints(), 1.0, fused=None, weight=None)
+    start = model("it", AnchorPoints(), 1.0, fused=None, weight=None)
     soft = scores_of_one(start.scorer_of(start.start), matches)
     hard = scores_of_one(AnchorPoints(temperature=None), matches)
     assert np.median(np.abs(soft / hard - 1)) < 0.08

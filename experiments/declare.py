@@ -1,0 +1,66 @@
+"""Writes the files of conf/ that follow from the fields of the scores: `make conf`, or `python -m experiments.declare`.
+
+They are files, not made when a program starts, because --help and a wrong setting must not wait for JAX.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from experiments.settings import CONF
+from mfvpr.data.files import write_text
+from mfvpr.declaration import declared, summary
+from mfvpr.scoring import SCORERS
+
+_FIRST = "# Made by `make conf` from mfvpr/scoring: change it there.\n"
+
+
+def files() -> dict[str, str]:
+    """Texts by path below conf/."""
+    made = {f"scorer/{name}.yaml": "\n".join(_scorer(name, scorer)) for name, scorer in SCORERS.items()}
+    every = "\n".join(f"  - {name}@{name}" for name in SCORERS)
+    made["scorer/all.yaml"] = f"# Every score, each with the paper's parameters.\ndefaults:\n{every}"
+    made["axes.yaml"] = "\n".join(_axes())
+    limits = {name: {field: one.limits for field, one in declared(scorer).items()} for name, scorer in SCORERS.items()}
+    made["rules.yaml"] = yaml.safe_dump(limits, sort_keys=False, default_flow_style=None).strip()
+    return {path: f"{_FIRST}{text}\n" for path, text in made.items()}
+
+
+def write(conf: Path) -> None:
+    """All of them, and no other scorer."""
+    made = {conf / path: text for path, text in files().items()}
+    for path, text in made.items():
+        write_text(path, text)
+    for path in {*(conf / "scorer").glob("*.yaml")} - made.keys():
+        path.unlink()
+
+
+def _scorer(name: str, scorer: type) -> Iterator[str]:
+    yield f"# {summary(scorer)}"
+    yield f"method: {name}"
+    for field, one in declared(scorer).items():
+        yield _line(field, one.default, "; ".join(filter(None, (one.unit, one.note, one.words))))
+
+
+def _axes() -> Iterator[str]:
+    """Parameters of one scorer, scorer by scorer; then those that several have."""
+    owners: dict[str, dict[str, str]] = {}
+    for name, scorer in SCORERS.items():
+        for field, one in declared(scorer).items():
+            if one.swept:
+                owners.setdefault(field, {})[name] = one.unit or one.words
+    yield "grid:  # lists of values of the scorer's parameters; null = its own value"
+    for field, units in sorted(owners.items(), key=lambda item: len(item[1]) > 1):
+        [unit, *others] = {*units.values()}
+        yield _line(f"  {field}", None, ", ".join(units) + (f": {unit}" if unit and not others else ""))
+
+
+def _line(name: str, default: Any, comment: str) -> str:
+    value = yaml.safe_dump(default, default_flow_style=True).splitlines()[0]
+    return f"{name}: {value}" + (f"  # {comment}" if comment else "").replace("None", "null")
+
+
+if __name__ == "__main__":
+    write(CONF)

@@ -1,0 +1,182 @@
+"""A scorer is declared once: settings, rules, help and axes follow from its class."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import hydra
+import jax.numpy as jnp
+import pytest
+
+from experiments import build, command_line, declare, groups, help_text, settings
+from experiments.settings import CONF
+from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, value
+from mfvpr.declaration import check_choices, choice, declared, flag, made, named, number, numbers, whole
+from mfvpr.learning.parameters import can_learn, starts
+from mfvpr.scoring import SCORERS, match_shifts
+from mfvpr.types import Array, Matches
+from mfvpr.weighting import WEIGHTS, UnitWeight, Weight, match_weights
+from tests.programs import ROOT, results, shared, small, typed
+
+
+@value
+class Nearness:
+    """Matches that shift by less than a radius."""
+
+    radius: float | Array = number(30.0, "px")
+    most: float | Array | None = number(None, "px", "None = all", bounds=(1, 500))
+    rounds: int = whole(2, "iterations", bounds=(1, 9))
+    norm: str = choice("sum", "largest", note="of x and y")
+    weight: Weight = named(WEIGHTS, "unit")
+    size: tuple[float, float] | None = numbers(None, 2, "[x, y] px", "None = any")
+    strict: bool = flag(False)
+    inner: tuple = ()  # no setting
+
+    def __post_init__(self) -> None:
+        check_choices(self)
+
+    def __call__(self, matches: Matches) -> Array:
+        shifts = jnp.abs(match_shifts(matches))
+        length = shifts.sum(-1) if self.norm == "sum" else shifts.max(-1)
+        return jnp.sum(jnp.where(length < self.radius, match_weights(self.weight, matches), 0.0))
+
+
+TEXT = """\
+# Made by `make conf` from mfvpr/scoring: change it there.
+# A scorer is declared once: settings, rules, help and axes follow from its class.
+method: near
+radius: 30.0  # px
+most: null  # px; null = all
+rounds: 2  # iterations
+norm: sum  # of x and y; sum, largest
+weight: unit  # WEIGHTS
+size: null  # [x, y] px; null = any
+strict: false
+""".replace("WEIGHTS", ", ".join(WEIGHTS))
+
+
+@pytest.fixture
+def near(tmp_path, monkeypatch):
+    """What adding a scorer takes beside its class: a line in the table, and `make conf`."""
+    monkeypatch.setitem(SCORERS, "near", Nearness)
+    conf = tmp_path / "conf"
+    shutil.copytree(CONF, conf)
+    declare.write(conf)
+    for module in (command_line, groups, help_text, settings):
+        monkeypatch.setattr(module, "CONF", conf)
+    return conf
+
+
+def test_the_files_of_conf_are_those_that_follow_from_the_scores():
+    made = declare.files()
+    assert {path.name for path in (CONF / "scorer").iterdir()} == {f"{name}.yaml" for name in (*SCORERS, "all")}
+    for path, text in made.items():
+        assert (CONF / path).read_text(encoding="utf-8") == text, f"conf/{path} is not up to date: make conf"
+
+
+def test_every_field_of_a_scorer_is_a_setting_whose_default_is_its_own():
+    for scorer in SCORERS.values():
+        assert [*declared(scorer)] == [*scorer.__dataclass_fields__]
+        assert made(scorer, {name: one.default for name, one in declared(scorer).items()}) == scorer()
+
+
+def test_a_scorer_that_is_gone_leaves_no_file(near, monkeypatch):
+    monkeypatch.delitem(SCORERS, "near")
+    declare.write(near)
+    assert {path.name: path.read_text() for path in near.rglob("*.yaml")} == {
+        path.name: path.read_text() for path in CONF.rglob("*.yaml")
+    }
+
+
+def test_conf_and_help_follow_from_the_class(near, monkeypatch, capsys):
+    assert (near / "scorer" / "near.yaml").read_text() == TEXT
+    code, stdout, _ = typed(monkeypatch, capsys, "sweep", "--help", "scorer=near")
+    assert code == 0
+    _, summary, *lines = TEXT.splitlines()
+    for line in (summary, *lines):
+        assert f"\n  {line}\n" in stdout
+    assert "Made by" not in stdout
+    assert "\n  scorer=near             all, anchor, count, histogram, sum\n" in stdout
+    assert "\n  radius: null  # near: px\n" in stdout
+    assert "\n  norm: null  # near: sum, largest\n" in stdout
+    assert f"\n  weight: null  # sum, anchor, histogram, near: {', '.join(WEIGHTS)}\n" in stdout
+    assert "\n  size: null\n" not in stdout[stdout.index("\ngrid:") :]
+    assert "\n  near:\n    # A scorer" in typed(monkeypatch, capsys, "evaluate", "--help")[1]
+
+
+@pytest.mark.parametrize(
+    ("program", "arguments", "words"),
+    [
+        ("evaluate", ["scorer=neat"], "expected one of all, anchor, count, histogram, near, sum; the nearest is near"),
+        ("evaluate", ["scorer.near.radius=0"], "scorer.near.radius=0: expected a number above 0 (1e-6 to 1e12)"),
+        ("evaluate", ["scorer.near.most=501"], "scorer.near.most=501: expected a number from 1 to 500, or null"),
+        ("evaluate", ["scorer=near", "scorer.rounds=10"], "scorer.rounds=10: expected a whole number from 1 to 9"),
+        ("evaluate", ["scorer=near", "scorer.norm=both"], "scorer.norm=both: expected one of sum, largest"),
+        ("evaluate", ["scorer=near", "scorer.weight=heavy"], f"expected one of {', '.join(WEIGHTS)}"),
+        ("evaluate", ["scorer=near", "scorer.size=[1]"], "size=[1]: expected a list of 2, each a number above 0"),
+        ("evaluate", ["scorer=near", "scorer.strict=1"], "scorer.strict=1: expected one of true, false"),
+        ("evaluate", ["scorer=near", "scorer.radios=1"], "unknown setting; the nearest is scorer.radius"),
+        ("evaluate", ["scorer=near", "scorer.method=sum"], "scorer=sum has no setting radius; see --help"),
+        ("evaluate", ["scorer=near", "scorer.method=[1]"], "scorer.method=[1]: expected one of count, sum, anchor"),
+        ("evaluate", ["scorer.near.method=sum"], "scorer.near.method=sum: expected near; choose with scorer=near"),
+        ("sweep", ["scorer=near", "grid.radius=[-1]"], "radius=[-1]: expected a list of one or more, each a number"),
+        ("sweep", ["scorer=near", "grid.most=[null,501]"], "each a number from 1 to 500, or null"),
+        ("sweep", ["scorer=near", "grid.sigma=[1]"], "no such parameter; it has radius, most, rounds"),
+        ("sweep", ["scorer=near", "grid.size=[[1,2]]"], "grid.size: unknown setting"),
+        ("learn", ["scorer=near"], "scorer=near: expected one to learn, of sum, anchor, histogram"),
+    ],
+)  # fmt: skip
+def test_rules_follow_from_the_class(near, monkeypatch, capsys, program, arguments, words):
+    code, stdout, stderr = typed(monkeypatch, capsys, program, *arguments)
+    assert (code, stdout) == (2, "")
+    assert words in stderr
+    assert stderr.count("\n") == 1
+
+
+def test_all_scores_contain_it(near):
+    with hydra.initialize_config_dir(str(near), version_base="1.3"):
+        found = build.scorers(hydra.compose("config", ["scorer.near.size=[1,2]", "scorer.near.norm=largest"])["scorer"])
+    assert [*found] == [*SCORERS]
+    assert found["near"] == Nearness(size=(1.0, 2.0), norm="largest")
+    assert found["near"].weight is WEIGHTS["unit"]
+
+
+def test_its_parameters_are_swept(near, tmp_path_factory, tmp_path, monkeypatch, capsys):
+    axes = ("scorer=near", "grid.radius=[0.001,20]", "grid.weight=[unit,dmf]", "grid.norm=[sum,largest]")
+    run = (*small(shared(tmp_path_factory)), f"out={tmp_path}/out")
+    code, _, stderr = typed(monkeypatch, capsys, "sweep", *run, *axes)
+    assert code == 0, stderr
+    found = results(tmp_path / "out")
+    assert found["own"] == {"radius": 30.0, "norm": "sum", "weight": "unit"}
+    recall = {radius: set() for radius in (0.001, 20)}
+    for entry in found["settings"][:8]:
+        recall[entry["parameters"]["radius"]].add(json.dumps(entry["recall_at"]))
+    assert len(recall[0.001]) == 1  # nothing is that near: the filter's order
+    assert len(recall[20]) > 1
+
+
+def test_plain_values_become_the_fields(near):
+    plain = {"radius": 3.0, "most": None, "size": [1, 2], "weight": "unit", "strict": True}
+    assert made(Nearness, plain) == Nearness(3.0, None, size=(1.0, 2.0), weight=UnitWeight(), strict=True)
+    with pytest.raises(ValueError, match=r"Nearness\(norm='both'\): expected one of sum, largest"):
+        Nearness(norm="both")
+
+
+def test_where_learning_starts_follows_from_the_fields():
+    assert [name for name, scorer in SCORERS.items() if can_learn(scorer)] == ["sum", "anchor", "histogram"]
+    assert starts(HistogramOfShifts(sigma=7.0), 2.0) == {"sigma": 7.0, "temperature": 0.2}  # of the spread
+    assert starts(AnchorPoints(temperature=0.5), 2.0) == {"tolerance": 3.0, "temperature": 0.5}
+    assert starts(AnchorPoints(), 2.0) == {"tolerance": 3.0, "temperature": 0.03}
+    assert starts(AggregatedScore(), 2.0) == {"temperature": 1.0}
+
+
+def test_a_wrong_setting_is_refused_without_jax():
+    code = ("import sys; from experiments.launch import launch; from experiments.evaluate import evaluate\n"
+            "sys.argv = ['evaluate', 'scorer.histogram.sigma=0']\n"
+            "try: launch(evaluate)\n"
+            "except SystemExit as left: assert left.code == 2\n"
+            "assert not {'jax', 'mfvpr', 'numpy'} & {*sys.modules}")  # fmt: skip
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == "error: scorer.histogram.sigma=0: expected a number above 0 (1e-6 to 1e12)\n"
