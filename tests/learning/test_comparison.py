@@ -6,25 +6,30 @@ import jax
 import numpy as np
 import pytest
 
-from experiments import lessons
-from experiments.models import LOSSES, model
 from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, score_candidates
-from mfvpr.learning.losses import cross_entropy, mean_loss
+from mfvpr.learning import comparison
+from mfvpr.learning.comparison import Options, start
+from mfvpr.learning.losses import LOSSES, cross_entropy, mean_loss
 from mfvpr.learning.match_weight import FEATURE_NAMES
+from mfvpr.learning.models import Model
+from mfvpr.sweeping import Axes
+from mfvpr.sweeping.search import untracked_stages
 from tests.builders import random_matches
-from tests.learning.schools import QUERIES, SIZES, TOLERANCES, school
+from tests.learning.paths import QUERIES, SIZES, TOLERANCES, split
+
+OPTIONS = Options(batch=4, hidden=5)
 
 
 @pytest.mark.parametrize("half", [0, 1])
 def test_candidates_are_right_wrong_or_of_no_account(half):
     """Right within the widest tolerance alone: neither positive nor negative. Reported places: not there at all."""
-    at = school(half=half)
-    lesson = at.lesson(at.learning, len(at.learning) + 2)
+    at = split(half=half)
+    batch = at.batch(at.train, len(at.train) + 2)
     reported = set(at.half.report.tolist())
     kinds = {"right": 0, "wrong": 0, "near": 0, "hidden": 0}
-    for row, query in enumerate(at.learning):
+    for row, query in enumerate(at.train):
         frames = dict(zip(at.candidates.scores[query].tolist(), at.candidates.indices[query].tolist(), strict=True))
-        rows = zip(lesson.filter_scores[row].tolist(), lesson.positives[row].tolist(), lesson.mask[row], strict=True)
+        rows = zip(batch.filter_scores[row].tolist(), batch.positives[row].tolist(), batch.mask[row], strict=True)
         taught = {frames[score]: positive for score, positive, real in rows if real}
         for frame in range(QUERIES):
             apart = abs(frame - query)
@@ -39,27 +44,27 @@ def test_candidates_are_right_wrong_or_of_no_account(half):
             assert taught.get(frame) is expected
             kinds[kind] += 1
     assert min(kinds.values()) > 0
-    assert not lesson.mask[len(at.learning) :].any()
+    assert not batch.mask[len(at.train) :].any()
 
 
 def test_statistics_of_a_learned_weight_are_of_nothing_hidden():
     """Distances of hidden candidates, and of candidates of no account, are moved out of range: nothing changes."""
 
-    def start(at):
-        return lessons._start(at, "it", AggregatedScore(), fused=False, learned_weight=True).start["weight"]
+    def weight(at):
+        return start(at, AggregatedScore(), OPTIONS, learned_weight=True).start["weight"]
 
-    at = school()
+    at = split()
     moved = []
-    for query, flat in enumerate(at.matches.matches):
-        there = np.repeat(at.usable[query], at.matches.counts[query]) & (query in at.learning)
+    for query, flat in enumerate(at.match_set.matches):
+        there = np.repeat(at.usable[query], at.match_set.counts[query]) & (query in at.train)
         moved.append(replace(flat, distance=np.where(there, flat.distance, np.float32(50))))
-    far = replace(at, matches=replace(at.matches, matches=moved))
-    jax.tree.map(np.testing.assert_array_equal, start(far), start(at))
+    far = replace(at, match_set=replace(at.match_set, matches=moved))
+    jax.tree.map(np.testing.assert_array_equal, weight(far), weight(at))
     distances = np.concatenate([
-        at.matches.matches[query].distance[np.repeat(at.usable[query], at.matches.counts[query])]
-        for query in at.learning[:4]
+        at.match_set.matches[query].distance[np.repeat(at.usable[query], at.match_set.counts[query])]
+        for query in at.train[:4]
     ])  # fmt: skip
-    assert start(at).center[FEATURE_NAMES.index("distance")] == pytest.approx(distances.mean(), rel=1e-5)
+    assert weight(at).center[FEATURE_NAMES.index("distance")] == pytest.approx(distances.mean(), rel=1e-5)
 
 
 HISTOGRAM = HistogramOfShifts(bin_size=20.0, sigma=20.0)
@@ -68,35 +73,36 @@ scores_of_one = jax.jit(score_candidates)
 
 def scores_of(scorer, at, query):
     """By the public function: every query with the sizes of its own images, and room for all bins."""
-    return np.asarray(scores_of_one(replace(scorer, max_bins=2 * max(SIZES) // 20), at.matches[query]))
+    return np.asarray(scores_of_one(replace(scorer, max_bins=2 * max(SIZES) // 20), at.match_set[query]))
 
 
 def test_images_of_two_sizes_are_reported_on_as_one_by_one():
-    at, c = school(), 2.5
+    at, c = split(), 2.5
     expected = []
     for query in at.half.report:
         order = np.argsort(-(scores_of(HISTOGRAM, at, query) + c * at.candidates.scores[query]), kind="stable")
         expected.append([abs(at.candidates.indices[query][order[0]] - query) <= width for width in TOLERANCES])
-    np.testing.assert_array_equal(lessons._reported(at, "it", HISTOGRAM, {"c": c}).hits, np.transpose(expected))
+    compared = comparison._Compared(at, Axes(HISTOGRAM, {}, {}), OPTIONS, None, untracked_stages)
+    np.testing.assert_array_equal(compared.reported("it", HISTOGRAM, {"c": c}).hits, np.transpose(expected))
 
 
 def test_images_of_two_sizes_are_learned_from_as_one_by_one():
-    """The loss of a lesson is that of its queries' scores, which are finite."""
-    at = school()
-    start = lessons._start(at, "it", HISTOGRAM, fused=False, learned_weight=False)
-    lesson = at.lesson(at.learning, len(at.learning))
-    found = jax.jit(start.objective(LOSSES["cross_entropy"]))(start.start, lesson)
-    scores = np.stack([scores_of(start.scorer_of(start.start), at, query) for query in at.learning])
+    """The loss of a batch is that of its queries' scores, which are finite."""
+    at = split()
+    model = start(at, HISTOGRAM, OPTIONS)
+    batch = at.batch(at.train, len(at.train))
+    found = jax.jit(model.objective(LOSSES["cross_entropy"]))(model.start, batch)
+    scores = np.stack([scores_of(model.scorer_of(model.start), at, query) for query in at.train])
     assert np.all(np.isfinite(scores))
-    expected = mean_loss(cross_entropy, 2 * scores / start.unit, at.right[at.learning], at.usable[at.learning])
+    expected = mean_loss(cross_entropy, 2 * scores / model.unit, at.right[at.train], at.usable[at.train])
     assert float(found) == pytest.approx(float(expected), rel=1e-4)
 
 
 def test_anchors_start_near_the_hard_score():
     matches = [random_matches(np.random.default_rng(seed), 200) for seed in range(10)]
     matches = jax.tree.map(lambda *leaves: np.stack(leaves), *matches)
-    start = model("it", AnchorPoints(), 1.0, fused=None, weight=None)
-    soft = scores_of_one(start.scorer_of(start.start), matches)
+    model = Model.of(AnchorPoints(), 1.0)
+    soft = scores_of_one(model.scorer_of(model.start), matches)
     hard = scores_of_one(AnchorPoints(temperature=None), matches)
     assert np.median(np.abs(soft / hard - 1)) < 0.08
 
@@ -104,7 +110,7 @@ def test_anchors_start_near_the_hard_score():
 def test_queries_without_a_wrong_candidate_teach_nothing_and_judge_nothing():
     """Their loss is 0 from the start: as a validation it would stop every training at once."""
     alone = range(0, QUERIES, 3)
-    every, rest = school(), school(only_right=alone)
-    for chosen, before in ((rest.learning, every.learning), (rest.validating, every.validating)):
+    every, rest = split(), split(only_right=alone)
+    for chosen, before in ((rest.train, every.train), (rest.validation, every.validation)):
         assert list(chosen) == [query for query in before if query not in alone]
         assert len(chosen) < len(before)
