@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, score_candidates
+from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, InputError, MatchCount, score_candidates
 from mfvpr.learning import comparison
 from mfvpr.learning.comparison import Options, start
 from mfvpr.learning.losses import LOSSES, cross_entropy, mean_loss
@@ -114,3 +114,15 @@ def test_queries_without_a_wrong_candidate_teach_nothing_and_judge_nothing():
     for chosen, before in ((rest.train, every.train), (rest.validation, every.validation)):
         assert list(chosen) == [query for query in before if query not in alone]
         assert len(chosen) < len(before)
+
+
+def test_what_cannot_be_compared_is_refused():
+    at = split()
+    data = at.match_set, at.candidates
+    with pytest.raises(InputError, match="MatchCount: expected a scorer with numbers to learn"):
+        comparison.compare(Axes(MatchCount(), {}, {}), at.judge, *data)
+    whole = replace(at.judge, halves=(), split=None)
+    with pytest.raises(InputError, match="split=None: expected first_half, second_half or both"):
+        comparison.compare(Axes(AggregatedScore(), {}, {}), whole, *data)
+    with pytest.raises(InputError, match="split=first_half: expected queries to learn on and to validate with, got 0"):
+        split(only_right=range(QUERIES))
