@@ -11,7 +11,7 @@ from mfvpr import InputError, sweeping
 from mfvpr.data.ground_truth import FrameTruth
 from mfvpr.evaluation import best_setting, hits, judge, statistics
 from mfvpr.report import sweeps
-from mfvpr.sweeping import Axes
+from mfvpr.sweeping import Axes, search
 from tests.learning.paths import QUERIES, TOLERANCES, split
 from tests.scorers import Wrapped
 
@@ -95,22 +95,30 @@ def test_each_half_is_reported_by_what_was_chosen_on_the_other(outcome):
     assert verdict.mcnemar == statistics.mcnemar(np.array(first), np.array(own))
 
 
-def test_optuna_draws_within_the_axes(data):
-    pytest.importorskip("optuna")
-    scorer = mfvpr.AnchorPoints()
-    values = {"num_bins": [4, 5], "tolerance": [1.5, 4.0], "weight": ["fs", "unit"], "window": [6]}
-    axes = Axes(scorer, values, {"num_bins": 5, "tolerance": 3.0, "weight": "fs", "window": 10})
-    outcome = sweeping.search_optuna(axes, judge(TRUTH, TOLERANCES), *data, trials=2, seed=1, ks=[1])
-    assert outcome.settings[0] == axes.own
-    assert outcome.rows.shape == (1, 3, QUERIES, 1)
-    for setting in outcome.settings[1:]:
+def test_optuna_draws_within_the_axes():
+    optuna = pytest.importorskip("optuna")
+    values = {"num_bins": [4, 9], "tolerance": [1.5, 4.0], "weight": ["fs", "unit"], "window": [6]}
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=1))
+    drawn = [search._suggested(study.ask(), Axes(mfvpr.AnchorPoints(), values, {})) for _ in range(20)]
+    for setting in drawn:
         assert type(setting["num_bins"]) is int
-        assert 4 <= setting["num_bins"] <= 5
+        assert 4 <= setting["num_bins"] <= 9
         assert 1.5 <= setting["tolerance"] <= 4
         assert setting["weight"] in values["weight"]
         assert setting["window"] == 6
+    assert len({setting["tolerance"] for setting in drawn}) == 20
+
+
+def test_optuna_proposes_as_many_as_asked_after_the_scorers_own(data):
+    pytest.importorskip("optuna")
+    axes = Axes(SUM, {"weight": ["fs", "unit"], "c": [0.5, 3.0]}, {"weight": "dmf", "c": 2})
+    outcome = sweeping.search_optuna(axes, judge(TRUTH, TOLERANCES), *data, trials=3, seed=1, ks=[1])
+    assert outcome.settings[0] == axes.own
+    assert outcome.rows.shape == (1, 4, QUERIES, 1)
     assert outcome.chosen == [int(np.argmax(outcome.recall[:, 1]))]
     assert sweeps.figures(outcome) == []
+    rows = sweeping.sweep(SUM, [axes.setting(one) for one in outcome.settings], *data, depth=1)
+    np.testing.assert_array_equal(outcome.rows, rows)
 
 
 def test_what_people_read_is_what_was_measured(outcome):
