@@ -6,14 +6,26 @@ from experiments import build
 from experiments.settings import SettingsError
 from mfvpr import sweeping
 from mfvpr.declaration import declared
+from mfvpr.errors import InputError
+from mfvpr.learning.parameters import can_learn
 from mfvpr.match_sets import MatchSet
 from mfvpr.numerics import free_host_bytes
+from mfvpr.scoring import SCORERS
 from mfvpr.sweeping import Axes
+from mfvpr.sweeping.search import require_optuna
 from mfvpr.sweeping.sweep import SETTINGS_PER_BLOCK
 
 OF_MATCHES = ("max_distance", "c")  # what is no parameter of a scorer
 BYTES_PER_SETTING = 2000  # of Python's own, about
 _MB = 1e6
+
+
+def as_final(settings: dict[str, Any]) -> dict[str, Any]:
+    """Where the score with the filter decides, every setting has it, with the c of the fusion if none is varied."""
+    grid = settings["grid"]
+    if settings["final"] == "score" or grid["c"] is not None or not any(grid.values()):
+        return settings
+    return settings | {"grid": grid | {"c": [settings["fusion"]["c"]]}}
 
 
 def axes(settings: dict[str, Any]) -> Axes:
@@ -37,23 +49,44 @@ def axes(settings: dict[str, Any]) -> Axes:
     return Axes(scorer, values, {name: own.get(name) for name in values})
 
 
+def searchable(settings: dict[str, Any]) -> Axes:
+    """The axes of a sweep, if they can be searched."""
+    varied = axes(settings)
+    if settings["search"] == "grid":
+        needed = varied.size * BYTES_PER_SETTING
+        _require(f"grid: {varied.size:,} settings", needed, "use fewer values, or search=optuna")
+        return varied
+    try:
+        require_optuna()
+    except InputError as error:
+        raise SettingsError(f"search=optuna: {error}, or search=grid") from error
+    return varied
+
+
+def learnable(settings: dict[str, Any]) -> Axes:
+    """What the grid-searched rows vary, of a scorer that can be learned."""
+    method = settings["scorer"].get("method", "all")
+    known = [name for name, scorer in SCORERS.items() if can_learn(scorer)]
+    if method not in known:
+        raise SettingsError(f"scorer={method}: expected one to learn, of {', '.join(known)}")
+    varied = axes(settings)
+    if settings["split"] is None:
+        raise SettingsError("split=null: what is learned is never reported on the same queries; expected first_half, "
+                            "second_half or both")  # fmt: skip
+    return varied
+
+
 def own_c(settings: dict[str, Any]) -> float | None:
     """The filter's weight by hand, None = balanced."""
     c = settings["fusion"]["c"]
     return None if c == "auto" else float(c)
 
 
-def require_grid_memory(varied: Axes) -> None:
-    """Refuse a grid that would not fit, before it is listed."""
-    needed = varied.size * BYTES_PER_SETTING
-    _require_memory(f"grid: {varied.size:,} settings", needed, "use fewer values, or search=optuna")
-
-
-def require_result_memory(settings: dict[str, Any], varied: Axes, views: int, matches: MatchSet) -> None:
+def require_memory(settings: dict[str, Any], varied: Axes, views: int, matches: MatchSet) -> None:
     """Refuse results, or a chunk, that would not fit, before they are begun."""
     queries, num_candidates = matches.counts.shape
     num_settings = varied.size + (dict(varied.own) not in varied.grid())
-    _require_memory(
+    _require(
         f"grid: rankings of {queries:,} queries by {num_settings:,} settings",
         sweeping.result_bytes(views, num_settings, queries, max(settings["recall"]["ks"])),
         "use fewer values, smaller recall.ks, or search=optuna",
@@ -62,14 +95,14 @@ def require_result_memory(settings: dict[str, Any], varied: Axes, views: int, ma
     if chunk["settings"] or chunk["queries"]:
         lines = min(chunk["settings"] or SETTINGS_PER_BLOCK, num_settings)
         columns = min(chunk["queries"] or 1, queries)
-        _require_memory(
+        _require(
             f"chunk: {lines:,} settings x {columns:,} queries",
             sweeping.block_bytes(matches, num_candidates, lines, columns),
             "use a smaller chunk.settings or chunk.queries, or leave them null",
         )
 
 
-def _require_memory(what: str, needed: int, mend: str) -> None:
+def _require(what: str, needed: int, mend: str) -> None:
     """Refuse what would not fit, before it is begun."""
     free = free_host_bytes()
     if needed > 0.8 * free:

@@ -4,24 +4,20 @@ from pathlib import Path
 from typing import Any
 
 from experiments import build, console, prepare, run_folder, stores, truth
-from experiments.axes import axes, own_c
-from experiments.settings import SettingsError
+from experiments.axes import learnable, own_c
 from mfvpr.data.files import write_text
 from mfvpr.evaluation import Judge
 from mfvpr.learning.comparison import Checkpoints, Options, compare
 from mfvpr.learning.losses import LOSSES
-from mfvpr.learning.parameters import can_learn
 from mfvpr.report import comparisons, runs
-from mfvpr.scoring import SCORERS
 from mfvpr.stores.manifest import recipe_fingerprint
-from mfvpr.sweeping import Axes
 from mfvpr.types import Shortlist
 
 
 def learn(settings: dict[str, Any]) -> None:
     """Matches -> learned, searched and hand-set scores on the half that none of them saw -> table, figures, files."""
     with run_folder.claimed(settings) as folder:
-        varied = _axes(settings)
+        varied = learnable(settings)
         tools = prepare.extractors(settings)
         watch = prepare.Stopwatch()
         with watch("data"):
@@ -50,19 +46,6 @@ def learn(settings: dict[str, Any]) -> None:
 
         figures = comparisons.figures(comparison)
         run_folder.leave(folder, settings, described, text=text, write=write, figures=figures)
-
-
-def _axes(settings: dict[str, Any]) -> Axes:
-    """What the grid-searched rows vary, of a scorer that can be learned."""
-    method = settings["scorer"].get("method", "all")
-    known = [name for name, scorer in SCORERS.items() if can_learn(scorer)]
-    if method not in known:
-        raise SettingsError(f"scorer={method}: expected one to learn, of {', '.join(known)}")
-    varied = axes(settings)
-    if settings["split"] is None:
-        raise SettingsError("split=null: what is learned is never reported on the same queries; expected first_half, "
-                            "second_half or both")  # fmt: skip
-    return varied
 
 
 def _options(settings: dict[str, Any]) -> Options:

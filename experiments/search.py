@@ -5,23 +5,20 @@ from pathlib import Path
 from typing import Any
 
 from experiments import build, console, prepare, run_folder, stores, truth
-from experiments.axes import axes, require_grid_memory, require_result_memory
-from experiments.settings import SettingsError
+from experiments.axes import as_final, require_memory, searchable
 from mfvpr import sweeping
 from mfvpr.data.files import write_text
-from mfvpr.errors import InputError
 from mfvpr.report import runs, sweeps
 from mfvpr.stores.manifest import recipe_fingerprint
-from mfvpr.sweeping import Axes, Outcome
-from mfvpr.sweeping.search import require_optuna
+from mfvpr.sweeping import Outcome
 from mfvpr.types import Shortlist
 
 
 def sweep(settings: dict[str, Any]) -> None:
     """Matches -> rows of every setting's ranking -> the best setting -> table, heat maps, files."""
-    settings = _as_final(settings)
+    settings = as_final(settings)
     with run_folder.claimed(settings) as folder:
-        varied = _axes(settings)
+        varied = searchable(settings)
         tools = prepare.extractors(settings)
         watch = prepare.Stopwatch()
         with watch("data"):
@@ -37,7 +34,7 @@ def sweep(settings: dict[str, Any]) -> None:
         with watch("sweep"):
             if settings["search"] == "grid":
                 varied.check(matches.image_sizes)
-                require_result_memory(settings, varied, 1 + len(judge.halves), matches)
+                require_memory(settings, varied, 1 + len(judge.halves), matches)
                 outcome = sweeping.search_grid(varied, judge, matches, candidates, **options)
             else:
                 trials = {"trials": settings["trials"], "seed": settings["seed"]}
@@ -54,27 +51,6 @@ def sweep(settings: dict[str, Any]) -> None:
         run_folder.leave(folder, settings, described, text=text, write=write, figures=sweeps.figures(outcome))
     if kept is not None:
         shutil.rmtree(kept, ignore_errors=True)
-
-
-def _as_final(settings: dict[str, Any]) -> dict[str, Any]:
-    """Where the score with the filter decides, every setting has it, with the c of the fusion if none is varied."""
-    grid = settings["grid"]
-    if settings["final"] == "score" or grid["c"] is not None or not any(grid.values()):
-        return settings
-    return settings | {"grid": grid | {"c": [settings["fusion"]["c"]]}}
-
-
-def _axes(settings: dict[str, Any]) -> Axes:
-    """What is varied, if that can be searched."""
-    varied = axes(settings)
-    if settings["search"] == "grid":
-        require_grid_memory(varied)
-        return varied
-    try:
-        require_optuna()
-    except InputError as error:
-        raise SettingsError(f"search=optuna: {error}, or search=grid") from error
-    return varied
 
 
 def _kept(settings: dict[str, Any], images: prepare.Images, candidates: Shortlist) -> Path | None:
