@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from mfvpr.declaration import declared
+from mfvpr.errors import InputError
 from mfvpr.scoring import Scorer
 from mfvpr.scoring.parameters import fit, with_parameters
 from mfvpr.sweeping.settings import FUSION, Setting, grid
@@ -47,7 +48,11 @@ class Axes:
         return Axes(self.scorer, values, own)
 
     def setting(self, plain: Mapping[str, Any]) -> Setting:
-        """A combination as `mfvpr.sweeping.sweep` takes it."""
+        """A combination as `mfvpr.sweeping.sweep` takes it.
+
+        Raises:
+            InputError: a word that is none of its parameter's.
+        """
         return {name: self._value(name, value) for name, value in plain.items()}
 
     def check(self, image_sizes: tuple[np.ndarray, np.ndarray]) -> None:
@@ -57,8 +62,10 @@ class Axes:
             image_sizes: `[n, 2]` of queries and of database images, all that occur (`MatchSet.image_sizes`).
 
         Raises:
-            InputError: histograms of more bins than there may be.
+            InputError: the scorer's own values are of other parameters, or histograms have more bins than there may be.
         """
+        if {*self.own} != {*self.values}:
+            raise InputError(f"own: expected a value of each of {', '.join(self.values)}, got {', '.join(self.own)}")
         for setting in grid({name: self.values[name] for name in CAPACITY if name in self.values}):
             fit(with_parameters(self.scorer, setting), *image_sizes)
 
@@ -68,4 +75,8 @@ class Axes:
         if name == MAX_DISTANCE:
             return math.inf if value is None else value
         parameter = declared(self.scorer).get(name)
-        return value if parameter is None else parameter.value(value)
+        if parameter is None:
+            return value
+        if parameter.named is not None and value not in parameter.named:
+            raise InputError(f"{name}={value!r}: expected one of {', '.join(parameter.named)}")
+        return parameter.value(value)

@@ -57,6 +57,15 @@ def test_bins_that_do_not_fit_are_refused_before_any_work(data):
         sweeping.search_grid(axes, judge(TRUTH, TOLERANCES), *data, track=lambda _: pytest.fail("begun"))
 
 
+def test_what_is_no_word_or_has_no_own_value_is_refused(data):
+    words = Axes(SUM, {"weight": [mfvpr.UnitWeight()]}, {"weight": "fs"})
+    with pytest.raises(InputError, match=r"weight=UnitWeight\(\): expected one of fs, dmf, unit"):
+        sweeping.search_grid(words, judge(TRUTH, TOLERANCES), *data)
+    without = Axes(SUM, {"weight": ["fs"], "c": [0]}, {"weight": "fs"})
+    with pytest.raises(InputError, match="own: expected a value of each of weight, c, got weight"):
+        sweeping.search_grid(without, judge(TRUTH, TOLERANCES), *data)
+
+
 def test_every_setting_of_the_grid_is_ranked_and_then_the_scorers_own(data, outcome):
     assert outcome.settings == [*sweeping.grid(WEIGHTS), {"weight": "dmf", "c": 2}]
     assert outcome.own == 4
