@@ -1,76 +1,40 @@
-"""The axes of a sweep: values as the user writes them, and as the library takes them."""
+"""The settings `grid.`: which parameters of which scorer are varied, and whether that fits into memory."""
 
-import math
-import os
-import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from experiments import build
 from experiments.settings import SettingsError
 from mfvpr import sweeping
-from mfvpr.declaration import Parameter, declared
-from mfvpr.pipeline import MatchSet
-from mfvpr.scoring import SCORERS, Scorer
-from mfvpr.scoring.parameters import fit, with_parameters
+from mfvpr.declaration import declared
+from mfvpr.errors import InputError
+from mfvpr.learning.parameters import can_learn
+from mfvpr.match_sets import MatchSet
+from mfvpr.numerics import free_host_bytes
+from mfvpr.scoring import SCORERS
+from mfvpr.sweeping import Axes
+from mfvpr.sweeping.search import require_optuna
+from mfvpr.sweeping.sweep import SETTINGS_PER_BLOCK
 
 OF_MATCHES = ("max_distance", "c")  # what is no parameter of a scorer
 BYTES_PER_SETTING = 2000  # of Python's own, about
 _MB = 1e6
 
 
-@dataclass(frozen=True)
-class Axes:
-    """What is varied.
-
-    Attributes:
-        method: the scorer's name.
-        values: by name, as they were written.
-        own: the scorer's own value of each, as it would be written.
-    """
-
-    method: str
-    values: Mapping[str, Sequence[Any]]
-    own: Mapping[str, Any]
-
-    @property
-    def size(self) -> int:
-        """Settings of the grid."""
-        return math.prod(map(len, self.values.values()))
-
-    def grid(self) -> list[dict[str, Any]]:
-        """Every combination, as written."""
-        return sweeping.grid(self.values)
-
-    @property
-    def parameters(self) -> dict[str, Parameter]:
-        """The scorer's."""
-        return declared(SCORERS[self.method])
-
-    def setting(self, written: Mapping[str, Any]) -> sweeping.Setting:
-        """The values that `mfvpr.sweeping` takes."""
-        return {name: self._value(name, value) for name, value in written.items()}
-
-    def _value(self, name: str, value: Any) -> Any:
-        if name == "c":
-            return None if value == "auto" else float(value)
-        if name == "max_distance":
-            return math.inf if value is None else value
-        return self.parameters[name].value(value)
+def as_final(settings: dict[str, Any]) -> dict[str, Any]:
+    """Where the score with the filter decides, every setting has it, with the c of the fusion if none is varied."""
+    grid = settings["grid"]
+    if settings["final"] == "score" or grid["c"] is not None or not any(grid.values()):
+        return settings
+    return settings | {"grid": grid | {"c": [settings["fusion"]["c"]]}}
 
 
 def axes(settings: dict[str, Any]) -> Axes:
     """The checked axes of one scorer."""
-    group = settings["scorer"]
-    if "method" not in group:
+    if "method" not in settings["scorer"]:
         raise SettingsError("scorer=all: a sweep takes one scorer at a time; choose with scorer=histogram, or several "
                             "with -m scorer=sum,anchor,histogram")  # fmt: skip
-    method = group["method"]
-    known = {*declared(SCORERS[method]), *OF_MATCHES}
+    [(method, scorer)] = build.scorers(settings["scorer"]).items()
+    known = {*declared(scorer), *OF_MATCHES}
     values = {name: axis for name, axis in settings["grid"].items() if axis is not None}
     for name, axis in values.items():
         if name not in known:
@@ -81,47 +45,67 @@ def axes(settings: dict[str, Any]) -> Axes:
     if not values:
         raise SettingsError("grid: expected at least one axis, such as 'grid.sigma=[10,22.5]', or an experiment=; see "
                             "--help")  # fmt: skip
-    own = {name: _own(settings, name) for name in values}
-    return Axes(method, values, own)
+    own = settings["scorer"] | {"c": settings["fusion"]["c"], "max_distance": settings["matching"]["max_distance"]}
+    return Axes(scorer, values, {name: own.get(name) for name in values})
 
 
-def _own(settings: dict[str, Any], name: str) -> Any:
-    if name == "c":
-        return settings["fusion"]["c"]
-    return settings["matching"]["max_distance"] if name == "max_distance" else settings["scorer"].get(name)
+def searchable(settings: dict[str, Any]) -> Axes:
+    """The axes of a sweep, if they can be searched."""
+    varied = axes(settings)
+    if settings["search"] == "grid":
+        needed = varied.size * BYTES_PER_SETTING
+        _require(f"grid: {varied.size:,} settings", needed, "use fewer values, or search=optuna")
+        return varied
+    try:
+        require_optuna()
+    except InputError as error:
+        raise SettingsError(f"search=optuna: {error}, or search=grid") from error
+    return varied
 
 
-def scorer(settings: dict[str, Any]) -> Scorer:
-    """The scorer whose parameters are varied."""
-    return next(iter(build.scorers(settings["scorer"]).values()))
+def learnable(settings: dict[str, Any]) -> Axes:
+    """What the grid-searched rows vary, of a scorer that can be learned."""
+    method = settings["scorer"].get("method", "all")
+    known = [name for name, scorer in SCORERS.items() if can_learn(scorer)]
+    if method not in known:
+        raise SettingsError(f"scorer={method}: expected one to learn, of {', '.join(known)}")
+    varied = axes(settings)
+    if settings["split"] is None:
+        raise SettingsError("split=null: what is learned is never reported on the same queries; expected first_half, "
+                            "second_half or both")  # fmt: skip
+    return varied
 
 
-def require_memory(what: str, needed: int, mend: str) -> None:
+def own_c(settings: dict[str, Any]) -> float | None:
+    """The filter's weight by hand, None = balanced."""
+    c = settings["fusion"]["c"]
+    return None if c == "auto" else float(c)
+
+
+def require_memory(settings: dict[str, Any], varied: Axes, views: int, matches: MatchSet) -> None:
+    """Refuse results, or a chunk, that would not fit, before they are begun."""
+    queries, num_candidates = matches.counts.shape
+    num_settings = varied.size + (dict(varied.own) not in varied.grid())
+    _require(
+        f"grid: rankings of {queries:,} queries by {num_settings:,} settings",
+        sweeping.result_bytes(views, num_settings, queries, max(settings["recall"]["ks"])),
+        "use fewer values, smaller recall.ks, or search=optuna",
+    )
+    chunk = settings["chunk"]
+    if chunk["settings"] or chunk["queries"]:
+        lines = min(chunk["settings"] or SETTINGS_PER_BLOCK, num_settings)
+        columns = min(chunk["queries"] or 1, queries)
+        _require(
+            f"chunk: {lines:,} settings x {columns:,} queries",
+            sweeping.block_bytes(matches, num_candidates, lines, columns),
+            "use a smaller chunk.settings or chunk.queries, or leave them null",
+        )
+
+
+def _require(what: str, needed: int, mend: str) -> None:
     """Refuse what would not fit, before it is begun."""
-    free = _free_memory()
+    free = free_host_bytes()
     if needed > 0.8 * free:
         raise SettingsError(
             f"{what} would take about {needed / _MB:,.0f} MB of memory, {free / _MB:,.0f} MB are free; {mend}"
         )
-
-
-def _free_memory() -> int:
-    """Bytes that a program may still take, those of cached files included; all of them where the system is silent."""
-    try:
-        return 1024 * int(re.findall(r"MemAvailable: *(\d+)", Path("/proc/meminfo").read_text())[0])
-    except (OSError, IndexError):
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-
-
-def require_bins(settings: dict[str, Any], varied: Axes, matches: MatchSet) -> None:
-    """Refuse before any work what would be refused when its turn comes: histograms of more bins than there may be."""
-    sizes = {name: varied.values[name] for name in ("bin_size", "align") if name in varied.values}
-    for setting in sweeping.grid(sizes):
-        fit(with_parameters(scorer(settings), setting), *matches.image_sizes)
-
-
-def shown(value: Any) -> str:
-    """A value as it is written."""
-    if value is None:
-        return "none"
-    return f"{value:g}" if isinstance(value, float | np.floating) else str(value)

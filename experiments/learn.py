@@ -8,9 +8,9 @@ from experiments.launch import launch
 
 def learn() -> Callable[[dict[str, Any]], None]:
     """Learning, its table, a run folder."""
-    from experiments import lessons  # here, so that --help and a wrong setting need not wait for JAX
+    from experiments import learning  # here, so that --help and a wrong setting need not wait for JAX
 
-    return lessons.learn
+    return learning.learn
 
 
 if __name__ == "__main__":

@@ -4,104 +4,53 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from experiments import build, console, prepare, run_folder, sweep_outputs, truth
-from experiments.axes import BYTES_PER_SETTING, Axes, axes, require_bins, require_memory, scorer
+from experiments import build, console, prepare, run_folder, truth
+from experiments.axes import as_final, require_memory, searchable
 from mfvpr import sweeping
-from mfvpr.evaluation import Judge
+from mfvpr.data.files import write_text
 from mfvpr.fingerprints import fingerprint
-from mfvpr.pipeline import MatchSet
-from mfvpr.report import runs
+from mfvpr.report import runs, sweeps
+from mfvpr.sweeping import Outcome
 from mfvpr.types import Shortlist
 
 
 def sweep(settings: dict[str, Any]) -> None:
     """Matches -> rows of every setting's ranking -> the best setting -> table, heat maps, files."""
-    settings = _as_final(settings)
+    settings = as_final(settings)
     with run_folder.claimed(settings) as folder:
-        found, kept = _found(settings)
-        run_folder.leave(
-            folder, settings, truth.described(settings, found.images.dataset), text=sweep_outputs.text(found),
-            write=lambda new: sweep_outputs.write(new, found), figures=sweep_outputs.figures(found),
-        )  # fmt: skip
+        varied = searchable(settings)
+        tools = prepare.tools(settings)
+        watch = prepare.Stopwatch()
+        with watch("data"):
+            images = prepare.images(settings, tools.archive)
+        judge = truth.judge(settings, images.dataset)
+        matches, candidates = prepare.matched(settings, tools, images, watch)
+        kept = _kept(settings, tools, images, candidates)
+        options = {
+            "ks": settings["recall"]["ks"], "ties": settings["ties"],
+            "filter_score": settings["fusion"]["filter_score"], "folder": kept, "track": console.track,
+            "settings_per_block": settings["chunk"]["settings"], "queries_per_block": settings["chunk"]["queries"],
+        }  # fmt: skip
+        with watch("sweep"):
+            if settings["search"] == "grid":
+                varied.check(matches.image_sizes)
+                require_memory(settings, varied, 1 + len(judge.halves), matches)
+                outcome = sweeping.search_grid(varied, judge, matches, candidates, **options)
+            else:
+                trials = {"trials": settings["trials"], "seed": settings["seed"]}
+                outcome = sweeping.search_optuna(varied, judge, matches, candidates, **trials, **options)
+        heading = _heading(settings, images, outcome)
+        text = f"{heading}\n\n{sweeps.text(outcome)}"
+
+        def write(new: Path) -> None:
+            runs.write_table(new, sweeps.table(outcome), heading)
+            runs.write_json(new / "results.json", _results(settings, images, outcome, watch.seconds))
+            write_text(new / "summary.txt", f"{text}\n")
+
+        described = truth.described(settings, images.dataset)
+        run_folder.leave(folder, settings, described, text=text, write=write, figures=sweeps.figures(outcome))
     if kept is not None:
         shutil.rmtree(kept, ignore_errors=True)
-
-
-def _as_final(settings: dict[str, Any]) -> dict[str, Any]:
-    """Where the score with the filter decides, every setting has it, with the c of the fusion if none is varied."""
-    grid = settings["grid"]
-    if settings["final"] == "score" or grid["c"] is not None or not any(grid.values()):
-        return settings
-    return settings | {"grid": grid | {"c": [settings["fusion"]["c"]]}}
-
-
-def _found(settings: dict[str, Any]) -> tuple[sweep_outputs.Found, Path | None]:
-    """What the sweep found, and where its blocks are kept until that is written."""
-    varied = axes(settings)
-    if settings["search"] == "grid":
-        require_memory(f"grid: {varied.size:,} settings", varied.size * BYTES_PER_SETTING,
-                       "use fewer values, or search=optuna")  # fmt: skip
-    else:
-        from experiments import optuna_search
-
-        optuna_search.require()
-    tools = prepare.tools(settings)
-    watch = prepare.Stopwatch()
-    with watch("data"):
-        images = prepare.images(settings, tools.archive)
-    judgment = truth.judge(settings, images.dataset)
-    matches, candidates = prepare.matched(settings, tools, images, watch)
-    require_bins(settings, varied, matches)
-    judgment = judgment.of(candidates)
-    kept = _kept(settings, tools, images, candidates)
-    with watch("sweep"):
-        written, rows = _search(settings, varied, judgment, matches, candidates, kept)
-    return sweep_outputs.Found(settings, images, varied, judgment, written, rows, watch.seconds), kept
-
-
-def _search(
-    settings: dict[str, Any], varied: Axes, judgment: Judge, matches: MatchSet, candidates: Shortlist, kept: Path | None
-) -> tuple[list[dict[str, Any]], np.ndarray]:
-    """Settings as written, and the rows `[V, S, Q, depth]` of their rankings."""
-
-    def rows_of(written: list[dict[str, Any]], label: str) -> np.ndarray:
-        return sweeping.sweep(
-            scorer(settings), list(map(varied.setting, written)), matches, candidates,
-            views=judgment.views, depth=max(settings["recall"]["ks"]), ties=settings["ties"],
-            filter_score=settings["fusion"]["filter_score"],
-            settings_per_block=settings["chunk"]["settings"], queries_per_block=settings["chunk"]["queries"],
-            folder=kept, track=console.track(label),
-        )  # fmt: skip
-
-    own = dict(varied.own)
-    if settings["search"] == "grid":
-        written = varied.grid()
-        written += [] if own in written else [own]
-        _require_memory(settings, judgment, matches, len(written))
-        return written, rows_of(written, "sweep")
-    from experiments import optuna_search
-
-    return optuna_search.search(settings, varied, judgment, rows_of)
-
-
-def _require_memory(settings: dict[str, Any], judgment: Judge, matches: MatchSet, num_settings: int) -> None:
-    queries, num_candidates = matches.counts.shape
-    depth = max(settings["recall"]["ks"])
-    require_memory(
-        f"grid: rankings of {queries:,} queries by {num_settings:,} settings",
-        sweeping.result_bytes(len(judgment.views), num_settings, queries, depth),
-        "use fewer values, smaller recall.ks, or search=optuna",
-    )
-    chunk = settings["chunk"]
-    if chunk["settings"] or chunk["queries"]:
-        lines, columns = min(chunk["settings"] or 64, num_settings), min(chunk["queries"] or 1, queries)
-        require_memory(
-            f"chunk: {lines:,} settings x {columns:,} queries",
-            sweeping.block_bytes(matches, num_candidates, lines, columns),
-            "use a smaller chunk.settings or chunk.queries, or leave them null",
-        )
 
 
 def _kept(settings: dict[str, Any], tools: prepare.Tools, images: prepare.Images, candidates: Shortlist) -> Path | None:
@@ -114,3 +63,25 @@ def _kept(settings: dict[str, Any], tools: prepare.Tools, images: prepare.Images
     versions = {name: runs.versions()[name] for name in ("mfvpr", "jax", "numpy")}
     name = fingerprint({"matches": recipe, "sweep": own, "versions": versions})
     return build.expanded(settings["store"]) / f"{settings['dataset']['name']}_sweep-{name}"
+
+
+def _heading(settings: dict[str, Any], images: prepare.Images, outcome: Outcome) -> str:
+    dataset, features = images.dataset, settings["features"]
+    return (
+        f"{dataset.name}: {len(dataset.queries)} queries, {outcome.judge.views[0].shape[1]} candidates of "
+        f"{len(dataset.database)} database images, {len(outcome.settings)} settings of the "
+        f"{settings['scorer']['method']} score, {features['name']} features at {features['image_size'][0]} x "
+        f"{features['image_size'][1]} px; {truth.in_words(settings, dataset)}"
+    )
+
+
+def _results(
+    settings: dict[str, Any], images: prepare.Images, outcome: Outcome, seconds: dict[str, float]
+) -> dict[str, Any]:
+    return {
+        "dataset": images.dataset.name, "data_fingerprint": images.fingerprints, "reading": images.reading,
+        "scorer": settings["scorer"], "features": settings["features"], "filter": settings["retrieval"],
+        "matching": settings["matching"], "candidates": settings["candidates"], "fusion": settings["fusion"],
+        "final": settings["final"], "ground_truth": truth.described(settings, images.dataset),
+        **sweeps.results(outcome), "seconds": seconds, "versions": runs.versions(),
+    }  # fmt: skip

@@ -145,6 +145,11 @@ def free_bytes(device: Device) -> int:
     """Bytes that may still be taken where a device keeps its arrays: its own memory, or the machine's."""
     if stats := device.memory_stats():
         return stats["bytes_limit"] - stats["bytes_in_use"]
+    return free_host_bytes()
+
+
+def free_host_bytes() -> int:
+    """Bytes that a program may still take of the machine's memory; all of it where the system is silent."""
     try:  # what caches of files take is free
         return 1024 * int(re.findall(r"MemAvailable: *(\d+)", Path("/proc/meminfo").read_text())[0])
     except (OSError, IndexError):

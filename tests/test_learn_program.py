@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments import evaluation, lessons, search
-from mfvpr.learning import checkpoints
+from experiments import evaluation, learning, search
+from mfvpr.learning import checkpoints, comparison
+from mfvpr.learning.splits import TrainingSplit
 from mfvpr.learning.training import Fit, Record
 from tests.programs import QUERIES, composed, results, shared, small, snapshot, typed
 
@@ -32,8 +33,8 @@ def learn(root):
     def call(out, *overrides, pictures=False):
         with pytest.MonkeyPatch.context() as patch:
             if not pictures:
-                patch.setattr(lessons.learn_outputs, "figures", lambda *_: [])
-            lessons.learn(composed(*small(root), f"out={out}", *overrides, config="learn"))
+                patch.setattr(learning.comparisons, "figures", lambda *_: [])
+            learning.learn(composed(*small(root), f"out={out}", *overrides, config="learn"))
         return results(out)
 
     return call
@@ -56,7 +57,7 @@ def untrained(monkeypatch):
             batches(step)
         return Fit(parameters, 0, (Record(0, None, 1.0),), "nothing was learned")
 
-    monkeypatch.setattr(lessons, "fit", start)
+    monkeypatch.setattr(comparison, "fit", start)
     return asked
 
 
@@ -106,28 +107,28 @@ def test_hand_set_and_searched_rows_are_those_of_a_sweep(root, learned, tmp_path
 
 def test_nothing_that_is_reported_on_was_seen(learn, untrained, tmp_path, monkeypatch):
     """Of both halves: neither the reported queries and places nor their neighbors, while learning or validating."""
-    seen, lesson = [], lessons.School.lesson
+    seen, batch = [], TrainingSplit.batch
 
-    def watched(school, queries, size):
-        seen.append((school, queries))
-        return lesson(school, queries, size)
+    def watched(split, queries, size):
+        seen.append((split, queries))
+        return batch(split, queries, size)
 
-    monkeypatch.setattr(lessons.School, "lesson", watched)
+    monkeypatch.setattr(TrainingSplit, "batch", watched)
     found = learn(tmp_path / "out", *SUM, "split=both", "steps=6", "batch=2", "fusion.filter_score=negative_euclidean")
     reported = dict(zip(("first_half", "second_half"), found["queries"]["reported"], strict=True))
     assert sorted(query for half in reported.values() for query in half) == list(range(QUERIES))
     for chosen_on, (half, others) in zip(found["queries"]["chosen_on"], reported.items(), strict=True):
         assert len(chosen_on) >= 8
         assert min(abs(one - other) for one in chosen_on for other in others) > 2 * WIDEST
-        taught = {int(query) for school, queries in seen if school.name == half for query in queries}
+        taught = {int(query) for split, queries in seen if split.name == half for query in queries}
         assert len(taught) >= 5
         assert taught <= set(chosen_on)
-    for school, queries in seen:
-        assert np.all(school.candidates.scores < 0)  # as it was asked
-        places = {int(place) for query in queries for place in school.candidates.indices[query][school.usable[query]]}
-        assert min(abs(place - other) for place in places for other in reported[school.name]) > WIDEST
-        assert min(abs(one - other) for one in school.learning for other in school.validating) > 2 * WIDEST
-        assert {*queries} <= {*school.learning} or {*queries} <= {*school.validating}
+    for split, queries in seen:
+        assert np.all(split.candidates.scores < 0)  # as it was asked
+        places = {int(place) for query in queries for place in split.candidates.indices[query][split.usable[query]]}
+        assert min(abs(place - other) for place in places for other in reported[split.name]) > WIDEST
+        assert min(abs(one - other) for one in split.train for other in split.validation) > 2 * WIDEST
+        assert {*queries} <= {*split.train} or {*queries} <= {*split.validation}
 
 
 @pytest.mark.parametrize("changes", [(), ("matching.max_distance=0.3", "ties=index")])
@@ -219,14 +220,14 @@ def test_a_checkpoint_of_another_model_is_refused(root, learned, tmp_path, monke
 
 def test_whatever_changes_the_result_changes_the_checkpoint(root, untrained, tmp_path, monkeypatch):
     """Else one training would go on with what another one left."""
-    monkeypatch.setattr(lessons.learn_outputs, "figures", lambda *_: [])
+    monkeypatch.setattr(learning.comparisons, "figures", lambda *_: [])
     shifted = tmp_path / "shifted.csv"
     shifted.write_text("query,database\n" + "".join(f"{row},{(row + 1) % QUERIES}\n" for row in range(QUERIES)))
     changes = ["seed=0", "seed=1", "hidden=4", "batch=3", "learning_rate=0.5", "loss=recall", "candidates=7", "every=1",
                "fusion.filter_score=negative_euclidean", f"dataset.index_file={shifted}"]  # fmt: skip
     for change in changes:
         fixed = (*SUM, "grid.c=[1]", "split=second_half", "steps=1", f"out={tmp_path}/out")
-        lessons.learn(composed(*small(root), *fixed, change, config="learn"))
+        learning.learn(composed(*small(root), *fixed, change, config="learn"))
         shutil.rmtree(tmp_path / "out")
     assert len({asked["folder"] for asked in untrained}) == 4 * len(changes)
     assert len({json.dumps(asked["recipe"]) for asked in untrained}) == 4 * len(changes)

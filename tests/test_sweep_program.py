@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -32,7 +31,7 @@ def sweep(root):
     def call(out, *overrides, pictures=False):
         with pytest.MonkeyPatch.context() as patch:
             if not pictures:
-                patch.setattr(search.sweep_outputs, "figures", lambda *_: [])
+                patch.setattr(search.sweeps, "figures", lambda *_: [])
             search.sweep(composed(*small(root), f"out={out}", *overrides, config="sweep"))
         return results(out)
 
@@ -272,7 +271,7 @@ def test_bins_that_do_not_fit_are_refused(root, swept, tmp_path, monkeypatch, ca
 
 def test_what_does_not_fit_in_memory_is_refused_with_its_size(root, swept, tmp_path, monkeypatch, capsys):
     def refused(free, *arguments):
-        monkeypatch.setattr(axes, "_free_memory", lambda: free)
+        monkeypatch.setattr(axes, "free_host_bytes", lambda: free)
         code, _, stderr = typed(monkeypatch, capsys, "sweep", *small(root), *arguments, f"out={tmp_path}/out")
         assert (code, list(tmp_path.iterdir())) == (2, [])
         return stderr.splitlines()[-1]
@@ -285,12 +284,6 @@ def test_what_does_not_fit_in_memory_is_refused_with_its_size(root, swept, tmp_p
     line = refused(2 * 10**5, SIGMA, "chunk.queries=24")
     assert "chunk: 2 settings x 24 queries would take about" in line
     assert "use a smaller chunk.settings or chunk.queries" in line
-
-
-def test_free_memory_is_told_by_any_system(monkeypatch):
-    assert axes._free_memory() > 10**7
-    monkeypatch.setattr(Path, "read_text", lambda _: "something else")
-    assert axes._free_memory() > 10**7
 
 
 @pytest.mark.parametrize("change", ["candidates=7", "retrieval.num_words=9", "features.max_keypoints=61"])

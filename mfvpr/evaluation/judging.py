@@ -1,5 +1,6 @@
 """The protocol of choosing and reporting: which queries decide, which are reported on, and what counts as right."""
 
+import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -28,6 +29,7 @@ class Judge:
         places: images of a query's place at the widest threshold, also those that are no answer.
         halves: where to choose and where to report; none = both on all queries.
         views: candidates `[Q, C]` bool that are ranked: all, and for each half those that choosing may see.
+        split: which half to choose on, or both in turn; None = no halves.
     """
 
     thresholds: Sequence[float]
@@ -36,11 +38,23 @@ class Judge:
     places: Positives
     halves: Sequence[Half]
     views: Sequence[np.ndarray] = ()
+    split: Split | None = None
 
     @property
     def main(self) -> int:
         """The threshold that decides: the middle one."""
         return len(self.thresholds) // 2
+
+    @property
+    def names(self) -> list[str]:
+        """Of the halves."""
+        return list(_HALVES) if self.split == "both" else [self.split] if self.split else []
+
+    @property
+    def fingerprint(self) -> str:
+        """Of what is right at each threshold: 16 hexadecimal digits."""
+        flat = [array.tobytes() for right in self.positives for array in (right.offsets, right.rows)]
+        return hashlib.sha256(b"".join(flat)).hexdigest()[:16]
 
     def of(self, candidates: Shortlist) -> "Judge":
         """With the views of a shortlist."""
@@ -100,4 +114,4 @@ def judge(truth: Truth, thresholds: Iterable[float], split: Split | None = None)
         if not positives[-1].take(half.tune).any():
             raise InputError(f"split={split}: no query of one half has a place far enough from the other half; "
                              "use more queries, or smaller tolerances or radius")  # fmt: skip
-    return Judge(thresholds, truth.unit, positives, places, chosen)
+    return Judge(thresholds, truth.unit, positives, places, chosen, split=split)

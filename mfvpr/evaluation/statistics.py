@@ -21,6 +21,22 @@ class McNemar(NamedTuple):
     p_value: float
 
 
+class Estimate(NamedTuple):
+    """A recall and how sure it is.
+
+    recall: fraction of the queries.
+    interval: its confidence interval, see `recall_interval`.
+    """
+
+    recall: float
+    interval: tuple[float, float]
+
+
+def estimate(hits: np.ndarray) -> Estimate:
+    """Recall of queries along a path, `[Q]` bool, at least one, with its interval."""
+    return Estimate(float(np.mean(hits)), recall_interval(hits))
+
+
 def recall_interval(hits: np.ndarray, *, level: float = 0.95) -> tuple[float, float]:
     """Confidence interval of the recall of queries along a path, which succeed and fail together with their neighbors.
 

@@ -1,1 +1,1 @@
-"""What can be learned, from losses of a ranking: match weights, projections, scorers' numbers; the loop that fits."""
+"""What can be learned from losses of a ranking: match weights, projections, scorers' numbers; and what it is worth."""

@@ -5,6 +5,7 @@ A query without a right candidate teaches nothing: its loss and its gradient are
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -64,6 +65,14 @@ def smooth_average_precision(scores: Array, positives: Array, mask: Array, tempe
     rank = 1 + jnp.sum(masked(lead, others), axis=1)
     rank_among_positives = 1 + jnp.sum(masked(lead, others & positives[None]), axis=1)
     return jnp.where(teaches, 1 - masked_mean(rank_among_positives / rank, positives), 0.0)
+
+
+LOSSES: dict[str, Loss] = {
+    "cross_entropy": cross_entropy,
+    "recall": partial(smooth_recall_at_1, temperature=1.0),
+    "average_precision": partial(smooth_average_precision, temperature=1.0),
+}
+"""Losses that programs know, by name."""
 
 
 def mean_loss(loss: Loss, scores: Array, positives: Array, mask: Array) -> Array:

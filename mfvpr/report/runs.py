@@ -8,7 +8,7 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from functools import cache
@@ -23,6 +23,8 @@ from mfvpr.report.tables import Table
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "opencv-python-headless", "pillow")
 _UNFINISHED = ".unfinished"
 _LAST = "results.json"
+
+Figure = tuple[str, Callable[[Path], None]]  # name of the file, and what draws it there
 
 
 def new_run_folder(root: Path, name: str) -> Path:

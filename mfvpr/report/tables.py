@@ -4,6 +4,9 @@ import csv
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,13 @@ class Table:
             for place, (cell, width) in enumerate(zip(row, widths, strict=True))
         )
         return "  ".join(cells).rstrip()
+
+
+def written(value: Any) -> str:
+    """A parameter's value in a cell."""
+    if value is None:
+        return "none"
+    return f"{value:g}" if isinstance(value, float | np.floating) else str(value)
 
 
 def _latex_escaped(cell: str) -> str:

@@ -81,3 +81,17 @@ def test_thresholds_ascend_and_the_middle_one_decides():
 def test_what_cannot_be_judged_is_said_before_anything_is_ranked(thresholds, split, words):
     with pytest.raises(InputError, match=words):
         judge(TRUTH, thresholds, split)
+
+
+def test_halves_have_the_names_of_the_split():
+    names = {split: judge(TRUTH, TOLERANCES, split).names for split in (None, "first_half", "second_half", "both")}
+    assert names == {
+        None: [], "first_half": ["first_half"], "second_half": ["second_half"], "both": ["first_half", "second_half"],
+    }  # fmt: skip
+
+
+def test_fingerprints_tell_what_is_right_apart():
+    shifted = FrameTruth(tuple(((row + 1) % QUERIES,) for row in range(QUERIES)), QUERIES)
+    made = [judge(TRUTH, TOLERANCES), judge(TRUTH, (0, 1, 2)), judge(shifted, TOLERANCES), judge(TRUTH, (1, 3))]
+    assert len({one.fingerprint for one in made}) == 4
+    assert judge(TRUTH, TOLERANCES, "both").fingerprint == made[0].fingerprint

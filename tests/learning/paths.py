@@ -1,10 +1,10 @@
-"""A small path with its matches, as the lessons of experiments.learn see it."""
+"""A small path with its matches, cut in two to learn on."""
 
 import numpy as np
 
-from experiments import lessons
 from mfvpr import Shortlist
 from mfvpr.evaluation import Judge, Positives, halves
+from mfvpr.learning.splits import training_splits
 from mfvpr.match_sets import MatchSet
 from tests.builders import of_query, random_matches
 
@@ -20,8 +20,8 @@ def matches_of(query, candidates, rng, sizes):
     return of_query(pairs)
 
 
-def school(settings=None, *, sizes=SIZES, half=0, only_right=()):
-    """The school of one half; all frames are candidates of every query, in an order of its own; of some, one is."""
+def split(*, sizes=SIZES, half=0, only_right=()):
+    """One half to learn on; all frames are candidates of every query, in an order of its own; of some, one is."""
     rng = np.random.default_rng(0)
     indices = np.stack([rng.permutation(QUERIES) for _ in range(QUERIES)]).astype(np.int32)
     mask = ~np.isin(np.arange(QUERIES), only_right)[:, None] | (indices == np.arange(QUERIES)[:, None])
@@ -31,6 +31,5 @@ def school(settings=None, *, sizes=SIZES, half=0, only_right=()):
     matches = MatchSet([one for one, _ in found], np.array([counts for _, counts in found]), 16)
     apart = np.abs(np.arange(QUERIES)[:, None] - np.arange(QUERIES))
     positives = [Positives.from_matrix(apart <= tolerance) for tolerance in TOLERANCES]
-    judge = Judge(TOLERANCES, "frames", positives, positives[-1], halves(positives[-1]))
-    settings = {"split": "both", "ties": "filter", "seed": 0, "batch": 4, "hidden": 5} | (settings or {})
-    return list(lessons._schools(settings, matches, candidates, judge))[half]
+    judge = Judge(TOLERANCES, "frames", positives, positives[-1], halves(positives[-1]), split="both")
+    return training_splits(matches, candidates, judge)[half]

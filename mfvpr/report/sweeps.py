@@ -1,0 +1,149 @@
+"""A sweep for people: the table of all settings, the summary, rows of results, and heat maps."""
+
+import itertools
+from collections.abc import Iterator, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from mfvpr import evaluation
+from mfvpr.evaluation.statistics import Estimate
+from mfvpr.report.heat_maps import heat_map_figure
+from mfvpr.report.runs import Figure
+from mfvpr.report.tables import Table, written
+from mfvpr.sweeping import Outcome
+
+TOP = 10
+MAX_HEAT_MAPS = 6
+
+
+def table(outcome: Outcome, numbers: Sequence[int] | None = None) -> Table:
+    """Recall at the first k by all thresholds, and at the other ks by the one that decides.
+
+    Args:
+        outcome: of a sweep.
+        numbers: of the settings; None = all.
+    """
+    judge, names = outcome.judge, list(outcome.axes.values)
+    numbers = range(len(outcome.settings)) if numbers is None else numbers
+    first, *others = outcome.ks
+    header = [judge.label(first, threshold) for threshold in judge.thresholds]
+    header += [judge.label(k, judge.thresholds[judge.main]) for k in others]
+    rows = outcome.rows[0][list(numbers)]
+    columns = [*judge.recall(rows, first).T, *(judge.recall(rows, k)[:, judge.main] for k in others)]
+    lines = [
+        [
+            *(written(outcome.settings[number][name]) for name in names),
+            *(f"{100 * column[place]:.1f}" for column in columns),
+        ]
+        for place, number in enumerate(numbers)
+    ]
+    return Table([*names, *header], lines, text_columns=0)
+
+
+def text(outcome: Outcome) -> str:
+    """The summary: the best settings, the chosen ones, and what they are worth."""
+    return "\n".join(_summary(outcome))
+
+
+def results(outcome: Outcome) -> dict[str, Any]:
+    """All of it as JSON values."""
+    judge, ks = outcome.judge, outcome.ks
+    recall = np.stack([judge.recall(outcome.rows[0], k) for k in ks], axis=-1)  # [S, thresholds, ks]
+    return {
+        "axes": dict(outcome.axes.values), "own": dict(outcome.axes.own),
+        "search": "grid" if outcome.is_grid else "optuna",
+        "unit": judge.unit, "thresholds": list(judge.thresholds), "ks": list(ks), "split": judge.split,
+        "chosen": [outcome.settings[number] for number in outcome.chosen],
+        "report": [
+            {"threshold": verdict.threshold, "queries": verdict.queries, "chosen": verdict.chosen._asdict(),
+             "own": verdict.own._asdict(), "mcnemar": verdict.mcnemar._asdict()}
+            for verdict in outcome.report
+        ],
+        "settings": [
+            {"parameters": setting, "recall_at": {
+                f"{threshold:g}": {str(k): round(float(recall[number, place, depth]), 6) for depth, k in enumerate(ks)}
+                for place, threshold in enumerate(judge.thresholds)}}
+            for number, setting in enumerate(outcome.settings)
+        ],
+    }  # fmt: skip
+
+
+def figures(outcome: Outcome) -> list[Figure]:
+    """Heat maps of every pair of axes with several values, the others at the best setting (of all queries).
+
+    None of a space that was not searched completely.
+    """
+    return list(_heat_maps(outcome)) if outcome.is_grid else []
+
+
+def _summary(outcome: Outcome) -> Iterator[str]:
+    judge, own = outcome.judge, outcome.own
+    best = np.argsort(-outcome.recall[:, judge.main], kind="stable")[:TOP].tolist()
+    beside = "" if own in best else "; last: the scorer's own values"
+    yield f"Best settings by {judge.label(1, judge.thresholds[judge.main])}, all queries{beside}."
+    yield table(outcome, list(dict.fromkeys([*best, own]))).text()
+    if outcome.is_grid and not judge.halves:
+        around = evaluation.neighbors(outcome.axes.values, outcome.chosen[0])
+        if around:
+            yield "The best, and its neighbors in the grid:"
+            yield table(outcome, [outcome.chosen[0], *around]).text()
+    yield from _verdicts(outcome)
+
+
+def _verdicts(outcome: Outcome) -> Iterator[str]:
+    judge = outcome.judge
+    for half, number in zip(judge.halves, outcome.chosen, strict=False):
+        yield (f"chosen on {len(half.tune)} queries of one half, reported on the {len(half.report)} of the other: "
+               f"{_in_words(outcome, number)}")  # fmt: skip
+    if not judge.halves:
+        yield f"chosen: {_in_words(outcome, outcome.chosen[0])}"
+    for verdict in outcome.report:
+        yield (
+            f"{judge.label(1, verdict.threshold)}: chosen {_with_interval(verdict.chosen)}, own values "
+            f"{_with_interval(verdict.own)}; only one of them right: {verdict.mcnemar.only_first} and "
+            f"{verdict.mcnemar.only_second} queries, McNemar p = {verdict.mcnemar.p_value:.2g}"
+        )
+    if not judge.halves:
+        yield (
+            "Chosen and reported on the same queries, so this flatters; split=both chooses on one half of the path "
+            "and reports on the other."
+        )
+
+
+def _with_interval(estimate: Estimate) -> str:
+    low, high = estimate.interval
+    return f"{100 * estimate.recall:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
+
+
+def _in_words(outcome: Outcome, number: int) -> str:
+    return ", ".join(f"{name} = {written(value)}" for name, value in outcome.settings[number].items())
+
+
+def _heat_maps(outcome: Outcome) -> Iterator[Figure]:
+    axes, judge = outcome.axes, outcome.judge
+    values = {name: list(map(written, axis)) for name, axis in axes.values.items()}
+    recall = outcome.recall[: axes.size, judge.main].reshape(*map(len, values.values()))
+    names = [name for name, axis in values.items() if len(axis) > 1]
+    pairs = list(itertools.combinations(names, 2)) or [(name, name) for name in names]
+    flat_best = evaluation.best_setting(recall.reshape(-1), axes.values)
+    best = dict(zip(values, map(int, np.unravel_index(flat_best, recall.shape)), strict=True))
+    own = {name: values[name].index(written(value)) if written(value) in values[name] else None
+           for name, value in axes.own.items()}  # fmt: skip
+    label = judge.label(1, judge.thresholds[judge.main])
+    for first, second in pairs[:MAX_HEAT_MAPS]:
+        single = first == second
+        plane = recall[tuple(slice(None) if name in (first, second) else best[name] for name in values)]
+        fixed = [f"{name} = {values[name][place]}" for name, place in best.items() if name not in (first, second)]
+        row, column = 0 if single else own[first], own[second]
+        draw = partial(
+            heat_map_figure,
+            recall=plane[None] if single else plane,
+            rows=("", [""]) if single else (first, values[first]),
+            columns=(second, values[second]),
+            best=(0 if single else best[first], best[second]),
+            own=None if row is None or column is None else (row, column),
+            title="; ".join([f"{label} in %", *fixed]),
+        )
+        yield f"{second}.png" if single else f"{first}_{second}.png", draw
