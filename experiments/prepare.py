@@ -81,8 +81,8 @@ def matched(
 ) -> tuple[MatchSet, Shortlist]:
     """Matches and shortlist of the only sequence, from their store where they are all there."""
     made = match_sequence(
-        found.dataset, found.dataset.only, chosen.extractor, chosen.filter, settings["candidates"], chosen.matching,
-        chosen.archive, watch, keep=True, with_ratio=with_ratio, **chosen.where,
+        found.dataset, found.dataset.only, chosen.extractor, chosen.filter, settings["candidates"],
+        matching=chosen.matching, archive=chosen.archive, watch=watch, keep=True, with_ratio=with_ratio, **chosen.where,
     )  # fmt: skip
     return made.matches[0], made.candidates
 

@@ -189,7 +189,9 @@ def evaluate(
     archive, watch = archive or Archive(), watch or Stopwatch()
     place = {"memory": memory, "devices": devices}
     matched = [
-        match_sequence(dataset, sequence, extractor, filter, candidates, matching, archive, watch, **place)
+        match_sequence(
+            dataset, sequence, extractor, filter, candidates, matching=matching, archive=archive, watch=watch, **place
+        )
         for sequence in dataset.sequences
     ]
     with watch("scores"):
@@ -204,11 +206,11 @@ def match_sequence(
     sequence: QuerySequence,
     extractor: Extractor,
     filter: Filter,
-    candidates: int | Literal["all"],
-    matching: Matching,
-    archive: Archive,
-    watch: Stopwatch | None = None,
+    candidates: int | Literal["all"] = 50,
     *,
+    matching: Matching = Matching(),
+    archive: Archive | None = None,
+    watch: Stopwatch | None = None,
     keep: bool = False,
     with_ratio: bool = False,
     **where: Any,
@@ -228,7 +230,7 @@ def match_sequence(
         with_ratio: see `mfvpr.match`.
         **where: `memory` and `devices` of `pipeline.match`.
     """
-    watch = watch or Stopwatch()
+    archive, watch = archive or Archive(), watch or Stopwatch()
     database = dataset.database
     num_candidates = len(database) if candidates == "all" else min(candidates, len(database))
     stores = _match_stores(dataset, sequence, extractor, filter, num_candidates, matching, archive) if keep else ()
