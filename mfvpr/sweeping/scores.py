@@ -19,7 +19,7 @@ from mfvpr.scoring import Scorer
 from mfvpr.scoring.parameters import fit
 from mfvpr.types import Array, Matches, Shortlist
 
-Batch = tuple[np.ndarray, Matches]  # places [n] of its pairs, and their Matches [P, K, ...]
+PaddedBatch = tuple[np.ndarray, Matches]  # places [n] of its pairs, and their Matches [P, K, ...]
 
 
 def score(
@@ -50,7 +50,7 @@ def score(
     return {name: np.where(candidates.mask, values, np.nan) for name, values in fused.items()}
 
 
-def all_batches(match_set: MatchSet | Scales, queries: range, *, settings: float) -> Iterator[Batch]:
+def all_batches(match_set: MatchSet | Scales, queries: range, *, settings: float) -> Iterator[PaddedBatch]:
     """Those of every scale, see `match_sets.batches`; places are in the flattened `[S, queries, C]`."""
     for scale, one in enumerate(scales(match_set)):
         pairs = len(queries) * one.counts.shape[1]
@@ -59,7 +59,7 @@ def all_batches(match_set: MatchSet | Scales, queries: range, *, settings: float
 
 
 def scored(
-    program: Callable[..., Any], inputs: tuple, batches: Iterable[Batch], *, devices: Sequence[Device] | None
+    program: Callable[..., Any], inputs: tuple, batches: Iterable[PaddedBatch], *, devices: Sequence[Device] | None
 ) -> Iterator[tuple[np.ndarray, Any]]:
     """(places `[n]`, arrays `[..., n]`) of every batch, in their order, NumPy.
 
@@ -69,12 +69,12 @@ def scored(
         batches: of few shapes; only a few are held at a time.
         devices: that take turns; None = the one that JAX takes.
     """
-    turns = [_as_it_is] if devices is None else [partial(jax.device_put, device=device) for device in devices]
+    turns = [partial(jax.device_put, device=device) for device in devices or ()] or [_as_it_is]
     own = [put(inputs) for put in turns]
     known: set[tuple] = set()
     compiling: dict[tuple, Lock] = {}
 
-    def score(numbered: tuple[int, Batch]) -> tuple[np.ndarray, Any]:
+    def score(numbered: tuple[int, PaddedBatch]) -> tuple[np.ndarray, Any]:
         number, (places, matches) = numbered
         turn = number % len(turns)
         key = turn, matches.mask.shape

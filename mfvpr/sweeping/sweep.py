@@ -24,7 +24,7 @@ from mfvpr.match_sets import BYTES_PER_SLOT, MatchSet, Scales, scales, shapes, s
 from mfvpr.numerics import Device, compiled
 from mfvpr.progress import Track, untracked
 from mfvpr.reranking import FilterScore, Ties, filter_scores
-from mfvpr.sweeping.scores import Batch, all_batches, fuse_all, scored
+from mfvpr.sweeping.scores import PaddedBatch, all_batches, fuse_all, scored
 from mfvpr.sweeping.settings import FUSION, Group, Setting, distinct, groups
 from mfvpr.types import Array, Matches, Shortlist, per_match
 
@@ -120,7 +120,7 @@ def sweep(
     blocks = [one for group in found_groups for one in group.blocks(per_block)]
     found = np.full((len(views), len(settings), num_queries, depth), -1, np.int32)
     steps = ((part, block) for part in work.parts(queries) for block in blocks)
-    held: dict[range, list[Batch]] = {}
+    held: dict[range, list[PaddedBatch]] = {}
     for part, block in track(steps, len(blocks) * -(-num_queries // queries)):
         if part.queries not in held:  # the batches of one part at a time, and only if some block needs them
             held = {part.queries: []}
@@ -153,7 +153,7 @@ def queries_that_fit(match_set: MatchSet | Scales, num_candidates: int, num_sett
 
 
 def _rows(
-    part: Work, block: Group, held: list[Batch], cs: Sequence[Any], shares: Sequence[int],
+    part: Work, block: Group, held: list[PaddedBatch], cs: Sequence[Any], shares: Sequence[int],
     devices: Sequence[Device] | None,
 ) -> np.ndarray:  # fmt: skip
     """`[V, W, q, depth]`: the block's distinct settings, each as often as it has values of c."""
@@ -171,7 +171,7 @@ def _rows(
 
 
 def _scores(
-    block: Group, held: Sequence[Batch], shape: tuple[int, int, int], devices: Sequence[Device] | None
+    block: Group, held: Sequence[PaddedBatch], shape: tuple[int, int, int], devices: Sequence[Device] | None
 ) -> np.ndarray:
     """`[S, G, W, q, C]` of every scale; a pair without matches scores 0."""
     scores = np.zeros((*block.rows.shape, math.prod(shape)), np.float32)

@@ -197,8 +197,9 @@ def test_a_shape_is_compiled_where_that_costs_less_than_padding(pairs):
     for few, many in itertools.pairwise(of_settings):
         assert (counts <= many).all()
         assert (many <= few).all()
-    numbers = [len(np.unique(sizes)) for sizes in of_settings]
-    assert numbers == {50: [1, 1, 1, 4], 5_000: [1, 1, 4, 5], 500_000: [5, 5, 5, 5]}[pairs]
+    fewest, *_, most = (len(np.unique(sizes)) for sizes in of_settings)
+    assert fewest == (1 if pairs < 500_000 else 4)
+    assert most == len(np.unique(slots(found))) >= 4
     least = slots(found, settings=10_000_000)
     for settings, sizes in zip((1, 8, 64), of_settings, strict=False):
         padding = sizes.sum() - least.sum()
