@@ -50,12 +50,10 @@ class ExactSearch:
     ) -> Shortlist:
         """See `Search`; descriptors are of unit length, or their dot products mean what they mean."""
         some, many = self._chunks(len(queries), len(database))
-        parts = [
-            _shortlist(
-                queries[part], database, num_candidates, many, None if excluded is None else excluded.dense(part)
-            )
-            for part in _parts(len(queries), some)
-        ]
+        parts = []
+        for part in _parts(len(queries), some):
+            allowed = None if excluded is None else ~excluded.dense(part)
+            parts.append(_shortlist(queries[part], database, num_candidates, many, allowed))
         return jax.tree.map(lambda *fields: np.concatenate(fields), *parts)
 
     def _chunks(self, num_queries: int, num_database: int) -> tuple[int, int]:
