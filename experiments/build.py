@@ -6,16 +6,20 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from experiments import console
 from experiments.settings import SettingsError
-from mfvpr.data.datasets import Dataset, folder_dataset
+from mfvpr.archive import Aggregated, Archive
+from mfvpr.data.datasets import Dataset, folder_dataset, sequences_dataset
 from mfvpr.data.ground_truth import CHOICES
 from mfvpr.data.streets import streets_folder
 from mfvpr.declaration import made
-from mfvpr.features import GlobalExtractor, LocalExtractor
+from mfvpr.evaluations import Fusion
+from mfvpr.features import Extractor
 from mfvpr.features.sift import Sift
-from mfvpr.features.vlad import fit_vlad
+from mfvpr.features.vlad import VladFitting
+from mfvpr.filters import Filter, Retrieval
+from mfvpr.retrieval import ExactSearch, WhitenedSearch
 from mfvpr.scoring import SCORERS, Scorer
-from mfvpr.sources import FeatureSet
 
 
 def expanded(path: str) -> Path:
@@ -33,14 +37,17 @@ def dataset(settings: dict[str, Any], progress: Callable[[int, int], None]) -> D
         )  # fmt: skip
     if settings["ground_truth"] is None:
         raise SettingsError(f"dataset.ground_truth: nothing is assumed of your own images; set it to one of {CHOICES}")
-    options = {name: value for name, value in settings.items() if name not in ("root", "exclude_neighbors")}
+    options: dict[str, Any] = {n: value for n, value in settings.items() if n not in ("root", "exclude_neighbors")}
+    if isinstance(options["queries"], list):
+        queries, images = [expanded(path) for path in options.pop("queries")], expanded(options.pop("database"))
+        return sequences_dataset(images, queries, **options)
     for name in ("database", "queries", "index_file", "database_labels", "query_labels"):
         options[name] = expanded(options[name]) if options[name] else None
     return folder_dataset(**options)
 
 
-def local_extractor(settings: dict[str, Any]) -> LocalExtractor:
-    """What finds local features; networks with their converted weights."""
+def extractor(settings: dict[str, Any]) -> Extractor:
+    """What takes local features from images; networks with their converted weights."""
     name, options = settings["name"], {name: value for name, value in settings.items() if name != "name"}
     options["image_size"] = tuple(options["image_size"])
     if name == "sift":
@@ -51,23 +58,46 @@ def local_extractor(settings: dict[str, Any]) -> LocalExtractor:
     from mfvpr.features.aliked import AlikedFeatures
     from mfvpr.features.d2net import D2NetFeatures
 
-    extractor = {"aliked": AlikedFeatures, "d2net": D2NetFeatures}[name]
+    made = {"aliked": AlikedFeatures, "d2net": D2NetFeatures}[name]
     weights = options.pop("weights", None)
-    return extractor(_network("features", name, weights), **_only(options, extractor, f"features={name}"))
+    return made(_network("features", name, weights), **_only(options, made, f"features={name}"))
 
 
-def global_extractor(settings: dict[str, Any]) -> Callable[[FeatureSet], GlobalExtractor]:
-    """What describes whole images, once the database's features are there, of which VLAD learns its vocabulary."""
-    options = {name: value for name, value in settings.items() if name != "name"}
+def filter(settings: dict[str, Any], local: Extractor) -> Filter:
+    """What finds candidates; VLAD takes the local features that are matched as well."""
+    options = {name: value for name, value in settings.items() if name not in ("name", "whiten")}
+    search = ExactSearch() if settings["whiten"] is None else WhitenedSearch(settings["whiten"])
     if settings["name"] == "vlad":
-        return lambda database: fit_vlad(database, **options)
+        return Retrieval(Aggregated(local, VladFitting(**options)), search)
     from mfvpr.features.mixvpr import IMAGE_SIZE, MixVprDescriptor
 
     size = options.pop("image_size")
     if tuple(size) != IMAGE_SIZE:
         raise SettingsError(f"retrieval.image_size={size}: MixVPR takes {list(IMAGE_SIZE)} only, as its weights do")
-    extractor = MixVprDescriptor(_network("retrieval", "mixvpr", options.pop("weights")), **options)
-    return lambda database: extractor
+    return Retrieval(MixVprDescriptor(_network("retrieval", "mixvpr", options.pop("weights")), **options), search)
+
+
+def archive(settings: dict[str, Any]) -> Archive:
+    """Where what is taken from images is kept."""
+    root = None if settings["store"] is None else expanded(settings["store"])
+    return Archive(root, skip_bad=settings["on_bad_image"] == "skip", track=console.track, tell=console.tell,
+                   wait=settings.get("multirun", False))  # fmt: skip
+
+
+def where(settings: dict[str, Any]) -> dict[str, Any]:
+    """Memory and devices."""
+    import jax
+
+    available, asked = jax.local_devices(), settings["devices"]
+    if asked != "all" and asked > len(available):
+        raise SettingsError(f"devices={asked}: expected at most {len(available)}, as many as there are here, or all")
+    return {"memory": settings["memory"], "devices": available if asked == "all" else available[:asked]}
+
+
+def fusion(settings: dict[str, Any]) -> Fusion:
+    """How the filter's score is added to another."""
+    c = settings["fusion"]["c"]
+    return Fusion(None if c == "auto" else float(c), settings["fusion"]["filter_score"])
 
 
 def _network(group: str, name: str, weights: str | None) -> Any:

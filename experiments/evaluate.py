@@ -8,9 +8,9 @@ from experiments.launch import launch
 
 def evaluate() -> Callable[[dict[str, Any]], None]:
     """Every stage, the table, a run folder."""
-    from experiments import run  # here, so that --help and a wrong setting need not wait for JAX
+    from experiments import evaluation  # here, so that --help and a wrong setting need not wait for JAX
 
-    return run.evaluate
+    return evaluation.evaluate
 
 
 if __name__ == "__main__":

@@ -3,28 +3,27 @@
 from pathlib import Path
 from typing import Any
 
-from experiments import build, console, prepare, run_folder, stores, truth
+from experiments import build, console, prepare, run_folder, truth
 from experiments.axes import learnable, own_c
 from mfvpr.data.files import write_text
 from mfvpr.evaluation import Judge
+from mfvpr.fingerprints import fingerprint
 from mfvpr.learning.comparison import Checkpoints, Options, compare
 from mfvpr.learning.losses import LOSSES
 from mfvpr.report import comparisons, runs
-from mfvpr.stores.manifest import recipe_fingerprint
-from mfvpr.types import Shortlist
 
 
 def learn(settings: dict[str, Any]) -> None:
     """Matches -> learned, searched and hand-set scores on the half that none of them saw -> table, figures, files."""
     with run_folder.claimed(settings) as folder:
         varied = learnable(settings)
-        tools = prepare.extractors(settings)
+        tools = prepare.tools(settings)
         watch = prepare.Stopwatch()
         with watch("data"):
-            images = prepare.images(settings)
+            images = prepare.images(settings, tools.archive)
         judge = truth.judge(settings, images.dataset)
         matches, candidates = prepare.matched(settings, tools, images, watch, with_ratio=True)
-        checkpoints = _checkpoints(settings, images, candidates, judge)
+        checkpoints = _checkpoints(settings, prepare.recipe(tools, images, candidates.mask.shape[1]), judge)
         with watch("learning"):
             options = {"checkpoints": checkpoints, "track": console.track}
             comparison = compare(varied, judge, matches, candidates, _options(settings), **options)
@@ -56,21 +55,18 @@ def _options(settings: dict[str, Any]) -> Options:
     )  # fmt: skip
 
 
-def _checkpoints(
-    settings: dict[str, Any], images: prepare.Images, candidates: Shortlist, judge: Judge
-) -> Checkpoints | None:
+def _checkpoints(settings: dict[str, Any], data: dict[str, Any], judge: Judge) -> Checkpoints | None:
     """Where the trainings are kept, and what identifies them."""
     root = settings["checkpoints"] or settings["store"]
     if root is None:
         return None
     names = ("scorer", "loss", "every", "patience", "batch", "learning_rate", "hidden", "seed")
     recipe = {
-        "matches": stores.matches_recipe(settings, images.fingerprints, candidates.mask.shape[1]),
-        "tolerances": settings["recall"], **{name: settings[name] for name in names},
+        "matches": data, "tolerances": settings["recall"], **{name: settings[name] for name in names},
         "filter_score": settings["fusion"]["filter_score"], "positives": judge.fingerprint,
         "versions": {name: runs.versions()[name] for name in ("mfvpr", "jax", "numpy")},
     }  # fmt: skip
-    own = "" if settings["checkpoints"] else f"{settings['dataset']['name']}_learning-{recipe_fingerprint(recipe)}"
+    own = "" if settings["checkpoints"] else f"{settings['dataset']['name']}_learning-{fingerprint(recipe)}"
     return Checkpoints(build.expanded(root) / own, recipe)
 
 

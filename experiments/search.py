@@ -4,12 +4,12 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from experiments import build, console, prepare, run_folder, stores, truth
+from experiments import build, console, prepare, run_folder, truth
 from experiments.axes import as_final, require_memory, searchable
 from mfvpr import sweeping
 from mfvpr.data.files import write_text
+from mfvpr.fingerprints import fingerprint
 from mfvpr.report import runs, sweeps
-from mfvpr.stores.manifest import recipe_fingerprint
 from mfvpr.sweeping import Outcome
 from mfvpr.types import Shortlist
 
@@ -19,13 +19,13 @@ def sweep(settings: dict[str, Any]) -> None:
     settings = as_final(settings)
     with run_folder.claimed(settings) as folder:
         varied = searchable(settings)
-        tools = prepare.extractors(settings)
+        tools = prepare.tools(settings)
         watch = prepare.Stopwatch()
         with watch("data"):
-            images = prepare.images(settings)
+            images = prepare.images(settings, tools.archive)
         judge = truth.judge(settings, images.dataset)
         matches, candidates = prepare.matched(settings, tools, images, watch)
-        kept = _kept(settings, images, candidates)
+        kept = _kept(settings, tools, images, candidates)
         options = {
             "ks": settings["recall"]["ks"], "ties": settings["ties"],
             "filter_score": settings["fusion"]["filter_score"], "folder": kept, "track": console.track,
@@ -53,15 +53,15 @@ def sweep(settings: dict[str, Any]) -> None:
         shutil.rmtree(kept, ignore_errors=True)
 
 
-def _kept(settings: dict[str, Any], images: prepare.Images, candidates: Shortlist) -> Path | None:
+def _kept(settings: dict[str, Any], tools: prepare.Tools, images: prepare.Images, candidates: Shortlist) -> Path | None:
     """Where an interrupted sweep goes on: its finished blocks on these matches, by this version."""
     if settings["store"] is None:
         return None
-    recipe = stores.matches_recipe(settings, images.fingerprints, candidates.mask.shape[1])
+    recipe = prepare.recipe(tools, images, candidates.mask.shape[1])
     names = ("scorer", "grid", "search", "trials", "seed", "split", "recall", "ties", "fusion")
     own = {name: settings[name] for name in names}  # or another sweep that ends would take away what this one needs
     versions = {name: runs.versions()[name] for name in ("mfvpr", "jax", "numpy")}
-    name = recipe_fingerprint({"matches": recipe, "sweep": own, "versions": versions})
+    name = fingerprint({"matches": recipe, "sweep": own, "versions": versions})
     return build.expanded(settings["store"]) / f"{settings['dataset']['name']}_sweep-{name}"
 
 

@@ -92,6 +92,11 @@ _FIGURES = Rule(
 _FLAG = _one_of(True, False)
 
 
+def _or_list(rule: Rule) -> Rule:
+    listed = _list_of(rule)
+    return Rule(lambda value: rule.holds(value) or listed.holds(value), f"{rule.expected}, or a list of them")
+
+
 def _axis(rule: Rule) -> Rule:
     listed = _list_of(rule)
     return Rule(
@@ -110,7 +115,7 @@ RULES: dict[str, Rule] = {
     "cache": _PATH,
     "root": _PATH,
     "database": _PATH,
-    "queries": _PATH,
+    "queries": _or_list(_PATH),
     "ground_truth": _one_of(None, "order", "index", "utm", "label", "none"),  # None: asked for, see build.dataset
     "index_file": _or(_PATH, None),
     "widen_index": _FLAG,
@@ -133,7 +138,10 @@ RULES: dict[str, Rule] = {
     "num_words": _between(1, 4096),
     "power": _POSITIVE,
     "max_samples": _COUNT,
+    "whiten": _or(_between(1, 4096), None),
     "candidates": _or(_COUNT, "all"),
+    "memory": _or(_POSITIVE, None),
+    "devices": _or(_COUNT, "all"),
     # matching
     "cross_check": _one_of("mutual", "opencv_legacy", "none"),
     "max_distance": _or(_DISTANCE, None),

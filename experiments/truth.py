@@ -29,7 +29,7 @@ def judge(settings: Mapping[str, Any], dataset: Dataset) -> Judge:
 
 def described(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, Any]:
     """Kind, files, unit and thresholds of the ground truth, as results keep them."""
-    chosen, truth = settings["dataset"], dataset.truth
+    chosen, truth = settings["dataset"], dataset.sequences[0].truth
     kind = {"kind": chosen.get("ground_truth", "drawn"), "files": [chosen[name] for name in _FILES if chosen.get(name)]}
     kind["exclude_neighbors"] = chosen.get("exclude_neighbors")
     return kind if truth is None else kind | {"unit": truth.unit, "thresholds": thresholds(settings, truth)}
@@ -37,7 +37,7 @@ def described(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, Any]:
 
 def in_words(settings: Mapping[str, Any], dataset: Dataset) -> str:
     """The same for a heading."""
-    if dataset.truth is None:
+    if dataset.sequences[0].truth is None:
         return "no ground truth: rankings only"
     found = described(settings, dataset)
     files = ", ".join(dict.fromkeys(found["files"]))

@@ -1,166 +1,58 @@
-"""Images -> features of a whole folder: threads decode while the device works, and a store keeps what is done."""
+"""Images -> descriptions of a whole folder: threads decode while the device works."""
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import fields
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from mfvpr.data.datasets import ImageFolder
 from mfvpr.data.images import Interpolation, ordered_map, resize
 from mfvpr.errors import InputError
-from mfvpr.features import GlobalExtractor, LocalExtractor
+from mfvpr.features import Description, Extractor
 from mfvpr.numerics import available_cpus
-from mfvpr.sources import FeatureSet, InMemory
-from mfvpr.types import Features
-
-if TYPE_CHECKING:
-    from mfvpr.stores.features import FeatureStore
+from mfvpr.progress import Track, untracked
 
 Item = TypeVar("Item")
-Track = Callable[[Iterable[Any], int], Iterable[Any]]
 
 
-def untracked(items: Iterable[Item], total: int) -> Iterable[Item]:
-    """No progress bar."""
-    return items
-
-
-@dataclass(frozen=True)
-class Descriptors:
-    """Global descriptors of all images of a folder.
-
-    Attributes:
-        values: `[M, D]` float32; NaN for bad images, which no shortlist contains.
-        bad: reason by row, for images that gave no usable features or descriptor.
-    """
-
-    values: np.ndarray
-    bad: Mapping[int, str]
-
-
-def extract(
+def described(
     folder: ImageFolder,
-    extractor: LocalExtractor,
+    extractor: Extractor,
+    rows: Sequence[int],
+    bad: dict[int, str],
     *,
-    store: "FeatureStore | None" = None,
     skip_bad: bool = False,
     track: Track = untracked,
-) -> FeatureSet:
-    """Local features of every image; decoding runs on threads meanwhile.
+) -> Iterator[dict[int, Description]]:
+    """Descriptions of some images by row, batch by batch.
 
     Args:
         folder: the images.
-        extractor: what turns images into Features.
-        store: of this folder and extractor. Only images that it lacks are read; each batch is on disk before the next
-            is begun; and what comes back reads from it, so that a later run gets the same numbers (descriptors as
-            float16 keeps them).
-        skip_bad: list unreadable images in `bad` and go on, instead of raising. An image whose features are not
-            finite is always listed.
+        extractor: what turns images into descriptions.
+        rows: which.
+        bad: gets the reason, by row, of images that are not used: those that cannot be read, if they are skipped, and
+            those whose description is not finite.
+        skip_bad: go on where an image cannot be read, instead of raising.
         track: progress.
 
     Raises:
-        InputError: an image cannot be read (unless `skip_bad`), or none can; or the store cannot be used.
+        InputError: an image cannot be read (unless `skip_bad`).
     """
-    bad: dict[int, str] = {}
-    with nullcontext() if store is None else store:
-        images: dict[int, Features] = {}
-        missing = range(len(folder)) if store is None else np.flatnonzero(~store.done).tolist()
-        for rows, pixels in _image_batches(folder, missing, extractor, skip_bad, bad, track):
-            batch = dict(zip(rows, extractor(pixels), strict=True))
-            for row in [row for row, features in batch.items() if not _finite(features)]:
-                del batch[row]
-                bad[row] = f"{folder.paths[row]}: features are not finite (NaN or infinite); the image ranks last"
-            if store is None:
-                images |= batch
-            else:
-                store.write(batch)
-    if len(bad) == len(folder):
-        raise InputError(f"{folder.root}: none of {len(folder)} images can be used; the first: {bad[min(bad)]}")
-    return FeatureSet(InMemory(images, len(folder)) if store is None else store, bad)
-
-
-def describe(
-    folder: ImageFolder,
-    feature_set: FeatureSet,
-    extractor: GlobalExtractor,
-    *,
-    store: "FeatureStore | None" = None,
-    skip_bad: bool = False,
-    track: Track = untracked,
-) -> Descriptors:
-    """Global descriptors of every image.
-
-    Args:
-        folder: the images.
-        feature_set: their local features.
-        extractor: what describes images, by their pixels or by their local features.
-        store: of this folder and extractor, where that reads pixels; as in `extract`.
-        skip_bad: go on where an image cannot be read.
-        track: progress.
-
-    Raises:
-        InputError: as `extract`.
-    """
-    bad = dict(feature_set.bad)
-    descriptors = np.zeros((len(folder), extractor.dimension), np.float32)
-    if extractor.image_size is None:
-        for batch in _batches(track(range(len(folder)), len(folder)), extractor.batch_size):
-            features = dict(feature_set.read(batch))
-            if features:
-                descriptors[list(features)] = extractor(None, list(features.values()))
-    else:
-        whole = extract(folder, _WholeImage(extractor), store=store, skip_bad=skip_bad, track=track)
-        bad = {**whole.bad, **bad}
-        for row, image in whole.read(range(len(folder))):
-            descriptors[row] = image.descriptors[0]
-    descriptors[list(bad)] = np.nan
-    return Descriptors(descriptors, bad)
-
-
-@dataclass(frozen=True)
-class _WholeImage:
-    """A global descriptor as the one feature of its image, so that both kinds are extracted and stored alike."""
-
-    extractor: GlobalExtractor
-
-    @property
-    def image_size(self) -> tuple[int, int]:
-        if self.extractor.image_size is None:
-            raise ValueError(f"{type(self.extractor).__name__} reads no images")
-        return self.extractor.image_size
-
-    @property
-    def interpolation(self) -> Interpolation:
-        return self.extractor.interpolation
-
-    @property
-    def batch_size(self) -> int:
-        return self.extractor.batch_size
-
-    @property
-    def dimension(self) -> int:
-        return self.extractor.dimension
-
-    @property
-    def typical_count(self) -> int:
-        return 1
-
-    def __call__(self, images: np.ndarray) -> list[Features]:
-        one, size = np.ones(1, np.float32), np.array(self.image_size, np.float32)
-        return [
-            Features(size[None] / 2, descriptor[None], one, one.astype(bool), size)
-            for descriptor in self.extractor(images, [])
-        ]
+    for part, images in _image_batches(folder, rows, extractor, skip_bad, bad, track):
+        batch = dict(zip(part, extractor(images), strict=True))
+        for row in [row for row, description in batch.items() if not _finite(description)]:
+            del batch[row]
+            bad[row] = f"{folder.paths[row]}: features are not finite (NaN or infinite); the image ranks last"
+        yield batch
 
 
 def _image_batches(
     folder: ImageFolder,
     wanted: Sequence[int],
-    extractor: LocalExtractor,
+    extractor: Extractor,
     skip_bad: bool,
     bad: dict[int, str],
     track: Track,
@@ -198,5 +90,7 @@ def _batches(items: Iterable[Item], size: int) -> Iterator[list[Item]]:
         yield batch
 
 
-def _finite(features: Features) -> bool:
-    return all(np.isfinite(getattr(features, field.name)).all() for field in fields(features))
+def _finite(description: Description) -> bool:
+    arrays = [getattr(local, part.name) for local in description.local for part in fields(local)]
+    arrays += [] if description.vector is None else [description.vector]
+    return all(np.isfinite(array).all() for array in arrays)

@@ -1,20 +1,27 @@
 """Matches of many queries with their candidates, ragged; in batches of pairs for whatever scores them."""
 
+import itertools
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from mfvpr import ragged
+from mfvpr.errors import InputError
 from mfvpr.numerics import round_up
 from mfvpr.types import Matches, per_match, per_pair
 
 BATCH_SLOTS = 2**14  # matches of a batch of pairs: its votes stay in cache
 PAIRS_STEP = 8
 SLOTS_STEP = 32
+PROGRAM_SLOTS = 2**21  # are scored by one setting while a program for one shape more would be compiled
 QUANTILES = (0.25, 0.5, 0.75, 0.95, 1.0)
 BYTES_PER_SLOT = 41
+
+Normalize = Literal["zscore", "none"]
 
 
 @dataclass(frozen=True)
@@ -104,30 +111,100 @@ class MatchSet:
         return np.repeat(sizes0, len(sizes1), 0), np.tile(sizes1, (len(sizes0), 1))
 
 
-def slots(match_set: MatchSet) -> np.ndarray:
-    """`[Q, C]` slots of the batch that each pair belongs to: few sizes, each a shape to compile, of little padding."""
-    return ragged.fitting(ragged.sizes(match_set.counts, QUANTILES, SLOTS_STEP), match_set.counts)
+@dataclass(frozen=True)
+class Scales:
+    """Several Matches of every pair, such as those of patches of several sizes: a match set for each scale.
+
+    Whatever scores a MatchSet takes it in its place: each scale is scored for itself, then they are fused over the
+    candidates of a query, see `mfvpr.reranking.fuse_scales`.
+
+    Attributes:
+        match_sets: S, of the same queries and candidates.
+        weights: of the scales; None = 1 each.
+        normalize: what is done to the scores of a scale before.
+    """
+
+    match_sets: Sequence[MatchSet]
+    weights: Sequence[float] | None = None
+    normalize: Normalize = "zscore"
+
+    def __post_init__(self) -> None:
+        shapes = {one.counts.shape for one in self.match_sets}
+        if len(shapes) != 1:
+            raise InputError(f"scales: expected match sets of the same queries and candidates, got {sorted(shapes)}")
+        if self.weights is not None and len(self.weights) != len(self.match_sets):
+            raise InputError(
+                f"scales: expected a weight for each of {len(self.match_sets)} scales, got {len(self.weights)}"
+            )
+
+    @property
+    def image_sizes(self) -> tuple[np.ndarray, np.ndarray]:
+        """As of a MatchSet, of all scales."""
+        sizes0, sizes1 = zip(*(one.image_sizes for one in self.match_sets), strict=True)
+        return np.concatenate(sizes0), np.concatenate(sizes1)
 
 
-def shapes(match_set: MatchSet) -> dict[int, int]:
+def scales(match_set: MatchSet | Scales) -> Sequence[MatchSet]:
+    """The match set of each scale; of one that has none, itself."""
+    return match_set.match_sets if isinstance(match_set, Scales) else [match_set]
+
+
+class Batch(NamedTuple):
+    """Pairs of about as many matches, which are scored in one call.
+
+    places: `[n]` in the flattened `[queries, C]`.
+    slots: of each pair, no less than its matches.
+    pairs: of the call, no less than n; what is beyond has no matches.
+    """
+
+    places: np.ndarray
+    slots: int
+    pairs: int
+
+
+def slots(match_set: MatchSet, *, settings: float = math.inf) -> np.ndarray:
+    """`[Q, C]` slots of the batch that each pair belongs to: few sizes, each a shape to compile, of little padding.
+
+    Args:
+        match_set: the largest size is its capacity, which those taken from it share.
+        settings: that every program scores. For few of them, or in a small set, padding costs less time than compiling
+            for a shape more, and there are fewer sizes.
+    """
+    sizes = ragged.sizes(match_set.counts, QUANTILES, SLOTS_STEP)
+    sizes[-1] = max(sizes[-1], match_set.capacity)
+    sizes = ragged.worthwhile(sizes, match_set.counts, PROGRAM_SLOTS / settings)
+    return ragged.fitting(sizes, match_set.counts)
+
+
+def shapes(match_set: MatchSet, *, settings: float = math.inf) -> dict[int, int]:
     """Pairs of a batch by their slots; not by how many there are, so that a larger set scores them as a smaller one."""
-    return {size: round_up(BATCH_SLOTS // size, PAIRS_STEP) for size in np.unique(slots(match_set)).tolist()}
+    sizes = np.unique(slots(match_set, settings=settings)).tolist()
+    return {size: round_up(BATCH_SLOTS // size, PAIRS_STEP) for size in sizes}
 
 
-def batches(match_set: MatchSet, queries: range) -> Iterator[tuple[np.ndarray, Matches]]:
+def partition(match_set: MatchSet, queries: range, *, settings: float = math.inf) -> list[Batch]:
+    """All pairs of some queries that have matches, in batches; the first of each shape come first."""
+    part = slice(queries.start, queries.stop)
+    counts = match_set.counts[part].reshape(-1)
+    sizes = slots(match_set, settings=settings)[part].reshape(-1)
+    by_shape = []
+    for size, pairs in shapes(match_set, settings=settings).items():
+        places = np.flatnonzero((sizes == size) & (counts > 0))
+        by_shape.append([Batch(places[start : start + pairs], size, pairs) for start in range(0, len(places), pairs)])
+    in_turn = itertools.chain.from_iterable(itertools.zip_longest(*by_shape))
+    return [batch for batch in in_turn if batch is not None]
+
+
+def batches(match_set: MatchSet, queries: range, *, settings: float = math.inf) -> Iterator[tuple[np.ndarray, Matches]]:
     """All pairs of some queries that have matches, those of about as many together.
 
     Returns:
-        (places `[n]` in the flattened `[queries, C]`, Matches `[P, K, ...]` of P >= n pairs; padding has no matches).
+        (places `[n]` in the flattened `[queries, C]`, Matches `[P, K, ...]` of P >= n pairs; padding has no matches),
+        the first of each shape first.
     """
-    part = slice(queries.start, queries.stop)
-    counts, sizes = match_set.counts[part].reshape(-1), slots(match_set)[part].reshape(-1)
-    for size, pairs in shapes(match_set).items():
-        places = np.flatnonzero((sizes == size) & (counts > 0))
-        for start in range(0, len(places), pairs):
-            some = places[start : start + pairs]
-            query, place = np.divmod(some, match_set.counts.shape[1])
-            yield some, match_set.pairs(query + queries.start, place, size, total=pairs)
+    for places, size, pairs in partition(match_set, queries, settings=settings):
+        query, place = np.divmod(places, match_set.counts.shape[1])
+        yield places, match_set.pairs(query + queries.start, place, size, total=pairs)
 
 
 def compacted(found: Matches) -> list[dict[str, np.ndarray]]:

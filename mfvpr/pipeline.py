@@ -1,50 +1,35 @@
-"""The whole way over a data set: extract and describe (`mfvpr.extraction`), shortlist, match, score, rank.
+"""The stages of re-ranking a data set: match, and score (`mfvpr.sweeping.scores`); `mfvpr.reranking` fuses and ranks.
 
-Files and threads stay on the host; each computation is one compiled program per shape, called for every query. `track`
-wraps the iterable of a stage: a progress bar, or nothing.
+Files and threads stay on the host; each computation is one compiled program per shape. `track` wraps the iterable of a
+stage: a progress bar, or nothing.
 """
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import numpy as np
 
-from mfvpr import pair_matching, reranking, retrieval
+from mfvpr import pair_matching
 from mfvpr.errors import InputError
-from mfvpr.extraction import Track, describe, extract, untracked
-from mfvpr.match_sets import MatchSet, QueryMatches
+from mfvpr.match_sets import MatchSet, QueryMatches, Scales
 from mfvpr.matching import CrossCheck
-from mfvpr.numerics import Device, compiled, device_of, held
-from mfvpr.scoring import HistogramOfShifts, Scorer, ShiftHistogram
+from mfvpr.numerics import Device, compiled, device_of
+from mfvpr.progress import Track, untracked
+from mfvpr.reranking import BIN_STEP
+from mfvpr.scoring import HistogramOfShifts, ShiftHistogram
 from mfvpr.scoring.parameters import fit
 from mfvpr.sources import FeatureSet
 from mfvpr.stores.matches import MatchStore
+from mfvpr.sweeping.scores import score
 from mfvpr.types import Array, Matches, Shortlist
 from mfvpr.weighting import match_weights
 
-__all__ = ["Explanation", "FeatureSet", "MatchSet", "Track", "describe", "explain", "extract", "fuse", "match", "rank",
-           "score", "shortlist", "stored_matches", "untracked"]  # fmt: skip
+__all__ = ["Explanation", "FeatureSet", "MatchSet", "Scales", "explain", "match", "score", "stored_matches"]
 
-Ties = Literal["filter", "index"]
-FilterScore = Literal["cosine", "negative_euclidean"]
-
-BIN_STEP = 16  # capacities of histograms are multiples of it
 STORE_BATCH = 8  # queries whose matches may be lost when a run is killed
-
-
-def shortlist(
-    query_descriptors: np.ndarray,
-    database_descriptors: np.ndarray,
-    num_candidates: int,
-    *,
-    allowed: np.ndarray | None = None,
-) -> Shortlist:
-    """The filter's candidates of all queries `[Q, C]`, NumPy, among database images `allowed` `[Q, N]`; None = all."""
-    found = retrieval.retrieve(query_descriptors, database_descriptors, num_candidates=num_candidates, mask=allowed)
-    return jax.tree.map(np.asarray, found)
 
 
 def match(
@@ -124,20 +109,6 @@ def stored_matches(store: MatchStore) -> tuple[MatchSet, Shortlist]:
     return MatchSet.of(found), Shortlist(indices=indices, scores=scores, mask=indices >= 0)
 
 
-def score(
-    scorers: Mapping[str, Scorer], match_set: MatchSet, candidates: Shortlist, *, track: Track = untracked
-) -> dict[str, np.ndarray]:
-    """Scores `[Q, C]` of every query's candidates by each scorer; NaN where there is no candidate.
-
-    All scorers are one program, which other parameter values use again (histograms: within a capacity of 16 bins).
-    """
-    fitted = held(fit(dict(scorers), *match_set.image_sizes, multiple=BIN_STEP))
-    queries = range(len(match_set.matches))
-    rows = [_score(fitted, match_set[query]) for query in track(queries, len(queries))]
-    scores = {name: np.array([row[name] for row in rows]) for name in scorers}
-    return {name: np.where(candidates.mask, values, np.nan) for name, values in scores.items()}
-
-
 @dataclass(frozen=True)
 class Explanation:
     """What a histogram says of one pair, NumPy.
@@ -163,40 +134,6 @@ def explain(scorer: HistogramOfShifts, matches: Matches) -> Explanation:
     """The parts of one pair's score, for figures and for steering; one program for all pairs."""
     fitted = fit(scorer, matches.image_size0, matches.image_size1, multiple=BIN_STEP)
     return Explanation(*jax.tree.map(np.asarray, _explain(fitted, matches)))
-
-
-def fuse(
-    candidates: Shortlist, scores: np.ndarray, c: float | None, *, filter_score: FilterScore = "cosine"
-) -> np.ndarray:
-    """Combined scores `[Q, C]` of filter and re-ranking.
-
-    Args:
-        candidates: the filter's, with their cosine similarities.
-        scores: `[Q, C]` of the re-ranking.
-        c: weight of the filter; None balances the spread of both per query.
-        filter_score: the filter's score, see `filter_scores`.
-    """
-    return np.asarray(reranking.fuse(filter_scores(candidates, filter_score), scores, candidates.mask, c))
-
-
-def filter_scores(candidates: Shortlist, kind: FilterScore = "cosine") -> np.ndarray:
-    """The filter's part of a combined score `[Q, C]`: cosine similarity, or minus the Euclidean distance."""
-    cosine = candidates.scores
-    return -np.sqrt(np.maximum(2 - 2 * cosine, 0)) if kind == "negative_euclidean" else cosine
-
-
-def rank(candidates: Shortlist, scores: np.ndarray, *, ties: Ties = "filter") -> np.ndarray:
-    """Positions `[Q, C]` into the shortlist, best first, those without a candidate last.
-
-    Equal scores keep the filter's order, or go by database index.
-    """
-    tie_break = candidates.indices if ties == "index" else None
-    return np.asarray(reranking.rank(scores, candidates.mask, tie_break=tie_break))
-
-
-@compiled
-def _score(scorers: dict[str, Scorer], matches: Matches) -> dict[str, Array]:
-    return {name: reranking.score_candidates(scorer, matches) for name, scorer in scorers.items()}
 
 
 @compiled

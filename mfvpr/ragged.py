@@ -59,6 +59,18 @@ def sizes(counts: np.ndarray, quantiles: Sequence[float], step: int) -> np.ndarr
     return np.unique(np.ceil(np.quantile(some, quantiles) / step).astype(int) * step)
 
 
+def worthwhile(capacities: np.ndarray, counts: np.ndarray, saving: float) -> np.ndarray:
+    """Those of ascending `capacities` without which there would be at least `saving` slots more; the largest always."""
+    some = counts[counts > 0]
+    while len(capacities) > 1:
+        rows = np.bincount(np.searchsorted(capacities, some), minlength=len(capacities))
+        saved = rows[:-1] * np.diff(capacities)
+        if saved.min() >= saving:
+            break
+        capacities = np.delete(capacities, saved.argmin())
+    return capacities
+
+
 def fitting(capacities: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """The smallest of ascending `capacities` that holds each of `counts`."""
     return capacities[np.searchsorted(capacities, counts)]

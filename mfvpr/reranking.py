@@ -3,14 +3,20 @@
 Scorers know one pair; here is `vmap` over candidates. Whole grids of parameters are in `mfvpr.parameter_grids`.
 """
 
+from functools import partial
+from typing import Literal
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mfvpr.numerics import compiled, is_concrete, masked, masked_std
+from mfvpr.numerics import as_float, compiled, is_concrete, masked, masked_mean, masked_std
 from mfvpr.scoring import Scorer
 from mfvpr.scoring.parameters import fit
-from mfvpr.types import Array, Matches, Ranking
+from mfvpr.types import Array, Matches, Ranking, Shortlist
+
+Ties = Literal["filter", "index"]
+FilterScore = Literal["cosine", "negative_euclidean"]
 
 BIN_STEP = 8  # capacities of histograms are multiples of it
 
@@ -23,7 +29,7 @@ def score_candidates(scorer: Scorer, matches: Matches) -> Array:
     it must have one before (`max_bins` of the histogram).
     """
     check_candidates(matches)
-    return _score_candidates(fit(scorer, *matched_sizes(matches), multiple=2 * BIN_STEP), matches)
+    return _score_candidates(fit(scorer, *matched_sizes(matches), multiple=BIN_STEP), matches)
 
 
 @compiled
@@ -74,6 +80,70 @@ def fuse(filter_scores: Array, scores: Array, mask: Array, c: float | Array | No
     if c is None:
         c = jax.vmap(balancing_c)(filter_scores, scores, mask)[:, None]
     return combine(filter_scores, scores, c=c)
+
+
+def fuse_shortlist(
+    candidates: Shortlist, scores: np.ndarray, c: float | None, *, filter_score: FilterScore = "cosine"
+) -> np.ndarray:
+    """Combined scores `[Q, C]` of filter and re-ranking, NumPy.
+
+    Args:
+        candidates: the filter's, with their cosine similarities.
+        scores: `[Q, C]` of the re-ranking.
+        c: weight of the filter; None balances the spread of both per query.
+        filter_score: the filter's score, see `filter_scores`.
+    """
+    return np.asarray(fuse(filter_scores(candidates, filter_score), scores, candidates.mask, c))
+
+
+def filter_scores(candidates: Shortlist, kind: FilterScore = "cosine") -> np.ndarray:
+    """The filter's part of a combined score `[Q, C]`: cosine similarity, or minus the Euclidean distance."""
+    cosine = candidates.scores
+    return -np.sqrt(np.maximum(2 - 2 * cosine, 0)) if kind == "negative_euclidean" else cosine
+
+
+@partial(compiled, static_argnames="normalize")
+def fuse_scales(
+    scores: Array, mask: Array, weights: Array | None = None, *, normalize: Literal["zscore", "none"] = "zscore"
+) -> Array:
+    """Weighted sum `[..., C]` of the scores of S scales, as Patch-NetVLAD's; NaN where there is no candidate.
+
+    Args:
+        scores: `[..., C, S]` of a query's candidates.
+        mask: `[..., C]` bool, with the axes of the scores or fewer in front.
+        weights: `[S]`; None = 1 each.
+        normalize: "zscore" first gives each scale mean 0 and standard deviation 1 over the query's candidates; where
+            all score the same, 0. A score that is not finite takes no part in that, and what it makes of the sum is its
+            candidate's alone. "none" leaves the scores as they are, as for a pair by itself.
+    """
+    scores = as_float(scores)
+    weights = jnp.ones(scores.shape[-1]) if weights is None else jnp.asarray(weights)
+    mask = jnp.broadcast_to(mask, scores.shape[:-1])
+    if normalize == "zscore":
+        by_scale = jnp.moveaxis(scores, -1, -2)
+        standardized = jnp.vectorize(_standardized, signature="(c),(c)->(c)")
+        scores = jnp.moveaxis(standardized(by_scale, mask[..., None, :]), -2, -1)
+    fused = jnp.matmul(masked(scores, mask), weights.astype(scores.dtype), precision=jax.lax.Precision.HIGHEST)
+    return masked(fused, mask, jnp.nan)
+
+
+def _standardized(scores: Array, mask: Array) -> Array:
+    """Scores `[C]` with mean 0 and standard deviation 1 over the finite ones of the candidates."""
+    finite = mask & jnp.isfinite(scores)
+    # Relative to one of them, equal scores have no spread that rounding would make.
+    some = jax.lax.stop_gradient(jnp.max(masked(scores, finite, -jnp.inf)))
+    values = masked(scores - jnp.where(jnp.isfinite(some), some, 0.0), finite)
+    mean, spread = masked_mean(values, finite), masked_std(values, finite)
+    return jnp.where(finite, (values - mean) / jnp.where(spread > 0, spread, 1.0), scores)
+
+
+def rank_shortlist(candidates: Shortlist, scores: np.ndarray, *, ties: Ties = "filter") -> np.ndarray:
+    """Positions `[Q, C]` into the shortlist, best first, those without a candidate last, NumPy.
+
+    Equal scores keep the filter's order, or go by database index.
+    """
+    tie_break = candidates.indices if ties == "index" else None
+    return np.asarray(rank(scores, candidates.mask, tie_break=tie_break))
 
 
 @compiled

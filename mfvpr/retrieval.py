@@ -1,12 +1,166 @@
-"""The filter: global descriptors -> Shortlist, by exact search."""
+"""The filter: global descriptors -> Shortlist, by exact search in chunks, and what is fitted on the database before."""
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import partial
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from mfvpr.numerics import at_least_single, compiled, masked
+from mfvpr.errors import InputError
+from mfvpr.evaluation.positives import Positives
+from mfvpr.numerics import at_least_single, compiled, device_of, free_bytes, masked
 from mfvpr.types import Array, Shortlist
+
+SHARE = 1 / 16  # of the free memory, for the similarities that exist at the same time
+
+
+class Search(Protocol):
+    """How candidates are found by global descriptors."""
+
+    def fit(self, database: np.ndarray) -> "Search":
+        """The same, knowing what it must of the database's descriptors `[N, D]`."""
+        ...
+
+    def shortlist(
+        self, queries: np.ndarray, database: np.ndarray, num_candidates: int, *, excluded: Positives | None = None
+    ) -> Shortlist:
+        """Candidates `[Q, C]`, NumPy, of queries `[Q, D]` among the database `[N, D]`, without those `excluded`."""
+        ...
+
+
+@dataclass(frozen=True)
+class ExactSearch:
+    """The largest dot products, as `retrieve` finds them, whatever the chunks.
+
+    Attributes:
+        memory: GB of similarities that may exist at the same time; None = a sixteenth of what is free.
+    """
+
+    memory: float | None = None
+
+    def fit(self, database: np.ndarray) -> "ExactSearch":
+        """Itself: it need not know the database."""
+        return self
+
+    def shortlist(
+        self, queries: np.ndarray, database: np.ndarray, num_candidates: int, *, excluded: Positives | None = None
+    ) -> Shortlist:
+        """See `Search`; descriptors are of unit length, or their dot products mean what they mean."""
+        some, many = self._chunks(len(queries), len(database))
+        parts = [
+            _shortlist(
+                queries[part], database, num_candidates, many, None if excluded is None else excluded.dense(part)
+            )
+            for part in _parts(len(queries), some)
+        ]
+        return jax.tree.map(lambda *fields: np.concatenate(fields), *parts)
+
+    def _chunks(self, num_queries: int, num_database: int) -> tuple[int, int]:
+        """Queries and database rows at a time: all rows where a tenth of the queries fit with them."""
+        available = SHARE * free_bytes(device_of(())) if self.memory is None else 1e9 * self.memory
+        numbers = max(1, int(available) // 8)  # a similarity, and what becomes of it
+        many = min(num_database, max(1, numbers // max(1, num_queries // 10)))
+        return max(1, min(num_queries, numbers // many)), many
+
+
+EXACT = ExactSearch()
+
+
+@dataclass(frozen=True)
+class WhitenedSearch:
+    """Search by the principal components of the database's descriptors, each of unit variance; then of unit length.
+
+    (Jegou & Chum, ECCV 2012.) What the database lacks in variance, the queries lose.
+
+    Attributes:
+        dimension: D' components that are kept.
+        max_samples: descriptors to learn from, at most: evenly spread over the database.
+        search: among what comes out.
+    """
+
+    dimension: int
+    max_samples: int = 4096
+    search: Search = EXACT
+
+    def fit(self, database: np.ndarray) -> Search:
+        """The components of a database `[N, D]`.
+
+        Raises:
+            InputError: there are fewer finite descriptors, or fewer numbers in each, than components.
+        """
+        usable = database[np.isfinite(database).all(axis=1)]
+        if self.dimension >= len(usable) or self.dimension > usable.shape[1]:
+            raise InputError(f"whitening: expected more than {self.dimension} descriptors of as many numbers, got "
+                             f"{len(usable)} of {usable.shape[1]}; keep fewer components")  # fmt: skip
+        rows = np.linspace(0, len(usable) - 1, min(len(usable), self.max_samples)).astype(int)
+        sample = usable[rows].astype(np.float64)
+        mean = sample.mean(axis=0)
+        _, spread, axes = np.linalg.svd(sample - mean, full_matrices=False)
+        spread = np.maximum(spread[: self.dimension], 1e-6 * spread[0]) / np.sqrt(len(sample))
+        components = axes[: self.dimension] / spread[:, None]
+        return Whitened(mean.astype(np.float32), components.astype(np.float32), self.search)
+
+    def shortlist(
+        self, queries: np.ndarray, database: np.ndarray, num_candidates: int, *, excluded: Positives | None = None
+    ) -> Shortlist:
+        """See `Search`; fitted here."""
+        return self.fit(database).shortlist(queries, database, num_candidates, excluded=excluded)
+
+
+@dataclass(frozen=True)
+class Whitened:
+    """`WhitenedSearch` that knows its database: the mean `[D]` and the components `[D', D]`."""
+
+    mean: np.ndarray
+    components: np.ndarray
+    search: Search
+
+    def fit(self, database: np.ndarray) -> "Whitened":
+        """Itself: fitted already."""
+        return self
+
+    def shortlist(
+        self, queries: np.ndarray, database: np.ndarray, num_candidates: int, *, excluded: Positives | None = None
+    ) -> Shortlist:
+        """See `Search`."""
+        queries, database = self._whitened(queries), self._whitened(database)
+        return self.search.shortlist(queries, database, num_candidates, excluded=excluded)
+
+    def _whitened(self, descriptors: np.ndarray) -> np.ndarray:
+        whitened = (descriptors - self.mean) @ self.components.T
+        lengths = np.linalg.norm(whitened, axis=1, keepdims=True)
+        return whitened / np.where(lengths > 0, lengths, 1)
+
+
+def _shortlist(
+    queries: np.ndarray, database: np.ndarray, num_candidates: int, many: int, allowed: np.ndarray | None
+) -> Shortlist:
+    """Of some queries, `many` rows of the database at a time; the first rows win ties, whatever the chunks."""
+    best: Shortlist | None = None
+    for part in _parts(len(database), many):
+        mask = None if allowed is None else allowed[:, part]
+        here = retrieve(queries, database[part], num_candidates=num_candidates, mask=mask)
+        here = Shortlist(jnp.where(here.mask, here.indices + part.start, -1), here.scores, here.mask)
+        best = here if best is None else _best(best, here)
+    return jax.tree.map(np.asarray, best)
+
+
+@compiled
+def _best(first: Shortlist, second: Shortlist) -> Shortlist:
+    """The best of two shortlists `[Q, C]`; the first one's win ties."""
+    indices, scores, mask = (
+        jnp.concatenate([getattr(one, name) for one in (first, second)], axis=1)
+        for name in ("indices", "scores", "mask")
+    )
+    _, place = jax.lax.top_k(masked(scores, mask, -jnp.inf), first.mask.shape[1])
+    return Shortlist(*(jnp.take_along_axis(field, place, axis=1) for field in (indices, scores, mask)))
+
+
+def _parts(total: int, size: int) -> Iterator[slice]:
+    return (slice(start, min(start + size, total)) for start in range(0, total, size))
 
 
 @partial(compiled, static_argnames="num_candidates")

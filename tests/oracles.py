@@ -305,6 +305,22 @@ def match_count(n):
 # --- fusion and ranking -------------------------------------------------------------------------------------
 
 
+def fuse_scales(scores, mask, weights, normalize):
+    """Of one query, `[C, S]` -> `[C]` (Patch-NetVLAD): z-scores over the candidates whose score is a number, summed."""
+    fused = np.full(len(mask), np.nan)
+    real = [place for place in range(len(mask)) if mask[place]]
+    for place in real:
+        fused[place] = 0.0
+        for scale, weight in enumerate(weights):
+            score = float(scores[place, scale])
+            finite = [float(scores[one, scale]) for one in real if np.isfinite(scores[one, scale])]
+            if normalize == "zscore" and np.isfinite(score):
+                deviation = np.std(finite) if min(finite) < max(finite) else 0.0
+                score = (score - np.mean(finite)) / deviation if deviation else 0.0
+            fused[place] += weight * score
+    return fused
+
+
 def combine(filter_scores, rerank_scores, c):
     """s = c * s_f + s_r (paper eq. 4)."""
     pairs = zip(_values(filter_scores), _values(rerank_scores), strict=True)

@@ -14,9 +14,11 @@ from pathlib import Path
 import hydra
 from omegaconf import OmegaConf
 
+from experiments import prepare
 from experiments.launch import launch
 from experiments.settings import CONF
 from mfvpr.data.streets import streets_folder
+from mfvpr.stores.manifest import MATCHES, store_path
 
 ROOT = Path(__file__).parent.parent
 QUICK = ("figures=0", "features.max_keypoints=100", "retrieval.num_words=8")
@@ -61,6 +63,14 @@ def small(root, *more):
         street, "features.max_keypoints=60", "features.image_size=[160,120]", "retrieval.num_words=8",
         f"candidates={CANDIDATES}", "recall.tolerances=[0,1]", "recall.ks=[1,5]", f"store={root}/store", *more,
     )  # fmt: skip
+
+
+def matches_path(settings):
+    """Where a program keeps the matches of its data set, and their recipe."""
+    tools = prepare.tools(settings)
+    images = prepare.images(settings, tools.archive)
+    recipe = prepare.recipe(tools, images, settings["candidates"])
+    return store_path(tools.archive.root, "matches", recipe, MATCHES), recipe
 
 
 def typed(monkeypatch, capsys, program, *arguments):

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments import prepare, stores
+from experiments import build, prepare
+from experiments.evaluation import evaluate
 from experiments.launch import launch
-from experiments.run import evaluate
 from mfvpr import InputError
 from mfvpr.data.images import read_image
-from tests.programs import composed, folder
+from tests.programs import composed, folder, matches_path
 
 QUICK = ("figures=0", "features.max_keypoints=60", "features.image_size=[160,120]", "retrieval.num_words=8",
          "scorer=sum", "candidates=4")  # fmt: skip
@@ -87,12 +87,13 @@ def test_two_sequences_cannot_exclude_neighbors(small_street, run):
         run(*folder(small_street, "dataset.exclude_neighbors=0"))
 
 
-def test_matches_are_kept_apart_by_what_is_left_out(small_street):
-    recipes = [
-        stores.matches_recipe(composed(*same(small_street, "dataset.ground_truth=order", *more)), {"query": "a"}, 4)
+def test_matches_are_kept_apart_by_what_is_left_out(small_street, tmp_path):
+    store = f"store={tmp_path}"
+    paths = {
+        matches_path(composed(*same(small_street, "dataset.ground_truth=order", "candidates=4", store, *more)))[0]
         for more in ([], ["dataset.exclude_neighbors=0"], ["dataset.exclude_neighbors=1"])
-    ]
-    assert recipes[0] != recipes[1] != recipes[2] != recipes[0]
+    }
+    assert len(paths) == 3
 
 
 def test_labels_are_right_and_make_one_column(small_street, tmp_path, run):
@@ -161,7 +162,7 @@ def test_turned_and_16_bit_copies_give_the_same_and_it_is_said(small_street, tmp
 
 def test_a_second_run_is_told_the_same_of_its_images(small_street, tmp_path, monkeypatch):
     settings = composed(*folder(small_street, f"store={tmp_path}/store"))
-    first, second = prepare.images(settings), prepare.images(settings)
+    first, second = (prepare.images(settings, build.archive(settings)) for _ in range(2))
     assert first.fingerprints == second.fingerprints
     assert first.reading == second.reading
     assert len(list((tmp_path / "store" / "contents").iterdir())) == 2

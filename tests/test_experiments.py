@@ -131,7 +131,7 @@ def test_bins_that_do_not_fit_are_refused(small_street, tmp_path, monkeypatch, c
 
 
 def test_one_evaluation_compiles_at_most_six_programs(small_street, tmp_path, monkeypatch, compilations, capsys):
-    from experiments import run as program
+    from experiments import evaluation as program
 
     monkeypatch.chdir(tmp_path)
     common = folder(small_street, "figures=2", "features.max_keypoints=120", "retrieval.num_words=8", "candidates=7")

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from mfvpr import InputError
 from mfvpr.features.sift import Sift
-from mfvpr.features.vlad import Vlad, fit_vlad
+from mfvpr.features.vlad import Vlad, VladFitting
 from mfvpr.sources import FeatureSet
 from tests import oracles
 from tests.builders import make_features, unit
@@ -21,7 +21,7 @@ def image():
 
 
 def test_rootsift_is_opencvs_sift_with_the_square_root(image):
-    (features,) = Sift(max_keypoints=200)(image[None])
+    features = Sift(max_keypoints=200)(image[None])[0].features
     found, descriptors = cv2.SIFT_create(200).detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
     by_place = {tuple(k.pt): (d, k.response) for k, d in zip(found, descriptors, strict=True)}
     assert 100 < len(features.mask) <= 200
@@ -39,7 +39,7 @@ def test_rootsift_is_opencvs_sift_with_the_square_root(image):
 
 
 def test_an_image_without_keypoints_gives_empty_features():
-    (features,) = Sift()(np.full((1, 336, 336, 3), 128, np.uint8))
+    features = Sift()(np.full((1, 336, 336, 3), 128, np.uint8))[0].features
     assert features.keypoints.shape == (0, 2)
     assert features.descriptors.shape == (0, 128)
     assert features.scores.shape == (0,)
@@ -47,7 +47,8 @@ def test_an_image_without_keypoints_gives_empty_features():
 
 def test_clahe_finds_more_in_the_dark(image):
     dark = (image // 16)[None]
-    assert len(Sift(clahe_clip=3.0)(dark)[0].mask) > 1.2 * len(Sift()(dark)[0].mask)
+    more, some = (len(sift(dark)[0].features.mask) for sift in (Sift(clahe_clip=3.0), Sift()))
+    assert more > 1.2 * some
 
 
 @given(st.integers(0, 2**32 - 1), st.lists(st.sampled_from([0, 1, 7, 40]), max_size=4), st.sampled_from([0.5, 1.0]))
@@ -55,7 +56,7 @@ def test_vlad_agrees_with_the_oracle(seed, counts, power):
     rng = np.random.default_rng(seed)
     centers = rng.normal(size=(5, 16)).astype(np.float32)
     images = [make_features(rng, count, capacity=44) for count in (*counts, 7)]
-    got = Vlad(centers, power)(None, images)
+    got = Vlad(centers, power)(images)
     expected = [oracles.vlad(features.descriptors[features.mask], centers, power) for features in images]
     np.testing.assert_allclose(got, expected, atol=2e-5)
     assert got.dtype == np.float32
@@ -67,7 +68,7 @@ def test_vocabulary_is_reproducible_and_finds_clusters():
     members = unit(np.repeat(true, 50, axis=0) + 0.01 * rng.normal(size=(200, 16)))
     features = make_features(rng, 200)
     features.descriptors[:] = members
-    one, two = (fit_vlad(FeatureSet.of([features]), num_words=4, seed=0) for _ in range(2))
+    one, two = (VladFitting(num_words=4, seed=0).fit(FeatureSet.of([features])) for _ in range(2))
     np.testing.assert_array_equal(one.centers, two.centers)
     found = np.linalg.norm(one.centers[:, None] - true, axis=-1).min(axis=0) < 0.05
     assert found.sum() >= 2  # a start at random may put two words into one cluster
@@ -77,24 +78,24 @@ def test_last_bits_and_one_keypoint_less_hardly_move_the_words():
     """Descriptors anywhere on the sphere, where k-means is as unstable as it can be."""
     rng = np.random.default_rng(2)
     images = [make_features(rng, 60) for _ in range(40)]
-    before = fit_vlad(FeatureSet.of(images), num_words=12, seed=3).centers
+    before = VladFitting(num_words=12, seed=3).fit(FeatureSet.of(images)).centers
     assert np.linalg.norm(before[:, None] - before, axis=-1)[np.triu_indices(12, 1)].min() > 0.02
     for features in images:
         features.descriptors[:] = np.nextafter(features.descriptors, rng.choice([-2, 2], features.descriptors.shape))
-    np.testing.assert_allclose(fit_vlad(FeatureSet.of(images), num_words=12, seed=3).centers, before, atol=1e-5)
+    np.testing.assert_allclose(VladFitting(num_words=12, seed=3).fit(FeatureSet.of(images)).centers, before, atol=1e-5)
     images[7].mask[5] = False
-    np.testing.assert_allclose(fit_vlad(FeatureSet.of(images), num_words=12, seed=3).centers, before, atol=0.02)
+    np.testing.assert_allclose(VladFitting(num_words=12, seed=3).fit(FeatureSet.of(images)).centers, before, atol=0.02)
 
 
 def test_a_vocabulary_of_some_images_knows_no_others():
     rng = np.random.default_rng(3)
     images = [make_features(rng, 20) for _ in range(5)]
-    before = fit_vlad(FeatureSet.of(images), num_words=4, max_samples=30).centers
+    before = VladFitting(num_words=4, max_samples=30).fit(FeatureSet.of(images)).centers
     unseen = 0
     for features in images:
         kept = features.descriptors.copy()
         features.descriptors[:] = kept[0]
-        unseen += np.array_equal(fit_vlad(FeatureSet.of(images), num_words=4, max_samples=30).centers, before)
+        unseen += np.array_equal(VladFitting(num_words=4, max_samples=30).fit(FeatureSet.of(images)).centers, before)
         features.descriptors[:] = kept
     assert unseen == 3
 
@@ -104,7 +105,7 @@ def test_identical_features_and_single_ones_have_words():
     alike.descriptors[:] = alike.descriptors[0]
     for images in ([alike], [make_features(np.random.default_rng(5), 1)] * 9):
         np.testing.assert_allclose(
-            np.linalg.norm(fit_vlad(FeatureSet.of(images), num_words=9).centers, axis=1), 1, atol=1e-3
+            np.linalg.norm(VladFitting(num_words=9).fit(FeatureSet.of(images)).centers, axis=1), 1, atol=1e-3
         )
 
 
@@ -112,9 +113,9 @@ def test_fewer_features_than_words_is_the_users_to_mend():
     with pytest.raises(
         InputError, match="10 local features in 1 database images: expected at least one for each of the 64 words"
     ):
-        fit_vlad(FeatureSet.of([make_features(np.random.default_rng(2), 10)]))
+        VladFitting().fit(FeatureSet.of([make_features(np.random.default_rng(2), 10)]))
 
 
 def test_fewer_samples_than_words_are_the_users_to_mend():
     with pytest.raises(InputError, match=r"^max_samples=10: expected at least one for each of num_words=64 words$"):
-        fit_vlad(FeatureSet.of([make_features(np.random.default_rng(2), 100)]), max_samples=10)
+        VladFitting(max_samples=10).fit(FeatureSet.of([make_features(np.random.default_rng(2), 100)]))

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments import learning, search
-from experiments import run as evaluation
+from experiments import evaluation, learning, search
 from mfvpr.learning import checkpoints, comparison
 from mfvpr.learning.splits import TrainingSplit
 from mfvpr.learning.training import Fit, Record

@@ -8,9 +8,9 @@ import time
 
 import pytest
 
-from experiments import prepare, stores
+from experiments import console
 from mfvpr.stores import matches as match_store
-from tests.programs import CANDIDATES, QUERIES, ROOT, composed, results, shared, small, typed
+from tests.programs import CANDIDATES, QUERIES, ROOT, composed, matches_path, results, shared, small, typed
 
 SIGMA = "grid.sigma=[10]"
 
@@ -55,8 +55,7 @@ def test_paths_stand_between_commas_in_a_multirun(root, tmp_path, monkeypatch, c
 def test_a_job_waits_for_the_matches_of_another_and_a_single_run_does_not(root, tmp_path, monkeypatch, capsys):
     overrides = *small(root), SIGMA
     settings = composed(*overrides, config="sweep")
-    recipe = stores.matches_recipe(settings, prepare.images(settings).fingerprints, CANDIDATES)
-    path = stores.matches_path(settings["store"], recipe)
+    path, recipe = matches_path(settings)
     assert typed(monkeypatch, capsys, "sweep", *overrides, f"out={tmp_path}/first")[0] == 0
     with match_store.open_match_store(path, recipe, num_queries=QUERIES, num_candidates=CANDIDATES) as complete:
         assert complete.done.all()  # so others read it at the same time
@@ -69,8 +68,8 @@ def test_a_job_waits_for_the_matches_of_another_and_a_single_run_does_not(root, 
             taken.set()
             told.wait(timeout=60)
 
-    other, tell = threading.Thread(target=another), stores.tell
-    monkeypatch.setattr(stores, "tell", lambda text: (tell(text), "waiting until" in text and told.set()))
+    other, tell = threading.Thread(target=another), console.tell
+    monkeypatch.setattr(console, "tell", lambda text: (tell(text), "waiting until" in text and told.set()))
     other.start()
     assert taken.wait(timeout=60)
     code, _, stderr = typed(monkeypatch, capsys, "sweep", *overrides, f"out={tmp_path}/single")

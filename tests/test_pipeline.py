@@ -10,12 +10,15 @@ import pytest
 from PIL import Image
 
 import mfvpr
-from mfvpr import pipeline
+from mfvpr import pipeline, reranking
+from mfvpr.archive import Aggregated, Archive
 from mfvpr.data.datasets import folder_dataset, image_folder
 from mfvpr.errors import InputError
 from mfvpr.features.sift import Sift
-from mfvpr.features.vlad import fit_vlad
+from mfvpr.features.vlad import VladFitting
+from mfvpr.filters import Retrieval
 from mfvpr.match_sets import MatchSet
+from mfvpr.retrieval import EXACT
 from mfvpr.stores.matches import open_match_store
 from mfvpr.types import Shortlist
 from tests import oracles
@@ -32,15 +35,15 @@ def street(small_street):
 
 @pytest.fixture(scope="module")
 def features(street):
-    return pipeline.extract(street.database, SIFT), pipeline.extract(street.queries, SIFT)
+    return [Archive().local(folder, SIFT)[0] for folder in (street.database, street.queries)]
 
 
 @pytest.fixture(scope="module")
-def candidates(street, features):
-    database, queries = features
-    vlad = fit_vlad(database, num_words=8)
-    described = [pipeline.describe(f, s, vlad) for f, s in ((street.queries, queries), (street.database, database))]
-    return pipeline.shortlist(*(one.values for one in described), 6)
+def candidates(street):
+    filtered = Retrieval(Aggregated(SIFT, VladFitting(num_words=8))).shortlist(
+        street.only, street.database, 6, Archive()
+    )
+    return filtered.candidates
 
 
 @pytest.fixture(scope="module")
@@ -77,19 +80,23 @@ def test_scores_are_those_of_the_oracle(candidates, matches):
 
 def test_the_street_is_recognized(street, candidates, matches):
     scores = pipeline.score({"h": mfvpr.HistogramOfShifts()}, matches, candidates)["h"]
-    rows = np.take_along_axis(candidates.indices, pipeline.rank(candidates, scores), axis=1)
+    rows = np.take_along_axis(candidates.indices, reranking.rank_shortlist(candidates, scores), axis=1)
     assert mfvpr.recall_at_k(rows, street.truth.positives(1), [1])[0] >= 0.8
 
 
 def test_fusion_with_a_constant_and_balanced(candidates, matches):
     scores = pipeline.score({"count": mfvpr.MatchCount()}, matches, candidates)["count"]
-    np.testing.assert_allclose(pipeline.fuse(candidates, scores, 10.0), 10 * candidates.scores + scores, rtol=1e-5)
+    np.testing.assert_allclose(
+        reranking.fuse_shortlist(candidates, scores, 10.0), 10 * candidates.scores + scores, rtol=1e-5
+    )
     distance = np.sqrt(2 - 2 * candidates.scores)
-    euclidean = pipeline.fuse(candidates, scores, 10.0, filter_score="negative_euclidean")
+    euclidean = reranking.fuse_shortlist(candidates, scores, 10.0, filter_score="negative_euclidean")
     np.testing.assert_allclose(euclidean, scores - 10 * distance, rtol=1e-5)
-    by_index = np.take_along_axis(candidates.indices, pipeline.rank(candidates, 0 * scores, ties="index"), axis=1)
+    by_index = np.take_along_axis(
+        candidates.indices, reranking.rank_shortlist(candidates, 0 * scores, ties="index"), axis=1
+    )
     np.testing.assert_array_equal(by_index, np.sort(candidates.indices, axis=1))
-    added = pipeline.fuse(candidates, scores, None) - scores
+    added = reranking.fuse_shortlist(candidates, scores, None) - scores
     np.testing.assert_allclose(added.std(axis=1), scores.std(axis=1), rtol=1e-3)
 
 
@@ -190,17 +197,13 @@ def mixed(tmp_path, small_street):
     return image_folder(tmp_path)
 
 
-def test_bad_images_fail_by_default_with_the_mend(mixed):
-    with pytest.raises(InputError, match=r"1\.png.*0 bytes.*, or skip bad images"):
-        pipeline.extract(mixed, SIFT)
-
-
 def test_skipped_images_are_listed_and_never_shortlisted(mixed, opened):
-    found = pipeline.extract(mixed, SIFT, skip_bad=True)
+    archive, vlad = Archive(skip_bad=True), Aggregated(SIFT, VladFitting(num_words=4))
+    [found] = archive.local(mixed, SIFT)
     assert sorted(found.bad) == [1, 2]
     assert not found.counts[[1, 2, 3]].any()
-    descriptors = pipeline.describe(mixed, found, fit_vlad(pipeline.FeatureSet.of([found[0]]), num_words=4)).values
-    candidates = pipeline.shortlist(descriptors, descriptors, 5)
+    descriptors = archive.vectors(mixed, vlad, mixed).values
+    candidates = EXACT.shortlist(descriptors, descriptors, 5)
     np.testing.assert_array_equal(candidates.indices[0], [0, 4, 3, -1, -1])
     np.testing.assert_array_equal(candidates.indices[1], [-1] * 5)
     matches = pipeline.match(found, found, candidates)
@@ -212,35 +215,29 @@ def test_skipped_images_are_listed_and_never_shortlisted(mixed, opened):
         assert values[0, 0] == values[0, 1] > 0
         assert values[0, 2] == 0.0  # no keypoints, no matches
         assert np.isnan(values[0, 3:]).all()
-        np.testing.assert_array_equal(pipeline.rank(candidates, values)[0], range(5))
-
-
-def test_only_bad_images_are_an_error_even_when_skipped(tmp_path):
-    (tmp_path / "a.png").write_bytes(b"")
-    with pytest.raises(InputError, match=r"none of 1 images can be used; the first: .*a\.png"):
-        pipeline.extract(image_folder(tmp_path), SIFT, skip_bad=True)
+        np.testing.assert_array_equal(reranking.rank_shortlist(candidates, values)[0], range(5))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_features_that_are_not_finite_are_named_and_rank_last(street, value):
     class Broken:
         image_size, interpolation, batch_size = SIFT.image_size, SIFT.interpolation, 3
+        vector_size, scales = SIFT.vector_size, SIFT.scales
         calls = 0
 
         def __call__(self, images):
-            found = SIFT(images)
+            described = SIFT(images)
             if Broken.calls == 0:
-                found[1].descriptors[5, 3] = value
+                described[1].features.descriptors[5, 3] = value
             Broken.calls += 1
-            return found
+            return described
 
-    found = pipeline.extract(street.database, Broken())
+    archive, extractor = Archive(), Broken()
+    [found] = archive.local(street.database, extractor)
     assert list(found.bad) == [1]
     assert "0001.png" in found.bad[1]
-    descriptors = pipeline.describe(
-        street.database, found, fit_vlad(pipeline.FeatureSet.of([found[0]]), num_words=4)
-    ).values
-    candidates = pipeline.shortlist(descriptors, descriptors, 10)
+    descriptors = archive.vectors(street.database, Aggregated(extractor, VladFitting(num_words=4)), street.database)
+    candidates = EXACT.shortlist(descriptors.values, descriptors.values, 10)
     assert (candidates.indices != 1).all()
 
 

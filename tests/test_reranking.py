@@ -3,11 +3,12 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import balancing_c, combine, rank, rerank
-from mfvpr.reranking import fuse
+from mfvpr.reranking import fuse, fuse_scales
 from tests import oracles
 
 
@@ -79,3 +80,67 @@ def test_fusion_and_ranking_compile_once_for_all_callers(compilations):
 
 def test_whole_numbers_are_ranked_as_they_are():
     np.testing.assert_array_equal(rank(jnp.array([2**24, 2**24 + 1, 7])), [1, 0, 2])
+
+
+ROUGH = st.one_of(
+    st.sampled_from([0.0, 0.1, 3.0, np.nan, np.inf, -np.inf]), st.floats(-1e3, 1e3, width=16, allow_subnormal=False)
+)
+
+
+@pytest.mark.parametrize("normalize", ["zscore", "none"])
+@given(data=st.data())
+def test_scales_are_fused_as_in_patch_netvlad(normalize, data):
+    scores = np.array(data.draw(st.lists(ROUGH, min_size=12, max_size=12)), np.float32).reshape(4, 3)
+    mask = np.array(data.draw(st.lists(st.booleans(), min_size=4, max_size=4)))
+    weights = (0.45, 0.15, 0.4)
+    with np.errstate(invalid="ignore"):
+        expected = oracles.fuse_scales(scores, mask, weights, normalize)
+    got = fuse_scales(scores, mask, np.array(weights, np.float32), normalize=normalize)
+    np.testing.assert_allclose(got, expected, rtol=2e-4, atol=2e-4)
+
+
+def test_a_candidate_that_is_not_there_or_no_number_matters_to_itself_alone():
+    scores = np.array([[1.0, 2.0], [3.0, np.nan], [5.0, 10.0], [77.0, -99.0]], np.float32)
+    mask = np.array([True, True, True, False])
+    fused = np.asarray(fuse_scales(scores, mask))
+    high = np.std([1.0, 3.0, 5.0])
+    np.testing.assert_allclose(fused[[0, 2]], [-2 / high - 1, 2 / high + 1], rtol=1e-6)
+    assert np.isnan(fused[[1, 3]]).all()
+
+
+def test_scales_of_equal_scores_say_nothing():
+    """Whatever rounding makes of the mean of equal scores."""
+    rng = np.random.default_rng(0)
+    scores = np.stack([np.full(49, 0.1), rng.random(49)], axis=-1).astype(np.float32)
+    mask = np.ones(49, bool)
+    np.testing.assert_array_equal(fuse_scales(scores, mask), fuse_scales(scores[:, 1:], mask))
+    np.testing.assert_array_equal(fuse_scales(scores[:, :1], mask), np.zeros(49))
+
+
+def test_one_scale_that_is_not_normalized_is_its_scores():
+    scores = np.random.default_rng(0).normal(size=(3, 5, 1)).astype(np.float32)
+    scores[1, 2] = np.nan
+    np.testing.assert_array_equal(fuse_scales(scores, np.ones((3, 5), bool), normalize="none"), scores[..., 0])
+
+
+def test_queries_and_settings_are_fused_one_by_one():
+    rng = np.random.default_rng(0)
+    scores, mask = rng.random((2, 3, 6, 4)).astype(np.float32), rng.random((3, 6)) < 0.7
+    got = fuse_scales(scores, mask)
+    for setting, query in np.ndindex(2, 3):
+        expected = oracles.fuse_scales(scores[setting, query], mask[query], np.ones(4), "zscore")
+        np.testing.assert_allclose(got[setting, query], expected, rtol=1e-5, atol=1e-5)
+
+
+def test_fused_scales_have_a_gradient_where_scores_are_equal_or_missing():
+    mask = np.array([True, True, True, False])
+    equal, own = np.full(4, 2.0), np.array([1.0, np.nan, 4.0, np.nan])
+
+    def total(scores):
+        fused = fuse_scales(scores, mask)
+        return jnp.sum(jnp.where(jnp.isfinite(fused), fused, 0.0) ** 2)
+
+    for scores in (np.stack([equal, equal], 1), np.stack([equal, own], 1)):
+        slope = jax.grad(total)(jnp.asarray(scores, jnp.float32))
+        assert np.isfinite(slope).all()
+    assert slope[[0, 2], 1].any()

@@ -17,8 +17,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from experiments import console, outputs, run_folder
-from experiments import run as evaluation
+from experiments import console, evaluation, run_folder
 from experiments.settings import SettingsError
 from mfvpr.data.ground_truth import AllowedTruth
 from mfvpr.data.images import read_image
@@ -26,6 +25,8 @@ from mfvpr.data.streets import streets_folder
 from mfvpr.errors import InputError
 from mfvpr.evaluation import Positives
 from mfvpr.report import runs
+from mfvpr.report.evaluations import _Page
+from mfvpr.scoring import HistogramOfShifts
 from tests.programs import CANDIDATES, QUERIES, ROOT, composed, shared, small, typed
 
 LINES = ("scorer=histogram", "figures=4")
@@ -45,7 +46,7 @@ def evaluated(root, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def outcome(root):
-    return evaluation._outcome(composed(*small(root), *LINES, "candidates=3"))
+    return evaluation.evaluated(composed(*small(root), *LINES, "candidates=3"))
 
 
 def rows(path):
@@ -145,53 +146,62 @@ def test_a_wrong_figure_has_the_right_image_below(evaluated, outcome):
     assert min(height for name, height in heights.items() if name.startswith("wrong")) > 700
     assert max(height for name, height in heights.items() if name.startswith("right")) < 600
 
-    system = outcome.systems["histogram"]
-    right = outcome.is_right(system)
+    page = page_of(outcome)
+    [ranked], right = outcome.judged.result.systems["histogram"], outcome.judged.is_right("histogram", 0)
     found = {bool(right[query].any()): query for query in np.flatnonzero(~right[:, 0])}
-    names = outcome.dataset.database.names
+    names = outcome.images.dataset.database.names
     query = found[True]
     rank = int(np.argmax(right[query]))
-    [answer] = outputs._right_answer(outcome, query)
-    score = f"{system.scores[query, rank]:.5g}"
-    assert answer.caption == f"right: {names[system.rows[query, rank]]}, rank {rank + 1}, score {score}"
+    [answer] = page._right_answer(query)
+    score = f"{ranked.scores[query, rank]:.5g}"
+    assert answer.caption == f"right: {names[ranked.rows[query, rank]]}, rank {rank + 1}, score {score}"
     assert float(answer.explanation.score) == pytest.approx(float(score), rel=1e-3)
-    [answer] = outputs._right_answer(outcome, found[False])
-    assert answer.caption == f"right: {names[outcome.dataset.truth.place(found[False])]}, not among the 3 candidates"
+    [answer] = page._right_answer(found[False])
+    place = outcome.images.dataset.truth.place(found[False])
+    assert answer.caption == f"right: {names[place]}, not among the 3 candidates"
     assert answer.matches is None
+
+
+def page_of(outcome, **changes):
+    """The figures' page of the only sequence, with another ground truth."""
+    result = outcome.judged.result
+    dataset = replace(result.dataset, sequences=(replace(result.dataset.only, **changes),))
+    judged = replace(outcome.judged, result=replace(result, dataset=dataset))
+    return _Page(judged, 0, outcome.tools.extractor, HistogramOfShifts())
 
 
 def test_what_does_not_count_is_never_shown_as_right(outcome):
     """Where the nearest image is left out, as a neighbor in one sequence, another is; or none."""
-    right = outcome.is_right(outcome.systems["histogram"])
+    right = outcome.judged.is_right("histogram", 0)
     query = int(np.flatnonzero(~right.any(axis=1))[0])
-    names, truth = outcome.dataset.database.names, outcome.dataset.truth
-    excluded = np.zeros((len(outcome.dataset.queries), len(names)), bool)
+    names, truth = outcome.images.dataset.database.names, outcome.images.dataset.truth
+    excluded = np.zeros((len(outcome.images.dataset.queries), len(names)), bool)
     excluded[query, truth.place(query)] = True
 
     def answers(excluded):
-        dataset = replace(outcome.dataset, truth=AllowedTruth(truth, Positives.from_matrix(excluded)))
-        return [answer.caption for answer in outputs._right_answer(replace(outcome, dataset=dataset), query)]
+        page = page_of(outcome, truth=AllowedTruth(truth, Positives.from_matrix(excluded)))
+        return [answer.caption for answer in page._right_answer(query)]
 
-    other = int(np.argmax(outcome.right.dense()[query] & ~excluded[query]))
+    other = int(np.argmax(outcome.judged.right[0].dense()[query] & ~excluded[query]))
     assert answers(excluded) == [f"right: {names[other]}, not among the 3 candidates"]
     assert answers(np.ones_like(excluded)) == []
 
 
 def test_figures_of_chosen_queries(outcome):
-    asked = outputs.asked_figures
-    assert asked([5, "0002.png", 5], outcome.dataset) == [5, 2]
-    assert asked(7, outcome.dataset) == 7
+    asked, dataset = evaluation.asked_figures, outcome.images.dataset
+    assert asked([5, "0002.png", 5], dataset) == [5, 2]
+    assert asked(7, dataset) == 7
     for wrong in (24, -1, "nope.png"):
         with pytest.raises(SettingsError, match=r"expected rows of queries from 0 to 23, or names such as 0000"):
-            asked([0, wrong], outcome.dataset)
-    assert list(outputs._shown(replace(outcome, shown=[5, 2]))) == [5, 2]
+            asked([0, wrong], dataset)
+    assert list(page_of(outcome).shown([5, 2])) == [5, 2]
 
 
 # --- the claim ---------------------------------------------------------------------------------------------------
 
 
 def test_a_folder_in_use_is_refused_at_the_start(root, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(evaluation, "_outcome", lambda *_: pytest.fail("it was begun"))
+    monkeypatch.setattr(evaluation, "evaluated", lambda *_: pytest.fail("it was begun"))
     with runs.claimed(tmp_path / "out"):
         code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *small(root), f"out={tmp_path}/out")
     assert (code, stdout) == (2, "")
@@ -306,7 +316,9 @@ def test_a_figure_that_cannot_be_drawn_costs_a_warning(root, evaluated, tmp_path
 
 
 def test_ctrl_c_while_figures_are_drawn_keeps_the_tables(root, evaluated, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(outputs, "histogram_figure", lambda *_, **__: os.kill(os.getpid(), signal.SIGINT))
+    monkeypatch.setattr(
+        "mfvpr.report.evaluations.histogram_figure", lambda *_, **__: os.kill(os.getpid(), signal.SIGINT)
+    )
     code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *small(root), *LINES, f"out={tmp_path}/out")
     assert code == 130
     assert "\nhistogram + filter " in stdout

@@ -1,21 +1,16 @@
 """Which store belongs to what; stores half done, or of something else, as the pipeline and the programs meet them."""
 
+import shutil
 from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
-from experiments import prepare, stores
 from mfvpr import InputError, Shortlist, pipeline
-from mfvpr.data.contents import contents
-from mfvpr.data.datasets import image_folder
-from mfvpr.features.sift import Sift
 from mfvpr.sources import FeatureSet
-from mfvpr.stores.manifest import store_path
 from mfvpr.stores.matches import open_match_store
 from mfvpr.types import Matches
-from mfvpr.weights import files
-from tests.programs import composed
+from tests.programs import composed, matches_path
 from tests.stores.made_up import digests, features_of
 
 # Matches of another shortlist
@@ -112,48 +107,31 @@ def settings_of(folder, *changes):
     )  # fmt: skip
 
 
-def matches_path(settings, images=None):
-    images = images or prepare.images(settings).fingerprints
-    return stores.matches_path(settings["store"], stores.matches_recipe(settings, images, 3))
-
-
-def test_a_store_belongs_to_images_whatever_their_data_set_is_called(small_street, tmp_path, capsys):
-    folder, extractor = image_folder(small_street / "database"), Sift(max_keypoints=40)
-    settings, images = {"name": "sift", "max_keypoints": 40}, contents(folder).fingerprint
-    for name in ("summer database", "winter queries"):
-        with stores.opened(str(tmp_path), name, folder, extractor, settings, images, wait=False) as store:
-            assert store.done.all() == (name != "summer database")
-            pipeline.extract(folder, extractor, store=store)
-    [path] = tmp_path.iterdir()
-    assert path.name.startswith("sift-")
-    told = capsys.readouterr().err.splitlines()
-    assert told[0].startswith("summer database: 10 of 10 images to do")
-    assert told[-1] == f"winter queries: all 10 images from {path}"
-
-
 def test_matches_belong_to_images_whatever_their_data_set_is_called(small_street, tmp_path):
     paths = {
-        matches_path(settings_of(small_street, f"store={tmp_path}", f"dataset.name={name}")) for name in ("one", "two")
+        matches_path(settings_of(small_street, f"store={tmp_path}", f"dataset.name={name}"))[0]
+        for name in ("one", "two")
     }
-    [path] = paths
-    assert path.name.startswith("sift_matches-")
+    assert len(paths) == 1
 
 
-def test_matches_of_runs_that_skip_bad_images_are_kept_apart(small_street):
-    """Else a run that stops at a bad image would find all matches, and not stop."""
-    images = {"database": "0", "query": "1"}
-    paths = {matches_path(settings_of(small_street, f"on_bad_image={word}"), images) for word in ("fail", "skip")}
-    assert len(paths) == 2
+@pytest.mark.parametrize(
+    "change",
+    ["on_bad_image=skip", "candidates=4", "features.max_keypoints=41", "retrieval.num_words=5", "retrieval.whiten=3",
+     "matching.max_distance=1", "dataset.exclude_neighbors=0"],
+)  # fmt: skip
+def test_matches_of_other_settings_are_kept_apart(small_street, tmp_path, change):
+    """Of those that skip bad images too: else a run that stops at one would find all matches, and not stop."""
+    street = tmp_path / "street"  # whose queries are database images
+    for side in ("database", "queries"):
+        shutil.copytree(small_street / "database", street / side)
+    plain, other = (matches_path(settings_of(street, f"store={tmp_path}/s", *more))[0] for more in ((), (change,)))
+    assert plain != other
 
 
-def test_features_belong_to_the_weights_whatever_they_are_called(tmp_path, monkeypatch):
-    """Weights that are installed anew under the same name make other features, descriptors and matches."""
-    monkeypatch.setenv("MFVPR_WEIGHTS", str(tmp_path))
-    source, settings, paths = tmp_path / "source", {"name": "mixvpr", "weights": "mixvpr_128"}, []
-    source.write_text("not published")
-    for value in (0, 1):
-        files.save("mixvpr_128", {"a": np.full(3, value, np.float32)}, source, parameters=3)
-        recipe = stores.features_recipe(settings, "images")
-        assert recipe["extractor"]["weights_sha256"] == files.fingerprint("mixvpr_128")
-        paths.append(store_path(tmp_path, "mixvpr", recipe))
-    assert paths[0] != paths[1]
+def test_matches_do_not_depend_on_how_they_are_computed(small_street, tmp_path):
+    paths = {
+        matches_path(settings_of(small_street, f"store={tmp_path}", change))[0]
+        for change in ("matching.chunk_size=3", "memory=1", "devices=all")
+    }
+    assert len(paths) == 1

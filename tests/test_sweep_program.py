@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments import axes, launch, prepare, search, stores
-from experiments import run as evaluation
+from experiments import axes, evaluation, launch, search
+from mfvpr.archive import Archive
 from mfvpr.stores import matches as match_store
-from tests.programs import CANDIDATES, QUERIES, ROOT, composed, results, shared, small, snapshot, typed
+from tests.programs import CANDIDATES, QUERIES, ROOT, composed, matches_path, results, shared, small, snapshot, typed
 
 SWEEP = sys.modules["mfvpr.sweeping.sweep"]
 
@@ -146,7 +146,7 @@ def test_split_reports_every_query_once_by_what_it_did_not_choose(sweep, swept, 
 
 
 def test_no_features_are_read_where_the_matches_are_stored(sweep, swept, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(prepare, "extracted", lambda *_: pytest.fail("features were read"))
+    monkeypatch.setattr(Archive, "local", lambda *_, **options: pytest.fail("features were read"))
     sweep(tmp_path / "out", *GRID)
     stderr = capsys.readouterr().err
     assert "folder sift matches: all 24 queries from" in stderr
@@ -292,10 +292,7 @@ def test_matches_of_something_else_are_refused(root, swept, tmp_path, monkeypatc
     """A store that was moved to where another one belongs."""
 
     def place(*changes):
-        settings = composed(*small(root), *changes, config="sweep")
-        images = prepare.images(settings)
-        recipe = stores.matches_recipe(settings, images.fingerprints, settings["candidates"])
-        return stores.matches_path(settings["store"], recipe)
+        return matches_path(composed(*small(root), *changes, config="sweep"))[0]
 
     own, foreign = place(f"store={tmp_path}/store"), place(change)
     with match_store.open_match_store(own, {"other": 1}, num_queries=24, num_candidates=8):

@@ -15,6 +15,7 @@ import numpy as np
 from experiments.benchmark.harness import Entry, Lineup, Results, Seconds, compete
 from mfvpr.data.images import read_image, resize
 from mfvpr.data.streets import draw_streets
+from mfvpr.features import Description
 from mfvpr.features.aliked import AlikedFeatures
 from mfvpr.features.d2net import D2NetFeatures
 from mfvpr.features.mixvpr import MixVprDescriptor
@@ -63,8 +64,9 @@ def _remarks(seconds: Seconds, results: Results) -> Iterator[str]:
         yield f"D2-Net, batch {count}: detection adds {100 * share:.1f} % to the dense map"
     counts: dict[str, list[str]] = {}
     for (step, name), result in results.items():
-        if hasattr(result[0], "keypoints"):
-            mean = np.mean([len(features.keypoints) for features in result])
+        local: list[Any] = [one.features if isinstance(one, Description) and one.local else one for one in result]
+        if hasattr(local[0], "keypoints"):
+            mean = np.mean([len(features.keypoints) for features in local])
             counts.setdefault(step, []).append(f"{name} {mean:.1f}")
     yield from (f"{step}: keypoints per image: {'; '.join(means)}" for step, means in counts.items())
     yield PAPER
@@ -125,7 +127,7 @@ def of_mixvpr(images: np.ndarray) -> list[Entry]:
     """Descriptors on the host."""
     model, arrays = make_network(MIXVPR)
     step = "MixVPR descriptor"
-    entries = of_mfvpr({step: lambda count: partial(MixVprDescriptor(model, batch_size=count), features=())}, images)
+    entries = of_mfvpr({step: lambda count: MixVprDescriptor(model, batch_size=count)}, images)
     if find_spec("torch"):
         from experiments.benchmark.torch_networks import mixvpr
 

@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,22 +45,63 @@ class ImageFolder:
 
 
 @dataclass(frozen=True)
-class Dataset:
-    """Database and queries with their ground truth.
+class QuerySequence:
+    """Query images of one drive or walk, with their ground truth.
 
     Attributes:
         name: what results call it.
-        database: images to find.
-        queries: images to find them for.
-        truth: which are right; None = only rankings can be told.
+        images: to find in the database.
+        truth: which database images are right; None = only rankings can be told.
         excluded: the database images that each query may not find; None = it may find all.
     """
 
     name: str
-    database: ImageFolder
-    queries: ImageFolder
+    images: ImageFolder
     truth: Truth | None
     excluded: Positives | None = None
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """One database, and the query sequences that are to be found in it.
+
+    Attributes:
+        name: what results call it.
+        database: images to find.
+        sequences: at least one.
+    """
+
+    name: str
+    database: ImageFolder
+    sequences: tuple[QuerySequence, ...]
+
+    @property
+    def only(self) -> QuerySequence:
+        """The only sequence.
+
+        Raises:
+            InputError: there are several.
+        """
+        if len(self.sequences) != 1:
+            raise InputError(f"{self.name}: expected one query sequence, got {len(self.sequences)}; choose one of "
+                             f"{', '.join(sequence.name for sequence in self.sequences)}")  # fmt: skip
+        [sequence] = self.sequences
+        return sequence
+
+    @property
+    def queries(self) -> ImageFolder:
+        """Of the only sequence."""
+        return self.only.images
+
+    @property
+    def truth(self) -> Truth | None:
+        """Of the only sequence."""
+        return self.only.truth
+
+    @property
+    def excluded(self) -> Positives | None:
+        """Of the only sequence."""
+        return self.only.excluded
 
 
 def image_folder(root: Path, *, orient: bool = True, bits: int | None = 16) -> ImageFolder:
@@ -113,20 +154,84 @@ def folder_dataset(
         orient: how the images are read, see `mfvpr.data.images.read_image`.
         bits: likewise.
     """
-    database_folder, query_folder = (image_folder(root, orient=orient, bits=bits) for root in (database, queries))
+    images = image_folder(database, orient=orient, bits=bits)
+    sequence = _sequence(
+        name, images, queries, ground_truth=ground_truth, index_file=index_file, widen_index=widen_index,
+        database_labels=database_labels, query_labels=query_labels,
+    )  # fmt: skip
+    return Dataset(name, images, (sequence,))
+
+
+def sequences_dataset(
+    database: Path,
+    queries: Sequence[Path],
+    *,
+    ground_truth: str | None,
+    name: str = "sequences",
+    index_file: str | None = None,
+    widen_index: bool = False,
+    orient: bool = True,
+    bits: int | None = 16,
+) -> Dataset:
+    """One folder of database images and several of queries, each a sequence that is called as its folder.
+
+    Args:
+        database: folder of database images.
+        queries: folders of query images, each of another name.
+        ground_truth: one of `ground_truth.KINDS` but `label`, of every sequence.
+        name: what results call it.
+        index_file: for `index`, the file's name in the folder of each sequence, see `truth_files.truth_from_file`.
+        widen_index: for `index`, whether database images within a tolerance in frames count as well.
+        orient: how the images are read, see `mfvpr.data.images.read_image`.
+        bits: likewise.
+
+    Raises:
+        InputError: no sequence, or two of one name; or as `folder_dataset`.
+    """
+    names = [folder.absolute().name for folder in queries]
+    if not names:
+        raise InputError("queries: expected the folder of at least one sequence, got none")
+    for twice in {one for one in names if names.count(one) > 1}:
+        raise InputError(
+            f"queries: expected sequences of different names, got {twice} twice; rename one of the folders"
+        )
+    images = image_folder(database, orient=orient, bits=bits)
+    sequences = (
+        _sequence(
+            one, images, folder, ground_truth=ground_truth, index_file=folder / index_file if index_file else None,
+            widen_index=widen_index, database_labels=None, query_labels=None,
+        )
+        for one, folder in zip(names, queries, strict=True)
+    )  # fmt: skip
+    return Dataset(name, images, tuple(sequences))
+
+
+def _sequence(
+    name: str,
+    database: ImageFolder,
+    queries: Path,
+    *,
+    ground_truth: str | None,
+    index_file: Path | None,
+    widen_index: bool,
+    database_labels: Path | None,
+    query_labels: Path | None,
+) -> QuerySequence:
+    """The queries of a folder, read as the database is, with their ground truth."""
+    images = image_folder(queries, orient=database.orient, bits=database.bits)
     files = {"index_file": index_file, "database_labels": database_labels, "query_labels": query_labels}
     _check_files(ground_truth, files)
-    names = query_folder.names, database_folder.names
+    names = images.names, database.names
     truth: Truth | None = None
     if ground_truth == "order":
-        truth = truth_by_order(len(query_folder), len(database_folder))
+        truth = truth_by_order(len(images), len(database))
     elif ground_truth == "utm":
         truth = truth_from_names(*names)
     elif index_file:
         truth = truth_from_file(index_file, *names, widened=widen_index)
     elif query_labels and database_labels:
         truth = truth_from_labels(query_labels, database_labels, *names)
-    return Dataset(name, database_folder, query_folder, truth)
+    return QuerySequence(name, images, truth)
 
 
 def _check_files(ground_truth: str | None, files: Mapping[str, Path | None]) -> None:

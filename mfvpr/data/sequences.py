@@ -4,7 +4,7 @@ from collections import defaultdict
 from dataclasses import replace
 
 from mfvpr.data.contents import Contents
-from mfvpr.data.datasets import Dataset
+from mfvpr.data.datasets import QuerySequence
 from mfvpr.data.ground_truth import AllowedTruth, FrameTruth
 from mfvpr.errors import InputError
 
@@ -20,14 +20,15 @@ def own_rows(queries: Contents, database: Contents) -> OwnRows:
     return tuple(tuple(rows.get(file.sha256, ())) for file in queries.files)
 
 
-def without_neighbors(dataset: Dataset, own: OwnRows, neighbors: int) -> Dataset:
-    """The data set in which no query finds itself, nor what stands within `neighbors` frames of it in the database.
+def without_neighbors(sequence: QuerySequence, num_database: int, own: OwnRows, neighbors: int) -> QuerySequence:
+    """The queries, none of which finds itself, nor what stands within `neighbors` frames of it in the database.
 
     Neither do these images count as right: a query all of whose right answers they are has none, and is a failure.
 
     Args:
-        dataset: whose database is a sequence.
-        own: `own_rows` of it.
+        sequence: of a database that is a sequence.
+        num_database: N.
+        own: `own_rows` of both.
         neighbors: in frames; 0 = the image itself alone.
 
     Raises:
@@ -36,8 +37,8 @@ def without_neighbors(dataset: Dataset, own: OwnRows, neighbors: int) -> Dataset
     if not any(own):
         raise InputError(
             f"exclude_neighbors={neighbors}: expected queries that are among the database images, got none in "
-            f"{dataset.queries.root}; leave it out for two different sequences"
+            f"{sequence.images.root}; leave it out for two different sequences"
         )
-    excluded = FrameTruth(own, len(dataset.database)).positives(neighbors)
-    truth = None if dataset.truth is None else AllowedTruth(dataset.truth, excluded)
-    return replace(dataset, truth=truth, excluded=excluded)
+    excluded = FrameTruth(own, num_database).positives(neighbors)
+    truth = None if sequence.truth is None else AllowedTruth(sequence.truth, excluded)
+    return replace(sequence, truth=truth, excluded=excluded)

@@ -1,20 +1,49 @@
-"""Images -> local Features, images -> global descriptors: what puts OpenCV or a network to work.
+"""Images -> descriptions: what puts OpenCV or a network to work.
 
-Both kinds take a batch of images that were squashed to the size they ask for, so that whoever feeds them (threads that
-decode while the device works) need not know what they are.
+An extractor takes a batch of images that were squashed to the size it asks for, so that whoever feeds it (threads that
+decode while the device works) need not know what it is. One pass may give a global descriptor of the image, local
+features, of one scale or of several, or both. What is computed from local features alone is an aggregation.
 """
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from mfvpr.data.images import Interpolation
+from mfvpr.sources import FeatureSet
 from mfvpr.types import Features
 
 
-class LocalExtractor(Protocol):
-    """Images `[B, H, W, 3]` uint8 RGB -> one unpadded Features per image (NumPy, mask all True)."""
+class Scale(NamedTuple):
+    """Local features of one scale: D of the `descriptors`, and `typical_count` of an image, for forecasts of space."""
+
+    dimension: int
+    typical_count: int
+
+
+class Description(NamedTuple):
+    """What one pass over an image gives. NumPy.
+
+    vector: `[D]` global descriptor of unit length, or several `[V, D]`; None = none.
+    local: Features by scale, unpadded, mask all True; () = none.
+    """
+
+    vector: np.ndarray | None = None
+    local: tuple[Features, ...] = ()
+
+    @property
+    def features(self) -> Features:
+        """Of the only scale."""
+        [features] = self.local
+        return features
+
+
+class Extractor(Protocol):
+    """Images `[B, H, W, 3]` uint8 RGB -> a Description of each.
+
+    With a store its recipe is needed, see `mfvpr.fingerprints.recipe_of`: a frozen dataclass has one.
+    """
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -32,44 +61,32 @@ class LocalExtractor(Protocol):
         ...
 
     @property
-    def dimension(self) -> int:
-        """D of the descriptors."""
+    def vector_size(self) -> int:
+        """Numbers of the global descriptor; 0 = there is none."""
         ...
 
     @property
-    def typical_count(self) -> int:
-        """Features that an image has, roughly: for forecasts of disk space."""
+    def scales(self) -> tuple[Scale, ...]:
+        """Of the local features; () = there are none."""
         ...
 
-    def __call__(self, images: np.ndarray) -> list[Features]: ...
+    def __call__(self, images: np.ndarray) -> list[Description]: ...
 
 
-class GlobalExtractor(Protocol):
-    """Images, or the local features already taken from them -> descriptors `[B, D]` of unit length."""
+class Aggregation(Protocol):
+    """Local features -> a global descriptor of each image `[B, D]` of unit length."""
 
     @property
-    def image_size(self) -> tuple[int, int] | None:
-        """(width, height) that images are squashed to; None = reads the local features alone."""
+    def vector_size(self) -> int:
+        """D."""
         ...
 
-    @property
-    def interpolation(self) -> Interpolation:
-        """How they are squashed."""
-        ...
+    def __call__(self, images: Sequence[Features]) -> np.ndarray: ...
 
-    @property
-    def batch_size(self) -> int:
-        """Images per call."""
-        ...
 
-    @property
-    def dimension(self) -> int:
-        """D of the descriptors."""
-        ...
+class Fitting(Protocol):
+    """What an aggregation is before it has seen the database."""
 
-    @property
-    def typical_count(self) -> int:
-        """1: descriptors of an image."""
+    def fit(self, database: FeatureSet) -> Aggregation:
+        """Fitted on the database's local features; the same ones give the same aggregation."""
         ...
-
-    def __call__(self, images: np.ndarray | None, features: Sequence[Features]) -> np.ndarray: ...

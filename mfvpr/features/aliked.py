@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, cached_property
 from typing import Any
 
@@ -12,6 +12,7 @@ from jax import Array
 
 from mfvpr.data.images import Interpolation
 from mfvpr.errors import InputError
+from mfvpr.features import Description, Scale
 from mfvpr.features.network import compiled, in_batches
 from mfvpr.models.aliked import Aliked
 from mfvpr.models.aliked_detection import RADIUS, Detections
@@ -43,7 +44,7 @@ class AlikedFeatures:
     interpolation: Interpolation = "pil_bilinear"
     threshold: float = 0.1
     max_keypoints: int | None = 5000
-    batch_size: int = 8
+    batch_size: int = field(default=8, metadata={"recipe": False})
 
     def __post_init__(self) -> None:
         if min(self.image_size) < _SMALLEST:
@@ -51,17 +52,20 @@ class AlikedFeatures:
             raise InputError(f"ALIKED: expected images of {_SMALLEST} x {_SMALLEST} px or more, got {width} x {height}")
 
     @property
-    def dimension(self) -> int:
-        """128, or 64 of the smallest network."""
-        return self.model.dimension
+    def vector_size(self) -> int:
+        """0: there is no global descriptor."""
+        return 0
 
     @property
-    def typical_count(self) -> int:
-        """One in 125 px, or `max_keypoints`; aliked-n16rot and aliked-n32 find half to two thirds of that."""
-        return min(self._limit, math.prod(self.image_size) // 125)
+    def scales(self) -> tuple[Scale, ...]:
+        """One, of 128 dimensions, or 64 of the smallest network.
 
-    def __call__(self, images: np.ndarray) -> list[Features]:
-        """Features of each image `[B, H, W, 3]` RGB, 0 .. 255.
+        One keypoint in 125 px, or `max_keypoints`; aliked-n16rot and aliked-n32 find half to two thirds of that.
+        """
+        return (Scale(self.model.dimension, min(self._limit, math.prod(self.image_size) // 125)),)
+
+    def __call__(self, images: np.ndarray) -> list[Description]:
+        """Local features of each image `[B, H, W, 3]` RGB, 0 .. 255.
 
         Raises:
             InputError: the images do not have the size asked for.
@@ -78,7 +82,7 @@ class AlikedFeatures:
             again = in_batches(self._program(roomy), images[crowded], self.batch_size)
             for row, result in zip(crowded, again, strict=True):
                 found[row] = result
-        return [self._features(*result) for result in found]
+        return [Description(local=(self._features(*result),)) for result in found]
 
     @property
     def _limit(self) -> int:

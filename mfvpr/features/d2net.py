@@ -1,7 +1,7 @@
 """D2-Net's local features (Dusmanu et al., CVPR 2019), 512 dimensions."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from mfvpr.data.images import Interpolation
 from mfvpr.errors import InputError
+from mfvpr.features import Description, Scale
 from mfvpr.features.network import compiled, in_batches
 from mfvpr.models.d2net import SCALES, STRIDE, D2Net, Detections, Preprocessing, extract, map_size
 from mfvpr.types import Features
@@ -40,10 +41,10 @@ class D2NetFeatures:
     preprocessing: Preprocessing = "caffe"
     multiscale: bool = False
     max_keypoints: int | None = None
-    batch_size: int = 8
+    batch_size: int = field(default=8, metadata={"recipe": False})
 
     def __post_init__(self) -> None:
-        smallest = round((_SMALLEST_MAP + 1) * STRIDE / min(self._scales))
+        smallest = round((_SMALLEST_MAP + 1) * STRIDE / min(self._network_scales))
         if min(self.image_size) < smallest:
             width, height = self.image_size
             scales = ", multi-scale" if self.multiscale else ""
@@ -52,19 +53,23 @@ class D2NetFeatures:
             )
 
     @property
-    def dimension(self) -> int:
-        """512."""
-        return 512
+    def vector_size(self) -> int:
+        """0: there is no global descriptor."""
+        return 0
 
     @property
-    def typical_count(self) -> int:
-        """740 at 336 x 336 px, and in proportion to the map's size; 1.4 times as many with all scales."""
-        width, height = self.image_size
-        found = round(map_size(width) * map_size(height) * 740 / map_size(336) ** 2 * (1.4 if self.multiscale else 1))
-        return found if self.max_keypoints is None else min(found, self.max_keypoints)
+    def scales(self) -> tuple[Scale, ...]:
+        """One, of 512 dimensions: all of the network's own scales are one set of features.
 
-    def __call__(self, images: np.ndarray) -> list[Features]:
-        """Features of each image `[B, H, W, 3]` RGB, 0 .. 255.
+        740 at 336 x 336 px, and in proportion to the map's size; 1.4 times as many with all scales.
+        """
+        width, height = self.image_size
+        share = map_size(width) * map_size(height) / map_size(336) ** 2
+        usual = round(740 * share * (1.4 if self.multiscale else 1))
+        return (Scale(512, usual if self.max_keypoints is None else min(usual, self.max_keypoints)),)
+
+    def __call__(self, images: np.ndarray) -> list[Description]:
+        """Local features of each image `[B, H, W, 3]` RGB, 0 .. 255.
 
         Raises:
             InputError: the images do not have the size asked for.
@@ -76,10 +81,10 @@ class D2NetFeatures:
         crowded = [row for row, levels in enumerate(found) if any(level.count > len(level.mask) for level in levels)]
         for row, levels in zip(crowded, in_batches(self._roomy_program, images[crowded], self.batch_size), strict=True):
             found[row] = levels
-        return [self._features(levels) for levels in found]
+        return [Description(local=(self._features(levels),)) for levels in found]
 
     @property
-    def _scales(self) -> tuple[float, ...]:
+    def _network_scales(self) -> tuple[float, ...]:
         return SCALES if self.multiscale else (1.0,)
 
     @cached_property
@@ -91,7 +96,7 @@ class D2NetFeatures:
         return self._program(1.0)
 
     def _program(self, share: float) -> Callable[..., Any]:
-        function = partial(extract, preprocessing=self.preprocessing, scales=self._scales, share=share)
+        function = partial(extract, preprocessing=self.preprocessing, scales=self._network_scales, share=share)
         return compiled(self.model, function)
 
     def _features(self, levels: tuple[Detections, ...]) -> Features:

@@ -1,7 +1,7 @@
 """MixVPR's global descriptors (Ali-bey et al., WACV 2023), 4096, 512 or 128 dimensions: the paper's filter."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -10,9 +10,9 @@ import numpy as np
 
 from mfvpr.data.images import Interpolation
 from mfvpr.errors import InputError
+from mfvpr.features import Description, Scale
 from mfvpr.features.network import compiled, in_batches
 from mfvpr.models.mixvpr import IMAGE_SIZE, MixVPR, preprocess
-from mfvpr.types import Features
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class MixVprDescriptor:
 
     model: MixVPR
     interpolation: Interpolation = "pil_bicubic"
-    batch_size: int = 8
+    batch_size: int = field(default=8, metadata={"recipe": False})
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -36,29 +36,25 @@ class MixVprDescriptor:
         return IMAGE_SIZE
 
     @property
-    def dimension(self) -> int:
+    def scales(self) -> tuple[Scale, ...]:
+        """(): there are no local features."""
+        return ()
+
+    @property
+    def vector_size(self) -> int:
         """4096, 512 or 128 with published weights."""
         return self.model.dimension
 
-    @property
-    def typical_count(self) -> int:
-        """1: descriptors of an image."""
-        return 1
-
-    def __call__(self, images: np.ndarray | None, features: Sequence[Features]) -> np.ndarray:
-        """`[B, D]` float32 descriptors of unit length, of images `[B, 320, 320, 3]` RGB, 0 .. 255, uint8 or float32.
+    def __call__(self, images: np.ndarray) -> list[Description]:
+        """`[D]` float32 descriptors of unit length, of images `[B, 320, 320, 3]` RGB, 0 .. 255, uint8 or float32.
 
         Raises:
             InputError: the images have another size.
-            ValueError: no images.
         """
-        if images is None:
-            raise ValueError("MixVPR describes images, but got none")
         if images.shape[1:3] != IMAGE_SIZE[::-1]:
             height, width = images.shape[1:3]
             raise InputError(f"MixVPR: expected images of {IMAGE_SIZE[0]} x {IMAGE_SIZE[1]} px, got {width} x {height}")
-        found = in_batches(self._program, images, self.batch_size)
-        return np.array(found, np.float32).reshape(len(images), self.dimension)
+        return [Description(np.asarray(vector)) for vector in in_batches(self._program, images, self.batch_size)]
 
     @cached_property
     def _program(self) -> Callable[..., Any]:

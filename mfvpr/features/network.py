@@ -7,6 +7,9 @@ import jax
 import numpy as np
 from flax import nnx
 
+from mfvpr import ragged
+from mfvpr.numerics import device_bytes
+
 
 def compiled(model: nnx.Module, function: Callable[..., Any]) -> Callable[..., Any]:
     """`function(model, ...)` as one program per shape. The weights lie on the device once, and are not constants."""
@@ -19,15 +22,13 @@ def compiled(model: nnx.Module, function: Callable[..., Any]) -> Callable[..., A
 def in_batches(program: Callable[[Any], Any], images: np.ndarray, batch_size: int) -> list[Any]:
     """What `program` gives for each image of `[B, H, W, 3]`, NumPy.
 
-    A CPU takes them one by one, which keeps activations in its caches (a batch of 8 is no faster there); elsewhere
-    the last batch is filled up, so that there is one program.
+    A device without memory of its own takes them one by one, which keeps activations in the processor's caches (a batch
+    of 8 is no faster there); elsewhere the last batch is filled up, so that there is one program.
     """
-    size = 1 if jax.default_backend() == "cpu" else batch_size
+    size = 1 if device_bytes(()) is None else batch_size
     found = []
     for start in range(0, len(images), size):
         batch = images[start : start + size]
-        missing = size - len(batch)
-        padded = np.concatenate([batch, np.repeat(batch[-1:], missing, axis=0)]) if missing else batch
-        results = jax.tree.map(np.asarray, program(padded))
+        results = jax.tree.map(np.asarray, program(ragged.filled(batch, size)))
         found += [jax.tree.map(lambda field, row=row: field[row], results) for row in range(len(batch))]
     return found

@@ -1,11 +1,12 @@
 """OpenCV SIFT as RootSIFT (Lowe, IJCV 2004; Arandjelovic & Zisserman, CVPR 2012): local features without a download."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 
 from mfvpr.data.images import Interpolation
+from mfvpr.features import Description, Scale
 from mfvpr.types import Features
 
 
@@ -26,21 +27,21 @@ class Sift:
     max_keypoints: int | None = 800
     contrast_threshold: float = 0.01
     clahe_clip: float = 0.0
-    batch_size: int = 8
+    batch_size: int = field(default=8, metadata={"recipe": False})
 
     @property
-    def dimension(self) -> int:
-        """128."""
-        return 128
+    def vector_size(self) -> int:
+        """0: there is no global descriptor."""
+        return 0
 
     @property
-    def typical_count(self) -> int:
-        """What textured images reach: `max_keypoints`, or one keypoint in 100 px."""
-        return self.max_keypoints or self.image_size[0] * self.image_size[1] // 100
+    def scales(self) -> tuple[Scale, ...]:
+        """One, of 128 dimensions; textured images reach `max_keypoints`, or one keypoint in 100 px."""
+        return (Scale(128, self.max_keypoints or self.image_size[0] * self.image_size[1] // 100),)
 
-    def __call__(self, images: np.ndarray) -> list[Features]:
-        """Features of each image `[B, H, W, 3]` uint8 RGB."""
-        return [self._extract(image) for image in images]
+    def __call__(self, images: np.ndarray) -> list[Description]:
+        """Local features of each image `[B, H, W, 3]` uint8 RGB."""
+        return [Description(local=(self._extract(image),)) for image in images]
 
     def _extract(self, image: np.ndarray) -> Features:
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import softmax
 
-from mfvpr.data.images import Interpolation
 from mfvpr.errors import InputError
 from mfvpr.sources import FeatureSet
 from mfvpr.types import Features
@@ -23,25 +22,68 @@ _CHUNK = 2**23  # numbers of an array at a time: few large products, which do no
 
 
 @dataclass(frozen=True)
+class VladFitting:
+    """How a vocabulary is learned: the centers of a mixture of round Gaussians of equal size, by a few steps of EM.
+
+    That is k-means whose memberships are soft, so that it is smooth in the descriptors. k-means itself is not: a last
+    bit, or one keypoint more, moves a descriptor to another word, and every step multiplies the difference.
+
+    Attributes:
+        num_words: M.
+        power: exponent of the power law.
+        max_samples: descriptors to learn from, at most.
+        seed: of the images that are drawn, and of the start: a normal draw with the descriptors' mean and covariance.
+
+    Raises:
+        InputError: `max_samples` are fewer than `num_words`.
+    """
+
+    num_words: int = 64
+    power: float = 0.5
+    max_samples: int = 100_000
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.max_samples < self.num_words:
+            raise InputError(f"max_samples={self.max_samples}: expected at least one for each of "
+                             f"num_words={self.num_words} words")  # fmt: skip
+
+    def fit(self, database: FeatureSet) -> "Vlad":
+        """The vocabulary of the database, of which some images are drawn where all have more than `max_samples`.
+
+        Raises:
+            InputError: the database has fewer descriptors than there are words.
+        """
+        counts = database.counts
+        if counts.sum() < self.num_words:
+            raise InputError(
+                f"{counts.sum()} local features in {len(database)} database images: expected at least one for each of "
+                f"the {self.num_words} words; check the images and what finds their features, or lower num_words"
+            )
+        rng = np.random.default_rng(self.seed)
+        drawn = rng.permutation(len(database))  # whole images: a feature more in one of them changes no other's part
+        enough = 1 + np.searchsorted(np.cumsum(counts[drawn]), self.max_samples)
+        real = [image.descriptors for _, image in database.read(drawn[:enough].tolist())]
+        centers = _mixture(np.concatenate(real)[: self.max_samples], self.num_words, rng)
+        return Vlad(centers.astype(np.float32), self.power)
+
+
+@dataclass(frozen=True)
 class Vlad:
     """A vocabulary of M visual words `centers` `[M, D]`, and the power law's exponent."""
 
     centers: np.ndarray  # [M, D]
     power: float = 0.5
-    image_size: None = None  # reads features, no pixels
-    interpolation: Interpolation = "pil_bilinear"
-    batch_size: int = 16
-    typical_count: int = 1
 
     @property
-    def dimension(self) -> int:
+    def vector_size(self) -> int:
         """Words x dimension of the local descriptors."""
         return self.centers.size
 
-    def __call__(self, images: np.ndarray | None, features: Sequence[Features]) -> np.ndarray:
+    def __call__(self, images: Sequence[Features]) -> np.ndarray:
         """`[B, M * D]` float32 descriptors of unit length; zero where an image has no features."""
         # All images at once, for the same reason.
-        real = [one.descriptors[one.mask] for one in features]
+        real = [features.descriptors[features.mask] for features in images]
         descriptors = np.concatenate(real)
         word = _nearest(descriptors, self.centers)
         cell = np.repeat(np.arange(len(real)) * len(self.centers), list(map(len, real))) + word
@@ -53,41 +95,7 @@ class Vlad:
             residuals[occupied] = sums - counts[:, None] * self.centers[occupied % len(self.centers)]
         vlad = _normalized(residuals)
         vlad = np.sign(vlad) * np.abs(vlad) ** self.power
-        return _normalized(vlad.reshape(len(real), self.dimension))
-
-
-def fit_vlad(
-    database: FeatureSet, *, num_words: int = 64, power: float = 0.5, max_samples: int = 100_000, seed: int = 0
-) -> Vlad:
-    """Vocabulary of the database: the centers of a mixture of round Gaussians of equal size, by a few steps of EM.
-
-    That is k-means whose memberships are soft, so that it is smooth in the descriptors. k-means itself is not: a last
-    bit, or one keypoint more, moves a descriptor to another word, and every step multiplies the difference.
-
-    Args:
-        database: images, of which some are drawn where all have more than `max_samples` descriptors.
-        num_words: M.
-        power: exponent of the power law.
-        max_samples: descriptors to learn from, at most.
-        seed: of the images that are drawn, and of the start: a normal draw with the descriptors' mean and covariance.
-
-    Raises:
-        InputError: the database has fewer descriptors than `num_words`, or `max_samples` are fewer.
-    """
-    if max_samples < num_words:
-        raise InputError(f"max_samples={max_samples}: expected at least one for each of num_words={num_words} words")
-    counts = database.counts
-    if counts.sum() < num_words:
-        raise InputError(
-            f"{counts.sum()} local features in {len(database)} database images: expected at least one for each of the "
-            f"{num_words} words; check the images and what finds their features, or lower num_words"
-        )
-    rng = np.random.default_rng(seed)
-    drawn = rng.permutation(len(database))  # whole images: one feature more in one of them changes no other's part
-    enough = 1 + np.searchsorted(np.cumsum(counts[drawn]), max_samples)
-    real = [image.descriptors for _, image in database.read(drawn[:enough].tolist())]
-    centers = _mixture(np.concatenate(real)[:max_samples], num_words, rng)
-    return Vlad(centers.astype(np.float32), power)
+        return _normalized(vlad.reshape(len(real), self.vector_size))
 
 
 def _mixture(sample: np.ndarray, num_words: int, rng: np.random.Generator) -> np.ndarray:

@@ -9,7 +9,6 @@ import jax
 import numpy as np
 import optax
 
-from mfvpr import pipeline
 from mfvpr.errors import InputError
 from mfvpr.evaluation import Judge, best_setting, hits
 from mfvpr.learning.losses import Loss, cross_entropy
@@ -19,7 +18,8 @@ from mfvpr.learning.parameters import can_learn
 from mfvpr.learning.splits import Batch, TrainingSplit, training_splits
 from mfvpr.learning.training import Fit, fit
 from mfvpr.match_sets import MatchSet
-from mfvpr.pipeline import FilterScore, Ties
+from mfvpr.progress import untracked
+from mfvpr.reranking import FilterScore, Ties
 from mfvpr.scoring import Scorer, parameters
 from mfvpr.sweeping import Axes, Setting, sweep
 from mfvpr.sweeping.search import Stages, untracked_stages
@@ -202,7 +202,7 @@ class _Compared:
         self, name: str, scorer: Scorer, settings: Sequence[Setting], queries: np.ndarray, seen: np.ndarray
     ) -> np.ndarray:
         """`[S, q, 1]` the first row of some queries' rankings of the candidates that are seen, by every setting."""
-        track = self.track(f"{self.split.name}: {name}") if len(settings) > 1 else pipeline.untracked
+        track = self.track(f"{self.split.name}: {name}") if len(settings) > 1 else untracked
         part, views = self.split.part(queries), [seen[queries]]
         return sweep(scorer, settings, *part, views=views, depth=1, ties=self.options.ties, track=track)[0]
 

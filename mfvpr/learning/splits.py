@@ -6,13 +6,14 @@ from functools import cached_property, partial
 import jax
 import numpy as np
 
-from mfvpr import pipeline, ragged
+from mfvpr import ragged, reranking
 from mfvpr.errors import InputError
 from mfvpr.evaluation import Half, Judge, Positives, separated
 from mfvpr.match_sets import MatchSet
 from mfvpr.numerics import round_up
-from mfvpr.pipeline import FilterScore
+from mfvpr.reranking import FilterScore
 from mfvpr.scoring import Scorer
+from mfvpr.sweeping.scores import score
 from mfvpr.types import Matches, Shortlist, value
 
 VALIDATION = 0.25  # of the queries to learn on, the end of their block
@@ -91,7 +92,7 @@ class TrainingSplit:
 
     def spread(self, scorer: Scorer) -> float:
         """Standard deviation of the scores that learning may see; 1 where all are equal."""
-        scores = pipeline.score({"it": scorer}, *self.part(self.train))["it"]
+        scores = score({"it": scorer}, *self.part(self.train))["it"]
         return float(np.std(scores[self.seen[self.train]])) or 1.0
 
     def balance(self, spread: float) -> float:
@@ -109,7 +110,7 @@ def training_splits(
         match_set: matches of Q queries with C candidates.
         candidates: their shortlist.
         judge: what is right, with halves.
-        filter_score: the filter's part of a combined score, see `mfvpr.pipeline.filter_scores`.
+        filter_score: the filter's part of a combined score, see `mfvpr.reranking.filter_scores`.
 
     Raises:
         InputError: the judge has no halves, or one has no queries that teach, or none to validate with.
@@ -117,7 +118,7 @@ def training_splits(
     if not judge.halves:
         raise InputError("split=None: expected first_half, second_half or both, since what is learned is never "
                          "reported on the same queries")  # fmt: skip
-    candidates = replace(candidates, scores=pipeline.filter_scores(candidates, filter_score))
+    candidates = replace(candidates, scores=reranking.filter_scores(candidates, filter_score))
     split = partial(_split, match_set, candidates, judge)
     return [split(half, name) for half, name in zip(judge.halves, judge.names, strict=True)]
 

@@ -1,7 +1,7 @@
 """Gradient descent on a pytree of arrays: validated, stopped in time, and resumed to the bit."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +14,8 @@ import optax
 
 from mfvpr.errors import InputError
 from mfvpr.learning import checkpoints
+from mfvpr.progress import Track, untracked
 from mfvpr.types import Array
-
-Track = Callable[[Iterable[int], int], Iterable[int]]
 
 
 class TrainingError(InputError):
@@ -69,7 +68,7 @@ def fit(
     patience: int | None = None,
     folder: Path | None = None,
     recipe: Mapping[str, Any] | None = None,
-    track: Track = lambda items, total: items,
+    track: Track = untracked,
 ) -> Fit:
     """Minimize the objective.
 

@@ -3,8 +3,6 @@
 The manifest is written before anything else and compared, ingredient by ingredient, whenever the store is opened.
 """
 
-import hashlib
-import itertools
 import json
 import os
 import re
@@ -15,11 +13,11 @@ from typing import Any
 
 from mfvpr.data.files import replacing
 from mfvpr.errors import InputError
+from mfvpr.fingerprints import difference, fingerprint, shortened
 
 MANIFEST = "manifest.json"
 _OLD_MANIFEST = "zarr.json"  # of format 1
 _LEFTOVER = re.compile(r"\.(manifest|\d+-\d+)-\w+\.(json|npz)")  # was being written when its process was killed
-_ABSENT = object()
 
 
 @dataclass(frozen=True)
@@ -47,13 +45,13 @@ class Kind:
 
 
 FEATURES = Kind("feature store", "features", "images", "extracts", compress=False)
+VECTORS = Kind("descriptor store", "global descriptors", "images", "describes", compress=False)
 MATCHES = Kind("match store", "matches", "queries", "matches", compress=True)
 
 
 def recipe_fingerprint(recipe: Mapping[str, Any], kind: Kind = FEATURES) -> str:
     """SHA-256 over the store's format and the recipe (JSON values only); the first 16 hexadecimal digits."""
-    text = json.dumps({"format": kind.format, "recipe": recipe}, sort_keys=True, allow_nan=False)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    return fingerprint({"format": kind.format, "recipe": recipe})
 
 
 def store_path(root: Path, name: str, recipe: Mapping[str, Any], kind: Kind = FEATURES) -> Path:
@@ -80,7 +78,7 @@ def check_owned(folder: Path, kind: Kind) -> None:
         if foreign:
             raise InputError(
                 f"{folder}: expected a folder of {kind.content}, got one without {MANIFEST} that holds "
-                f"{_short(foreign[0])}; choose another path"
+                f"{shortened(foreign[0])}; choose another path"
             )
 
 
@@ -126,24 +124,6 @@ def settle_manifest(folder: Path, kind: Kind, manifest: Mapping[str, Any]) -> No
         _write(folder / MANIFEST, manifest)
 
 
-def difference(found: Any, expected: Any, name: str = "") -> str | None:
-    """What differs first in two JSON values, as `name=found, expected ...`; the names of `expected` come first."""
-    if isinstance(found, dict) and isinstance(expected, dict):
-        parts = [
-            (f"{name}.{key}".lstrip("."), found.get(key, _ABSENT), expected.get(key, _ABSENT))
-            for key in {**expected, **found}
-        ]
-    elif isinstance(found, list) and isinstance(expected, list):
-        pairs = itertools.zip_longest(found, expected, fillvalue=_ABSENT)
-        parts = [(f"{name}[{place}]", *pair) for place, pair in enumerate(pairs)]
-    elif type(found) is type(expected) and found == expected:
-        return None
-    else:
-        return f"{name}={_short(found)}, expected {_short(expected)}"
-    differences = (difference(one, other, part) for part, one, other in parts)
-    return next(filter(None, differences), None)
-
-
 def _is_leftover(path: Path) -> bool:
     return _LEFTOVER.fullmatch(path.name) is not None
 
@@ -166,8 +146,3 @@ def _read(path: Path, kind: Kind) -> Any:
         f"{path}: expected the manifest of a {kind.store}, got something else; choose another path, or delete this "
         "folder"
     )
-
-
-def _short(value: Any) -> str:
-    text = "nothing" if value is _ABSENT else json.dumps(value)
-    return text if len(text) <= 80 else f"{text[:77]}..."

@@ -18,11 +18,11 @@ import numpy as np
 from mfvpr.data.arrays import read_arrays, write_arrays
 from mfvpr.data.images import ordered_map
 from mfvpr.errors import InputError
+from mfvpr.fingerprints import difference
 from mfvpr.stores._disk import free_bytes, locked, told, too_full
 from mfvpr.stores.manifest import (
     Kind,
     check_owned,
-    difference,
     is_settled,
     manifest_of,
     settle_manifest,

@@ -10,7 +10,7 @@ from mfvpr.declaration import declared
 from mfvpr.errors import InputError
 from mfvpr.evaluation import Judge
 from mfvpr.match_sets import MatchSet
-from mfvpr.pipeline import Track, untracked
+from mfvpr.progress import Track, untracked
 from mfvpr.sweeping.axes import Axes
 from mfvpr.sweeping.outcome import Outcome
 from mfvpr.sweeping.sweep import sweep

@@ -6,6 +6,7 @@ block by block (some settings, some queries), which bounds the memory and is whe
 
 import hashlib
 import itertools
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -18,11 +19,12 @@ import numpy as np
 
 from mfvpr import parameter_grids, reranking
 from mfvpr.data.arrays import read_arrays, write_arrays
-from mfvpr.data.images import ordered_map
 from mfvpr.errors import InputError
-from mfvpr.match_sets import BYTES_PER_SLOT, MatchSet, batches, shapes, slots
-from mfvpr.numerics import available_cpus, compiled, knows_own_context
-from mfvpr.pipeline import FilterScore, Ties, Track, filter_scores, untracked
+from mfvpr.match_sets import BYTES_PER_SLOT, MatchSet, Scales, scales, shapes, slots
+from mfvpr.numerics import Device, compiled
+from mfvpr.progress import Track, untracked
+from mfvpr.reranking import FilterScore, Ties, filter_scores
+from mfvpr.sweeping.scores import Batch, all_batches, fuse_all, scored
 from mfvpr.sweeping.settings import FUSION, Group, Setting, distinct, groups
 from mfvpr.types import Array, Matches, Shortlist, per_match
 
@@ -38,15 +40,17 @@ class Work:
     Attributes:
         match_set: of all queries.
         queries: the part.
+        settings: that a program serves, for which the batches are made.
         candidates: of the part, `[q, C]`.
         views: V times the candidates `[q, C]` bool that are ranked.
         depth: rows kept of each ranking.
-        ties: as in `pipeline.rank`.
-        filter_score: as in `pipeline.fuse`.
+        ties: as in `reranking.rank_shortlist`.
+        filter_score: as in `reranking.fuse_shortlist`.
     """
 
-    match_set: MatchSet
+    match_set: MatchSet | Scales
     queries: range
+    settings: float
     candidates: Shortlist
     views: Sequence[np.ndarray]
     depth: int
@@ -55,10 +59,10 @@ class Work:
 
     @cached_property
     def digest(self) -> str:
-        """Of the matches, the shortlist and the views of these queries."""
-        found = self.match_set
-        matches = [found.matches[query] for query in self.queries]
-        return _digest(found.counts[self.queries.start : self.queries.stop], matches, self.candidates, list(self.views))
+        """Of the matches, how scales are fused, the shortlist and the views of these queries."""
+        taken = [one.take(self.queries) for one in scales(self.match_set)]
+        fusion = (self.match_set.weights, self.match_set.normalize) if isinstance(self.match_set, Scales) else ()
+        return _digest(fusion, [(one.counts, one.matches) for one in taken], self.candidates, list(self.views))
 
     def parts(self, size: int) -> Iterator["Work"]:
         """The same for at most `size` queries at a time."""
@@ -70,11 +74,11 @@ class Work:
 
 
 def sweep(
-    scorer: Any, settings: Sequence[Setting], match_set: MatchSet, candidates: Shortlist, *,
+    scorer: Any, settings: Sequence[Setting], match_set: MatchSet | Scales, candidates: Shortlist, *,
     views: Sequence[np.ndarray] | None = None, depth: int = 10, ties: Ties = "filter",
     filter_score: FilterScore = "cosine",
     settings_per_block: int | None = None, queries_per_block: int | None = None,
-    folder: Path | None = None, track: Track = untracked,
+    folder: Path | None = None, devices: Sequence[Device] | None = None, track: Track = untracked,
 ) -> np.ndarray:  # fmt: skip
     """The first rows of every query's ranking by every setting.
 
@@ -83,17 +87,19 @@ def sweep(
         settings: S times values by name, the same names in each: fields of the scorer (numbers are batch axes, what
             is static costs a program for each value), `weight` (a Weight), `max_distance` of matches, and `c` of the
             fusion with the filter (None = balanced). Without `c` the score alone ranks.
-        match_set: matches of Q queries with C candidates.
+        match_set: matches of Q queries with C candidates; those of several scales are scored one by one and fused over
+            the candidates that are ranked.
         candidates: their shortlist.
         views: V times the candidates `[Q, C]` bool that are ranked; by default one, all of the shortlist.
         depth: how many rows of a ranking are kept.
-        ties: as in `pipeline.rank`.
-        filter_score: as in `pipeline.fuse`.
+        ties: as in `reranking.rank_shortlist`.
+        filter_score: as in `reranking.fuse_shortlist`.
         settings_per_block: by default 64. The result does not depend on it, nor on the next.
         queries_per_block: by default what 256 MB hold.
         folder: where finished blocks are kept, to be read instead of being computed again; None = nowhere. Blocks of
             other matches, shortlists, values or scorers, by what their code computes, may lie there as well. A scorer
             that calls back to Python is computed anew, since nobody sees what that does.
+        devices: that share the batches of pairs; no bit of the scores depends on it. None = the one that JAX takes.
         track: progress over blocks.
 
     Returns:
@@ -103,25 +109,26 @@ def sweep(
     parameter_grids.refuse_own_names(scorer, names, reserved=(*parameter_grids.WEIGHTINGS, FUSION))
     num_queries, num_candidates = candidates.mask.shape
     views = [candidates.mask] if views is None else views
-    scored, places = distinct(settings)
-    per_block = min(settings_per_block or SETTINGS_PER_BLOCK, len(scored))
+    scored_once, places = distinct(settings)
+    per_block = min(settings_per_block or SETTINGS_PER_BLOCK, len(scored_once))
     queries = queries_per_block or queries_that_fit(match_set, num_candidates, per_block)
-    work = Work(match_set, range(num_queries), candidates, views, depth, ties, filter_score)
-    found_groups = list(groups(scorer, scored, match_set.image_sizes))
+    found_groups = list(groups(scorer, scored_once, match_set.image_sizes))
+    per_program = len(scored_once) / len(found_groups)
+    work = Work(match_set, range(num_queries), per_program, candidates, views, depth, ties, filter_score)
     if folder is not None:
-        program = partial(_program, match_set.matches[0], shapes(match_set))
-        found_groups = [replace(group, program=program(group)) for group in found_groups]
+        found_groups = [replace(group, program=_program(work, group)) for group in found_groups]
     blocks = [one for group in found_groups for one in group.blocks(per_block)]
     found = np.full((len(views), len(settings), num_queries, depth), -1, np.int32)
     steps = ((part, block) for part in work.parts(queries) for block in blocks)
-    held: dict[range, list[tuple[np.ndarray, Matches]]] = {}
+    held: dict[range, list[Batch]] = {}
     for part, block in track(steps, len(blocks) * -(-num_queries // queries)):
         if part.queries not in held:  # the batches of one part at a time, and only if some block needs them
             held = {part.queries: []}
         sharing = [places[row] for row in dict.fromkeys(block.rows.reshape(-1).tolist())]
         wanted, shares = list(itertools.chain.from_iterable(sharing)), list(map(len, sharing))
         cs = [settings[place].get(FUSION, _ALONE) for place in wanted]
-        rows = _kept(folder, part, block, cs, lambda: _rows(part, block, held[part.queries], cs, shares))  # noqa: B023
+        compute = partial(_rows, part, block, held[part.queries], cs, shares, devices)
+        rows = _kept(folder, part, block, cs, compute)
         found[:, wanted, part.queries.start : part.queries.stop] = rows
     return found
 
@@ -131,50 +138,51 @@ def result_bytes(num_views: int, num_settings: int, num_queries: int, depth: int
     return 4 * num_views * num_settings * num_queries * depth
 
 
-def block_bytes(match_set: MatchSet, num_candidates: int, num_settings: int, num_queries: int) -> int:
+def block_bytes(match_set: MatchSet | Scales, num_candidates: int, num_settings: int, num_queries: int) -> int:
     """Bytes that a block of `sweep` takes, about: its padded matches, its scores and their rankings."""
-    padded = np.sort(slots(match_set).sum(1))[::-1][:num_queries].sum()
-    return int(2 * BYTES_PER_SLOT * padded) + 12 * num_settings * num_queries * num_candidates
+    padded = sum(slots(one, settings=num_settings).sum(1) for one in scales(match_set))
+    largest = np.sort(padded)[::-1][:num_queries].sum()
+    of_scores = (8 + 4 * len(scales(match_set))) * num_settings * num_queries * num_candidates
+    return int(2 * BYTES_PER_SLOT * largest) + of_scores
 
 
-def queries_that_fit(match_set: MatchSet, num_candidates: int, num_settings: int) -> int:
+def queries_that_fit(match_set: MatchSet | Scales, num_candidates: int, num_settings: int) -> int:
     """Queries of a block of so many settings that BLOCK_BYTES hold, at least one."""
     one = block_bytes(match_set, num_candidates, num_settings, 1)
-    return max(1, min(len(match_set.matches), BLOCK_BYTES // max(one, 1)))
+    return max(1, min(len(scales(match_set)[0]), BLOCK_BYTES // max(one, 1)))
 
 
 def _rows(
-    part: Work, block: Group, held: list[tuple[np.ndarray, Matches]], cs: Sequence[Any], shares: Sequence[int]
-) -> np.ndarray:
+    part: Work, block: Group, held: list[Batch], cs: Sequence[Any], shares: Sequence[int],
+    devices: Sequence[Device] | None,
+) -> np.ndarray:  # fmt: skip
     """`[V, W, q, depth]`: the block's distinct settings, each as often as it has values of c."""
     if not held:
-        held.extend(batches(part.match_set, part.queries))
-    scores = _scores(block, held, part.candidates.mask.shape)
+        held.extend(all_batches(part.match_set, part.queries, settings=part.settings))
+    shape = len(scales(part.match_set)), *part.candidates.mask.shape
+    scores = _scores(block, held, shape, devices)
     _, first = np.unique(block.rows, return_index=True)
-    scores = np.repeat(scores.reshape(-1, *part.candidates.mask.shape)[np.sort(first)], shares, axis=0)
-    return np.stack([_first_rows(part, scores, cs, view) for view in part.views])
+    scores = scores.reshape(shape[0], -1, *shape[1:])[:, np.sort(first)]
+
+    def first_rows(view: np.ndarray) -> np.ndarray:
+        return _first_rows(part, np.repeat(fuse_all(part.match_set, scores, view), shares, axis=0), cs, view)
+
+    return np.stack([first_rows(view) for view in part.views])
 
 
-def _scores(block: Group, held: Sequence[tuple[np.ndarray, Matches]], shape: tuple[int, int]) -> np.ndarray:
-    """`[G, W, q, C]`; a pair without matches scores 0."""
-    scores = np.zeros((*block.rows.shape, shape[0] * shape[1]), np.float32)
+def _scores(
+    block: Group, held: Sequence[Batch], shape: tuple[int, int, int], devices: Sequence[Device] | None
+) -> np.ndarray:
+    """`[S, G, W, q, C]` of every scale; a pair without matches scores 0."""
+    scores = np.zeros((*block.rows.shape, math.prod(shape)), np.float32)
+    inputs = block.scorer, block.settings, block.weightings
+    for places, values in scored(_score_settings, inputs, held, devices=devices):
+        scores[..., places] = values
+    return np.moveaxis(scores.reshape(*block.rows.shape, *shape), 2, 0)
 
-    def score(batch: tuple[np.ndarray, Matches]) -> np.ndarray:
-        return np.asarray(parameter_grids.score_settings(block.scorer, batch[1], block.settings, block.weightings))
 
-    # Products this small keep one core busy: as many batches at a time as there are cores; but first one of each shape
-    # alone, which compiles.
-    first = {matches.mask.shape: number for number, (_, matches) in reversed(list(enumerate(held)))}
-    order = sorted(range(len(held)), key=lambda number: number not in first.values())
-    alone, together = order[: len(first)], order[len(first) :]
-    spread = partial(ordered_map, workers=available_cpus()) if knows_own_context() else map
-    found = itertools.chain(
-        (score(held[number]) for number in alone), spread(score, [held[number] for number in together])
-    )
-    for number, values in zip(order, found, strict=True):
-        places, _ = held[number]
-        scores[:, :, places] = values[:, :, : len(places)]
-    return scores.reshape(*block.rows.shape, *shape)
+def _score_settings(matches: Matches, scorer: Any, *values: Mapping[str, Array]) -> Array:
+    return parameter_grids.score_settings(scorer, matches, *values)
 
 
 def _first_rows(part: Work, scores: np.ndarray, cs: Sequence[Any], view: np.ndarray) -> np.ndarray:
@@ -239,10 +247,10 @@ def _fingerprint(part: Work, block: Group, cs: Sequence[Any]) -> str:
     return _digest(repr(options), block.program, part.digest, numbers)
 
 
-def _program(matches: Matches, pairs_by_slots: Mapping[int, int], group: Group) -> str:
+def _program(work: Work, group: Group) -> str:
     """What the scorer computes of batches of these shapes: a user's code may change while its class keeps its name."""
 
-    def text(size: int, pairs: int) -> str:
+    def text(matches: Matches, size: int, pairs: int) -> str:
         entries = per_match(matches).items()
         example = {name: np.zeros((pairs, size, *values.shape[1:]), values.dtype) for name, values in entries}
         image_size = np.ones((pairs, 2), np.float32)
@@ -250,7 +258,10 @@ def _program(matches: Matches, pairs_by_slots: Mapping[int, int], group: Group) 
         settings = {name: axis[:1] for name, axis in group.settings.items()}
         return jax.jit(parameter_grids.score_settings).lower(group.scorer, batch, settings, group.weightings).as_text()
 
-    return "".join(itertools.starmap(text, pairs_by_slots.items()))
+    sets = scales(work.match_set)
+    return "".join(
+        text(one.matches[0], *shape) for one in sets for shape in shapes(one, settings=work.settings).items()
+    )
 
 
 def _digest(*parts: Any) -> str:

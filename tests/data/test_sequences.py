@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mfvpr import InputError, pipeline
+from mfvpr import InputError
 from mfvpr.data.contents import contents
 from mfvpr.data.datasets import folder_dataset
 from mfvpr.data.sequences import own_rows, without_neighbors
+from mfvpr.evaluation import Positives
+from mfvpr.retrieval import ExactSearch
 from tests.builders import unit
 
 
@@ -47,12 +49,12 @@ def test_neighbors_are_neither_found_nor_right(sequence):
     dataset, own = owned(sequence, sequence, "order")
     for neighbors in (0, 1):
         allowed = np.abs(np.arange(6)[:, None] - np.arange(6)) > neighbors
-        found = without_neighbors(dataset, own, neighbors)
+        found = without_neighbors(dataset.only, 6, own, neighbors)
         np.testing.assert_array_equal(found.excluded.dense(), ~allowed)
         expected = dataset.truth.positives(2).dense() & allowed
         np.testing.assert_array_equal(found.truth.positives(2).dense(), expected)
     assert not found.truth.positives(1).any()  # a query whose right answers are all left out has none
-    assert without_neighbors(owned(sequence, sequence)[0], own, 0).truth is None
+    assert without_neighbors(owned(sequence, sequence)[0].only, 6, own, 0).truth is None
 
 
 def test_two_sequences_have_no_neighbors(sequence, tmp_path):
@@ -60,17 +62,18 @@ def test_two_sequences_have_no_neighbors(sequence, tmp_path):
     Image.new("RGB", (4, 4), (99, 0, 0)).save(tmp_path / "other" / "0.png")
     dataset, own = owned(sequence, tmp_path / "other")
     with pytest.raises(InputError, match="exclude_neighbors=2: expected queries that are among the database images"):
-        without_neighbors(dataset, own, 2)
+        without_neighbors(dataset.only, 6, own, 2)
 
 
-def test_the_shortlist_leaves_out_what_is_not_allowed():
-    rng = np.random.default_rng(0)
+@pytest.mark.parametrize("memory", [None, 1e-6, 1e-9])
+def test_the_shortlist_leaves_out_what_is_not_allowed(memory):
+    """Whatever is searched at a time: all, some dozens of numbers, one."""
+    rng, search = np.random.default_rng(0), ExactSearch(memory)
     descriptors = unit(rng.normal(size=(6, 8)))
-    everything = pipeline.shortlist(descriptors, descriptors, 6)
+    everything = search.shortlist(descriptors, descriptors, 6)
     np.testing.assert_array_equal(everything.indices[:, 0], np.arange(6))
-    allowed = np.abs(np.arange(6)[:, None] - np.arange(6)) > 1
-    found = pipeline.shortlist(descriptors, descriptors, 6, allowed=allowed)
+    excluded = np.abs(np.arange(6)[:, None] - np.arange(6)) <= 1
+    found = search.shortlist(descriptors, descriptors, 6, excluded=Positives.from_matrix(excluded))
     for query in range(6):
-        expected = [row for row in everything.indices[query] if allowed[query, row]]
+        expected = [row for row in everything.indices[query] if not excluded[query, row]]
         np.testing.assert_array_equal(found.indices[query], expected + [-1] * (6 - len(expected)))
-    np.testing.assert_array_equal(found.mask, found.indices >= 0)

@@ -1,5 +1,6 @@
 """Sweeps against one evaluation after the other."""
 
+import itertools
 from dataclasses import replace
 
 import jax
@@ -7,8 +8,8 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr import pipeline, sweeping
-from mfvpr.match_sets import MatchSet, shapes, slots
+from mfvpr import reranking, sweeping
+from mfvpr.match_sets import PROGRAM_SLOTS, MatchSet, shapes, slots
 from mfvpr.scoring.parameters import with_parameters
 from mfvpr.sweeping.settings import groups
 from mfvpr.types import Shortlist
@@ -56,8 +57,8 @@ def one_by_one(scorer, setting, match_set, candidates, view=None, **options):
     view = candidates.mask if view is None else view
     seen = replace(candidates, mask=candidates.mask & view)
     scores = np.array(scores, np.float32)
-    scores = pipeline.fuse(seen, scores, c) if fused else scores
-    order = pipeline.rank(seen, scores, **options)
+    scores = reranking.fuse_shortlist(seen, scores, c) if fused else scores
+    order = reranking.rank_shortlist(seen, scores, **options)
     return np.where(np.take_along_axis(seen.mask, order, 1), np.take_along_axis(candidates.indices, order, 1), -1)
 
 
@@ -185,6 +186,23 @@ def test_slots_hold_every_match_in_few_sizes_with_little_padding(high):
     assert (counts <= sizes).all()
     assert len(np.unique(sizes)) <= 5
     assert sizes.sum() <= counts.sum() + counts.size * (32 + 0.15 * high)
+
+
+@pytest.mark.parametrize("pairs", [50, 5_000, 500_000])
+def test_a_shape_is_compiled_where_that_costs_less_than_padding(pairs):
+    """The fewer settings there are to score, and the fewer pairs, the fewer shapes."""
+    counts = np.random.default_rng(0).integers(0, 321, (pairs // 50, 50))
+    found = MatchSet([], counts, 320)
+    of_settings = [slots(found, settings=settings) for settings in (1, 8, 64, 10_000)]
+    for few, many in itertools.pairwise(of_settings):
+        assert (counts <= many).all()
+        assert (many <= few).all()
+    numbers = [len(np.unique(sizes)) for sizes in of_settings]
+    assert numbers == {50: [1, 1, 1, 4], 5_000: [1, 1, 4, 5], 500_000: [5, 5, 5, 5]}[pairs]
+    least = slots(found, settings=10_000_000)
+    for settings, sizes in zip((1, 8, 64), of_settings, strict=False):
+        padding = sizes.sum() - least.sum()
+        assert settings * padding <= 4 * PROGRAM_SLOTS
 
 
 def test_slots_of_no_matches():
@@ -330,4 +348,4 @@ def test_pairs_score_the_same_in_a_smaller_set(data, scorer, monkeypatch):
     for one in (match_set, few):
         listed = jax.tree.map(lambda rows: rows[: len(one.matches)], candidates)  # noqa: B023
         sweeping.sweep(scorer, [{"max_distance": 2.0}], one, listed)
-    np.testing.assert_array_equal(found[0][:, :, :2], found[1])
+    np.testing.assert_array_equal(found[0][..., :2, :], found[1])

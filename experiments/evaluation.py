@@ -1,0 +1,150 @@
+"""The main job: images -> features -> shortlist and matches -> scores -> rankings -> recall, in a run folder."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from experiments import build, prepare, run_folder, truth
+from experiments.prepare import Images, Tools
+from experiments.settings import SettingsError
+from mfvpr import evaluations
+from mfvpr.data.datasets import Dataset
+from mfvpr.evaluation import Unit
+from mfvpr.evaluations import FILTER, Stopwatch
+from mfvpr.report import runs
+from mfvpr.report.evaluations import Figure, Judged, figures, recall_table, write_rankings, write_skipped
+from mfvpr.scoring import HistogramOfShifts
+
+_THRESHOLDS: dict[Unit, str] = {"frames": "tolerance", "m": "radius"}  # their names in results
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Everything that one evaluation made; parameters by system."""
+
+    settings: dict[str, Any]
+    images: Images
+    tools: Tools
+    judged: Judged
+    parameters: dict[str, dict[str, Any]]
+    figures: list[Figure]
+
+
+def evaluate(settings: dict[str, Any]) -> None:
+    """Every stage, the table, a run folder."""
+    with run_folder.claimed(settings) as folder:
+        outcome = evaluated(settings)
+        run_folder.leave(
+            folder, settings, truth.described(settings, outcome.images.dataset), text=text(outcome),
+            write=lambda new: write(new, outcome), figures=outcome.figures,
+        )  # fmt: skip
+
+
+def evaluated(settings: dict[str, Any]) -> Outcome:
+    """The filter alone, each scorer, and the best of them (the paper: histogram) combined with the filter."""
+    scorers, tools, watch = build.scorers(settings["scorer"]), prepare.tools(settings), Stopwatch()
+    with watch("data"):
+        images = prepare.images(settings, tools.archive)
+    shown = asked_figures(settings["figures"], images.dataset)
+    main = "histogram" if "histogram" in scorers else next(iter(scorers))
+    combined, group, histogram = f"{main} + {FILTER}", settings["scorer"], scorers.get("histogram")
+    result = evaluations.evaluate(
+        images.dataset, tools.extractor, tools.filter, scorers, candidates=settings["candidates"],
+        matching=tools.matching, fused={main: build.fusion(settings)}, ties=settings["ties"], archive=tools.archive,
+        watch=watch, **tools.where,
+    )  # fmt: skip
+    parameters = {name: group if "method" in group else group[name] for name in scorers}
+    parameters = {FILTER: {}} | parameters | {combined: parameters[main] | settings["fusion"]}
+    thresholds = truth.thresholds(settings, images.dataset.sequences[0].truth)
+    headline = combined if settings["final"] == "combined" else main
+    judged = Judged(result, thresholds, sorted(set(settings["recall"]["ks"])), headline)
+    histogram = histogram if isinstance(histogram, HistogramOfShifts) else None
+    drawn = figures(judged, tools.extractor, shown, histogram)
+    return Outcome(settings, images, tools, judged, parameters, drawn)
+
+
+def text(outcome: Outcome) -> str:
+    """For the terminal: what was evaluated, and the table."""
+    table = f"\n{recall_table(outcome.judged).text()}" if outcome.judged.thresholds else ""
+    return f"{heading(outcome)}\n{table}"
+
+
+def heading(outcome: Outcome) -> str:
+    """One line that says what was evaluated."""
+    settings, dataset = outcome.settings, outcome.images.dataset
+    queries = sum(len(sequence.images) for sequence in dataset.sequences)
+    several = f" in {len(dataset.sequences)} sequences" if len(dataset.sequences) > 1 else ""
+    return (
+        f"{dataset.name}: {queries} queries{several}, {len(dataset.database)} database images, "
+        f"{_num_candidates(outcome)} candidates ({settings['retrieval']['name']}), "
+        f"{settings['features']['name']} features; {truth.in_words(settings, dataset)}"
+    )
+
+
+def write(folder: Path, outcome: Outcome) -> None:
+    """All files of a run folder but the figures."""
+    runs.write_json(folder / "results.json", result_rows(outcome))
+    if outcome.judged.thresholds:
+        runs.write_table(folder, recall_table(outcome.judged), heading(outcome))
+    write_rankings(folder, outcome.judged)
+    write_skipped(folder, outcome.judged.result)
+
+
+def result_rows(outcome: Outcome) -> list[dict[str, Any]]:
+    """One row per system and threshold, and sequence where there are several."""
+    judged, settings, dataset = outcome.judged, outcome.settings, outcome.images.dataset
+    common = {
+        "filter": settings["retrieval"],
+        "features": settings["features"],
+        "matching": settings["matching"],
+        "candidates": _num_candidates(outcome),
+        "queries": sum(len(sequence.images) for sequence in dataset.sequences),
+        "database": len(dataset.database),
+        "dataset": dataset.name,
+        "data_fingerprint": outcome.images.fingerprints,
+        "ground_truth": truth.described(settings, dataset),
+        "reading": outcome.images.reading,
+        "seconds": judged.result.seconds,
+        "versions": runs.versions(),
+    }
+    rows = []
+    for name, parameters in outcome.parameters.items():
+        system = {"system": name, "scorer": name.removesuffix(" + filter"), "parameters": parameters}
+        system |= {"scorer": "none"} if name == "filter" else {}
+        rows += [system | judgment | common for judgment in _judgments(judged, name)]
+    return rows
+
+
+def _judgments(judged: Judged, system: str) -> list[dict[str, Any]]:
+    """Threshold, and recall by K; of several sequences, each, and their means."""
+    if not judged.thresholds:
+        return [{"recall_at": {}}]
+    known = judged.sequences[0].truth
+    name = _THRESHOLDS.get(known.unit) if known else None
+    several = len(judged.sequences) > 1
+    return [
+        ({"sequence": sequence} if several else {})
+        | ({name: threshold} if name else {})
+        | {"recall_at": {str(k): round(float(value), 6) for k, value in zip(judged.ks, recall[place], strict=True)}}
+        for sequence, recall in judged.parts(system)
+        for place, threshold in enumerate(judged.thresholds)
+    ]
+
+
+def _num_candidates(outcome: Outcome) -> int:
+    return int(outcome.judged.result.matched[0].candidates.indices.shape[1])
+
+
+def asked_figures(asked: int | list[int | str], dataset: Dataset) -> int | list[int]:
+    """How many figures, or of which queries, as rows; what is asked for may be names."""
+    if isinstance(asked, int):
+        return asked
+    names = {name: row for row, name in enumerate(dataset.queries.names)}
+    rows = [names.get(one, -1) if isinstance(one, str) else one for one in asked]
+    for one, row in zip(asked, rows, strict=True):
+        if not 0 <= row < len(names):
+            raise SettingsError(
+                f"figures=[{one}]: expected rows of queries from 0 to {len(names) - 1}, or names such as "
+                f"{dataset.queries.names[0]}"
+            )
+    return list(dict.fromkeys(rows))

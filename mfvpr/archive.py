@@ -1,0 +1,273 @@
+"""What was taken from images, kept by their content: asked for again, by anybody, it is there.
+
+    archive = Archive(Path("~/.cache/mfvpr/features").expanduser())
+    [features] = archive.local(folder, Sift())
+    vectors = archive.vectors(folder, MixVprDescriptor(model))
+
+Stores are found by what they hold (the images' content and the extractor's recipe), never by a data set's name, so that
+a database which several data sets share is extracted once.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mfvpr.data.contents import Contents, contents
+from mfvpr.data.datasets import ImageFolder
+from mfvpr.errors import InputError
+from mfvpr.extraction import described
+from mfvpr.features import Aggregation, Extractor, Fitting
+from mfvpr.fingerprints import recipe_of
+from mfvpr.progress import Track, untracked
+from mfvpr.report.runs import versions
+from mfvpr.sources import FeatureSet, InMemory
+from mfvpr.stores import features as feature_stores
+from mfvpr.stores import matches as match_stores
+from mfvpr.stores import vectors as vector_stores
+from mfvpr.stores.manifest import MATCHES, VECTORS, store_path
+from mfvpr.stores.rows import RowStore, require_space
+
+DECODERS = ("mfvpr", "opencv-python-headless", "pillow")  # whose versions decide what an image becomes
+AGGREGATED = 16  # images at a time
+_MB = 1e6
+
+
+@dataclass(frozen=True)
+class Vectors:
+    """Global descriptors of all images of a folder.
+
+    Attributes:
+        values: `[M, D]` float32; NaN for bad images, which no shortlist contains.
+        bad: reason by row, for images that gave no usable descriptor.
+    """
+
+    values: np.ndarray
+    bad: Mapping[int, str]
+
+
+@dataclass(frozen=True)
+class Aggregated:
+    """Global descriptors that are computed from an extractor's local features, once the database's are known."""
+
+    extractor: Extractor
+    fitting: Fitting
+
+
+@dataclass
+class Sink:
+    """Where one part of the descriptions of a folder's images is kept: in a store, or in memory.
+
+    Attributes:
+        pick: the part of a description.
+        store: None = in memory.
+        items: by row, where there is no store.
+        forecast: bytes on disk of so many images.
+    """
+
+    pick: Callable[[Any], Any]
+    store: RowStore[Any] | None
+    forecast: Callable[[int], int]
+    items: dict[int, Any] = field(default_factory=dict)
+
+    def lacks(self, rows: Sequence[int]) -> list[int]:
+        """Those of some rows that are not here."""
+        done = self.items if self.store is None else {*np.flatnonzero(self.store.done).tolist()}
+        return [row for row in rows if row not in done]
+
+    def keep(self, batch: Mapping[int, Any]) -> None:
+        """A batch of rows; where there is a store, they are on disk when this returns."""
+        if self.store is None:
+            self.items |= batch
+        else:
+            self.store.write({row: batch[row] for row in self.lacks([*batch])})
+
+
+@dataclass
+class Archive:
+    """What was taken from images, in stores below a folder, or for the time of this process.
+
+    Attributes:
+        root: folder of all stores; None = nothing is kept on disk.
+        skip_bad: list images that cannot be read as bad, and go on, instead of raising.
+        track: label -> progress of what follows.
+        tell: is told, in one line, what is to be done and how much space that takes; None = nobody.
+        wait: for other processes that are making the same, instead of refusing.
+    """
+
+    root: Path | None = None
+    skip_bad: bool = False
+    track: Callable[[str], Track] = lambda label: untracked
+    tell: Callable[[str], None] = lambda line: None
+    wait: bool = False
+    _contents: dict[ImageFolder, Contents] = field(default_factory=dict, repr=False)
+    _sinks: dict[tuple[ImageFolder, int], list[Sink]] = field(default_factory=dict, repr=False)
+    _bad: dict[tuple[ImageFolder, int], dict[int, str]] = field(default_factory=dict, repr=False)
+    _fitted: dict[tuple[ImageFolder, int], Aggregation] = field(default_factory=dict, repr=False)
+    _used: list[Any] = field(default_factory=list, repr=False)  # whose ids are keys: they must live
+
+    def contents(self, folder: ImageFolder) -> Contents:
+        """What the files of a folder hold; remembered below the root from run to run."""
+        if folder not in self._contents:
+            self._contents[folder] = contents(folder, None if self.root is None else self.root / "contents")
+        return self._contents[folder]
+
+    def recipe(self, folder: ImageFolder, extractor: Extractor | Aggregated) -> dict[str, Any]:
+        """All that changes what an extractor takes from a folder's images."""
+        decoders = {name: versions()[name] for name in DECODERS}
+        return {"extractor": recipe_of(extractor), "images": self.contents(folder).fingerprint, "versions": decoders}
+
+    def local(
+        self, folder: ImageFolder, extractor: Extractor, rows: Iterable[int] | None = None, *, label: str = "features"
+    ) -> tuple[FeatureSet, ...]:
+        """Local features by scale, to be read on demand.
+
+        Args:
+            folder: the images.
+            extractor: what takes them.
+            rows: images whose features will be asked for; those that are not there are extracted. None = all.
+            label: for people.
+
+        Raises:
+            InputError: an image cannot be read (unless `skip_bad`), or none can; or a store cannot be used.
+        """
+        bad = self._extract(folder, extractor, range(len(folder)) if rows is None else [*rows], label)
+        return tuple(
+            FeatureSet(InMemory(sink.items, len(folder)) if sink.store is None else sink.store, dict(bad))
+            for sink in self._sinks[folder, id(extractor)][bool(extractor.vector_size) :]
+        )
+
+    def vectors(self, folder: ImageFolder, describer: Extractor | Aggregated, database: ImageFolder, *,
+                label: str = "descriptors") -> Vectors:  # fmt: skip
+        """Global descriptors of all images.
+
+        Args:
+            folder: the images.
+            describer: what describes them.
+            database: images that an aggregation is fitted on.
+            label: for people.
+
+        Raises:
+            InputError: as `local`.
+        """
+        if isinstance(describer, Aggregated):
+            return self._aggregated(folder, describer, database, label)
+        bad = self._extract(folder, describer, range(len(folder)), label)
+        values = np.full((len(folder), describer.vector_size), np.nan, np.float32)
+        sink = self._sinks[folder, id(describer)][0]
+        for row, vector in sink.items.items() if sink.store is None else sink.store.read():
+            values[row] = vector
+        return Vectors(values, dict(bad))
+
+    def matches(
+        self, recipe: Mapping[str, Any], num_queries: int, num_candidates: int, *, typical: int, label: str
+    ) -> match_stores.MatchStore:
+        """The store of matches that are made so, where there is a root.
+
+        Args:
+            recipe: of the matches.
+            num_queries: Q.
+            num_candidates: C.
+            typical: matches of a pair, about.
+            label: for people.
+        """
+        if self.root is None:
+            raise ValueError("nothing is kept on disk: this archive has no root")
+        path = store_path(self.root, "matches", recipe, MATCHES)
+        sizes = {"num_queries": num_queries, "num_candidates": num_candidates}
+        store = match_stores.open_match_store(path, recipe, **sizes, waiting=self._waiting)
+        if missing := num_queries - int(store.done.sum()):
+            needed = match_stores.forecast_bytes(missing, num_candidates, typical)
+            require_space(store.folder, needed)
+            self.tell(f"{label}: {missing} of {num_queries} queries to match with {num_candidates} candidates: about "
+                      f"{needed / _MB:.1f} MB in {store.folder}")  # fmt: skip
+        else:
+            self.tell(f"{label}: all {num_queries} queries from {store.folder}")
+        return store
+
+    @property
+    def _waiting(self) -> Callable[[str], None] | None:
+        return self.tell if self.wait else None
+
+    def _extract(self, folder: ImageFolder, extractor: Extractor, rows: Sequence[int], label: str) -> dict[int, str]:
+        """Run the extractor on those of the rows that lack something; reasons of all bad images so far."""
+        key = folder, id(extractor)
+        if is_new := key not in self._sinks:
+            self._used.append(extractor)
+            self._sinks[key], self._bad[key] = self._opened(folder, extractor), {}
+        sinks, bad = self._sinks[key], self._bad[key]
+        with ExitStack() as held:
+            if any(sink.lacks(rows) for sink in sinks):
+                for sink in sinks:
+                    if sink.store is not None:
+                        held.enter_context(sink.store)
+            missing = sorted({row for sink in sinks for row in sink.lacks(rows)} - bad.keys())
+            if missing or is_new:
+                self._announce(extractor, sinks, missing, len(folder), label)
+            for batch in described(folder, extractor, missing, bad, skip_bad=self.skip_bad, track=self.track(label)):
+                for sink in sinks:
+                    sink.keep({row: sink.pick(description) for row, description in batch.items()})
+        if len(bad) == len(folder):
+            raise InputError(f"{folder.root}: none of {len(folder)} images can be used; the first: {bad[min(bad)]}")
+        return bad
+
+    def _opened(self, folder: ImageFolder, extractor: Extractor) -> list[Sink]:
+        """The vector's sink, where there is one, and those of the scales."""
+        sinks, images = [], len(folder)
+        recipe = self.recipe(folder, extractor) if self.root is not None else {}
+        name = type(extractor).__name__
+        if extractor.vector_size:
+            store = None
+            if self.root is not None:
+                path = store_path(self.root, name, recipe, VECTORS)
+                store = vector_stores.open_vector_store(path, recipe, num_images=images, waiting=self._waiting)
+            size = extractor.vector_size
+            sinks.append(Sink(lambda found: found.vector, store, lambda n: vector_stores.forecast_bytes(n, size)))
+        for number, scale in enumerate(extractor.scales):
+            store = None
+            if self.root is not None:
+                own = recipe | ({"scale": number} if len(extractor.scales) > 1 else {})
+                path = store_path(self.root, name, own)
+                store = feature_stores.open_store(path, own, num_images=images, waiting=self._waiting)
+            sinks.append(Sink(
+                lambda found, number=number: found.local[number], store,
+                lambda n, scale=scale: feature_stores.forecast_bytes(n, scale.typical_count, scale.dimension),
+            ))  # fmt: skip
+        return sinks
+
+    def _announce(
+        self, extractor: Extractor, sinks: Sequence[Sink], missing: Sequence[int], total: int, label: str
+    ) -> None:
+        stores = [sink.store for sink in sinks if sink.store is not None]
+        if not stores:
+            return
+        where = ", ".join(str(store.folder) for store in stores)
+        if not missing:
+            self.tell(f"{label}: all {total} images from {where}")
+            return
+        needed = sum(sink.forecast(len(missing)) for sink in sinks)
+        require_space(stores[0].folder, needed)
+        each = ", ".join(f"about {scale.typical_count} features of {scale.dimension} dimensions each"
+                         for scale in extractor.scales)  # fmt: skip
+        each = each or f"descriptors of {extractor.vector_size} numbers"
+        self.tell(f"{label}: {len(missing)} of {total} images to do, {each}: about {needed / _MB:.1f} MB in {where}")
+
+    def _aggregated(self, folder: ImageFolder, describer: Aggregated, database: ImageFolder, label: str) -> Vectors:
+        key = database, id(describer)
+        if key not in self._fitted:
+            self._used.append(describer)
+            [features] = self.local(database, describer.extractor, label="database features")
+            self._fitted[key] = describer.fitting.fit(features)
+        aggregation = self._fitted[key]
+        [features] = self.local(folder, describer.extractor, label=label)
+        values = np.zeros((len(folder), aggregation.vector_size), np.float32)
+        rows = range(len(folder))
+        for start in self.track(label)(range(0, len(rows), AGGREGATED), -(-len(rows) // AGGREGATED)):
+            images = dict(features.read(rows[start : start + AGGREGATED]))
+            if images:
+                values[list(images)] = aggregation(list(images.values()))
+        values[list(features.bad)] = np.nan
+        return Vectors(values, features.bad)

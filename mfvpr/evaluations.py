@@ -1,0 +1,328 @@
+"""The whole way in one call: images -> features -> shortlist -> matches -> scores -> ranking -> recall.
+
+result = mfvpr.evaluate(dataset, Sift(), Retrieval(Aggregated(sift, VladFitting())),
+                        {"histogram": mfvpr.HistogramOfShifts()}, candidates=50)
+print(result.table())
+"""
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from mfvpr import pipeline
+from mfvpr.archive import Archive
+from mfvpr.data.datasets import Dataset, ImageFolder, QuerySequence
+from mfvpr.evaluation import Positives, hits
+from mfvpr.features import Extractor
+from mfvpr.filters import Filter
+from mfvpr.fingerprints import recipe_of
+from mfvpr.match_sets import MatchSet, Scales
+from mfvpr.matching import CrossCheck
+from mfvpr.numerics import Device
+from mfvpr.progress import Track, untracked
+from mfvpr.reranking import FilterScore, Ties, fuse_shortlist, rank_shortlist
+from mfvpr.scoring import Scorer
+from mfvpr.sources import FeatureSet
+from mfvpr.stores.matches import MatchStore
+from mfvpr.types import Shortlist
+
+FILTER = "filter"  # the name of the filter's own ranking
+
+
+@dataclass(frozen=True)
+class Matching:
+    """Options of the matches, see `mfvpr.matching`; `chunk_size` changes nothing but the memory that is taken."""
+
+    cross_check: CrossCheck = "mutual"
+    max_distance: float | None = None
+    max_matches: int | None = None
+    chunk_size: int | None = field(default=None, metadata={"recipe": False})
+
+
+@dataclass(frozen=True)
+class Fusion:
+    """How the filter's score is added to another: `c` times (None = as much as balances both per query), and which."""
+
+    c: float | None = None
+    filter_score: FilterScore = "cosine"
+
+
+@dataclass(frozen=True)
+class Matched:
+    """A sequence's candidates, and their matches by scale."""
+
+    sequence: QuerySequence
+    candidates: Shortlist
+    matches: tuple[MatchSet, ...]
+    bad_queries: Mapping[int, str]
+    bad_database: Mapping[int, str]
+
+    @property
+    def by_scale(self) -> MatchSet | Scales:
+        """What is scored: several scales are fused, each standardized over a query's candidates."""
+        return self.matches[0] if len(self.matches) == 1 else Scales(self.matches)
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """A system's ranking of a sequence: database rows `[Q, C]`, best first, and their scores in that order."""
+
+    rows: np.ndarray
+    scores: np.ndarray
+
+
+@dataclass(frozen=True)
+class Recall:
+    """Recall of one system at thresholds and ks: `[sequences, thresholds, ks]`, and the number of queries in each."""
+
+    by_sequence: np.ndarray
+    queries: np.ndarray
+
+    @property
+    def mean(self) -> np.ndarray:
+        """`[thresholds, ks]` plain mean over the sequences."""
+        return self.by_sequence.mean(axis=0)
+
+    @property
+    def pooled(self) -> np.ndarray:
+        """`[thresholds, ks]` over all queries of all sequences."""
+        return np.tensordot(self.queries / self.queries.sum(), self.by_sequence, axes=1)
+
+
+@dataclass(frozen=True)
+class Result:
+    """What an evaluation found.
+
+    Attributes:
+        dataset: what was evaluated.
+        matched: by sequence.
+        systems: by name and sequence: the filter alone, each scorer, and those combined with the filter.
+        seconds: by stage.
+    """
+
+    dataset: Dataset
+    matched: Sequence[Matched]
+    systems: Mapping[str, Sequence[Ranked]]
+    seconds: Mapping[str, float]
+
+    def positives(self, threshold: float) -> list[Positives]:
+        """What is right at a threshold, by sequence.
+
+        Raises:
+            ValueError: a sequence has no ground truth.
+        """
+        found = [sequence.truth for sequence in self.dataset.sequences]
+        if any(truth is None for truth in found):
+            raise ValueError(f"{self.dataset.name}: there is no ground truth, so rankings only")
+        return [truth.positives(threshold) for truth in found if truth is not None]
+
+    def recall(self, thresholds: Sequence[float], ks: Sequence[int] = (1, 5, 10)) -> dict[str, Recall]:
+        """Recall@K of every system; a query without a right answer counts as a failure.
+
+        Args:
+            thresholds: what counts as right, in the unit of the ground truth.
+            ks: depths.
+        """
+        right = [self.positives(threshold) for threshold in thresholds]
+        queries = np.array([len(one.candidates.mask) for one in self.matched])
+
+        def of(ranked: Sequence[Ranked]) -> Recall:
+            return Recall(np.array([
+                [[hits(one.rows, truths[place], k).mean() for k in ks] for truths in right]
+                for place, one in enumerate(ranked)
+            ]), queries)  # fmt: skip
+
+        return {name: of(ranked) for name, ranked in self.systems.items()}
+
+
+@dataclass
+class Stopwatch:
+    """Seconds by stage."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.seconds[stage] = round(self.seconds.get(stage, 0) + time.perf_counter() - start, 3)
+
+
+def evaluate(
+    dataset: Dataset,
+    extractor: Extractor,
+    filter: Filter,
+    scorers: Mapping[str, Scorer],
+    *,
+    candidates: int | Literal["all"] = 50,
+    matching: Matching = Matching(),
+    fused: Mapping[str, Fusion] | None = None,
+    ties: Ties = "filter",
+    archive: Archive | None = None,
+    memory: float | None = None,
+    devices: Sequence[Device] | None = None,
+    watch: "Stopwatch | None" = None,
+) -> Result:
+    """Rank every query's candidates by every scorer.
+
+    Args:
+        dataset: one database, one or more query sequences.
+        extractor: what takes local features from images.
+        filter: what finds candidates.
+        scorers: by name.
+        candidates: that the filter proposes for each query.
+        matching: options of the matches.
+        fused: scorers, by name, that are ranked together with the filter's score as well, as `name + filter`.
+        ties: equal scores keep the order of the filter, or go by the row of the database: "filter", "index".
+        archive: where features are kept; None = in memory, until this returns.
+        memory: GB that features of the database may take on the devices, see `mfvpr.sources.memory_budget`.
+        devices: that share the queries; None = the one that JAX takes.
+        watch: gets the seconds of the stages.
+
+    Raises:
+        InputError: images, stores or features that cannot be used; one line says which, and the mend.
+    """
+    archive, watch = archive or Archive(), watch or Stopwatch()
+    place = {"memory": memory, "devices": devices}
+    matched = [
+        match_sequence(dataset, sequence, extractor, filter, candidates, matching, archive, watch, **place)
+        for sequence in dataset.sequences
+    ]
+    with watch("scores"):
+        options = {"devices": devices, "track": archive.track("scores")}
+        ranked = [rank_sequence(one, scorers, fused or {}, ties, **options) for one in matched]
+    systems = {name: [one[name] for one in ranked] for name in ranked[0]}
+    return Result(dataset, matched, systems, watch.seconds)
+
+
+def match_sequence(
+    dataset: Dataset,
+    sequence: QuerySequence,
+    extractor: Extractor,
+    filter: Filter,
+    candidates: int | Literal["all"],
+    matching: Matching,
+    archive: Archive,
+    watch: Stopwatch | None = None,
+    *,
+    keep: bool = False,
+    with_ratio: bool = False,
+    **where: Any,
+) -> Matched:
+    """Candidates and matches of one sequence's queries; features of no other database images than candidates are taken.
+
+    Args:
+        dataset: of the sequence.
+        sequence: Q queries.
+        extractor: see `evaluate`.
+        filter: see there.
+        candidates: see there.
+        matching: see there.
+        archive: see there.
+        watch: gets the seconds of the stages.
+        keep: matches in a store of the archive; where they are all there, nothing else is read.
+        with_ratio: see `mfvpr.match`.
+        **where: `memory` and `devices` of `pipeline.match`.
+    """
+    watch = watch or Stopwatch()
+    database = dataset.database
+    num_candidates = len(database) if candidates == "all" else min(candidates, len(database))
+    stores = _match_stores(dataset, sequence, extractor, filter, num_candidates, matching, archive) if keep else ()
+    if stores and all(store.done.all() for store in stores):
+        with watch("matches read"):
+            found = [pipeline.stored_matches(store) for store in stores]
+        return Matched(sequence, found[0][1], tuple(match_set for match_set, _ in found), {}, {})
+    with watch("filter"):
+        filtered = filter.shortlist(sequence, database, num_candidates, archive)
+    with watch("features"):
+        wanted = np.unique(filtered.candidates.indices[filtered.candidates.mask])
+        known = archive.local(database, extractor, wanted.tolist(), label="database features")
+        asked = archive.local(sequence.images, extractor, label=f"{sequence.name} features")
+    bad_queries, bad_database = {**filtered.bad_queries, **asked[0].bad}, {**filtered.bad_database, **known[0].bad}
+    _tell_of(archive, database, known[0], bad_database)
+    _tell_of(archive, sequence.images, asked[0], bad_queries)
+    with watch("matching"):
+        matches = []
+        for scale, (queries, images) in enumerate(zip(asked, known, strict=True)):
+            with stores[scale] if stores else nullcontext() as store:
+                matches.append(pipeline.match(
+                    queries, images, filtered.candidates, **asdict(matching), with_ratio=with_ratio, store=store,
+                    track=archive.track("matching"), **where,
+                ))  # fmt: skip
+    return Matched(sequence, filtered.candidates, tuple(matches), bad_queries, bad_database)
+
+
+def rank_sequence(
+    matched: Matched,
+    scorers: Mapping[str, Scorer],
+    fused: Mapping[str, Fusion],
+    ties: Ties,
+    *,
+    devices: Sequence[Device] | None = None,
+    track: Track = untracked,
+) -> dict[str, Ranked]:
+    """Rankings of a sequence by name of the system: the filter alone, each scorer, and those that are fused with it."""
+    candidates = matched.candidates
+    scores = pipeline.score(scorers, matched.by_scale, candidates, devices=devices, track=track)
+    combined = {
+        f"{name} + {FILTER}": fuse_shortlist(candidates, scores[name], how.c, filter_score=how.filter_score)
+        for name, how in fused.items()
+    }
+    return {
+        name: _ranked(candidates, values, ties)
+        for name, values in ({FILTER: candidates.scores} | scores | combined).items()
+    }
+
+
+def _ranked(candidates: Shortlist, scores: np.ndarray, ties: Ties) -> Ranked:
+    order = rank_shortlist(candidates, scores, ties=ties)
+    return Ranked(*(np.take_along_axis(values, order, axis=1) for values in (candidates.indices, scores)))
+
+
+def matches_recipe(
+    dataset: Dataset, sequence: QuerySequence, extractor: Extractor, filter: Filter, num_candidates: int,
+    matching: Matching, archive: Archive,
+) -> dict[str, Any]:  # fmt: skip
+    """All that changes a shortlist and its matches: both sides' images and features, the filter, and the matching."""
+    excluded = sequence.excluded
+    return {
+        "database": archive.recipe(dataset.database, extractor),
+        "query": archive.recipe(sequence.images, extractor),
+        "filter": recipe_of(filter),
+        "candidates": num_candidates,
+        "matching": recipe_of(matching),
+        "skip_bad": archive.skip_bad,
+        "excluded": None if excluded is None else recipe_of([excluded.rows, excluded.offsets]),
+    }
+
+
+def _match_stores(
+    dataset: Dataset, sequence: QuerySequence, extractor: Extractor, filter: Filter, num_candidates: int,
+    matching: Matching, archive: Archive,
+) -> tuple[MatchStore, ...]:  # fmt: skip
+    """A store for the matches of each scale; none where nothing is kept on disk."""
+    if archive.root is None:
+        return ()
+    recipe = matches_recipe(dataset, sequence, extractor, filter, num_candidates, matching, archive)
+    several = len(extractor.scales) > 1
+    return tuple(
+        archive.matches(
+            recipe | ({"scale": number} if several else {}), len(sequence.images), num_candidates,
+            typical=scale.typical_count // 3, label=f"{sequence.name} matches",
+        )
+        for number, scale in enumerate(extractor.scales)
+    )  # fmt: skip
+
+
+def _tell_of(archive: Archive, folder: ImageFolder, features: FeatureSet, bad: Mapping[int, str]) -> None:
+    """What is wrong with some images, which rank last, or have no matches."""
+    for reason in bad.values():
+        archive.tell(f"warning: {reason}")
+    known = np.asarray(features.source.counts)
+    if empty := [row for row in np.flatnonzero(known == 0).tolist() if row not in bad]:
+        archive.tell(f"warning: {folder.paths[empty[0]]}: no keypoints, so no matches ({len(empty)} such images of "
+                     f"{len(folder)}); scores are 0")  # fmt: skip

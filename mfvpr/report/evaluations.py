@@ -1,0 +1,219 @@
+"""An evaluation as a table, as files of rankings, and as figures of some queries."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from mfvpr.data.datasets import ImageFolder, QuerySequence
+from mfvpr.data.files import write_text
+from mfvpr.data.images import resize
+from mfvpr.evaluation import Positives, threshold_words
+from mfvpr.evaluations import Matched, Ranked, Recall, Result
+from mfvpr.features import Extractor
+from mfvpr.pipeline import explain
+from mfvpr.report.figures import Answer, histogram_figure
+from mfvpr.report.rankings import Rankings, write_failures, write_predictions
+from mfvpr.report.runs import Figure
+from mfvpr.report.tables import Table
+from mfvpr.scoring import HistogramOfShifts
+
+MEANS = ("mean", "pooled")  # over the sequences, and over all of their queries
+
+
+@dataclass(frozen=True)
+class Judged:
+    """An evaluation and what it is judged by.
+
+    Attributes:
+        result: of all sequences.
+        thresholds: what counts as right, in the unit of the ground truth, ascending; none without ground truth.
+        ks: depths of recall.
+        headline: the system of predictions.csv and of the figures.
+    """
+
+    result: Result
+    thresholds: Sequence[float]
+    ks: Sequence[int]
+    headline: str
+
+    @property
+    def threshold(self) -> float:
+        """The one in the middle, which predictions, failures and figures go by."""
+        return self.thresholds[len(self.thresholds) // 2]
+
+    @property
+    def sequences(self) -> Sequence[QuerySequence]:
+        """Of the data set."""
+        return self.result.dataset.sequences
+
+    @cached_property
+    def recall(self) -> dict[str, Recall]:
+        """By system."""
+        return self.result.recall(self.thresholds, self.ks)
+
+    def parts(self, system: str) -> Iterator[tuple[str, np.ndarray]]:
+        """(sequence, recall `[thresholds, ks]`), and behind several sequences their means."""
+        recall = self.recall[system]
+        yield from zip((sequence.name for sequence in self.sequences), recall.by_sequence, strict=True)
+        if len(self.sequences) > 1:
+            yield from zip(MEANS, (recall.mean, recall.pooled), strict=True)
+
+    @cached_property
+    def right(self) -> Sequence[Positives | None]:
+        """By `threshold`, of each sequence."""
+        return self.result.positives(self.threshold) if self.thresholds else [None] * len(self.sequences)
+
+    def is_right(self, system: str, place: int) -> np.ndarray | None:
+        """`[Q, C]` bool in the order of a system's ranking of the sequence at a place."""
+        right = self.right[place]
+        return None if right is None else right.contains(self.result.systems[system][place].rows)
+
+
+def recall_table(judged: Judged) -> Table:
+    """R@first k at every threshold, and all ks at the middle one; a line for each system, and sequence."""
+    truth, ks, main = judged.sequences[0].truth, judged.ks, len(judged.thresholds) // 2
+    cells = [(place, 0) for place in range(len(judged.thresholds))] + [(main, depth) for depth in range(1, len(ks))]
+    unit = "exact" if truth is None else truth.unit
+    labels = [f"R@{ks[depth]}{threshold_words(unit, judged.thresholds[place])}" for place, depth in cells]
+    several = len(judged.sequences) > 1
+    lines = [
+        [system, *([name] if several else []), *(f"{100 * recall[cell]:.1f}" for cell in cells)]
+        for system in judged.result.systems
+        for name, recall in judged.parts(system)
+    ]
+    return Table(["system", *(["sequence"] if several else []), *labels], lines, text_columns=1 + several)
+
+
+def write_rankings(folder: Path, judged: Judged) -> None:
+    """`predictions/` and `failures/` of every system, those of the headline's in the folder itself.
+
+    Of several sequences each has its own folders.
+    """
+    database = judged.result.dataset.database.names
+    for place, sequence in enumerate(judged.sequences):
+        own = folder / sequence.name if len(judged.sequences) > 1 else folder
+        for name, ranked in judged.result.systems.items():
+            one = ranked[place]
+            found = Rankings(sequence.images.names, database, one.rows, one.scores, judged.is_right(name, place))
+            file = f"{name.replace(' + ', '_')}.csv"
+            write_predictions(own / "predictions" / file, found)
+            write_failures(own / "failures" / file, found)
+            if name == judged.headline:
+                write_predictions(own / "predictions.csv", found)
+                write_failures(own / "failures.csv", found)
+
+
+def write_skipped(folder: Path, result: Result) -> None:
+    """`skipped.csv`: images that could not be used, and why; none where all could."""
+    database = result.dataset.database
+    bad = {("database", database.names[row], why) for one in result.matched for row, why in one.bad_database.items()}
+    lines = sorted(bad) + [
+        ("queries", one.sequence.images.names[row], why)
+        for one in result.matched
+        for row, why in one.bad_queries.items()
+    ]
+    if lines:
+        write_text(folder / "skipped.csv", Table(["folder", "image", "reason"], lines).csv())
+
+
+def figures(
+    judged: Judged, extractor: Extractor, shown: int | Sequence[int], histogram: HistogramOfShifts | None = None
+) -> list[Figure]:
+    """The paper's figure for a few queries, right and wrong ones, spread over each sequence.
+
+    Args:
+        judged: the evaluation.
+        extractor: whose images are shown.
+        shown: how many, or rows of queries.
+        histogram: which; None = the paper's.
+    """
+    several = len(judged.sequences) > 1
+    return [
+        (f"{sequence.name}/{name}" if several else name, partial(page.draw, query=query, verdict=verdict))
+        for place, sequence in enumerate(judged.sequences)
+        for page in [_Page(judged, place, extractor, histogram or HistogramOfShifts())]
+        for query, verdict in page.shown(shown).items()
+        for name in [f"{verdict}_{query:04d}.png"]
+    ]
+
+
+@dataclass(frozen=True)
+class _Page:
+    """One sequence, for its figures."""
+
+    judged: Judged
+    place: int
+    extractor: Extractor
+    histogram: HistogramOfShifts
+
+    @property
+    def sequence(self) -> QuerySequence:
+        return self.judged.sequences[self.place]
+
+    @property
+    def matched(self) -> Matched:
+        return self.judged.result.matched[self.place]
+
+    @property
+    def ranked(self) -> Ranked:
+        return self.judged.result.systems[self.judged.headline][self.place]
+
+    @property
+    def database(self) -> ImageFolder:
+        return self.judged.result.dataset.database
+
+    def shown(self, asked: int | Sequence[int]) -> dict[int, str]:
+        """Queries that get a figure, with what became of them: half right, half wrong where that can be told."""
+        right = self.judged.is_right(self.judged.headline, self.place)
+        some = self.ranked.rows[:, 0] >= 0
+        verdicts = np.full(len(some), "best") if right is None else np.where(right[:, 0], "right", "wrong")
+        if not isinstance(asked, int):
+            return {query: str(verdicts[query]) for query in asked if some[query]}
+        numbers = {"best": asked} if right is None else {"right": (asked + 1) // 2, "wrong": asked // 2}
+        return {query: verdict for verdict, number in numbers.items()
+                for query in _spread(np.flatnonzero(some & (verdicts == verdict)), number)}  # fmt: skip
+
+    def draw(self, path: Path, query: int, verdict: str) -> None:
+        """What was answered; where that is wrong, below it what is right."""
+        names, truth = self.sequence.images.names, self.sequence.truth
+        answers = [self._answer(query, 0, verdict), *(self._right_answer(query) if verdict == "wrong" else [])]
+        within = "" if truth is None else threshold_words(truth.unit, self.judged.threshold)
+        verdict += " at" * bool(within) + within
+        answer = self.database.names[self.ranked.rows[query, 0]]
+        title = f"{self.judged.headline}, {verdict}: {names[query]} -> {answer}"
+        histogram_figure(path, self._image(self.sequence.images, query), answers, title=title)
+
+    def _answer(self, query: int, rank: int, verdict: str) -> Answer:
+        """The candidate at a rank from 0."""
+        row, score = int(self.ranked.rows[query, rank]), self.ranked.scores[query, rank]
+        place = int(np.flatnonzero(self.matched.candidates.indices[query] == row)[0])
+        pair = jax.tree.map(lambda values: values[place], self.matched.matches[0][query])
+        caption = f"{verdict}: {self.database.names[row]}, rank {rank + 1}, score {score:.5g}"
+        return Answer(self._image(self.database, row), caption, pair, explain(self.histogram, pair))
+
+    def _right_answer(self, query: int) -> list[Answer]:
+        """The first right candidate; else the right image, which the filter missed; nothing where there is none."""
+        ranked, right = self.judged.is_right(self.judged.headline, self.place), self.judged.right[self.place]
+        truth = self.sequence.truth
+        if ranked is None or right is None or truth is None or not right.counts[query]:
+            return []
+        if ranked[query].any():
+            return [self._answer(query, int(np.argmax(ranked[query])), "right")]
+        nearest, rows = truth.place(query), right.of(query)
+        row = nearest if nearest is not None and nearest in rows else int(rows[0])
+        num_candidates = self.matched.candidates.indices.shape[1]
+        caption = f"right: {self.database.names[row]}, not among the {num_candidates} candidates"
+        return [Answer(self._image(self.database, row), caption, None, None)]
+
+    def _image(self, folder: ImageFolder, row: int) -> np.ndarray:
+        return resize(folder.read(row), self.extractor.image_size, self.extractor.interpolation)
+
+
+def _spread(values: np.ndarray, number: int) -> list[int]:
+    """Some of the values, evenly spread."""
+    chosen = np.linspace(0, len(values) - 1, min(number, len(values))).round().astype(int)
+    return [int(values[place]) for place in chosen]

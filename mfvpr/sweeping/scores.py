@@ -1,0 +1,107 @@
+"""Scores of whole data sets: matches go pair by pair, whatever query they belong to, in batches on all devices."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from functools import partial
+from threading import Lock
+from typing import Any
+
+import jax
+import numpy as np
+
+from mfvpr.data.images import ordered_map
+from mfvpr.match_sets import MatchSet, Scales, batches, partition, scales
+from mfvpr.numerics import Device, available_cpus, compiled, held, knows_own_context
+from mfvpr.parameter_grids import score_settings
+from mfvpr.progress import Track, untracked
+from mfvpr.reranking import BIN_STEP, fuse_scales
+from mfvpr.scoring import Scorer
+from mfvpr.scoring.parameters import fit
+from mfvpr.types import Array, Matches, Shortlist
+
+Batch = tuple[np.ndarray, Matches]  # places [n] of its pairs, and their Matches [P, K, ...]
+
+
+def score(
+    scorers: Mapping[str, Scorer], match_set: MatchSet | Scales, candidates: Shortlist, *,
+    devices: Sequence[Device] | None = None, track: Track = untracked,
+) -> dict[str, np.ndarray]:  # fmt: skip
+    """Scores `[Q, C]` float32 of every query's candidates by each scorer; NaN where there is no candidate.
+
+    All scorers are one program for each shape of a batch, which other parameter values use again (histograms: within a
+    capacity of 8 bins). A pair without matches scores 0.
+
+    Args:
+        scorers: by name.
+        match_set: matches of Q queries with C candidates; those of several scales are scored one by one and fused.
+        candidates: their shortlist.
+        devices: that share the batches, which changes no bit of the scores; None = the one that JAX takes.
+        track: progress, over batches.
+    """
+    queries, sets = range(len(candidates.mask)), scales(match_set)
+    fitted = held(fit(dict(scorers), *match_set.image_sizes, multiple=BIN_STEP))
+    total = sum(len(partition(one, queries, settings=1)) for one in sets)
+    made = scored(_score_all, (fitted,), all_batches(match_set, queries, settings=1), devices=devices)
+    scores = {name: np.zeros((len(sets), *candidates.mask.shape), np.float32) for name in scorers}
+    for places, values in track(made, total):
+        for name, of_pairs in values.items():
+            scores[name].reshape(-1)[places] = of_pairs
+    fused = {name: fuse_all(match_set, by_scale, candidates.mask) for name, by_scale in scores.items()}
+    return {name: np.where(candidates.mask, values, np.nan) for name, values in fused.items()}
+
+
+def all_batches(match_set: MatchSet | Scales, queries: range, *, settings: float) -> Iterator[Batch]:
+    """Those of every scale, see `match_sets.batches`; places are in the flattened `[S, queries, C]`."""
+    for scale, one in enumerate(scales(match_set)):
+        pairs = len(queries) * one.counts.shape[1]
+        for places, matches in batches(one, queries, settings=settings):
+            yield scale * pairs + places, matches
+
+
+def scored(
+    program: Callable[..., Any], inputs: tuple, batches: Iterable[Batch], *, devices: Sequence[Device] | None
+) -> Iterator[tuple[np.ndarray, Any]]:
+    """(places `[n]`, arrays `[..., n]`) of every batch, in their order, NumPy.
+
+    Args:
+        program: of Matches `[P, K, ...]` and the inputs, gives arrays `[..., P]`.
+        inputs: arrays, and what holds some.
+        batches: of few shapes; only a few are held at a time.
+        devices: that take turns; None = the one that JAX takes.
+    """
+    turns = [_as_it_is] if devices is None else [partial(jax.device_put, device=device) for device in devices]
+    own = [put(inputs) for put in turns]
+    known: set[tuple] = set()
+    compiling: dict[tuple, Lock] = {}
+
+    def score(numbered: tuple[int, Batch]) -> tuple[np.ndarray, Any]:
+        number, (places, matches) = numbered
+        turn = number % len(turns)
+        key = turn, matches.mask.shape
+        # The first batch of a shape compiles: those that come meanwhile wait for it.
+        with nullcontext() if key in known else compiling.setdefault(key, Lock()):
+            values = program(turns[turn](matches), *own[turn])
+        known.add(key)
+        return places, jax.tree.map(lambda of_pairs: np.asarray(of_pairs)[..., : len(places)], values)
+
+    # Products this small keep one core busy: as many batches at a time as there are cores.
+    workers = max(available_cpus(), len(turns))
+    spread = partial(ordered_map, workers=workers) if knows_own_context() else map
+    return iter(spread(score, enumerate(batches)))
+
+
+def fuse_all(match_set: MatchSet | Scales, scores: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Scores `[..., Q, C]` of candidates `mask` `[Q, C]`, out of those of every scale `[S, ..., Q, C]`."""
+    if not isinstance(match_set, Scales):
+        return scores[0]
+    weights = None if match_set.weights is None else np.asarray(match_set.weights, np.float32)
+    return np.asarray(fuse_scales(np.moveaxis(scores, 0, -1), mask, weights, normalize=match_set.normalize))
+
+
+@compiled
+def _score_all(matches: Matches, scorers: dict[str, Scorer]) -> dict[str, Array]:
+    return {name: score_settings(scorer, matches, {}, {})[0, 0] for name, scorer in scorers.items()}
+
+
+def _as_it_is(tree: Any) -> Any:
+    return tree
