@@ -149,7 +149,7 @@ def test_no_features_are_read_where_the_matches_are_stored(sweep, swept, tmp_pat
     monkeypatch.setattr(Archive, "local", lambda *_, **options: pytest.fail("features were read"))
     sweep(tmp_path / "out", *GRID)
     stderr = capsys.readouterr().err
-    assert "folder sift matches: all 24 queries from" in stderr
+    assert "folder matches: all 24 queries from" in stderr
     assert "features" not in stderr
 
 
