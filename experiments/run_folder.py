@@ -9,8 +9,8 @@ from experiments import build, console
 from experiments.settings import SettingsError
 from mfvpr.errors import InputError
 from mfvpr.report import runs
+from mfvpr.report.runs import Figure
 
-Figure = tuple[str, Callable[[Path], None]]  # name of the file, and what draws it there
 _OF_THE_START = ("multirun", "command")  # what `command_line` adds to the settings
 
 

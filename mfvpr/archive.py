@@ -8,8 +8,8 @@ Stores are found by what they hold (the images' content and the extractor's reci
 a database which several data sets share is extracted once.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -162,10 +162,11 @@ class Archive:
             values[row] = vector
         return Vectors(values, dict(bad))
 
+    @contextmanager
     def matches(
         self, recipe: Mapping[str, Any], num_queries: int, num_candidates: int, *, typical: int, label: str
-    ) -> match_stores.MatchStore:
-        """The store of matches that are made so, where there is a root.
+    ) -> Iterator[match_stores.MatchStore]:
+        """The store of matches that are made so, where there is a root, held while it lacks some.
 
         Args:
             recipe: of the matches.
@@ -178,15 +179,15 @@ class Archive:
             raise ValueError("nothing is kept on disk: this archive has no root")
         path = store_path(self.root, "matches", recipe, MATCHES)
         sizes = {"num_queries": num_queries, "num_candidates": num_candidates}
-        store = match_stores.open_match_store(path, recipe, **sizes, waiting=self._waiting)
-        if missing := num_queries - int(store.done.sum()):
-            needed = match_stores.forecast_bytes(missing, num_candidates, typical)
-            require_space(store.folder, needed)
-            self.tell(f"{label}: {missing} of {num_queries} queries to match with {num_candidates} candidates: about "
-                      f"{needed / _MB:.1f} MB in {store.folder}")  # fmt: skip
-        else:
-            self.tell(f"{label}: all {num_queries} queries from {store.folder}")
-        return store
+        with match_stores.open_match_store(path, recipe, **sizes, waiting=self._waiting) as store:
+            if missing := num_queries - int(store.done.sum()):
+                needed = match_stores.forecast_bytes(missing, num_candidates, typical)
+                require_space(store.folder, needed)
+                self.tell(f"{label}: {missing} of {num_queries} queries to match with {num_candidates} candidates: "
+                          f"about {needed / _MB:.1f} MB in {store.folder}")  # fmt: skip
+            else:
+                self.tell(f"{label}: all {num_queries} queries from {store.folder}")
+            yield store
 
     @property
     def _waiting(self) -> Callable[[str], None] | None:

@@ -7,7 +7,7 @@ print(result.table())
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
@@ -233,29 +233,33 @@ def match_sequence(
     archive, watch = archive or Archive(), watch or Stopwatch()
     database = dataset.database
     num_candidates = len(database) if candidates == "all" else min(candidates, len(database))
-    stores = _match_stores(dataset, sequence, extractor, filter, num_candidates, matching, archive) if keep else ()
-    if stores and all(store.done.all() for store in stores):
-        with watch("matches read"):
-            found = [pipeline.stored_matches(store) for store in stores]
-        return Matched(sequence, found[0][1], tuple(match_set for match_set, _ in found), {}, {})
-    with watch("filter"):
-        filtered = filter.shortlist(sequence, database, num_candidates, archive)
-    with watch("features"):
-        wanted = np.unique(filtered.candidates.indices[filtered.candidates.mask])
-        known = archive.local(database, extractor, wanted.tolist(), label="database features")
-        asked = archive.local(sequence.images, extractor, label=f"{sequence.name} features")
-    bad_queries, bad_database = {**filtered.bad_queries, **asked[0].bad}, {**filtered.bad_database, **known[0].bad}
-    _tell_of(archive, database, known[0], bad_database)
-    _tell_of(archive, sequence.images, asked[0], bad_queries)
-    with watch("matching"):
-        matches = []
-        for scale, (queries, images) in enumerate(zip(asked, known, strict=True)):
-            with stores[scale] if stores else nullcontext() as store:
-                matches.append(pipeline.match(
+    with ExitStack() as held:
+        stores = []
+        if keep and archive.root is not None:
+            recipe = matches_recipe(dataset, sequence, extractor, filter, num_candidates, matching, archive)
+            stores = [held.enter_context(one) for one in _match_stores(sequence, extractor, recipe, archive)]
+        if stores and all(store.done.all() for store in stores):
+            with watch("matches read"):
+                read = [pipeline.stored_matches(store) for store in stores]
+            return Matched(sequence, read[0][1], tuple(match_set for match_set, _ in read), {}, {})
+        with watch("filter"):
+            filtered = filter.shortlist(sequence, database, num_candidates, archive)
+        with watch("features"):
+            wanted = np.unique(filtered.candidates.indices[filtered.candidates.mask])
+            known = archive.local(database, extractor, wanted.tolist(), label="database features")
+            asked = archive.local(sequence.images, extractor, label=f"{sequence.name} features")
+        bad_queries, bad_database = {**filtered.bad_queries, **asked[0].bad}, {**filtered.bad_database, **known[0].bad}
+        _tell_of(archive, database, known[0], bad_database)
+        _tell_of(archive, sequence.images, asked[0], bad_queries)
+        with watch("matching"):
+            matches = tuple(
+                pipeline.match(
                     queries, images, filtered.candidates, **asdict(matching), with_ratio=with_ratio, store=store,
                     track=archive.track("matching"), **where,
-                ))  # fmt: skip
-    return Matched(sequence, filtered.candidates, tuple(matches), bad_queries, bad_database)
+                )
+                for queries, images, store in zip(asked, known, stores or [None] * len(asked), strict=True)
+            )  # fmt: skip
+    return Matched(sequence, filtered.candidates, matches, bad_queries, bad_database)
 
 
 def rank_sequence(
@@ -303,21 +307,15 @@ def matches_recipe(
 
 
 def _match_stores(
-    dataset: Dataset, sequence: QuerySequence, extractor: Extractor, filter: Filter, num_candidates: int,
-    matching: Matching, archive: Archive,
-) -> tuple[MatchStore, ...]:  # fmt: skip
-    """A store for the matches of each scale; none where nothing is kept on disk."""
-    if archive.root is None:
-        return ()
-    recipe = matches_recipe(dataset, sequence, extractor, filter, num_candidates, matching, archive)
+    sequence: QuerySequence, extractor: Extractor, recipe: Mapping[str, Any], archive: Archive
+) -> Iterator[AbstractContextManager[MatchStore]]:
+    """A store for the matches of each scale."""
     several = len(extractor.scales) > 1
-    return tuple(
-        archive.matches(
-            recipe | ({"scale": number} if several else {}), len(sequence.images), num_candidates,
+    for number, scale in enumerate(extractor.scales):
+        yield archive.matches(
+            {**recipe, "scale": number} if several else recipe, len(sequence.images), recipe["candidates"],
             typical=scale.typical_count // 3, label=f"{sequence.name} matches",
-        )
-        for number, scale in enumerate(extractor.scales)
-    )  # fmt: skip
+        )  # fmt: skip
 
 
 def _tell_of(archive: Archive, folder: ImageFolder, features: FeatureSet, bad: Mapping[int, str]) -> None:

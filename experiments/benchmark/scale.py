@@ -23,6 +23,8 @@ from mfvpr.data.files import write_text
 from mfvpr.numerics import available_cpus
 from mfvpr.report.runs import versions
 from mfvpr.report.tables import Table
+from mfvpr.reranking import rank_shortlist
+from mfvpr.retrieval import EXACT
 from mfvpr.sources import FeatureSet, FeatureSource, InMemory
 from mfvpr.types import Features
 
@@ -182,13 +184,13 @@ def ranked(
 ) -> Answer:
     """All steps for all queries; `vectors` are the global descriptors of both sides."""
     times = [time.perf_counter()]
-    candidates = pipeline.shortlist(*vectors, CANDIDATES)
+    candidates = EXACT.shortlist(*vectors, CANDIDATES)
     times.append(time.perf_counter())
     matches = pipeline.match(queries, database, candidates, memory=memory)
     times.append(time.perf_counter())
     scores = pipeline.score({"histogram": HistogramOfShifts()}, matches, candidates)["histogram"]
     times.append(time.perf_counter())
-    order = pipeline.rank(candidates, scores)
+    order = rank_shortlist(candidates, scores)
     times.append(time.perf_counter())
     rows = np.take_along_axis(candidates.indices, order, axis=1)
     return Answer(rows, scores, dict(zip(STEPS, np.diff(times).tolist(), strict=True)))

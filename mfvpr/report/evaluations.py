@@ -1,6 +1,6 @@
 """An evaluation as a table, as files of rankings, and as figures of some queries."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -17,10 +17,10 @@ from mfvpr.features import Extractor
 from mfvpr.pipeline import explain
 from mfvpr.report.figures import Answer, histogram_figure
 from mfvpr.report.rankings import Rankings, write_failures, write_predictions
+from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table
 from mfvpr.scoring import HistogramOfShifts
 
-Figure = tuple[str, Callable[[Path], None]]  # name of the file, and what draws it there
 MEANS = ("mean", "pooled")  # over the sequences, and over all of their queries
 
 
