@@ -4,9 +4,11 @@ A data set's features need not fit into memory. They stay where they are (a stor
 known by their counts; rows are read when somebody matches them, and kept on the device until others need the room.
 """
 
+import itertools
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import jax
@@ -20,7 +22,8 @@ from mfvpr.types import Features, per_keypoint
 
 SHARE = 1 / 3  # of the free memory, where nobody says how much
 STEP = 32  # capacities are multiples of it
-WRITTEN = 64  # rows that go to the device at a time: one program
+WRITTEN = 16  # rows that go to the device at a time: one program
+KEPT, STAGED = 2 / 3, 1 / 12  # of the budget: for rows that stay, and for each of the three parts on their way
 
 
 class FeatureSource(Protocol):
@@ -74,6 +77,11 @@ class FeatureSet:
             raise InputError("FeatureSet.of: expected the features of at least one image, got none")
         for number, image in enumerate(images):
             _check(image, number, unit_length)
+            if (dimension := image.descriptors.shape[1]) != (expected := images[0].descriptors.shape[1]):
+                raise InputError(
+                    f"features of image {number}: expected descriptors of {expected} dimensions, as those of image 0, "
+                    f"got {dimension}; extract all images alike"
+                )
         return cls(InMemory(dict(enumerate(map(_without_padding, images))), len(images)), {})
 
     @property
@@ -89,20 +97,26 @@ class FeatureSet:
         [(_, features)] = self.source.read([row])
         return features
 
+    @cached_property
+    def keypoint_bytes(self) -> int:
+        """Bytes of one keypoint with all that belongs to it, as the first image says that has any."""
+        image = self[int(np.argmax(self.counts > 0))]
+        return sum(values[:1].nbytes for values in per_keypoint(image).values())
+
     def read(self, rows: Iterable[int]) -> Iterator[tuple[int, Features]]:
         """(row, Features `[n, ...]`) of those among `rows` that have keypoints."""
         counts = self.counts
         return self.source.read([row for row in rows if counts[row] > 0])
 
 
-def memory_budget(memory: float | None, device: Device) -> int:
-    """Bytes for features on a device: of `memory` GB, by default a third of what is free there.
+def memory_budget(memory: float | None, devices: Sequence[Device]) -> int:
+    """Bytes for features on each of the devices that share the work: of `memory` GB, by default a third of what is free.
 
-    Devices that share the machine's memory share what is given.
+    Devices without a memory of their own, which share the machine's, share what is given.
     """
-    own = bool(device.memory_stats())
-    sharing = 1 if own else jax.local_device_count(device.platform)
-    return int((SHARE * free_bytes(device) if memory is None else 1e9 * memory) / sharing)
+    free = free_bytes(devices[0])
+    sharing = 1 if devices[0].memory_stats() else len(devices)
+    return int((SHARE * free if memory is None else 1e9 * memory) / sharing)
 
 
 def _capacities(counts: np.ndarray) -> np.ndarray:
@@ -114,125 +128,123 @@ def _capacities(counts: np.ndarray) -> np.ndarray:
 class Staged(NamedTuple):
     """Rows that are to be on the device, and those among them that are not there yet.
 
-    capacity, slot: `[R]` where each of the rows is: in the slots of which capacity, and in which.
-    new: by capacity, (slots `[n]`, Features `[n, N, ...]`).
+    capacity, slot: `[n]` where each of the rows is: in the slots of which capacity, and in which.
+    new: (capacity, slots `[WRITTEN]`, Features `[WRITTEN, N, ...]`), some of which may be no rows: no slots either.
     """
 
     capacity: np.ndarray
     slot: np.ndarray
-    new: dict[int, tuple[np.ndarray, Features]]
+    new: Sequence[tuple[int, np.ndarray, Features]]
+
+
+class Recent:
+    """The slots of one capacity: which row is in which; what was used longest ago makes room."""
+
+    def __init__(self, number: int) -> None:
+        """All of them empty."""
+        self.number = number
+        self._slots: OrderedDict[int, int] = OrderedDict()
+
+    def take(self, rows: Sequence[int]) -> tuple[list[int], list[int]]:
+        """(slots of distinct rows, no more than there are; the rows among them that were not there)."""
+        new = [row for row in rows if row not in self._slots]
+        for row in rows:  # first all that are there, so that none of them makes room
+            if row in self._slots:
+                self._slots.move_to_end(row)
+        for row in new:
+            is_full = len(self._slots) == self.number
+            self._slots[row] = self._slots.popitem(last=False)[1] if is_full else len(self._slots)
+        return [self._slots[row] for row in rows], new
 
 
 class Slots:
-    """Rows of a feature set on one device, padded, in slots of a few capacities; what was used longest ago makes room.
+    """Rows of a feature set on one device, padded, in slots of a few capacities.
 
     An image's capacity depends on its count and on those of all the images that will be asked for, never on the
-    others that are matched with it. `stage` reads, and may run ahead on another thread; `put` writes to the device.
+    others that are matched with it. `stage` reads, and may run ahead on another thread, by two calls; `put` writes to
+    the device.
     """
 
     def __init__(self, features: FeatureSet, wanted: np.ndarray, budget: int, device: Device) -> None:
-        """Nothing is read yet.
+        """Nothing is on the device yet.
 
         Args:
             features: whose rows.
-            wanted: the rows that will be asked for.
-            budget: bytes that the slots may take; a few slots there are in any case.
+            wanted: `[n]` distinct rows that will be asked for.
+            budget: bytes that the slots and what is on its way to them may take; a few slots there are in any case.
             device: where.
         """
-        self._features, self._device, self._budget = features, device, budget
+        self._features, self._device = features, device
         counts = features.counts
         capacities = _capacities(counts[wanted])
         self._capacity = ragged.fitting(capacities, np.minimum(counts, capacities[-1]))
-        self._wanted = {int(c): int(np.sum((self._capacity == c)[wanted] & (counts[wanted] > 0))) for c in capacities}
-        self._used: dict[int, OrderedDict[int, int]] = {capacity: OrderedDict() for capacity in self._wanted}
+        asked = self._capacity[wanted[counts[wanted] > 0]]
+        rows = {int(capacity): int(np.sum(asked == capacity)) for capacity in capacities}
+        size = features.keypoint_bytes if asked.size else 1
+        kept = KEPT * budget / max(1, sum(capacity * size * number for capacity, number in rows.items()))
+        self._together = max(WRITTEN, int(STAGED * budget / (capacities[-1] * size)))
+        self._recent = {
+            capacity: Recent(min(number, max(self._together, int(kept * number)))) for capacity, number in rows.items()
+        }
         self._arrays: dict[int, Features] = {}
-        self._number: dict[int, int] = {}
-        self._bytes = 0
 
     def parts(self, rows: np.ndarray) -> Iterator[np.ndarray]:
-        """The rows in parts that the slots hold at the same time, as they come."""
-        room: dict[int, int] = {}
-        start = 0
-        for place, row in enumerate(rows.tolist()):
-            capacity = int(self._capacity[row])
-            if room.get(capacity, 0) >= self._slots(capacity, row):
-                yield rows[start:place]
-                start, room = place, {}
-            room[capacity] = room.get(capacity, 0) + 1
-        if start < len(rows):
-            yield rows[start:]
+        """Distinct rows in parts that can be asked for at the same time, as they come."""
+        return (rows[start : start + self._together] for start in range(0, len(rows), self._together))
 
     def stage(self, rows: np.ndarray) -> Staged:
-        """Where distinct rows will be, one of `parts`, having read those that are not there."""
-        missing: dict[int, dict[int, int]] = {}  # by capacity: row -> slot
-        for row in rows.tolist():  # first all that are there, so that none of them makes room
-            used = self._used[int(self._capacity[row])]
-            if row in used:
-                used.move_to_end(row)
-        for row in rows.tolist():
-            capacity = int(self._capacity[row])
-            used = self._used[capacity]
-            if row not in used:
-                full = len(used) >= self._slots(capacity, row)
-                used[row] = used.popitem(last=False)[1] if full else len(used)
-                missing.setdefault(capacity, {})[row] = used[row]
-        read = dict(self._features.read([row for slots in missing.values() for row in slots]))
-        new = {
-            capacity: (np.array([*slots.values()], np.int32), stacked([read[row] for row in slots], capacity))
-            for capacity, slots in missing.items()
-        }
-        capacity = self._capacity[rows]
-        slot = [self._used[int(one)][row] for one, row in zip(capacity, rows.tolist(), strict=True)]
-        return Staged(capacity, np.array(slot, np.int32), new)
+        """Where rows `[n]` of one of the `parts` will be, each as often as it comes, having read what is not there."""
+        distinct, place = np.unique(rows, return_inverse=True)
+        capacity, slot = self._capacity[distinct], np.zeros(len(distinct), np.int32)
+        missing: list[tuple[int, list[int]]] = []
+        for size, recent in self._recent.items():
+            there = capacity == size
+            slot[there], new = recent.take(distinct[there].tolist())
+            missing += [(size, new[start : start + WRITTEN]) for start in range(0, len(new), WRITTEN)]
+        read = self._features.read([row for _, new in missing for row in new])
+        written = []
+        for size, new in missing:
+            images = [image for _, image in itertools.islice(read, len(new))]
+            slots = np.full(WRITTEN, self._recent[size].number, np.int32)
+            slots[: len(new)] = slot[np.searchsorted(distinct, new)]
+            written.append((size, slots, stacked(images, size, total=WRITTEN)))
+        return Staged(capacity[place], slot[place], written)
 
     def put(self, staged: Staged) -> Mapping[int, Features]:
         """The rows on the device, by capacity `[slots, N, ...]`: good until the next call."""
-        for capacity, (slots, features) in staged.new.items():
+        for capacity, slots, features in staged.new:
+            rows = jax.device_put(features, self._device)
             if capacity not in self._arrays:
-                self._arrays[capacity] = self._empty(features, self._number[capacity])
-            for start in range(0, len(slots), WRITTEN):
-                part = ragged.filled(np.arange(len(slots))[start : start + WRITTEN], WRITTEN)
-                rows = jax.device_put(jax.tree.map(lambda leaf: leaf[part], features), self._device)  # noqa: B023
-                self._arrays[capacity] = _write(self._arrays[capacity], slots[part], rows)
+                self._arrays[capacity] = _empty(rows, self._recent[capacity].number)
+            self._arrays[capacity] = _write(self._arrays[capacity], slots, rows)
         return self._arrays
 
-    def _slots(self, capacity: int, row: int) -> int:
-        """How many of a capacity there are: for all that will be asked for, or what its part of the budget holds."""
-        if capacity not in self._number:
-            self._bytes = self._bytes or _bytes_of_keypoint(self._features, row)
-            total = sum(number * size for size, number in self._wanted.items()) * self._bytes
-            share = min(1.0, self._budget / max(total, 1))
-            number = self._wanted[capacity]
-            self._number[capacity] = max(1, min(number, max(WRITTEN, int(share * number))))
-        return self._number[capacity]
 
-    def _empty(self, features: Features, number: int) -> Features:
-        with jax.default_device(self._device):
-            return jax.tree.map(lambda leaf: jnp.zeros((number, *leaf.shape[1:]), leaf.dtype), features)
+def _empty(rows: Features, number: int) -> Features:
+    """As many rows, where these are."""
+    return jax.tree.map(lambda leaf: jnp.zeros((number, *leaf.shape[1:]), leaf.dtype, device=leaf.device), rows)
 
 
 def _write(arrays: Features, slots: np.ndarray, rows: Features) -> Features:
-    return jax.tree.map(lambda array, row: array.at[slots].set(row), arrays, rows)
+    return jax.tree.map(lambda array, row: array.at[slots].set(row, mode="drop"), arrays, rows)
 
 
 _write = compiled(_write, donate_argnums=0)  # in place: the arrays may be as large as the memory allows
 
 
-def _bytes_of_keypoint(features: FeatureSet, row: int) -> int:
-    [(_, image)] = features.read([row])
-    return sum(values.nbytes for values in per_keypoint(image).values()) // len(image.mask)
-
-
-def stacked(images: Sequence[Features], capacity: int) -> Features:
-    """Features `[n, ...]` of at least one image as `[R, capacity, ...]`, NumPy."""
+def stacked(images: Sequence[Features], capacity: int, *, total: int | None = None) -> Features:
+    """Features `[n, ...]` of at least one image as `[R, capacity, ...]`, NumPy; see `ragged.padded`."""
     rows = [{name: values for name, values in per_keypoint(image).items() if name != "mask"} for image in images]
-    arrays, mask = ragged.padded(rows, capacity)
-    return Features(**arrays, mask=mask, image_size=np.stack([image.image_size for image in images]))
+    arrays, mask = ragged.padded(rows, capacity, total=total)
+    sizes = np.stack([image.image_size for image in images])
+    return Features(**arrays, mask=mask, image_size=sizes if total is None else ragged.filled(sizes, total))
 
 
 def _without_padding(image: Features) -> Features:
+    """In single precision, as it is matched."""
     real = np.asarray(image.mask)
-    return replace(image, **{name: np.asarray(values)[real] for name, values in per_keypoint(image).items()})
+    arrays = {name: np.asarray(values, np.float32)[real] for name, values in per_keypoint(image).items()}
+    return Features(**arrays | {"mask": real[real]}, image_size=np.asarray(image.image_size, np.float32))
 
 
 def _check(image: Features, number: int, unit_length: bool) -> None:

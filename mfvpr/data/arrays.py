@@ -58,16 +58,28 @@ def read_arrays(path: Path, about: str = "") -> dict[str, np.ndarray]:
         InputError: any bit differs, or the arrays are about something else.
         OSError: there is no such file, or it cannot be read.
     """
-    content = memoryview(path.read_bytes())
-    if content[-_DIGEST:] != _digest(content[:-_DIGEST], about):
+    content = path.read_bytes()
+    whole = memoryview(content)
+    if whole[-_DIGEST:] != _digest(whole[:-_DIGEST], about):
         raise InputError(f"{path}: expected arrays as they were written here, got others or damaged ones; delete it")
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        return {name.removesuffix(".npy"): _array(archive.read(name)) for name in archive.namelist()}
+        return {
+            member.filename.removesuffix(".npy"): _array(_values(archive, member, whole)) for member in archive.filelist
+        }
 
 
-def _array(member: bytes) -> np.ndarray:
+def _values(archive: zipfile.ZipFile, member: zipfile.ZipInfo, whole: memoryview) -> bytes | memoryview:
+    """What a member holds; where it is as it stands in the file, without another checksum and two copies."""
+    if member.compress_type != zipfile.ZIP_STORED:
+        return archive.read(member)
+    name, extra = (int.from_bytes(whole[member.header_offset + at :][:2], "little") for at in (26, 28))
+    start = member.header_offset + 30 + name + extra
+    return whole[start : start + member.file_size]
+
+
+def _array(member: bytes | memoryview) -> np.ndarray:
     start = 10 + int.from_bytes(member[8:10], "little")  # of the values, in the format's version 1
-    shape, fortran_order, dtype = _header(member[:start])
+    shape, fortran_order, dtype = _header(bytes(member[:start]))
     return np.frombuffer(member, dtype, offset=start).reshape(shape, order="F" if fortran_order else "C").copy()
 
 

@@ -6,9 +6,9 @@
             ...
 
 A row store (`mfvpr.stores.rows`), whose rows are `keypoints` float32 `[N, 2]` (px), `descriptors` float16 `[N, D]`,
-all of unit length, `lengths` float32 `[N]` that they had, `scores` float32 `[N]` and `image_size` float32 `[2]` (px).
-Padding is left out. What comes back is float32; a descriptor has its length, and its direction to 5e-4, all else is as
-it was.
+all of unit length but for rounding, `scales` float32 `[N]` that give them back the lengths that they had, `scores`
+float32 `[N]` and `image_size` float32 `[2]` (px). Padding is left out. What comes back is float32; a descriptor has its
+length, and its direction to 5e-4, all else is as it was.
 """
 
 from collections.abc import Callable, Mapping
@@ -58,23 +58,24 @@ def _pack(features: Features) -> dict[str, np.ndarray]:
     image_size = np.asarray(features.image_size, np.float32)
     if not all(np.isfinite(part).all() for part in (keypoints, lengths, scores, image_size)):
         raise ValueError("features must be finite")
+    directions = (descriptors / np.where(lengths > 0, lengths, 1)[:, None]).astype(np.float16)
+    norms = np.sqrt(np.einsum("nd,nd->n", directions, directions, dtype=np.float32))
     return {
         "keypoints": keypoints,
-        "descriptors": (descriptors / np.where(lengths > 0, lengths, 1)[:, None]).astype(np.float16),
-        "lengths": lengths,
+        "descriptors": directions,
+        "scales": lengths / np.where(norms > 0, norms, 1),
         "scores": scores,
         "image_size": image_size,
     }
 
 
 def _unpack(parts: Mapping[str, np.ndarray]) -> Features:
-    directions = parts["descriptors"].astype(np.float32)
-    norms = np.sqrt(np.einsum("nd,nd->n", directions, directions))
-    directions *= (parts["lengths"] / np.where(norms > 0, norms, 1))[:, None]
+    descriptors = parts["descriptors"].astype(np.float32)
+    descriptors *= parts["scales"][:, None]
     return Features(
         keypoints=parts["keypoints"],
-        descriptors=directions,
+        descriptors=descriptors,
         scores=parts["scores"],
-        mask=np.ones(len(directions), bool),
+        mask=np.ones(len(descriptors), bool),
         image_size=parts["image_size"],
     )

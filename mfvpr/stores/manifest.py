@@ -28,6 +28,7 @@ class Kind:
 
     Attributes:
         store: what it is called.
+        version: of its arrays on disk.
         content: what a row is made of.
         rows: what a row belongs to.
         remake: what the next run does with a row that is not done.
@@ -35,6 +36,7 @@ class Kind:
     """
 
     store: str
+    version: int
     content: str
     rows: str
     remake: str
@@ -42,12 +44,12 @@ class Kind:
 
     @property
     def format(self) -> str:
-        """Of the arrays on disk, with its version."""
-        return f"mfvpr {self.store} 2"
+        """What the manifest says of the arrays on disk."""
+        return f"mfvpr {self.store} {self.version}"
 
 
-FEATURES = Kind("feature store", "features", "images", "extracts", compress=False)
-MATCHES = Kind("match store", "matches", "queries", "matches", compress=True)
+FEATURES = Kind("feature store", 3, "features", "images", "extracts", compress=False)
+MATCHES = Kind("match store", 2, "matches", "queries", "matches", compress=True)
 
 
 def recipe_fingerprint(recipe: Mapping[str, Any], kind: Kind = FEATURES) -> str:

@@ -123,8 +123,8 @@ class RowStore(Generic[Item]):
         """(row, item) of rows that are done, by default of all; some are read ahead on threads.
 
         Raises:
-            InputError: some were damaged on disk, told after the others were given; they are removed, so that the next
-                run makes them anew. Or the disk cannot be read.
+            InputError: some are damaged on disk; all that are asked for are looked at, none is given after the first,
+                and they are removed, so that the next run makes them anew. Or the disk cannot be read.
             ValueError: a row that is not done.
         """
         rows = np.flatnonzero(self.done).tolist() if rows is None else list(rows)
@@ -135,7 +135,7 @@ class RowStore(Generic[Item]):
         for row, path, item in zip(rows, paths, ordered_map(self._read_item, paths, workers=THREADS), strict=True):
             if item is None:
                 damaged[row] = path
-            else:
+            elif not damaged:
                 yield row, item
         if damaged:
             raise InputError(self._remove(damaged))

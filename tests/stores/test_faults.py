@@ -113,7 +113,7 @@ def test_a_damaged_row_is_told_and_made_anew(tmp_path, subject, damage):
     with subject.open(folder, 3) as store:
         assert store.done.all()
         found = store.read()
-        assert [next(found)[0], next(found)[0]] == [0, 2]
+        assert next(found)[0] == 0
         expected = rf"s: {words.content} of 1 {words.rows} are damaged.*row 1 \(1-.*\); run again, which {words.remake}"
         with pytest.raises(InputError, match=expected) as told:
             next(found)

@@ -255,7 +255,7 @@ def _no_json(folder):
         (_below_a_file, r"\(Not a directory\)"),
         (_other_json, "expected the manifest of a feature store, got something else"),
         (_list, "expected the manifest of a feature store, got something else"),
-        (_old, "expected 'mfvpr feature store 2', got the format of an earlier version"),
+        (_old, "expected 'mfvpr feature store 3', got the format of an earlier version"),
         (_no_json, "expected the manifest of a feature store, got something else"),
     ],
 )
