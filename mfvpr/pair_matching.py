@@ -118,7 +118,9 @@ def matched(
                 of_query = [pairs.pop((query, place), None) for place in range(indices.shape[1])]
                 counts = np.where(indices[query] >= 0, counts1[indices[query]], 0)
                 matches = _joined(of_query, counts0[query], counts, with_ratio)
-                numbers = np.array([0 if pair is None else len(pair.matches["distance"]) for pair in of_query], np.int32)
+                numbers = np.array(
+                    [0 if pair is None else len(pair.matches["distance"]) for pair in of_query], np.int32
+                )
                 yield query, QueryMatches(matches, numbers, indices[query], scores[query])
 
 

@@ -110,9 +110,10 @@ class FeatureSet:
 
 
 def memory_budget(memory: float | None, devices: Sequence[Device]) -> int:
-    """Bytes for features on each of the devices that share the work: of `memory` GB, by default a third of what is free.
+    """Bytes for features on each of the devices that share the work.
 
-    Devices without a memory of their own, which share the machine's, share what is given.
+    They are `memory` GB, by default a third of what is free. Devices without a memory of their own share the machine's, and
+    what is given.
     """
     free = free_bytes(devices[0])
     sharing = 1 if devices[0].memory_stats() else len(devices)
