@@ -17,13 +17,13 @@ import numpy as np
 
 from mfvpr import ragged
 from mfvpr.errors import InputError
-from mfvpr.numerics import Device, compiled, free_bytes
+from mfvpr.numerics import Device, compiled, free_bytes, round_up
 from mfvpr.types import Features, per_keypoint
 
 SHARE = 1 / 3  # of the free memory, where nobody says how much
 STEP = 32  # capacities are multiples of it
 WRITTEN = 16  # rows that go to the device at a time: one program
-KEPT, STAGED = 2 / 3, 1 / 12  # of the budget: for rows that stay, and for each of the three parts on their way
+KEPT, STAGED = 3 / 5, 1 / 24  # of the budget: for rows that stay, and for each of the parts on their way, up to six
 
 
 class FeatureSource(Protocol):
@@ -112,8 +112,7 @@ class FeatureSet:
 def memory_budget(memory: float | None, devices: Sequence[Device]) -> int:
     """Bytes for features on each of the devices that share the work.
 
-    They are `memory` GB, by default a third of what is free. Devices without a memory of their own share the machine's, and
-    what is given.
+    They are `memory` GB, by default a third of what is free. Devices without a memory of their own share it.
     """
     free = free_bytes(devices[0])
     sharing = 1 if devices[0].memory_stats() else len(devices)
@@ -124,6 +123,12 @@ def _capacities(counts: np.ndarray) -> np.ndarray:
     """One or two capacities for images of such counts: two where that spares the half of them a quarter or more."""
     half, most = ragged.sizes(counts, (0.5, 1.0), STEP)[[0, -1]]
     return np.array([half, most] if half <= 0.75 * most else [most])
+
+
+def _few_sizes(number: int) -> int:
+    """At least as many slots, by a quarter more at most: another number is another program."""
+    number = max(WRITTEN, number)
+    return round_up(number, 2 ** (number.bit_length() - 3))
 
 
 class Staged(NamedTuple):
@@ -185,7 +190,8 @@ class Slots:
         kept = KEPT * budget / max(1, sum(capacity * size * number for capacity, number in rows.items()))
         self._together = max(WRITTEN, int(STAGED * budget / (capacities[-1] * size)))
         self._recent = {
-            capacity: Recent(min(number, max(self._together, int(kept * number)))) for capacity, number in rows.items()
+            capacity: Recent(_few_sizes(min(number, max(self._together, int(kept * number)))))
+            for capacity, number in rows.items()
         }
         self._arrays: dict[int, Features] = {}
 

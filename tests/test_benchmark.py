@@ -90,6 +90,39 @@ def test_report_has_everyone(contest):
         assert wanted in remarks
 
 
+@pytest.mark.slow
+def test_a_small_database_is_ranked_in_its_own_process(tmp_path, monkeypatch, capsys):
+    from experiments.benchmark import scale
+    from experiments.benchmark.made_up import MadeUp
+
+    data = MadeUp(60, 3, 60, 16)
+    monkeypatch.setattr(scale, "SETS", [data])
+    scale.run(1, tmp_path / "out.json", tmp_path / "stores")
+    stores = {path: path.stat().st_mtime_ns for path in (tmp_path / "stores").rglob("*.npz")}
+    assert len(stores) == 60 + 3
+    content = json.loads((tmp_path / "out.json").read_text())
+    [row] = content["results"]
+    assert row["images"] == 60
+    assert row["same"] is True
+    assert row["recall"] == 1
+    assert row["rows"] == pytest.approx((60 + 3) / 3, abs=3)  # nearly all are somebody's candidates, and read once
+    assert 0.1 < row["peak"] < 3
+    assert 0 < row["steps"]["matching"] < row["total"][0]
+    assert "bit for bit: 60 images, D = 16: yes" in capsys.readouterr().out
+    data.stores(tmp_path / "stores")
+    assert stores == {path: path.stat().st_mtime_ns for path in (tmp_path / "stores").rglob("*.npz")}
+
+
+def test_stores_are_for_scale_alone(monkeypatch, capsys):
+    from experiments.benchmark.__main__ import main
+
+    monkeypatch.setattr(sys, "argv", ["benchmark", "scores", "--stores", "somewhere"])
+    with pytest.raises(SystemExit) as left:
+        main()
+    assert left.value.code == 2
+    assert "--stores is for scale alone" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", BENCHMARKS)
 def test_every_benchmark_is_a_module(name):
     assert callable(import_module(f"experiments.benchmark.{name}").run)

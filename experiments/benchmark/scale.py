@@ -12,6 +12,7 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -64,6 +65,14 @@ class Result:
     same: bool | None
 
 
+class Answer(NamedTuple):
+    """Rows of the database `[Q, C]`, best first; the candidates' scores `[Q, C]` in their order; seconds by step."""
+
+    rows: np.ndarray
+    scores: np.ndarray
+    seconds: dict[str, float]
+
+
 class Counted:
     """A source that counts the rows that are read of it, and the seconds that this takes."""
 
@@ -113,19 +122,19 @@ def measure(data: MadeUp, root: Path, rounds: int, start: float) -> Result:
     first = time.monotonic() - start
     source.rows, source.seconds = 0, 0.0
     cpu = time.process_time()
-    ranking, scores, steps = zip(*(ranked(queries, database, vectors) for _ in range(rounds)), strict=True)
+    answers = [ranked(queries, database, vectors) for _ in range(rounds)]
     cpu = time.process_time() - cpu
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9
-    per_query = rounds * data.queries
+    per_query, answer = rounds * data.queries, answers[0]
     same = None
     if data.images * data.dimension <= IN_MEMORY * 128:
         whole = FeatureSet(InMemory(dict(database_store.read()), data.images), {})
         expected = ranked(queries, whole, vectors, memory=None)
-        same = all(np.array_equal(*pair, equal_nan=True) for pair in zip((ranking[0], scores[0]), expected))  # noqa: B905
-    hits = [best in rows for best, rows in zip(ranking[0][:, 0], data.similar(), strict=True)]
+        same = np.array_equal(answer.rows, expected.rows) and np.array_equal(answer.scores, expected.scores)
+    hits = [best in rows for best, rows in zip(answer.rows[:, 0], data.similar(), strict=True)]
     return Result(
-        total=[sum(seconds.values()) / data.queries for seconds in steps],
-        steps={name: float(np.median([seconds[name] for seconds in steps])) / data.queries for name in STEPS},
+        total=[sum(one.seconds.values()) / data.queries for one in answers],
+        steps={name: float(np.median([one.seconds[name] for one in answers])) / data.queries for name in STEPS},
         cpu=cpu / per_query,
         reading=source.seconds / per_query,
         rows=source.rows / per_query,
@@ -142,8 +151,8 @@ def ranked(
     vectors: tuple[np.ndarray, np.ndarray],
     *,
     memory: float | None = MEMORY,
-) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
-    """Rows of the database `[Q, C]`, best first; the candidates' scores `[Q, C]`; and seconds by step."""
+) -> Answer:
+    """All steps for all queries; `vectors` are the global descriptors of both sides."""
     times = [time.perf_counter()]
     candidates = pipeline.shortlist(*vectors, CANDIDATES)
     times.append(time.perf_counter())
@@ -154,7 +163,7 @@ def ranked(
     order = pipeline.rank(candidates, scores)
     times.append(time.perf_counter())
     rows = np.take_along_axis(candidates.indices, order, axis=1)
-    return rows, scores, dict(zip(STEPS, np.diff(times).tolist(), strict=True))
+    return Answer(rows, scores, dict(zip(STEPS, np.diff(times).tolist(), strict=True)))
 
 
 def report(sets: Sequence[MadeUp], results: Sequence[Result], out: Path) -> None:

@@ -83,6 +83,30 @@ def test_a_complete_store_is_read_by_any_number_at_the_same_time(tmp_path, subje
             assert run_here(f"read_whole({str(tmp_path / 's')!r})").split() == ["0", "1", "2"]
 
 
+def test_a_store_is_read_while_another_process_writes_it(tmp_path):
+    """And what that has done meanwhile is done for whoever opens the store again, or enters it."""
+    call = f"from tests.stores.test_faults import *; hold({str(tmp_path / 's')!r})"
+    before = open_store(tmp_path / "s", RECIPE, num_images=3)
+    with subprocess.Popen([sys.executable, "-c", call], cwd=ROOT, stdout=subprocess.PIPE) as holder:
+        try:
+            assert holder.stdout is not None
+            assert holder.stdout.readline() == b"open\n"
+            store = open_store(tmp_path / "s", RECIPE, num_images=3)
+            assert store.counts.tolist() == [40, -1, -1]
+            [(row, found)] = store.read()
+            assert row == 0
+            np.testing.assert_array_equal(found.keypoints, features_of(0).keypoints)
+            with pytest.raises(ValueError, match="row 1 is not done"):
+                list(store.read([1]))
+            with pytest.raises(ValueError, match="write `with store:`"):
+                store.write({1: features_of(1)})
+            assert not before.done.any()
+        finally:
+            holder.kill()
+    with before:
+        assert before.done.tolist() == [True, False, False]
+
+
 def test_who_completes_a_store_lets_others_read_it(tmp_path):
     with open_store(tmp_path / "s", RECIPE, num_images=3) as writer:
         writer.write({row: features_of(row) for row in range(3)})

@@ -1,0 +1,261 @@
+"""Features on demand: own features that are checked, and rows on a device that make room for others."""
+
+from collections import Counter
+from dataclasses import fields, replace
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mfvpr import Features, InputError
+from mfvpr.sources import KEPT, WRITTEN, FeatureSet, InMemory, Recent, Slots, memory_budget, stacked
+from mfvpr.stores.features import open_store
+from tests.builders import make_features
+
+DEVICE = jax.devices()[0]
+KEYPOINT = 4 * (16 + 2 + 1) + 1  # bytes of one keypoint of `make_features`
+
+
+class Counting:
+    """A source that says how often each row was read."""
+
+    def __init__(self, source):
+        self.source, self.counts, self.reads = source, source.counts, Counter()
+
+    def read(self, rows=None):
+        for row, image in self.source.read(rows):
+            self.reads[row] += 1
+            yield row, image
+
+
+def images_of(counts, seed=0):
+    rng = np.random.default_rng(seed)
+    return [make_features(rng, count) for count in counts]
+
+
+def counted(counts):
+    source = Counting(FeatureSet.of(images_of(counts)).source)
+    return FeatureSet(source, {}), source
+
+
+def on_device(slots, rows):
+    """Each row as it lies there `[N, ...]`, NumPy."""
+    staged = slots.stage(np.asarray(rows, int))
+    arrays = slots.put(staged)
+    return [
+        jax.tree.map(lambda leaf, slot=slot: np.asarray(leaf[slot]), arrays[int(capacity)])
+        for capacity, slot in zip(staged.capacity, staged.slot, strict=True)
+    ]
+
+
+def assert_are(got, images, rows):
+    for one, row in zip(got, rows, strict=True):
+        expected = jax.tree.map(lambda leaf: leaf[0], stacked([images[row]], len(one.mask)))
+        for part in fields(Features):
+            np.testing.assert_array_equal(getattr(one, part.name), getattr(expected, part.name))
+
+
+# Own features
+
+
+def test_own_features_lose_their_padding_and_nothing_else():
+    rng = np.random.default_rng(0)
+    images = [make_features(rng, count, capacity=9) for count in (9, 0, 4)]
+    found = FeatureSet.of(images)
+    assert len(found) == 3
+    assert found.counts.tolist() == [9, 0, 4]
+    assert found.bad == {}
+    assert [row for row, _ in found.read(range(3))] == [0, 2]
+    for name in ("keypoints", "descriptors", "scores"):
+        np.testing.assert_array_equal(getattr(found[2], name), getattr(images[2], name)[:4])
+    assert found[2].mask.all()
+    assert found.keypoint_bytes == KEYPOINT
+
+
+def test_own_features_of_any_type_are_matched_in_single_precision():
+    [image] = images_of([5])
+    whole = replace(
+        image, keypoints=np.round(image.keypoints).astype(int), descriptors=image.descriptors.astype(np.float64)
+    )
+    found = FeatureSet.of([whole, image])
+    for row in range(2):
+        dtypes = {part.name: getattr(found[row], part.name).dtype for part in fields(Features)}
+        assert set(dtypes.values()) == {np.dtype(np.float32), np.dtype(bool)}
+    assert_are(on_device(Slots(found, np.arange(2), 10**6, DEVICE), [1]), [whole, image], [1])
+
+
+def spoiled(**changes):
+    [image] = images_of([5])
+    return replace(image, **changes)
+
+
+@pytest.mark.parametrize(
+    "images, message",
+    [
+        ([], "at least one image, got none"),
+        ([spoiled(descriptors=np.zeros((16, 5), np.float32))], r"image 0: .*\[N, D\].*\(16, 5\).*transpose"),
+        ([spoiled(scores=np.zeros((5, 1), np.float32))], r"image 0: .*scores \[N\]"),
+        ([spoiled(mask=np.ones(5))], "mask .* bool"),
+        ([*images_of([3]), spoiled(descriptors=2 * images_of([5])[0].descriptors)], "image 1: .*unit length, got 2;"),
+        ([*images_of([3]), make_features(np.random.default_rng(0), 3, dimension=8)], "image 1: .*16 .*, got 8;"),
+    ],
+)
+def test_own_features_that_do_not_fit_are_refused(images, message):
+    with pytest.raises(InputError, match=message) as told:
+        FeatureSet.of(images)
+    assert "\n" not in str(told.value)
+
+
+def test_lengths_are_free_where_said():
+    image = spoiled(descriptors=3 * images_of([5])[0].descriptors)
+    np.testing.assert_array_equal(FeatureSet.of([image], unit_length=False)[0].descriptors, image.descriptors)
+
+
+def test_rows_that_are_not_there_have_no_keypoints():
+    [image] = images_of([5])
+    found = FeatureSet(InMemory({2: image}, 4), {0: "cannot be read"})
+    assert found.counts.tolist() == [0, 0, 5, 0]
+    assert [row for row, _ in found.read(range(4))] == [2]
+    assert [row for row, _ in found.source.read()] == [2]
+
+
+# Memory
+
+
+class Accelerator:
+    platform = "gpu"
+
+    def memory_stats(self):
+        return {"bytes_limit": 9 * 10**9, "bytes_in_use": 3 * 10**9}
+
+
+def test_processors_share_what_is_given_and_accelerators_have_their_own():
+    assert memory_budget(3, [DEVICE]) == 3 * 10**9
+    assert memory_budget(3, [DEVICE] * 8) == 3 * 10**9 // 8
+    assert memory_budget(3, [Accelerator()] * 8) == 3 * 10**9  # pyright: ignore
+    assert memory_budget(None, [Accelerator()] * 8) == 2 * 10**9  # pyright: ignore
+    assert 10**6 < memory_budget(None, [DEVICE]) < 10**13
+
+
+# Rows on a device
+
+
+@given(st.lists(st.lists(st.integers(0, 9), max_size=4, unique=True), max_size=12))
+def test_what_was_used_longest_ago_makes_room(asked):
+    recent, last_use, places = Recent(4), {}, {}
+    for time, rows in enumerate(asked):
+        slots, new = recent.take(rows)
+        assert new == [row for row in rows if row not in places]
+        for row in new:
+            if len(places) == 4:
+                oldest = min((one for one in places if one not in rows), key=lambda one: last_use[one])
+                del places[oldest]
+            places[row] = slots[rows.index(row)]
+        last_use |= {row: (time, row in new, number) for number, row in enumerate(rows)}
+        assert [places[row] for row in rows] == slots
+        assert len(set(places.values())) == len(places)
+        assert set(places.values()) <= set(range(4))
+
+
+COUNTS = [30, 25, 0, 200, 31, 1, 180, 29, 200, 32]
+
+
+@pytest.mark.parametrize("rows", [[0], [0, 3], [3, 0, 3, 0, 9], [1, 5, 4, 6, 8, 9], []])
+def test_rows_lie_there_as_they_are(rows):
+    images = images_of(COUNTS)
+    slots = Slots(FeatureSet.of(images), np.arange(10), 10**9, DEVICE)
+    got = on_device(slots, rows)
+    assert_are(got, images, rows)
+    assert {len(one.mask) for one in got} <= {32, 224}
+    assert_are(on_device(slots, [*rows, 7]), images, [*rows, 7])
+
+
+def test_what_fits_is_read_once():
+    counts = [30, 200, 30] * 33 + [200]
+    features, source = counted(counts)
+    slots = Slots(features, np.arange(100), 10**9, DEVICE)
+    source.reads.clear()
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        on_device(slots, rng.integers(0, 100, 60))
+    assert max(source.reads.values()) == 1
+    assert len(source.reads) > 90
+
+
+def test_few_slots_hold_the_rows_in_use_and_reads_are_as_few_as_can_be():
+    """Against a model that knows what was used when."""
+    counts = [30] * 60 + [200] * 40
+    images = images_of(counts)
+    source = Counting(FeatureSet.of(images).source)
+    slots = Slots(FeatureSet(source, {}), np.arange(100), 0, DEVICE)
+    source.reads.clear()
+    rng = np.random.default_rng(1)
+    there, reads = {32: [], 224: []}, 0  # by capacity, what was used longest ago first
+    for _ in range(30):
+        rows = np.unique(rng.integers(0, 100, WRITTEN))
+        assert_are(on_device(slots, rows), images, rows)
+        for capacity, order in there.items():
+            asked = [row for row in rows.tolist() if (counts[row] > 30) == (capacity == 224)]
+            reads += len(set(asked) - set(order))
+            used = [row for row in asked if row in order] + [row for row in asked if row not in order]
+            order[:] = ([row for row in order if row not in asked] + used)[-WRITTEN:]
+    assert sum(source.reads.values()) == reads
+    assert reads > 250
+
+
+def test_slots_and_what_is_on_its_way_stay_within_the_budget():
+    features, _ = counted([200] * 380 + [30] * 420)
+    rows = np.arange(800)
+    everything = (380 * 224 + 420 * 32) * KEYPOINT
+    for share in (0.7, 1, 1.5, 3):
+        budget = share * everything
+        slots = Slots(features, rows, int(budget), DEVICE)
+        staged = [slots.stage(part) for part in slots.parts(rows)]
+        assert len(next(slots.parts(rows))) > (WRITTEN if share >= 1.5 else 0)
+        largest = max(sum(leaf.nbytes for *_, new in one.new for leaf in jax.tree.leaves(new)) for one in staged)
+        for one in staged:
+            arrays = slots.put(one)
+        taken = sum(leaf.nbytes for leaf in jax.tree.leaves(arrays))
+        assert 0.45 * min(budget, everything) < taken < 1.25 * everything
+        assert taken + 6 * largest < budget + 6 * WRITTEN * (224 + 32) * KEYPOINT  # of each capacity, `WRITTEN` rows
+        again = [slots.stage(part) for part in slots.parts(rows)]
+        assert any(one.new for one in again) == (share < 1 / KEPT)
+
+
+def test_parts_are_what_can_be_asked_for_at_the_same_time():
+    features, _ = counted([200] * 50)
+    slots = Slots(features, np.arange(50), 0, DEVICE)
+    rows = np.arange(50)[::-1]
+    parts = list(slots.parts(rows))
+    np.testing.assert_array_equal(np.concatenate(parts), rows)
+    assert {len(part) for part in parts[:-1]} == {WRITTEN}
+    assert list(slots.parts(rows[:0])) == []
+
+
+def test_rows_are_written_by_one_program_for_each_capacity(compilations):
+    rng = np.random.default_rng(5)
+
+    def use(counts, asked, budget):
+        features = FeatureSet.of([make_features(rng, count, dimension=24) for count in counts])
+        slots = Slots(features, np.arange(len(counts)), budget, DEVICE)
+        for part in slots.parts(rng.permutation(len(counts))[:asked]):
+            jax.block_until_ready(slots.put(slots.stage(part)))
+
+    for budget in (0, 10**8):
+        use([40] * 37 + [300] * 36, 73, budget)
+        compilations.reset()
+        use([50] * 40 + [310] * 33, 37, budget)
+        use([64] * 38 + [320] * 35, 9, budget)
+        assert compilations.count == 0
+
+
+def test_a_damaged_row_is_told(tmp_path):
+    images = images_of([30] * 20)
+    with open_store(tmp_path / "s", {}, num_images=20) as store:
+        store.write(dict(enumerate(images)))
+    (tmp_path / "s" / "3-30.npz").write_bytes(b"")
+    slots = Slots(FeatureSet(store, {}), np.arange(20), 0, DEVICE)
+    with pytest.raises(InputError, match="damaged on disk, the first in row 3"):
+        slots.stage(np.arange(10))
