@@ -3,7 +3,7 @@
 import itertools
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -116,12 +116,11 @@ def matched(
                 pairs.update(_collected(part, *call))
             for query in part.ends.tolist():
                 of_query = [pairs.pop((query, place), None) for place in range(indices.shape[1])]
-                counts = np.where(indices[query] >= 0, counts1[indices[query]], 0)
-                matches = _joined(of_query, counts0[query], counts, with_ratio)
-                numbers = np.array(
-                    [0 if pair is None else len(pair.matches["distance"]) for pair in of_query], np.int32
-                )
-                yield query, QueryMatches(matches, numbers, indices[query], scores[query])
+                keypoints = np.where(indices[query] >= 0, counts1[indices[query]], 0).astype(np.int32)
+                matches = _joined(of_query, with_ratio)
+                matches = replace(matches, count0=counts0[query].astype(np.int32), count1=keypoints)
+                counts = np.array([0 if pair is None else len(pair.matches["index0"]) for pair in of_query], np.int32)
+                yield query, QueryMatches(matches, counts, indices[query], scores[query])
 
 
 def _parts(
@@ -147,18 +146,16 @@ def _collected(part: Part, members: np.ndarray, matches: Matches) -> Iterator[tu
         yield (query, place), Pair(row, *sizes)
 
 
-def _joined(pairs: Sequence[Pair | None], count0: int, counts1: np.ndarray, with_ratio: bool) -> Matches:
+def _joined(pairs: Sequence[Pair | None], with_ratio: bool) -> Matches:
     """All candidates' matches, one after the other; an image that was not matched is of 1 x 1 px, as nobody looks."""
     some = [pair for pair in pairs if pair is not None]
     rows = ragged.joined([pair.matches for pair in some] or [_nothing(with_ratio)])
     unknown = np.ones(2, np.float32)
     return Matches(
         **rows,
-        mask=np.ones(len(rows["distance"]), bool),
+        mask=np.ones(len(rows["index0"]), bool),
         image_size0=some[0].image_size0 if some else unknown,
         image_size1=np.array([unknown if pair is None else pair.image_size1 for pair in pairs]).reshape(-1, 2),
-        count0=np.array(count0, np.int32),
-        count1=counts1.astype(np.int32),
     )
 
 
