@@ -9,7 +9,7 @@ import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from experiments.benchmark.made_up import MadeUp
-from experiments.console import tell
+from experiments.console import bar
 from mfvpr import HistogramOfShifts, pipeline
 from mfvpr.data.files import write_text
 from mfvpr.numerics import available_cpus
@@ -91,10 +91,17 @@ class Counted:
 
 def run(rounds: int | None, out: Path, stores: Path | None = None) -> None:
     """Print a table and write it as JSON to `out`; stores that are made are kept in `stores`, or else deleted."""
-    with _folder(stores) as root:
+    with _folder(stores) as root, ExitStack() as processes:
         for data in SETS:
             data.stores(root)
-        results = [_in_own_process(data, root, rounds or ROUNDS) for data in SETS]
+        pools = []
+        for data in bar("first queries", len(SETS), SETS):
+            pools.append(processes.enter_context(ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))))
+            pools[-1].submit(_begin, data, root, time.monotonic()).result()
+        turns = [pool for _ in range(rounds or ROUNDS) for pool in pools]  # so a noisy machine disturbs all alike
+        for pool in bar("rounds", len(turns), turns):
+            pool.submit(_take_turn).result()
+        results = [pool.submit(_end).result() for pool in pools]
     report(SETS, results, out)
 
 
@@ -107,42 +114,63 @@ def _folder(stores: Path | None) -> Iterator[Path]:
             yield Path(root)
 
 
-def _in_own_process(data: MadeUp, root: Path, rounds: int) -> Result:
-    tell(f"{data.title}: {rounds} rounds of {data.queries} queries")
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(measure, data, root, rounds, time.monotonic()).result()
+_session: list["Session"] = []  # of a process that `run` started
 
 
-def measure(data: MadeUp, root: Path, rounds: int, start: float) -> Result:
+def _begin(data: MadeUp, root: Path, start: float) -> None:
+    _session.append(Session(data, root, start))
+
+
+def _take_turn() -> None:
+    _session[0].take_turn()
+
+
+def _end() -> Result:
+    return _session[0].result()
+
+
+class Session:
     """One size, in the process that calls, which was begun at `start` by `time.monotonic`."""
-    query_store, database_store = data.stores(root)
-    source, vectors = Counted(database_store), data.global_descriptors()
-    queries, database = FeatureSet(query_store, {}), FeatureSet(source, {})
-    ranked(FeatureSet.of([queries[0]]), database, (vectors[0][:1], vectors[1]))
-    first = time.monotonic() - start
-    source.rows, source.seconds = 0, 0.0
-    cpu = time.process_time()
-    answers = [ranked(queries, database, vectors) for _ in range(rounds)]
-    cpu = time.process_time() - cpu
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9
-    per_query, answer = rounds * data.queries, answers[0]
-    same = None
-    if data.images * data.dimension <= IN_MEMORY * 128:
-        whole = FeatureSet(InMemory(dict(database_store.read()), data.images), {})
-        expected = ranked(queries, whole, vectors, memory=None)
-        same = np.array_equal(answer.rows, expected.rows) and np.array_equal(answer.scores, expected.scores)
-    hits = [best in rows for best, rows in zip(answer.rows[:, 0], data.similar(), strict=True)]
-    return Result(
-        total=[sum(one.seconds.values()) / data.queries for one in answers],
-        steps={name: float(np.median([one.seconds[name] for one in answers])) / data.queries for name in STEPS},
-        cpu=cpu / per_query,
-        reading=source.seconds / per_query,
-        rows=source.rows / per_query,
-        peak=peak,
-        first=first,
-        recall=float(np.mean(hits)),
-        same=same,
-    )
+
+    def __init__(self, data: MadeUp, root: Path, start: float) -> None:
+        """Rank a first query."""
+        self.data, self.vectors = data, data.global_descriptors()
+        query_store, self.store = data.stores(root)
+        self.source, self.queries = Counted(self.store), FeatureSet(query_store, {})
+        self.database = FeatureSet(self.source, {})
+        ranked(FeatureSet.of([self.queries[0]]), self.database, (self.vectors[0][:1], self.vectors[1]))
+        self.first = time.monotonic() - start
+        self.source.rows, self.source.seconds = 0, 0.0
+        self.answers: list[Answer] = []
+        self.cpu = 0.0
+
+    def take_turn(self) -> None:
+        """Rank all queries."""
+        cpu = time.process_time()
+        self.answers.append(ranked(self.queries, self.database, self.vectors))
+        self.cpu += time.process_time() - cpu
+
+    def result(self) -> Result:
+        """Of all turns; only now is anything held in memory as a whole."""
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9
+        data, answers, per_query = self.data, self.answers, len(self.answers) * self.data.queries
+        hits = [best in rows for best, rows in zip(answers[0].rows[:, 0], data.similar(), strict=True)]
+        return Result(
+            total=[sum(one.seconds.values()) / data.queries for one in answers],
+            steps={name: float(np.median([one.seconds[name] for one in answers])) / data.queries for name in STEPS},
+            cpu=self.cpu / per_query,
+            reading=self.source.seconds / per_query,
+            rows=self.source.rows / per_query,
+            peak=peak,
+            first=self.first,
+            recall=float(np.mean(hits)),
+            same=self._is_as_in_memory() if data.images * data.dimension <= IN_MEMORY * 128 else None,
+        )
+
+    def _is_as_in_memory(self) -> bool:
+        whole = FeatureSet(InMemory(dict(self.store.read()), self.data.images), {})
+        expected, answer = ranked(self.queries, whole, self.vectors, memory=None), self.answers[0]
+        return np.array_equal(answer.rows, expected.rows) and np.array_equal(answer.scores, expected.scores)
 
 
 def ranked(
