@@ -189,6 +189,14 @@ def test_features_made_from_something_else_are_refused(tmp_path, recipe, num_ima
     assert fill(tmp_path / "s") == []
 
 
+def test_a_store_of_an_earlier_format_is_told(tmp_path):
+    fill(tmp_path / "s")
+    manifest = tmp_path / "s" / "manifest.json"
+    manifest.write_text(manifest.read_text().replace("feature store 3", "feature store 2"))
+    with pytest.raises(InputError, match=r'format="mfvpr feature store 2", expected "mfvpr feature store 3"; .*delete'):
+        open_store(tmp_path / "s", RECIPE, num_images=3)
+
+
 def test_manifest_is_plain_text_and_names_that_are_no_unicode_survive(tmp_path):
     recipe = {**RECIPE, "images": ["a\udcff.png", "日本.png"]}
     for _ in range(2):
