@@ -1,14 +1,17 @@
 """Model-free re-ranking for visual place recognition.
 
 Images become features; features become a shortlist and matches; matches become scores; scores become a ranking;
-rankings become recall. The names below are the core of that sentence, on arrays; `mfvpr.data`, `mfvpr.features`,
-`mfvpr.pipeline` and `mfvpr.report` put it to work on images and files. `value`, `Scorer` and what follows from them is
+rankings become recall. `evaluate` goes the whole way over a data set; the other names below are the core of that
+sentence, on arrays. `mfvpr.data`, `mfvpr.features`, `mfvpr.filters`, `mfvpr.archive` and `mfvpr.report` put it to work
+on images and files. `value`, `Scorer` and what follows from them is
 what a scorer of your own is written with; `mfvpr.testing.check_scorer` says whether it keeps the contract.
 """
 
+from typing import TYPE_CHECKING, Any
+
 from mfvpr.errors import InputError
 from mfvpr.evaluation import frame_positives, radius_positives, recall_at_k
-from mfvpr.matching import compact, filter_matches, match, match_candidates, soft_match
+from mfvpr.matching import compact, filter_matches, match, match_candidates
 from mfvpr.numerics import masked, masked_mean, masked_median, safe_sqrt
 from mfvpr.parameter_grids import score_grid
 from mfvpr.reranking import balancing_c, combine, rank, rerank, score_candidates
@@ -23,8 +26,12 @@ from mfvpr.scoring import (
     image_sizes,
     match_shifts,
 )
+from mfvpr.soft_matching import soft_match
 from mfvpr.types import Features, Matches, Ranking, Shortlist, value
 from mfvpr.weighting import DescriptorDistanceWeight, FeatureScoreWeight, UnitWeight, Weight, match_weights
+
+if TYPE_CHECKING:
+    from mfvpr.evaluations import evaluate
 
 __version__ = "0.2.0"
 
@@ -47,6 +54,7 @@ __all__ = [
     "balancing_c",
     "combine",
     "compact",
+    "evaluate",
     "filter_matches",
     "frame_positives",
     "image_sizes",
@@ -68,3 +76,12 @@ __all__ = [
     "soft_match",
     "value",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """`evaluate`, once it is asked for: images take longer to import than arrays."""
+    if name != "evaluate":
+        raise AttributeError(f"module 'mfvpr' has no attribute {name!r}")
+    from mfvpr.evaluations import evaluate
+
+    return evaluate

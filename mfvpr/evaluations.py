@@ -16,15 +16,14 @@ import numpy as np
 from mfvpr import pipeline
 from mfvpr.archive import Archive
 from mfvpr.data.datasets import Dataset, ImageFolder, QuerySequence
-from mfvpr.evaluation import Positives, hits
 from mfvpr.features import Extractor
 from mfvpr.filters import Filter
 from mfvpr.fingerprints import recipe_of
-from mfvpr.match_sets import MatchSet, Scales
 from mfvpr.matching import CrossCheck
 from mfvpr.numerics import Device
 from mfvpr.progress import Track, untracked
 from mfvpr.reranking import FilterScore, Ties, fuse_shortlist, rank_shortlist
+from mfvpr.results import Matched, Ranked, Result
 from mfvpr.scoring import Scorer
 from mfvpr.sources import FeatureSet
 from mfvpr.stores.matches import MatchStore
@@ -49,94 +48,6 @@ class Fusion:
 
     c: float | None = None
     filter_score: FilterScore = "cosine"
-
-
-@dataclass(frozen=True)
-class Matched:
-    """A sequence's candidates, and their matches by scale."""
-
-    sequence: QuerySequence
-    candidates: Shortlist
-    matches: tuple[MatchSet, ...]
-    bad_queries: Mapping[int, str]
-    bad_database: Mapping[int, str]
-
-    @property
-    def by_scale(self) -> MatchSet | Scales:
-        """What is scored: several scales are fused, each standardized over a query's candidates."""
-        return self.matches[0] if len(self.matches) == 1 else Scales(self.matches)
-
-
-@dataclass(frozen=True)
-class Ranked:
-    """A system's ranking of a sequence: database rows `[Q, C]`, best first, and their scores in that order."""
-
-    rows: np.ndarray
-    scores: np.ndarray
-
-
-@dataclass(frozen=True)
-class Recall:
-    """Recall of one system at thresholds and ks: `[sequences, thresholds, ks]`, and the number of queries in each."""
-
-    by_sequence: np.ndarray
-    queries: np.ndarray
-
-    @property
-    def mean(self) -> np.ndarray:
-        """`[thresholds, ks]` plain mean over the sequences."""
-        return self.by_sequence.mean(axis=0)
-
-    @property
-    def pooled(self) -> np.ndarray:
-        """`[thresholds, ks]` over all queries of all sequences."""
-        return np.tensordot(self.queries / self.queries.sum(), self.by_sequence, axes=1)
-
-
-@dataclass(frozen=True)
-class Result:
-    """What an evaluation found.
-
-    Attributes:
-        dataset: what was evaluated.
-        matched: by sequence.
-        systems: by name and sequence: the filter alone, each scorer, and those combined with the filter.
-        seconds: by stage.
-    """
-
-    dataset: Dataset
-    matched: Sequence[Matched]
-    systems: Mapping[str, Sequence[Ranked]]
-    seconds: Mapping[str, float]
-
-    def positives(self, threshold: float) -> list[Positives]:
-        """What is right at a threshold, by sequence.
-
-        Raises:
-            ValueError: a sequence has no ground truth.
-        """
-        found = [sequence.truth for sequence in self.dataset.sequences]
-        if any(truth is None for truth in found):
-            raise ValueError(f"{self.dataset.name}: there is no ground truth, so rankings only")
-        return [truth.positives(threshold) for truth in found if truth is not None]
-
-    def recall(self, thresholds: Sequence[float], ks: Sequence[int] = (1, 5, 10)) -> dict[str, Recall]:
-        """Recall@K of every system; a query without a right answer counts as a failure.
-
-        Args:
-            thresholds: what counts as right, in the unit of the ground truth.
-            ks: depths.
-        """
-        right = [self.positives(threshold) for threshold in thresholds]
-        queries = np.array([len(one.candidates.mask) for one in self.matched])
-
-        def of(ranked: Sequence[Ranked]) -> Recall:
-            return Recall(np.array([
-                [[hits(one.rows, truths[place], k).mean() for k in ks] for truths in right]
-                for place, one in enumerate(ranked)
-            ]), queries)  # fmt: skip
-
-        return {name: of(ranked) for name, ranked in self.systems.items()}
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""Features of two images -> Matches: nearest neighbors, hard or soft, and filters of the matches found.
+"""Features of two images -> Matches: nearest neighbors, and filters of the matches.
 
 The similarity matrix is the cost. It is formed once per pair, read once along its rows and once along its columns while
 it is in cache (see `neighbors`), and never stored for more than one chunk of candidates.
@@ -15,7 +15,7 @@ import numpy as np
 
 from mfvpr import ragged
 from mfvpr.neighbors import nearest, nearest_two
-from mfvpr.numerics import as_float, at_least_single, compiled, device_bytes, masked, positive, safe_sqrt
+from mfvpr.numerics import at_least_single, compiled, device_bytes, masked, safe_sqrt
 from mfvpr.types import Array, Features, Matches, per_keypoint, per_match
 
 CrossCheck = Literal["mutual", "opencv_legacy", "none"]
@@ -43,7 +43,7 @@ def match(
     """
     if cross_check not in get_args(CrossCheck):
         raise ValueError(f"cross_check={cross_check!r}: expected one of {', '.join(get_args(CrossCheck))}")
-    features0, features1 = _ready(features0), _ready(_at_least_one(features1))
+    features0, features1 = ready(features0), ready(at_least_one(features1))
     similarity = _similarity(features0, features1)
     nearest1, valid = _neighbors(similarity, cross_check)
     return Matches(
@@ -56,47 +56,10 @@ def match(
         image_size0=features0.image_size,
         image_size1=features1.image_size,
         ratio=_ratio(features0, features1, similarity) if with_ratio else None,
-        index0=_slots(features0),
+        index0=slot_numbers(features0),
         index1=nearest1,
-        count0=_count(features0),
-        count1=_count(features1),
-    )
-
-
-def soft_match(features0: Features, features1: Features, *, temperature: float | Array) -> Matches:
-    """`match` of one pair made smooth: a dual softmax over the similarities s_ij (Rocco et al., NeurIPS 2018).
-
-    With R the softmax of s / T over the candidate's keypoints j and C that over the query's i, slot i goes to the
-    means of points, scores and squared distances 2 - 2 s_ij under R, with confidence sum_j R_ij C_ij. As T -> 0 that is
-    `match`: the neighbor, with confidence 1 where it is mutual and 0 elsewhere.
-
-    Args:
-        features0: query, keypoints `[N0, 2]`; padding may hold anything.
-        features1: candidate, keypoints `[N1, 2]`.
-        temperature: T, in units of the similarity, which lies in [-1, 1]; not above 0 gives NaN.
-
-    Returns:
-        Matches with K = N0 slots, real where the query has a keypoint with a finite descriptor and the candidate any.
-    """
-    features0, features1 = _ready(features0), _ready(_at_least_one(features1))
-    real0, real1 = (f.mask & jnp.all(jnp.isfinite(f.descriptors), axis=-1) for f in (features0, features1))
-    similarity = _products(masked(features0.descriptors, real0), masked(features1.descriptors, real1))
-    logits = similarity / positive(temperature, similarity.dtype)
-    real = real0[:, None] & real1[None]
-    rows, columns = (_softmax(logits, real, axis) for axis in (1, 0))
-    return Matches(
-        points0=features0.keypoints,
-        points1=_products(rows, masked(as_float(features1.keypoints), real1).T),
-        distance=safe_sqrt(2 - 2 * jnp.sum(rows * similarity, axis=1)),
-        scores0=features0.scores,
-        scores1=jnp.sum(rows * masked(as_float(features1.scores), real1)[None], axis=1),
-        mask=jnp.any(real, axis=1),
-        image_size0=features0.image_size,
-        image_size1=features1.image_size,
-        confidence=jnp.minimum(jnp.sum(rows * columns, axis=1), 1.0),  # rounding may exceed 1
-        index0=_slots(features0),
-        count0=_count(features0),
-        count1=_count(features1),
+        count0=keypoint_count(features0),
+        count1=keypoint_count(features1),
     )
 
 
@@ -239,41 +202,35 @@ def compact(matches: Matches, capacity: int) -> Matches:
     return replace(matches, mask=jnp.arange(capacity) < jnp.sum(matches.mask), **entries)
 
 
-def _ready(features: Features) -> Features:
+def ready(features: Features) -> Features:
     """On the device, in at least single precision: products of half ones flip near-ties, sums of points overflow."""
     wide = {name: at_least_single(values) for name, values in per_keypoint(features).items() if name != "mask"}
     return replace(features, **wide, mask=jnp.asarray(features.mask), image_size=at_least_single(features.image_size))
 
 
-def _slots(features: Features) -> Array:
+def slot_numbers(features: Features) -> Array:
     return jnp.arange(features.mask.shape[-1], dtype=jnp.int32)
 
 
-def _count(features: Features) -> Array:
+def keypoint_count(features: Features) -> Array:
     return jnp.sum(features.mask, dtype=jnp.int32)
 
 
-def _at_least_one(features: Features) -> Features:
+def at_least_one(features: Features) -> Features:
     """An image without a single slot gets one of padding."""
     return replace(features, **ragged.at_least_one(per_keypoint(features)))
 
 
 def _similarity(features0: Features, features1: Features) -> Array:
     """`[N0, N1]` dot products, -inf where either keypoint is padding or its descriptor is not finite."""
-    products = _products(features0.descriptors, features1.descriptors)
-    real = features0.mask[:, None] & features1.mask[None] & jnp.isfinite(products)
-    return jnp.where(real, products, -jnp.inf)
+    similarity = products(features0.descriptors, features1.descriptors)
+    real = features0.mask[:, None] & features1.mask[None] & jnp.isfinite(similarity)
+    return jnp.where(real, similarity, -jnp.inf)
 
 
-def _products(rows0: Array, rows1: Array) -> Array:
+def products(rows0: Array, rows1: Array) -> Array:
     """Dot products of all rows of both, in full precision on every device."""
     return jnp.matmul(rows0, rows1.T, precision=jax.lax.Precision.HIGHEST)
-
-
-def _softmax(logits: Array, real: Array, axis: int) -> Array:
-    """Softmax over the real entries along `axis`; 0 elsewhere, also where none is real."""
-    lowest = jnp.finfo(logits.dtype).min  # not -inf, whose softmax over nothing real is NaN, and so is its gradient
-    return masked(jax.nn.softmax(jnp.where(real, logits, lowest), axis=axis), real)
 
 
 def _distance(features0: Features, features1: Features, index1: Array, real: Array) -> Array:

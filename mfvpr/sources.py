@@ -152,9 +152,6 @@ class Recent:
         self._slots: OrderedDict[int, int] = OrderedDict()
 
     def take(self, rows: Sequence[int]) -> tuple[list[int], list[int]]:
-<<<<<<< HEAD
-        """(slots of distinct rows, no more than there are; the rows among them that were not there)."""
-=======
         """(slots of distinct rows, the rows among them that were not there).
 
         Raises:
@@ -162,7 +159,6 @@ class Recent:
         """
         if len(rows) > self.number:
             raise ValueError(f"expected at most {self.number} rows at the same time, got {len(rows)}")
->>>>>>> wip-g
         new = [row for row in rows if row not in self._slots]
         for row in rows:  # first all that are there, so that none of them makes room
             if row in self._slots:

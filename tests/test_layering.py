@@ -17,6 +17,7 @@ ALLOWED = {
     "ragged": set(),
     "progress": set(),
     "matching": {"neighbors", "numerics", "ragged", "types"},
+    "soft_matching": {"matching", "numerics", "types"},
     "match_sets": {"errors", "numerics", "ragged", "types"},
     "sources": {"errors", "numerics", "ragged", "types"},
     "fingerprints": set(),

@@ -43,15 +43,9 @@ def counted(counts):
 def on_device(slots, rows):
     """Each row as it lies there `[N, ...]`, NumPy."""
     staged = slots.stage(np.asarray(rows, int))
-<<<<<<< HEAD
-    arrays = slots.put(staged)
-    return [
-        jax.tree.map(lambda leaf, slot=slot: np.asarray(leaf[slot]), arrays[int(capacity)])
-=======
     arrays = jax.tree.map(np.array, dict(slots.put(staged)))
     return [
         jax.tree.map(lambda leaf, slot=slot: leaf[slot], arrays[int(capacity)])
->>>>>>> wip-g
         for capacity, slot in zip(staged.capacity, staged.slot, strict=True)
     ]
 
@@ -165,14 +159,11 @@ def test_what_was_used_longest_ago_makes_room(asked):
         assert set(places.values()) <= set(range(4))
 
 
-<<<<<<< HEAD
-=======
 def test_more_rows_than_slots_are_refused():
     with pytest.raises(ValueError, match="at most 2 rows at the same time, got 3"):
         Recent(2).take([4, 5, 6])
 
 
->>>>>>> wip-g
 COUNTS = [30, 25, 0, 200, 31, 1, 180, 29, 200, 32]
 
 
@@ -220,17 +211,10 @@ def test_few_slots_hold_the_rows_in_use_and_reads_are_as_few_as_can_be():
 
 
 def test_slots_and_what_is_on_its_way_stay_within_the_budget():
-<<<<<<< HEAD
-    features, _ = counted([200] * 380 + [30] * 420)
-    rows = np.arange(800)
-    everything = (380 * 224 + 420 * 32) * KEYPOINT
-    for share in (0.7, 1, 1.5, 3):
-=======
     features, _ = counted([200] * 190 + [30] * 210)
     rows = np.arange(400)
     everything = (190 * 224 + 210 * 32) * KEYPOINT
     for share in (1, 3):
->>>>>>> wip-g
         budget = share * everything
         slots = Slots(features, rows, int(budget), DEVICE)
         staged = [slots.stage(part) for part in slots.parts(rows)]

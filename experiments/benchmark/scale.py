@@ -23,11 +23,8 @@ from mfvpr.data.files import write_text
 from mfvpr.numerics import available_cpus
 from mfvpr.report.runs import versions
 from mfvpr.report.tables import Table
-<<<<<<< HEAD
 from mfvpr.reranking import rank_shortlist
 from mfvpr.retrieval import EXACT
-=======
->>>>>>> wip-g
 from mfvpr.sources import FeatureSet, FeatureSource, InMemory
 from mfvpr.types import Features
 
@@ -187,21 +184,13 @@ def ranked(
 ) -> Answer:
     """All steps for all queries; `vectors` are the global descriptors of both sides."""
     times = [time.perf_counter()]
-<<<<<<< HEAD
     candidates = EXACT.shortlist(*vectors, CANDIDATES)
-=======
-    candidates = pipeline.shortlist(*vectors, CANDIDATES)
->>>>>>> wip-g
     times.append(time.perf_counter())
     matches = pipeline.match(queries, database, candidates, memory=memory)
     times.append(time.perf_counter())
     scores = pipeline.score({"histogram": HistogramOfShifts()}, matches, candidates)["histogram"]
     times.append(time.perf_counter())
-<<<<<<< HEAD
     order = rank_shortlist(candidates, scores)
-=======
-    order = pipeline.rank(candidates, scores)
->>>>>>> wip-g
     times.append(time.perf_counter())
     rows = np.take_along_axis(candidates.indices, order, axis=1)
     return Answer(rows, scores, dict(zip(STEPS, np.diff(times).tolist(), strict=True)))
@@ -229,11 +218,6 @@ def report(sets: Sequence[MadeUp], results: Sequence[Result], out: Path) -> None
 def _remarks(sets: Sequence[MadeUp], results: Sequence[Result]) -> Iterator[str]:
     alike = [one for data, one in zip(sets, results, strict=True) if data.dimension == sets[0].dimension]
     first, last = alike[0], alike[-1]
-<<<<<<< HEAD
-    yield (
-        f"seconds per query, largest / smallest: {np.median(last.total) / np.median(first.total):.2f} "
-        f"(CPU {last.cpu / first.cpu:.2f})"
-=======
     yield "seconds per query, largest / smallest: " + ", ".join(
         f"{name} {of(last) / of(first):.2f}"
         for name, of in (
@@ -241,7 +225,6 @@ def _remarks(sets: Sequence[MadeUp], results: Sequence[Result]) -> Iterator[str]
             ("fastest round", lambda one: min(one.total)),
             ("CPU", lambda one: one.cpu),
         )
->>>>>>> wip-g
     )
     yield f"peak memory: {max(one.peak for one in results):.2f} GB at most"
     tried = {data.title: one.same for data, one in zip(sets, results, strict=True) if one.same is not None}

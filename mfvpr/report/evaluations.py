@@ -12,13 +12,13 @@ from mfvpr.data.datasets import ImageFolder, QuerySequence
 from mfvpr.data.files import write_text
 from mfvpr.data.images import resize
 from mfvpr.evaluation import Positives, threshold_words
-from mfvpr.evaluations import Matched, Ranked, Recall, Result
 from mfvpr.features import Extractor
 from mfvpr.pipeline import explain
 from mfvpr.report.figures import Answer, histogram_figure
 from mfvpr.report.rankings import Rankings, write_failures, write_predictions
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table
+from mfvpr.results import Matched, Ranked, Recall, Result
 from mfvpr.scoring import HistogramOfShifts
 
 MEANS = ("mean", "pooled")  # over the sequences, and over all of their queries

@@ -47,12 +47,8 @@ class Kind:
 
 
 FEATURES = Kind("feature store", 3, "features", "images", "extracts", compress=False)
-<<<<<<< HEAD
 VECTORS = Kind("descriptor store", 1, "global descriptors", "images", "describes", compress=False)
 MATCHES = Kind("match store", 3, "matches", "queries", "matches", compress=True)
-=======
-MATCHES = Kind("match store", 2, "matches", "queries", "matches", compress=True)
->>>>>>> wip-g
 
 
 def recipe_fingerprint(recipe: Mapping[str, Any], kind: Kind = FEATURES) -> str:

@@ -178,15 +178,9 @@ def test_stores_of_the_other_kind_are_refused_and_left_alone(tmp_path):
     fill(tmp_path / "features")
     fill(tmp_path / "matches", subject=MATCHES)
     before = digests(tmp_path)
-<<<<<<< HEAD
     with pytest.raises(InputError, match='made with format="mfvpr feature store 3", expected "mfvpr match store 3"; '):
         fill(tmp_path / "features", subject=MATCHES)
     with pytest.raises(InputError, match='made with format="mfvpr match store 3", expected "mfvpr feature store 3"; '):
-=======
-    with pytest.raises(InputError, match='made with format="mfvpr feature store 3", expected "mfvpr match store 2"; '):
-        fill(tmp_path / "features", subject=MATCHES)
-    with pytest.raises(InputError, match='made with format="mfvpr match store 2", expected "mfvpr feature store 3"; '):
->>>>>>> wip-g
         fill(tmp_path / "matches")
     assert digests(tmp_path) == before
 
