@@ -18,6 +18,7 @@ from mfvpr.features import Extractor
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
 from mfvpr.filters import Filter, Retrieval
+from mfvpr.imported import DescriptorFiles, FeatureFiles, File, ShortlistFiles
 from mfvpr.retrieval import ExactSearch, WhitenedSearch
 from mfvpr.scoring import SCORERS, Scorer
 
@@ -46,10 +47,12 @@ def dataset(settings: dict[str, Any], progress: Callable[[int, int], None]) -> D
     return folder_dataset(**options)
 
 
-def extractor(settings: dict[str, Any]) -> Extractor:
-    """What takes local features from images; networks with their converted weights."""
+def extractor(settings: dict[str, Any], data: Dataset | None) -> Extractor | FeatureFiles:
+    """What takes local features from images, networks with their converted weights; or files of another program."""
     name, options = settings["name"], {name: value for name, value in settings.items() if name != "name"}
-    options["image_size"] = tuple(options["image_size"])
+    options["image_size"] = options["image_size"] and tuple(options["image_size"])
+    if name == "import":
+        return FeatureFiles(_files("features", options, data), options["lengths"], options["image_size"])
     if name == "sift":
         if options["interpolation"] == "torch_bilinear":
             raise SettingsError("features.interpolation=torch_bilinear: gives fractions, but SIFT takes whole numbers")
@@ -63,10 +66,14 @@ def extractor(settings: dict[str, Any]) -> Extractor:
     return made(_network("features", name, weights), **_only(options, made, f"features={name}"))
 
 
-def filter(settings: dict[str, Any], local: Extractor) -> Filter:
+def filter(settings: dict[str, Any], local: Extractor | FeatureFiles, data: Dataset | None) -> Filter:
     """What finds candidates; VLAD takes the local features that are matched as well."""
+    if settings["name"] == "pairs":
+        return ShortlistFiles(_files("retrieval", {"database": None} | settings, data), settings["database_prefix"])
     options = {name: value for name, value in settings.items() if name not in ("name", "whiten")}
     search = ExactSearch() if settings["whiten"] is None else WhitenedSearch(settings["whiten"])
+    if settings["name"] == "import":
+        return DescriptorFiles(_files("retrieval", options, data), options["lengths"], search)
     if settings["name"] == "vlad":
         return Retrieval(Aggregated(local, VladFitting(**options)), search)
     from mfvpr.features.mixvpr import IMAGE_SIZE, MixVprDescriptor
@@ -75,6 +82,23 @@ def filter(settings: dict[str, Any], local: Extractor) -> Filter:
     if tuple(size) != IMAGE_SIZE:
         raise SettingsError(f"retrieval.image_size={size}: MixVPR takes {list(IMAGE_SIZE)} only, as its weights do")
     return Retrieval(MixVprDescriptor(_network("retrieval", "mixvpr", options.pop("weights")), **options), search)
+
+
+def _files(group: str, settings: dict[str, Any], data: Dataset | None) -> dict[Path, File]:
+    """Files of another program by the folder whose images they are of."""
+    if data is None:
+        raise ValueError(f"{group}: files of another program belong to a data set")
+    queries = settings["queries"] if isinstance(settings["queries"], list) else [settings["queries"]]
+    if len(queries) not in (1, len(data.sequences)):
+        raise SettingsError(f"{group}.queries: expected one file, or one for each of {len(data.sequences)} sequences, "
+                            f"got {len(queries)}")  # fmt: skip
+    files = {} if settings["database"] is None else {
+        data.database.root: File(expanded(settings["database"]), settings["database_prefix"])
+    }  # fmt: skip
+    for place, sequence in enumerate(data.sequences):
+        path = expanded(queries[place if len(queries) > 1 else 0])
+        files[sequence.images.root] = File(path, settings["query_prefix"])
+    return files
 
 
 def archive(settings: dict[str, Any]) -> Archive:

@@ -27,6 +27,7 @@ from experiments.settings import CONF, SettingsError, check
 PATHS = {"dataset.database", "dataset.queries", "dataset.root", "dataset.index_file", "dataset.cache"}
 PATHS |= {"dataset.database_labels", "dataset.query_labels"}
 PATHS |= {"store", "out", "checkpoints"}
+PATHS |= {f"{group}.{side}" for group in ("features", "retrieval") for side in ("database", "queries")}
 MULTIRUN = ("-m", "--multirun")
 _NAME = r"[A-Za-z_][\w/@]*(?:\.\w+)*"  # of a setting, or of a group
 MOST_DIGITS = 300  # more are no number of float64, and Python refuses to read thousands
@@ -108,7 +109,7 @@ def _check_form(argument: str, config: str) -> None:
 def _as_typed(argument: str, several: bool) -> str:
     """A setting quoted for Hydra where its grammar would not take the value as it was typed (paths, mostly).
 
-    Where `several`, in a multirun, paths stand between commas.
+    Paths may stand in a list; where `several`, in a multirun, between commas.
     """
     name, equals, value = argument.partition("=")
     is_path = name in PATHS and value not in ("", "null") and value[0] not in "'\""
@@ -116,6 +117,8 @@ def _as_typed(argument: str, several: bool) -> str:
         return argument
     for special in ("\\", "'", "${"):
         value = value.replace(special, f"\\{special}")
+    if is_path and value[0] == "[" and value[-1] == "]":
+        return f"{name}=[" + ",".join(f"'{one}'" for one in value[1:-1].split(",")) + "]"
     values = value.split(",") if several and is_path else [value]
     return f"{name}=" + ",".join(f"'{one}'" for one in values)
 

@@ -42,9 +42,8 @@ def evaluate(settings: dict[str, Any]) -> None:
 
 def evaluated(settings: dict[str, Any]) -> Outcome:
     """The filter alone, each scorer, and the best of them (the paper: histogram) combined with the filter."""
-    scorers, tools, watch = build.scorers(settings["scorer"]), prepare.tools(settings), Stopwatch()
-    with watch("data"):
-        images = prepare.images(settings, tools.archive)
+    scorers, watch = build.scorers(settings["scorer"]), Stopwatch()
+    tools, images = prepare.begun(settings, watch)
     shown = asked_figures(settings["figures"], images.dataset)
     main = "histogram" if "histogram" in scorers else next(iter(scorers))
     combined, group, histogram = f"{main} + {FILTER}", settings["scorer"], scorers.get("histogram")

@@ -17,10 +17,8 @@ def learn(settings: dict[str, Any]) -> None:
     """Matches -> learned, searched and hand-set scores on the half that none of them saw -> table, figures, files."""
     with run_folder.claimed(settings) as folder:
         varied = learnable(settings)
-        tools = prepare.tools(settings)
         watch = prepare.Stopwatch()
-        with watch("data"):
-            images = prepare.images(settings, tools.archive)
+        tools, images = prepare.begun(settings, watch)
         judge = truth.judge(settings, images.dataset)
         matches, candidates = prepare.matched(settings, tools, images, watch, with_ratio=True)
         checkpoints = _checkpoints(settings, prepare.recipe(tools, images, candidates.mask.shape[1]), judge)

@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 from experiments import build, truth
 from experiments.console import bar, tell
-from mfvpr.archive import Archive
+from mfvpr.archive import Archive, Source
 from mfvpr.data.contents import Contents
 from mfvpr.data.datasets import Dataset, QuerySequence
 from mfvpr.data.sequences import OwnRows, own_rows, without_neighbors
@@ -20,7 +20,7 @@ from mfvpr.filters import Filter
 from mfvpr.match_sets import MatchSet
 from mfvpr.types import Shortlist
 
-__all__ = ["Images", "Stopwatch", "Tools", "images", "matched", "recipe", "tools"]
+__all__ = ["Images", "Stopwatch", "Tools", "begun", "matched", "recipe"]
 
 
 @dataclass(frozen=True)
@@ -45,21 +45,33 @@ class Images:
 class Tools:
     """What features, candidates and matches are made with, and where that is kept."""
 
-    extractor: Extractor
+    extractor: Extractor | Source
     filter: Filter
     matching: Matching
     archive: Archive
     where: Mapping[str, Any]  # memory and devices
 
 
-def tools(settings: dict[str, Any]) -> Tools:
-    """Before anything slow: what is wrong with them is told first."""
-    extractor = build.extractor(settings["features"])
-    where, matching = build.where(settings), Matching(**settings["matching"])
-    return Tools(extractor, build.filter(settings["retrieval"], extractor), matching, build.archive(settings), where)
+def begun(settings: dict[str, Any], watch: Stopwatch) -> tuple[Tools, Images]:
+    """The tools and the data set that the settings name.
+
+    What is wrong with the tools is told before anything slow, but of files of others, which belong to images.
+    """
+    archive = build.archive(settings)
+    names = {settings[group]["name"] for group in ("features", "retrieval")}
+    early = None if names & {"import", "pairs"} else _tools(settings, archive, None)
+    with watch("data"):
+        found = _images(settings, archive)
+    return early or _tools(settings, archive, found.dataset), found
 
 
-def images(settings: dict[str, Any], archive: Archive) -> Images:
+def _tools(settings: dict[str, Any], archive: Archive, dataset: Dataset | None) -> Tools:
+    extractor = build.extractor(settings["features"], dataset)
+    chosen = build.filter(settings["retrieval"], extractor, dataset)
+    return Tools(extractor, chosen, Matching(**settings["matching"]), archive, build.where(settings))
+
+
+def _images(settings: dict[str, Any], archive: Archive) -> Images:
     """The data set that the settings name."""
     dataset, neighbors = _dataset(settings["dataset"]), settings["dataset"].get("exclude_neighbors")
     sides = {"database": archive.contents(dataset.database)}

@@ -19,10 +19,8 @@ def sweep(settings: dict[str, Any]) -> None:
     settings = as_final(settings)
     with run_folder.claimed(settings) as folder:
         varied = searchable(settings)
-        tools = prepare.tools(settings)
         watch = prepare.Stopwatch()
-        with watch("data"):
-            images = prepare.images(settings, tools.archive)
+        tools, images = prepare.begun(settings, watch)
         judge = truth.judge(settings, images.dataset)
         matches, candidates = prepare.matched(settings, tools, images, watch)
         kept = _kept(settings, tools, images, candidates)

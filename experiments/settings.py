@@ -108,8 +108,9 @@ RULES: dict[str, Rule] = {
     "dataset.name": Rule(
         lambda value: isinstance(value, str) and bool(re.fullmatch(r"[\w-][\w.-]*", value)), "letters, digits, - and _"
     ),
-    "features.name": _one_of("sift", "d2net", "aliked"),
-    "retrieval.name": _one_of("vlad", "mixvpr"),
+    "features.name": _one_of("sift", "d2net", "aliked", "import"),
+    "retrieval.name": _one_of("vlad", "mixvpr", "import", "pairs"),
+    "features.image_size": _or(_list_of(_SIDE, 2), None),
     # data
     "seed": _INDEX,
     "cache": _PATH,
@@ -119,6 +120,9 @@ RULES: dict[str, Rule] = {
     "ground_truth": _one_of(None, "order", "index", "utm", "label", "none"),  # None: asked for, see build.dataset
     "index_file": _or(_PATH, None),
     "widen_index": _FLAG,
+    "lengths": _one_of("unit", "normalize", "keep"),
+    "database_prefix": _or(_TEXT, ""),
+    "query_prefix": _or(_TEXT, ""),
     "database_labels": _or(_PATH, None),
     "query_labels": _or(_PATH, None),
     "exclude_neighbors": _or(_INDEX, None),

@@ -12,24 +12,24 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from mfvpr.data.contents import Contents, contents
 from mfvpr.data.datasets import ImageFolder
+from mfvpr.data.images import Interpolation
 from mfvpr.errors import InputError
 from mfvpr.extraction import described
-from mfvpr.features import Aggregation, Extractor, Fitting
+from mfvpr.features import Aggregation, Extractor, Fitting, Scale
 from mfvpr.fingerprints import recipe_of
 from mfvpr.progress import Track, untracked
 from mfvpr.report.runs import versions
-from mfvpr.sources import FeatureSet, InMemory
-from mfvpr.stores import features as feature_stores
+from mfvpr.sinks import Sink, open_sinks
+from mfvpr.sources import FeatureSet, FeatureSource, InMemory
 from mfvpr.stores import matches as match_stores
-from mfvpr.stores import vectors as vector_stores
-from mfvpr.stores.manifest import MATCHES, VECTORS, store_path
-from mfvpr.stores.rows import RowStore, require_space
+from mfvpr.stores.manifest import MATCHES, store_path
+from mfvpr.stores.rows import require_space
 
 DECODERS = ("mfvpr", "opencv-python-headless", "pillow")  # whose versions decide what an image becomes
 AGGREGATED = 16  # images at a time
@@ -49,41 +49,36 @@ class Vectors:
     bad: Mapping[int, str]
 
 
+@runtime_checkable
+class Source(Protocol):
+    """What has local features of folders of images, without extracting them."""
+
+    @property
+    def image_size(self) -> tuple[int, int] | None:
+        """(width, height) of the images that the keypoints are in; None = as the files are."""
+        ...
+
+    @property
+    def interpolation(self) -> Interpolation:
+        """How images are squashed to it."""
+        ...
+
+    @property
+    def scales(self) -> tuple[Scale, ...]:
+        """One."""
+        ...
+
+    def opened(self, folder: ImageFolder, *, partial: bool) -> FeatureSource:
+        """The features of a folder's images; `partial`: some may be missing."""
+        ...
+
+
 @dataclass(frozen=True)
 class Aggregated:
     """Global descriptors that are computed from an extractor's local features, once the database's are known."""
 
-    extractor: Extractor
+    extractor: Extractor | Source
     fitting: Fitting
-
-
-@dataclass
-class Sink:
-    """Where one part of the descriptions of a folder's images is kept: in a store, or in memory.
-
-    Attributes:
-        pick: the part of a description.
-        store: None = in memory.
-        items: by row, where there is no store.
-        forecast: bytes on disk of so many images.
-    """
-
-    pick: Callable[[Any], Any]
-    store: RowStore[Any] | None
-    forecast: Callable[[int], int]
-    items: dict[int, Any] = field(default_factory=dict)
-
-    def lacks(self, rows: Sequence[int]) -> list[int]:
-        """Those of some rows that are not here."""
-        done = self.items if self.store is None else {*np.flatnonzero(self.store.done).tolist()}
-        return [row for row in rows if row not in done]
-
-    def keep(self, batch: Mapping[int, Any]) -> None:
-        """A batch of rows; where there is a store, they are on disk when this returns."""
-        if self.store is None:
-            self.items |= batch
-        else:
-            self.store.write({row: batch[row] for row in self.lacks([*batch])})
 
 
 @dataclass
@@ -115,13 +110,30 @@ class Archive:
             self._contents[folder] = contents(folder, None if self.root is None else self.root / "contents")
         return self._contents[folder]
 
-    def recipe(self, folder: ImageFolder, extractor: Extractor | Aggregated) -> dict[str, Any]:
+    def recipe_of(self, value: Any, *folders: ImageFolder) -> Any:
+        """Of an extractor or a filter; with the content of the files that it reads, in place of their names."""
+        recipe = recipe_of(value)
+        if not hasattr(value, "paths"):
+            return recipe
+        paths = sorted({path for folder in folders for path in value.paths(folder) if path.is_file()})
+        return recipe | {"files": [self.contents(ImageFolder(path.parent, (path.name,))).sha256 for path in paths]}
+
+    def recipe(self, folder: ImageFolder, extractor: Extractor | Aggregated | Source) -> dict[str, Any]:
         """All that changes what an extractor takes from a folder's images."""
         decoders = {name: versions()[name] for name in DECODERS}
-        return {"extractor": recipe_of(extractor), "images": self.contents(folder).fingerprint, "versions": decoders}
+        return {
+            "extractor": self.recipe_of(extractor, folder),
+            "images": self.contents(folder).fingerprint,
+            "versions": decoders,
+        }
 
     def local(
-        self, folder: ImageFolder, extractor: Extractor, rows: Iterable[int] | None = None, *, label: str = "features"
+        self,
+        folder: ImageFolder,
+        extractor: Extractor | Source,
+        rows: Iterable[int] | None = None,
+        *,
+        label: str = "features",
     ) -> tuple[FeatureSet, ...]:
         """Local features by scale, to be read on demand.
 
@@ -134,6 +146,8 @@ class Archive:
         Raises:
             InputError: an image cannot be read (unless `skip_bad`), or none can; or a store cannot be used.
         """
+        if isinstance(extractor, Source):
+            return (FeatureSet(extractor.opened(folder, partial=self.skip_bad), {}),)
         bad = self._extract(folder, extractor, range(len(folder)) if rows is None else [*rows], label)
         return tuple(
             FeatureSet(InMemory(sink.items, len(folder)) if sink.store is None else sink.store, dict(bad))
@@ -198,7 +212,7 @@ class Archive:
         key = folder, id(extractor)
         if is_new := key not in self._sinks:
             self._used.append(extractor)
-            self._sinks[key], self._bad[key] = self._opened(folder, extractor), {}
+            self._sinks[key], self._bad[key] = self._sinks_of(folder, extractor), {}
         sinks, bad = self._sinks[key], self._bad[key]
         with ExitStack() as held:
             if any(sink.lacks(rows) for sink in sinks):
@@ -215,29 +229,9 @@ class Archive:
             raise InputError(f"{folder.root}: none of {len(folder)} images can be used; the first: {bad[min(bad)]}")
         return bad
 
-    def _opened(self, folder: ImageFolder, extractor: Extractor) -> list[Sink]:
-        """The vector's sink, where there is one, and those of the scales."""
-        sinks, images = [], len(folder)
+    def _sinks_of(self, folder: ImageFolder, extractor: Extractor) -> list[Sink]:
         recipe = self.recipe(folder, extractor) if self.root is not None else {}
-        name = type(extractor).__name__
-        if extractor.vector_size:
-            store = None
-            if self.root is not None:
-                path = store_path(self.root, name, recipe, VECTORS)
-                store = vector_stores.open_vector_store(path, recipe, num_images=images, waiting=self._waiting)
-            size = extractor.vector_size
-            sinks.append(Sink(lambda found: found.vector, store, lambda n: vector_stores.forecast_bytes(n, size)))
-        for number, scale in enumerate(extractor.scales):
-            store = None
-            if self.root is not None:
-                own = recipe | ({"scale": number} if len(extractor.scales) > 1 else {})
-                path = store_path(self.root, name, own)
-                store = feature_stores.open_store(path, own, num_images=images, waiting=self._waiting)
-            sinks.append(Sink(
-                lambda found, number=number: found.local[number], store,
-                lambda n, scale=scale: feature_stores.forecast_bytes(n, scale.typical_count, scale.dimension),
-            ))  # fmt: skip
-        return sinks
+        return open_sinks(self.root, extractor, recipe, num_images=len(folder), waiting=self._waiting)
 
     def _announce(
         self, extractor: Extractor, sinks: Sequence[Sink], missing: Sequence[int], total: int, label: str

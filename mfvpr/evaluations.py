@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from mfvpr import pipeline
-from mfvpr.archive import Archive
+from mfvpr.archive import Archive, Source
 from mfvpr.data.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.features import Extractor
 from mfvpr.filters import Filter
@@ -65,7 +65,7 @@ class Stopwatch:
 
 def evaluate(
     dataset: Dataset,
-    extractor: Extractor,
+    extractor: Extractor | Source,
     filter: Filter,
     scorers: Mapping[str, Scorer],
     *,
@@ -82,7 +82,7 @@ def evaluate(
 
     Args:
         dataset: one database, one or more query sequences.
-        extractor: what takes local features from images.
+        extractor: what takes local features from images, or has them, see `mfvpr.imported`.
         filter: what finds candidates.
         scorers: by name.
         candidates: that the filter proposes for each query.
@@ -115,7 +115,7 @@ def evaluate(
 def match_sequence(
     dataset: Dataset,
     sequence: QuerySequence,
-    extractor: Extractor,
+    extractor: Extractor | Source,
     filter: Filter,
     candidates: int | Literal["all"] = 50,
     *,
@@ -201,7 +201,7 @@ def _ranked(candidates: Shortlist, scores: np.ndarray, ties: Ties) -> Ranked:
 
 
 def matches_recipe(
-    dataset: Dataset, sequence: QuerySequence, extractor: Extractor, filter: Filter, num_candidates: int,
+    dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, filter: Filter, num_candidates: int,
     matching: Matching, archive: Archive,
 ) -> dict[str, Any]:  # fmt: skip
     """All that changes a shortlist and its matches: both sides' images and features, the filter, and the matching."""
@@ -209,7 +209,7 @@ def matches_recipe(
     return {
         "database": archive.recipe(dataset.database, extractor),
         "query": archive.recipe(sequence.images, extractor),
-        "filter": recipe_of(filter),
+        "filter": archive.recipe_of(filter, dataset.database, sequence.images),
         "candidates": num_candidates,
         "matching": recipe_of(matching),
         "skip_bad": archive.skip_bad,
@@ -218,7 +218,7 @@ def matches_recipe(
 
 
 def _match_stores(
-    sequence: QuerySequence, extractor: Extractor, recipe: Mapping[str, Any], archive: Archive
+    sequence: QuerySequence, extractor: Extractor | Source, recipe: Mapping[str, Any], archive: Archive
 ) -> Iterator[AbstractContextManager[MatchStore]]:
     """A store for the matches of each scale."""
     several = len(extractor.scales) > 1

@@ -29,7 +29,10 @@ KEPT, STAGED = 3 / 5, 1 / 24  # of the budget: for rows that stay, and for each 
 class FeatureSource(Protocol):
     """Local features of M images, in rows."""
 
-    counts: np.ndarray  # [M] int keypoints of each image; below 0 = there are none to be read
+    @property
+    def counts(self) -> np.ndarray:
+        """`[M]` int keypoints of each image; below 0 = there are none to be read."""
+        ...
 
     def read(self, rows: Iterable[int] | None = None) -> Iterator[tuple[int, Features]]:
         """(row, Features `[n, ...]`, NumPy, without padding) of the rows asked for, in their order; by default all."""

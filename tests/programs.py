@@ -67,8 +67,7 @@ def small(root, *more):
 
 def matches_path(settings):
     """Where a program keeps the matches of its data set, and their recipe."""
-    tools = prepare.tools(settings)
-    images = prepare.images(settings, tools.archive)
+    tools, images = prepare.begun(settings, prepare.Stopwatch())
     recipe = prepare.recipe(tools, images, settings["candidates"])
     return store_path(tools.archive.root, "matches", recipe, MATCHES), recipe
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments import build, prepare
+from experiments import prepare
 from experiments.evaluation import evaluate
 from experiments.launch import launch
 from mfvpr import InputError
@@ -162,7 +162,7 @@ def test_turned_and_16_bit_copies_give_the_same_and_it_is_said(small_street, tmp
 
 def test_a_second_run_is_told_the_same_of_its_images(small_street, tmp_path, monkeypatch):
     settings = composed(*folder(small_street, f"store={tmp_path}/store"))
-    first, second = (prepare.images(settings, build.archive(settings)) for _ in range(2))
+    first, second = (prepare.begun(settings, prepare.Stopwatch())[1] for _ in range(2))
     assert first.fingerprints == second.fingerprints
     assert first.reading == second.reading
     assert len(list((tmp_path / "store" / "contents").iterdir())) == 2

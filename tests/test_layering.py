@@ -68,6 +68,8 @@ ALLOWED = {
     "exchange": {"errors", "types", "data", "exchange"},
     "testing": {"numerics", "reranking", "scoring", "types"},
     "report": {
+        "archive",
+        "results",
         "data",
         "errors",
         "evaluation",

@@ -18,7 +18,7 @@ from typing import Any
 
 from mfvpr.data.datasets import ImageFolder
 from mfvpr.data.files import write_text
-from mfvpr.data.images import ordered_map, read_header
+from mfvpr.data.images import SUFFIXES, ordered_map, read_header
 
 FORMAT = 2  # of the records: raise it when they change
 SETTLED = 2_000_000_000  # ns; the coarsest clock of a file system (FAT) ticks every two seconds
@@ -58,6 +58,11 @@ class Contents:
             if file.largest is not None:
                 digest.update(f"\0bits={self.folder.bits}".encode())
         return digest.hexdigest()[:16]
+
+    @cached_property
+    def sha256(self) -> str:
+        """Over the contents alone, whatever the files are called; the first 16 hexadecimal digits."""
+        return hashlib.sha256("".join(file.sha256 for file in self.files).encode()).hexdigest()[:16]
 
     def summary(self) -> dict[str, int | bool | None]:
         """What reading does to the images, for people and results."""
@@ -107,6 +112,9 @@ def _content(path: Path) -> Content:
     try:
         if not path.is_file():  # a pipe would keep us waiting
             return Content()
+        if path.suffix.lower() not in SUFFIXES:  # no image, and perhaps larger than the memory
+            with path.open("rb") as file:
+                return Content(hashlib.file_digest(file, "sha256").hexdigest())
         content = path.read_bytes()
     except OSError:
         return Content()  # whoever reads the image will tell

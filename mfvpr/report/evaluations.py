@@ -8,6 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from mfvpr.archive import Source
 from mfvpr.data.datasets import ImageFolder, QuerySequence
 from mfvpr.data.files import write_text
 from mfvpr.data.images import resize
@@ -121,7 +122,10 @@ def write_skipped(folder: Path, result: Result) -> None:
 
 
 def figures(
-    judged: Judged, extractor: Extractor, shown: int | Sequence[int], histogram: HistogramOfShifts | None = None
+    judged: Judged,
+    extractor: Extractor | Source,
+    shown: int | Sequence[int],
+    histogram: HistogramOfShifts | None = None,
 ) -> list[Figure]:
     """The paper's figure for a few queries, right and wrong ones, spread over each sequence.
 
@@ -147,7 +151,7 @@ class _Page:
 
     judged: Judged
     place: int
-    extractor: Extractor
+    extractor: Extractor | Source
     histogram: HistogramOfShifts
 
     @property
@@ -210,7 +214,8 @@ class _Page:
         return [Answer(self._image(self.database, row), caption, None, None)]
 
     def _image(self, folder: ImageFolder, row: int) -> np.ndarray:
-        return resize(folder.read(row), self.extractor.image_size, self.extractor.interpolation)
+        image, size = folder.read(row), self.extractor.image_size
+        return image if size is None else resize(image, size, self.extractor.interpolation)
 
 
 def _spread(values: np.ndarray, number: int) -> list[int]:

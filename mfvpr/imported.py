@@ -1,0 +1,147 @@
+"""What other programs computed, in place of extractors and filters: local features, global descriptors, shortlists.
+
+Files are told apart by their content, see `Archive.recipe_of`, wherever they are and whatever they are called.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from mfvpr.archive import Archive
+from mfvpr.data.datasets import ImageFolder, QuerySequence
+from mfvpr.data.images import Interpolation
+from mfvpr.exchange import ImportedFeatures, open_features, read_global_descriptors, read_shortlist
+from mfvpr.exchange.checks import Lengths
+from mfvpr.features import Scale
+from mfvpr.filters import Filtered
+from mfvpr.retrieval import EXACT, Search
+from mfvpr.types import Shortlist
+
+TYPICAL = 1000  # keypoints of an image, where nobody knows before the file is read
+
+
+@dataclass(frozen=True)
+class File:
+    """A file of another program, and what stands before the images' names in it, such as `database/`."""
+
+    path: Path
+    prefix: str = ""
+
+    def names(self, folder: ImageFolder) -> list[str]:
+        """What a folder's images are called in it."""
+        return [self.prefix + name for name in folder.names]
+
+
+@dataclass(frozen=True)
+class FeatureFiles:
+    """Local features of another program, see `mfvpr.exchange.open_features`.
+
+    Attributes:
+        files: by the root of the folder whose images they are of.
+        lengths: of descriptors, see there.
+        image_size: (width, height) px, where the files do not tell.
+    """
+
+    files: Mapping[Path, File] = field(metadata={"recipe": False})
+    lengths: Lengths = "unit"
+    image_size: tuple[int, int] | None = None
+    interpolation: Interpolation = field(default="pil_bilinear", metadata={"recipe": False})
+    vector_size: int = field(default=0, metadata={"recipe": False})
+    scales: tuple[Scale, ...] = field(default=(Scale(0, TYPICAL),), metadata={"recipe": False})
+
+    def paths(self, folder: ImageFolder) -> list[Path]:
+        """Of a folder's images."""
+        path = self.files[folder.root].path
+        return sorted(path.rglob("*")) if path.is_dir() else [path]
+
+    def opened(self, folder: ImageFolder, *, partial: bool) -> ImportedFeatures:
+        """The features of a folder's images; `partial`: some may be missing.
+
+        Raises:
+            InputError: see `open_features`.
+        """
+        file = self.files[folder.root]
+        return open_features(
+            file.path, file.names(folder), image_size=self.image_size, lengths=self.lengths, partial=partial
+        )
+
+
+@dataclass(frozen=True)
+class DescriptorFiles:
+    """Candidates by global descriptors of another program, see `mfvpr.exchange.read_global_descriptors`.
+
+    Attributes:
+        files: by the root of the folder whose images they are of.
+        lengths: see there.
+        search: among the descriptors.
+    """
+
+    files: Mapping[Path, File] = field(metadata={"recipe": False})
+    lengths: Lengths = "unit"
+    search: Search = EXACT
+
+    def paths(self, folder: ImageFolder) -> list[Path]:
+        """Of a folder's images."""
+        return [self.files[folder.root].path]
+
+    def shortlist(
+        self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, archive: Archive
+    ) -> Filtered:
+        """See `mfvpr.filters.Filter`."""
+        known, asked = (self._read(folder) for folder in (database, sequence.images))
+        search = self.search.fit(known)
+        return Filtered(search.shortlist(asked, known, num_candidates, excluded=sequence.excluded), {}, {})
+
+    def _read(self, folder: ImageFolder) -> np.ndarray:
+        file = self.files[folder.root]
+        return read_global_descriptors(file.path, file.names(folder), lengths=self.lengths)
+
+
+@dataclass(frozen=True)
+class ShortlistFiles:
+    """Candidates of another program, see `mfvpr.exchange.read_shortlist`.
+
+    Attributes:
+        files: by the root of the folder of queries that they are for, with the prefix of these.
+        database_prefix: of the database images.
+    """
+
+    files: Mapping[Path, File] = field(metadata={"recipe": False})
+    database_prefix: str = field(default="", metadata={"recipe": False})
+
+    def paths(self, folder: ImageFolder) -> list[Path]:
+        """Of a folder of queries."""
+        return [self.files[folder.root].path] if folder.root in self.files else []
+
+    def shortlist(
+        self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, archive: Archive
+    ) -> Filtered:
+        """See `mfvpr.filters.Filter`; what the sequence excludes is left out, and the others move up."""
+        file = self.files[sequence.images.root]
+        names = [self.database_prefix + name for name in database.names]
+        known = read_shortlist(file.path, file.names(sequence.images), names)
+        if sequence.excluded is not None:
+            known = _without(known, sequence.excluded.contains(known.indices))
+        return Filtered(_cut(known, num_candidates), {}, {})
+
+
+def _without(shortlist: Shortlist, excluded: np.ndarray) -> Shortlist:
+    """A shortlist `[Q, C]` without some of its candidates; padding at the end."""
+    kept = shortlist.mask & ~excluded
+    order = np.argsort(~kept, axis=1, kind="stable")
+    kept, indices, scores = (
+        np.take_along_axis(values, order, axis=1) for values in (kept, shortlist.indices, shortlist.scores)
+    )
+    return Shortlist(np.where(kept, indices, -1), np.where(kept, scores, 0), kept)
+
+
+def _cut(shortlist: Shortlist, num_candidates: int) -> Shortlist:
+    """To `[Q, num_candidates]`, with padding where there are fewer."""
+    missing = max(0, num_candidates - shortlist.mask.shape[1])
+
+    def cut(values: np.ndarray, fill: float) -> np.ndarray:
+        return np.pad(values[:, :num_candidates], ((0, 0), (0, missing)), constant_values=fill)
+
+    return Shortlist(cut(shortlist.indices, -1), cut(shortlist.scores, 0), cut(shortlist.mask, False))

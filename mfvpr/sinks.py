@@ -1,0 +1,79 @@
+"""Where what an extractor gives is kept: a store, or the memory of this process, for each part of a description."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mfvpr.features import Extractor
+from mfvpr.stores import features, vectors
+from mfvpr.stores.manifest import VECTORS, store_path
+from mfvpr.stores.rows import RowStore
+
+
+@dataclass
+class Sink:
+    """Where one part of the descriptions of a folder's images is kept: in a store, or in memory.
+
+    Attributes:
+        pick: the part of a description.
+        store: None = in memory.
+        items: by row, where there is no store.
+        forecast: bytes on disk of so many images.
+    """
+
+    pick: Callable[[Any], Any]
+    store: RowStore[Any] | None
+    forecast: Callable[[int], int]
+    items: dict[int, Any] = field(default_factory=dict)
+
+    def lacks(self, rows: Sequence[int]) -> list[int]:
+        """Those of some rows that are not here."""
+        done = self.items if self.store is None else {*np.flatnonzero(self.store.done).tolist()}
+        return [row for row in rows if row not in done]
+
+    def keep(self, batch: Mapping[int, Any]) -> None:
+        """A batch of rows; where there is a store, they are on disk when this returns."""
+        if self.store is None:
+            self.items |= batch
+        else:
+            self.store.write({row: batch[row] for row in self.lacks([*batch])})
+
+
+def open_sinks(
+    root: Path | None,
+    extractor: Extractor,
+    recipe: Mapping[str, Any],
+    *,
+    num_images: int,
+    waiting: Callable[[str], None] | None,
+) -> list[Sink]:
+    """Those of an extractor: of its global descriptor, where it gives one, then of every scale.
+
+    Args:
+        root: folder of stores; None = in memory.
+        extractor: whose.
+        recipe: of what it takes from these images.
+        num_images: M.
+        waiting: see `stores.rows.open_rows`.
+    """
+    name, options, size = (
+        type(extractor).__name__,
+        {"num_images": num_images, "waiting": waiting},
+        extractor.vector_size,
+    )
+    sinks = []
+    if size:
+        path = None if root is None else store_path(root, name, recipe, VECTORS)
+        store = None if path is None else vectors.open_vector_store(path, recipe, **options)
+        sinks.append(Sink(lambda description: description.vector, store, lambda n: vectors.forecast_bytes(n, size)))
+    for number, scale in enumerate(extractor.scales):
+        own = {**recipe, "scale": number} if len(extractor.scales) > 1 else recipe
+        store = None if root is None else features.open_store(store_path(root, name, own), own, **options)
+        sinks.append(Sink(
+            lambda description, number=number: description.local[number], store,
+            lambda n, scale=scale: features.forecast_bytes(n, scale.typical_count, scale.dimension),
+        ))  # fmt: skip
+    return sinks

@@ -1,0 +1,225 @@
+"""A whole evaluation in one call: sequences, what is kept, and files of other programs in place of our own stages."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import mfvpr
+from mfvpr.archive import Aggregated, Archive
+from mfvpr.data.datasets import folder_dataset, sequences_dataset
+from mfvpr.errors import InputError
+from mfvpr.evaluation import Positives
+from mfvpr.evaluations import Fusion, match_sequence
+from mfvpr.exchange import write_features, write_global_descriptors, write_shortlist
+from mfvpr.features.sift import Sift
+from mfvpr.features.vlad import VladFitting
+from mfvpr.filters import Retrieval
+from mfvpr.imported import DescriptorFiles, FeatureFiles, File, ShortlistFiles
+from mfvpr.report.evaluations import Judged, recall_table
+from mfvpr.retrieval import WhitenedSearch
+from tests.programs import typed
+
+SIFT = Sift(max_keypoints=60, image_size=(160, 120))
+VLAD = Retrieval(Aggregated(SIFT, VladFitting(num_words=8)))
+SCORERS = {"histogram": mfvpr.HistogramOfShifts(), "count": mfvpr.MatchCount()}
+
+
+@pytest.fixture(scope="module")
+def dataset(small_street):
+    return folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
+
+
+@pytest.fixture(scope="module")
+def result(dataset):
+    return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=5, fused={"histogram": Fusion(c=10.0)})
+
+
+@pytest.fixture(scope="module")
+def split(small_street, tmp_path_factory):
+    """The queries in two folders, 3 and 7 of them, with the rows of the database that they show."""
+    root = tmp_path_factory.mktemp("split")
+    for name, rows in (("first", range(3)), ("second", range(3, 10))):
+        (root / name).mkdir()
+        for row in rows:
+            shutil.copy(small_street / "queries" / f"{row:04d}.png", root / name)
+        lines = [f"{row:04d}.png,{row:04d}.png\n" for row in rows]
+        (root / name / "truth.csv").write_text("query,database\n" + "".join(lines))
+    return [root / "first", root / "second"]
+
+
+def test_systems_and_their_recall(dataset, result):
+    assert list(result.systems) == ["filter", "histogram", "count", "histogram + filter"]
+    [matched] = result.matched
+    for ranked in (ranked for [ranked] in result.systems.values()):
+        assert ranked.rows.shape == (10, 5)
+        assert (np.diff(ranked.scores, axis=1) <= 0).all()
+        assert all(
+            sorted(row) == sorted(listed) for row, listed in zip(ranked.rows, matched.candidates.indices, strict=True)
+        )
+    recall = result.recall([0, 1], [1, 5])["histogram"]
+    [ranked] = result.systems["histogram"]
+    expected = [[mfvpr.recall_at_k(ranked.rows, dataset.truth.positives(t), [k])[0] for k in (1, 5)] for t in (0, 1)]
+    np.testing.assert_allclose(recall.by_sequence, [expected])
+    np.testing.assert_array_equal(recall.mean, recall.pooled)
+
+
+def test_sequences_are_evaluated_by_themselves_with_their_means(dataset, split, small_street, result):
+    several = sequences_dataset(
+        small_street / "database", split, ground_truth="index", index_file="truth.csv", widen_index=True
+    )
+    found = mfvpr.evaluate(several, SIFT, VLAD, SCORERS, candidates=5)
+    [whole] = result.systems["count"]
+    rows = np.concatenate([ranked.rows for ranked in found.systems["count"]])
+    np.testing.assert_array_equal(rows, whole.rows)
+    recall = found.recall([0, 1], [1])["count"]
+    np.testing.assert_allclose(recall.pooled, result.recall([0, 1], [1])["count"].pooled)
+    np.testing.assert_allclose(recall.mean, recall.by_sequence.mean(axis=0))
+    assert recall.queries.tolist() == [3, 7]
+    table = recall_table(Judged(found, [0, 1], [1], "count"))
+    assert [line[:2] for line in table.rows[:4]] == [["filter", name] for name in ("first", "second", "mean", "pooled")]
+    with pytest.raises(InputError, match="expected one query sequence, got 2; choose one of first, second"):
+        several.queries  # noqa: B018
+    with pytest.raises(InputError, match="sequences of different names, got first twice"):
+        sequences_dataset(small_street / "database", [split[0], split[0]], ground_truth="order")
+
+
+def test_the_database_is_described_once_for_all_sequences(split, small_street, tmp_path):
+    several = sequences_dataset(small_street / "database", split, ground_truth="none")
+    lines = []
+    mfvpr.evaluate(several, SIFT, VLAD, SCORERS, candidates=5, archive=Archive(tmp_path, tell=lines.append))
+    assert [line for line in lines if "10 of 10 images to do" in line and "database" in line] == lines[:1]
+    assert sum("images to do" in line for line in lines) == 3
+
+
+class Vectors:
+    """A filter's extractor that knows nothing of local features."""
+
+    image_size, interpolation, batch_size, vector_size, scales = (8, 8), "pil_bilinear", 4, 192, ()
+    recipe = "thumbnails"
+
+    def __call__(self, images):
+        from mfvpr.features import Description
+
+        flat = images.reshape(len(images), -1).astype(np.float32)
+        return [Description(one / np.linalg.norm(one)) for one in flat]
+
+
+def test_only_candidates_are_extracted(dataset, tmp_path):
+    few = replace(dataset.only, images=replace(dataset.queries, names=dataset.queries.names[:2]), truth=None)
+    archive, lines = Archive(tmp_path), []
+    archive.tell = lines.append
+    matched = match_sequence(dataset, few, SIFT, Retrieval(Vectors()), 3, archive=archive)
+    wanted = np.unique(matched.candidates.indices)
+    assert len(wanted) < 7
+    [features] = Archive(tmp_path).local(dataset.database, SIFT, [])
+    assert np.flatnonzero(features.counts).tolist() == wanted.tolist()
+    assert f"database features: {len(wanted)} of 10 images to do" in "\n".join(lines)
+
+
+def test_matches_are_kept_and_read_without_features(dataset, tmp_path):
+    first = match_sequence(dataset, dataset.only, SIFT, VLAD, 4, archive=Archive(tmp_path), keep=True)
+    again = match_sequence(
+        replace(dataset, database=replace(dataset.database)), dataset.only, SIFT, VLAD, 4,
+        archive=Archive(tmp_path, track=lambda label: pytest.fail(f"{label} begun")), keep=True,
+    )  # fmt: skip
+    for one, other in zip(first.matches[0].matches, again.matches[0].matches, strict=True):
+        np.testing.assert_array_equal(one.points1, other.points1)
+    np.testing.assert_array_equal(first.candidates.indices, again.candidates.indices)
+
+
+def test_whitening_is_fitted_on_the_database():
+    rng = np.random.default_rng(0)
+    database, queries = (rng.normal(size=(n, 12)).astype(np.float32) for n in (200, 5))
+    database[3] = np.nan
+    fitted = WhitenedSearch(4).fit(database)
+    usable = np.delete(database, 3, axis=0).astype(np.float64)
+    values, axes = np.linalg.eigh(np.cov(usable.T, bias=True))
+    components = axes[:, ::-1][:, :4] / np.sqrt(values[::-1][:4])
+    unit = [(side - usable.mean(axis=0)) @ components for side in (queries, usable)]
+    unit = [side / np.linalg.norm(side, axis=1, keepdims=True) for side in unit]
+    found = fitted.shortlist(queries, database, 6)
+    rows = np.delete(np.arange(200), 3)[np.argsort(-(unit[0] @ unit[1].T), axis=1)[:, :6]]
+    np.testing.assert_array_equal(found.indices, rows)
+    with pytest.raises(InputError, match="expected more than 12 descriptors"):
+        WhitenedSearch(12).fit(usable[:12])
+
+
+@pytest.fixture(scope="module")
+def files(dataset, tmp_path_factory):
+    """What another program would have left of the data set, exactly."""
+    root, archive = tmp_path_factory.mktemp("files"), Archive()
+    for side, folder in (("database", dataset.database), ("queries", dataset.queries)):
+        names = [f"{side}/{name}" for name in folder.names]
+        [features] = archive.local(folder, SIFT)
+        write_features(root / f"{side}.npz", names, features.read(range(len(folder))))
+        vectors = archive.vectors(folder, VLAD.describer, dataset.database).values
+        write_global_descriptors(root / f"{side}_vectors.npz", names, vectors)
+    candidates = VLAD.shortlist(dataset.only, dataset.database, 5, archive).candidates
+    write_shortlist(root / "pairs.npz", candidates, dataset.queries.names, dataset.database.names)
+    return root
+
+
+def at(dataset, root, suffix):
+    sides = (("database", dataset.database), ("queries", dataset.queries))
+    return {folder.root: File(root / f"{side}{suffix}", f"{side}/") for side, folder in sides}
+
+
+def test_files_of_other_programs_stand_in_for_every_stage(dataset, files, result):
+    local = FeatureFiles(at(dataset, files, ".npz"))
+    filters = {
+        "aggregated": Retrieval(Aggregated(local, VladFitting(num_words=8))),
+        "descriptors": DescriptorFiles(at(dataset, files, "_vectors.npz")),
+        "pairs": ShortlistFiles({dataset.queries.root: File(files / "pairs.npz")}),
+    }
+    for name, chosen in filters.items():
+        found = mfvpr.evaluate(dataset, local, chosen, SCORERS, candidates=5)
+        for system in ("filter", "histogram", "count"):
+            [got], [expected] = found.systems[system], result.systems[system]
+            np.testing.assert_array_equal(got.rows, expected.rows, err_msg=name)
+            np.testing.assert_allclose(got.scores, expected.scores, rtol=1e-5)
+
+
+def test_imported_shortlists_leave_out_what_is_excluded(dataset, files):
+    excluded = Positives.from_rows([[row] for row in range(10)], 10)
+    sequence = replace(dataset.only, excluded=excluded)
+    listed = ShortlistFiles({dataset.queries.root: File(files / "pairs.npz")})
+    for width in (2, 7):
+        found = listed.shortlist(sequence, dataset.database, width, Archive()).candidates
+        assert found.indices.shape == (10, width)
+        assert not excluded.contains(found.indices).any()
+        for row, mask in zip(found.indices, found.mask, strict=True):
+            assert (row[mask] >= 0).all()
+            assert (row[~mask] == -1).all()
+            assert (np.diff(mask.astype(int)) <= 0).all()
+
+
+def test_files_are_known_by_content(dataset, files, tmp_path):
+    archive, before = Archive(tmp_path / "s"), FeatureFiles(at(dataset, files, ".npz"))
+    recipe = archive.recipe(dataset.database, before)
+    moved = tmp_path / "elsewhere"
+    shutil.copytree(files, moved)
+    assert archive.recipe(dataset.database, FeatureFiles(at(dataset, moved, ".npz"))) == recipe
+    shutil.copy(files / "queries.npz", moved / "database.npz")
+    assert Archive(tmp_path / "s").recipe(dataset.database, FeatureFiles(at(dataset, moved, ".npz"))) != recipe
+
+
+def test_programs_take_sequences_and_files(split, small_street, files, tmp_path, monkeypatch, capsys):
+    common = ("dataset=sequences", f"dataset.database={small_street}/database", "dataset.ground_truth=index",
+              f"dataset.queries=[{split[0]},{split[1]}]", "dataset.index_file=truth.csv", "dataset.widen_index=true",
+              "candidates=5", "recall.tolerances=[0,1]", "recall.ks=[1,5]", "store=null",
+              "features=import", f"features.database={files}/database.npz", f"features.queries={files}/queries.npz",
+              "features.database_prefix=database/", "features.query_prefix=queries/", "retrieval=vlad",
+              "retrieval.num_words=8", "scorer=count", "devices=all", "memory=0.5")  # fmt: skip
+    code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *common, "figures=2", f"out={tmp_path}/out")
+    assert code == 0, stderr
+    assert "sequences: 10 queries in 2 sequences, 10 database images, 5 candidates (vlad), import features" in stdout
+    names = {path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.csv")}
+    assert {"first/predictions.csv", "second/predictions/count_filter.csv", "table.csv"} <= names
+    table = (tmp_path / "out" / "table.csv").read_text().splitlines()
+    assert [line.split(",")[1] for line in table[1:5]] == ["first", "second", "mean", "pooled"]
+    code, _, stderr = typed(monkeypatch, capsys, "sweep", *common[:-3], "scorer=histogram", "grid.sigma=[10,20]",
+                            f"out={tmp_path}/swept")  # fmt: skip
+    assert code == 2
+    assert "expected one query sequence, got 2" in stderr
