@@ -225,6 +225,8 @@ class Archive:
             for batch in described(folder, extractor, missing, bad, skip_bad=self.skip_bad, track=self.track(label)):
                 for sink in sinks:
                     sink.keep({row: sink.pick(description) for row, description in batch.items()})
+            if missing:
+                self._account(extractor, sinks, label)
         if len(bad) == len(folder):
             raise InputError(f"{folder.root}: none of {len(folder)} images can be used; the first: {bad[min(bad)]}")
         return bad
@@ -249,6 +251,16 @@ class Archive:
                          for scale in extractor.scales)  # fmt: skip
         each = each or f"descriptors of {extractor.vector_size} numbers"
         self.tell(f"{label}: {len(missing)} of {total} images to do, {each}: about {needed / _MB:.1f} MB in {where}")
+
+    def _account(self, extractor: Extractor, sinks: Sequence[Sink], label: str) -> None:
+        """What local features take on disk, beside what they would as the paper keeps them."""
+        for scale, sink in zip(extractor.scales, sinks[bool(extractor.vector_size) :], strict=True):
+            if sink.store is not None:
+                size, features = sink.store.size_bytes, int(sink.store.counts.clip(0).sum())
+                images, paper = max(int(sink.store.done.sum()), 1), max(features, 1) * (4 * scale.dimension + 16)
+                self.tell(f"{label}: {size / _MB:.1f} MB, {size / images / _MB:.2f} MB and {features / images:.0f} "
+                          f"features an image; as the paper stores them, in float32, {paper / _MB:.1f} MB: "
+                          f"{size / paper:.2f}x")  # fmt: skip
 
     def _aggregated(self, folder: ImageFolder, describer: Aggregated, database: ImageFolder, label: str) -> Vectors:
         key = database, id(describer)

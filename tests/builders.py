@@ -137,3 +137,8 @@ def of_query(pairs):
         if name.endswith("1")
     }
     return replace(pairs[0], **joined, **of_candidates), [int(pair.mask.sum()) for pair in pairs]
+
+
+def local(descriptions):
+    """The local features of images, of the only scale."""
+    return [description.features for description in descriptions]

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from experiments.benchmark.__main__ import BENCHMARKS
+from mfvpr.features import Description
 
 ROOT = Path(__file__).parent.parent
 
@@ -42,6 +43,8 @@ def peers(results):
     """mfvpr's result, and each peer's."""
     others = dict(results)
     ours = others.pop("mfvpr")
+    if isinstance(ours[0], Description):
+        ours = [one.features if one.local else one.vector for one in ours]
     assert len(others) == 3  # two memory layouts, and one by one
     return ours, others.values()
 

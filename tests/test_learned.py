@@ -32,7 +32,7 @@ def test_the_papers_system_runs_and_is_read_from_its_stores_ever_after(evaluate,
     monkeypatch.setenv("MFVPR_CACHE", str(tmp_path / "cache"))
     first = evaluate(*system("mix_hist_comb_10", small_street, tmp_path / "first"))
     stores = sorted(path.name.rpartition("-")[0] for path in (tmp_path / "cache" / "features").glob("*-*"))
-    assert stores == ["d2net", "d2net", "mixvpr", "mixvpr"]
+    assert stores == ["D2NetFeatures", "D2NetFeatures", "MixVprDescriptor", "MixVprDescriptor"]
     assert "10 of 10 images to do, about 163 features of 512 dimensions each" in first
     assert "as the paper stores them" in first
     rows = json.loads((tmp_path / "first" / "results.json").read_text())
@@ -95,7 +95,9 @@ def test_mistakes_are_one_line(arguments, words, refused, tmp_path):
 
 def test_a_store_that_is_a_file_is_refused(refused, small_street, weights):
     places = (f"dataset.database={small_street}/database", f"dataset.queries={small_street}/queries")
-    error = refused(weights, "dataset=folder", *places, "dataset.ground_truth=order", f"store={ROOT}/README.md")
+    error = refused(
+        weights, "dataset=folder", *places, "dataset.ground_truth=order", "candidates=10", f"store={ROOT}/README.md"
+    )
     assert error.startswith("error: ")
     assert "README.md" in error
 

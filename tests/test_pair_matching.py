@@ -17,6 +17,7 @@ from mfvpr import Matches, pipeline, ragged
 from mfvpr.match_sets import MatchSet, QueryMatches, batches, compacted, shapes, slots
 from mfvpr.matching import filter_matches
 from mfvpr.pair_matching import QUERIES
+from mfvpr.reranking import rank_shortlist
 from mfvpr.sources import FeatureSet, InMemory
 from mfvpr.stores.features import open_store
 from mfvpr.types import Shortlist, per_match, per_pair
@@ -230,7 +231,7 @@ def on_devices(out):
         found = pipeline.match(queries, database, candidates, devices=devices, memory=memory)
         scores = pipeline.score({"histogram": mfvpr.HistogramOfShifts()}, found, candidates)["histogram"]
         content = [np.asarray(leaf).tobytes().hex() for leaf in jax.tree.leaves(list(found.matches))]
-        results.append({"ranking": pipeline.rank(candidates, scores).tolist(), "matches": content})
+        results.append({"ranking": rank_shortlist(candidates, scores).tolist(), "matches": content})
     Path(out).write_text(json.dumps({"devices": jax.device_count(), "results": results}))
 
 

@@ -11,6 +11,10 @@ import numpy as np
 import pytest
 
 from experiments.settings import CONF, RULES, check, scorer_rules
+from mfvpr.archive import Archive
+from mfvpr.data.datasets import image_folder
+from mfvpr.exchange import write_features
+from mfvpr.features.sift import Sift
 from tests import checkpoints
 from tests.builders import make_matches
 from tests.programs import QUICK, ROOT, composed, typed
@@ -49,11 +53,20 @@ def test_commands_run(command, small_street, weights, tmp_path, monkeypatch, cap
     arguments = shlex.split(command.removeprefix("python -m experiments.evaluate"))
     places = {"database": root / "database", "queries": root / "queries", "root": root}
     folders = {f"dataset.{name}=DIR": f"dataset.{name}={path}" for name, path in places.items()}
+    folders["dataset.queries=[DIR,DIR]"] = f"dataset.queries=[{root}/queries,{root}/query]"
+    for side in ("database", "queries"):
+        folders[f"features.{side}=FILE"] = f"features.{side}={tmp_path}/{side}.npz"
     arguments = [folders.get(argument, argument) for argument in arguments]
     if not any(argument.startswith("dataset=") for argument in arguments):  # streets would take longer
         arguments += ["dataset=folder", "dataset.ground_truth=order", *list(folders.values())[:2]]
+    if "features=import" in arguments:
+        for side in ("database", "queries"):
+            images = image_folder(root / side)
+            [features] = Archive().local(images, Sift(max_keypoints=60))
+            write_features(tmp_path / f"{side}.npz", images.names, features.read(range(len(images))))
     known = "vlad" if "mixvpr" not in command and "system" not in command else "mixvpr"
     quick = [setting for setting in QUICK if known == "vlad" or not setting.startswith("retrieval.")]
+    quick = [setting for setting in quick if "features=import" not in arguments or not setting.startswith("features.")]
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MFVPR_WEIGHTS", str(weights))
     code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *arguments, *quick)
@@ -104,14 +117,24 @@ def test_library_example(small_street, tmp_path, monkeypatch, capsys):
         assert name in printed
 
 
+def test_the_whole_way_in_one_call(small_street, tmp_path, monkeypatch, capsys):
+    for side in ("database", "queries"):
+        shutil.copytree(small_street / side, tmp_path / side)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(EXAMPLES[1], "README.md", "exec"), {})
+    printed = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in printed if "[[" in line] == ["filter", "histogram"]
+    assert (tmp_path / "features").is_dir()
+
+
 def test_a_scorer_of_your_own_keeps_the_contract():
     """The example checks itself; what it scores is the number of matches that agree."""
-    code, made = EXAMPLES[1], {}
+    code, made = EXAMPLES[2], {}
     assert len(lines(code)) <= 15
     exec(compile(code, "README.md", "exec"), made)
     points = np.random.default_rng(0).uniform(50, 250, (12, 2))
     assert made["Concentration"]()(make_matches(points, points + 30)) == pytest.approx(12)
-    assert len(EXAMPLES) == 2
+    assert len(EXAMPLES) == 3
 
 
 def test_settings_that_the_text_names_exist():
@@ -124,5 +147,5 @@ def test_settings_that_the_text_names_exist():
 
 def test_readme_names_no_machine_path():
     assert not re.search(r"/(work|tmp|root|home)/", "".join([README, *BESIDE]))
-    assert len(README.splitlines()) <= 250
+    assert len(README.splitlines()) <= 320
     assert Path(ROOT / "LICENSE").read_text().startswith("MIT")

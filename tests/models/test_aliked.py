@@ -19,6 +19,7 @@ from mfvpr.weights.networks import blueprint
 from mfvpr.weights.registry import entry_of
 from mfvpr.weights.tables import ALIKED
 from tests import checkpoints
+from tests.builders import local
 from tests.golden.make_aliked import DRAWN, GOLDEN, REAL, checkpoint, picture, projections, samples, texture
 from tests.models import aliked_oracle as oracle
 
@@ -111,7 +112,7 @@ def test_with_random_weights_too_and_images_of_a_batch_do_not_mix(drawn):
 def test_the_extractor_does_as_the_public_code_and_compiles_once(drawn, compilations):
     extractor = AlikedFeatures(drawn, (DRAWN.width, DRAWN.height), threshold=DRAWN.threshold)
     image = picture(DRAWN, IMAGES)[None]
-    (features,) = extractor(image)
+    features = extractor(image)[0].features
     compilations.reset()
     extractor(image[:, ::-1])
     assert compilations.count == 0
@@ -245,7 +246,7 @@ def unlimited() -> AlikedFeatures:
 
 
 def test_what_does_not_fit_the_usual_slots_is_not_lost(unlimited):
-    first, second = unlimited(crowded())
+    first, second = local(unlimited(crowded()))
     assert len(first.scores) == 216
     assert len(second.scores) == 32
     for features in (first, second):
@@ -256,8 +257,8 @@ def test_what_does_not_fit_the_usual_slots_is_not_lost(unlimited):
 
 @pytest.mark.parametrize("limit", [50, 100])
 def test_of_too_many_the_highest_scores_are_kept_by_falling_score(unlimited, limit):
-    everything, _ = unlimited(crowded())
-    features, other = AlikedFeatures(Direct(), (60, 40), max_keypoints=limit)(crowded())
+    everything, _ = local(unlimited(crowded()))
+    features, other = local(AlikedFeatures(Direct(), (60, 40), max_keypoints=limit)(crowded()))
     peaks = crowded()[0, 3:37:3, 3:57:3, 0].reshape(-1)
     strongest = np.argsort(-peaks.astype(int), kind="stable")[:limit]
     np.testing.assert_array_equal(features.keypoints, everything.keypoints[strongest])
@@ -266,7 +267,7 @@ def test_of_too_many_the_highest_scores_are_kept_by_falling_score(unlimited, lim
 
 def test_no_images_and_dark_images_have_no_features(unlimited):
     assert unlimited(crowded()[:0]) == []
-    (features,) = unlimited(np.zeros((1, 40, 60, 3), np.uint8))
+    (features,) = local(unlimited(np.zeros((1, 40, 60, 3), np.uint8)))
     assert features.keypoints.shape == features.descriptors.shape == (0, 2)
     assert features.scores.shape == features.mask.shape == (0,)
 
@@ -281,13 +282,13 @@ def test_images_too_small_or_of_another_size_are_refused(drawn):
 def test_the_smallest_image_has_one_pixel_within_its_border(drawn):
     image = np.zeros((1, 5, 5, 3), np.uint8)
     image[0, 2, 2] = 200
-    (features,) = AlikedFeatures(Direct(), (5, 5))(image)
+    features = AlikedFeatures(Direct(), (5, 5))(image)[0].features
     np.testing.assert_array_equal(features.keypoints, [[2, 2]])
     found, descriptors = jax.eval_shape(lambda: drawn.extract(image.astype(np.float32), 0.1, 25))
     assert (found.keypoints.shape, descriptors.shape) == ((1, 25, 2), (1, 25, 64))
 
 
 def test_the_forecast_grows_with_the_image(drawn):
-    assert AlikedFeatures(drawn).typical_count == 819
-    assert AlikedFeatures(drawn, max_keypoints=None).typical_count == 819
-    assert AlikedFeatures(drawn, max_keypoints=300).typical_count == 300
+    assert AlikedFeatures(drawn).scales[0].typical_count == 819
+    assert AlikedFeatures(drawn, max_keypoints=None).scales[0].typical_count == 819
+    assert AlikedFeatures(drawn, max_keypoints=300).scales[0].typical_count == 300

@@ -15,6 +15,7 @@ from mfvpr.weights.conversion import convert
 from mfvpr.weights.networks import blueprint
 from mfvpr.weights.registry import entry_of
 from mfvpr.weights.tables import D2NET
+from tests.builders import local
 from tests.checkpoints import d2net_shapes, random_checkpoint
 from tests.golden.make_d2net import CASES, GOLDEN, PLAIN, projections, samples, texture
 from tests.models import d2net_oracle as oracle
@@ -120,7 +121,7 @@ def test_maps_and_features_are_those_of_the_public_code(model, case):
 
     size = (case.width, case.height)
     extractor = D2NetFeatures(Observed(), size, preprocessing=case.preprocessing, multiscale=case.multiscale)
-    (features,) = extractor(texture(*size)[None])
+    features = extractor(texture(*size)[None])[0].features
     jax.effects_barrier()
     (dense,) = maps[len(maps) // 2]  # at full size
     np.testing.assert_allclose(samples(dense), golden["dense"], rtol=1e-5, atol=1e-5 * golden["dense"].max())
@@ -245,7 +246,7 @@ def test_what_does_not_fit_is_counted_and_the_strongest_stay():
 def test_crowded_images_are_extracted_again(small, images, monkeypatch):
     monkeypatch.setattr(features_d2net, "_SHARE", 0.01)
     crowded = D2NetFeatures(small.model, small.image_size)
-    for ours, expected in zip(crowded(images), small(images), strict=True):
+    for ours, expected in zip(local(crowded(images)), local(small(images)), strict=True):
         assert len(expected.scores) > 2
         jax.tree.map(lambda ours, theirs: np.testing.assert_allclose(ours, theirs, rtol=1e-5), ours, expected)
 
@@ -269,7 +270,7 @@ def test_one_program_per_extractor(images, compilations):
 
 def test_the_highest_scores_are_kept_in_order(small, images):
     limited = D2NetFeatures(small.model, small.image_size, max_keypoints=4)
-    for ours, everything in zip(limited(images), small(images), strict=True):
+    for ours, everything in zip(local(limited(images)), local(small(images)), strict=True):
         kept = np.sort(np.argsort(-everything.scores, kind="stable")[:4])
         np.testing.assert_array_equal(ours.scores, everything.scores[kept])
         np.testing.assert_array_equal(ours.keypoints, everything.keypoints[kept])
@@ -279,7 +280,7 @@ def test_an_image_without_keypoints_gives_empty_features(images):
     graph, state = nnx.split(Tiny())
     blind = nnx.merge(graph, jax.tree.map(jnp.zeros_like, state))
     for multiscale in (False, True):
-        (features,) = D2NetFeatures(blind, image_size=(64, 48), multiscale=multiscale)(images[:1])
+        features = D2NetFeatures(blind, image_size=(64, 48), multiscale=multiscale)(images[:1])[0].features
         assert features.keypoints.shape == (0, 2)
         assert features.descriptors.shape == (0, 6)
         assert features.scores.shape == features.mask.shape == (0,)
@@ -315,11 +316,11 @@ def test_images_of_another_size_are_refused(small, images):
 
 
 def test_the_forecast_grows_with_the_map(model):
-    assert D2NetFeatures(model).typical_count == 740
-    assert D2NetFeatures(model).dimension == 512
-    assert D2NetFeatures(model, (320, 320)).typical_count == pytest.approx(684, abs=20)
-    assert D2NetFeatures(model, multiscale=True).typical_count > 740
-    assert D2NetFeatures(model, max_keypoints=100).typical_count == 100
+    assert D2NetFeatures(model).scales[0].typical_count == 740
+    assert D2NetFeatures(model).scales[0].dimension == 512
+    assert D2NetFeatures(model, (320, 320)).scales[0].typical_count == pytest.approx(684, abs=20)
+    assert D2NetFeatures(model, multiscale=True).scales[0].typical_count > 740
+    assert D2NetFeatures(model, max_keypoints=100).scales[0].typical_count == 100
 
 
 def test_relu_is_an_option(model, images):
