@@ -98,9 +98,12 @@ def matched(
     """
     indices, scores = np.asarray(candidates.indices), np.asarray(candidates.scores)
     counts0, counts1, rows = queries.counts, database.counts, np.asarray(todo, int)
-    some, budget = np.unique(indices[rows]), memory_budget(memory, devices)
+    # Of all queries, though some are done: what goes on where it was must have the shapes, and the bits, of one run.
+    some, budget = np.unique(indices), memory_budget(memory, devices)
     sides = {
-        device: Sides(Slots(queries, rows, 0, device), Slots(database, some[some >= 0], budget, device))
+        device: Sides(
+            Slots(queries, np.arange(len(queries)), 0, device), Slots(database, some[some >= 0], budget, device)
+        )
         for device in devices
     }
     pairs: dict[tuple[int, int], Pair] = {}  # by query and place, until the query's last

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr import Matches, pipeline, ragged
+from mfvpr import Matches, pair_matching, pipeline, ragged
 from mfvpr.match_sets import MatchSet, QueryMatches, batches, compacted, shapes, slots
 from mfvpr.matching import filter_matches
 from mfvpr.pair_matching import QUERIES
@@ -322,3 +322,27 @@ def test_image_sizes_are_all_combinations():
         (3, 9, 5, 6), (3, 9, 7, 8), (4, 9, 5, 6), (4, 9, 7, 8)
     }  # fmt: skip
     assert len(sizes0) == 4
+
+
+def test_some_queries_are_matched_as_all_of_them():
+    """To the bit: where the others have more keypoints, so that shapes would be other ones without them."""
+    rng = np.random.default_rng(3)
+    queries = FeatureSet.of([make_features(rng, count) for count in (20, 200, 150)])
+    database = FeatureSet.of([make_features(rng, count) for count in (30, 25, 300, 220)])
+    indices = np.array([[0, 1], [2, 3], [3, 2]], np.int32)
+    listed = Shortlist(indices, np.zeros(indices.shape, np.float32), indices >= 0)
+    options = {"memory": None, "devices": jax.local_devices()[:1], "with_ratio": True}
+    sizes, call = [], pair_matching.match_pairs
+
+    def counted(first, second, *rest, **more):
+        sizes.append((first.mask.shape[1], second.mask.shape[1]))
+        return call(first, second, *rest, **more)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pair_matching, "match_pairs", counted)
+        whole = dict(pair_matching.matched(queries, database, listed, [0, 1, 2], **options))
+        of_all, sizes[:] = {*sizes}, []
+        alone = dict(pair_matching.matched(queries, database, listed, [0], **options))
+    assert {*sizes} < of_all
+    for one, other in zip(jax.tree.leaves(whole[0].matches), jax.tree.leaves(alone[0].matches), strict=True):
+        np.testing.assert_array_equal(one, other)
