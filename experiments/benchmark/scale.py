@@ -4,6 +4,7 @@ import json
 import multiprocessing
 import platform
 import re
+import resource
 import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -175,8 +176,9 @@ class Session:
 
 
 def _peak_bytes() -> int:
-    """Resident memory at its most, of this process alone: `getrusage` would count what it was forked from."""
-    return 1024 * int(re.findall(r"VmHWM: *(\d+)", Path("/proc/self/status").read_text())[0])
+    """Resident memory at its most, of this process; where the system keeps no such count, not below its parent's."""
+    own = re.findall(r"VmHWM: *(\d+)", Path("/proc/self/status").read_text())
+    return 1024 * (int(own[0]) if own else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 
 
 def ranked(

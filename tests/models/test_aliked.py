@@ -121,7 +121,7 @@ def test_the_extractor_does_as_the_public_code_and_compiles_once(drawn, compilat
         np.testing.assert_allclose(projections(features.descriptors), file[f"{DRAWN}/projections"], atol=1e-5)
     np.testing.assert_array_equal(features.image_size, [300, 200])
     assert features.mask.all()
-    assert features.descriptors.shape[1] == extractor.dimension == 64
+    assert features.descriptors.shape[1] == extractor.scales[0].dimension == 64
 
 
 def test_a_deformable_convolution_agrees_with_the_oracle():
