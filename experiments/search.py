@@ -27,6 +27,7 @@ def sweep(settings: dict[str, Any]) -> None:
         options = {
             "ks": settings["recall"]["ks"], "ties": settings["ties"],
             "filter_score": settings["fusion"]["filter_score"], "folder": kept, "track": console.track,
+            "devices": tools.where["devices"],
             "settings_per_block": settings["chunk"]["settings"], "queries_per_block": settings["chunk"]["queries"],
         }  # fmt: skip
         with watch("sweep"):

@@ -4,7 +4,6 @@ Settings are batch axes of one compiled call. Matches are scored pair by pair, w
 block by block (some settings, some queries), which bounds the memory and is where an interrupted sweep goes on.
 """
 
-import hashlib
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -14,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from mfvpr import parameter_grids, reranking
 from mfvpr.data.arrays import read_arrays, write_arrays
 from mfvpr.errors import InputError
+from mfvpr.fingerprints import content_hash
 from mfvpr.match_sets import BYTES_PER_SLOT, MatchSet, Scales, scales, shapes, slots
 from mfvpr.numerics import Device, compiled
 from mfvpr.progress import Track, untracked
@@ -62,7 +61,7 @@ class Work:
         """Of the matches, how scales are fused, the shortlist and the views of these queries."""
         taken = [one.take(self.queries) for one in scales(self.match_set)]
         fusion = (self.match_set.weights, self.match_set.normalize) if isinstance(self.match_set, Scales) else ()
-        return _digest(fusion, [(one.counts, one.matches) for one in taken], self.candidates, list(self.views))
+        return content_hash(fusion, [(one.counts, one.matches) for one in taken], self.candidates, list(self.views))
 
     def parts(self, size: int) -> Iterator["Work"]:
         """The same for at most `size` queries at a time."""
@@ -244,7 +243,7 @@ def _fingerprint(part: Work, block: Group, cs: Sequence[Any]) -> str:
         [*block.settings, *block.weightings],
     )
     numbers = block.scorer, dict(block.settings), dict(block.weightings)
-    return _digest(repr(options), block.program, part.digest, numbers)
+    return content_hash(repr(options), block.program, part.digest, numbers)
 
 
 def _program(work: Work, group: Group) -> str:
@@ -262,14 +261,3 @@ def _program(work: Work, group: Group) -> str:
     return "".join(
         text(one.matches[0], *shape) for one in sets for shape in shapes(one, settings=work.settings).items()
     )
-
-
-def _digest(*parts: Any) -> str:
-    """Of texts, and of the types, shapes and bytes of the arrays in pytrees."""
-    digest = hashlib.sha256()
-    for leaf in jax.tree.leaves(parts):
-        if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-            leaf = jax.random.key_data(leaf)
-        array = np.frombuffer(leaf.encode(), np.uint8) if isinstance(leaf, str) else np.asarray(leaf)
-        digest.update(f"{array.dtype}{array.shape};".encode() + array.tobytes())
-    return digest.hexdigest()[:24]
