@@ -7,6 +7,7 @@ from experiments import build, console, prepare, run_folder, truth
 from experiments.axes import learnable, own_c
 from mfvpr.data.files import write_text
 from mfvpr.evaluation import Judge
+from mfvpr.evaluations import Stopwatch
 from mfvpr.fingerprints import fingerprint
 from mfvpr.learning.comparison import Checkpoints, Options, compare
 from mfvpr.learning.losses import LOSSES
@@ -17,7 +18,7 @@ def learn(settings: dict[str, Any]) -> None:
     """Matches -> learned, searched and hand-set scores on the half that none of them saw -> table, figures, files."""
     with run_folder.claimed(settings) as folder:
         varied = learnable(settings)
-        watch = prepare.Stopwatch()
+        watch = Stopwatch()
         tools, images = prepare.begun(settings, watch)
         judge = truth.judge(settings, images.dataset)
         matches, candidates = prepare.matched(settings, tools, images, watch, with_ratio=True)

@@ -20,7 +20,7 @@ from mfvpr.filters import Filter
 from mfvpr.match_sets import MatchSet
 from mfvpr.types import Shortlist
 
-__all__ = ["Images", "Stopwatch", "Tools", "begun", "matched", "recipe"]
+__all__ = ["Images", "Tools", "begun", "matched", "recipe"]
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from experiments import build, console, prepare, run_folder, truth
 from experiments.axes import as_final, require_memory, searchable
 from mfvpr import sweeping
 from mfvpr.data.files import write_text
+from mfvpr.evaluations import Stopwatch
 from mfvpr.fingerprints import fingerprint
 from mfvpr.report import runs, sweeps
 from mfvpr.sweeping import Outcome
@@ -19,7 +20,7 @@ def sweep(settings: dict[str, Any]) -> None:
     settings = as_final(settings)
     with run_folder.claimed(settings) as folder:
         varied = searchable(settings)
-        watch = prepare.Stopwatch()
+        watch = Stopwatch()
         tools, images = prepare.begun(settings, watch)
         judge = truth.judge(settings, images.dataset)
         matches, candidates = prepare.matched(settings, tools, images, watch)

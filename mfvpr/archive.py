@@ -11,7 +11,7 @@ a database which several data sets share is extracted once.
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -23,6 +23,7 @@ from mfvpr.errors import InputError
 from mfvpr.extraction import described
 from mfvpr.features import Aggregation, Extractor, Fitting, Scale
 from mfvpr.fingerprints import recipe_of
+from mfvpr.memo import Memo
 from mfvpr.progress import Track, untracked
 from mfvpr.report.runs import versions
 from mfvpr.sinks import Sink, open_sinks
@@ -82,6 +83,15 @@ class Aggregated:
 
 
 @dataclass
+class _Taken:
+    """What an extractor takes from a folder's images: where that is kept, and why some gave nothing, by row."""
+
+    sinks: list[Sink]
+    bad: dict[int, str] = field(default_factory=dict)
+    announced: bool = False
+
+
+@dataclass
 class Archive:
     """What was taken from images, in stores below a folder, or for the time of this process.
 
@@ -89,8 +99,9 @@ class Archive:
         root: folder of all stores; None = nothing is kept on disk.
         skip_bad: list images that cannot be read as bad, and go on, instead of raising.
         track: label -> progress of what follows.
-        tell: is told, in one line, what is to be done and how much space that takes; None = nobody.
+        tell: is told, in one line, what is to be done and how much space that takes, and what is wrong with images.
         wait: for other processes that are making the same, instead of refusing.
+        memo: what this process knows already, such as what was fitted on a database.
     """
 
     root: Path | None = None
@@ -98,31 +109,26 @@ class Archive:
     track: Callable[[str], Track] = lambda label: untracked
     tell: Callable[[str], None] = lambda line: None
     wait: bool = False
-    _contents: dict[ImageFolder, Contents] = field(default_factory=dict, repr=False)
-    _sinks: dict[tuple[ImageFolder, int], list[Sink]] = field(default_factory=dict, repr=False)
-    _bad: dict[tuple[ImageFolder, int], dict[int, str]] = field(default_factory=dict, repr=False)
-    _fitted: dict[tuple[ImageFolder, int], Aggregation] = field(default_factory=dict, repr=False)
-    _used: list[Any] = field(default_factory=list, repr=False)  # whose ids are keys: they must live
+    memo: Memo = field(default_factory=Memo, repr=False)
 
     def contents(self, folder: ImageFolder) -> Contents:
         """What the files of a folder hold; remembered below the root from run to run."""
-        if folder not in self._contents:
-            self._contents[folder] = contents(folder, None if self.root is None else self.root / "contents")
-        return self._contents[folder]
+        cache = None if self.root is None else self.root / "contents"
+        return self.memo.once("contents", lambda: contents(folder, cache), equal=folder)
 
-    def recipe_of(self, value: Any, *folders: ImageFolder) -> Any:
-        """Of an extractor or a filter; with the content of the files that it reads, in place of their names."""
-        recipe = recipe_of(value)
-        if not hasattr(value, "paths"):
-            return recipe
-        paths = sorted({path for folder in folders for path in value.paths(folder) if path.is_file()})
-        return recipe | {"files": [self.contents(ImageFolder(path.parent, (path.name,))).sha256 for path in paths]}
+    def recipe_of(self, value: Any) -> Any:
+        """See `fingerprints.recipe_of`, with the content of files and folders of files in place of their paths."""
+        return recipe_of(value, self._told_by_content)
+
+    def warn(self, line: str, *, about: Any = None) -> None:
+        """Tell what is wrong; once, whoever finds it again (the next sequence that asks the same database)."""
+        self.memo.once("warning", lambda: self.tell(f"warning: {line}"), equal=about or line)
 
     def recipe(self, folder: ImageFolder, extractor: Extractor | Aggregated | Source) -> dict[str, Any]:
         """All that changes what an extractor takes from a folder's images."""
         decoders = {name: versions()[name] for name in DECODERS}
         return {
-            "extractor": self.recipe_of(extractor, folder),
+            "extractor": self.recipe_of(extractor),
             "images": self.contents(folder).fingerprint,
             "versions": decoders,
         }
@@ -147,11 +153,14 @@ class Archive:
             InputError: an image cannot be read (unless `skip_bad`), or none can; or a store cannot be used.
         """
         if isinstance(extractor, Source):
-            return (FeatureSet(extractor.opened(folder, partial=self.skip_bad), {}),)
-        bad = self._extract(folder, extractor, range(len(folder)) if rows is None else [*rows], label)
+            opened = self.memo.once(
+                "opened", lambda: extractor.opened(folder, partial=self.skip_bad), extractor, equal=folder
+            )
+            return (FeatureSet(opened, {}),)
+        taken = self._extract(folder, extractor, range(len(folder)) if rows is None else [*rows], label)
         return tuple(
-            FeatureSet(InMemory(sink.items, len(folder)) if sink.store is None else sink.store, dict(bad))
-            for sink in self._sinks[folder, id(extractor)][bool(extractor.vector_size) :]
+            FeatureSet(InMemory(sink.items, len(folder)) if sink.store is None else sink.store, dict(taken.bad))
+            for sink in taken.sinks[bool(extractor.vector_size) :]
         )
 
     def vectors(self, folder: ImageFolder, describer: Extractor | Aggregated, database: ImageFolder, *,
@@ -167,14 +176,11 @@ class Archive:
         Raises:
             InputError: as `local`.
         """
-        if isinstance(describer, Aggregated):
-            return self._aggregated(folder, describer, database, label)
-        bad = self._extract(folder, describer, range(len(folder)), label)
-        values = np.full((len(folder), describer.vector_size), np.nan, np.float32)
-        sink = self._sinks[folder, id(describer)][0]
-        for row, vector in sink.items.items() if sink.store is None else sink.store.read():
-            values[row] = vector
-        return Vectors(values, dict(bad))
+        if folder != database:
+            return self._vectors(folder, describer, database, label)
+        return self.memo.once(
+            "vectors", lambda: self._vectors(folder, describer, database, label), describer, equal=folder
+        )
 
     @contextmanager
     def matches(
@@ -207,45 +213,53 @@ class Archive:
     def _waiting(self) -> Callable[[str], None] | None:
         return self.tell if self.wait else None
 
-    def _extract(self, folder: ImageFolder, extractor: Extractor, rows: Sequence[int], label: str) -> dict[int, str]:
-        """Run the extractor on those of the rows that lack something; reasons of all bad images so far."""
-        key = folder, id(extractor)
-        if is_new := key not in self._sinks:
-            self._used.append(extractor)
-            self._sinks[key], self._bad[key] = self._sinks_of(folder, extractor), {}
-        sinks, bad = self._sinks[key], self._bad[key]
+    def _told_by_content(self, path: PurePath) -> Any:
+        path = Path(path)
+        if path.is_file():
+            return self.contents(ImageFolder(path.parent, (path.name,))).sha256
+        if path.is_dir():
+            names = sorted(file.relative_to(path).as_posix() for file in path.rglob("*") if file.is_file())
+            return self.contents(ImageFolder(path, tuple(names))).fingerprint
+        return str(path)
+
+    def _extract(self, folder: ImageFolder, extractor: Extractor, rows: Sequence[int], label: str) -> _Taken:
+        """Run the extractor on those of the rows that lack something."""
+        taken = self.memo.once("taken", lambda: _Taken(self._sinks(folder, extractor)), extractor, equal=folder)
         with ExitStack() as held:
-            if any(sink.lacks(rows) for sink in sinks):
-                for sink in sinks:
+            if any(sink.lacks(rows) for sink in taken.sinks):
+                for sink in taken.sinks:
                     if sink.store is not None:
                         held.enter_context(sink.store)
-            missing = sorted({row for sink in sinks for row in sink.lacks(rows)} - bad.keys())
-            if missing or is_new:
-                self._announce(extractor, sinks, missing, len(folder), label)
-            for batch in described(folder, extractor, missing, bad, skip_bad=self.skip_bad, track=self.track(label)):
-                for sink in sinks:
+            missing = sorted({row for sink in taken.sinks for row in sink.lacks(rows)} - taken.bad.keys())
+            self._announce(extractor, taken, missing, len(rows), len(folder), label)
+            batches = described(folder, extractor, missing, taken.bad, skip_bad=self.skip_bad, track=self.track(label))
+            for batch in batches:
+                for sink in taken.sinks:
                     sink.keep({row: sink.pick(description) for row, description in batch.items()})
             if missing:
-                self._account(extractor, sinks, label)
-        if len(bad) == len(folder):
-            raise InputError(f"{folder.root}: none of {len(folder)} images can be used; the first: {bad[min(bad)]}")
-        return bad
+                self._account(extractor, taken.sinks, label)
+        if len(taken.bad) == len(folder):
+            raise InputError(f"{folder.root}: none of {len(folder)} images can be used; the first: "
+                             f"{taken.bad[min(taken.bad)]}")  # fmt: skip
+        return taken
 
-    def _sinks_of(self, folder: ImageFolder, extractor: Extractor) -> list[Sink]:
+    def _sinks(self, folder: ImageFolder, extractor: Extractor) -> list[Sink]:
         recipe = self.recipe(folder, extractor) if self.root is not None else {}
         return open_sinks(self.root, extractor, recipe, num_images=len(folder), waiting=self._waiting)
 
     def _announce(
-        self, extractor: Extractor, sinks: Sequence[Sink], missing: Sequence[int], total: int, label: str
+        self, extractor: Extractor, taken: _Taken, missing: Sequence[int], asked: int, total: int, label: str
     ) -> None:
-        stores = [sink.store for sink in sinks if sink.store is not None]
-        if not stores:
+        """What is to be done; that nothing is, only once."""
+        stores = [sink.store for sink in taken.sinks if sink.store is not None]
+        if not stores or not asked or (taken.announced and not missing):
             return
-        where = ", ".join(str(store.folder) for store in stores)
+        where, taken.announced = ", ".join(str(store.folder) for store in stores), True
         if not missing:
-            self.tell(f"{label}: all {total} images from {where}")
+            some = f"all {total}" if asked == total else f"the {asked} of {total}"
+            self.tell(f"{label}: {some} images from {where}")
             return
-        needed = sum(sink.forecast(len(missing)) for sink in sinks)
+        needed = sum(sink.forecast(len(missing)) for sink in taken.sinks)
         require_space(stores[0].folder, needed)
         each = ", ".join(f"about {scale.typical_count} features of {scale.dimension} dimensions each"
                          for scale in extractor.scales)  # fmt: skip
@@ -262,13 +276,19 @@ class Archive:
                           f"features an image; as the paper stores them, in float32, {paper / _MB:.1f} MB: "
                           f"{size / paper:.2f}x")  # fmt: skip
 
+    def _vectors(
+        self, folder: ImageFolder, describer: Extractor | Aggregated, database: ImageFolder, label: str
+    ) -> Vectors:
+        if isinstance(describer, Aggregated):
+            return self._aggregated(folder, describer, database, label)
+        taken = self._extract(folder, describer, range(len(folder)), label)
+        values, sink = np.full((len(folder), describer.vector_size), np.nan, np.float32), taken.sinks[0]
+        for row, vector in sink.items.items() if sink.store is None else sink.store.read():
+            values[row] = vector
+        return Vectors(values, dict(taken.bad))
+
     def _aggregated(self, folder: ImageFolder, describer: Aggregated, database: ImageFolder, label: str) -> Vectors:
-        key = database, id(describer)
-        if key not in self._fitted:
-            self._used.append(describer)
-            [features] = self.local(database, describer.extractor, label="database features")
-            self._fitted[key] = describer.fitting.fit(features)
-        aggregation = self._fitted[key]
+        aggregation = self.memo.once("fitted", lambda: self._fitted(describer, database), describer, equal=database)
         [features] = self.local(folder, describer.extractor, label=label)
         values = np.zeros((len(folder), aggregation.vector_size), np.float32)
         rows = range(len(folder))
@@ -278,3 +298,7 @@ class Archive:
                 values[list(images)] = aggregation(list(images.values()))
         values[list(features.bad)] = np.nan
         return Vectors(values, features.bad)
+
+    def _fitted(self, describer: Aggregated, database: ImageFolder) -> Aggregation:
+        [features] = self.local(database, describer.extractor, label="database features")
+        return describer.fitting.fit(features)

@@ -1,8 +1,9 @@
 """The whole way in one call: images -> features -> shortlist -> matches -> scores -> ranking -> recall.
 
-result = mfvpr.evaluate(dataset, Sift(), Retrieval(Aggregated(sift, VladFitting())),
+sift = Sift()
+result = mfvpr.evaluate(dataset, sift, Retrieval(Aggregated(sift, VladFitting())),
                         {"histogram": mfvpr.HistogramOfShifts()}, candidates=50)
-print(result.table())
+print(result.recall([0.0])["histogram"].pooled)
 """
 
 import time
@@ -76,7 +77,7 @@ def evaluate(
     archive: Archive | None = None,
     memory: float | None = None,
     devices: Sequence[Device] | None = None,
-    watch: "Stopwatch | None" = None,
+    watch: Stopwatch | None = None,
 ) -> Result:
     """Rank every query's candidates by every scorer.
 
@@ -209,7 +210,7 @@ def matches_recipe(
     return {
         "database": archive.recipe(dataset.database, extractor),
         "query": archive.recipe(sequence.images, extractor),
-        "filter": archive.recipe_of(filter, dataset.database, sequence.images),
+        "filter": archive.recipe_of(filter),
         "candidates": num_candidates,
         "matching": recipe_of(matching),
         "skip_bad": archive.skip_bad,
@@ -232,8 +233,8 @@ def _match_stores(
 def _tell_of(archive: Archive, folder: ImageFolder, features: FeatureSet, bad: Mapping[int, str]) -> None:
     """What is wrong with some images, which rank last, or have no matches."""
     for reason in bad.values():
-        archive.tell(f"warning: {reason}")
+        archive.warn(reason)
     known = np.asarray(features.source.counts)
     if empty := [row for row in np.flatnonzero(known == 0).tolist() if row not in bad]:
-        archive.tell(f"warning: {folder.paths[empty[0]]}: no keypoints, so no matches ({len(empty)} such images of "
-                     f"{len(folder)}); scores are 0")  # fmt: skip
+        archive.warn(f"{folder.paths[empty[0]]}: no keypoints, so no matches ({len(empty)} such images of "
+                     f"{len(folder)}); scores are 0", about=(folder, "no keypoints"))  # fmt: skip

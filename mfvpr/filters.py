@@ -57,7 +57,6 @@ class Retrieval:
         """See `Filter`."""
         known = archive.vectors(database, self.describer, database, label="database descriptors")
         asked = archive.vectors(sequence.images, self.describer, database, label=f"{sequence.name} descriptors")
-        found = self.search.fit(known.values).shortlist(
-            asked.values, known.values, num_candidates, excluded=sequence.excluded
-        )
+        search = archive.memo.once("search", lambda: self.search.fit(known.values), self, equal=database)
+        found = search.shortlist(asked.values, known.values, num_candidates, excluded=sequence.excluded)
         return Filtered(found, asked.bad, known.bad)

@@ -6,7 +6,8 @@ Stores, checkpoints and blocks are keyed by the recipe of what they hold, and co
 import hashlib
 import itertools
 import json
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import PurePath
 from typing import Any
@@ -16,13 +17,19 @@ import jax.numpy as jnp
 import numpy as np
 
 _ABSENT = object()
+_ADDRESS = re.compile(" at 0x[0-9a-f]+")  # of a network's functions, which every process has elsewhere
 
 
-def recipe_of(value: Any) -> Any:
+def recipe_of(value: Any, of_path: Callable[[PurePath], Any] = str) -> Any:
     """A value in JSON's terms, arrays by their content: what makes an extractor, a filter or a scorer what it is.
 
     Dataclasses are told by the names of their class and fields, networks by their arrays. Fields with the metadata
-    `recipe` False (how many images go at a time) change nothing, and are left out.
+    `recipe` False (how many images go at a time) change nothing, and are left out. What the code does is not looked
+    at: whoever changes it changes a field too (`version: int = 2`), or nobody knows that old results are old.
+
+    Args:
+        value: dataclasses, mappings, lists, arrays, networks, texts, numbers, paths, and what has a property `recipe`.
+        of_path: what stands for a path; keys of mappings are always told by their names.
 
     Raises:
         TypeError: a part is none of these, such as a function: nobody knows what it does. A property `recipe` of its
@@ -31,21 +38,27 @@ def recipe_of(value: Any) -> Any:
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if not isinstance(value, type) and hasattr(value, "recipe"):
-        return recipe_of(value.recipe)
+        return recipe_of(value.recipe, of_path)
     if is_dataclass(value) and not isinstance(value, type):
         parts = {f.name: getattr(value, f.name) for f in fields(value) if f.metadata.get("recipe", True)}
-        return {"class": type(value).__name__} | recipe_of(parts)
+        return {"class": _name(type(value))} | recipe_of(parts, of_path)
     if isinstance(value, Mapping):
-        return {str(name): recipe_of(part) for name, part in value.items()}
+        return {str(name): recipe_of(part, of_path) for name, part in value.items()}
     if isinstance(value, list | tuple):
-        return [recipe_of(part) for part in value]
+        return [recipe_of(part, of_path) for part in value]
     if isinstance(value, PurePath):
-        return str(value)
+        return of_path(value)
     leaves, structure = jax.tree.flatten(value)
     if leaves and all(isinstance(leaf, np.ndarray | np.generic | jax.Array) for leaf in leaves):
-        own = {} if jax.tree_util.all_leaves([value]) else {"class": type(value).__name__}
-        return own | {"sha256": content_hash(str(structure), leaves)}
+        own = {} if jax.tree_util.all_leaves([value]) else {"class": _name(type(value))}
+        return own | {"sha256": content_hash(_ADDRESS.sub("", str(structure)), leaves)}
     raise TypeError(f"{type(value).__name__}: expected a dataclass, arrays, or a property `recipe` that JSON takes")
+
+
+def _name(kind: type) -> str:
+    """Of a class; ours may move from module to module, two of others may have one name."""
+    own = kind.__module__.partition(".")[0] == __name__.partition(".")[0]
+    return kind.__qualname__ if own else f"{kind.__module__}.{kind.__qualname__}"
 
 
 def fingerprint(recipe: Any) -> str:

@@ -1,6 +1,7 @@
 """What other programs computed, in place of extractors and filters: local features, global descriptors, shortlists.
 
-Files are told apart by their content, see `Archive.recipe_of`, wherever they are and whatever they are called.
+What was made from files is found again by their content, see `Archive.recipe_of`, wherever they are and whatever they
+are called.
 """
 
 from collections.abc import Mapping
@@ -44,17 +45,11 @@ class FeatureFiles:
         image_size: (width, height) px, where the files do not tell.
     """
 
-    files: Mapping[Path, File] = field(metadata={"recipe": False})
+    files: Mapping[Path, File]
     lengths: Lengths = "unit"
     image_size: tuple[int, int] | None = None
     interpolation: Interpolation = field(default="pil_bilinear", metadata={"recipe": False})
-    vector_size: int = field(default=0, metadata={"recipe": False})
     scales: tuple[Scale, ...] = field(default=(Scale(0, TYPICAL),), metadata={"recipe": False})
-
-    def paths(self, folder: ImageFolder) -> list[Path]:
-        """Of a folder's images."""
-        path = self.files[folder.root].path
-        return sorted(path.rglob("*")) if path.is_dir() else [path]
 
     def opened(self, folder: ImageFolder, *, partial: bool) -> ImportedFeatures:
         """The features of a folder's images; `partial`: some may be missing.
@@ -78,20 +73,17 @@ class DescriptorFiles:
         search: among the descriptors.
     """
 
-    files: Mapping[Path, File] = field(metadata={"recipe": False})
+    files: Mapping[Path, File]
     lengths: Lengths = "unit"
     search: Search = EXACT
-
-    def paths(self, folder: ImageFolder) -> list[Path]:
-        """Of a folder's images."""
-        return [self.files[folder.root].path]
 
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, archive: Archive
     ) -> Filtered:
         """See `mfvpr.filters.Filter`."""
-        known, asked = (self._read(folder) for folder in (database, sequence.images))
-        search = self.search.fit(known)
+        known = archive.memo.once("vectors", lambda: self._read(database), self, equal=database)
+        search = archive.memo.once("search", lambda: self.search.fit(known), self, equal=database)
+        asked = self._read(sequence.images)
         return Filtered(search.shortlist(asked, known, num_candidates, excluded=sequence.excluded), {}, {})
 
     def _read(self, folder: ImageFolder) -> np.ndarray:
@@ -108,12 +100,8 @@ class ShortlistFiles:
         database_prefix: of the database images.
     """
 
-    files: Mapping[Path, File] = field(metadata={"recipe": False})
-    database_prefix: str = field(default="", metadata={"recipe": False})
-
-    def paths(self, folder: ImageFolder) -> list[Path]:
-        """Of a folder of queries."""
-        return [self.files[folder.root].path] if folder.root in self.files else []
+    files: Mapping[Path, File]
+    database_prefix: str = ""
 
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, archive: Archive

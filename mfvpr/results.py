@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mfvpr.data.datasets import Dataset, QuerySequence
+from mfvpr.errors import InputError
 from mfvpr.evaluation import Positives, hits
 from mfvpr.match_sets import MatchSet, Scales
 from mfvpr.types import Shortlist
@@ -73,11 +74,11 @@ class Result:
         """What is right at a threshold, by sequence.
 
         Raises:
-            ValueError: a sequence has no ground truth.
+            InputError: a sequence has no ground truth.
         """
         found = [sequence.truth for sequence in self.dataset.sequences]
         if any(truth is None for truth in found):
-            raise ValueError(f"{self.dataset.name}: there is no ground truth, so rankings only")
+            raise InputError(f"{self.dataset.name}: there is no ground truth, so rankings only")
         return [truth.positives(threshold) for truth in found if truth is not None]
 
     def recall(self, thresholds: Sequence[float], ks: Sequence[int] = (1, 5, 10)) -> dict[str, Recall]:

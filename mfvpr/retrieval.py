@@ -149,12 +149,9 @@ def _shortlist(
 @compiled
 def _best(first: Shortlist, second: Shortlist) -> Shortlist:
     """The best of two shortlists `[Q, C]`; the first one's win ties."""
-    indices, scores, mask = (
-        jnp.concatenate([getattr(one, name) for one in (first, second)], axis=1)
-        for name in ("indices", "scores", "mask")
-    )
-    _, place = jax.lax.top_k(masked(scores, mask, -jnp.inf), first.mask.shape[1])
-    return Shortlist(*(jnp.take_along_axis(field, place, axis=1) for field in (indices, scores, mask)))
+    both = jax.tree.map(lambda *fields: jnp.concatenate(fields, axis=1), first, second)
+    _, place = jax.lax.top_k(masked(both.scores, both.mask, -jnp.inf), first.mask.shape[1])
+    return jax.tree.map(lambda field: jnp.take_along_axis(field, place, axis=1), both)
 
 
 def _parts(total: int, size: int) -> Iterator[slice]:

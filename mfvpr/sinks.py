@@ -5,8 +5,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mfvpr.features import Extractor
 from mfvpr.stores import features, vectors
 from mfvpr.stores.manifest import VECTORS, store_path
@@ -31,8 +29,9 @@ class Sink:
 
     def lacks(self, rows: Sequence[int]) -> list[int]:
         """Those of some rows that are not here."""
-        done = self.items if self.store is None else {*np.flatnonzero(self.store.done).tolist()}
-        return [row for row in rows if row not in done]
+        if self.store is None:
+            return [row for row in rows if row not in self.items]
+        return [row for row in rows if not self.store.done[row]]
 
     def keep(self, batch: Mapping[int, Any]) -> None:
         """A batch of rows; where there is a store, they are on disk when this returns."""
@@ -59,11 +58,8 @@ def open_sinks(
         num_images: M.
         waiting: see `stores.rows.open_rows`.
     """
-    name, options, size = (
-        type(extractor).__name__,
-        {"num_images": num_images, "waiting": waiting},
-        extractor.vector_size,
-    )
+    name, size = type(extractor).__name__, extractor.vector_size
+    options: dict[str, Any] = {"num_images": num_images, "waiting": waiting}
     sinks = []
     if size:
         path = None if root is None else store_path(root, name, recipe, VECTORS)

@@ -2,11 +2,12 @@
 
 import json
 import shutil
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
 import pytest
+from flax import nnx
 from PIL import Image
 
 from mfvpr import match, pipeline
@@ -240,6 +241,12 @@ def test_other_numbers_weights_and_images_make_other_stores(folder, tmp_path):
         Archive(tmp_path).local(folder, lambda images: images)
 
 
+def test_classes_of_one_name_are_told_apart():
+    made = [dataclass(type("Sift", (), {"__module__": name})) for name in ("theirs", "theirs.newer", "mfvpr.features")]
+    assert [recipe_of(one())["class"] for one in made] == ["theirs.Sift", "theirs.newer.Sift", "Sift"]
+    assert recipe_of(SIFT)["class"] == "Sift"
+
+
 def test_a_network_is_known_by_its_weights():
     entry = entry_of("aliked-t16")
     plan = blueprint(entry)
@@ -250,6 +257,18 @@ def test_a_network_is_known_by_its_weights():
     recipes = [recipe_of(AlikedFeatures(model)) for model in (*filled, filled[0])]
     assert recipes[0] == recipes[2]
     assert recipes[0] != recipes[1]
+
+
+def test_a_network_is_known_wherever_its_functions_are_in_memory():
+    def network():
+        def promote(arrays, **_):
+            return arrays
+
+        return nnx.Conv(1, 1, (1, 1), promote_dtype=promote, rngs=nnx.Rngs(0))
+
+    first, second = network(), network()
+    assert str(jax.tree.structure(first)) != str(jax.tree.structure(second))
+    assert recipe_of(first) == recipe_of(second)
 
 
 def test_aggregations_are_fitted_on_the_database(folder, small_street, tmp_path):

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import mfvpr
 from mfvpr.archive import Aggregated, Archive
@@ -16,6 +17,7 @@ from mfvpr.exchange import write_features, write_global_descriptors, write_short
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
 from mfvpr.filters import Retrieval
+from mfvpr.fingerprints import fingerprint
 from mfvpr.imported import DescriptorFiles, FeatureFiles, File, ShortlistFiles
 from mfvpr.report.evaluations import Judged, recall_table
 from mfvpr.retrieval import WhitenedSearch
@@ -203,6 +205,45 @@ def test_files_are_known_by_content(dataset, files, tmp_path):
     assert archive.recipe(dataset.database, FeatureFiles(at(dataset, moved, ".npz"))) == recipe
     shutil.copy(files / "queries.npz", moved / "database.npz")
     assert Archive(tmp_path / "s").recipe(dataset.database, FeatureFiles(at(dataset, moved, ".npz"))) != recipe
+
+
+def test_what_is_read_of_files_is_part_of_the_recipe(dataset, files, tmp_path):
+    """Which file belongs to which folder, and the prefixes; also within an aggregation."""
+    archive, sides = Archive(tmp_path), at(dataset, files, ".npz")
+    (one, first), (other, second) = sides.items()
+    changed = [sides, {one: second, other: first}, sides | {one: replace(first, prefix="other/")}]
+    for wrap in (
+        FeatureFiles,
+        DescriptorFiles,
+        lambda found: Retrieval(Aggregated(FeatureFiles(found), VladFitting())),
+    ):
+        assert len({fingerprint(archive.recipe_of(wrap(found))) for found in changed}) == len(changed)
+    pairs = [ShortlistFiles({one: first}, prefix) for prefix in ("", "database/")]
+    assert len({fingerprint(archive.recipe_of(found)) for found in pairs}) == 2
+
+
+def test_what_is_fitted_on_the_database_is_fitted_once_for_all_sequences(split, small_street, monkeypatch):
+    several, learned = sequences_dataset(small_street / "database", split, ground_truth="none"), []
+    for kind in (VladFitting, WhitenedSearch):
+        plain = kind.fit
+        monkeypatch.setattr(kind, "fit", lambda self, found, plain=plain: learned.append(self) or plain(self, found))
+    whitened = replace(VLAD, search=WhitenedSearch(4))
+    mfvpr.evaluate(several, SIFT, whitened, SCORERS, candidates=5)
+    assert learned == [VLAD.describer.fitting, whitened.search]
+
+
+def test_bad_images_of_the_database_are_told_once(split, small_street, tmp_path):
+    shutil.copytree(small_street / "database", tmp_path / "database")
+    (tmp_path / "database" / "0004.png").write_bytes(b"")
+    Image.new("RGB", (160, 120)).save(tmp_path / "database" / "0005.png")
+    several, lines = sequences_dataset(tmp_path / "database", split, ground_truth="none"), []
+    archive = Archive(skip_bad=True, tell=lines.append)
+    found = mfvpr.evaluate(several, SIFT, VLAD, SCORERS, candidates="all", archive=archive)
+    assert all(list(one.bad_database) == [4] for one in found.matched)
+    warned = [line for line in lines if line.startswith("warning: ")]
+    assert len(warned) == 2
+    assert "0004.png" in warned[0]
+    assert "0005.png: no keypoints, so no matches (1 such images of 10)" in warned[1]
 
 
 def test_programs_take_sequences_and_files(split, small_street, files, tmp_path, monkeypatch, capsys):

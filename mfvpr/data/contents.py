@@ -93,9 +93,9 @@ def contents(folder: ImageFolder, cache: Path | None = None) -> Contents:
     changed = [name for name in folder.names if name not in trusted]
     read = ordered_map(_content, [folder.root / name for name in changed], workers=2)
     files = {name: Content(*known[name][4:]) for name in trusted} | dict(zip(changed, read, strict=True))
-    if record is not None and changed:
+    if record is not None and changed:  # other files of this folder, which another data set asks for, stay known
         settled = {name: state for name, state in states.items() if state and max(state[1:3]) < begun - SETTLED}
-        _remember(record, {name: [*state, *astuple(files[name])] for name, state in settled.items()})
+        _remember(record, known | {name: [*state, *astuple(files[name])] for name, state in settled.items()})
     return Contents(folder, tuple(files[name] for name in folder.names))
 
 

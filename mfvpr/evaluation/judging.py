@@ -87,7 +87,15 @@ class Judge:
             [hits(rows[0][setting][half.report], right.take(half.report)) for right in self.positives]
             for setting, half in zip(chosen, self.halves, strict=True)
         ]
-        return np.concatenate([np.array(part) for part in parts], axis=1)
+        return self.joined([np.array(part) for part in parts])
+
+    def joined(self, parts: Sequence[np.ndarray]) -> np.ndarray:
+        """`[thresholds, R]` of `[thresholds, r]`, what each half reports: in the order of the path.
+
+        Neighbors fail together, so intervals depend on who is whose neighbor.
+        """
+        path = np.argsort(np.concatenate([half.report for half in self.halves]))
+        return np.concatenate(parts, axis=1)[:, path]
 
 
 def judge(truth: Truth, thresholds: Iterable[float], split: Split | None = None) -> Judge:

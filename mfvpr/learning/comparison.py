@@ -108,9 +108,9 @@ class Comparison:
     halves: Sequence[Sequence[Row]]
 
     def rows(self) -> Iterator[tuple[str, np.ndarray, Sequence[Row]]]:
-        """Name, hits `[thresholds, R]` of all reported queries, and the row of each half."""
+        """Name, hits `[thresholds, R]` of all reported queries along the path, and the row of each half."""
         for same in zip(*self.halves, strict=True):
-            yield same[0].name, np.concatenate([row.hits for row in same], axis=1), same
+            yield same[0].name, self.judge.joined([row.hits for row in same]), same
 
 
 def compare(

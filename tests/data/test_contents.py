@@ -91,6 +91,16 @@ def test_a_second_run_reads_no_image(tmp_path, cache):
     assert counts[1] < size / 10
 
 
+def test_parts_of_a_folder_do_not_forget_each_other(folder, cache, monkeypatch):
+    """Files beside each other, of which one is asked for after the other."""
+    whole = image_folder(folder)
+    parts = [replace(whole, names=names) for names in (whole.names[:1], whole.names[1:], whole.names)]
+    settle()
+    found = [contents(part, cache) for part in parts]
+    monkeypatch.setattr(module, "_content", lambda path: pytest.fail(f"{path} read again"))
+    assert [contents(part, cache) for part in parts] == found
+
+
 def test_content_decides_whatever_times_and_names_say(tmp_path, folder, cache):
     settle()
     first = fingerprint(folder, cache)

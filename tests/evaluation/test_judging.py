@@ -50,7 +50,8 @@ def test_each_half_chooses_by_its_own_view_and_is_reported_on_by_the_other(rows,
          for tolerance in TOLERANCES]
         for setting, number in zip(chosen, numbers, strict=True)
     ]  # fmt: skip
-    np.testing.assert_array_equal(found.reported(rows, chosen), np.concatenate(parts, axis=1))
+    along_the_path = np.concatenate(parts[::-1], axis=1)  # the first half is reported on by who chose on the second
+    np.testing.assert_array_equal(found.reported(rows, chosen), along_the_path)
 
 
 def test_choosing_sees_no_candidate_of_a_reported_place():
