@@ -8,7 +8,7 @@ from mfvpr import sweeping
 from mfvpr.declaration import declared
 from mfvpr.errors import InputError
 from mfvpr.learning.parameters import can_learn
-from mfvpr.match_sets import MatchSet
+from mfvpr.match_sets import MatchSet, block_bytes
 from mfvpr.numerics import free_host_bytes
 from mfvpr.scoring import SCORERS
 from mfvpr.sweeping import Axes
@@ -84,7 +84,7 @@ def own_c(settings: dict[str, Any]) -> float | None:
 
 def require_memory(settings: dict[str, Any], varied: Axes, views: int, matches: MatchSet) -> None:
     """Refuse results, or a chunk, that would not fit, before they are begun."""
-    queries, num_candidates = matches.counts.shape
+    queries = len(matches)
     num_settings = varied.size + (dict(varied.own) not in varied.grid())
     _require(
         f"grid: rankings of {queries:,} queries by {num_settings:,} settings",
@@ -97,7 +97,7 @@ def require_memory(settings: dict[str, Any], varied: Axes, views: int, matches: 
         columns = min(chunk["queries"] or 1, queries)
         _require(
             f"chunk: {lines:,} settings x {columns:,} queries",
-            sweeping.block_bytes(matches, num_candidates, lines, columns),
+            block_bytes(matches, lines, columns),
             "use a smaller chunk.settings or chunk.queries, or leave them null",
         )
 

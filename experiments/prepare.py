@@ -94,7 +94,7 @@ def matched(
     """Matches and shortlist of the only sequence, from their store where they are all there."""
     made = match_sequence(
         found.dataset, found.dataset.only, chosen.extractor, chosen.filter, settings["candidates"],
-        matching=chosen.matching, archive=chosen.archive, watch=watch, keep=True, with_ratio=with_ratio, **chosen.where,
+        matching=chosen.matching, archive=chosen.archive, watch=watch, with_ratio=with_ratio, **chosen.where,
     )  # fmt: skip
     return made.matches[0], made.candidates
 

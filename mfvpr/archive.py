@@ -26,7 +26,7 @@ from mfvpr.fingerprints import recipe_of
 from mfvpr.memo import Memo
 from mfvpr.progress import Track, untracked
 from mfvpr.report.runs import versions
-from mfvpr.sinks import Sink, open_sinks
+from mfvpr.sinks import Sink, account, open_sinks
 from mfvpr.sources import FeatureSet, FeatureSource, InMemory
 from mfvpr.stores import matches as match_stores
 from mfvpr.stores.manifest import MATCHES, store_path
@@ -120,9 +120,9 @@ class Archive:
         """See `fingerprints.recipe_of`, with the content of files and folders of files in place of their paths."""
         return recipe_of(value, self._told_by_content)
 
-    def warn(self, line: str, *, about: Any = None) -> None:
+    def warn(self, line: str) -> None:
         """Tell what is wrong; once, whoever finds it again (the next sequence that asks the same database)."""
-        self.memo.once("warning", lambda: self.tell(f"warning: {line}"), equal=about or line)
+        self.memo.once("warning", lambda: self.tell(f"warning: {line}"), equal=line)
 
     def recipe(self, folder: ImageFolder, extractor: Extractor | Aggregated | Source) -> dict[str, Any]:
         """All that changes what an extractor takes from a folder's images."""
@@ -237,7 +237,8 @@ class Archive:
                 for sink in taken.sinks:
                     sink.keep({row: sink.pick(description) for row, description in batch.items()})
             if missing:
-                self._account(extractor, taken.sinks, label)
+                for line in account(taken.sinks[bool(extractor.vector_size) :], extractor.scales):
+                    self.tell(f"{label}: {line}")
         if len(taken.bad) == len(folder):
             raise InputError(f"{folder.root}: none of {len(folder)} images can be used; the first: "
                              f"{taken.bad[min(taken.bad)]}")  # fmt: skip
@@ -265,16 +266,6 @@ class Archive:
                          for scale in extractor.scales)  # fmt: skip
         each = each or f"descriptors of {extractor.vector_size} numbers"
         self.tell(f"{label}: {len(missing)} of {total} images to do, {each}: about {needed / _MB:.1f} MB in {where}")
-
-    def _account(self, extractor: Extractor, sinks: Sequence[Sink], label: str) -> None:
-        """What local features take on disk, beside what they would as the paper keeps them."""
-        for scale, sink in zip(extractor.scales, sinks[bool(extractor.vector_size) :], strict=True):
-            if sink.store is not None:
-                size, features = sink.store.size_bytes, int(sink.store.counts.clip(0).sum())
-                images, paper = max(int(sink.store.done.sum()), 1), max(features, 1) * (4 * scale.dimension + 16)
-                self.tell(f"{label}: {size / _MB:.1f} MB, {size / images / _MB:.2f} MB and {features / images:.0f} "
-                          f"features an image; as the paper stores them, in float32, {paper / _MB:.1f} MB: "
-                          f"{size / paper:.2f}x")  # fmt: skip
 
     def _vectors(
         self, folder: ImageFolder, describer: Extractor | Aggregated, database: ImageFolder, label: str

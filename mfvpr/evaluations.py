@@ -6,6 +6,7 @@ result = mfvpr.evaluate(dataset, sift, Retrieval(Aggregated(sift, VladFitting())
 print(result.recall([0.0])["histogram"].pooled)
 """
 
+import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
@@ -17,6 +18,7 @@ import numpy as np
 from mfvpr import pipeline
 from mfvpr.archive import Archive, Source
 from mfvpr.data.datasets import Dataset, ImageFolder, QuerySequence
+from mfvpr.data.files import write_text
 from mfvpr.features import Extractor
 from mfvpr.filters import Filter
 from mfvpr.fingerprints import recipe_of
@@ -31,6 +33,7 @@ from mfvpr.stores.matches import MatchStore
 from mfvpr.types import Shortlist
 
 FILTER = "filter"  # the name of the filter's own ranking
+_REMARKS = "images.json"  # beside the matches: which images are bad
 
 
 @dataclass(frozen=True)
@@ -90,8 +93,9 @@ def evaluate(
         matching: options of the matches.
         fused: scorers, by name, that are ranked together with the filter's score as well, as `name + filter`.
         ties: equal scores keep the order of the filter, or go by the row of the database: "filter", "index".
-        archive: where features are kept; None = in memory, until this returns.
-        memory: GB that features of the database may take on the devices, see `mfvpr.sources.memory_budget`.
+        archive: where features and matches are kept; None = in memory.
+        memory: GB that features of the database may take on the devices, and matches that are kept in memory; None = a
+            third of what is free.
         devices: that share the queries; None = the one that JAX takes.
         watch: gets the seconds of the stages.
 
@@ -123,11 +127,12 @@ def match_sequence(
     matching: Matching = Matching(),
     archive: Archive | None = None,
     watch: Stopwatch | None = None,
-    keep: bool = False,
     with_ratio: bool = False,
     **where: Any,
 ) -> Matched:
     """Candidates and matches of one sequence's queries; features of no other database images than candidates are taken.
+
+    Where the archive has a root, matches are kept below it, and where they are all there, nothing else is read.
 
     Args:
         dataset: of the sequence.
@@ -138,8 +143,7 @@ def match_sequence(
         matching: see there.
         archive: see there.
         watch: gets the seconds of the stages.
-        keep: matches in a store of the archive; where they are all there, nothing else is read.
-        with_ratio: see `mfvpr.match`.
+        with_ratio: see `mfvpr.match`; matches that are kept always have the ratio.
         **where: `memory` and `devices` of `pipeline.match`.
     """
     archive, watch = archive or Archive(), watch or Stopwatch()
@@ -147,13 +151,11 @@ def match_sequence(
     num_candidates = len(database) if candidates == "all" else min(candidates, len(database))
     with ExitStack() as held:
         stores = []
-        if keep and archive.root is not None:
+        if archive.root is not None:
             recipe = matches_recipe(dataset, sequence, extractor, filter, num_candidates, matching, archive)
             stores = [held.enter_context(one) for one in _match_stores(sequence, extractor, recipe, archive)]
-        if stores and all(store.done.all() for store in stores):
-            with watch("matches read"):
-                read = [pipeline.stored_matches(store) for store in stores]
-            return Matched(sequence, read[0][1], tuple(match_set for match_set, _ in read), {}, {})
+        if kept := _kept(sequence, stores, archive, watch, where.get("memory")):
+            return kept
         with watch("filter"):
             filtered = filter.shortlist(sequence, database, num_candidates, archive)
         with watch("features"):
@@ -161,8 +163,11 @@ def match_sequence(
             known = archive.local(database, extractor, wanted.tolist(), label="database features")
             asked = archive.local(sequence.images, extractor, label=f"{sequence.name} features")
         bad_queries, bad_database = {**filtered.bad_queries, **asked[0].bad}, {**filtered.bad_database, **known[0].bad}
-        _tell_of(archive, database, known[0], bad_database)
-        _tell_of(archive, sequence.images, asked[0], bad_queries)
+        warnings = [
+            *_wrong_with(database, known[0], bad_database),
+            *_wrong_with(sequence.images, asked[0], bad_queries),
+        ]
+        _remark(stores, archive, {"queries": bad_queries, "database": bad_database, "warnings": warnings})
         with watch("matching"):
             matches = tuple(
                 pipeline.match(
@@ -172,6 +177,32 @@ def match_sequence(
                 for queries, images, store in zip(asked, known, stores or [None] * len(asked), strict=True)
             )  # fmt: skip
     return Matched(sequence, filtered.candidates, matches, bad_queries, bad_database)
+
+
+def _kept(
+    sequence: QuerySequence, stores: Sequence[MatchStore], archive: Archive, watch: Stopwatch, memory: float | None
+) -> Matched | None:
+    """Matches of all scales, of stores that are complete."""
+    if not stores or not all(store.done.all() for store in stores):
+        return None
+    try:
+        remarks = json.loads((stores[0].folder / _REMARKS).read_text())
+    except (OSError, ValueError):
+        return None  # so images are looked at again, but not matched
+    with watch("matches read"):
+        read = [pipeline.stored_matches(store, memory=memory) for store in stores]
+    for line in remarks["warnings"]:
+        archive.warn(line)
+    bad = ({int(row): reason for row, reason in remarks[side].items()} for side in ("queries", "database"))
+    return Matched(sequence, read[0][1], tuple(match_set for match_set, _ in read), *bad)
+
+
+def _remark(stores: Sequence[MatchStore], archive: Archive, remarks: Mapping[str, Any]) -> None:
+    """Tell what is wrong with images, also to those who will read the matches and nothing else."""
+    for store in stores[:1]:
+        write_text(store.folder / _REMARKS, json.dumps(remarks))
+    for line in remarks["warnings"]:
+        archive.warn(line)
 
 
 def rank_sequence(
@@ -230,11 +261,10 @@ def _match_stores(
         )  # fmt: skip
 
 
-def _tell_of(archive: Archive, folder: ImageFolder, features: FeatureSet, bad: Mapping[int, str]) -> None:
+def _wrong_with(folder: ImageFolder, features: FeatureSet, bad: Mapping[int, str]) -> Iterator[str]:
     """What is wrong with some images, which rank last, or have no matches."""
-    for reason in bad.values():
-        archive.warn(reason)
+    yield from bad.values()
     known = np.asarray(features.source.counts)
     if empty := [row for row in np.flatnonzero(known == 0).tolist() if row not in bad]:
-        archive.warn(f"{folder.paths[empty[0]]}: no keypoints, so no matches ({len(empty)} such images of "
-                     f"{len(folder)}); scores are 0", about=(folder, "no keypoints"))  # fmt: skip
+        yield (f"{folder.paths[empty[0]]}: no keypoints, so no matches ({len(empty)} such images of {len(folder)}); "
+               "scores are 0")  # fmt: skip

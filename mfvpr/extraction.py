@@ -9,11 +9,12 @@ from typing import TypeVar
 import numpy as np
 
 from mfvpr.data.datasets import ImageFolder
-from mfvpr.data.images import Interpolation, ordered_map, resize
+from mfvpr.data.images import Interpolation, resize
 from mfvpr.errors import InputError
 from mfvpr.features import Description, Extractor
 from mfvpr.numerics import available_cpus
 from mfvpr.progress import Track, untracked
+from mfvpr.threads import ordered_map
 
 Item = TypeVar("Item")
 

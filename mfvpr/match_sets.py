@@ -11,7 +11,8 @@ import numpy as np
 
 from mfvpr import ragged
 from mfvpr.errors import InputError
-from mfvpr.numerics import round_up
+from mfvpr.numerics import available_cpus, round_up
+from mfvpr.threads import ordered_map
 from mfvpr.types import Matches, per_match, per_pair
 
 BATCH_SLOTS = 2**14  # matches of a batch of pairs: its votes stay in cache
@@ -20,6 +21,7 @@ SLOTS_STEP = 32
 PROGRAM_SLOTS = 2**21  # are scored by one setting while a program for one shape more would be compiled
 QUANTILES = (0.25, 0.5, 0.75, 0.95, 1.0)
 BYTES_PER_SLOT = 41
+BLOCK_BYTES = 2**28
 
 Normalize = Literal["zscore", "none"]
 
@@ -47,7 +49,7 @@ class MatchSet:
     """Matches of every query with its candidates, of one scale, without padding.
 
     Attributes:
-        matches: per query, as in QueryMatches.
+        matches: per query, as in QueryMatches; those of a store may be read whenever they are asked for.
         counts: `[Q, C]` matches of each candidate.
         capacity: slots that hold every pair's matches.
     """
@@ -57,10 +59,9 @@ class MatchSet:
     capacity: int
 
     @classmethod
-    def of(cls, queries: Sequence[QueryMatches]) -> "MatchSet":
-        """Of all queries, at least one."""
-        counts = np.array([query.counts for query in queries])
-        return cls([query.matches for query in queries], counts, round_up(int(counts.max(initial=0)), 64))
+    def of(cls, matches: Sequence[Matches], counts: np.ndarray) -> "MatchSet":
+        """With a capacity that other sets of about as many matches have as well."""
+        return cls(matches, counts, round_up(int(counts.max(initial=0)), 64))
 
     def __getitem__(self, query: int) -> Matches:
         """Matches `[C, K, ...]` of one query, padded with zeros to the capacity."""
@@ -70,8 +71,9 @@ class MatchSet:
         return len(self.matches)
 
     def take(self, queries: Sequence[int] | np.ndarray) -> "MatchSet":
-        """Of some queries."""
-        return MatchSet([self.matches[query] for query in queries], self.counts[queries], self.capacity)
+        """Of some queries, in memory."""
+        taken = ordered_map(self.matches.__getitem__, list(queries), workers=available_cpus())
+        return MatchSet(list(taken), self.counts[queries], self.capacity)
 
     def pairs(self, queries: np.ndarray, places: np.ndarray, capacity: int, *, total: int | None = None) -> Matches:
         """Matches `[P, K, ...]` of pairs, padded with zeros.
@@ -82,32 +84,33 @@ class MatchSet:
             capacity: K, no less than the matches of any of the pairs.
             total: so many pairs in all; those beyond have no matches, and the images of the last.
         """
-        rows = [self._rows[query][place] for query, place in zip(queries.tolist(), places.tolist(), strict=True)]
+        asked = {query: self.matches[query] for query in np.unique(queries).tolist()}
+        pairs = [(asked[query], query, place) for query, place in zip(queries.tolist(), places.tolist(), strict=True)]
+        rows = [self._row(of_query, query, place) for of_query, query, place in pairs]
         entries, mask = ragged.padded(rows, capacity, total=total)
         of_pair = {
-            name: np.stack([self._of_pair(name, query, place) for query, place in zip(queries, places, strict=True)])
-            for name in per_pair(self.matches[queries[0]])
+            name: np.stack([_of_pair(of_query, name, place) for of_query, _, place in pairs])
+            for name in per_pair(pairs[0][0])
         }
         if total is not None:
             of_pair = {name: ragged.filled(values, total) for name, values in of_pair.items()}
         return Matches(**entries, mask=mask, **of_pair)
 
     @cached_property
-    def _rows(self) -> list[list[dict[str, np.ndarray]]]:
-        """By query and candidate: views."""
-        return [ragged.split(per_match(one), counts) for one, counts in zip(self.matches, self.counts, strict=True)]
+    def _ends(self) -> np.ndarray:
+        """`[Q, C]` of each candidate's matches among its query's."""
+        return np.cumsum(self.counts, axis=1)
 
-    def _of_pair(self, name: str, query: int, place: int) -> np.ndarray:
-        values = getattr(self.matches[query], name)
-        return values if name.endswith("0") else values[place]
+    def _row(self, of_query: Matches, query: int, place: int) -> ragged.Row:
+        """The matches of a pair, views."""
+        end = self._ends[query, place]
+        return {name: values[end - self.counts[query, place] : end] for name, values in per_match(of_query).items()}
 
-    @property
+    @cached_property
     def image_sizes(self) -> tuple[np.ndarray, np.ndarray]:
         """All combinations of sizes of query and database images, `[n, 2]` each."""
-        sizes0, sizes1 = (
-            np.unique(np.concatenate([np.reshape(getattr(one, name), (-1, 2)) for one in self.matches]), axis=0)
-            for name in ("image_size0", "image_size1")
-        )
+        sizes = [[np.reshape(one.image_size0, (-1, 2)), np.reshape(one.image_size1, (-1, 2))] for one in self.matches]
+        sizes0, sizes1 = (np.unique(np.concatenate(side), axis=0) for side in zip(*sizes, strict=True))
         return np.repeat(sizes0, len(sizes1), 0), np.tile(sizes1, (len(sizes0), 1))
 
 
@@ -142,6 +145,11 @@ class Scales:
         """As of a MatchSet, of all scales."""
         sizes0, sizes1 = zip(*(one.image_sizes for one in self.match_sets), strict=True)
         return np.concatenate(sizes0), np.concatenate(sizes1)
+
+
+def _of_pair(of_query: Matches, name: str, place: int) -> np.ndarray:
+    values = getattr(of_query, name)
+    return values if name.endswith("0") else values[place]
 
 
 def scales(match_set: MatchSet | Scales) -> Sequence[MatchSet]:
@@ -202,9 +210,24 @@ def batches(match_set: MatchSet, queries: range, *, settings: float = math.inf) 
         (places `[n]` in the flattened `[queries, C]`, Matches `[P, K, ...]` of P >= n pairs; padding has no matches),
         the first of each shape first.
     """
+    part = match_set.take(queries)
     for places, size, pairs in partition(match_set, queries, settings=settings):
         query, place = np.divmod(places, match_set.counts.shape[1])
-        yield places, match_set.pairs(query + queries.start, place, size, total=pairs)
+        yield places, part.pairs(query, place, size, total=pairs)
+
+
+def queries_that_fit(match_set: MatchSet | Scales, num_settings: int) -> int:
+    """Queries whose matches, padded, and scores by so many settings BLOCK_BYTES hold, at least one."""
+    one = block_bytes(match_set, num_settings, 1)
+    return max(1, min(len(scales(match_set)[0]), BLOCK_BYTES // max(one, 1)))
+
+
+def block_bytes(match_set: MatchSet | Scales, num_settings: int, num_queries: int) -> int:
+    """Bytes that some queries take whose scores are computed together, about: matches, scores and their rankings."""
+    padded = sum(slots(one, settings=num_settings).sum(1) for one in scales(match_set))
+    largest, num_candidates = np.sort(padded)[::-1][:num_queries].sum(), scales(match_set)[0].counts.shape[1]
+    of_scores = (8 + 4 * len(scales(match_set))) * num_settings * num_queries * num_candidates
+    return int(2 * BYTES_PER_SLOT * largest) + of_scores
 
 
 def compacted(found: Matches) -> list[dict[str, np.ndarray]]:

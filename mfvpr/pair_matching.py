@@ -10,12 +10,12 @@ import jax
 import numpy as np
 
 from mfvpr import ragged
-from mfvpr.data.images import ordered_map
 from mfvpr.match_sets import QueryMatches, compacted
 from mfvpr.matching import match_pairs
 from mfvpr.numerics import Device
 from mfvpr.ragged import Row
 from mfvpr.sources import FeatureSet, Slots, Staged, memory_budget
+from mfvpr.threads import ordered_map
 from mfvpr.types import Matches, Shortlist
 
 QUERIES = 8  # of a batch: they share the candidates that are read for them

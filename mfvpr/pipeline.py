@@ -5,8 +5,9 @@ stage: a progress bar, or nothing.
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -14,15 +15,15 @@ import numpy as np
 
 from mfvpr import pair_matching
 from mfvpr.errors import InputError
-from mfvpr.match_sets import MatchSet, QueryMatches, Scales
+from mfvpr.match_sets import MatchSet, Scales
 from mfvpr.matching import CrossCheck
 from mfvpr.numerics import Device, compiled, device_of
 from mfvpr.progress import Track, untracked
 from mfvpr.reranking import BIN_STEP
 from mfvpr.scoring import HistogramOfShifts, ShiftHistogram
 from mfvpr.scoring.parameters import fit
-from mfvpr.sources import FeatureSet
-from mfvpr.stores.matches import MatchStore
+from mfvpr.sources import FeatureSet, memory_budget
+from mfvpr.stores.matches import MatchStore, StoredMatches
 from mfvpr.sweeping.scores import score
 from mfvpr.types import Array, Matches, Shortlist
 from mfvpr.weighting import match_weights
@@ -58,7 +59,8 @@ def match(
         max_matches: see there.
         chunk_size: see there.
         with_ratio: see there; a store always has the ratio.
-        memory: GB that features of the database may take on the devices; None = a third of what is free.
+        memory: GB that features of the database may take on the devices, and, of a store, the matches in memory; None
+            = a third of what is free.
         devices: that share the queries; None = the one that JAX takes.
         store: of these features, candidates and options. Only queries that it lacks are matched; some at a time are on
             disk before the next are begun; and what comes back was read from it.
@@ -67,34 +69,42 @@ def match(
     Raises:
         InputError: the store cannot be used, or is of other candidates: then nothing is written.
     """
-    options = {"cross_check": cross_check, "max_distance": max_distance, "max_matches": max_matches}
-    where = {"memory": memory, "devices": devices or [device_of(())], "chunk_size": chunk_size}
-    found = {} if store is None else _stored(store, candidates)
-    if missing := [row for row in range(len(queries)) if row not in found]:
-        ratio = with_ratio or store is not None
-        made = pair_matching.matched(queries, database, candidates, missing, **options, **where, with_ratio=ratio)
-        tracked = iter(track(made, len(missing)))
+    made = partial(
+        pair_matching.matched, queries, database, candidates, cross_check=cross_check, max_distance=max_distance,
+        max_matches=max_matches, memory=memory, devices=devices or [device_of(())], chunk_size=chunk_size,
+    )  # fmt: skip
+    if store is None:
+        found = [one for _, one in track(made(range(len(queries)), with_ratio=with_ratio), len(queries))]
+        return MatchSet.of([one.matches for one in found], np.array([one.counts for one in found]))
+    if missing := np.flatnonzero(~store.done).tolist():
+        before = {row: one.indices for row, one in store.read()}
+        _require_same(store, candidates, before)  # then nothing is written
+        tracked = iter(track(made(missing, with_ratio=True), len(missing)))
         while batch := dict(itertools.islice(tracked, STORE_BATCH)):
-            if store is not None:
-                store.write(batch)
-            found |= batch if store is None else store.read(batch)
-    return MatchSet.of([found[row] for row in range(len(queries))])
+            store.write(batch)
+    match_set, listed = stored_matches(store, memory=memory)
+    if not missing:
+        _require_same(store, candidates, dict(enumerate(listed.indices)))
+    return match_set
 
 
-def _stored(store: MatchStore, candidates: Shortlist) -> dict[int, QueryMatches]:
-    """What the store holds of these candidates, by row."""
-    found = dict(store.read())
+def _require_same(store: MatchStore, candidates: Shortlist, found: Mapping[int, np.ndarray]) -> None:
+    """That what the store holds, by row, is of these candidates."""
     same_shape = candidates.indices.shape == tuple(store.sizes.values())
-    if not same_shape or any((one.indices != candidates.indices[row]).any() for row, one in found.items()):
+    if not same_shape or any((indices != candidates.indices[row]).any() for row, indices in found.items()):
         raise InputError(
             f"{store.folder}: expected matches of these candidates, got those of another shortlist; choose another "
             "path, or delete this folder"
         )
-    return found
 
 
-def stored_matches(store: MatchStore) -> tuple[MatchSet, Shortlist]:
+def stored_matches(store: MatchStore, *, memory: float | None = None) -> tuple[MatchSet, Shortlist]:
     """All that a complete store holds, NumPy: the features are not needed any more.
+
+    Args:
+        store: of matches.
+        memory: GB that all matches may take in memory; None = a third of what is free. Where that is not enough, none
+            stays there, and they are read whenever they are asked for.
 
     Raises:
         InputError: matches of some queries are missing or damaged.
@@ -104,9 +114,16 @@ def stored_matches(store: MatchStore) -> tuple[MatchSet, Shortlist]:
             f"{store.folder}: expected the matches of all {len(store.done)} queries, got {store.done.sum()}; finish "
             "the matching first"
         )
-    found = [one for _, one in store.read()]
-    indices, scores = np.array([one.indices for one in found]), np.array([one.filter_scores for one in found])
-    return MatchSet.of(found), Shortlist(indices=indices, scores=scores, mask=indices >= 0)
+    left, matches, lists = memory_budget(memory, jax.local_devices(backend="cpu")[:1]), [], []
+    for _, one in store.read():
+        left -= sum(leaf.nbytes for leaf in jax.tree.leaves(one.matches))
+        matches.append(one.matches)
+        if left < 0:
+            matches.clear()
+        lists.append((one.counts, one.indices, one.filter_scores))
+    counts, indices, scores = map(np.array, zip(*lists, strict=True))
+    shortlist = Shortlist(indices=indices, scores=scores, mask=indices >= 0)
+    return MatchSet.of(matches or StoredMatches(store), counts), shortlist
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,16 @@
 """Where what an extractor gives is kept: a store, or the memory of this process, for each part of a description."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mfvpr.features import Extractor
+from mfvpr.features import Extractor, Scale
 from mfvpr.stores import features, vectors
 from mfvpr.stores.manifest import VECTORS, store_path
 from mfvpr.stores.rows import RowStore
+
+_MB = 1e6
 
 
 @dataclass
@@ -73,3 +75,13 @@ def open_sinks(
             lambda n, scale=scale: features.forecast_bytes(n, scale.typical_count, scale.dimension),
         ))  # fmt: skip
     return sinks
+
+
+def account(sinks: Sequence[Sink], scales: Sequence[Scale]) -> Iterator[str]:
+    """What the local features of each scale take on disk, beside what they would as the paper keeps them."""
+    for scale, sink in zip(scales, sinks, strict=True):
+        if sink.store is not None:
+            size, features = sink.store.size_bytes, int(sink.store.counts.clip(0).sum())
+            images, paper = max(int(sink.store.done.sum()), 1), max(features, 1) * (4 * scale.dimension + 16)
+            yield (f"{size / _MB:.1f} MB, {size / images / _MB:.2f} MB and {features / images:.0f} features an image; "
+                   f"as the paper stores them, in float32, {paper / _MB:.1f} MB: {size / paper:.2f}x")  # fmt: skip

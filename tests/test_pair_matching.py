@@ -14,7 +14,7 @@ import pytest
 
 import mfvpr
 from mfvpr import Matches, pair_matching, pipeline, ragged
-from mfvpr.match_sets import MatchSet, QueryMatches, batches, compacted, shapes, slots
+from mfvpr.match_sets import MatchSet, batches, compacted, shapes, slots
 from mfvpr.matching import filter_matches
 from mfvpr.pair_matching import QUERIES
 from mfvpr.reranking import rank_shortlist
@@ -313,11 +313,10 @@ def test_batches_have_every_pair_with_matches_once(match_set):
 
 def test_image_sizes_are_all_combinations():
     def of_query(width):
-        flat = Matches(*(np.zeros((0, 2), np.float32),) * 2, *(np.zeros(0, np.float32),) * 3, np.zeros(0, bool),
+        return Matches(*(np.zeros((0, 2), np.float32),) * 2, *(np.zeros(0, np.float32),) * 3, np.zeros(0, bool),
                        np.array([width, 9], np.float32), np.array([[5, 6], [7, 8]], np.float32))  # fmt: skip
-        return QueryMatches(flat, np.zeros(2, np.int32), np.arange(2, dtype=np.int32), np.zeros(2, np.float32))
 
-    sizes0, sizes1 = MatchSet.of([of_query(width) for width in (3, 4, 3)]).image_sizes
+    sizes0, sizes1 = MatchSet.of([of_query(width) for width in (3, 4, 3)], np.zeros((3, 2), int)).image_sizes
     assert {(*a, *b) for a, b in zip(sizes0.tolist(), sizes1.tolist(), strict=True)} == {
         (3, 9, 5, 6), (3, 9, 7, 8), (4, 9, 5, 6), (4, 9, 7, 8)
     }  # fmt: skip

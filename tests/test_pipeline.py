@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 import mfvpr
-from mfvpr import pipeline, reranking
+from mfvpr import match_sets, pipeline, reranking
 from mfvpr.archive import Aggregated, Archive
 from mfvpr.data.datasets import folder_dataset, image_folder
 from mfvpr.errors import InputError
@@ -19,7 +19,8 @@ from mfvpr.features.vlad import VladFitting
 from mfvpr.filters import Retrieval
 from mfvpr.match_sets import MatchSet
 from mfvpr.retrieval import EXACT
-from mfvpr.stores.matches import open_match_store
+from mfvpr.stores.matches import StoredMatches, open_match_store
+from mfvpr.sweeping import sweep
 from mfvpr.types import Shortlist
 from tests import oracles
 from tests.builders import of_query, random_matches, real
@@ -145,23 +146,33 @@ def assert_same_matches(got, expected, names=(*PER_MATCH, "ratio")):
             np.testing.assert_array_equal(getattr(got[query], name), getattr(expected[query], name))
 
 
-def test_a_store_gives_what_was_matched_and_is_read_ever_after(features, candidates, matches, opened):
+def test_a_store_gives_what_was_matched_and_is_read_ever_after(features, candidates, matches, opened, monkeypatch):
     with opened() as store:
         first = pipeline.match(features[1], features[0], candidates, store=store)
     with opened() as store:
         again = pipeline.match(features[1], features[0], candidates, store=store, track=nothing_done)
         alone, stored = pipeline.stored_matches(store)
+        read_again, _ = pipeline.stored_matches(store, memory=1e-5)
+    assert isinstance(read_again.matches, StoredMatches)
+    assert len(read_again.matches) == len(first)
     assert_same_matches(first, matches, PER_MATCH)
     assert matches[0].ratio is None
     assert ((first[0].ratio > 0) == first[0].mask).all()
-    for later in (again, alone):
+    for later in (again, alone, read_again, read_again.take(range(10))):
         assert_same_matches(later, first)
+        np.testing.assert_array_equal(later.image_sizes, first.image_sizes)
     for name in ("indices", "scores", "mask"):
         np.testing.assert_array_equal(getattr(stored, name), getattr(candidates, name))
     scorers = {"h": mfvpr.HistogramOfShifts(), "a": mfvpr.AnchorPoints(), "s": mfvpr.AggregatedScore()}
-    fresh, swept = (pipeline.score(scorers, one, candidates) for one in (matches, alone))
+    fresh, *others = (pipeline.score(scorers, one, candidates) for one in (matches, alone, read_again))
+    for name, other in itertools.product(scorers, others):
+        np.testing.assert_array_equal(fresh[name], other[name])
+    monkeypatch.setattr(match_sets, "BLOCK_BYTES", 1)  # a query at a time
+    one_by_one = pipeline.score(scorers, read_again, candidates)
     for name in scorers:
-        np.testing.assert_array_equal(fresh[name], swept[name])
+        np.testing.assert_array_equal(fresh[name], one_by_one[name])
+    rows = [sweep(scorers["h"], [{"sigma": 9.0}], one, candidates) for one in (matches, read_again)]
+    np.testing.assert_array_equal(*rows)
 
 
 def test_an_interrupted_matching_goes_on_where_it_was(features, candidates, opened):

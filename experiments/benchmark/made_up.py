@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from experiments.console import bar
-from mfvpr.data.images import ordered_map
 from mfvpr.stores.features import FeatureStore, forecast_bytes, open_store, require_space
 from mfvpr.stores.manifest import store_path
+from mfvpr.threads import ordered_map
 from mfvpr.types import Features
 
 SIZE = 336  # px

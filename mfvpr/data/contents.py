@@ -18,7 +18,8 @@ from typing import Any
 
 from mfvpr.data.datasets import ImageFolder
 from mfvpr.data.files import write_text
-from mfvpr.data.images import SUFFIXES, ordered_map, read_header
+from mfvpr.data.images import SUFFIXES, read_header
+from mfvpr.threads import ordered_map
 
 FORMAT = 2  # of the records: raise it when they change
 SETTLED = 2_000_000_000  # ns; the coarsest clock of a file system (FAT) ticks every two seconds

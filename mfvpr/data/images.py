@@ -5,16 +5,12 @@ leaves to its callers are done here: images are turned as their EXIF orientation
 become images of 8 bits by their upper ones.
 """
 
-import itertools
 import stat
 import warnings
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -42,9 +38,6 @@ _MAY_BE_TURNED = (b"eXIf", b"Raw profile type exif", b"XML:com.adobe.xmp")  # of
 # Pillow warns from 89 megapixels on; `read_image` refuses earlier, with the file's name.
 warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
 warnings.filterwarnings("ignore", message="Palette images with Transparency")
-
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -136,27 +129,6 @@ def resize(image: np.ndarray, size: tuple[int, int], interpolation: Interpolatio
     if interpolation in _PIL:
         return np.asarray(Image.fromarray(image).resize(size, _PIL[interpolation]))
     return np.asarray(cv2.resize(image, size, interpolation=_CV2[interpolation]))
-
-
-def ordered_map(function: Callable[[Item], Result], items: Iterable[Item], *, workers: int) -> Iterator[Result]:
-    """`map` on threads, results in order, at most 2 x `workers` of them waiting.
-
-    Decoding and resampling release the interpreter lock, so this overlaps them with whatever consumes the results.
-    """
-    remaining = iter(items)
-    with ThreadPoolExecutor(workers) as pool:
-        waiting: deque[Future[Result]] = deque(
-            pool.submit(function, item) for item in itertools.islice(remaining, 2 * workers)
-        )
-        try:
-            while waiting:
-                result = waiting.popleft().result()
-                for item in itertools.islice(remaining, 1):
-                    waiting.append(pool.submit(function, item))
-                yield result
-        finally:
-            for future in waiting:
-                future.cancel()
 
 
 def _resized_in_float(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:

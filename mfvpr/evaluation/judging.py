@@ -1,6 +1,5 @@
 """The protocol of choosing and reporting: which queries decide, which are reported on, and what counts as right."""
 
-import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -12,6 +11,7 @@ from mfvpr.evaluation.choosing import Half, halves
 from mfvpr.evaluation.positives import Positives
 from mfvpr.evaluation.recall import hits
 from mfvpr.evaluation.truth import Truth, Unit, threshold_words
+from mfvpr.fingerprints import content_hash
 from mfvpr.types import Shortlist
 
 Split = Literal["first_half", "second_half", "both"]
@@ -52,9 +52,8 @@ class Judge:
 
     @property
     def fingerprint(self) -> str:
-        """Of what is right at each threshold: 16 hexadecimal digits."""
-        flat = [array.tobytes() for right in self.positives for array in (right.offsets, right.rows)]
-        return hashlib.sha256(b"".join(flat)).hexdigest()[:16]
+        """Of what is right at each threshold."""
+        return content_hash([(right.offsets, right.rows) for right in self.positives])
 
     def of(self, candidates: Shortlist) -> "Judge":
         """With the views of a shortlist."""

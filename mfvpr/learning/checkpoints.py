@@ -10,7 +10,7 @@ import logging
 import os
 import warnings
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from mfvpr.errors import InputError
+from mfvpr.fingerprints import difference
 
 FORMAT = "mfvpr training 2"
 _KEPT = 2
@@ -99,8 +100,8 @@ def restore(folder: Path, recipe: Mapping[str, Any], state: Any) -> tuple[Any, A
         if not (where / "record").exists():
             raise InputError(f"{where}: expected a checkpoint of mfvpr, got another; choose another folder")
         record = _read(manager, where, record=ocp.args.JsonRestore())
-        if difference := _difference(record, _expected(recipe, state)):
-            raise InputError(f"{folder}: this checkpoint is of {difference}; choose another folder, or delete this one")
+        if differs := _difference(record, _expected(recipe, state)):
+            raise InputError(f"{folder}: this checkpoint is of {differs}; choose another folder, or delete this one")
         arrays = _read(manager, where, arrays=ocp.args.StandardRestore())
     leaves = [arrays[str(place)] for place in range(len(arrays))]
     if _checksum(leaves, record.get("progress")) != record.get("checksum"):
@@ -114,9 +115,9 @@ def newest(folder: Path) -> Path | None:
     return folder / str(max(steps)) if steps else None
 
 
-def named(tree: Any, is_leaf: Callable[[Any], bool] | None = None) -> dict[str, Any]:
+def named(tree: Any) -> dict[str, Any]:
     """The leaves of a pytree by their path, `weight.hidden`."""
-    leaves = jax.tree_util.tree_leaves_with_path(tree, is_leaf=is_leaf)
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
@@ -177,22 +178,14 @@ def _holds_checkpoints(folder: Path) -> bool:
 def _expected(recipe: Mapping[str, Any], state: Any) -> dict[str, Any]:
     """What a checkpoint says that it is of."""
     arrays = {name: f"{leaf.dtype}{list(leaf.shape)}" for name, leaf in named(state).items()}
-    return json.loads(json.dumps({"format": FORMAT, "recipe": recipe, "arrays": arrays}))  # tuples become lists
+    return json.loads(json.dumps({"format": FORMAT, "recipe": recipe or {}, "arrays": arrays}))  # tuples become lists
 
 
 def _difference(found: Mapping[str, Any], expected: Mapping[str, Any]) -> str | None:
-    """The first thing that differs, as `name=found, expected ...`; the recipe before the arrays."""
-    for one, other in zip(_parts(found), _parts(expected), strict=True):
-        for name in {**other, **one}:
-            if (name in one) != (name in other) or one[name] != other[name]:
-                texts = (json.dumps(side[name]) if name in side else "nothing" for side in (one, other))
-                return f"{name}={', expected '.join(texts)}"
-    return None
-
-
-def _parts(record: Mapping[str, Any]) -> tuple[dict[str, Any], ...]:
-    recipe = named(record.get("recipe", {}), is_leaf=lambda value: value is None)
-    return {"format": record.get("format")}, recipe, record.get("arrays", {})
+    """The first thing that differs, see `fingerprints.difference`; the recipe before the arrays."""
+    parts = (("format", "format"), ("recipe", ""), ("arrays", ""))
+    differences = (difference(found.get(part, {}), expected[part], name) for part, name in parts)
+    return next(filter(None, differences), None)
 
 
 def _reason(error: Exception) -> str:

@@ -17,7 +17,7 @@ from mfvpr.fingerprints import difference, fingerprint, shortened
 
 MANIFEST = "manifest.json"
 _OLD_MANIFEST = "zarr.json"  # of format 1
-_LEFTOVER = re.compile(r"\.(manifest|\d+-\d+)-\w+\.(json|npz)")  # was being written when its process was killed
+_LEFTOVER = re.compile(r"\.(manifest|images|\d+-\d+)-\w+\.(json|npz)")  # was being written when its process was killed
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ those of its Matches that are there, by their names. They are compressed, since 
 every candidate: a match takes about 23 bytes of the 32 that it has.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
@@ -53,6 +53,24 @@ def open_match_store(
     """
     sizes, pack = {"num_queries": num_queries, "num_candidates": num_candidates}, partial(_pack, num_candidates)
     return open_rows(folder, MATCHES, recipe, sizes, pack=pack, unpack=_unpack, waiting=waiting)
+
+
+class StoredMatches(Sequence[Matches]):
+    """Matches of each query of a complete store, as in QueryMatches: read whenever they are asked for."""
+
+    def __init__(self, store: MatchStore) -> None:
+        self._store = store
+
+    def __len__(self) -> int:
+        return len(self._store.done)
+
+    def __getitem__(self, query: Any) -> Matches:
+        """Of one query; there are no slices."""
+        [(_, found)] = self._store.read([query])
+        return found.matches
+
+    def __iter__(self) -> Iterator[Matches]:
+        return (found.matches for _, found in self._store.read())
 
 
 def forecast_bytes(num_queries: int, num_candidates: int, matches_per_candidate: float) -> int:

@@ -16,7 +16,6 @@ from typing import Any, Generic, Self, TypeVar
 import numpy as np
 
 from mfvpr.data.arrays import read_arrays, write_arrays
-from mfvpr.data.images import ordered_map
 from mfvpr.errors import InputError
 from mfvpr.fingerprints import difference
 from mfvpr.stores._disk import free_bytes, locked, told, too_full
@@ -27,6 +26,7 @@ from mfvpr.stores.manifest import (
     manifest_of,
     settle_manifest,
 )
+from mfvpr.threads import ordered_map
 
 THREADS = 4  # that read ahead, or write the rows of a batch
 BLOCK = 4096  # bytes that a file system hands out at a time

@@ -9,14 +9,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from mfvpr.data.images import ordered_map
-from mfvpr.match_sets import MatchSet, Scales, batches, partition, scales
+from mfvpr.match_sets import MatchSet, Scales, batches, partition, queries_that_fit, scales
 from mfvpr.numerics import Device, available_cpus, compiled, held, knows_own_context
 from mfvpr.parameter_grids import score_settings
 from mfvpr.progress import Track, untracked
 from mfvpr.reranking import BIN_STEP, fuse_scales
 from mfvpr.scoring import Scorer
 from mfvpr.scoring.parameters import fit
+from mfvpr.threads import ordered_map
 from mfvpr.types import Array, Matches, Shortlist
 
 PaddedBatch = tuple[np.ndarray, Matches]  # places [n] of its pairs, and their Matches [P, K, ...]
@@ -38,20 +38,29 @@ def score(
         devices: that share the batches, which changes no bit of the scores; None = the one that JAX takes.
         track: progress, over batches.
     """
-    queries, sets = range(len(candidates.mask)), scales(match_set)
+    num_queries, sets = len(candidates.mask), scales(match_set)
+    size = queries_that_fit(match_set, len(scorers))
+    parts = [range(start, min(start + size, num_queries)) for start in range(0, num_queries, size)]
     fitted = held(fit(dict(scorers), *match_set.image_sizes, multiple=BIN_STEP))
-    total = sum(len(partition(one, queries, settings=1)) for one in sets)
-    made = scored(_score_all, (fitted,), all_batches(match_set, queries, settings=1), devices=devices)
     scores = {name: np.zeros((len(sets), *candidates.mask.shape), np.float32) for name in scorers}
-    for places, values in track(made, total):
+
+    def made() -> Iterator[tuple[range, np.ndarray, dict[str, np.ndarray]]]:
+        for part in parts:
+            part_batches = all_batches(match_set, part, settings=1)
+            for places, values in scored(_score_all, (fitted,), part_batches, devices=devices):
+                yield part, places, values
+
+    total = sum(len(partition(one, part, settings=1)) for one in sets for part in parts)
+    for part, places, values in track(made(), total):
+        scale, query, place = np.unravel_index(places, (len(sets), len(part), candidates.mask.shape[1]))
         for name, of_pairs in values.items():
-            scores[name].reshape(-1)[places] = of_pairs
+            scores[name][scale, part.start + query, place] = of_pairs
     fused = {name: fuse_all(match_set, by_scale, candidates.mask) for name, by_scale in scores.items()}
     return {name: np.where(candidates.mask, values, np.nan) for name, values in fused.items()}
 
 
 def all_batches(match_set: MatchSet | Scales, queries: range, *, settings: float) -> Iterator[PaddedBatch]:
-    """Those of every scale, see `match_sets.batches`; places are in the flattened `[S, queries, C]`."""
+    """Those of some q queries and every scale, see `match_sets.batches`; places are in the flattened `[S, q, C]`."""
     for scale, one in enumerate(scales(match_set)):
         pairs = len(queries) * one.counts.shape[1]
         for places, matches in batches(one, queries, settings=settings):

@@ -19,7 +19,7 @@ from mfvpr import parameter_grids, reranking
 from mfvpr.data.arrays import read_arrays, write_arrays
 from mfvpr.errors import InputError
 from mfvpr.fingerprints import content_hash
-from mfvpr.match_sets import BYTES_PER_SLOT, MatchSet, Scales, scales, shapes, slots
+from mfvpr.match_sets import MatchSet, Scales, queries_that_fit, scales, shapes
 from mfvpr.numerics import Device, compiled
 from mfvpr.progress import Track, untracked
 from mfvpr.reranking import FilterScore, Ties, filter_scores
@@ -28,7 +28,6 @@ from mfvpr.sweeping.settings import FUSION, Group, Setting, distinct, groups
 from mfvpr.types import Array, Matches, Shortlist, per_match
 
 SETTINGS_PER_BLOCK = 64
-BLOCK_BYTES = 2**28
 _ALONE = "alone"  # the c of a score that is not fused
 
 
@@ -106,11 +105,11 @@ def sweep(
     """
     names = {name for setting in settings for name in setting}
     parameter_grids.refuse_own_names(scorer, names, reserved=(*parameter_grids.WEIGHTINGS, FUSION))
-    num_queries, num_candidates = candidates.mask.shape
+    num_queries = len(candidates.mask)
     views = [candidates.mask] if views is None else views
     scored_once, places = distinct(settings)
     per_block = min(settings_per_block or SETTINGS_PER_BLOCK, len(scored_once))
-    queries = queries_per_block or queries_that_fit(match_set, num_candidates, per_block)
+    queries = queries_per_block or queries_that_fit(match_set, per_block)
     found_groups = list(groups(scorer, scored_once, match_set.image_sizes))
     per_program = len(scored_once) / len(found_groups)
     work = Work(match_set, range(num_queries), per_program, candidates, views, depth, ties, filter_score)
@@ -135,20 +134,6 @@ def sweep(
 def result_bytes(num_views: int, num_settings: int, num_queries: int, depth: int) -> int:
     """Bytes that `sweep` returns."""
     return 4 * num_views * num_settings * num_queries * depth
-
-
-def block_bytes(match_set: MatchSet | Scales, num_candidates: int, num_settings: int, num_queries: int) -> int:
-    """Bytes that a block of `sweep` takes, about: its padded matches, its scores and their rankings."""
-    padded = sum(slots(one, settings=num_settings).sum(1) for one in scales(match_set))
-    largest = np.sort(padded)[::-1][:num_queries].sum()
-    of_scores = (8 + 4 * len(scales(match_set))) * num_settings * num_queries * num_candidates
-    return int(2 * BYTES_PER_SLOT * largest) + of_scores
-
-
-def queries_that_fit(match_set: MatchSet | Scales, num_candidates: int, num_settings: int) -> int:
-    """Queries of a block of so many settings that BLOCK_BYTES hold, at least one."""
-    one = block_bytes(match_set, num_candidates, num_settings, 1)
-    return max(1, min(len(scales(match_set)[0]), BLOCK_BYTES // max(one, 1)))
 
 
 def _rows(

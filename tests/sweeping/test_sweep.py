@@ -9,7 +9,7 @@ import pytest
 
 import mfvpr
 from mfvpr import reranking, sweeping
-from mfvpr.match_sets import PROGRAM_SLOTS, MatchSet, shapes, slots
+from mfvpr.match_sets import PROGRAM_SLOTS, MatchSet, block_bytes, shapes, slots
 from mfvpr.scoring.parameters import with_parameters
 from mfvpr.sweeping.settings import groups
 from mfvpr.types import Shortlist
@@ -213,8 +213,7 @@ def test_slots_of_no_matches():
 def test_memory_is_told_beforehand(data):
     match_set, _ = data
     assert sweeping.result_bytes(2, 10, 7, 3) == np.zeros((2, 10, 7, 3), np.int32).nbytes
-    one = sweeping.block_bytes(match_set, CANDIDATES, 10, 1)
-    assert one < sweeping.block_bytes(match_set, CANDIDATES, 20, 1) < sweeping.block_bytes(match_set, CANDIDATES, 20, 7)
+    assert block_bytes(match_set, 10, 1) < block_bytes(match_set, 20, 1) < block_bytes(match_set, 20, 7)
 
 
 def other_matches(match_set, candidates):
