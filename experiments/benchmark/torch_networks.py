@@ -83,11 +83,6 @@ def _linear(w: Weights, name: str, x: Tensor) -> Tensor:
 
 _BGR_MEAN = (103.939, 116.779, 123.68)
 _EDGE = (5 + 1) ** 2 / 5
-_SLOPE, _CURVE, _HERE = torch.tensor([[-0.5, 0, 0.5], [1, -2, 1], [0, 1, 0]])
-_TAPS = [  # di, dj, dii, djj, dij
-    torch.outer(down, right)[None, None]
-    for down, right in ((_SLOPE, _HERE), (_HERE, _SLOPE), (_CURVE, _HERE), (_HERE, _CURVE), (_SLOPE, _SLOPE))
-]
 
 
 def d2net_map(w: Weights, images: Tensor) -> Tensor:
@@ -108,8 +103,8 @@ def d2net_map(w: Weights, images: Tensor) -> Tensor:
 
 def d2net(w: Weights, images: Tensor) -> list[LocalFeatures]:
     """Features at the maxima of the dense map over channels and neighborhoods."""
-    dense = d2net_map(w, images).contiguous()
-    di, dj, dii, djj, dij = (_derivative(dense, taps.to(dense.device)) for taps in _TAPS)
+    dense = d2net_map(w, images)
+    di, dj, dii, djj, dij = _derivatives(dense)
     det, trace = dii * djj - dij * dij, dii + djj
     strongest = dense == dense.amax(1, keepdim=True)
     highest = dense == F.max_pool2d(dense, 3, stride=1, padding=1)
@@ -118,9 +113,12 @@ def d2net(w: Weights, images: Tensor) -> list[LocalFeatures]:
     return [_described(*image) for image in zip(dense, detected, steps, strict=True)]
 
 
-def _derivative(dense: Tensor, taps: Tensor) -> Tensor:
-    """Of every channel `[B, C, h, w]` by itself, zeros outside."""
-    return F.conv2d(dense.flatten(0, 1)[:, None], taps, padding=1).reshape(dense.shape)
+def _derivatives(dense: Tensor) -> tuple[Tensor, ...]:
+    """(di, dj, dii, djj, dij) of maps `[B, C, h, w]`, zeros outside: shifted maps are faster than convolutions."""
+    wide = F.pad(dense, (1, 1, 1, 1))
+    up, down, left, right = wide[..., :-2, 1:-1], wide[..., 2:, 1:-1], wide[..., 1:-1, :-2], wide[..., 1:-1, 2:]
+    corners = wide[..., 2:, 2:] - wide[..., 2:, :-2] - wide[..., :-2, 2:] + wide[..., :-2, :-2]
+    return (down - up) / 2, (right - left) / 2, up - 2 * dense + down, left - 2 * dense + right, corners / 4
 
 
 def _described(dense: Tensor, detected: Tensor, steps: Tensor) -> LocalFeatures:
