@@ -4,6 +4,7 @@ Stores, checkpoints and blocks are keyed by the recipe of what they hold, and co
 """
 
 import hashlib
+import inspect
 import itertools
 import json
 import re
@@ -23,9 +24,9 @@ _ADDRESS = re.compile(" at 0x[0-9a-f]+")  # of a network's functions, which ever
 def recipe_of(value: Any, of_path: Callable[[PurePath], Any] = str) -> Any:
     """A value in JSON's terms, arrays by their content: what makes an extractor, a filter or a scorer what it is.
 
-    Dataclasses are told by the names of their class and fields, networks by their arrays. Fields with the metadata
-    `recipe` False (how many images go at a time) change nothing, and are left out. What the code does is not looked
-    at: whoever changes it changes a field too (`version: int = 2`), or nobody knows that old results are old.
+    Dataclasses are told by their class and fields, networks by their class and arrays; a class of one's own by the
+    text of its code as well, but not by what that calls. Fields with the metadata `recipe` False (how many images go at
+    a time) change nothing, and are left out.
 
     Args:
         value: dataclasses, mappings, lists, arrays, networks, texts, numbers, paths, and what has a property `recipe`.
@@ -41,7 +42,7 @@ def recipe_of(value: Any, of_path: Callable[[PurePath], Any] = str) -> Any:
         return recipe_of(value.recipe, of_path)
     if is_dataclass(value) and not isinstance(value, type):
         parts = {f.name: getattr(value, f.name) for f in fields(value) if f.metadata.get("recipe", True)}
-        return {"class": _name(type(value))} | recipe_of(parts, of_path)
+        return _class(type(value)) | recipe_of(parts, of_path)
     if isinstance(value, Mapping):
         return {str(name): recipe_of(part, of_path) for name, part in value.items()}
     if isinstance(value, list | tuple):
@@ -50,15 +51,28 @@ def recipe_of(value: Any, of_path: Callable[[PurePath], Any] = str) -> Any:
         return of_path(value)
     leaves, structure = jax.tree.flatten(value)
     if leaves and all(isinstance(leaf, np.ndarray | np.generic | jax.Array) for leaf in leaves):
-        own = {} if jax.tree_util.all_leaves([value]) else {"class": _name(type(value))}
+        own = {} if jax.tree_util.all_leaves([value]) else _class(type(value))
         return own | {"sha256": content_hash(_ADDRESS.sub("", str(structure)), leaves)}
     raise TypeError(f"{type(value).__name__}: expected a dataclass, arrays, or a property `recipe` that JSON takes")
 
 
-def _name(kind: type) -> str:
-    """Of a class; ours may move from module to module, two of others may have one name."""
-    own = kind.__module__.partition(".")[0] == __name__.partition(".")[0]
-    return kind.__qualname__ if own else f"{kind.__module__}.{kind.__qualname__}"
+def _class(kind: type) -> dict[str, str]:
+    """Ours by its name, for it may move from module to module; that of others by where it is, and by its code."""
+    if _is_ours(kind):
+        return {"class": kind.__qualname__}
+    code = [source for base in kind.__mro__[:-1] if not _is_ours(base) for source in _source(base)]
+    return {"class": f"{kind.__module__}.{kind.__qualname__}", "code": content_hash(code)}
+
+
+def _is_ours(kind: type) -> bool:
+    return kind.__module__.partition(".")[0] == __name__.partition(".")[0]
+
+
+def _source(kind: type) -> list[str]:
+    try:
+        return [inspect.getsource(kind)]
+    except (OSError, TypeError):  # typed into a terminal, or made by a program
+        return []
 
 
 def fingerprint(recipe: Any) -> str:

@@ -1,13 +1,11 @@
 """What is taken from the images of a folder: extracted once, whatever happens in between."""
 
-import json
 import shutil
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import jax
 import numpy as np
 import pytest
-from flax import nnx
 from PIL import Image
 
 from mfvpr import match, pipeline
@@ -15,16 +13,13 @@ from mfvpr.archive import Aggregated, Archive
 from mfvpr.data.datasets import image_folder
 from mfvpr.errors import InputError
 from mfvpr.features import Description, Scale
-from mfvpr.features.aliked import AlikedFeatures
 from mfvpr.features.sift import Sift
-from mfvpr.features.vlad import Vlad, VladFitting
+from mfvpr.features.vlad import VladFitting
 from mfvpr.fingerprints import recipe_of
 from mfvpr.retrieval import EXACT
 from mfvpr.stores import vectors
 from mfvpr.stores.features import forecast_bytes, open_store
 from mfvpr.types import Features
-from mfvpr.weights.networks import blueprint
-from mfvpr.weights.registry import entry_of
 from tests.builders import make_features
 from tests.stores.made_up import assert_same
 
@@ -227,48 +222,6 @@ def test_stores_are_found_by_content_whatever_folders_are_called(folder, tmp_pat
     assert lines[1].startswith("summer: 0.")
     assert " features an image; as the paper stores them, in float32, 0." in lines[1]
     assert lines[2] == f"winter: all 10 images from {path}"
-
-
-def test_other_numbers_weights_and_images_make_other_stores(folder, tmp_path):
-    """Batch sizes do not."""
-    keys = [recipe_of(Sift(max_keypoints=60, batch_size=size)) for size in (1, 8)]
-    assert keys[0] == keys[1]
-    others = [recipe_of(Sift(max_keypoints=61)), recipe_of(Sift(max_keypoints=60, image_size=(320, 336)))]
-    others += [recipe_of(VladFitting(seed=1)), recipe_of(Vlad(np.ones((2, 3), np.float32)))]
-    others += [recipe_of(Vlad(np.ones((3, 2), np.float32))), recipe_of(Vlad(np.zeros((2, 3), np.float32)))]
-    assert len({json.dumps(one, sort_keys=True) for one in (*keys, *others)}) == 7
-    with pytest.raises(TypeError, match="expected a dataclass, arrays, or a property `recipe`"):
-        Archive(tmp_path).local(folder, lambda images: images)
-
-
-def test_classes_of_one_name_are_told_apart():
-    made = [dataclass(type("Sift", (), {"__module__": name})) for name in ("theirs", "theirs.newer", "mfvpr.features")]
-    assert [recipe_of(one())["class"] for one in made] == ["theirs.Sift", "theirs.newer.Sift", "Sift"]
-    assert recipe_of(SIFT)["class"] == "Sift"
-
-
-def test_a_network_is_known_by_its_weights():
-    entry = entry_of("aliked-t16")
-    plan = blueprint(entry)
-    filled = [
-        plan.filled({name: np.full(shape, value, np.float32) for name, shape in plan.shapes.items()})
-        for value in (0, 1)
-    ]
-    recipes = [recipe_of(AlikedFeatures(model)) for model in (*filled, filled[0])]
-    assert recipes[0] == recipes[2]
-    assert recipes[0] != recipes[1]
-
-
-def test_a_network_is_known_wherever_its_functions_are_in_memory():
-    def network():
-        def promote(arrays, **_):
-            return arrays
-
-        return nnx.Conv(1, 1, (1, 1), promote_dtype=promote, rngs=nnx.Rngs(0))
-
-    first, second = network(), network()
-    assert str(jax.tree.structure(first)) != str(jax.tree.structure(second))
-    assert recipe_of(first) == recipe_of(second)
 
 
 def test_aggregations_are_fitted_on_the_database(folder, small_street, tmp_path):
