@@ -23,7 +23,10 @@ def files() -> dict[str, str]:
     every = "\n".join(f"  - {name}@{name}" for name in SCORERS)
     made["scorer/all.yaml"] = f"# Every score, each with the paper's parameters.\ndefaults:\n{every}"
     made["axes.yaml"] = "\n".join(_axes())
-    limits = {name: {field: one.limits for field, one in declared(scorer).items()} for name, scorer in SCORERS.items()}
+    limits = {
+        name: {field: parameter.limits for field, parameter in declared(scorer).items()}
+        for name, scorer in SCORERS.items()
+    }
     made["rules.yaml"] = yaml.safe_dump(limits, sort_keys=False, default_flow_style=None).strip()
     return {path: f"{_FIRST}{text}\n" for path, text in made.items()}
 
@@ -40,17 +43,19 @@ def write(conf: Path) -> None:
 def _scorer(name: str, scorer: type) -> Iterator[str]:
     yield f"# {summary(scorer)}"
     yield f"method: {name}"
-    for field, one in declared(scorer).items():
-        yield _line(field, one.default, "; ".join(filter(None, (one.unit, one.note, one.words))))
+    for field, parameter in declared(scorer).items():
+        yield _line(
+            field, parameter.default, "; ".join(filter(None, (parameter.unit, parameter.note, parameter.words)))
+        )
 
 
 def _axes() -> Iterator[str]:
     """Parameters of one scorer, scorer by scorer; then those that several have."""
     owners: dict[str, dict[str, str]] = {}
     for name, scorer in SCORERS.items():
-        for field, one in declared(scorer).items():
-            if one.swept:
-                owners.setdefault(field, {})[name] = one.unit or one.words
+        for field, parameter in declared(scorer).items():
+            if parameter.swept:
+                owners.setdefault(field, {})[name] = parameter.unit or parameter.words
     yield "grid:  # lists of values of the scorer's parameters; null = its own value"
     for field, units in sorted(owners.items(), key=lambda item: len(item[1]) > 1):
         [unit, *others] = {*units.values()}

@@ -61,14 +61,14 @@ def begun(settings: dict[str, Any], watch: Stopwatch) -> tuple[Tools, Images]:
     names = {settings[group]["name"] for group in ("features", "retrieval")}
     early = None if names & {"import", "pairs"} else _tools(settings, archive, None)
     with watch("data"):
-        found = _images(settings, archive)
-    return early or _tools(settings, archive, found.dataset), found
+        images = _images(settings, archive)
+    return early or _tools(settings, archive, images.dataset), images
 
 
 def _tools(settings: dict[str, Any], archive: Archive, dataset: Dataset | None) -> Tools:
     extractor = build.extractor(settings["features"], dataset)
-    chosen = build.filter(settings["retrieval"], extractor, dataset)
-    return Tools(extractor, chosen, Matching(**settings["matching"]), archive, build.where(settings))
+    retrieval = build.filter(settings["retrieval"], extractor, dataset)
+    return Tools(extractor, retrieval, Matching(**settings["matching"]), archive, build.where(settings))
 
 
 def _images(settings: dict[str, Any], archive: Archive) -> Images:
@@ -83,27 +83,27 @@ def _images(settings: dict[str, Any], archive: Archive) -> Images:
         if neighbors is not None:
             sequence = without_neighbors(sequence, len(dataset.database), own[-1], neighbors)
         sequences.append(sequence)
-    found = Images(replace(dataset, sequences=tuple(sequences)), sides)
-    _warn_of_images(settings, found, own)
-    return found
+    images = Images(replace(dataset, sequences=tuple(sequences)), sides)
+    _warn_of_images(settings, images, own)
+    return images
 
 
 def matched(
-    settings: dict[str, Any], chosen: Tools, found: Images, watch: Stopwatch, *, with_ratio: bool = False
+    settings: dict[str, Any], tools: Tools, images: Images, watch: Stopwatch, *, with_ratio: bool = False
 ) -> tuple[MatchSet, Shortlist]:
     """Matches and shortlist of the only sequence, from their store where they are all there."""
-    made = match_sequence(
-        found.dataset, found.dataset.only, chosen.extractor, chosen.filter, settings["candidates"],
-        matching=chosen.matching, archive=chosen.archive, watch=watch, with_ratio=with_ratio, **chosen.where,
+    result = match_sequence(
+        images.dataset, images.dataset.only, tools.extractor, tools.filter, settings["candidates"],
+        matching=tools.matching, archive=tools.archive, watch=watch, with_ratio=with_ratio, **tools.where,
     )  # fmt: skip
-    return made.matches[0], made.candidates
+    return result.matches[0], result.candidates
 
 
-def recipe(chosen: Tools, found: Images, num_candidates: int) -> dict[str, Any]:
+def recipe(tools: Tools, images: Images, num_candidates: int) -> dict[str, Any]:
     """Of the shortlist and the matches of the only sequence."""
     return matches_recipe(
-        found.dataset, found.dataset.only, chosen.extractor, chosen.filter, num_candidates, chosen.matching,
-        chosen.archive,
+        images.dataset, images.dataset.only, tools.extractor, tools.filter, num_candidates, tools.matching,
+        tools.archive,
     )  # fmt: skip
 
 
@@ -118,30 +118,30 @@ def _dataset(settings: dict[str, Any]) -> Dataset:
     try:
         return build.dataset(settings, progress)
     finally:
-        for one in bars:
-            one.close()
+        for progress_bar in bars:
+            progress_bar.close()
 
 
-def _warn_of_images(settings: dict[str, Any], found: Images, own: list[OwnRows]) -> None:
+def _warn_of_images(settings: dict[str, Any], images: Images, own: list[OwnRows]) -> None:
     """What is in the data set that may give wrong numbers, and what was done about it."""
-    dataset = found.dataset
+    dataset = images.dataset
     for sequence, rows in zip(dataset.sequences, own, strict=True):
         _warn_of_sequence(settings, sequence, rows)
-    for side, did in found.reading.items():
+    for side, did in images.reading.items():
         if did["turned"]:
             tell(f"note: {did['turned']} {side} images are turned as their EXIF orientation says")
         if did["scaled_16bit"]:
             tell(f"note: {did['scaled_16bit']} 16-bit {side} images are scaled to 8 bits")
-    bits, largest = dataset.database.bits, max(did["largest_16bit"] or 0 for did in found.reading.values())
+    bits, largest = dataset.database.bits, max(did["largest_16bit"] or 0 for did in images.reading.values())
     used = max(largest.bit_length(), 8)
     if largest and bits is not None and not bits - 1 <= used <= bits:
         look = "dark" if used < bits else "cut off"
         tell(f"warning: the largest value of all 16-bit images is {largest}, so that they come out {look}; "
               f"dataset.bits={used} would use their range")  # fmt: skip
-    asked, available = settings["candidates"], len(dataset.database)
-    if asked != "all" and asked > available:
-        tell(f"note: candidates={asked}, but the database has {available} images; all of them are re-ranked")
-    deepest, available = max(settings["recall"]["ks"]), available if asked == "all" else min(asked, available)
+    candidates, available = settings["candidates"], len(dataset.database)
+    if candidates != "all" and candidates > available:
+        tell(f"note: candidates={candidates}, but the database has {available} images; all of them are re-ranked")
+    deepest, available = max(settings["recall"]["ks"]), available if candidates == "all" else min(candidates, available)
     if deepest > available:
         tell(f"note: R@{deepest} is R@{available}, of the filter too: no more candidates are looked at")
 
@@ -153,13 +153,13 @@ def _warn_of_sequence(settings: dict[str, Any], sequence: QuerySequence, own: Ow
               "dataset.exclude_neighbors=N to leave out what is within N frames of it (0 = itself alone)")  # fmt: skip
     if excluded is not None and among < len(own):
         tell(f"note: {len(own) - among} of {len(own)} queries are no database images; nothing is left out for them")
-    known, asked = sequence.truth, truth.thresholds(settings, sequence.truth)
-    if known is None:
+    ground_truth, thresholds = sequence.truth, truth.thresholds(settings, sequence.truth)
+    if ground_truth is None:
         return
-    without = list(takewhile(lambda threshold: not known.positives(threshold).any(), asked))
-    if without == asked:
+    without = list(takewhile(lambda threshold: not ground_truth.positives(threshold).any(), thresholds))
+    if without == thresholds:
         tell("warning: the ground truth gives no query a right answer; every recall will be 0")
     elif without:
-        words = ", ".join(threshold_words(known.unit, threshold).strip() for threshold in without)
+        words = ", ".join(threshold_words(ground_truth.unit, threshold).strip() for threshold in without)
         mend = "larger recall.tolerances" + ", or fewer dataset.exclude_neighbors" * (excluded is not None)
         tell(f"warning: no query has a right answer within {words}, so that recall will be 0 there; use {mend}")

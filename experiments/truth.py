@@ -39,10 +39,12 @@ def in_words(settings: Mapping[str, Any], dataset: Dataset) -> str:
     """The same for a heading."""
     if dataset.sequences[0].truth is None:
         return "no ground truth: rankings only"
-    found = described(settings, dataset)
-    files = ", ".join(dict.fromkeys(found["files"]))
-    source = ("labels in " if found["kind"] == "label" else "") + files or _WORDS.get(found["kind"], found["kind"])
-    if found["unit"] == "exact":
+    description = described(settings, dataset)
+    files = ", ".join(dict.fromkeys(description["files"]))
+    source = ("labels in " if description["kind"] == "label" else "") + files or _WORDS.get(
+        description["kind"], description["kind"]
+    )
+    if description["unit"] == "exact":
         return f"recall in %, ground truth: {source}"
-    within = ", ".join(f"{threshold:g}" for threshold in found["thresholds"])
-    return f"recall in %, within {within} {found['unit']} of the ground truth: {source}"
+    within = ", ".join(f"{threshold:g}" for threshold in description["thresholds"])
+    return f"recall in %, within {within} {description['unit']} of the ground truth: {source}"

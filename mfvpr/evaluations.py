@@ -103,17 +103,17 @@ def evaluate(
         InputError: images, stores or features that cannot be used; one line says which, and the mend.
     """
     archive, watch = archive or Archive(), watch or Stopwatch()
-    place = {"memory": memory, "devices": devices}
     matched = [
         match_sequence(
-            dataset, sequence, extractor, filter, candidates, matching=matching, archive=archive, watch=watch, **place
+            dataset, sequence, extractor, filter, candidates, matching=matching, archive=archive, watch=watch,
+            memory=memory, devices=devices,
         )
         for sequence in dataset.sequences
-    ]
+    ]  # fmt: skip
     with watch("scores"):
         options = {"devices": devices, "track": archive.track("scores")}
-        ranked = [rank_sequence(one, scorers, fused or {}, ties, **options) for one in matched]
-    systems = {name: [one[name] for one in ranked] for name in ranked[0]}
+        ranked = [rank_sequence(sequence, scorers, fused or {}, ties, **options) for sequence in matched]
+    systems = {name: [by_system[name] for by_system in ranked] for name in ranked[0]}
     return Result(dataset, matched, systems, watch.seconds)
 
 
@@ -159,13 +159,14 @@ def match_sequence(
         with watch("filter"):
             filtered = filter.shortlist(sequence, database, num_candidates, archive)
         with watch("features"):
-            wanted = np.unique(filtered.candidates.indices[filtered.candidates.mask])
-            known = archive.local(database, extractor, wanted.tolist(), label="database features")
-            asked = archive.local(sequence.images, extractor, label=f"{sequence.name} features")
-        bad_queries, bad_database = {**filtered.bad_queries, **asked[0].bad}, {**filtered.bad_database, **known[0].bad}
+            rows = np.unique(filtered.candidates.indices[filtered.candidates.mask])
+            database_features = archive.local(database, extractor, rows.tolist(), label="database features")
+            query_features = archive.local(sequence.images, extractor, label=f"{sequence.name} features")
+        bad_queries = {**filtered.bad_queries, **query_features[0].bad}
+        bad_database = {**filtered.bad_database, **database_features[0].bad}
         warnings = [
-            *_wrong_with(database, known[0], bad_database),
-            *_wrong_with(sequence.images, asked[0], bad_queries),
+            *_wrong_with(database, database_features[0], bad_database),
+            *_wrong_with(sequence.images, query_features[0], bad_queries),
         ]
         _remark(stores, archive, {"queries": bad_queries, "database": bad_database, "warnings": warnings})
         with watch("matching"):
@@ -174,7 +175,9 @@ def match_sequence(
                     queries, images, filtered.candidates, **asdict(matching), with_ratio=with_ratio, store=store,
                     track=archive.track("matching"), **where,
                 )
-                for queries, images, store in zip(asked, known, stores or [None] * len(asked), strict=True)
+                for queries, images, store in zip(
+                    query_features, database_features, stores or [None] * len(query_features), strict=True
+                )
             )  # fmt: skip
     return Matched(sequence, filtered.candidates, matches, bad_queries, bad_database)
 
@@ -264,7 +267,7 @@ def _match_stores(
 def _wrong_with(folder: ImageFolder, features: FeatureSet, bad: Mapping[int, str]) -> Iterator[str]:
     """What is wrong with some images, which rank last, or have no matches."""
     yield from bad.values()
-    known = np.asarray(features.source.counts)
-    if empty := [row for row in np.flatnonzero(known == 0).tolist() if row not in bad]:
+    counts = np.asarray(features.source.counts)
+    if empty := [row for row in np.flatnonzero(counts == 0).tolist() if row not in bad]:
         yield (f"{folder.paths[empty[0]]}: no keypoints, so no matches ({len(empty)} such images of {len(folder)}); "
                "scores are 0")  # fmt: skip

@@ -55,8 +55,10 @@ class Retrieval:
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, archive: Archive
     ) -> Filtered:
         """See `Filter`."""
-        known = archive.vectors(database, self.describer, database, label="database descriptors")
-        asked = archive.vectors(sequence.images, self.describer, database, label=f"{sequence.name} descriptors")
-        search = archive.memo.once("search", lambda: self.search.fit(known.values), self, equal=database)
-        found = search.shortlist(asked.values, known.values, num_candidates, excluded=sequence.excluded)
-        return Filtered(found, asked.bad, known.bad)
+        database_vectors = archive.vectors(database, self.describer, database, label="database descriptors")
+        query_vectors = archive.vectors(sequence.images, self.describer, database, label=f"{sequence.name} descriptors")
+        search = archive.memo.once("search", lambda: self.search.fit(database_vectors.values), self, equal=database)
+        candidates = search.shortlist(
+            query_vectors.values, database_vectors.values, num_candidates, excluded=sequence.excluded
+        )
+        return Filtered(candidates, query_vectors.bad, database_vectors.bad)

@@ -81,10 +81,11 @@ class DescriptorFiles:
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, archive: Archive
     ) -> Filtered:
         """See `mfvpr.filters.Filter`."""
-        known = archive.memo.once("vectors", lambda: self._read(database), self, equal=database)
-        search = archive.memo.once("search", lambda: self.search.fit(known), self, equal=database)
-        asked = self._read(sequence.images)
-        return Filtered(search.shortlist(asked, known, num_candidates, excluded=sequence.excluded), {}, {})
+        database_vectors = archive.memo.once("vectors", lambda: self._read(database), self, equal=database)
+        search = archive.memo.once("search", lambda: self.search.fit(database_vectors), self, equal=database)
+        query_vectors = self._read(sequence.images)
+        shortlist = search.shortlist(query_vectors, database_vectors, num_candidates, excluded=sequence.excluded)
+        return Filtered(shortlist, {}, {})
 
     def _read(self, folder: ImageFolder) -> np.ndarray:
         file = self.files[folder.root]
@@ -109,10 +110,10 @@ class ShortlistFiles:
         """See `mfvpr.filters.Filter`; what the sequence excludes is left out, and the others move up."""
         file = self.files[sequence.images.root]
         names = [self.database_prefix + name for name in database.names]
-        known = read_shortlist(file.path, file.names(sequence.images), names)
+        shortlist = read_shortlist(file.path, file.names(sequence.images), names)
         if sequence.excluded is not None:
-            known = _without(known, sequence.excluded.contains(known.indices))
-        return Filtered(_cut(known, num_candidates), {}, {})
+            shortlist = _without(shortlist, sequence.excluded.contains(shortlist.indices))
+        return Filtered(_cut(shortlist, num_candidates), {}, {})
 
 
 def _without(shortlist: Shortlist, excluded: np.ndarray) -> Shortlist:

@@ -109,7 +109,9 @@ class MatchSet:
     @cached_property
     def image_sizes(self) -> tuple[np.ndarray, np.ndarray]:
         """All combinations of sizes of query and database images, `[n, 2]` each."""
-        sizes = [[np.reshape(one.image_size0, (-1, 2)), np.reshape(one.image_size1, (-1, 2))] for one in self.matches]
+        sizes = [
+            [np.reshape(query.image_size0, (-1, 2)), np.reshape(query.image_size1, (-1, 2))] for query in self.matches
+        ]
         sizes0, sizes1 = (np.unique(np.concatenate(side), axis=0) for side in zip(*sizes, strict=True))
         return np.repeat(sizes0, len(sizes1), 0), np.tile(sizes1, (len(sizes0), 1))
 
@@ -132,7 +134,7 @@ class Scales:
     normalize: Normalize = "zscore"
 
     def __post_init__(self) -> None:
-        shapes = {one.counts.shape for one in self.match_sets}
+        shapes = {match_set.counts.shape for match_set in self.match_sets}
         if len(shapes) != 1:
             raise InputError(f"scales: expected match sets of the same queries and candidates, got {sorted(shapes)}")
         if self.weights is not None and len(self.weights) != len(self.match_sets):
@@ -143,7 +145,7 @@ class Scales:
     @property
     def image_sizes(self) -> tuple[np.ndarray, np.ndarray]:
         """As of a MatchSet, of all scales."""
-        sizes0, sizes1 = zip(*(one.image_sizes for one in self.match_sets), strict=True)
+        sizes0, sizes1 = zip(*(match_set.image_sizes for match_set in self.match_sets), strict=True)
         return np.concatenate(sizes0), np.concatenate(sizes1)
 
 
@@ -218,13 +220,13 @@ def batches(match_set: MatchSet, queries: range, *, settings: float = math.inf) 
 
 def queries_that_fit(match_set: MatchSet | Scales, num_settings: int) -> int:
     """Queries whose matches, padded, and scores by so many settings BLOCK_BYTES hold, at least one."""
-    one = block_bytes(match_set, num_settings, 1)
-    return max(1, min(len(scales(match_set)[0]), BLOCK_BYTES // max(one, 1)))
+    bytes_of_query = block_bytes(match_set, num_settings, 1)
+    return max(1, min(len(scales(match_set)[0]), BLOCK_BYTES // max(bytes_of_query, 1)))
 
 
 def block_bytes(match_set: MatchSet | Scales, num_settings: int, num_queries: int) -> int:
     """Bytes that some queries take whose scores are computed together, about: matches, scores and their rankings."""
-    padded = sum(slots(one, settings=num_settings).sum(1) for one in scales(match_set))
+    padded = sum(slots(scale, settings=num_settings).sum(1) for scale in scales(match_set))
     largest, num_candidates = np.sort(padded)[::-1][:num_queries].sum(), scales(match_set)[0].counts.shape[1]
     of_scores = (8 + 4 * len(scales(match_set))) * num_settings * num_queries * num_candidates
     return int(2 * BYTES_PER_SLOT * largest) + of_scores

@@ -74,10 +74,10 @@ def match(
         max_matches=max_matches, memory=memory, devices=devices or [device_of(())], chunk_size=chunk_size,
     )  # fmt: skip
     if store is None:
-        found = [one for _, one in track(made(range(len(queries)), with_ratio=with_ratio), len(queries))]
-        return MatchSet.of([one.matches for one in found], np.array([one.counts for one in found]))
+        rows = [row for _, row in track(made(range(len(queries)), with_ratio=with_ratio), len(queries))]
+        return MatchSet.of([row.matches for row in rows], np.array([row.counts for row in rows]))
     if missing := np.flatnonzero(~store.done).tolist():
-        before = {row: one.indices for row, one in store.read()}
+        before = {query: row.indices for query, row in store.read()}
         _require_same(store, candidates, before)  # then nothing is written
         tracked = iter(track(made(missing, with_ratio=True), len(missing)))
         while batch := dict(itertools.islice(tracked, STORE_BATCH)):
@@ -88,10 +88,10 @@ def match(
     return match_set
 
 
-def _require_same(store: MatchStore, candidates: Shortlist, found: Mapping[int, np.ndarray]) -> None:
+def _require_same(store: MatchStore, candidates: Shortlist, stored: Mapping[int, np.ndarray]) -> None:
     """That what the store holds, by row, is of these candidates."""
     same_shape = candidates.indices.shape == tuple(store.sizes.values())
-    if not same_shape or any((indices != candidates.indices[row]).any() for row, indices in found.items()):
+    if not same_shape or any((indices != candidates.indices[row]).any() for row, indices in stored.items()):
         raise InputError(
             f"{store.folder}: expected matches of these candidates, got those of another shortlist; choose another "
             "path, or delete this folder"
@@ -115,12 +115,12 @@ def stored_matches(store: MatchStore, *, memory: float | None = None) -> tuple[M
             "the matching first"
         )
     left, matches, lists = memory_budget(memory, jax.local_devices(backend="cpu")[:1]), [], []
-    for _, one in store.read():
-        left -= sum(leaf.nbytes for leaf in jax.tree.leaves(one.matches))
-        matches.append(one.matches)
+    for _, row in store.read():
+        left -= sum(leaf.nbytes for leaf in jax.tree.leaves(row.matches))
+        matches.append(row.matches)
         if left < 0:
             matches.clear()
-        lists.append((one.counts, one.indices, one.filter_scores))
+        lists.append((row.counts, row.indices, row.filter_scores))
     counts, indices, scores = map(np.array, zip(*lists, strict=True))
     shortlist = Shortlist(indices=indices, scores=scores, mask=indices >= 0)
     return MatchSet.of(matches or StoredMatches(store), counts), shortlist

@@ -76,10 +76,10 @@ class Result:
         Raises:
             InputError: a sequence has no ground truth.
         """
-        found = [sequence.truth for sequence in self.dataset.sequences]
-        if any(truth is None for truth in found):
+        truths = [sequence.truth for sequence in self.dataset.sequences]
+        if any(truth is None for truth in truths):
             raise InputError(f"{self.dataset.name}: there is no ground truth, so rankings only")
-        return [truth.positives(threshold) for truth in found if truth is not None]
+        return [truth.positives(threshold) for truth in truths if truth is not None]
 
     def recall(self, thresholds: Sequence[float], ks: Sequence[int] = (1, 5, 10)) -> dict[str, Recall]:
         """Recall@K of every system; a query without a right answer counts as a failure.
@@ -89,12 +89,12 @@ class Result:
             ks: depths.
         """
         right = [self.positives(threshold) for threshold in thresholds]
-        queries = np.array([len(one.candidates.mask) for one in self.matched])
+        queries = np.array([len(sequence.candidates.mask) for sequence in self.matched])
 
         def of(ranked: Sequence[Ranked]) -> Recall:
             return Recall(np.array([
-                [[hits(one.rows, truths[place], k).mean() for k in ks] for truths in right]
-                for place, one in enumerate(ranked)
+                [[hits(sequence.rows, positives[number], k).mean() for k in ks] for positives in right]
+                for number, sequence in enumerate(ranked)
             ]), queries)  # fmt: skip
 
         return {name: of(ranked) for name, ranked in self.systems.items()}

@@ -158,8 +158,10 @@ class Session:
         data, answers, per_query = self.data, self.answers, len(self.answers) * self.data.queries
         hits = [best in rows for best, rows in zip(answers[0].rows[:, 0], data.similar(), strict=True)]
         return Result(
-            total=[sum(one.seconds.values()) / data.queries for one in answers],
-            steps={name: float(np.median([one.seconds[name] for one in answers])) / data.queries for name in STEPS},
+            total=[sum(answer.seconds.values()) / data.queries for answer in answers],
+            steps={
+                name: float(np.median([answer.seconds[name] for answer in answers])) / data.queries for name in STEPS
+            },
             cpu=self.cpu / per_query,
             reading=self.source.seconds / per_query,
             rows=self.source.rows / per_query,
@@ -207,14 +209,23 @@ def report(sets: Sequence[MadeUp], results: Sequence[Result], out: Path) -> None
     header = ["database", "ms / query", *STEPS, "(reading)", "rows read", "CPU ms", "peak GB", "first answer s", "R@1"]
     lines = [
         [data.title]
-        + [f"{1e3 * value:.1f}" for value in (np.median(one.total), *(one.steps[name] for name in STEPS), one.reading)]
-        + [f"{one.rows:.1f}", f"{1e3 * one.cpu:.1f}", f"{one.peak:.2f}", f"{one.first:.1f}", f"{100 * one.recall:.0f}"]
-        for data, one in zip(sets, results, strict=True)
+        + [
+            f"{1e3 * value:.1f}"
+            for value in (np.median(result.total), *(result.steps[name] for name in STEPS), result.reading)
+        ]
+        + [
+            f"{result.rows:.1f}",
+            f"{1e3 * result.cpu:.1f}",
+            f"{result.peak:.2f}",
+            f"{result.first:.1f}",
+            f"{100 * result.recall:.0f}",
+        ]
+        for data, result in zip(sets, results, strict=True)
     ]
     table, remarks = Table(header, lines), list(_remarks(sets, results))
     machine = {"cores": available_cpus(), "processor": platform.machine()}
     setting = {"queries": sets[0].queries, "candidates": CANDIDATES, "keypoints": sets[0].keypoints, "memory": MEMORY}
-    rows = [vars(data) | vars(one) for data, one in zip(sets, results, strict=True)]
+    rows = [vars(data) | vars(result) for data, result in zip(sets, results, strict=True)]
     content = setting | {"machine": machine, "versions": versions(), "remarks": remarks, "results": rows}
     write_text(out, json.dumps(content, indent=1) + "\n")
     title = f"{setting['queries']} queries with {CANDIDATES} candidates, {MEMORY:g} GB asked for; {machine}"
@@ -222,18 +233,18 @@ def report(sets: Sequence[MadeUp], results: Sequence[Result], out: Path) -> None
 
 
 def _remarks(sets: Sequence[MadeUp], results: Sequence[Result]) -> Iterator[str]:
-    alike = [one for data, one in zip(sets, results, strict=True) if data.dimension == sets[0].dimension]
+    alike = [result for data, result in zip(sets, results, strict=True) if data.dimension == sets[0].dimension]
     first, last = alike[0], alike[-1]
     yield "seconds per query, largest / smallest: " + ", ".join(
         f"{name} {of(last) / of(first):.2f}"
         for name, of in (
-            ("median", lambda one: np.median(one.total)),
-            ("fastest round", lambda one: min(one.total)),
-            ("CPU", lambda one: one.cpu),
+            ("median", lambda result: np.median(result.total)),
+            ("fastest round", lambda result: min(result.total)),
+            ("CPU", lambda result: result.cpu),
         )
     )
-    yield f"peak memory: {max(one.peak for one in results):.2f} GB at most"
-    tried = {data.title: one.same for data, one in zip(sets, results, strict=True) if one.same is not None}
+    yield f"peak memory: {max(result.peak for result in results):.2f} GB at most"
+    tried = {data.title: result.same for data, result in zip(sets, results, strict=True) if result.same is not None}
     yield "scores and rankings as with all features in memory, bit for bit: " + ", ".join(
         f"{title}: {'yes' if same else 'NO'}" for title, same in tried.items()
     )

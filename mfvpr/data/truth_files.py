@@ -49,12 +49,12 @@ def truth_from_file(
     readers = {".csv": _csv_pairs, ".npz": _npz_pairs, ".json": _json_pairs}
     if path.suffix.lower() not in readers:
         raise InputError(f"{path}: expected an index file named .csv, .npz or .json, got {path.suffix or 'no suffix'}")
-    found = _parsed(path, readers[path.suffix.lower()])
-    if isinstance(found, RadiusTruth):
-        _same_count(path, "query positions (utmQ)", len(found.query_xy), len(query_names))
-        _same_count(path, "database positions (utmDb)", len(found.database_xy), len(database_names))
-        return found
-    return _frame_truth(path, found, query_names, database_names, widened)
+    content = _parsed(path, readers[path.suffix.lower()])
+    if isinstance(content, RadiusTruth):
+        _same_count(path, "query positions (utmQ)", len(content.query_xy), len(query_names))
+        _same_count(path, "database positions (utmDb)", len(content.database_xy), len(database_names))
+        return content
+    return _frame_truth(path, content, query_names, database_names, widened)
 
 
 def _parsed(path: Path, reader: Callable[[Path], Any]) -> Any:
@@ -125,8 +125,8 @@ def _csv_columns(path: Path, *choices: tuple[str, str]) -> list[tuple[str, str]]
                 first, second = map(names.index, pair)
                 short = [""] * len(names)  # cells that a line lacks are empty
                 return [((line + short)[first], (line + short)[second]) for line in lines if line]
-    found = _shortened(",".join(names)) or "no header"
-    raise InputError(f"{path}: expected a header with the columns {','.join(choices[0])}; got {found}")
+    got = _shortened(",".join(names)) or "no header"
+    raise InputError(f"{path}: expected a header with the columns {','.join(choices[0])}; got {got}")
 
 
 def _csv_pairs(path: Path) -> list[tuple[str, str]]:

@@ -33,15 +33,15 @@ def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> lis
     matched: list[str | None] = [printable(name) if printable(name) in plain else None for name in names]
     for variants in (_whole, _stems):
         free = plain.keys() - set(matched)
-        rows = [row for row, found in enumerate(matched) if found is None]
+        rows = [row for row, match in enumerate(matched) if match is None]
         if free and rows:
             _match_ends(path, names, rows, _Ends(free, variants), matched)
-    return [None if found is None else plain[found] for found in matched]
+    return [None if match is None else plain[match] for match in matched]
 
 
 def require_all(path: Path, names: Sequence[str], matched: Sequence[str | None], what: str) -> None:
     """Refuse a file that lacks images."""
-    missing = [name for name, found in zip(names, matched, strict=True) if found is None]
+    missing = [name for name, match in zip(names, matched, strict=True) if match is None]
     if missing:
         raise InputError(
             f"{path}: expected {what} of all {len(names)} images, got {len(names) - len(missing)}; the first without "

@@ -98,24 +98,30 @@ def write_rankings(folder: Path, judged: Judged) -> None:
     for place, sequence in enumerate(judged.sequences):
         own = folder / sequence.name if len(judged.sequences) > 1 else folder
         for name, ranked in judged.result.systems.items():
-            one = ranked[place]
-            found = Rankings(sequence.images.names, database, one.rows, one.scores, judged.is_right(name, place))
+            answers = ranked[place]
+            rankings = Rankings(
+                sequence.images.names, database, answers.rows, answers.scores, judged.is_right(name, place)
+            )
             file = f"{name.replace(' + ', '_')}.csv"
-            write_predictions(own / "predictions" / file, found)
-            write_failures(own / "failures" / file, found)
+            write_predictions(own / "predictions" / file, rankings)
+            write_failures(own / "failures" / file, rankings)
             if name == judged.headline:
-                write_predictions(own / "predictions.csv", found)
-                write_failures(own / "failures.csv", found)
+                write_predictions(own / "predictions.csv", rankings)
+                write_failures(own / "failures.csv", rankings)
 
 
 def write_skipped(folder: Path, result: Result) -> None:
     """`skipped.csv`: images that could not be used, and why; none where all could."""
     database = result.dataset.database
-    bad = {("database", database.names[row], why) for one in result.matched for row, why in one.bad_database.items()}
+    bad = {
+        ("database", database.names[row], why)
+        for matched in result.matched
+        for row, why in matched.bad_database.items()
+    }
     lines = sorted(bad) + [
-        ("queries", one.sequence.images.names[row], why)
-        for one in result.matched
-        for row, why in one.bad_queries.items()
+        ("queries", matched.sequence.images.names[row], why)
+        for matched in result.matched
+        for row, why in matched.bad_queries.items()
     ]
     if lines:
         write_text(folder / "skipped.csv", Table(["folder", "image", "reason"], lines).csv())

@@ -30,40 +30,40 @@ class Rankings:
     right: np.ndarray | None
 
 
-def write_predictions(path: Path, found: Rankings) -> None:
+def write_predictions(path: Path, rankings: Rankings) -> None:
     """CSV with a line per query and candidate, best first: `query,rank,database,score,right`.
 
     `right` is 1 or 0, or empty where it is unknown.
     """
     lines = (
-        [found.queries[query], rank + 1, found.database[row], _written(found.scores[query, rank]),
-         "" if found.right is None else int(found.right[query, rank])]
-        for (query, rank), row in np.ndenumerate(found.rows) if row >= 0
+        [rankings.queries[query], rank + 1, rankings.database[row], _written(rankings.scores[query, rank]),
+         "" if rankings.right is None else int(rankings.right[query, rank])]
+        for (query, rank), row in np.ndenumerate(rankings.rows) if row >= 0
     )  # fmt: skip
     _write_csv(path, ("query", "rank", "database", "score", "right"), lines)
 
 
-def write_failures(path: Path, found: Rankings) -> None:
+def write_failures(path: Path, rankings: Rankings) -> None:
     """CSV with a line per query whose first answer is wrong: `query,answer,rank,right_answer,score,margin`.
 
     `rank`, `right_answer` and `score` are of the first right candidate, empty where there is none; `margin` is how
     much higher the first answer scores. Nothing is written where it is unknown what is right.
     """
-    if found.right is None:
+    if rankings.right is None:
         return
     lines = []
-    for query in map(int, np.flatnonzero(~found.right[:, 0])):
-        row = int(found.rows[query, 0])
-        answer = found.database[row] if row >= 0 else ""
-        lines.append([found.queries[query], answer, *_first_right(found, found.right[query], query)])
+    for query in map(int, np.flatnonzero(~rankings.right[:, 0])):
+        row = int(rankings.rows[query, 0])
+        answer = rankings.database[row] if row >= 0 else ""
+        lines.append([rankings.queries[query], answer, *_first_right(rankings, rankings.right[query], query)])
     _write_csv(path, ("query", "answer", "rank", "right_answer", "score", "margin"), lines)
 
 
-def _first_right(found: Rankings, right: np.ndarray, query: int) -> list[str | int]:
+def _first_right(rankings: Rankings, right: np.ndarray, query: int) -> list[str | int]:
     if not right.any():
         return [""] * 4
-    rank, scores = int(np.argmax(right)), found.scores[query]
-    name = found.database[int(found.rows[query, rank])]
+    rank, scores = int(np.argmax(right)), rankings.scores[query]
+    name = rankings.database[int(rankings.rows[query, rank])]
     return [rank + 1, name, _written(scores[rank]), _written(scores[0] - scores[rank])]
 
 

@@ -97,22 +97,22 @@ def _products(settings: Sequence[Setting], members: Sequence[int]) -> list[np.nd
     """The members as products `[G, W]` of settings and weightings: those with the same weightings are one."""
     columns = _grouped(settings, members, lambda name, _: name in WEIGHTINGS)
     column = {row: place for place, (_, rows) in enumerate(columns) for row in rows}
-    found: dict[tuple[int, ...], list[list[int]]] = {}
+    products: dict[tuple[int, ...], list[list[int]]] = {}
     for _, line in _grouped(settings, members, lambda name, _: name not in WEIGHTINGS):
         line = sorted(line, key=column.__getitem__)
-        found.setdefault(tuple(column[row] for row in line), []).append(line)
-    return [np.array(lines) for lines in found.values()]
+        products.setdefault(tuple(column[row] for row in line), []).append(line)
+    return [np.array(lines) for lines in products.values()]
 
 
 def _grouped(
     settings: Sequence[Setting], members: Sequence[int], chosen: Callable[[str, Any], bool]
 ) -> list[tuple[dict, list[int]]]:
     """Members that share the chosen names' values, with those values."""
-    found: dict[Any, tuple[dict, list[int]]] = {}
+    groups: dict[Any, tuple[dict, list[int]]] = {}
     for row in members:
         shared = {name: value for name, value in settings[row].items() if chosen(name, value)}
-        found.setdefault(_key(shared), (shared, []))[1].append(row)
-    return list(found.values())
+        groups.setdefault(_key(shared), (shared, []))[1].append(row)
+    return list(groups.values())
 
 
 def _arrays(

@@ -58,9 +58,11 @@ class Work:
     @cached_property
     def digest(self) -> str:
         """Of the matches, how scales are fused, the shortlist and the views of these queries."""
-        taken = [one.take(self.queries) for one in scales(self.match_set)]
+        taken = [scale.take(self.queries) for scale in scales(self.match_set)]
         fusion = (self.match_set.weights, self.match_set.normalize) if isinstance(self.match_set, Scales) else ()
-        return content_hash(fusion, [(one.counts, one.matches) for one in taken], self.candidates, list(self.views))
+        return content_hash(
+            fusion, [(scale.counts, scale.matches) for scale in taken], self.candidates, list(self.views)
+        )
 
     def parts(self, size: int) -> Iterator["Work"]:
         """The same for at most `size` queries at a time."""
@@ -115,7 +117,7 @@ def sweep(
     work = Work(match_set, range(num_queries), per_program, candidates, views, depth, ties, filter_score)
     if folder is not None:
         found_groups = [replace(group, program=_program(work, group)) for group in found_groups]
-    blocks = [one for group in found_groups for one in group.blocks(per_block)]
+    blocks = [block for group in found_groups for block in group.blocks(per_block)]
     found = np.full((len(views), len(settings), num_queries, depth), -1, np.int32)
     steps = ((part, block) for part in work.parts(queries) for block in blocks)
     held: dict[range, list[PaddedBatch]] = {}
@@ -244,5 +246,5 @@ def _program(work: Work, group: Group) -> str:
 
     sets = scales(work.match_set)
     return "".join(
-        text(one.matches[0], *shape) for one in sets for shape in shapes(one, settings=work.settings).items()
+        text(scale.matches[0], *shape) for scale in sets for shape in shapes(scale, settings=work.settings).items()
     )
