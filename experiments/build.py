@@ -8,13 +8,13 @@ from typing import Any
 
 from experiments import console
 from experiments.settings import SettingsError
-from mfvpr.archive import Aggregated, Archive
+from mfvpr.archive import Archive
 from mfvpr.data.datasets import Dataset, folder_dataset, sequences_dataset
 from mfvpr.data.ground_truth import CHOICES
 from mfvpr.data.streets import streets_folder
 from mfvpr.declaration import made
 from mfvpr.evaluations import Fusion
-from mfvpr.features import Extractor
+from mfvpr.features import Aggregated, Extractor
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
 from mfvpr.filters import Filter, Retrieval

@@ -9,13 +9,13 @@ from tqdm import tqdm
 
 from experiments import build, truth
 from experiments.console import bar, tell
-from mfvpr.archive import Archive, Source
+from mfvpr.archive import Archive
 from mfvpr.data.contents import Contents
 from mfvpr.data.datasets import Dataset, QuerySequence
 from mfvpr.data.sequences import OwnRows, own_rows, without_neighbors
 from mfvpr.evaluation import threshold_words
 from mfvpr.evaluations import Matching, Stopwatch, match_sequence, matches_recipe
-from mfvpr.features import Extractor
+from mfvpr.features import Extractor, Source
 from mfvpr.filters import Filter
 from mfvpr.match_sets import MatchSet
 from mfvpr.types import Shortlist

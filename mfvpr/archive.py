@@ -12,22 +12,20 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, TypeVar
 
 import numpy as np
 
 from mfvpr.data.contents import Contents, contents
 from mfvpr.data.datasets import ImageFolder
-from mfvpr.data.images import Interpolation
 from mfvpr.errors import InputError
 from mfvpr.extraction import described
-from mfvpr.features import Aggregation, Extractor, Fitting, Scale
-from mfvpr.fingerprints import recipe_of
-from mfvpr.memo import Memo
+from mfvpr.features import Aggregated, Aggregation, Extractor, Source
+from mfvpr.fingerprints import fingerprint, recipe_of
 from mfvpr.progress import Track, untracked
 from mfvpr.report.runs import versions
 from mfvpr.sinks import Sink, account, open_sinks
-from mfvpr.sources import FeatureSet, FeatureSource, InMemory
+from mfvpr.sources import FeatureSet, InMemory
 from mfvpr.stores import matches as match_stores
 from mfvpr.stores.manifest import MATCHES, store_path
 from mfvpr.stores.rows import require_space
@@ -35,6 +33,8 @@ from mfvpr.stores.rows import require_space
 DECODERS = ("mfvpr", "opencv-python-headless", "pillow")  # whose versions decide what an image becomes
 AGGREGATED = 16  # images at a time
 _MB = 1e6
+
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
@@ -50,38 +50,6 @@ class Vectors:
     bad: Mapping[int, str]
 
 
-@runtime_checkable
-class Source(Protocol):
-    """What has local features of folders of images, without extracting them."""
-
-    @property
-    def image_size(self) -> tuple[int, int] | None:
-        """(width, height) of the images that the keypoints are in; None = as the files are."""
-        ...
-
-    @property
-    def interpolation(self) -> Interpolation:
-        """How images are squashed to it."""
-        ...
-
-    @property
-    def scales(self) -> tuple[Scale, ...]:
-        """One."""
-        ...
-
-    def opened(self, folder: ImageFolder, *, partial: bool) -> FeatureSource:
-        """The features of a folder's images; `partial`: some may be missing."""
-        ...
-
-
-@dataclass(frozen=True)
-class Aggregated:
-    """Global descriptors that are computed from an extractor's local features, once the database's are known."""
-
-    extractor: Extractor | Source
-    fitting: Fitting
-
-
 @dataclass
 class _Taken:
     """What an extractor takes from a folder's images: where that is kept, and why some gave nothing, by row."""
@@ -95,13 +63,14 @@ class _Taken:
 class Archive:
     """What was taken from images, in stores below a folder, or for the time of this process.
 
+    While it lives, the files of a folder are what they were when it first saw them.
+
     Attributes:
         root: folder of all stores; None = nothing is kept on disk.
         skip_bad: list images that cannot be read as bad, and go on, instead of raising.
         track: label -> progress of what follows.
         tell: is told, in one line, what is to be done and how much space that takes, and what is wrong with images.
         wait: for other processes that are making the same, instead of refusing.
-        memo: what this process knows already, such as what was fitted on a database.
     """
 
     root: Path | None = None
@@ -109,12 +78,30 @@ class Archive:
     track: Callable[[str], Track] = lambda label: untracked
     tell: Callable[[str], None] = lambda line: None
     wait: bool = False
-    memo: Memo = field(default_factory=Memo, repr=False)
+    _computed: dict[tuple, tuple[Any, Any]] = field(default_factory=dict, repr=False)
+    _warned: set[str] = field(default_factory=set, repr=False)
 
     def contents(self, folder: ImageFolder) -> Contents:
         """What the files of a folder hold; remembered below the root from run to run."""
         cache = None if self.root is None else self.root / "contents"
-        return self.memo.once("contents", lambda: contents(folder, cache), equal=folder)
+        return self.once("contents", lambda: contents(folder, cache), folder, None)
+
+    def once(self, name: str, compute: Callable[[], Value], folder: ImageFolder, by: Any) -> Value:
+        """What is computed of a folder by an extractor or a filter: once in this process, while that is what it is.
+
+        Args:
+            name: of the result.
+            compute: gives it.
+            folder: of images.
+            by: what computes it; where that has no recipe, the object counts.
+        """
+        try:
+            key = name, folder, fingerprint(recipe_of(by))
+        except TypeError:
+            key = name, folder, id(by)
+        if key not in self._computed:
+            self._computed[key] = compute(), by  # which lives as long, so that its id is no other's
+        return self._computed[key][0]
 
     def recipe_of(self, value: Any) -> Any:
         """See `fingerprints.recipe_of`, with the content of files and folders of files in place of their paths."""
@@ -122,7 +109,9 @@ class Archive:
 
     def warn(self, line: str) -> None:
         """Tell what is wrong; once, whoever finds it again (the next sequence that asks the same database)."""
-        self.memo.once("warning", lambda: self.tell(f"warning: {line}"), equal=line)
+        if line not in self._warned:
+            self._warned.add(line)
+            self.tell(f"warning: {line}")
 
     def recipe(self, folder: ImageFolder, extractor: Extractor | Aggregated | Source) -> dict[str, Any]:
         """All that changes what an extractor takes from a folder's images."""
@@ -153,9 +142,7 @@ class Archive:
             InputError: an image cannot be read (unless `skip_bad`), or none can; or a store cannot be used.
         """
         if isinstance(extractor, Source):
-            opened = self.memo.once(
-                "opened", lambda: extractor.opened(folder, partial=self.skip_bad), extractor, equal=folder
-            )
+            opened = self.once("opened", lambda: extractor.opened(folder, partial=self.skip_bad), folder, extractor)
             return (FeatureSet(opened, {}),)
         taken = self._extract(folder, extractor, range(len(folder)) if rows is None else [*rows], label)
         return tuple(
@@ -178,9 +165,7 @@ class Archive:
         """
         if folder != database:
             return self._vectors(folder, describer, database, label)
-        return self.memo.once(
-            "vectors", lambda: self._vectors(folder, describer, database, label), describer, equal=folder
-        )
+        return self.once("vectors", lambda: self._vectors(folder, describer, database, label), folder, describer)
 
     @contextmanager
     def matches(
@@ -224,7 +209,7 @@ class Archive:
 
     def _extract(self, folder: ImageFolder, extractor: Extractor, rows: Sequence[int], label: str) -> _Taken:
         """Run the extractor on those of the rows that lack something."""
-        taken = self.memo.once("taken", lambda: _Taken(self._sinks(folder, extractor)), extractor, equal=folder)
+        taken = self.once("taken", lambda: _Taken(self._sinks(folder, extractor)), folder, extractor)
         with ExitStack() as held:
             if any(sink.lacks(rows) for sink in taken.sinks):
                 for sink in taken.sinks:
@@ -279,7 +264,7 @@ class Archive:
         return Vectors(values, dict(taken.bad))
 
     def _aggregated(self, folder: ImageFolder, describer: Aggregated, database: ImageFolder, label: str) -> Vectors:
-        aggregation = self.memo.once("fitted", lambda: self._fitted(describer, database), describer, equal=database)
+        aggregation = self.once("fitted", lambda: self._fitted(describer, database), database, describer)
         [features] = self.local(folder, describer.extractor, label=label)
         values = np.zeros((len(folder), aggregation.vector_size), np.float32)
         rows = range(len(folder))

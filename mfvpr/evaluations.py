@@ -16,10 +16,10 @@ from typing import Any, Literal
 import numpy as np
 
 from mfvpr import pipeline
-from mfvpr.archive import Archive, Source
+from mfvpr.archive import Archive
 from mfvpr.data.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.data.files import write_text
-from mfvpr.features import Extractor
+from mfvpr.features import Extractor, Source
 from mfvpr.filters import Filter
 from mfvpr.fingerprints import recipe_of
 from mfvpr.matching import CrossCheck

@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
-from mfvpr.archive import Aggregated, Archive
+from mfvpr.archive import Archive
 from mfvpr.data.datasets import ImageFolder, QuerySequence
-from mfvpr.features import Extractor
+from mfvpr.features import Aggregated, Extractor
 from mfvpr.retrieval import EXACT, Search
 from mfvpr.types import Shortlist
 
@@ -57,7 +57,7 @@ class Retrieval:
         """See `Filter`."""
         database_vectors = archive.vectors(database, self.describer, database, label="database descriptors")
         query_vectors = archive.vectors(sequence.images, self.describer, database, label=f"{sequence.name} descriptors")
-        search = archive.memo.once("search", lambda: self.search.fit(database_vectors.values), self, equal=database)
+        search = archive.once("search", lambda: self.search.fit(database_vectors.values), database, self)
         candidates = search.shortlist(
             query_vectors.values, database_vectors.values, num_candidates, excluded=sequence.excluded
         )

@@ -7,6 +7,7 @@ import hashlib
 import inspect
 import itertools
 import json
+import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
@@ -37,7 +38,7 @@ def recipe_of(value: Any, of_path: Callable[[PurePath], Any] = str) -> Any:
             class would say.
     """
     if value is None or isinstance(value, bool | int | float | str):
-        return value
+        return value if not isinstance(value, float) or math.isfinite(value) else str(value)
     if not isinstance(value, type) and hasattr(value, "recipe"):
         return recipe_of(value.recipe, of_path)
     if is_dataclass(value) and not isinstance(value, type):

@@ -81,8 +81,8 @@ class DescriptorFiles:
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, archive: Archive
     ) -> Filtered:
         """See `mfvpr.filters.Filter`."""
-        database_vectors = archive.memo.once("vectors", lambda: self._read(database), self, equal=database)
-        search = archive.memo.once("search", lambda: self.search.fit(database_vectors), self, equal=database)
+        database_vectors = archive.once("vectors", lambda: self._read(database), database, self)
+        search = archive.once("search", lambda: self.search.fit(database_vectors), database, self)
         query_vectors = self._read(sequence.images)
         shortlist = search.shortlist(query_vectors, database_vectors, num_candidates, excluded=sequence.excluded)
         return Filtered(shortlist, {}, {})

@@ -1,7 +1,7 @@
 """What is taken from the images of a folder: extracted once, whatever happens in between."""
 
 import shutil
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
@@ -9,10 +9,10 @@ import pytest
 from PIL import Image
 
 from mfvpr import match, pipeline
-from mfvpr.archive import Aggregated, Archive
+from mfvpr.archive import Archive
 from mfvpr.data.datasets import image_folder
 from mfvpr.errors import InputError
-from mfvpr.features import Description, Scale
+from mfvpr.features import Aggregated, Description, Scale
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
 from mfvpr.fingerprints import recipe_of
@@ -118,6 +118,30 @@ def test_only_what_is_asked_for_is_extracted_and_nothing_twice(folder, tmp_path,
     [whole] = archive.local(folder, extractor)
     assert extractor.seen == len(folder)
     assert_same_features(whole, Archive(tmp_path if kept else None).local(folder, SIFT)[0])
+
+
+@dataclass
+class Fewer:
+    """SIFT's first features, as many as somebody may change at any time."""
+
+    number: int
+    image_size, interpolation, batch_size = SIFT.image_size, SIFT.interpolation, SIFT.batch_size
+    vector_size, scales = SIFT.vector_size, SIFT.scales
+
+    def __call__(self, images):
+        return [Description(None, (jax.tree.map(self.first, one.features),)) for one in SIFT(images)]
+
+    def first(self, values):
+        return values if values.shape == (2,) else values[: self.number]
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_an_extractor_that_was_changed_is_another_one(folder, tmp_path, kept):
+    extractor, archive = Fewer(5), Archive(tmp_path if kept else None)
+    for number in (5, 9, 5):
+        extractor.number = number
+        [features] = archive.local(folder, extractor)
+        assert features.counts.tolist() == [number] * len(folder)
 
 
 def test_one_pass_gives_a_vector_and_several_scales(folder, tmp_path):

@@ -9,12 +9,13 @@ import pytest
 from PIL import Image
 
 import mfvpr
-from mfvpr.archive import Aggregated, Archive
+from mfvpr.archive import Archive
 from mfvpr.data.datasets import folder_dataset, sequences_dataset
 from mfvpr.errors import InputError
 from mfvpr.evaluation import Positives
 from mfvpr.evaluations import Fusion, match_sequence
 from mfvpr.exchange import write_features, write_global_descriptors, write_shortlist
+from mfvpr.features import Aggregated
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
 from mfvpr.filters import Retrieval

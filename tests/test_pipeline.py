@@ -11,9 +11,10 @@ from PIL import Image
 
 import mfvpr
 from mfvpr import match_sets, pipeline, reranking
-from mfvpr.archive import Aggregated, Archive
+from mfvpr.archive import Archive
 from mfvpr.data.datasets import folder_dataset, image_folder
 from mfvpr.errors import InputError
+from mfvpr.features import Aggregated
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
 from mfvpr.filters import Retrieval

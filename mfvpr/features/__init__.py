@@ -6,12 +6,14 @@ features, of one scale or of several, or both. What is computed from local featu
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
+from mfvpr.data.datasets import ImageFolder
 from mfvpr.data.images import Interpolation
-from mfvpr.sources import FeatureSet
+from mfvpr.sources import FeatureSet, FeatureSource
 from mfvpr.types import Features
 
 
@@ -90,3 +92,35 @@ class Fitting(Protocol):
     def fit(self, database: FeatureSet) -> Aggregation:
         """Fitted on the database's local features; the same ones give the same aggregation."""
         ...
+
+
+@runtime_checkable
+class Source(Protocol):
+    """What has local features of folders of images, without extracting them."""
+
+    @property
+    def image_size(self) -> tuple[int, int] | None:
+        """(width, height) of the images that the keypoints are in; None = as the files are."""
+        ...
+
+    @property
+    def interpolation(self) -> Interpolation:
+        """How images are squashed to it."""
+        ...
+
+    @property
+    def scales(self) -> tuple[Scale, ...]:
+        """One."""
+        ...
+
+    def opened(self, folder: ImageFolder, *, partial: bool) -> FeatureSource:
+        """The features of a folder's images; `partial`: some may be missing."""
+        ...
+
+
+@dataclass(frozen=True)
+class Aggregated:
+    """Global descriptors that are computed from an extractor's local features, once the database's are known."""
+
+    extractor: Extractor | Source
+    fitting: Fitting

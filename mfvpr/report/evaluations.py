@@ -8,12 +8,11 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from mfvpr.archive import Source
 from mfvpr.data.datasets import ImageFolder, QuerySequence
 from mfvpr.data.files import write_text
 from mfvpr.data.images import resize
 from mfvpr.evaluation import Positives, threshold_words
-from mfvpr.features import Extractor
+from mfvpr.features import Extractor, Source
 from mfvpr.pipeline import explain
 from mfvpr.report.figures import Answer, histogram_figure
 from mfvpr.report.rankings import Rankings, write_failures, write_predictions
