@@ -21,8 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 from experiments.console import tell
 from experiments.errors import on_interrupt, one_line
 from experiments.groups import PROGRAMS, check_choice, groups
-from experiments.launch import Program
-from experiments.settings import CONF, SettingsError, check
+from experiments.settings import CONF, Program, SettingsError, check
 
 PATHS = {"dataset.database", "dataset.queries", "dataset.root", "dataset.index_file", "dataset.cache"}
 PATHS |= {"dataset.database_labels", "dataset.query_labels"}

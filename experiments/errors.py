@@ -1,15 +1,20 @@
 """Wrong input and interruption, for every program: one line and an exit code, never a traceback."""
 
 import os
+import shlex
 import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from experiments.settings import SettingsError
 
+if TYPE_CHECKING:  # it brings JAX along
+    from mfvpr.weights.registry import Entry
+
+WEIGHTS = "python -m experiments.weights"
 _INTERRUPTED = "\ninterrupted; nothing half-written was left, and what was finished is kept\n"
 
 
@@ -38,10 +43,15 @@ def one_line() -> Iterator[None]:
 
 def with_command(error: Exception) -> str:
     """The message, and where weights are to be installed, how."""
-    from experiments.weights import how_to_install
     from mfvpr.weights.files import WeightsError
 
     return f"{error}: {how_to_install(error.entry)}" if isinstance(error, WeightsError) else str(error)
+
+
+def how_to_install(entry: "Entry") -> str:
+    """The command that an installation of weights begins with."""
+    command = f"convert {shlex.quote(entry.file)}" if entry.sha256 is None else f"download {entry.name}"
+    return f"{WEIGHTS} {command}"
 
 
 def refuse(reason: str) -> NoReturn:

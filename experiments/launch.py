@@ -9,12 +9,9 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable
-from typing import Any
 
 from experiments.errors import leave, on_interrupt, one_line, unwind_on_sigterm
-
-Program = Callable[[], Callable[[dict[str, Any]], None]]  # imports the job, which takes a while, and returns it
+from experiments.settings import Program
 
 
 def launch(program: Program, config: str = "config") -> None:

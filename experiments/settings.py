@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 
 CONF = Path(__file__).parent.parent / "conf"
 
+Program = Callable[[], Callable[[dict[str, Any]], None]]  # imports the job, which takes a while, and returns it
+
 
 class SettingsError(Exception):
     """A setting that cannot be used; one line that names it, what was expected, and what was got."""

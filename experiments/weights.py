@@ -6,19 +6,18 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from experiments.errors import one_line, refuse, unwind_on_sigterm, with_command
+from experiments.errors import WEIGHTS, how_to_install, one_line, refuse, unwind_on_sigterm, with_command
 
 if TYPE_CHECKING:
     from mfvpr.weights.registry import Entry
 
 # Functions import what they need: --help and wrong usage need not wait for JAX.
-PROGRAM = "python -m experiments.weights"
 _CHUNK = 1 << 18
 
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        refuse(f"{message}; see {PROGRAM} --help")
+        refuse(f"{message}; see {WEIGHTS} --help")
 
 
 def main() -> None:
@@ -29,16 +28,10 @@ def main() -> None:
         arguments.pop("run")(**arguments)
 
 
-def how_to_install(entry: "Entry") -> str:
-    """The command that an installation begins with."""
-    command = f"convert {shlex.quote(entry.file)}" if entry.sha256 is None else f"download {entry.name}"
-    return f"{PROGRAM} {command}"
-
-
 def _parser() -> argparse.ArgumentParser:
     from experiments.launch import version
 
-    parser = _Parser(prog=PROGRAM, description="Weights live in MFVPR_WEIGHTS, by default "
+    parser = _Parser(prog=WEIGHTS, description="Weights live in MFVPR_WEIGHTS, by default "
                      "~/.cache/mfvpr/weights. None come with the package; each has its own license.")  # fmt: skip
     parser.add_argument("--version", action="version", version=version(), help="print it and exit")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
@@ -126,7 +119,7 @@ def download(name: str) -> None:
         _fetch(entry, target)
         print(f"{target}: downloaded, with the published hash")
     if name in NETWORKS:
-        print(f"to install it: {PROGRAM} convert {shlex.quote(str(target))}")
+        print(f"to install it: {WEIGHTS} convert {shlex.quote(str(target))}")
 
 
 def _fetch(entry: "Entry", target: Path) -> None:
