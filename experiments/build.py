@@ -39,7 +39,11 @@ def dataset(settings: dict[str, Any], progress: Callable[[int, int], None]) -> D
     if settings["ground_truth"] is None:
         raise SettingsError(f"dataset.ground_truth: nothing is assumed of your own images; set it to one of {CHOICES}")
     options: dict[str, Any] = {n: value for n, value in settings.items() if n not in ("root", "exclude_neighbors")}
-    if isinstance(options["queries"], list):
+    several = isinstance(options["queries"], list)
+    if several == ("database_labels" in options):  # which several sequences do not have
+        expected = "DIR, or [DIR,...] with dataset=sequences" if several else "[DIR,...], or DIR with dataset=folder"
+        raise SettingsError(f"dataset.queries: expected {expected}, got {settings['queries']}")
+    if several:
         queries, images = [expanded(path) for path in options.pop("queries")], expanded(options.pop("database"))
         return sequences_dataset(images, queries, **options)
     for name in ("database", "queries", "index_file", "database_labels", "query_labels"):

@@ -17,10 +17,12 @@ import numpy as np
 
 from mfvpr import pipeline
 from mfvpr.archive import Archive
+from mfvpr.checks import check_request, check_shortlist
 from mfvpr.data.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.data.files import write_text
+from mfvpr.errors import InputError
 from mfvpr.features import Extractor, Source
-from mfvpr.filters import Filter
+from mfvpr.filters import Filter, Filtered
 from mfvpr.fingerprints import recipe_of
 from mfvpr.matching import CrossCheck
 from mfvpr.numerics import Device
@@ -100,8 +102,10 @@ def evaluate(
         watch: gets the seconds of the stages.
 
     Raises:
-        InputError: images, stores or features that cannot be used; one line says which, and the mend.
+        InputError: arguments, images, stores or features that cannot be used, or what an extractor, a filter or a
+            scorer gives; one line says which, and the mend.
     """
+    check_request(candidates, scorers, fused or {}, ties, memory)
     archive, watch = archive or Archive(), watch or Stopwatch()
     matched = [
         match_sequence(
@@ -158,6 +162,11 @@ def match_sequence(
             return kept
         with watch("filter"):
             filtered = filter.shortlist(sequence, database, num_candidates, archive)
+            if not isinstance(filtered, Filtered):
+                raise InputError(f"{type(filter).__name__}: expected a Filtered, got {type(filtered).__name__}; "
+                                 "return Filtered(shortlist, {}, {})")  # fmt: skip
+            sizes = len(sequence.images), len(database), num_candidates
+            check_shortlist(filtered.candidates, type(filter).__name__, *sizes)
         with watch("features"):
             rows = np.unique(filtered.candidates.indices[filtered.candidates.mask])
             database_features = archive.local(database, extractor, rows.tolist(), label="database features")

@@ -43,11 +43,33 @@ def described(
         InputError: an image cannot be read (unless `skip_bad`).
     """
     for part, images in _image_batches(folder, rows, extractor, skip_bad, bad, track):
-        batch = dict(zip(part, extractor(images), strict=True))
+        batch = dict(zip(part, _checked(extractor(images), extractor, len(part)), strict=True))
         for row in [row for row, description in batch.items() if not _finite(description)]:
             del batch[row]
             bad[row] = f"{folder.paths[row]}: features are not finite (NaN or infinite); the image ranks last"
         yield batch
+
+
+def _checked(descriptions: list[Description], extractor: Extractor, number: int) -> list[Description]:
+    """What an extractor of somebody's own gives.
+
+    Raises:
+        InputError: not what it says.
+    """
+    who, scales = type(extractor).__name__, extractor.scales
+    if len(descriptions) != number:
+        raise InputError(f"{who}: expected a Description of each of {number} images, got {len(descriptions)}")
+    for one in descriptions:
+        if not isinstance(one, Description):
+            raise InputError(f"{who}: expected a Description, got {type(one).__name__}; return "
+                             "Description(vector, (features,))")  # fmt: skip
+        sizes = [local.descriptors.shape[-1] for local in one.local]
+        if sizes != (expected := [scale.dimension for scale in scales]):
+            raise InputError(f"{who}: expected local features of {expected} dimensions, as its scales say, got {sizes}")
+        if (one.vector is not None) != bool(extractor.vector_size):
+            raise InputError(f"{who}: vector_size={extractor.vector_size}, but a description "
+                             f"{'without' if one.vector is None else 'with'} a vector")  # fmt: skip
+    return descriptions
 
 
 def _image_batches(

@@ -230,6 +230,9 @@ def _similarity(features0: Features, features1: Features) -> Array:
 
 def products(rows0: Array, rows1: Array) -> Array:
     """Dot products of all rows of both, in full precision on every device."""
+    if rows0.shape[-1] != rows1.shape[-1]:
+        raise ValueError(f"descriptors: expected as many dimensions on both sides, got {rows0.shape[-1]} and "
+                         f"{rows1.shape[-1]}; extract all images alike")  # fmt: skip
     return jnp.matmul(rows0, rows1.T, precision=jax.lax.Precision.HIGHEST)
 
 

@@ -35,6 +35,12 @@ class Ranked:
     rows: np.ndarray
     scores: np.ndarray
 
+    @property
+    def shortlist(self) -> Shortlist:
+        """The same, to be written (`mfvpr.exchange.write_shortlist`) or matched again."""
+        there = self.rows >= 0
+        return Shortlist(indices=self.rows, scores=np.where(there, self.scores, 0), mask=there)
+
 
 @dataclass(frozen=True)
 class Recall:
@@ -54,7 +60,7 @@ class Recall:
         return np.tensordot(self.queries / self.queries.sum(), self.by_sequence, axes=1)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Result:
     """What an evaluation found.
 
@@ -69,6 +75,10 @@ class Result:
     matched: Sequence[Matched]
     systems: Mapping[str, Sequence[Ranked]]
     seconds: Mapping[str, float]
+
+    def __repr__(self) -> str:
+        sizes = ", ".join(f"{one.sequence.name} ({len(one.sequence.images)} queries)" for one in self.matched)
+        return f"Result({self.dataset.name}: {sizes}; {', '.join(self.systems)})"
 
     def positives(self, threshold: float) -> list[Positives]:
         """What is right at a threshold, by sequence.

@@ -69,6 +69,7 @@ ALLOWED = {
     "features": {"errors", "types", "numerics", "data", "models", "ragged", "sources", "features"},
     "extraction": {"errors", "types", "numerics", "data", "features", "progress", "threads"},
     "exchange": {"errors", "types", "data", "exchange"},
+    "checks": {"declaration", "errors", "reranking", "scoring", "types"},
     "testing": {"numerics", "reranking", "scoring", "types"},
     "report": {
         "archive",

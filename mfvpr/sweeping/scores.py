@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from mfvpr.errors import InputError
 from mfvpr.match_sets import MatchSet, Scales, batches, partition, queries_that_fit, scales
 from mfvpr.numerics import Device, available_cpus, compiled, held, knows_own_context
 from mfvpr.parameter_grids import score_settings
@@ -38,6 +39,8 @@ def score(
         devices: that share the batches, which changes no bit of the scores; None = the one that JAX takes.
         track: progress, over batches.
     """
+    if not scorers:
+        return {}
     num_queries, sets = len(candidates.mask), scales(match_set)
     size = queries_that_fit(match_set, len(scorers))
     parts = [range(start, min(start + size, num_queries)) for start in range(0, num_queries, size)]
@@ -109,7 +112,11 @@ def fuse_all(match_set: MatchSet | Scales, scores: np.ndarray, mask: np.ndarray)
 
 @compiled
 def _score_all(matches: Matches, scorers: dict[str, Scorer]) -> dict[str, Array]:
-    return {name: score_settings(scorer, matches, {}, {})[0, 0] for name, scorer in scorers.items()}
+    scores = {name: score_settings(scorer, matches, {}, {})[0, 0] for name, scorer in scorers.items()}
+    for name, values in scores.items():
+        if values.shape != matches.mask.shape[:1]:
+            raise InputError(f"{name}: expected a number for each pair, got an array {list(values.shape[1:])}")
+    return scores
 
 
 def _as_it_is(tree: Any) -> Any:

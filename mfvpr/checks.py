@@ -1,0 +1,79 @@
+"""What an evaluation is asked for, and what other people's filters and scorers are: told in one line before it costs."""
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any, get_args
+
+import numpy as np
+
+from mfvpr.declaration import declared
+from mfvpr.errors import InputError
+from mfvpr.reranking import Ties
+from mfvpr.scoring import SCORERS
+from mfvpr.types import Shortlist
+
+
+def check_request(
+    candidates: Any, scorers: Mapping[str, Any], fused: Iterable[str], ties: Any, memory: float | None
+) -> None:
+    """The arguments of `mfvpr.evaluate`.
+
+    Raises:
+        InputError: one cannot be used.
+    """
+    whole = isinstance(candidates, int | np.integer) and not isinstance(candidates, bool)
+    if candidates != "all" and not (whole and candidates >= 1):
+        raise InputError(f"candidates={candidates!r}: expected a whole number from 1, or 'all'")
+    if ties not in get_args(Ties):
+        raise InputError(f"ties={ties!r}: expected one of {', '.join(get_args(Ties))}")
+    if memory is not None and not 0 < memory < math.inf:
+        raise InputError(f"memory={memory!r}: expected GB above 0, or None")
+    if unknown := [name for name in fused if name not in scorers]:
+        raise InputError(
+            f"fused: expected names of scorers ({', '.join(scorers) or 'there are none'}), got {unknown[0]}"
+        )
+    for name, scorer in scorers.items():
+        if type(scorer) in SCORERS.values():
+            _check_numbers(name, scorer)
+
+
+def _check_numbers(name: str, scorer: Any) -> None:
+    for field, parameter in declared(scorer).items():
+        value, (low, high) = getattr(scorer, field), parameter.bounds
+        if parameter.choices or value is None:
+            continue
+        values = np.ravel(np.asarray(value, float))
+        if not ((values >= low) & (values <= high) | (values == parameter.none)).all():
+            raise InputError(f"{name}: {field}={value}: expected numbers from {low:g} to {high:g}")
+
+
+def check_shortlist(shortlist: Any, who: str, num_queries: int, num_database: int, num_candidates: int) -> None:
+    """Candidates as a filter of somebody's own gives them.
+
+    Args:
+        shortlist: of the filter.
+        who: the filter's name.
+        num_queries: Q.
+        num_database: N.
+        num_candidates: C.
+
+    Raises:
+        InputError: no Shortlist `[Q, C]`, rows that the database lacks, or a row twice for one query.
+    """
+    if not isinstance(shortlist, Shortlist):
+        raise InputError(f"{who}: expected a Shortlist as the candidates of Filtered, got {type(shortlist).__name__}")
+    indices, scores, mask = (np.asarray(part) for part in (shortlist.indices, shortlist.scores, shortlist.mask))
+    expected = (num_queries, num_candidates)
+    if {indices.shape, scores.shape, mask.shape} != {expected} or mask.dtype != bool:
+        raise InputError(f"{who}: expected indices, scores and mask (bool) of {list(expected)} each, got "
+                         f"{list(indices.shape)}, {list(scores.shape)} and {list(mask.shape)}; pad with -1")  # fmt: skip
+    if not ((indices[mask] >= 0) & (indices[mask] < num_database)).all():
+        raise InputError(f"{who}: expected rows of the database from 0 to {num_database - 1}, got "
+                         f"{indices[mask].min()} to {indices[mask].max()}")  # fmt: skip
+    ordered = np.sort(np.where(mask, indices, -1), axis=1)
+    if (twice := (ordered[:, 1:] == ordered[:, :-1]) & (ordered[:, 1:] >= 0)).any():
+        query, place = np.argwhere(twice)[0]
+        raise InputError(f"{who}: expected every row of the database once, got {ordered[query, place]} twice for query "
+                         f"{query}")  # fmt: skip
+    if not (np.isfinite(scores[mask]).all() and (indices[~mask] == -1).all()):
+        raise InputError(f"{who}: expected finite scores, and -1 where there is no candidate")
