@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from mfvpr.data.contents import Contents, contents
+from mfvpr.data.contents import Contents, contents, files_of, state_of
 from mfvpr.data.datasets import ImageFolder
 from mfvpr.errors import InputError
 from mfvpr.extraction import described
@@ -25,7 +25,7 @@ from mfvpr.fingerprints import fingerprint, recipe_of
 from mfvpr.progress import Track, untracked
 from mfvpr.report.runs import versions
 from mfvpr.sinks import Sink, account, open_sinks
-from mfvpr.sources import FeatureSet, InMemory
+from mfvpr.sources import FeatureSet, FeatureSource, InMemory
 from mfvpr.stores import matches as match_stores
 from mfvpr.stores.manifest import MATCHES, store_path
 from mfvpr.stores.rows import require_space
@@ -63,8 +63,6 @@ class _Taken:
 class Archive:
     """What was taken from images, in stores below a folder, or for the time of this process.
 
-    While it lives, the files of a folder are what they were when it first saw them.
-
     Attributes:
         root: folder of all stores; None = nothing is kept on disk.
         skip_bad: list images that cannot be read as bad, and go on, instead of raising.
@@ -81,13 +79,16 @@ class Archive:
     _computed: dict[tuple, tuple[Any, Any]] = field(default_factory=dict, repr=False)
     _warned: set[str] = field(default_factory=set, repr=False)
 
+    def __post_init__(self) -> None:
+        self.root = None if self.root is None else Path(self.root)
+
     def contents(self, folder: ImageFolder) -> Contents:
         """What the files of a folder hold; remembered below the root from run to run."""
         cache = None if self.root is None else self.root / "contents"
         return self.once("contents", lambda: contents(folder, cache), folder, None)
 
     def once(self, name: str, compute: Callable[[], Value], folder: ImageFolder, by: Any) -> Value:
-        """What is computed of a folder by an extractor or a filter: once in this process, while that is what it is.
+        """What is computed of a folder by an extractor or a filter: once in this process, while both are what they are.
 
         Args:
             name: of the result.
@@ -96,9 +97,10 @@ class Archive:
             by: what computes it; where that has no recipe, the object counts.
         """
         try:
-            key = name, folder, fingerprint(recipe_of(by))
+            recipe = fingerprint(recipe_of(by, lambda path: [str(path), *map(state_of, files_of(path).paths)]))
         except TypeError:
-            key = name, folder, id(by)
+            recipe = id(by)
+        key = name, folder, hash(tuple(map(str, map(state_of, folder.paths)))), recipe
         if key not in self._computed:
             self._computed[key] = compute(), by  # which lives as long, so that its id is no other's
         return self._computed[key][0]
@@ -128,7 +130,7 @@ class Archive:
         extractor: Extractor | Source,
         rows: Iterable[int] | None = None,
         *,
-        label: str = "features",
+        label: str = "image",
     ) -> tuple[FeatureSet, ...]:
         """Local features by scale, to be read on demand.
 
@@ -136,33 +138,38 @@ class Archive:
             folder: the images.
             extractor: what takes them.
             rows: images whose features will be asked for; those that are not there are extracted. None = all.
-            label: for people.
+            label: whose they are, for people.
 
         Raises:
             InputError: an image cannot be read (unless `skip_bad`), or none can; or a store cannot be used.
         """
         if isinstance(extractor, Source):
-            opened = self.once("opened", lambda: extractor.opened(folder, partial=self.skip_bad), folder, extractor)
-            return (FeatureSet(opened, {}),)
-        taken = self._extract(folder, extractor, range(len(folder)) if rows is None else [*rows], label)
+            opened = self.once("opened", lambda: self._opened(folder, extractor, label), folder, extractor)
+            missing = np.flatnonzero(np.asarray(opened.counts) < 0).tolist()
+            return (FeatureSet(opened, {row: f"{folder.paths[row]}: no features were imported" for row in missing}),)
+        rows = range(len(folder)) if rows is None else [*rows]
+        taken = self._extract(folder, extractor, rows, f"{label} features")
         return tuple(
             FeatureSet(InMemory(sink.items, len(folder)) if sink.store is None else sink.store, dict(taken.bad))
             for sink in taken.sinks[bool(extractor.vector_size) :]
         )
 
     def vectors(self, folder: ImageFolder, describer: Extractor | Aggregated, database: ImageFolder, *,
-                label: str = "descriptors") -> Vectors:  # fmt: skip
+                label: str = "image") -> Vectors:  # fmt: skip
         """Global descriptors of all images.
 
         Args:
             folder: the images.
             describer: what describes them.
             database: images that an aggregation is fitted on.
-            label: for people.
+            label: whose they are, for people.
 
         Raises:
             InputError: as `local`.
         """
+        if not isinstance(describer, Aggregated) and not describer.vector_size:
+            raise InputError(f"{type(describer).__name__}: gives no global descriptor; expected one that does, or "
+                             "Aggregated(extractor, VladFitting())")  # fmt: skip
         if folder != database:
             return self._vectors(folder, describer, database, label)
         return self.once("vectors", lambda: self._vectors(folder, describer, database, label), folder, describer)
@@ -200,12 +207,17 @@ class Archive:
 
     def _told_by_content(self, path: PurePath) -> Any:
         path = Path(path)
-        if path.is_file():
-            return self.contents(ImageFolder(path.parent, (path.name,))).sha256
-        if path.is_dir():
-            names = sorted(file.relative_to(path).as_posix() for file in path.rglob("*") if file.is_file())
-            return self.contents(ImageFolder(path, tuple(names))).fingerprint
-        return str(path)
+        if not path.exists():
+            return str(path)
+        found = self.contents(files_of(path))
+        return found.fingerprint if path.is_dir() else found.sha256
+
+    def _opened(self, folder: ImageFolder, source: Source, label: str) -> FeatureSource:
+        opened = source.opened(folder, partial=self.skip_bad)
+        counts = np.asarray(opened.counts)
+        number, typical = int((counts >= 0).sum()), np.mean(counts[counts >= 0]) if (counts >= 0).any() else 0
+        self.tell(f"{label} features: {number} of {len(folder)} images imported, about {typical:.0f} features each")
+        return opened
 
     def _extract(self, folder: ImageFolder, extractor: Extractor, rows: Sequence[int], label: str) -> _Taken:
         """Run the extractor on those of the rows that lack something."""
@@ -257,7 +269,7 @@ class Archive:
     ) -> Vectors:
         if isinstance(describer, Aggregated):
             return self._aggregated(folder, describer, database, label)
-        taken = self._extract(folder, describer, range(len(folder)), label)
+        taken = self._extract(folder, describer, range(len(folder)), f"{label} descriptors")
         values, sink = np.full((len(folder), describer.vector_size), np.nan, np.float32), taken.sinks[0]
         for row, vector in sink.items.items() if sink.store is None else sink.store.read():
             values[row] = vector
@@ -268,7 +280,7 @@ class Archive:
         [features] = self.local(folder, describer.extractor, label=label)
         values = np.zeros((len(folder), aggregation.vector_size), np.float32)
         rows = range(len(folder))
-        for start in self.track(label)(range(0, len(rows), AGGREGATED), -(-len(rows) // AGGREGATED)):
+        for start in self.track(f"{label} descriptors")(range(0, len(rows), AGGREGATED), -(-len(rows) // AGGREGATED)):
             images = dict(features.read(rows[start : start + AGGREGATED]))
             if images:
                 values[list(images)] = aggregation(list(images.values()))
@@ -276,5 +288,5 @@ class Archive:
         return Vectors(values, features.bad)
 
     def _fitted(self, describer: Aggregated, database: ImageFolder) -> Aggregation:
-        [features] = self.local(database, describer.extractor, label="database features")
+        [features] = self.local(database, describer.extractor, label="database")
         return describer.fitting.fit(features)

@@ -1,7 +1,7 @@
-"""What an evaluation is asked for, and what other people's filters and scorers are: told in one line before it costs."""
+"""What an evaluation is asked for, and what filters of others give: told in one line, before it costs anything."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, get_args
 
 import numpy as np
@@ -9,12 +9,13 @@ import numpy as np
 from mfvpr.declaration import declared
 from mfvpr.errors import InputError
 from mfvpr.reranking import Ties
+from mfvpr.results import FILTER
 from mfvpr.scoring import SCORERS
 from mfvpr.types import Shortlist
 
 
 def check_request(
-    candidates: Any, scorers: Mapping[str, Any], fused: Iterable[str], ties: Any, memory: float | None
+    candidates: Any, scorers: Mapping[str, Any], fused: Collection[str], ties: Any, memory: float | None
 ) -> None:
     """The arguments of `mfvpr.evaluate`.
 
@@ -32,6 +33,8 @@ def check_request(
         raise InputError(
             f"fused: expected names of scorers ({', '.join(scorers) or 'there are none'}), got {unknown[0]}"
         )
+    if taken := [name for name in scorers if name in {FILTER, *(f"{other} + {FILTER}" for other in fused)}]:
+        raise InputError(f"scorers: {taken[0]} is the name of another system; choose another one")
     for name, scorer in scorers.items():
         if type(scorer) in SCORERS.values():
             _check_numbers(name, scorer)
@@ -65,8 +68,9 @@ def check_shortlist(shortlist: Any, who: str, num_queries: int, num_database: in
     indices, scores, mask = (np.asarray(part) for part in (shortlist.indices, shortlist.scores, shortlist.mask))
     expected = (num_queries, num_candidates)
     if {indices.shape, scores.shape, mask.shape} != {expected} or mask.dtype != bool:
-        raise InputError(f"{who}: expected indices, scores and mask (bool) of {list(expected)} each, got "
-                         f"{list(indices.shape)}, {list(scores.shape)} and {list(mask.shape)}; pad with -1")  # fmt: skip
+        shapes = f"{list(indices.shape)}, {list(scores.shape)} and {list(mask.shape)}"
+        raise InputError(f"{who}: expected indices, scores and mask (bool) of {list(expected)} each, got {shapes}; "
+                         "pad with -1")  # fmt: skip
     if not ((indices[mask] >= 0) & (indices[mask] < num_database)).all():
         raise InputError(f"{who}: expected rows of the database from 0 to {num_database - 1}, got "
                          f"{indices[mask].min()} to {indices[mask].max()}")  # fmt: skip

@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -28,24 +28,23 @@ from mfvpr.matching import CrossCheck
 from mfvpr.numerics import Device
 from mfvpr.progress import Track, untracked
 from mfvpr.reranking import FilterScore, Ties, fuse_shortlist, rank_shortlist
-from mfvpr.results import Matched, Ranked, Result
+from mfvpr.results import FILTER, Matched, Ranked, Result
 from mfvpr.scoring import Scorer
 from mfvpr.sources import FeatureSet
 from mfvpr.stores.matches import MatchStore
 from mfvpr.types import Shortlist
 
-FILTER = "filter"  # the name of the filter's own ranking
 _REMARKS = "images.json"  # beside the matches: which images are bad
 
 
 @dataclass(frozen=True)
 class Matching:
-    """Options of the matches, see `mfvpr.matching`; `chunk_size` changes nothing but the memory that is taken."""
+    """Options of the matches, see `mfvpr.matching`; `chunk_size` changes memory and the last bits alone."""
 
     cross_check: CrossCheck = "mutual"
     max_distance: float | None = None
     max_matches: int | None = None
-    chunk_size: int | None = field(default=None, metadata={"recipe": False})
+    chunk_size: int | None = None
 
 
 @dataclass(frozen=True)
@@ -117,6 +116,7 @@ def evaluate(
     with watch("scores"):
         options = {"devices": devices, "track": archive.track("scores")}
         ranked = [rank_sequence(sequence, scorers, fused or {}, ties, **options) for sequence in matched]
+    _warn_of_nan(archive, matched, ranked)
     systems = {name: [by_system[name] for by_system in ranked] for name in ranked[0]}
     return Result(dataset, matched, systems, watch.seconds)
 
@@ -152,7 +152,11 @@ def match_sequence(
     """
     archive, watch = archive or Archive(), watch or Stopwatch()
     database = dataset.database
-    num_candidates = len(database) if candidates == "all" else min(candidates, len(database))
+    num_candidates = len(database) if candidates == "all" else min(int(candidates), len(database))
+    if not extractor.scales:
+        raise InputError(f"{type(extractor).__name__}: gives no local features; expected an extractor that does")
+    if matching.cross_check not in get_args(CrossCheck):
+        raise InputError(f"cross_check={matching.cross_check!r}: expected one of {', '.join(get_args(CrossCheck))}")
     with ExitStack() as held:
         stores = []
         if archive.root is not None:
@@ -169,8 +173,8 @@ def match_sequence(
             check_shortlist(filtered.candidates, type(filter).__name__, *sizes)
         with watch("features"):
             rows = np.unique(filtered.candidates.indices[filtered.candidates.mask])
-            database_features = archive.local(database, extractor, rows.tolist(), label="database features")
-            query_features = archive.local(sequence.images, extractor, label=f"{sequence.name} features")
+            database_features = archive.local(database, extractor, rows.tolist(), label="database")
+            query_features = archive.local(sequence.images, extractor, label=f"query {sequence.name}")
         bad_queries = {**filtered.bad_queries, **query_features[0].bad}
         bad_database = {**filtered.bad_database, **database_features[0].bad}
         warnings = [
@@ -199,13 +203,16 @@ def _kept(
         return None
     try:
         remarks = json.loads((stores[0].folder / _REMARKS).read_text())
-    except (OSError, ValueError):
+        bad = [{int(row): reason for row, reason in remarks[side].items()} for side in ("queries", "database")]
+        warnings = [*remarks["warnings"]]
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
         return None  # so images are looked at again, but not matched
     with watch("matches read"):
         read = [pipeline.stored_matches(store, memory=memory) for store in stores]
-    for line in remarks["warnings"]:
+    if any((other.indices != read[0][1].indices).any() for _, other in read):
+        return None  # another shortlist for some scales, which will be told
+    for line in warnings:
         archive.warn(line)
-    bad = ({int(row): reason for row, reason in remarks[side].items()} for side in ("queries", "database"))
     return Matched(sequence, read[0][1], tuple(match_set for match_set, _ in read), *bad)
 
 
@@ -271,6 +278,14 @@ def _match_stores(
             {**recipe, "scale": number} if several else recipe, len(sequence.images), recipe["candidates"],
             typical=scale.typical_count // 3, label=f"{sequence.name} matches",
         )  # fmt: skip
+
+
+def _warn_of_nan(archive: Archive, matched: Sequence[Matched], ranked: Sequence[Mapping[str, Ranked]]) -> None:
+    """Scorers of one's own may divide by 0."""
+    for one, systems in zip(matched, ranked, strict=True):
+        for name, system in systems.items():
+            if number := int(np.isnan(system.scores[system.rows >= 0]).sum()):
+                archive.warn(f"{one.sequence.name}: {number} scores of {name} are NaN, and rank last")
 
 
 def _wrong_with(folder: ImageFolder, features: FeatureSet, bad: Mapping[int, str]) -> Iterator[str]:

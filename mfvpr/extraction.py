@@ -14,6 +14,7 @@ from mfvpr.errors import InputError
 from mfvpr.features import Description, Extractor
 from mfvpr.numerics import available_cpus
 from mfvpr.progress import Track, untracked
+from mfvpr.sources import check_features, without_padding
 from mfvpr.threads import ordered_map
 
 Item = TypeVar("Item")
@@ -63,13 +64,15 @@ def _checked(descriptions: list[Description], extractor: Extractor, number: int)
         if not isinstance(one, Description):
             raise InputError(f"{who}: expected a Description, got {type(one).__name__}; return "
                              "Description(vector, (features,))")  # fmt: skip
+        for local in one.local:
+            check_features(local, f"{who}: features", unit_length=False)
         sizes = [local.descriptors.shape[-1] for local in one.local]
         if sizes != (expected := [scale.dimension for scale in scales]):
             raise InputError(f"{who}: expected local features of {expected} dimensions, as its scales say, got {sizes}")
         if (one.vector is not None) != bool(extractor.vector_size):
             raise InputError(f"{who}: vector_size={extractor.vector_size}, but a description "
                              f"{'without' if one.vector is None else 'with'} a vector")  # fmt: skip
-    return descriptions
+    return [Description(one.vector, tuple(map(without_padding, one.local))) for one in descriptions]
 
 
 def _image_batches(

@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
+import numpy as np
+
 from mfvpr.archive import Archive
 from mfvpr.data.datasets import ImageFolder, QuerySequence
 from mfvpr.features import Aggregated, Extractor
@@ -55,10 +57,14 @@ class Retrieval:
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, archive: Archive
     ) -> Filtered:
         """See `Filter`."""
-        database_vectors = archive.vectors(database, self.describer, database, label="database descriptors")
-        query_vectors = archive.vectors(sequence.images, self.describer, database, label=f"{sequence.name} descriptors")
+        database_vectors = archive.vectors(database, self.describer, database, label="database")
+        query_vectors = archive.vectors(sequence.images, self.describer, database, label=f"query {sequence.name}")
+        nothing = ~query_vectors.values.any(axis=1, keepdims=True)  # of no features, which resembles all alike
         search = archive.once("search", lambda: self.search.fit(database_vectors.values), database, self)
         candidates = search.shortlist(
-            query_vectors.values, database_vectors.values, num_candidates, excluded=sequence.excluded
+            np.where(nothing, np.nan, query_vectors.values),
+            database_vectors.values,
+            num_candidates,
+            excluded=sequence.excluded,
         )
         return Filtered(candidates, query_vectors.bad, database_vectors.bad)

@@ -3,20 +3,23 @@
 Stores, checkpoints and blocks are keyed by the recipe of what they hold, and compared with it, part by part.
 """
 
+import functools
 import hashlib
-import inspect
 import itertools
 import json
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import fields, is_dataclass
+from functools import cached_property
 from pathlib import PurePath
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from mfvpr.behavior import behavior_of
 
 _ABSENT = object()
 _ADDRESS = re.compile(" at 0x[0-9a-f]+")  # of a network's functions, which every process has elsewhere
@@ -25,25 +28,27 @@ _ADDRESS = re.compile(" at 0x[0-9a-f]+")  # of a network's functions, which ever
 def recipe_of(value: Any, of_path: Callable[[PurePath], Any] = str) -> Any:
     """A value in JSON's terms, arrays by their content: what makes an extractor, a filter or a scorer what it is.
 
-    Dataclasses are told by their class and fields, networks by their class and arrays; a class of one's own by the
-    text of its code as well, but not by what that calls. Fields with the metadata `recipe` False (how many images go at
-    a time) change nothing, and are left out.
+    Dataclasses are told by their class and fields, networks by their class and arrays; classes of one's own by what
+    their methods are compiled to as well, see `mfvpr.behavior`, but not by what these call. Fields with the metadata
+    `recipe` False (how many images go at a time) change nothing, and are left out.
 
     Args:
-        value: dataclasses, mappings, lists, arrays, networks, texts, numbers, paths, and what has a property `recipe`.
+        value: dataclasses, mappings, lists, arrays, networks, texts, numbers, paths, and what has a property `recipe`,
+            which then says all but the name of the class.
         of_path: what stands for a path; keys of mappings are always told by their names.
 
     Raises:
         TypeError: a part is none of these, such as a function: nobody knows what it does. A property `recipe` of its
             class would say.
     """
+    value = value.item() if isinstance(value, np.number) else value
     if value is None or isinstance(value, bool | int | float | str):
         return value if not isinstance(value, float) or math.isfinite(value) else str(value)
     if not isinstance(value, type) and hasattr(value, "recipe"):
-        return recipe_of(value.recipe, of_path)
+        return {"class": _name(type(value)), "recipe": recipe_of(value.recipe, of_path)}
     if is_dataclass(value) and not isinstance(value, type):
         parts = {f.name: getattr(value, f.name) for f in fields(value) if f.metadata.get("recipe", True)}
-        return _class(type(value)) | recipe_of(parts, of_path)
+        return _class(value, {f.name for f in fields(value)}, of_path) | recipe_of(parts, of_path)
     if isinstance(value, Mapping):
         return {str(name): recipe_of(part, of_path) for name, part in value.items()}
     if isinstance(value, list | tuple):
@@ -51,29 +56,35 @@ def recipe_of(value: Any, of_path: Callable[[PurePath], Any] = str) -> Any:
     if isinstance(value, PurePath):
         return of_path(value)
     leaves, structure = jax.tree.flatten(value)
-    if leaves and all(isinstance(leaf, np.ndarray | np.generic | jax.Array) for leaf in leaves):
-        own = {} if jax.tree_util.all_leaves([value]) else _class(type(value))
-        return own | {"sha256": content_hash(_ADDRESS.sub("", str(structure)), leaves)}
-    raise TypeError(f"{type(value).__name__}: expected a dataclass, arrays, or a property `recipe` that JSON takes")
+    arrays = leaves and all(isinstance(leaf, np.ndarray | np.generic | jax.Array) for leaf in leaves)
+    if not arrays or isinstance(value, functools.partial):
+        raise TypeError(f"{type(value).__name__}: expected a dataclass, arrays, or a property `recipe` that JSON takes")
+    own = {} if jax.tree_util.all_leaves([value]) else _class(value, None, of_path)
+    return own | {"sha256": content_hash(_ADDRESS.sub("", str(structure)), leaves)}
 
 
-def _class(kind: type) -> dict[str, str]:
-    """Ours by its name, for it may move from module to module; that of others by where it is, and by its code."""
+def _name(kind: type) -> str:
+    """Ours may move from module to module; two of others may have one name."""
+    return kind.__qualname__ if _is_ours(kind) else f"{kind.__module__}.{kind.__qualname__}"
+
+
+def _class(value: Any, known: Collection[str] | None, of_path: Callable[[PurePath], Any]) -> dict[str, Any]:
+    """Ours by its name; that of others by its behavior as well, and by attributes that are not among those `known`."""
+    kind = type(value)
     if _is_ours(kind):
-        return {"class": kind.__qualname__}
-    code = [source for base in kind.__mro__[:-1] if not _is_ours(base) for source in _source(base)]
-    return {"class": f"{kind.__module__}.{kind.__qualname__}", "code": content_hash(code)}
+        return {"class": _name(kind)}
+    bases = [base for base in kind.__mro__ if not _is_ours(base) and base is not object]
+    behavior = [behavior_of(base, lambda part: recipe_of(part, of_path)) for base in bases]
+    own = {"class": _name(kind), "code": fingerprint(behavior)}
+    if known is None or not hasattr(value, "__dict__"):
+        return own
+    cached = {name for base in bases for name, part in vars(base).items() if isinstance(part, cached_property)}
+    more = {name: part for name, part in vars(value).items() if name not in known and name not in cached}
+    return own | ({"attributes": recipe_of(more, of_path)} if more else {})
 
 
 def _is_ours(kind: type) -> bool:
     return kind.__module__.partition(".")[0] == __name__.partition(".")[0]
-
-
-def _source(kind: type) -> list[str]:
-    try:
-        return [inspect.getsource(kind)]
-    except (OSError, TypeError):  # typed into a terminal, or made by a program
-        return []
 
 
 def fingerprint(recipe: Any) -> str:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mfvpr import ragged
+from mfvpr.errors import InputError
 from mfvpr.neighbors import nearest, nearest_two
 from mfvpr.numerics import at_least_single, compiled, device_bytes, masked, safe_sqrt
 from mfvpr.types import Array, Features, Matches, per_keypoint, per_match
@@ -231,7 +232,7 @@ def _similarity(features0: Features, features1: Features) -> Array:
 def products(rows0: Array, rows1: Array) -> Array:
     """Dot products of all rows of both, in full precision on every device."""
     if rows0.shape[-1] != rows1.shape[-1]:
-        raise ValueError(f"descriptors: expected as many dimensions on both sides, got {rows0.shape[-1]} and "
+        raise InputError(f"descriptors: expected as many dimensions on both sides, got {rows0.shape[-1]} and "
                          f"{rows1.shape[-1]}; extract all images alike")  # fmt: skip
     return jnp.matmul(rows0, rows1.T, precision=jax.lax.Precision.HIGHEST)
 

@@ -67,8 +67,12 @@ def match(
         track: progress, over queries.
 
     Raises:
-        InputError: the store cannot be used, or is of other candidates: then nothing is written.
+        InputError: the two sides' descriptors do not fit; or the store cannot be used, or is of other candidates: then
+            nothing is written.
     """
+    if (queries.counts > 0).any() and (database.counts > 0).any() and queries.dimension != database.dimension:
+        raise InputError(f"features: expected as many dimensions on both sides, got {queries.dimension} "
+                         f"and {database.dimension} (database); extract all images alike")  # fmt: skip
     made = partial(
         pair_matching.matched, queries, database, candidates, cross_check=cross_check, max_distance=max_distance,
         max_matches=max_matches, memory=memory, devices=devices or [device_of(())], chunk_size=chunk_size,

@@ -4,12 +4,13 @@ Scorers know one pair; here is `vmap` over candidates. Whole grids of parameters
 """
 
 from functools import partial
-from typing import Literal
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mfvpr.errors import InputError
 from mfvpr.numerics import as_float, compiled, is_concrete, masked, masked_mean, masked_std
 from mfvpr.scoring import Scorer
 from mfvpr.scoring.parameters import fit
@@ -99,7 +100,14 @@ def fuse_shortlist(
 def filter_scores(candidates: Shortlist, kind: FilterScore = "cosine") -> np.ndarray:
     """The filter's part of a combined score `[Q, C]`: cosine similarity, or minus the Euclidean distance."""
     cosine = candidates.scores
-    return -np.sqrt(np.maximum(2 - 2 * cosine, 0)) if kind == "negative_euclidean" else cosine
+    if kind == "cosine":
+        return cosine
+    if kind != "negative_euclidean":
+        raise InputError(f"filter_score={kind!r}: expected one of {', '.join(get_args(FilterScore))}")
+    if (largest := np.max(cosine, initial=0)) > 1 + 1e-3:
+        raise InputError(f"filter_score=negative_euclidean: expected cosine similarities up to 1, got {largest:.4g}; "
+                         "use cosine, which takes any score")  # fmt: skip
+    return -np.sqrt(np.maximum(2 - 2 * cosine, 0))
 
 
 @partial(compiled, static_argnames="normalize")
@@ -137,12 +145,23 @@ def _standardized(scores: Array, mask: Array) -> Array:
     return jnp.where(finite, (values - mean) / jnp.where(spread > 0, spread, 1.0), scores)
 
 
+def indexed(ties: Ties) -> bool:
+    """Whether equal scores go by the row of the database.
+
+    Raises:
+        InputError: another word.
+    """
+    if ties not in get_args(Ties):
+        raise InputError(f"ties={ties!r}: expected one of {', '.join(get_args(Ties))}")
+    return ties == "index"
+
+
 def rank_shortlist(candidates: Shortlist, scores: np.ndarray, *, ties: Ties = "filter") -> np.ndarray:
     """Positions `[Q, C]` into the shortlist, best first, those without a candidate last, NumPy.
 
     Equal scores keep the filter's order, or go by database index.
     """
-    tie_break = candidates.indices if ties == "index" else None
+    tie_break = candidates.indices if indexed(ties) else None
     return np.asarray(rank(scores, candidates.mask, tie_break=tie_break))
 
 

@@ -11,6 +11,8 @@ from mfvpr.evaluation import Positives, hits
 from mfvpr.match_sets import MatchSet, Scales
 from mfvpr.types import Shortlist
 
+FILTER = "filter"  # the name of the filter's own ranking
+
 
 @dataclass(frozen=True)
 class Matched:
@@ -84,20 +86,33 @@ class Result:
         """What is right at a threshold, by sequence.
 
         Raises:
-            InputError: a sequence has no ground truth.
+            InputError: a sequence has no ground truth, or one of other images.
         """
+        if not threshold >= 0:
+            raise InputError(f"threshold={threshold}: expected a number from 0")
         truths = [sequence.truth for sequence in self.dataset.sequences]
         if any(truth is None for truth in truths):
             raise InputError(f"{self.dataset.name}: there is no ground truth, so rankings only")
-        return [truth.positives(threshold) for truth in truths if truth is not None]
+        positives = [truth.positives(threshold) for truth in truths if truth is not None]
+        for sequence, right in zip(self.dataset.sequences, positives, strict=True):
+            expected, got = (len(sequence.images), len(self.dataset.database)), (len(right), right.num_database)
+            if got != expected:
+                raise InputError(f"{sequence.name}: expected a ground truth of {expected[0]} queries and {expected[1]} "
+                                 f"database images, got one of {got[0]} and {got[1]}")  # fmt: skip
+        return positives
 
     def recall(self, thresholds: Sequence[float], ks: Sequence[int] = (1, 5, 10)) -> dict[str, Recall]:
         """Recall@K of every system; a query without a right answer counts as a failure.
 
         Args:
             thresholds: what counts as right, in the unit of the ground truth.
-            ks: depths.
+            ks: depths, from 1.
+
+        Raises:
+            InputError: as `positives`, or a depth below 1.
         """
+        if min(ks, default=1) < 1:
+            raise InputError(f"ks={[*ks]}: expected depths from 1")
         right = [self.positives(threshold) for threshold in thresholds]
         queries = np.array([len(sequence.candidates.mask) for sequence in self.matched])
 

@@ -49,6 +49,9 @@ class ExactSearch:
         self, queries: np.ndarray, database: np.ndarray, num_candidates: int, *, excluded: Positives | None = None
     ) -> Shortlist:
         """See `Search`; descriptors are of unit length, or their dot products mean what they mean."""
+        if queries.shape[1] != database.shape[1]:
+            raise InputError(f"global descriptors: expected as many numbers on both sides, got {queries.shape[1]} for "
+                             f"queries and {database.shape[1]} for the database")  # fmt: skip
         some, many = self._chunks(len(queries), len(database))
         parts = []
         for part in _parts(len(queries), some):
@@ -82,6 +85,11 @@ class WhitenedSearch:
     dimension: int
     max_samples: int = 4096
     search: Search = EXACT
+
+    def __post_init__(self) -> None:
+        """Refuse what keeps nothing."""
+        if self.dimension < 1:
+            raise InputError(f"whitening: dimension={self.dimension}: expected at least 1")
 
     def fit(self, database: np.ndarray) -> Search:
         """The components of a database `[N, D]`.

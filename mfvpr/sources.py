@@ -79,13 +79,13 @@ class FeatureSet:
         if not images:
             raise InputError("FeatureSet.of: expected the features of at least one image, got none")
         for number, image in enumerate(images):
-            _check(image, number, unit_length)
+            check_features(image, f"features of image {number}", unit_length=unit_length)
             if (dimension := image.descriptors.shape[1]) != (expected := images[0].descriptors.shape[1]):
                 raise InputError(
                     f"features of image {number}: expected descriptors of {expected} dimensions, as those of image 0, "
                     f"got {dimension}; extract all images alike"
                 )
-        return cls(InMemory(dict(enumerate(map(_without_padding, images))), len(images)), {})
+        return cls(InMemory(dict(enumerate(map(without_padding, images))), len(images)), {})
 
     @property
     def counts(self) -> np.ndarray:
@@ -101,10 +101,19 @@ class FeatureSet:
         return features
 
     @cached_property
+    def _example(self) -> Features:
+        """The first image that has keypoints."""
+        return self[int(np.argmax(self.counts > 0))]
+
+    @property
     def keypoint_bytes(self) -> int:
         """Bytes of one keypoint with all that belongs to it, as the first image says that has any."""
-        image = self[int(np.argmax(self.counts > 0))]
-        return sum(values[:1].nbytes for values in per_keypoint(image).values())
+        return sum(values[:1].nbytes for values in per_keypoint(self._example).values())
+
+    @property
+    def dimension(self) -> int:
+        """Numbers of a descriptor, likewise."""
+        return self._example.descriptors.shape[1]
 
     def read(self, rows: Iterable[int]) -> Iterator[tuple[int, Features]]:
         """(row, Features `[n, ...]`) of those among `rows` that have keypoints."""
@@ -256,15 +265,19 @@ def stacked(images: Sequence[Features], capacity: int, *, total: int | None = No
     return Features(**arrays, mask=mask, image_size=sizes if total is None else ragged.filled(sizes, total))
 
 
-def _without_padding(image: Features) -> Features:
+def without_padding(image: Features) -> Features:
     """In single precision, as it is matched."""
     real = np.asarray(image.mask)
     arrays = {name: np.asarray(values, np.float32)[real] for name, values in per_keypoint(image).items()}
     return Features(**arrays | {"mask": real[real]}, image_size=np.asarray(image.image_size, np.float32))
 
 
-def _check(image: Features, number: int, unit_length: bool) -> None:
-    """Of one's own image `[N, ...]`."""
+def check_features(image: Features, who: str, *, unit_length: bool) -> None:
+    """Features of one's own, `[N, ...]`.
+
+    Raises:
+        InputError: arrays do not fit, or descriptors are not of unit length where they must be.
+    """
     count = len(image.mask)
     shapes = {name: np.shape(values) for name, values in per_keypoint(image).items()}
     expected = {
@@ -275,12 +288,12 @@ def _check(image: Features, number: int, unit_length: bool) -> None:
     }
     if shapes != expected or len(shapes["descriptors"]) != 2 or np.asarray(image.mask).dtype != bool:
         raise InputError(
-            f"features of image {number}: expected keypoints [N, 2], descriptors [N, D], scores [N] and mask [N] bool, "
+            f"{who}: expected keypoints [N, 2], descriptors [N, D], scores [N] and mask [N] bool, "
             f"got shapes {', '.join(str(shape) for shape in shapes.values())}; transpose descriptors that are [D, N]"
         )
     lengths = np.linalg.norm(np.asarray(image.descriptors, np.float32)[image.mask], axis=1)
     if unit_length and (wrong := np.abs(lengths - 1) > 0.01).any():
         raise InputError(
-            f"features of image {number}: expected descriptors of unit length, got {lengths[wrong][0]:.4g}; "
+            f"{who}: expected descriptors of unit length, got {lengths[wrong][0]:.4g}; "
             "divide them by their Euclidean length, or say unit_length=False"
         )

@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -144,6 +145,29 @@ def test_an_extractor_that_was_changed_is_another_one(folder, tmp_path, kept):
         assert features.counts.tolist() == [number] * len(folder)
 
 
+@pytest.mark.parametrize("kept", [True, False])
+def test_files_that_were_changed_are_looked_at_again(tmp_path, kept, small_street, monkeypatch):
+    root = tmp_path / "images"
+    shutil.copytree(small_street / "database", root)
+    archive, folder = Archive(tmp_path / "s" if kept else None), image_folder(root)
+    [before] = archive.local(folder, SIFT, [0, 1])
+    before = before[1]
+    for row in range(len(folder)):
+        shutil.copy(small_street / "queries" / f"{9 - row:04d}.png", root / f"{row:04d}.png")
+    [after] = archive.local(folder, SIFT)
+    [expected] = Archive(tmp_path / "other" if kept else None).local(folder, SIFT)
+    assert_same_features(after, expected)
+    assert not np.array_equal(before.keypoints, after[1].keypoints)
+    monkeypatch.chdir(small_street)
+    here = replace(folder, root=Path("database"))
+    [first] = archive.local(here, SIFT)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "database")
+    [second] = archive.local(here, SIFT)
+    assert_same_features(second, expected)
+    assert not np.array_equal(first[1].keypoints, second[1].keypoints)
+
+
 def test_one_pass_gives_a_vector_and_several_scales(folder, tmp_path):
     for root in (None, tmp_path, tmp_path):
         extractor, archive = Both(), Archive(root)
@@ -242,10 +266,12 @@ def test_stores_are_found_by_content_whatever_folders_are_called(folder, tmp_pat
         Archive(tmp_path / "s", tell=lines.append).local(images, extractor, label=label)
     assert extractor.seen == len(folder)
     [path] = [path for path in (tmp_path / "s").iterdir() if path.name != "contents"]
-    assert lines[0].startswith("summer: 10 of 10 images to do, about 60 features of 128 dimensions each: about 0.2 MB")
-    assert lines[1].startswith("summer: 0.")
+    assert lines[0].startswith(
+        "summer features: 10 of 10 images to do, about 60 features of 128 dimensions each: about 0.2 MB"
+    )
+    assert lines[1].startswith("summer features: 0.")
     assert " features an image; as the paper stores them, in float32, 0." in lines[1]
-    assert lines[2] == f"winter: all 10 images from {path}"
+    assert lines[2] == f"winter features: all 10 images from {path}"
 
 
 def test_aggregations_are_fitted_on_the_database(folder, small_street, tmp_path):

@@ -4,6 +4,7 @@ import importlib
 import json
 import sys
 from dataclasses import dataclass
+from functools import cached_property
 
 import jax
 import numpy as np
@@ -36,19 +37,66 @@ def test_classes_of_one_name_are_told_apart():
     assert recipe_of(Sift())["class"] == "Sift"
 
 
-def test_changed_code_of_ones_own_is_another_recipe(tmp_path, monkeypatch):
-    text = "from dataclasses import dataclass\n@dataclass\nclass Base:\n    a: int = 1\n    def f(self): return {}\n" \
-           "@dataclass\nclass Mine(Base):\n    b: int = {}\n"  # fmt: skip
-    recipes = []
-    for number, values in enumerate(((1, 2), (1, 2), (5, 2), (1, 3))):
-        root = tmp_path / str(number)
-        root.mkdir()
-        (root / "of_ones_own.py").write_text(text.format(*values))
-        monkeypatch.syspath_prepend(root)
-        recipes.append(recipe_of(importlib.import_module("of_ones_own").Mine(b=2)))
-        del sys.modules["of_ones_own"]
-    assert recipes[0] == recipes[1]
-    assert len({fingerprint(one) for one in recipes}) == 3
+def made_by(number, *, gain=1, default=3):
+    """Classes that differ by what they close over, by an attribute, by a default, by a wrapped method."""
+
+    @dataclass
+    class Mine:
+        size: int = 2
+        strength = gain
+
+        def __call__(self, images, power=default):
+            return images * number**power
+
+        @cached_property
+        def table(self):
+            return [number] * self.size
+
+    return Mine
+
+
+class Inner(made_by(1)):
+    def __call__(self, images):
+        return super().__call__(images) + 1
+
+
+def test_code_of_ones_own_is_part_of_the_recipe():
+    same = [recipe_of(made_by(1)()), recipe_of(made_by(1)())]
+    assert same[0] == same[1]
+    more, used = made_by(1)(), made_by(1)()
+    more.tuned = 5
+    assert used.table
+    assert recipe_of(used) == same[0]
+    others = [made_by(2)(), made_by(1, gain=7)(), made_by(1, default=4)(), made_by(1)(size=3), more, Inner()]
+    assert len({fingerprint(one) for one in (same[0], *map(recipe_of, others))}) == 1 + len(others)
+    assert recipe_of(Inner()) == recipe_of(Inner())
+
+
+def test_what_runs_counts_and_not_the_text_of_a_file(tmp_path, monkeypatch):
+    text = "from dataclasses import dataclass\n@dataclass\nclass Mine:\n    def f(self): return {}\n"
+    path = tmp_path / "of_ones_own.py"
+    path.write_text(text.format(1))
+    monkeypatch.syspath_prepend(tmp_path)
+    module = importlib.import_module("of_ones_own")
+    before = recipe_of(module.Mine())
+    path.write_text(text.format(222))
+    assert recipe_of(module.Mine()) == before
+    importlib.reload(module)
+    assert recipe_of(module.Mine()) != before
+    del sys.modules["of_ones_own"]
+
+
+def test_a_recipe_of_ones_own_belongs_to_its_class():
+    class Theirs:
+        recipe = "thumbnails"
+
+    class Others(Theirs):
+        pass
+
+    assert recipe_of(Theirs())["recipe"] == "thumbnails"
+    assert recipe_of(Theirs()) != recipe_of(Others())
+    with pytest.raises(TypeError, match="Partial: expected a dataclass"):
+        recipe_of(jax.tree_util.Partial(lambda x: 2 * x, np.ones(2)))
 
 
 def test_a_network_is_known_by_its_weights():

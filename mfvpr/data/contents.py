@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import astuple, dataclass
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 from mfvpr.data.datasets import ImageFolder
@@ -89,7 +89,7 @@ def contents(folder: ImageFolder, cache: Path | None = None) -> Contents:
     root = folder.root.absolute()
     record = None if cache is None else cache / f"{hashlib.sha256(os.fsencode(root)).hexdigest()[:32]}.json"
     known, begun = {} if record is None else _recalled(record), time.time_ns()
-    states = {name: _state(path) for name, path in zip(folder.names, folder.paths, strict=True)}
+    states = dict(zip(folder.names, map(state_of, folder.paths), strict=True))
     trusted = {name for name, state in states.items() if state and name in known and known[name][:4] == state}
     changed = [name for name in folder.names if name not in trusted]
     read = ordered_map(_content, [folder.root / name for name in changed], workers=2)
@@ -100,8 +100,18 @@ def contents(folder: ImageFolder, cache: Path | None = None) -> Contents:
     return Contents(folder, tuple(files[name] for name in folder.names))
 
 
-def _state(path: Path) -> list[int] | None:
-    """Size, when content and entry last changed (ns), and the number of the file, which moves along with it."""
+def files_of(path: PurePath) -> ImageFolder:
+    """A file, or all files below a folder, as what contents are known of."""
+    path = Path(path)
+    names = [file.relative_to(path).as_posix() for file in path.rglob("*") if file.is_file()]
+    return ImageFolder(path, tuple(sorted(names))) if path.is_dir() else ImageFolder(path.parent, (path.name,))
+
+
+def state_of(path: Path) -> list[int] | None:
+    """Size, when content and entry last changed (ns), and the number of the file, which moves along with it.
+
+    None where there is no file.
+    """
     try:
         status = path.stat()
     except OSError:

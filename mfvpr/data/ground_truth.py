@@ -47,7 +47,7 @@ class FrameTruth(Truth):
 
     def positives(self, threshold: float) -> Positives:
         """Those for a tolerance in frames, inclusive."""
-        tolerance, last = int(threshold) if self.widened else 0, self.num_database
+        tolerance, last = int(min(threshold, self.num_database)) if self.widened else 0, self.num_database
 
         def around(row: int) -> np.ndarray:
             return np.arange(max(row - tolerance, 0), min(row + tolerance + 1, last), dtype=np.int32)

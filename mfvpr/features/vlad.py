@@ -85,6 +85,9 @@ class Vlad:
         # All images at once, for the same reason.
         real = [features.descriptors[features.mask] for features in images]
         descriptors = np.concatenate(real)
+        if descriptors.shape[1] != self.centers.shape[1]:
+            raise InputError(f"VLAD: expected descriptors of {self.centers.shape[1]} dimensions, as those that it was "
+                             f"fitted on, got {descriptors.shape[1]}")  # fmt: skip
         word = _nearest(descriptors, self.centers)
         cell = np.repeat(np.arange(len(real)) * len(self.centers), list(map(len, real))) + word
         order = np.argsort(cell, kind="stable")

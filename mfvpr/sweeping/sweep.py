@@ -22,7 +22,7 @@ from mfvpr.fingerprints import content_hash
 from mfvpr.match_sets import MatchSet, Scales, queries_that_fit, scales, shapes
 from mfvpr.numerics import Device, compiled
 from mfvpr.progress import Track, untracked
-from mfvpr.reranking import FilterScore, Ties, filter_scores
+from mfvpr.reranking import FilterScore, Ties, filter_scores, indexed
 from mfvpr.sweeping.scores import PaddedBatch, all_batches, fuse_all, scored
 from mfvpr.sweeping.settings import FUSION, Group, Setting, distinct, groups
 from mfvpr.types import Array, Matches, Shortlist, per_match
@@ -179,7 +179,7 @@ def _first_rows(part: Work, scores: np.ndarray, cs: Sequence[Any], view: np.ndar
     for kind in np.unique(kinds):
         members = np.flatnonzero(kinds == kind)
         c = np.array([cs[int(member)] for member in members], np.float32) if kind == "given" else None
-        tie_break = indices if part.ties == "index" else None
+        tie_break = indices if indexed(part.ties) else None
         order = np.asarray(_orders(of_filter, scores[members], c, view, tie_break, fused=kind != "alone"))
         order = order[..., : part.depth]
         ranked = np.where(np.take_along_axis(view[None], order, -1), np.take_along_axis(indices[None], order, -1), -1)

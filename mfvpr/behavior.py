@@ -1,0 +1,80 @@
+"""What the methods of a class do, as far as they say it themselves: so that changed code is not taken for the old.
+
+It is what runs that counts, not the text of a file, which may have been edited since: instructions, constants, names,
+defaults, and what a function closes over. What methods call elsewhere is not looked at.
+"""
+
+import functools
+from collections.abc import Callable
+from types import CodeType, FunctionType
+from typing import Any
+
+_PLAIN = (type(None), bool, int, float, complex, str, bytes)
+
+
+def behavior_of(kind: type, recipe_of: Callable[[Any], Any]) -> list[Any]:
+    """In JSON's terms.
+
+    Args:
+        kind: a class, without its bases.
+        recipe_of: what stands for a value that is no function; it may raise a TypeError.
+    """
+    parts = sorted(vars(kind).items())
+    return [kind.__qualname__, *([name, _part(part, recipe_of, ())] for name, part in parts if _counts(name, part))]
+
+
+def _counts(name: str, part: Any) -> bool:
+    """Not what Python itself notes of a class."""
+    return not name.startswith("__") or bool(_functions(part))
+
+
+def _functions(part: Any) -> list[Any]:
+    """Those of a method, a property, or of what wraps one."""
+    if isinstance(part, property):
+        return [function for function in (part.fget, part.fset, part.fdel) if function is not None]
+    inner = getattr(part, "func", None) if isinstance(part, functools.cached_property) else None
+    inner = inner or getattr(part, "__wrapped__", None) or getattr(part, "__func__", None)
+    return [part] if isinstance(part, FunctionType) and inner is None else [inner] if inner is not None else []
+
+
+def _part(part: Any, recipe_of: Callable[[Any], Any], seen: tuple[int, ...]) -> Any:
+    if id(part) in seen:  # a function that closes over itself
+        return "itself"
+    seen = (*seen, id(part))
+    if isinstance(part, FunctionType):
+        closure = [cell.cell_contents for cell in part.__closure__ or () if _is_filled(cell)]
+        held = [part.__defaults__ or (), part.__kwdefaults__ or {}, *closure]
+        return [_code(part.__code__), [_part(value, recipe_of, seen) for value in held]]
+    if isinstance(part, functools.partial):
+        return [_part(value, recipe_of, seen) for value in (part.func, part.args, part.keywords)]
+    if functions := _functions(part):
+        return [_part(function, recipe_of, seen) for function in functions]
+    if isinstance(part, tuple | list):
+        return [_part(value, recipe_of, seen) for value in part]
+    if isinstance(part, dict):
+        return [[str(name), _part(value, recipe_of, seen)] for name, value in part.items()]
+    try:
+        return recipe_of(part)
+    except TypeError:
+        return type(part).__qualname__ if not isinstance(part, type) else part.__qualname__
+
+
+def _is_filled(cell: Any) -> bool:
+    try:
+        _ = cell.cell_contents
+    except ValueError:  # not yet
+        return False
+    return True
+
+
+def _code(code: CodeType) -> list[Any]:
+    return [code.co_code.hex(), list(code.co_names), list(code.co_varnames), [_constant(one) for one in code.co_consts]]
+
+
+def _constant(value: Any) -> Any:
+    if isinstance(value, CodeType):
+        return _code(value)
+    if isinstance(value, frozenset | tuple):  # a set has another order in every process
+        parts = [_constant(part) for part in value]
+        return sorted(map(repr, parts)) if isinstance(value, frozenset) else parts
+    return [type(value).__name__, repr(value)] if isinstance(value, _PLAIN) else type(value).__name__

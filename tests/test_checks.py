@@ -1,0 +1,169 @@
+"""What is asked of an evaluation, and what other people's parts give: one line, before anything is done with it."""
+
+import shutil
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+import mfvpr
+from mfvpr.archive import Archive
+from mfvpr.data.datasets import folder_dataset, image_folder
+from mfvpr.data.ground_truth import FrameTruth
+from mfvpr.errors import InputError
+from mfvpr.evaluations import Fusion, Matching
+from mfvpr.features import Aggregated, Description
+from mfvpr.features.sift import Sift
+from mfvpr.features.vlad import VladFitting
+from mfvpr.filters import Filtered, Retrieval
+from mfvpr.retrieval import EXACT, WhitenedSearch
+from mfvpr.types import Shortlist
+
+SIFT = Sift(max_keypoints=20, image_size=(160, 120))
+HISTOGRAM = {"histogram": mfvpr.HistogramOfShifts()}
+
+
+@pytest.fixture(scope="module")
+def dataset(small_street):
+    return folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """A filter that gives what it is told to."""
+
+    indices: tuple
+    scores: float = 0.5
+
+    def shortlist(self, sequence, database, num_candidates, archive):
+        indices = np.tile(np.array(self.indices, np.int32), (len(sequence.images), 1))
+        return Filtered(Shortlist(indices, np.full(indices.shape, self.scores, np.float32), indices != -1), {}, {})
+
+
+@dataclass(frozen=True)
+class Own:
+    """An extractor that gives what it is told to."""
+
+    change: str = ""
+    image_size, interpolation, batch_size = SIFT.image_size, SIFT.interpolation, 3
+    vector_size, scales = 0, SIFT.scales
+
+    def __call__(self, images):
+        features = [one.features for one in SIFT(images)]
+        if self.change == "fewer":
+            return [Description(None, (one,)) for one in features[1:]]
+        if self.change == "features":
+            return features
+        if self.change == "dimension":
+            features = [replace(one, descriptors=one.descriptors[:, :5]) for one in features]
+        if self.change == "shape":
+            features = [replace(one, descriptors=one.descriptors.T) for one in features]
+        if self.change == "padded":
+            features = [padded(one) for one in features]
+        return [Description(np.ones(2, np.float32) if self.change == "vector" else None, (one,)) for one in features]
+
+
+def padded(features):
+    """With four slots of nonsense."""
+    more = {name: np.concatenate([values, np.full((4, *values.shape[1:]), 9, values.dtype)])
+            for name, values in (("keypoints", features.keypoints), ("descriptors", features.descriptors),
+                                 ("scores", features.scores))}  # fmt: skip
+    return replace(features, **more, mask=np.arange(len(features.mask) + 4) < len(features.mask))
+
+
+def evaluated(dataset, extractor=SIFT, chosen=None, scorers=HISTOGRAM, **options):
+    chosen = chosen or Fixed((0, 1, 2))
+    return mfvpr.evaluate(dataset, extractor, chosen, scorers, **{"candidates": 3} | options)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"candidates": 0}, "candidates=0: expected a whole number from 1, or 'all'"),
+        ({"candidates": "some"}, "candidates='some': expected"),
+        ({"candidates": 2.5}, "candidates=2.5: expected"),
+        ({"ties": "indx"}, "ties='indx': expected one of filter, index"),
+        ({"memory": -1}, "memory=-1: expected GB above 0, or None"),
+        ({"memory": np.nan}, "memory=nan: expected GB"),
+        ({"fused": {"nope": Fusion()}}, r"fused: expected names of scorers \(histogram\), got nope"),
+        ({"scorers": {"filter": mfvpr.MatchCount()}}, "filter is the name of another system"),
+        ({"scorers": HISTOGRAM | {"histogram + filter": mfvpr.MatchCount()}, "fused": {"histogram": Fusion()}},
+         r"histogram \+ filter is the name of another system"),
+        ({"scorers": {"h": mfvpr.HistogramOfShifts(sigma=-1.0)}}, "h: sigma=-1.0: expected numbers from"),
+        ({"scorers": {"v": lambda matches: matches.points0[:, 0]}}, "v: expected a number for each pair"),
+        ({"matching": Matching(cross_check="x")}, "cross_check='x': expected one of"),
+        ({"fused": {"histogram": Fusion(1.0, "euclidean")}}, "filter_score='euclidean': expected one of"),
+        ({"fused": {"histogram": Fusion(1.0, "negative_euclidean")}, "chosen": Fixed((0, 1, 2), 3.0)},
+         "expected cosine similarities up to 1, got 3"),
+        ({"chosen": Fixed((0, 1, 99))}, "Fixed: expected rows of the database from 0 to 9, got 0 to 99"),
+        ({"chosen": Fixed((0, 1, 1))}, "Fixed: expected every row of the database once, got 1 twice for query 0"),
+        ({"chosen": Fixed((0, 1))}, r"Fixed: expected indices, scores and mask \(bool\) of \[10, 3\] each"),
+        ({"chosen": Fixed((0, 1, 2), np.nan)}, "Fixed: expected finite scores"),
+        ({"chosen": Retrieval(SIFT)}, "Sift: gives no global descriptor; expected one that does, or Aggregated"),
+        ({"extractor": Own("fewer")}, "Own: expected a Description of each of 3 images, got 2"),
+        ({"extractor": Own("features")}, "Own: expected a Description, got Features"),
+        ({"extractor": Own("dimension")}, r"Own: expected local features of \[128\] dimensions, .* got \[5\]"),
+        ({"extractor": Own("shape")}, r"Own: features: expected keypoints \[N, 2\]"),
+        ({"extractor": Own("vector")}, "Own: vector_size=0, but a description with a vector"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_used_is_told(dataset, options, words):
+    with pytest.raises(InputError, match=words):
+        evaluated(dataset, **options)
+
+
+def test_padding_of_ones_own_extractor_is_dropped(dataset, tmp_path):
+    counts = [
+        match.counts
+        for extractor, archive in ((SIFT, None), (Own("padded"), None), (Own("padded"), Archive(tmp_path)))
+        for match in evaluated(dataset, extractor, archive=archive).matched[0].matches
+    ]
+    np.testing.assert_array_equal(counts[1], counts[0])
+    np.testing.assert_array_equal(counts[2], counts[0])
+
+
+def test_no_scorer_is_the_filter_alone(dataset):
+    result = evaluated(dataset, scorers={}, candidates=np.int64(3))
+    assert list(result.systems) == ["filter"]
+    assert repr(result) == "Result(folder: folder (10 queries); filter)"
+    [ranked] = result.systems["filter"]
+    np.testing.assert_array_equal(ranked.shortlist.indices, ranked.rows)
+
+
+def test_scores_that_are_nan_are_told(dataset):
+    lines = []
+    scorers = {"n": lambda matches: jnp.nan * jnp.sum(matches.distance)}
+    evaluated(dataset, scorers=scorers, archive=Archive(tell=lines.append))
+    assert any("of n are NaN, and rank last" in line for line in lines)
+
+
+def test_a_ground_truth_of_other_images_is_told(dataset):
+    other = replace(dataset.only, truth=FrameTruth(tuple((row,) for row in range(9)), 10))
+    result = evaluated(replace(dataset, sequences=(other,)))
+    with pytest.raises(InputError, match="expected a ground truth of 10 queries and 10 database images, got one of 9"):
+        result.recall([0])
+    with pytest.raises(InputError, match=r"ks=\[0\]: expected depths from 1"):
+        result.recall([0], [0])
+    with pytest.raises(InputError, match="threshold=-1: expected a number from 0"):
+        result.recall([-1])
+
+
+def test_dimensions_of_both_sides_must_be_the_same():
+    rng = np.random.default_rng(0)
+    vectors = [rng.normal(size=(4, size)).astype(np.float32) for size in (3, 5)]
+    with pytest.raises(InputError, match="expected as many numbers on both sides, got 3 for queries and 5"):
+        EXACT.shortlist(*vectors, 2)
+    with pytest.raises(InputError, match="dimension=0: expected at least 1"):
+        WhitenedSearch(0)
+
+
+def test_images_of_nothing_have_no_shortlist(dataset, tmp_path):
+    """Their aggregated descriptor is zero, which resembles all images alike."""
+    Image.new("RGB", (160, 120)).save(tmp_path / "0.png")
+    shutil.copy(dataset.queries.paths[3], tmp_path / "1.png")
+    sequence = replace(dataset.only, images=image_folder(tmp_path))
+    described = Retrieval(Aggregated(SIFT, VladFitting(num_words=4)))
+    found = described.shortlist(sequence, dataset.database, 3, Archive()).candidates
+    assert found.mask.tolist() == [[False] * 3, [True] * 3]
