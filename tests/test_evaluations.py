@@ -275,3 +275,14 @@ def test_programs_take_sequences_and_files(split, small_street, files, tmp_path,
                             f"out={tmp_path}/swept")  # fmt: skip
     assert code == 2
     assert "expected one query sequence, got 2" in stderr
+
+
+def test_a_sweep_takes_features_whose_files_tell_the_image_size(small_street, files, tmp_path, monkeypatch, capsys):
+    common = ("dataset=folder", f"dataset.database={small_street}/database", f"dataset.queries={small_street}/queries",
+              "dataset.ground_truth=order", "candidates=5", "store=null", "scorer=sum", "grid.clamp=[true]",
+              "features=import", f"features.database={files}/database.npz", f"features.queries={files}/queries.npz",
+              "features.database_prefix=database/", "features.query_prefix=queries/", "retrieval=pairs",
+              f"retrieval.queries={files}/pairs.npz")  # fmt: skip
+    code, stdout, stderr = typed(monkeypatch, capsys, "sweep", *common, f"out={tmp_path}/out")
+    assert code == 0, stderr
+    assert "score, import features; recall in %" in stdout
