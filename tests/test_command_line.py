@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from experiments import groups
+from experiments.benchmark.__main__ import main as benchmark
 from experiments.launch import version
 from experiments.settings import CONF
 from tests.programs import ROOT, composed, run, typed
@@ -171,3 +172,21 @@ def test_ctrl_c_during_imports_is_one_line(tmp_path, module):
 def test_version_of_programs_without_settings(program):
     done = run("--version", program=program)
     assert (done.returncode, done.stdout) == (0, f"{version()}\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [(["foo"], "invalid choice: 'foo'"), (["--rounds", "0"], "expected a whole number above 0"),
+     (["--stores", "a"], "--stores is for scale alone")],
+)  # fmt: skip
+def test_mistakes_of_the_benchmark_are_one_line(monkeypatch, capsys, arguments, words):
+    monkeypatch.setenv("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # which it sets
+    monkeypatch.setattr(sys, "argv", ["benchmark", *arguments])
+    with pytest.raises(SystemExit) as left:
+        benchmark()
+    stdout, stderr = capsys.readouterr()
+    assert (left.value.code, stdout) == (2, "")
+    assert stderr.startswith("error: ")
+    assert words in stderr
+    assert stderr.endswith("; see python -m experiments.benchmark --help\n")
+    assert stderr.count("\n") == 1
