@@ -100,8 +100,13 @@ def _files(group: str, settings: dict[str, Any], data: Dataset | None) -> dict[P
         data.database.root: File(expanded(settings["database"]), settings["database_prefix"])
     }  # fmt: skip
     for place, sequence in enumerate(data.sequences):
-        path = expanded(queries[place if len(queries) > 1 else 0])
-        files[sequence.images.root] = File(path, settings["query_prefix"])
+        root, path = sequence.images.root, expanded(queries[place if len(queries) > 1 else 0])
+        file = File(path, settings["query_prefix"])
+        if files.setdefault(root, file) != file:
+            raise SettingsError(
+                f"{group}.queries={path}: expected the file and the prefix of {group}.database, since the queries and "
+                f"the database are one folder, {root}; give one file with all of its images for both"
+            )
     return files
 
 

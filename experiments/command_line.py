@@ -20,8 +20,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 from experiments.console import tell
 from experiments.errors import on_interrupt, one_line
-from experiments.groups import PROGRAMS, check_choice, groups
+from experiments.groups import PROGRAMS, check_choice, choices_with, groups
 from experiments.settings import CONF, Program, SettingsError, check
+from experiments.wording import in_settings
 
 PATHS = {"dataset.database", "dataset.queries", "dataset.root", "dataset.index_file", "dataset.cache"}
 PATHS |= {"dataset.database_labels", "dataset.query_labels"}
@@ -46,7 +47,7 @@ def run(program: Program, config: str) -> None:
             work = program()
             _require_device()
             command = shlex.join(job.overrides.task if many else typed)
-            with on_interrupt(signal.default_int_handler):
+            with on_interrupt(signal.default_int_handler), in_settings(settings):
                 work(settings | {"multirun": many, "command": f"python -m experiments.{PROGRAMS[config]} {command}"})
 
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises instead of printing and exiting with 1
@@ -154,10 +155,20 @@ def _explain(error: Exception, config: str) -> str:
     unknown = re.search(r"Could not override '([^']*)'", text) or re.search(r"Key '([^']*)' is not in struct", text)
     if not unknown:
         return text
-    wrong = unknown.group(1)
-    nearest = max(_setting_names(config), key=lambda name: _likeness(wrong, name))
-    alike = max(_likeness(wrong, nearest)) >= 0.6
-    return f"{wrong}: unknown setting; " + (f"the nearest is {nearest}" if alike else "see --help")
+    return f"{unknown[1]}: unknown setting; {_meant(unknown[1], config)}"
+
+
+def _meant(wrong: str, config: str) -> str:
+    """What an unknown setting may be: one of its group, of another choice of its group, of the same name, or alike."""
+    group, name, names = wrong.partition(".")[0], wrong.rpartition(".")[2], _setting_names(config)
+    own = [known for known in names if known.startswith(f"{group}.")] if group in groups(config) else []
+    same = [known for known in names if known.rpartition(".")[2] == name]
+    same_of_own = [known for known in same if known in own]
+    others = [f"{group}={choice}" for choice in choices_with(group, name)] if group in groups(config) else []
+    if others and not same_of_own:
+        return f"{' and '.join(others)} {'have' if len(others) > 1 else 'has'} {group}.{name}"
+    nearest = max(same_of_own or same or own or names, key=lambda known: _likeness(wrong, known))
+    return f"the nearest is {nearest}" if max(_likeness(wrong, nearest)) >= 0.6 else "see --help"
 
 
 def _no_default(name: str) -> str:

@@ -1,5 +1,6 @@
 """Wrong input and interruption, for every program: one line and an exit code, never a traceback."""
 
+import argparse
 import os
 import shlex
 import signal
@@ -16,6 +17,14 @@ if TYPE_CHECKING:  # it brings JAX along
 
 WEIGHTS = "python -m experiments.weights"
 _INTERRUPTED = "\ninterrupted; nothing half-written was left, and what was finished is kept\n"
+
+
+class Parser(argparse.ArgumentParser):
+    """Of programs without settings."""
+
+    def error(self, message: str) -> NoReturn:
+        """Refuse wrong usage."""
+        refuse(f"{message}; see {self.prog} --help")
 
 
 @contextmanager

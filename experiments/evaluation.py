@@ -70,14 +70,21 @@ def text(outcome: Outcome) -> str:
 
 def heading(outcome: Outcome) -> str:
     """One line that says what was evaluated."""
-    settings, dataset = outcome.settings, outcome.images.dataset
+    settings, dataset, matched = outcome.settings, outcome.images.dataset, outcome.judged.result.matched
     queries = sum(len(sequence.images) for sequence in dataset.sequences)
+    bad_queries = sum(len(one.bad_queries) for one in matched)
+    bad_database = len({row for one in matched for row in one.bad_database})
     several = f" in {len(dataset.sequences)} sequences" if len(dataset.sequences) > 1 else ""
     return (
-        f"{dataset.name}: {queries} queries{several}, {len(dataset.database)} database images, "
+        f"{dataset.name}: {queries} queries{several}{_skipped(bad_queries)}, "
+        f"{len(dataset.database)} database images{_skipped(bad_database)}, "
         f"{_num_candidates(outcome)} candidates ({settings['retrieval']['name']}), "
         f"{settings['features']['name']} features; {truth.in_words(settings, dataset)}"
     )
+
+
+def _skipped(number: int) -> str:
+    return f" ({number} skipped)" if number else ""
 
 
 def write(folder: Path, outcome: Outcome) -> None:

@@ -39,6 +39,12 @@ def choices(group: str) -> list[str]:
     return sorted(path.stem for path in (CONF / group).glob("*.yaml")) if group.isidentifier() else []
 
 
+def choices_with(group: str, name: str) -> list[str]:
+    """The choices of a group that have a setting, but for those that are made of other choices."""
+    files = (CONF / group / f"{choice}.yaml" for choice in choices(group))
+    return [file.stem for file in files if name in _read(file) and not defaults(file)]
+
+
 def check_choice(name: str, value: str, config: str) -> None:
     """Refuse a choice that a group does not have, and a group that a program does not take.
 

@@ -1,23 +1,17 @@
 """Published weights: list them, download, convert, verify. `python -m experiments.weights --help`."""
 
-import argparse
 import shlex
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
-from experiments.errors import WEIGHTS, how_to_install, one_line, refuse, unwind_on_sigterm, with_command
+from experiments.errors import WEIGHTS, Parser, how_to_install, one_line, refuse, unwind_on_sigterm, with_command
 
 if TYPE_CHECKING:
     from mfvpr.weights.registry import Entry
 
 # Functions import what they need: --help and wrong usage need not wait for JAX.
 _CHUNK = 1 << 18
-
-
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        refuse(f"{message}; see {WEIGHTS} --help")
 
 
 def main() -> None:
@@ -28,10 +22,10 @@ def main() -> None:
         arguments.pop("run")(**arguments)
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> Parser:
     from experiments.launch import version
 
-    parser = _Parser(prog=WEIGHTS, description="Weights live in MFVPR_WEIGHTS, by default "
+    parser = Parser(prog=WEIGHTS, description="Weights live in MFVPR_WEIGHTS, by default "
                      "~/.cache/mfvpr/weights. None come with the package; each has its own license.")  # fmt: skip
     parser.add_argument("--version", action="version", version=version(), help="print it and exit")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)

@@ -13,6 +13,7 @@ import numpy as np
 from mfvpr.archive import Archive
 from mfvpr.data.datasets import ImageFolder, QuerySequence
 from mfvpr.data.images import Interpolation
+from mfvpr.errors import InputError
 from mfvpr.exchange import ImportedFeatures, open_features, read_global_descriptors, read_shortlist
 from mfvpr.exchange.checks import Lengths
 from mfvpr.features import Scale
@@ -55,9 +56,9 @@ class FeatureFiles:
         """The features of a folder's images; `partial`: some may be missing.
 
         Raises:
-            InputError: see `open_features`.
+            InputError: there is no file of the folder, or see `open_features`.
         """
-        file = self.files[folder.root]
+        file = _file_of(self.files, folder)
         return open_features(
             file.path, file.names(folder), image_size=self.image_size, lengths=self.lengths, partial=partial
         )
@@ -88,7 +89,7 @@ class DescriptorFiles:
         return Filtered(shortlist, {}, {})
 
     def _read(self, folder: ImageFolder) -> np.ndarray:
-        file = self.files[folder.root]
+        file = _file_of(self.files, folder)
         return read_global_descriptors(file.path, file.names(folder), lengths=self.lengths)
 
 
@@ -107,13 +108,27 @@ class ShortlistFiles:
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, archive: Archive
     ) -> Filtered:
-        """See `mfvpr.filters.Filter`; what the sequence excludes is left out, and the others move up."""
-        file = self.files[sequence.images.root]
+        """See `mfvpr.filters.Filter`; what the sequence excludes is left out, and the others move up.
+
+        The archive warns of queries without candidates.
+        """
+        file = _file_of(self.files, sequence.images)
         names = [self.database_prefix + name for name in database.names]
         shortlist = read_shortlist(file.path, file.names(sequence.images), names)
+        if len(without := np.flatnonzero(~shortlist.mask.any(axis=1))):
+            archive.warn(f"{file.path}: no candidates for {len(without)} of {len(shortlist.mask)} queries, the first "
+                         f"{sequence.images.names[without[0]]}; they count as failures")  # fmt: skip
         if sequence.excluded is not None:
             shortlist = _without(shortlist, sequence.excluded.contains(shortlist.indices))
         return Filtered(_cut(shortlist, num_candidates), {}, {})
+
+
+def _file_of(files: Mapping[Path, File], folder: ImageFolder) -> File:
+    """The file of a folder's images."""
+    if folder.root not in files:
+        known = ", ".join(map(str, files)) or "none"
+        raise InputError(f"{folder.root}: expected a folder that a file was given of, one of: {known}")
+    return files[folder.root]
 
 
 def _without(shortlist: Shortlist, excluded: np.ndarray) -> Shortlist:

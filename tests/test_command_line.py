@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from experiments import groups
+from experiments.benchmark.__main__ import main as benchmark
 from experiments.launch import version
 from experiments.settings import CONF
 from tests.programs import ROOT, composed, run, typed
@@ -100,6 +101,12 @@ def test_version(monkeypatch, capsys, program):
         ("evaluate", ["scorer.sgma=3"], "scorer.sgma: unknown setting; the nearest is scorer.histogram.sigma"),
         ("evaluate", ["scorer=histogram", "scorer.sgma=3"], "the nearest is scorer.sigma"),
         ("evaluate", ["candidats=3"], "the nearest is candidates"),
+        ("evaluate", ["dataset.database=a"], "unknown setting; dataset=folder and dataset=sequences have dataset."),
+        ("evaluate", ["scorer=sum", "scorer.sigma=15"], "unknown setting; scorer=histogram has scorer.sigma"),
+        ("evaluate", ["scorer=sum", "scorer.histogram.sigma=15"], "scorer=histogram has scorer.sigma"),
+        ("evaluate", ["scorer.sigma=15"], "the nearest is scorer.histogram.sigma"),
+        ("evaluate", ["retrieval=pairs", "retrieval.file=a"], "the nearest is retrieval.queries"),
+        ("evaluate", ["features.num_words=9"], "the nearest is retrieval.num_words"),
         ("evaluate", ["scorer=histogram", "scorer.sigma=nan"], "scorer.sigma=nan: expected a number above 0"),
         ("evaluate", ["candidates=0"], "candidates=0: expected a whole number above 0 (at most 1000000), or all"),
         ("evaluate", ["features.image_size=[336]"], "features.image_size=[336]: expected a list of 2"),
@@ -165,3 +172,21 @@ def test_ctrl_c_during_imports_is_one_line(tmp_path, module):
 def test_version_of_programs_without_settings(program):
     done = run("--version", program=program)
     assert (done.returncode, done.stdout) == (0, f"{version()}\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [(["foo"], "invalid choice: 'foo'"), (["--rounds", "0"], "expected a whole number above 0"),
+     (["--stores", "a"], "--stores is for scale alone")],
+)  # fmt: skip
+def test_mistakes_of_the_benchmark_are_one_line(monkeypatch, capsys, arguments, words):
+    monkeypatch.setenv("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # which it sets
+    monkeypatch.setattr(sys, "argv", ["benchmark", *arguments])
+    with pytest.raises(SystemExit) as left:
+        benchmark()
+    stdout, stderr = capsys.readouterr()
+    assert (left.value.code, stdout) == (2, "")
+    assert stderr.startswith("error: ")
+    assert words in stderr
+    assert stderr.endswith("; see python -m experiments.benchmark --help\n")
+    assert stderr.count("\n") == 1

@@ -3,6 +3,7 @@
 import itertools
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from mfvpr.filters import Retrieval
 from mfvpr.fingerprints import fingerprint
 from mfvpr.imported import DescriptorFiles, FeatureFiles, File, ShortlistFiles
 from mfvpr.progress import untracked
-from mfvpr.report.evaluations import Judged, recall_table
+from mfvpr.report.evaluations import Judged, recall_table, write_rankings
 from mfvpr.retrieval import WhitenedSearch
 from tests.programs import typed
 
@@ -268,10 +269,46 @@ def test_programs_take_sequences_and_files(split, small_street, files, tmp_path,
     assert code == 0, stderr
     assert "sequences: 10 queries in 2 sequences, 10 database images, 5 candidates (vlad), import features" in stdout
     names = {path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.csv")}
-    assert {"first/predictions.csv", "second/predictions/count_filter.csv", "table.csv"} <= names
+    assert {"sequences/first/predictions.csv", "sequences/second/predictions/count_filter.csv", "table.csv"} <= names
     table = (tmp_path / "out" / "table.csv").read_text().splitlines()
     assert [line.split(",")[1] for line in table[1:5]] == ["first", "second", "mean", "pooled"]
     code, _, stderr = typed(monkeypatch, capsys, "sweep", *common[:-3], "scorer=histogram", "grid.sigma=[10,20]",
                             f"out={tmp_path}/swept")  # fmt: skip
     assert code == 2
     assert "expected one query sequence, got 2" in stderr
+
+
+def test_a_sweep_takes_features_whose_files_tell_the_image_size(small_street, files, tmp_path, monkeypatch, capsys):
+    common = ("dataset=folder", f"dataset.database={small_street}/database", f"dataset.queries={small_street}/queries",
+              "dataset.ground_truth=order", "candidates=5", "store=null", "scorer=sum", "grid.clamp=[true]",
+              "features=import", f"features.database={files}/database.npz", f"features.queries={files}/queries.npz",
+              "features.database_prefix=database/", "features.query_prefix=queries/", "retrieval=pairs",
+              f"retrieval.queries={files}/pairs.npz")  # fmt: skip
+    code, stdout, stderr = typed(monkeypatch, capsys, "sweep", *common, f"out={tmp_path}/out")
+    assert code == 0, stderr
+    assert "score, import features; recall in %" in stdout
+
+
+@pytest.mark.parametrize("taken", ["mean", "pooled"])
+def test_no_sequence_is_called_as_a_row_of_the_table(small_street, tmp_path, taken):
+    with pytest.raises(InputError, match=f"queries: expected no sequence called {taken}, as results call one of their"):
+        sequences_dataset(small_street / "database", [tmp_path / "a", tmp_path / taken], ground_truth="none")
+
+
+def test_sequences_of_any_name_leave_all_of_their_files(split, small_street, tmp_path, monkeypatch):
+    """Called as files of the run folder, by a path that ends with no name, or by a link."""
+    names = ["predictions", "results.json", "table.csv", "figures"]
+    for name in names:
+        (tmp_path / name).symlink_to(split[0])
+    shutil.copytree(split[0], tmp_path / "real")
+    (tmp_path / "real" / "deeper").mkdir()
+    monkeypatch.chdir(split[1])
+    folders = [*(tmp_path / name for name in names), tmp_path / "real" / "deeper" / "..", Path()]
+    several = sequences_dataset(small_street / "database", folders, ground_truth="none")
+    assert [sequence.name for sequence in several.sequences] == [*names, "real", "second"]
+    found = mfvpr.evaluate(several, SIFT, VLAD, {"count": mfvpr.MatchCount()}, candidates=2)
+    write_rankings(tmp_path / "out", Judged(found, [], [1], "count"))
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["sequences"]
+    for name in (*names, "real", "second"):
+        own = tmp_path / "out" / "sequences" / name
+        assert {path.name for path in own.rglob("*.csv")} >= {"predictions.csv", "filter.csv", "count.csv"}

@@ -76,6 +76,8 @@ def test_bad_images_by_policy(small_street, tmp_path, monkeypatch, capsys):
     code, _, stderr = typed(monkeypatch, capsys, "evaluate", *arguments, "on_bad_image=skip")
     assert code == 0, stderr
     assert "candidates=99, but the database has 10 images" in stderr
+    heading = (tmp_path / "out" / "table.md").read_text().splitlines()[0]
+    assert ": 10 queries, 10 database images (1 skipped), 10 candidates (" in heading
     with (tmp_path / "out" / "skipped.csv").open() as file:
         assert [(row["folder"], row["image"]) for row in csv.DictReader(file)] == [("database", "é 0003.png")]
     with (tmp_path / "out" / "predictions.csv").open() as file:

@@ -8,7 +8,7 @@ import os
 from importlib import import_module
 from pathlib import Path
 
-from experiments.errors import one_line
+from experiments.errors import Parser, one_line
 from experiments.launch import version
 
 # Each is the module of this name, whose `run(rounds, out)` prints a table and writes it as JSON.
@@ -22,7 +22,7 @@ BENCHMARKS = {
 
 def main() -> None:
     """Run the chosen benchmark; only then is its module imported, so that --help need not wait for JAX."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="python -m experiments.benchmark",
         description=__doc__,
         epilog="\n".join(["benchmarks:", *(f"  {name:<9} {about}" for name, about in BENCHMARKS.items())]),

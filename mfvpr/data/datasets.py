@@ -14,6 +14,8 @@ from mfvpr.data.truth_files import truth_from_file, truth_from_labels
 from mfvpr.errors import InputError
 from mfvpr.evaluation import Positives, Truth
 
+MEANS = ("mean", "pooled")  # what results call the means over sequences, and over all of their queries
+
 
 @dataclass(frozen=True)
 class ImageFolder:
@@ -177,7 +179,7 @@ def sequences_dataset(
 
     Args:
         database: folder of database images.
-        queries: folders of query images, each of another name.
+        queries: folders of query images, each of another name, and none called as a mean (`MEANS`).
         ground_truth: one of `ground_truth.KINDS` but `label`, of every sequence.
         name: what results call it.
         index_file: for `index`, the file's name in the folder of each sequence, see `truth_files.truth_from_file`.
@@ -186,14 +188,18 @@ def sequences_dataset(
         bits: likewise.
 
     Raises:
-        InputError: no sequence, or two of one name; or as `folder_dataset`.
+        InputError: no sequence, two of one name, or one with the name of a mean; or as `folder_dataset`.
     """
-    names = [folder.absolute().name for folder in queries]
+    names = [(folder.resolve() if folder.name in ("", "..") else folder).name for folder in queries]
     if not names:
         raise InputError("queries: expected the folder of at least one sequence, got none")
     for twice in {one for one in names if names.count(one) > 1}:
         raise InputError(
             f"queries: expected sequences of different names, got {twice} twice; rename one of the folders"
+        )
+    for taken in {*names} & {*MEANS}:
+        raise InputError(
+            f"queries: expected no sequence called {taken}, as results call one of their means; rename the folder"
         )
     images = image_folder(database, orient=orient, bits=bits)
     sequences = (

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
 from mfvpr.data.files import printable
+from mfvpr.data.images import SUFFIXES
 from mfvpr.errors import InputError
 from mfvpr.exchange.containers import shortened
 
@@ -13,8 +14,8 @@ def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> lis
     """What a file calls each image.
 
     An image is called by its relative path, as in hloc; else by a path that is the end of its own or has its own as its
-    end (so a file name alone, or a path from another root); else the same without the suffixes. Paths that differ in a
-    folder are different images.
+    end (so a file name alone, or a path from another root); else the same without the suffixes of images. Paths that
+    differ in a folder are different images.
 
     Args:
         path: file, for messages.
@@ -93,9 +94,9 @@ def _whole(name: str) -> list[str]:
 
 
 def _stems(name: str) -> list[str]:
-    """Without the suffix, or as it is: files named by stems have none, and stems may hold dots."""
-    stem = PurePosixPath(name).with_suffix("").as_posix() if PurePosixPath(name).suffix else name
-    return [stem, name] if stem != name else [name]
+    """Without the suffix of an image, or as it is: files named by stems have none, and stems may hold dots."""
+    path = PurePosixPath(name)
+    return [path.with_suffix("").as_posix(), name] if path.suffix.lower() in SUFFIXES else [name]
 
 
 def _ends(name: str) -> Iterator[str]:

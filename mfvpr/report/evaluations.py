@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from mfvpr.data.datasets import ImageFolder, QuerySequence
+from mfvpr.data.datasets import MEANS, ImageFolder, QuerySequence
 from mfvpr.data.files import write_text
 from mfvpr.data.images import resize
 from mfvpr.evaluation import Positives, threshold_words
@@ -20,8 +20,6 @@ from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table
 from mfvpr.results import Matched, Ranked, Recall, Result
 from mfvpr.scoring import HistogramOfShifts
-
-MEANS = ("mean", "pooled")  # over the sequences, and over all of their queries
 
 
 @dataclass(frozen=True)
@@ -91,11 +89,11 @@ def recall_table(judged: Judged) -> Table:
 def write_rankings(folder: Path, judged: Judged) -> None:
     """`predictions/` and `failures/` of every system, those of the headline's in the folder itself.
 
-    Of several sequences each has its own folders.
+    Of several sequences each has a folder with its own, `sequences/<name>/`: a name may be that of any other file.
     """
     database = judged.result.dataset.database.names
     for place, sequence in enumerate(judged.sequences):
-        own = folder / sequence.name if len(judged.sequences) > 1 else folder
+        own = folder / "sequences" / sequence.name if len(judged.sequences) > 1 else folder
         for name, ranked in judged.result.systems.items():
             answers = ranked[place]
             rankings = Rankings(

@@ -83,8 +83,9 @@ def _summary(outcome: Outcome) -> Iterator[str]:
     best = np.argsort(-outcome.recall[:, judge.main], kind="stable")[:TOP].tolist()
     beside = "" if own in best else "; last: the scorer's own values"
     yield f"Best settings by {judge.label(1, judge.thresholds[judge.main])}, all queries{beside}."
-    yield table(outcome, list(dict.fromkeys([*best, own]))).text()
-    if outcome.is_grid and not judge.halves:
+    shown = list(dict.fromkeys([*best, own]))
+    yield table(outcome, shown).text()
+    if outcome.is_grid and not judge.halves and len(shown) < len(outcome.settings):
         around = evaluation.neighbors(outcome.axes.values, outcome.chosen[0])
         if around:
             yield "The best, and its neighbors in the grid:"
@@ -94,11 +95,12 @@ def _summary(outcome: Outcome) -> Iterator[str]:
 
 def _verdicts(outcome: Outcome) -> Iterator[str]:
     judge = outcome.judge
-    for half, number in zip(judge.halves, outcome.chosen, strict=False):
-        yield (f"chosen on {len(half.tune)} queries of one half, reported on the {len(half.report)} of the other: "
+    for name, half, number in zip(judge.names, judge.halves, outcome.chosen, strict=False):
+        yield (f"chosen on {len(half.tune)} queries of {name}, reported on the {len(half.report)} of the other half: "
                f"{_in_words(outcome, number)}")  # fmt: skip
     if not judge.halves:
         yield f"chosen: {_in_words(outcome, outcome.chosen[0])}"
+    yield "Recall at 1 in %, with 95 % intervals in brackets:"
     for verdict in outcome.report:
         yield (
             f"{judge.label(1, verdict.threshold)}: chosen {_with_interval(verdict.chosen)}, own values "

@@ -7,6 +7,7 @@ block by block (some settings, some queries), which bounds the memory and is whe
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -215,7 +216,8 @@ def _kept(
     except (OSError, InputError):
         pass  # not there, or damaged
     rows = compute()
-    write_arrays(path, {"rows": rows}, key)
+    with suppress(FileNotFoundError):  # the folder goes where another process ends the same sweep meanwhile
+        write_arrays(path, {"rows": rows}, key)
     return rows
 
 

@@ -24,6 +24,10 @@ FILE = Path("feats.h5")
         (["a/1.jpg"], ["a/1.png"], ["a/1.png"]),
         (["@5.25@4.50@.jpg"], ["@5.25@4.50@", "@5.25@4.50"], ["@5.25@4.50@"]),
         (["a/1.jpg"], ["b/1.jpg"], [None]),  # another folder is another image
+        (["img.jpg", "img.1.jpg"], ["img.1"], [None, "img.1"]),  # stems may hold dots
+        (["img.jpg"], ["img.1"], [None]),
+        (["img.1.jpg"], ["img"], [None]),
+        (["a/1.JPG"], ["a/1.tiff"], ["a/1.tiff"]),
         (["a/1.jpg", "b/1.jpg"], ["a/1.jpg", "1.png.h5"], ["a/1.jpg", None]),
         (["1.jpg", "x/1.jpg"], ["1.jpg"], ["1.jpg", None]),  # what is matched whole is not matched again
         (["a.jpg"], ["queries/b.jpg"], [None]),
@@ -61,7 +65,7 @@ def test_missing_images_are_counted():
         require_all(FILE, ["a.jpg", "b.jpg", "c.jpg"], ["a.jpg", None, None], "features")
 
 
-paths = st.lists(st.sampled_from(["a", "b", "1.x", "1.y", "2"]), min_size=1, max_size=3).map("/".join)
+paths = st.lists(st.sampled_from(["a", "b", "1.png", "1.jpg", "1.1", "2"]), min_size=1, max_size=3).map("/".join)
 
 
 @given(st.lists(paths, unique=True, max_size=5), st.lists(paths, unique=True, max_size=5))
@@ -75,7 +79,7 @@ def test_whatever_is_matched_is_called_so_alone(names, foreign):
     for name, other in zip(names, matched, strict=True):
         assert (other == name) if name in foreign else True
         if other is not None:
-            ours, theirs = (text.rpartition(".")[0] or text for text in (name, other))
+            ours, theirs = (text.removesuffix(".png").removesuffix(".jpg") for text in (name, other))
             shorter = min(len(ours.split("/")), len(theirs.split("/")))
             tails = [text.split("/")[-shorter:] for text in (ours, theirs)]
             assert tails[0] == tails[1] or name.split("/")[-shorter:] == other.split("/")[-shorter:]

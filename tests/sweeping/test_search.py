@@ -141,5 +141,15 @@ def test_what_people_read_is_what_was_measured(outcome):
     assert found["chosen"] == [outcome.settings[number] for number in outcome.chosen]
     assert [entry["parameters"] for entry in found["settings"]] == outcome.settings
     text = sweeps.text(outcome)
-    assert text.count("queries of one half, reported on the 16 of the other: weight = ") == 2
+    for half in ("first_half", "second_half"):
+        assert text.count(f"queries of {half}, reported on the 16 of the other half: weight = ") == 1
+    assert text.count("95 % intervals") == 1
     assert [name for name, _ in sweeps.figures(outcome)] == ["weight_c.png"]
+
+
+def test_neighbors_of_the_best_are_shown_where_not_all_settings_are(data, monkeypatch):
+    axes = Axes(SUM, {"clamp": [False, True], "c": [0, 1, 2]}, {"clamp": False, "c": 0})
+    outcome = sweeping.search_grid(axes, judge(TRUTH, TOLERANCES), *data, ks=[1])
+    assert "neighbors" not in sweeps.text(outcome)
+    monkeypatch.setattr(sweeps, "TOP", 2)
+    assert "The best, and its neighbors in the grid:" in sweeps.text(outcome)

@@ -1,6 +1,8 @@
 """Sweeps against one evaluation after the other."""
 
+import errno
 import itertools
+import sys
 from dataclasses import replace
 
 import jax
@@ -349,3 +351,18 @@ def test_pairs_score_the_same_in_a_smaller_set(data, scorer, monkeypatch):
         listed = jax.tree.map(lambda rows: rows[: len(one.matches)], candidates)  # noqa: B023
         sweeping.sweep(scorer, [{"max_distance": 2.0}], one, listed)
     np.testing.assert_array_equal(found[0][..., :2, :], found[1])
+
+
+def test_a_folder_that_goes_meanwhile_costs_nothing_but_a_full_disk_is_told(data, tmp_path, monkeypatch):
+    """Of blocks: whoever ends the same sweep first removes it."""
+    settings, expected = [{"c": 0.5}], sweeping.sweep(mfvpr.MatchCount(), [{"c": 0.5}], *data)
+    error = FileNotFoundError
+
+    def write(*_):
+        raise error(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(sys.modules["mfvpr.sweeping.sweep"], "write_arrays", write)
+    np.testing.assert_array_equal(sweeping.sweep(mfvpr.MatchCount(), settings, *data, folder=tmp_path), expected)
+    error = OSError
+    with pytest.raises(OSError, match="No space left"):
+        sweeping.sweep(mfvpr.MatchCount(), settings, *data, folder=tmp_path)

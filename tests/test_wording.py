@@ -1,0 +1,88 @@
+"""What the library refuses, in words of the settings."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mfvpr.exchange import write_features, write_global_descriptors
+from tests.builders import make_features, unit
+from tests.programs import typed
+
+SIZE = 64
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory):
+    """Three images on either side and their features, of another program: called by other paths, of other lengths."""
+    root, rng = tmp_path_factory.mktemp("wording"), np.random.default_rng(0)
+    names, features = [], []
+    for side in ("database", "queries", "broken"):
+        (root / side).mkdir()
+        for row in range(3):
+            picture = rng.integers(0, 255, (SIZE, SIZE, 3), np.uint8)
+            Image.fromarray(picture).save(root / side / f"{row}.png")
+            names.append(f"{side}/{row}.png")
+            features.append(make_features(rng, 5, size=SIZE))
+    whole = (root / "broken" / "1.png").read_bytes()
+    (root / "broken" / "1.png").write_bytes(whole[: len(whole) // 2])
+    write_features(root / "both.h5", names, enumerate(features))
+    vectors = unit(rng.normal(size=(len(names), 4)))
+    write_global_descriptors(root / "both_vectors.h5", names, vectors)
+    plain = [f"{row}.png" for row in range(3)]
+    write_features(root / "some.npz", plain[:2], enumerate(features[:2]))
+    write_global_descriptors(root / "long.npz", plain, 2 * vectors[:3])
+    parts = {part: np.asarray(getattr(features[0], part)) for part in ("keypoints", "descriptors", "scores")}
+    np.savez(root / "sizeless.npz", **{f"{name}/{part}": array for name in plain for part, array in parts.items()})
+    np.savez(root / "long_features.npz", **{
+        f"{name}/{part}": array * (2 if part == "descriptors" else 1)
+        for name in plain for part, array in (parts | {"image_size": np.array([SIZE, SIZE])}).items()
+    })  # fmt: skip
+    return root
+
+
+def files(group, file):
+    return [f"{group}=import", *(f"{group}.{side}=ROOT/{file}" for side in ("database", "queries"))]
+
+
+ORDER = "dataset.ground_truth=order"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["dataset.ground_truth=index"], "error: dataset.ground_truth=index: expected a file; give "
+                                         "dataset.index_file=FILE as well"),
+        (["dataset.ground_truth=label"], "give dataset.database_labels=FILE as well"),
+        ([ORDER, "dataset.index_file=a.csv"], "given as dataset.index_file, but dataset.ground_truth=order; set it"),
+        ([ORDER, "dataset.exclude_neighbors=1"], "error: dataset.exclude_neighbors=1: expected queries that"),
+        ([ORDER, "retrieval.num_words=99"], "or lower retrieval.num_words"),
+        ([ORDER, "dataset.queries=ROOT/broken"], "or set on_bad_image=skip"),
+        ([ORDER, "dataset=sequences", "dataset.queries=[ROOT/queries,ROOT/mean]"], "error: dataset.queries: expected"),
+        ([ORDER, *files("features", "both.h5")], "with features.database_prefix=... and features.query_prefix=..."),
+        ([ORDER, *files("retrieval", "both_vectors.h5")], "with retrieval.database_prefix=... and retrieval.qu"),
+        ([ORDER, *files("features", "some.npz")], "behind features.database_prefix and features.query_prefix)"),
+        ([ORDER, *files("features", "sizeless.npz")], "give it as features.image_size=[W,H]"),
+        ([ORDER, *files("features", "long_features.npz")], "features.lengths=normalize gives them unit length, fea"),
+        ([ORDER, *files("retrieval", "long.npz")], "retrieval.lengths=normalize gives them unit length, ret"),
+    ],
+)  # fmt: skip
+def test_what_is_refused_says_which_setting_mends_it(images, tmp_path, monkeypatch, capsys, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    own = ("dataset=folder", f"dataset.database={images}/database", f"dataset.queries={images}/queries", "store=null",
+           "candidates=2", "scorer=count")  # fmt: skip
+    typed_here = [one.replace("ROOT", str(images)) for one in arguments]
+    given = [one for one in own if not any(one.partition("=")[0] == other.partition("=")[0] for other in typed_here)]
+    given += [] if "features=import" in typed_here else ["features.image_size=[64,64]"]
+    given += [] if {"retrieval=import", "retrieval.num_words=99"} & {*typed_here} else ["retrieval.num_words=2"]
+    code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *given, *typed_here)
+    assert (code, stdout) == (2, ""), stderr
+    assert words in stderr.splitlines()[-1]
+
+
+def test_a_sweep_says_how_one_sequence_is_chosen(images, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    several = ("dataset=sequences", f"dataset.database={images}/database", ORDER,
+               f"dataset.queries=[{images}/queries,{images}/database]", "scorer=sum", "grid.clamp=[true]")  # fmt: skip
+    code, _, stderr = typed(monkeypatch, capsys, "sweep", *several, "store=null")
+    assert code == 2
+    assert "expected one query sequence, got 2; give one folder as dataset.queries=[DIR], of queries, d" in stderr
