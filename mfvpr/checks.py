@@ -1,16 +1,18 @@
 """What an evaluation is asked for, and what filters of others give: told in one line, before it costs anything."""
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, get_args
 
 import numpy as np
 
+from mfvpr.data.datasets import ImageFolder
 from mfvpr.declaration import declared
 from mfvpr.errors import InputError
 from mfvpr.reranking import Ties
-from mfvpr.results import FILTER
+from mfvpr.results import FILTER, Matched, Ranked
 from mfvpr.scoring import SCORERS
+from mfvpr.sources import FeatureSet
 from mfvpr.types import Shortlist
 
 
@@ -81,3 +83,20 @@ def check_shortlist(shortlist: Any, who: str, num_queries: int, num_database: in
                          f"{query}")  # fmt: skip
     if not (np.isfinite(scores[mask]).all() and (indices[~mask] == -1).all()):
         raise InputError(f"{who}: expected finite scores, and -1 where there is no candidate")
+
+
+def wrong_with(folder: ImageFolder, features: FeatureSet, bad: Mapping[int, str]) -> Iterator[str]:
+    """What is wrong with some images, which rank last, or have no matches."""
+    yield from bad.values()
+    counts = np.asarray(features.source.counts)
+    if empty := [row for row in np.flatnonzero(counts == 0).tolist() if row not in bad]:
+        yield (f"{folder.paths[empty[0]]}: no keypoints, so no matches ({len(empty)} such images of {len(folder)}); "
+               "scores are 0")  # fmt: skip
+
+
+def nan_scores(matched: Sequence[Matched], ranked: Sequence[Mapping[str, Ranked]]) -> Iterator[str]:
+    """Scorers of one's own may divide by 0."""
+    for sequence, systems in zip(matched, ranked, strict=True):
+        for name, system in systems.items():
+            if number := int(np.isnan(system.scores[system.rows >= 0]).sum()):
+                yield f"{sequence.sequence.name}: {number} scores of {name} are NaN, and rank last"

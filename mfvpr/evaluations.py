@@ -17,8 +17,8 @@ import numpy as np
 
 from mfvpr import pipeline
 from mfvpr.archive import Archive
-from mfvpr.checks import check_request, check_shortlist
-from mfvpr.data.datasets import Dataset, ImageFolder, QuerySequence
+from mfvpr.checks import check_request, check_shortlist, nan_scores, wrong_with
+from mfvpr.data.datasets import Dataset, QuerySequence
 from mfvpr.data.files import write_text
 from mfvpr.errors import InputError
 from mfvpr.features import Extractor, Source
@@ -30,7 +30,6 @@ from mfvpr.progress import Track, untracked
 from mfvpr.reranking import FilterScore, Ties, fuse_shortlist, rank_shortlist
 from mfvpr.results import FILTER, Matched, Ranked, Result
 from mfvpr.scoring import Scorer
-from mfvpr.sources import FeatureSet
 from mfvpr.stores.matches import MatchStore
 from mfvpr.types import Shortlist
 
@@ -116,7 +115,8 @@ def evaluate(
     with watch("scores"):
         options = {"devices": devices, "track": archive.track("scores")}
         ranked = [rank_sequence(sequence, scorers, fused or {}, ties, **options) for sequence in matched]
-    _warn_of_nan(archive, matched, ranked)
+    for line in nan_scores(matched, ranked):
+        archive.warn(line)
     systems = {name: [by_system[name] for by_system in ranked] for name in ranked[0]}
     return Result(dataset, matched, systems, watch.seconds)
 
@@ -163,7 +163,7 @@ def match_sequence(
             recipe = matches_recipe(dataset, sequence, extractor, filter, num_candidates, matching, archive)
             stores = [held.enter_context(one) for one in _match_stores(sequence, extractor, recipe, archive)]
         if kept := _kept(sequence, stores, archive, watch, where.get("memory")):
-            return kept
+            return _looked_at(kept, archive)
         with watch("filter"):
             filtered = filter.shortlist(sequence, database, num_candidates, archive)
             if not isinstance(filtered, Filtered):
@@ -178,8 +178,8 @@ def match_sequence(
         bad_queries = {**filtered.bad_queries, **query_features[0].bad}
         bad_database = {**filtered.bad_database, **database_features[0].bad}
         warnings = [
-            *_wrong_with(database, database_features[0], bad_database),
-            *_wrong_with(sequence.images, query_features[0], bad_queries),
+            *wrong_with(database, database_features[0], bad_database),
+            *wrong_with(sequence.images, query_features[0], bad_queries),
         ]
         _remark(stores, archive, {"queries": bad_queries, "database": bad_database, "warnings": warnings})
         with watch("matching"):
@@ -192,7 +192,17 @@ def match_sequence(
                     query_features, database_features, stores or [None] * len(query_features), strict=True
                 )
             )  # fmt: skip
-    return Matched(sequence, filtered.candidates, matches, bad_queries, bad_database)
+    return _looked_at(Matched(sequence, filtered.candidates, matches, bad_queries, bad_database), archive)
+
+
+def _looked_at(matched: Matched, archive: Archive) -> Matched:
+    """The same; queries that the filter finds nothing for are told."""
+    nothing = [row for row in np.flatnonzero(~matched.candidates.mask.any(axis=1)) if row not in matched.bad_queries]
+    if nothing:
+        images = matched.sequence.images
+        archive.warn(f"{images.paths[nothing[0]]}: no candidates ({len(nothing)} such queries of {len(images)}), which "
+                     "counts as a failure")  # fmt: skip
+    return matched
 
 
 def _kept(
@@ -278,20 +288,3 @@ def _match_stores(
             {**recipe, "scale": number} if several else recipe, len(sequence.images), recipe["candidates"],
             typical=scale.typical_count // 3, label=f"{sequence.name} matches",
         )  # fmt: skip
-
-
-def _warn_of_nan(archive: Archive, matched: Sequence[Matched], ranked: Sequence[Mapping[str, Ranked]]) -> None:
-    """Scorers of one's own may divide by 0."""
-    for one, systems in zip(matched, ranked, strict=True):
-        for name, system in systems.items():
-            if number := int(np.isnan(system.scores[system.rows >= 0]).sum()):
-                archive.warn(f"{one.sequence.name}: {number} scores of {name} are NaN, and rank last")
-
-
-def _wrong_with(folder: ImageFolder, features: FeatureSet, bad: Mapping[int, str]) -> Iterator[str]:
-    """What is wrong with some images, which rank last, or have no matches."""
-    yield from bad.values()
-    counts = np.asarray(features.source.counts)
-    if empty := [row for row in np.flatnonzero(counts == 0).tolist() if row not in bad]:
-        yield (f"{folder.paths[empty[0]]}: no keypoints, so no matches ({len(empty)} such images of {len(folder)}); "
-               "scores are 0")  # fmt: skip

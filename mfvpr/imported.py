@@ -108,16 +108,10 @@ class ShortlistFiles:
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, archive: Archive
     ) -> Filtered:
-        """See `mfvpr.filters.Filter`; what the sequence excludes is left out, and the others move up.
-
-        The archive warns of queries without candidates.
-        """
+        """See `mfvpr.filters.Filter`; what the sequence excludes is left out, and the others move up."""
         file = _file_of(self.files, sequence.images)
         names = [self.database_prefix + name for name in database.names]
         shortlist = read_shortlist(file.path, file.names(sequence.images), names)
-        if len(without := np.flatnonzero(~shortlist.mask.any(axis=1))):
-            archive.warn(f"{file.path}: no candidates for {len(without)} of {len(shortlist.mask)} queries, the first "
-                         f"{sequence.images.names[without[0]]}; they count as failures")  # fmt: skip
         if sequence.excluded is not None:
             shortlist = _without(shortlist, sequence.excluded.contains(shortlist.indices))
         return Filtered(_cut(shortlist, num_candidates), {}, {})

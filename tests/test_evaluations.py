@@ -207,6 +207,18 @@ def test_imported_shortlists_leave_out_what_is_excluded(dataset, files):
             assert (np.diff(mask.astype(int)) <= 0).all()
 
 
+def test_queries_without_candidates_are_told(dataset, tmp_path):
+    """Also where matches are kept from before, and nothing else is read."""
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("0000.png 0001.png\n0004.png 0003.png\n")
+    listed = ShortlistFiles({dataset.queries.root: File(pairs)})
+    for _ in range(2):
+        lines = []
+        mfvpr.evaluate(dataset, SIFT, listed, SCORERS, candidates=2, archive=Archive(tmp_path / "s", tell=lines.append))
+        [line] = [line for line in lines if "no candidates" in line]
+        assert line.endswith("0001.png: no candidates (8 such queries of 10), which counts as a failure")
+
+
 def test_files_are_known_by_content(dataset, files, tmp_path):
     archive, before = Archive(tmp_path / "s"), FeatureFiles(at(dataset, files, ".npz"))
     recipe = archive.recipe(dataset.database, before)

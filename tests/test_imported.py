@@ -2,7 +2,6 @@
 
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 from experiments import build
@@ -15,20 +14,6 @@ from mfvpr.imported import DescriptorFiles, FeatureFiles, File, ShortlistFiles
 
 def folder(root, count=3):
     return ImageFolder(root, tuple(f"{row}.png" for row in range(count)))
-
-
-def test_queries_without_candidates_are_told_once(tmp_path):
-    pairs, lines = tmp_path / "pairs.txt", []
-    pairs.write_text("0.png 1.png\n0.png 2.png\n")
-    images = folder(tmp_path)
-    found, sequence = ShortlistFiles({tmp_path: File(pairs)}), QuerySequence("some", images, None)
-    archive = Archive(tell=lines.append)
-    for _ in range(2):
-        shortlist = found.shortlist(sequence, images, 2, archive).candidates
-    np.testing.assert_array_equal(shortlist.indices, [[1, 2], [-1, -1], [-1, -1]])
-    assert lines == [f"warning: {pairs}: no candidates for 2 of 3 queries, the first 1.png; they count as failures"]
-    pairs.write_text("0.png 1.png\n1.png 2.png\n2.png 0.png\n")
-    found.shortlist(sequence, images, 2, Archive(tell=pytest.fail))
 
 
 @pytest.mark.parametrize(

@@ -70,7 +70,7 @@ ALLOWED = {
     "features": {"errors", "types", "numerics", "data", "models", "ragged", "sources", "features"},
     "extraction": {"errors", "types", "numerics", "data", "features", "progress", "sources", "threads"},
     "exchange": {"errors", "types", "data", "exchange"},
-    "checks": {"declaration", "errors", "reranking", "results", "scoring", "types"},
+    "checks": {"data", "declaration", "errors", "reranking", "results", "scoring", "sources", "types"},
     "testing": {"numerics", "reranking", "scoring", "types"},
     "report": {
         "archive",
