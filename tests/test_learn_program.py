@@ -204,7 +204,7 @@ def test_a_checkpoint_of_another_model_is_refused(root, learned, tmp_path, monke
     before = snapshot(root)
     for change, words in (
         ("learning_rate=0.5", "learning_rate=0.05, expected 0.5"),
-        ("recall.tolerances=[1]", "positives="),
+        ("recall.tolerances=[1]", "tolerances.tolerances[0]=0, expected 1"),
         ("loss=recall", 'loss="cross_entropy", expected "recall"'),
     ):
         arguments = (*small(root), *SHORT, change, f"checkpoints={kept.parent}", f"out={tmp_path}/out")
