@@ -100,7 +100,7 @@ class Archive:
             recipe = fingerprint(recipe_of(by, lambda path: [str(path), *map(state_of, files_of(path).paths)]))
         except TypeError:
             recipe = id(by)
-        key = name, folder, hash(tuple(map(str, map(state_of, folder.paths)))), recipe
+        key = name, folder, hash(tuple(str(state_of(f"{folder.root}/{image}")) for image in folder.names)), recipe
         if key not in self._computed:
             self._computed[key] = compute(), by  # which lives as long, so that its id is no other's
         return self._computed[key][0]

@@ -1,15 +1,19 @@
 """What the methods of a class do, as far as they say it themselves: so that changed code is not taken for the old.
 
-It is what runs that counts, not the text of a file, which may have been edited since: instructions, constants, names,
-defaults, and what a function closes over. What methods call elsewhere is not looked at.
+It is what runs that counts (instructions, constants, names, defaults, and what a function closes over), and the text
+of the class where there is one: a file may have been edited since it was read. What methods call is not looked at.
 """
 
 import functools
+import inspect
 from collections.abc import Callable
 from types import CodeType, FunctionType
 from typing import Any
 
-_PLAIN = (type(None), bool, int, float, complex, str, bytes)
+import jax
+import numpy as np
+
+_PLAIN = (bool, int, float, complex, str, bytes)
 
 
 def behavior_of(kind: type, recipe_of: Callable[[Any], Any]) -> list[Any]:
@@ -17,15 +21,22 @@ def behavior_of(kind: type, recipe_of: Callable[[Any], Any]) -> list[Any]:
 
     Args:
         kind: a class, without its bases.
-        recipe_of: what stands for a value that is no function; it may raise a TypeError.
+        recipe_of: what stands for an array.
     """
-    parts = sorted(vars(kind).items())
-    return [kind.__qualname__, *([name, _part(part, recipe_of, ())] for name, part in parts if _counts(name, part))]
+    parts = [[name, _part(part, recipe_of, ())] for name, part in sorted(vars(kind).items()) if _counts(name, part)]
+    return [kind.__qualname__, _text(kind), parts]
+
+
+def _text(kind: type) -> str:
+    try:
+        return inspect.getsource(kind)
+    except (OSError, TypeError):  # typed into a terminal, or made by a program
+        return ""
 
 
 def _counts(name: str, part: Any) -> bool:
-    """Not what Python itself notes of a class."""
-    return not name.startswith("__") or bool(_functions(part))
+    """Not what Python notes of a class, nor what a class keeps for itself while it works."""
+    return bool(_functions(part)) or isinstance(part, functools.partial) or not name.startswith("_")
 
 
 def _functions(part: Any) -> list[Any]:
@@ -53,10 +64,13 @@ def _part(part: Any, recipe_of: Callable[[Any], Any], seen: tuple[int, ...]) -> 
         return [_part(value, recipe_of, seen) for value in part]
     if isinstance(part, dict):
         return [[str(name), _part(value, recipe_of, seen)] for name, value in part.items()]
-    try:
+    if isinstance(part, set | frozenset):
+        return sorted(map(repr, part)) if all(isinstance(value, _PLAIN) for value in part) else type(part).__qualname__
+    if part is None or isinstance(part, _PLAIN):
+        return [type(part).__qualname__, repr(part)]
+    if isinstance(part, np.ndarray | np.generic | jax.Array):
         return recipe_of(part)
-    except TypeError:
-        return type(part).__qualname__ if not isinstance(part, type) else part.__qualname__
+    return part.__qualname__ if isinstance(part, type) else type(part).__qualname__
 
 
 def _is_filled(cell: Any) -> bool:
@@ -77,4 +91,4 @@ def _constant(value: Any) -> Any:
     if isinstance(value, frozenset | tuple):  # a set has another order in every process
         parts = [_constant(part) for part in value]
         return sorted(map(repr, parts)) if isinstance(value, frozenset) else parts
-    return [type(value).__name__, repr(value)] if isinstance(value, _PLAIN) else type(value).__name__
+    return [type(value).__name__, repr(value)] if value is None or isinstance(value, _PLAIN) else type(value).__name__

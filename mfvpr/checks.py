@@ -47,13 +47,13 @@ def _check_numbers(name: str, scorer: Any) -> None:
         value, (low, high) = getattr(scorer, field), parameter.bounds
         if parameter.choices or value is None:
             continue
-        values = np.ravel(np.asarray(value, float))
+        values, low = np.ravel(np.asarray(value, float)), 0 if parameter.length else low
         if not ((values >= low) & (values <= high) | (values == parameter.none)).all():
             raise InputError(f"{name}: {field}={value}: expected numbers from {low:g} to {high:g}")
 
 
-def check_shortlist(shortlist: Any, who: str, num_queries: int, num_database: int, num_candidates: int) -> None:
-    """Candidates as a filter of somebody's own gives them.
+def check_shortlist(shortlist: Any, who: str, num_queries: int, num_database: int, num_candidates: int) -> Shortlist:
+    """Candidates as a filter of somebody's own gives them, with -1 and 0 as padding.
 
     Args:
         shortlist: of the filter.
@@ -69,10 +69,10 @@ def check_shortlist(shortlist: Any, who: str, num_queries: int, num_database: in
         raise InputError(f"{who}: expected a Shortlist as the candidates of Filtered, got {type(shortlist).__name__}")
     indices, scores, mask = (np.asarray(part) for part in (shortlist.indices, shortlist.scores, shortlist.mask))
     expected = (num_queries, num_candidates)
-    if {indices.shape, scores.shape, mask.shape} != {expected} or mask.dtype != bool:
+    if {indices.shape, scores.shape, mask.shape} != {expected} or mask.dtype != bool or indices.dtype.kind not in "iu":
         shapes = f"{list(indices.shape)}, {list(scores.shape)} and {list(mask.shape)}"
-        raise InputError(f"{who}: expected indices, scores and mask (bool) of {list(expected)} each, got {shapes}; "
-                         "pad with -1")  # fmt: skip
+        raise InputError(f"{who}: expected indices (whole), scores and mask (bool) of {list(expected)} each, got "
+                         f"{shapes}; pad with -1")  # fmt: skip
     if not ((indices[mask] >= 0) & (indices[mask] < num_database)).all():
         raise InputError(f"{who}: expected rows of the database from 0 to {num_database - 1}, got "
                          f"{indices[mask].min()} to {indices[mask].max()}")  # fmt: skip
@@ -81,8 +81,9 @@ def check_shortlist(shortlist: Any, who: str, num_queries: int, num_database: in
         query, place = np.argwhere(twice)[0]
         raise InputError(f"{who}: expected every row of the database once, got {ordered[query, place]} twice for query "
                          f"{query}")  # fmt: skip
-    if not (np.isfinite(scores[mask]).all() and (indices[~mask] == -1).all()):
-        raise InputError(f"{who}: expected finite scores, and -1 where there is no candidate")
+    if not np.isfinite(scores[mask]).all():
+        raise InputError(f"{who}: expected finite scores")
+    return Shortlist(np.where(mask, indices, -1).astype(np.int32), np.where(mask, scores, 0).astype(np.float32), mask)
 
 
 def wrong_with(folder: ImageFolder, features: FeatureSet, bad: Mapping[int, str]) -> Iterator[str]:

@@ -170,13 +170,14 @@ def match_sequence(
                 raise InputError(f"{type(filter).__name__}: expected a Filtered, got {type(filtered).__name__}; "
                                  "return Filtered(shortlist, {}, {})")  # fmt: skip
             sizes = len(sequence.images), len(database), num_candidates
-            check_shortlist(filtered.candidates, type(filter).__name__, *sizes)
+            candidates_of = check_shortlist(filtered.candidates, type(filter).__name__, *sizes)
+            filtered = filtered._replace(candidates=candidates_of)
         with watch("features"):
             rows = np.unique(filtered.candidates.indices[filtered.candidates.mask])
             database_features = archive.local(database, extractor, rows.tolist(), label="database")
             query_features = archive.local(sequence.images, extractor, label=f"query {sequence.name}")
-        bad_queries = {**filtered.bad_queries, **query_features[0].bad}
-        bad_database = {**filtered.bad_database, **database_features[0].bad}
+        bad_queries = _by_row(filtered.bad_queries, query_features[0].bad)
+        bad_database = _by_row(filtered.bad_database, database_features[0].bad)
         warnings = [
             *wrong_with(database, database_features[0], bad_database),
             *wrong_with(sequence.images, query_features[0], bad_queries),
@@ -203,6 +204,10 @@ def _looked_at(matched: Matched, archive: Archive) -> Matched:
         archive.warn(f"{images.paths[nothing[0]]}: no candidates ({len(nothing)} such queries of {len(images)}), which "
                      "counts as a failure")  # fmt: skip
     return matched
+
+
+def _by_row(*reasons: Mapping[int, str]) -> dict[int, str]:
+    return {int(row): reason for some in reasons for row, reason in some.items()}
 
 
 def _kept(

@@ -44,7 +44,7 @@ def described(
         InputError: an image cannot be read (unless `skip_bad`).
     """
     for part, images in _image_batches(folder, rows, extractor, skip_bad, bad, track):
-        batch = dict(zip(part, _checked(extractor(images), extractor, len(part)), strict=True))
+        batch = dict(zip(part, _checked(list(extractor(images)), extractor, len(part)), strict=True))
         for row in [row for row, description in batch.items() if not _finite(description)]:
             del batch[row]
             bad[row] = f"{folder.paths[row]}: features are not finite (NaN or infinite); the image ranks last"
@@ -69,9 +69,8 @@ def _checked(descriptions: list[Description], extractor: Extractor, number: int)
         sizes = [local.descriptors.shape[-1] for local in one.local]
         if sizes != (expected := [scale.dimension for scale in scales]):
             raise InputError(f"{who}: expected local features of {expected} dimensions, as its scales say, got {sizes}")
-        if (one.vector is not None) != bool(extractor.vector_size):
-            raise InputError(f"{who}: vector_size={extractor.vector_size}, but a description "
-                             f"{'without' if one.vector is None else 'with'} a vector")  # fmt: skip
+        if (size := 0 if one.vector is None else np.size(one.vector)) != extractor.vector_size:
+            raise InputError(f"{who}: vector_size={extractor.vector_size}, but a description with {size} numbers")
     return [Description(one.vector, tuple(map(without_padding, one.local))) for one in descriptions]
 
 

@@ -9,9 +9,8 @@ import itertools
 import json
 import math
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
-from functools import cached_property
 from pathlib import PurePath
 from typing import Any
 
@@ -28,9 +27,9 @@ _ADDRESS = re.compile(" at 0x[0-9a-f]+")  # of a network's functions, which ever
 def recipe_of(value: Any, of_path: Callable[[PurePath], Any] = str) -> Any:
     """A value in JSON's terms, arrays by their content: what makes an extractor, a filter or a scorer what it is.
 
-    Dataclasses are told by their class and fields, networks by their class and arrays; classes of one's own by what
-    their methods are compiled to as well, see `mfvpr.behavior`, but not by what these call. Fields with the metadata
-    `recipe` False (how many images go at a time) change nothing, and are left out.
+    Dataclasses are told by their class and fields, networks by their class and arrays; classes of one's own by their
+    code as well, see `mfvpr.behavior`, but neither by what that calls nor by attributes that are no fields. Fields with
+    the metadata `recipe` False (how many images go at a time, seconds) change nothing, and are left out.
 
     Args:
         value: dataclasses, mappings, lists, arrays, networks, texts, numbers, paths, and what has a property `recipe`,
@@ -48,7 +47,7 @@ def recipe_of(value: Any, of_path: Callable[[PurePath], Any] = str) -> Any:
         return {"class": _name(type(value)), "recipe": recipe_of(value.recipe, of_path)}
     if is_dataclass(value) and not isinstance(value, type):
         parts = {f.name: getattr(value, f.name) for f in fields(value) if f.metadata.get("recipe", True)}
-        return _class(value, {f.name for f in fields(value)}, of_path) | recipe_of(parts, of_path)
+        return _class(type(value), of_path) | recipe_of(parts, of_path)
     if isinstance(value, Mapping):
         return {str(name): recipe_of(part, of_path) for name, part in value.items()}
     if isinstance(value, list | tuple):
@@ -59,7 +58,7 @@ def recipe_of(value: Any, of_path: Callable[[PurePath], Any] = str) -> Any:
     arrays = leaves and all(isinstance(leaf, np.ndarray | np.generic | jax.Array) for leaf in leaves)
     if not arrays or isinstance(value, functools.partial):
         raise TypeError(f"{type(value).__name__}: expected a dataclass, arrays, or a property `recipe` that JSON takes")
-    own = {} if jax.tree_util.all_leaves([value]) else _class(value, None, of_path)
+    own = {} if jax.tree_util.all_leaves([value]) else _class(type(value), of_path)
     return own | {"sha256": content_hash(_ADDRESS.sub("", str(structure)), leaves)}
 
 
@@ -68,19 +67,13 @@ def _name(kind: type) -> str:
     return kind.__qualname__ if _is_ours(kind) else f"{kind.__module__}.{kind.__qualname__}"
 
 
-def _class(value: Any, known: Collection[str] | None, of_path: Callable[[PurePath], Any]) -> dict[str, Any]:
-    """Ours by its name; that of others by its behavior as well, and by attributes that are not among those `known`."""
-    kind = type(value)
+def _class(kind: type, of_path: Callable[[PurePath], Any]) -> dict[str, Any]:
+    """Ours by its name; that of others by its behavior as well."""
     if _is_ours(kind):
         return {"class": _name(kind)}
     bases = [base for base in kind.__mro__ if not _is_ours(base) and base is not object]
     behavior = [behavior_of(base, lambda part: recipe_of(part, of_path)) for base in bases]
-    own = {"class": _name(kind), "code": fingerprint(behavior)}
-    if known is None or not hasattr(value, "__dict__"):
-        return own
-    cached = {name for base in bases for name, part in vars(base).items() if isinstance(part, cached_property)}
-    more = {name: part for name, part in vars(value).items() if name not in known and name not in cached}
-    return own | ({"attributes": recipe_of(more, of_path)} if more else {})
+    return {"class": _name(kind), "code": fingerprint(behavior)}
 
 
 def _is_ours(kind: type) -> bool:

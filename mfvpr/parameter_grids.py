@@ -117,7 +117,8 @@ def score_settings(
         weightings: `[W]` values of what only says how much a match counts, which is cheap to vary: `max_distance`
             (matches further apart do not count) and `weight` (an option of the scorer's `ChosenWeight`); none: W = 1.
     """
-    if isinstance(scorer, HistogramOfShifts):  # its Gaussians are the same for all weightings
+    own = isinstance(scorer, HistogramOfShifts) and type(scorer).__call__ is HistogramOfShifts.__call__
+    if own:  # its Gaussians are the same for all weightings; a class on top of it may score otherwise
         weights = jax.vmap(partial(_weights_of, scorer, weightings))(matches)
         return _map(lambda setting: with_parameters(scorer, setting).all_reweighted(matches, weights).T, settings)
 

@@ -104,7 +104,7 @@ def filter_scores(candidates: Shortlist, kind: FilterScore = "cosine") -> np.nda
         return cosine
     if kind != "negative_euclidean":
         raise InputError(f"filter_score={kind!r}: expected one of {', '.join(get_args(FilterScore))}")
-    if (largest := np.max(cosine, initial=0)) > 1 + 1e-3:
+    if (largest := np.max(cosine, initial=0, where=candidates.mask)) > 1 + 1e-3:
         raise InputError(f"filter_score=negative_euclidean: expected cosine similarities up to 1, got {largest:.4g}; "
                          "use cosine, which takes any score")  # fmt: skip
     return -np.sqrt(np.maximum(2 - 2 * cosine, 0))

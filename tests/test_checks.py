@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 import mfvpr
+from mfvpr import pipeline
 from mfvpr.archive import Archive
 from mfvpr.data.datasets import folder_dataset, image_folder
 from mfvpr.data.ground_truth import FrameTruth
@@ -99,14 +100,14 @@ def evaluated(dataset, extractor=SIFT, chosen=None, scorers=HISTOGRAM, **options
          "expected cosine similarities up to 1, got 3"),
         ({"chosen": Fixed((0, 1, 99))}, "Fixed: expected rows of the database from 0 to 9, got 0 to 99"),
         ({"chosen": Fixed((0, 1, 1))}, "Fixed: expected every row of the database once, got 1 twice for query 0"),
-        ({"chosen": Fixed((0, 1))}, r"Fixed: expected indices, scores and mask \(bool\) of \[10, 3\] each"),
+        ({"chosen": Fixed((0, 1))}, r"Fixed: expected indices \(whole\), scores and mask \(bool\) of \[10, 3\] each"),
         ({"chosen": Fixed((0, 1, 2), np.nan)}, "Fixed: expected finite scores"),
         ({"chosen": Retrieval(SIFT)}, "Sift: gives no global descriptor; expected one that does, or Aggregated"),
         ({"extractor": Own("fewer")}, "Own: expected a Description of each of 3 images, got 2"),
         ({"extractor": Own("features")}, "Own: expected a Description, got Features"),
         ({"extractor": Own("dimension")}, r"Own: expected local features of \[128\] dimensions, .* got \[5\]"),
         ({"extractor": Own("shape")}, r"Own: features: expected keypoints \[N, 2\]"),
-        ({"extractor": Own("vector")}, "Own: vector_size=0, but a description with a vector"),
+        ({"extractor": Own("vector")}, "Own: vector_size=0, but a description with 2 numbers"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_used_is_told(dataset, options, words):
@@ -130,6 +131,22 @@ def test_no_scorer_is_the_filter_alone(dataset):
     assert repr(result) == "Result(folder: folder (10 queries); filter)"
     [ranked] = result.systems["filter"]
     np.testing.assert_array_equal(ranked.shortlist.indices, ranked.rows)
+
+
+@mfvpr.value
+class Negative(mfvpr.HistogramOfShifts):
+    """Scores otherwise than the class that it stands on."""
+
+    def __call__(self, matches):
+        return -super().__call__(matches)
+
+
+def test_a_scorer_on_top_of_ours_scores_as_it_says(dataset):
+    scorers = HISTOGRAM | {"negative": Negative(), "flat": mfvpr.HistogramOfShifts(shift_range=(100.0, 0.0))}
+    [matched] = evaluated(dataset, scorers=scorers).matched
+    scores = pipeline.score(scorers, matched.by_scale, matched.candidates)
+    np.testing.assert_allclose(scores["negative"], -scores["histogram"], rtol=1e-6)
+    assert (scores["histogram"] > 0).any()
 
 
 def test_scores_that_are_nan_are_told(dataset):

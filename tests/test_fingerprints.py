@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import linecache
 import sys
 from dataclasses import dataclass
 from functools import cached_property
@@ -63,16 +64,36 @@ class Inner(made_by(1)):
 def test_code_of_ones_own_is_part_of_the_recipe():
     same = [recipe_of(made_by(1)()), recipe_of(made_by(1)())]
     assert same[0] == same[1]
-    more, used = made_by(1)(), made_by(1)()
-    more.tuned = 5
+    used = made_by(1)()
     assert used.table
     assert recipe_of(used) == same[0]
-    others = [made_by(2)(), made_by(1, gain=7)(), made_by(1, default=4)(), made_by(1)(size=3), more, Inner()]
+    others = [made_by(2)(), made_by(1, gain=7)(), made_by(1, default=4)(), made_by(1)(size=3), Inner()]
     assert len({fingerprint(one) for one in (same[0], *map(recipe_of, others))}) == 1 + len(others)
     assert recipe_of(Inner()) == recipe_of(Inner())
 
 
-def test_what_runs_counts_and_not_the_text_of_a_file(tmp_path, monkeypatch):
+def test_text_counts_where_code_does_not_say_all(tmp_path, monkeypatch):
+    """A nested class, a word of an enumeration."""
+    text = "from dataclasses import dataclass\n@dataclass\nclass Mine:\n    class Config:\n        n = {}\n"
+    monkeypatch.syspath_prepend(tmp_path)
+    recipes = []
+    for number in (60, 10):
+        (tmp_path / "mine.py").write_text(text.format(number))
+        importlib.invalidate_caches()
+        recipes.append(recipe_of(importlib.import_module("mine").Mine()))
+        del sys.modules["mine"]
+        linecache.clearcache()
+    assert recipes[0] != recipes[1]
+
+
+def test_what_a_class_keeps_while_it_works_is_no_part_of_the_recipe():
+    used = made_by(1)()
+    before = recipe_of(used)
+    used.detector, type(used)._cache = object(), {1: 2}
+    assert recipe_of(used) == before
+
+
+def test_what_runs_counts_and_not_the_text_of_a_file_alone(tmp_path, monkeypatch):
     text = "from dataclasses import dataclass\n@dataclass\nclass Mine:\n    def f(self): return {}\n"
     path = tmp_path / "of_ones_own.py"
     path.write_text(text.format(1))
@@ -80,9 +101,10 @@ def test_what_runs_counts_and_not_the_text_of_a_file(tmp_path, monkeypatch):
     module = importlib.import_module("of_ones_own")
     before = recipe_of(module.Mine())
     path.write_text(text.format(222))
-    assert recipe_of(module.Mine()) == before
+    linecache.clearcache()
+    edited = recipe_of(module.Mine())  # the old code still runs
     importlib.reload(module)
-    assert recipe_of(module.Mine()) != before
+    assert len({fingerprint(one) for one in (before, edited, recipe_of(module.Mine()))}) == 3
     del sys.modules["of_ones_own"]
 
 

@@ -132,6 +132,6 @@ def test_matches_of_other_settings_are_kept_apart(small_street, tmp_path, change
 def test_matches_do_not_depend_on_how_they_are_computed(small_street, tmp_path):
     paths = {
         matches_path(settings_of(small_street, f"store={tmp_path}", change))[0]
-        for change in ("matching.chunk_size=3", "memory=1", "devices=all")
+        for change in ("memory=1", "devices=all")
     }
     assert len(paths) == 1

@@ -107,13 +107,13 @@ def files_of(path: PurePath) -> ImageFolder:
     return ImageFolder(path, tuple(sorted(names))) if path.is_dir() else ImageFolder(path.parent, (path.name,))
 
 
-def state_of(path: Path) -> list[int] | None:
+def state_of(path: Path | str) -> list[int] | None:
     """Size, when content and entry last changed (ns), and the number of the file, which moves along with it.
 
     None where there is no file.
     """
     try:
-        status = path.stat()
+        status = os.stat(path)
     except OSError:
         return None
     return [status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino]
