@@ -55,7 +55,10 @@ def _part(part: Any, recipe_of: Callable[[Any], Any], seen: tuple[int, ...]) -> 
     if isinstance(part, FunctionType):
         closure = [cell.cell_contents for cell in part.__closure__ or () if _is_filled(cell)]
         held = [part.__defaults__ or (), part.__kwdefaults__ or {}, *closure]
-        return [_code(part.__code__), [_part(value, recipe_of, seen) for value in held]]
+        return [_part(value, recipe_of, seen) for value in (part.__code__, *held)]
+    if isinstance(part, CodeType):
+        constants = [_part(value, recipe_of, seen) for value in part.co_consts]
+        return [part.co_code.hex(), list(part.co_names), list(part.co_varnames), constants]
     if isinstance(part, functools.partial):
         return [_part(value, recipe_of, seen) for value in (part.func, part.args, part.keywords)]
     if functions := _functions(part):
@@ -79,16 +82,3 @@ def _is_filled(cell: Any) -> bool:
     except ValueError:  # not yet
         return False
     return True
-
-
-def _code(code: CodeType) -> list[Any]:
-    return [code.co_code.hex(), list(code.co_names), list(code.co_varnames), [_constant(one) for one in code.co_consts]]
-
-
-def _constant(value: Any) -> Any:
-    if isinstance(value, CodeType):
-        return _code(value)
-    if isinstance(value, frozenset | tuple):  # a set has another order in every process
-        parts = [_constant(part) for part in value]
-        return sorted(map(repr, parts)) if isinstance(value, frozenset) else parts
-    return [type(value).__name__, repr(value)] if value is None or isinstance(value, _PLAIN) else type(value).__name__

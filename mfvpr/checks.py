@@ -1,15 +1,18 @@
-"""What an evaluation is asked for, and what filters of others give: told in one line, before it costs anything."""
+"""What an evaluation is asked for, and what filters and scorers of others give: told in one line."""
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from typing import Any, get_args
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from mfvpr.data.datasets import ImageFolder
-from mfvpr.declaration import declared
-from mfvpr.errors import InputError
-from mfvpr.reranking import Ties
+from mfvpr.declaration import check_bounds
+from mfvpr.errors import InputError, require_word
+from mfvpr.features import Extractor, Source
+from mfvpr.filters import Filtered
+from mfvpr.matching import CrossCheck
+from mfvpr.reranking import FilterScore, Ties
 from mfvpr.results import FILTER, Matched, Ranked
 from mfvpr.scoring import SCORERS
 from mfvpr.sources import FeatureSet
@@ -17,9 +20,36 @@ from mfvpr.types import Shortlist
 
 
 def check_request(
-    candidates: Any, scorers: Mapping[str, Any], fused: Collection[str], ties: Any, memory: float | None
+    scorers: Mapping[str, Any], fused: Mapping[str, FilterScore], ties: Ties, memory: float | None
 ) -> None:
-    """The arguments of `mfvpr.evaluate`.
+    """What `mfvpr.evaluate` is asked to do with matches.
+
+    Args:
+        scorers: by name.
+        fused: the filter's score that is added to some of them, by name.
+        ties: see there.
+        memory: see there.
+
+    Raises:
+        InputError: one cannot be used.
+    """
+    require_word("ties", ties, Ties)
+    if memory is not None and not 0 < memory < math.inf:
+        raise InputError(f"memory={memory!r}: expected GB above 0, or None")
+    for name, filter_score in fused.items():
+        require_word("filter_score", filter_score, FilterScore)
+        if name not in scorers:
+            known = ", ".join(scorers) or "there are none"
+            raise InputError(f"fused: expected names of scorers ({known}), got {name}")
+    for name, scorer in scorers.items():
+        if name in {FILTER, *(f"{other} + {FILTER}" for other in fused)}:
+            raise InputError(f"scorers: {name} is the name of another system; choose another one")
+        if type(scorer) in SCORERS.values():
+            check_bounds(scorer)
+
+
+def check_matching(candidates: Any, extractor: Extractor | Source, cross_check: CrossCheck) -> None:
+    """What is asked of the matches of a sequence.
 
     Raises:
         InputError: one cannot be used.
@@ -27,44 +57,29 @@ def check_request(
     whole = isinstance(candidates, int | np.integer) and not isinstance(candidates, bool)
     if candidates != "all" and not (whole and candidates >= 1):
         raise InputError(f"candidates={candidates!r}: expected a whole number from 1, or 'all'")
-    if ties not in get_args(Ties):
-        raise InputError(f"ties={ties!r}: expected one of {', '.join(get_args(Ties))}")
-    if memory is not None and not 0 < memory < math.inf:
-        raise InputError(f"memory={memory!r}: expected GB above 0, or None")
-    if unknown := [name for name in fused if name not in scorers]:
-        raise InputError(
-            f"fused: expected names of scorers ({', '.join(scorers) or 'there are none'}), got {unknown[0]}"
-        )
-    if taken := [name for name in scorers if name in {FILTER, *(f"{other} + {FILTER}" for other in fused)}]:
-        raise InputError(f"scorers: {taken[0]} is the name of another system; choose another one")
-    for name, scorer in scorers.items():
-        if type(scorer) in SCORERS.values():
-            _check_numbers(name, scorer)
+    if not extractor.scales:
+        raise InputError(f"{type(extractor).__name__}: gives no local features; expected an extractor that does")
+    require_word("cross_check", cross_check, CrossCheck)
 
 
-def _check_numbers(name: str, scorer: Any) -> None:
-    for field, parameter in declared(scorer).items():
-        value, (low, high) = getattr(scorer, field), parameter.bounds
-        if parameter.choices or value is None:
-            continue
-        values, low = np.ravel(np.asarray(value, float)), 0 if parameter.length else low
-        if not ((values >= low) & (values <= high) | (values == parameter.none)).all():
-            raise InputError(f"{name}: {field}={value}: expected numbers from {low:g} to {high:g}")
-
-
-def check_shortlist(shortlist: Any, who: str, num_queries: int, num_database: int, num_candidates: int) -> Shortlist:
-    """Candidates as a filter of somebody's own gives them, with -1 and 0 as padding.
+def checked_candidates(filtered: Any, who: str, num_queries: int, num_database: int, num_candidates: int) -> Filtered:
+    """What a filter of somebody's own gives, with -1 and 0 as padding.
 
     Args:
-        shortlist: of the filter.
+        filtered: of the filter.
         who: the filter's name.
         num_queries: Q.
         num_database: N.
         num_candidates: C.
 
     Raises:
-        InputError: no Shortlist `[Q, C]`, rows that the database lacks, or a row twice for one query.
+        InputError: no Filtered, or no Shortlist `[Q, C]` in it, rows that the database lacks, or a row twice for one
+            query.
     """
+    if not isinstance(filtered, Filtered):
+        raise InputError(f"{who}: expected a Filtered, got {type(filtered).__name__}; return "
+                         "Filtered(shortlist, {}, {})")  # fmt: skip
+    shortlist = filtered.candidates
     if not isinstance(shortlist, Shortlist):
         raise InputError(f"{who}: expected a Shortlist as the candidates of Filtered, got {type(shortlist).__name__}")
     indices, scores, mask = (np.asarray(part) for part in (shortlist.indices, shortlist.scores, shortlist.mask))
@@ -83,7 +98,8 @@ def check_shortlist(shortlist: Any, who: str, num_queries: int, num_database: in
                          f"{query}")  # fmt: skip
     if not np.isfinite(scores[mask]).all():
         raise InputError(f"{who}: expected finite scores")
-    return Shortlist(np.where(mask, indices, -1).astype(np.int32), np.where(mask, scores, 0).astype(np.float32), mask)
+    indices, scores = np.where(mask, indices, -1).astype(np.int32), np.where(mask, scores, 0).astype(np.float32)
+    return filtered._replace(candidates=Shortlist(indices, scores, mask))
 
 
 def wrong_with(folder: ImageFolder, features: FeatureSet, bad: Mapping[int, str]) -> Iterator[str]:

@@ -10,6 +10,10 @@ from dataclasses import dataclass, field, fields
 from inspect import getmodule
 from typing import Any
 
+import numpy as np
+
+from mfvpr.errors import InputError
+
 POSITIVE = (1e-6, 1e12)  # beyond these bounds float32 would fail, without a word
 SCORE = "units of the score"
 _KEY = "parameter"  # of the field's metadata
@@ -133,6 +137,17 @@ def check_choices(method: Any) -> None:
         if choices and parameter.named is None and value not in choices:
             expected = ", ".join(map(str, choices))
             raise ValueError(f"{type(method).__name__}({name}={value!r}): expected one of {expected}")
+
+
+def check_bounds(method: Any) -> None:
+    """Raise an InputError that names the field whose number, which is no traced one, is beyond its bounds."""
+    for name, parameter in declared(method).items():
+        value, (low, high) = getattr(method, name), parameter.bounds
+        if parameter.choices or value is None:
+            continue
+        values = np.ravel(np.asarray(value, float))
+        if not ((values >= low) & (values <= high) | (values == parameter.none)).all():
+            raise InputError(f"{name}={value}: expected numbers from {low:g} to {high:g}")
 
 
 def _field(default: Any, parameter: Parameter, *, static: bool = False) -> Any:

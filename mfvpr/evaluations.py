@@ -1,9 +1,11 @@
 """The whole way in one call: images -> features -> shortlist -> matches -> scores -> ranking -> recall.
 
-sift = Sift()
-result = mfvpr.evaluate(dataset, sift, Retrieval(Aggregated(sift, VladFitting())),
-                        {"histogram": mfvpr.HistogramOfShifts()}, candidates=50)
-print(result.recall([0.0])["histogram"].pooled)
+    sift = Sift()
+    result = mfvpr.evaluate(dataset, sift, Retrieval(Aggregated(sift, VladFitting())),
+                            {"histogram": mfvpr.HistogramOfShifts()}, candidates=50)
+    print(result.recall([0.0])["histogram"].pooled)
+
+Features, shortlist and matches are kept in an archive, where that has a folder.
 """
 
 import json
@@ -11,16 +13,15 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
 from mfvpr import pipeline
 from mfvpr.archive import Archive
-from mfvpr.checks import check_request, check_shortlist, nan_scores, wrong_with
+from mfvpr.checks import check_matching, check_request, checked_candidates, nan_scores, wrong_with
 from mfvpr.data.datasets import Dataset, QuerySequence
 from mfvpr.data.files import write_text
-from mfvpr.errors import InputError
 from mfvpr.features import Extractor, Source
 from mfvpr.filters import Filter, Filtered
 from mfvpr.fingerprints import recipe_of
@@ -30,6 +31,7 @@ from mfvpr.progress import Track, untracked
 from mfvpr.reranking import FilterScore, Ties, fuse_shortlist, rank_shortlist
 from mfvpr.results import FILTER, Matched, Ranked, Result
 from mfvpr.scoring import Scorer
+from mfvpr.sources import FeatureSet
 from mfvpr.stores.matches import MatchStore
 from mfvpr.types import Shortlist
 
@@ -103,7 +105,7 @@ def evaluate(
         InputError: arguments, images, stores or features that cannot be used, or what an extractor, a filter or a
             scorer gives; one line says which, and the mend.
     """
-    check_request(candidates, scorers, fused or {}, ties, memory)
+    check_request(scorers, {name: how.filter_score for name, how in (fused or {}).items()}, ties, memory)
     archive, watch = archive or Archive(), watch or Stopwatch()
     matched = [
         match_sequence(
@@ -150,13 +152,9 @@ def match_sequence(
         with_ratio: see `mfvpr.match`; matches that are kept always have the ratio.
         **where: `memory` and `devices` of `pipeline.match`.
     """
-    archive, watch = archive or Archive(), watch or Stopwatch()
-    database = dataset.database
+    check_matching(candidates, extractor, matching.cross_check)
+    archive, watch, database = archive or Archive(), watch or Stopwatch(), dataset.database
     num_candidates = len(database) if candidates == "all" else min(int(candidates), len(database))
-    if not extractor.scales:
-        raise InputError(f"{type(extractor).__name__}: gives no local features; expected an extractor that does")
-    if matching.cross_check not in get_args(CrossCheck):
-        raise InputError(f"cross_check={matching.cross_check!r}: expected one of {', '.join(get_args(CrossCheck))}")
     with ExitStack() as held:
         stores = []
         if archive.root is not None:
@@ -166,34 +164,36 @@ def match_sequence(
             return _looked_at(kept, archive)
         with watch("filter"):
             filtered = filter.shortlist(sequence, database, num_candidates, archive)
-            if not isinstance(filtered, Filtered):
-                raise InputError(f"{type(filter).__name__}: expected a Filtered, got {type(filtered).__name__}; "
-                                 "return Filtered(shortlist, {}, {})")  # fmt: skip
             sizes = len(sequence.images), len(database), num_candidates
-            candidates_of = check_shortlist(filtered.candidates, type(filter).__name__, *sizes)
-            filtered = filtered._replace(candidates=candidates_of)
+            filtered = checked_candidates(filtered, type(filter).__name__, *sizes)
         with watch("features"):
-            rows = np.unique(filtered.candidates.indices[filtered.candidates.mask])
-            database_features = archive.local(database, extractor, rows.tolist(), label="database")
-            query_features = archive.local(sequence.images, extractor, label=f"query {sequence.name}")
-        bad_queries = _by_row(filtered.bad_queries, query_features[0].bad)
-        bad_database = _by_row(filtered.bad_database, database_features[0].bad)
-        warnings = [
-            *wrong_with(database, database_features[0], bad_database),
-            *wrong_with(sequence.images, query_features[0], bad_queries),
-        ]
-        _remark(stores, archive, {"queries": bad_queries, "database": bad_database, "warnings": warnings})
+            sides, bad = _features(dataset, sequence, extractor, filtered, archive)
+        _remark(stores, archive, bad)
+        options = {**asdict(matching), "with_ratio": with_ratio, "track": archive.track("matching"), **where}
         with watch("matching"):
             matches = tuple(
-                pipeline.match(
-                    queries, images, filtered.candidates, **asdict(matching), with_ratio=with_ratio, store=store,
-                    track=archive.track("matching"), **where,
-                )
-                for queries, images, store in zip(
-                    query_features, database_features, stores or [None] * len(query_features), strict=True
-                )
-            )  # fmt: skip
-    return _looked_at(Matched(sequence, filtered.candidates, matches, bad_queries, bad_database), archive)
+                pipeline.match(*scale, filtered.candidates, store=store, **options)
+                for scale, store in zip(sides, stores or [None] * len(sides), strict=True)
+            )
+    return _looked_at(Matched(sequence, filtered.candidates, matches, bad["queries"], bad["database"]), archive)
+
+
+def _features(
+    dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, filtered: Filtered, archive: Archive
+) -> tuple[list[tuple[FeatureSet, FeatureSet]], dict[str, Any]]:
+    """By scale, those of the queries and of all candidates; and what is wrong with some images of either side."""
+    rows = np.unique(filtered.candidates.indices[filtered.candidates.mask])
+    database = archive.local(dataset.database, extractor, rows.tolist(), label="database")
+    queries = archive.local(sequence.images, extractor, label=f"query {sequence.name}")
+    bad = {
+        "queries": _by_row(filtered.bad_queries, queries[0].bad),
+        "database": _by_row(filtered.bad_database, database[0].bad),
+    }
+    warnings = [
+        *wrong_with(dataset.database, database[0], bad["database"]),
+        *wrong_with(sequence.images, queries[0], bad["queries"]),
+    ]
+    return list(zip(queries, database, strict=True)), bad | {"warnings": warnings}
 
 
 def _looked_at(matched: Matched, archive: Archive) -> Matched:

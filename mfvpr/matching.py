@@ -7,14 +7,14 @@ it is in cache (see `neighbors`), and never stored for more than one chunk of ca
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mfvpr import ragged
-from mfvpr.errors import InputError
+from mfvpr.errors import InputError, require_word
 from mfvpr.neighbors import nearest, nearest_two
 from mfvpr.numerics import at_least_single, compiled, device_bytes, masked, safe_sqrt
 from mfvpr.types import Array, Features, Matches, per_keypoint, per_match
@@ -42,8 +42,7 @@ def match(
     Returns:
         Matches with K = N0 slots. A descriptor that is not finite matches nothing.
     """
-    if cross_check not in get_args(CrossCheck):
-        raise ValueError(f"cross_check={cross_check!r}: expected one of {', '.join(get_args(CrossCheck))}")
+    require_word("cross_check", cross_check, CrossCheck)
     features0, features1 = ready(features0), ready(at_least_one(features1))
     similarity = _similarity(features0, features1)
     nearest1, valid = _neighbors(similarity, cross_check)

@@ -4,13 +4,13 @@ Scorers know one pair; here is `vmap` over candidates. Whole grids of parameters
 """
 
 from functools import partial
-from typing import Literal, get_args
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mfvpr.errors import InputError
+from mfvpr.errors import InputError, require_word
 from mfvpr.numerics import as_float, compiled, is_concrete, masked, masked_mean, masked_std
 from mfvpr.scoring import Scorer
 from mfvpr.scoring.parameters import fit
@@ -99,11 +99,10 @@ def fuse_shortlist(
 
 def filter_scores(candidates: Shortlist, kind: FilterScore = "cosine") -> np.ndarray:
     """The filter's part of a combined score `[Q, C]`: cosine similarity, or minus the Euclidean distance."""
+    require_word("filter_score", kind, FilterScore)
     cosine = candidates.scores
     if kind == "cosine":
         return cosine
-    if kind != "negative_euclidean":
-        raise InputError(f"filter_score={kind!r}: expected one of {', '.join(get_args(FilterScore))}")
     if (largest := np.max(cosine, initial=0, where=candidates.mask)) > 1 + 1e-3:
         raise InputError(f"filter_score=negative_euclidean: expected cosine similarities up to 1, got {largest:.4g}; "
                          "use cosine, which takes any score")  # fmt: skip
@@ -151,8 +150,7 @@ def indexed(ties: Ties) -> bool:
     Raises:
         InputError: another word.
     """
-    if ties not in get_args(Ties):
-        raise InputError(f"ties={ties!r}: expected one of {', '.join(get_args(Ties))}")
+    require_word("ties", ties, Ties)
     return ties == "index"
 
 

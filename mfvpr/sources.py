@@ -291,8 +291,10 @@ def check_features(image: Features, who: str, *, unit_length: bool) -> None:
             f"{who}: expected keypoints [N, 2], descriptors [N, D], scores [N] and mask [N] bool, "
             f"got shapes {', '.join(str(shape) for shape in shapes.values())}; transpose descriptors that are [D, N]"
         )
-    lengths = np.linalg.norm(np.asarray(image.descriptors, np.float32)[image.mask], axis=1)
-    if unit_length and (wrong := np.abs(lengths - 1) > 0.01).any():
+    lengths = (
+        np.linalg.norm(np.asarray(image.descriptors, np.float32)[image.mask], axis=1) if unit_length else np.ones(1)
+    )
+    if (wrong := np.abs(lengths - 1) > 0.01).any():
         raise InputError(
             f"{who}: expected descriptors of unit length, got {lengths[wrong][0]:.4g}; "
             "divide them by their Euclidean length, or say unit_length=False"

@@ -92,7 +92,7 @@ def evaluated(dataset, extractor=SIFT, chosen=None, scorers=HISTOGRAM, **options
         ({"scorers": {"filter": mfvpr.MatchCount()}}, "filter is the name of another system"),
         ({"scorers": HISTOGRAM | {"histogram + filter": mfvpr.MatchCount()}, "fused": {"histogram": Fusion()}},
          r"histogram \+ filter is the name of another system"),
-        ({"scorers": {"h": mfvpr.HistogramOfShifts(sigma=-1.0)}}, "h: sigma=-1.0: expected numbers from"),
+        ({"scorers": {"h": mfvpr.HistogramOfShifts(sigma=-1.0)}}, "sigma=-1.0: expected numbers from"),
         ({"scorers": {"v": lambda matches: matches.points0[:, 0]}}, "v: expected a number for each pair"),
         ({"matching": Matching(cross_check="x")}, "cross_check='x': expected one of"),
         ({"fused": {"histogram": Fusion(1.0, "euclidean")}}, "filter_score='euclidean': expected one of"),

@@ -5,6 +5,7 @@ import multiprocessing
 import platform
 import re
 import resource
+import sys
 import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -179,8 +180,10 @@ class Session:
 
 def _peak_bytes() -> int:
     """Resident memory at its most, of this process; where the system keeps no such count, not below its parent's."""
-    own = re.findall(r"VmHWM: *(\d+)", Path("/proc/self/status").read_text())
-    return 1024 * (int(own[0]) if own else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+    status = Path("/proc/self/status")
+    own = re.findall(r"VmHWM: *(\d+)", status.read_text()) if status.exists() else []
+    unit = 1 if sys.platform == "darwin" else 1024
+    return 1024 * int(own[0]) if own else unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def ranked(

@@ -67,7 +67,9 @@ class HistogramOfShifts:
     sigma: float | Array = number(22.5, "px", learned=True)
     weight: Weight = named(WEIGHTS, "fs")
     truncate: float | Array = number(math.inf, "sigmas", "vote only within so many; None = for all bins")
-    shift_range: tuple[float, float] | None = numbers(None, 2, "[x, y] px", "None = all possible shifts")
+    shift_range: tuple[float, float] | None = numbers(
+        None, 2, "[x, y] px", "None = all possible shifts", bounds=(0.0, 1e12)
+    )
     align: str = choice("min_edge", "zero_center", "zero_edge")
     sigma_is_variance: bool = flag(False)
     direction: str = choice("candidate_minus_query", "query_minus_candidate")
