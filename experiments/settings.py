@@ -149,7 +149,7 @@ RULES: dict[str, Rule] = {
     "memory": _or(_POSITIVE, None),
     "devices": _or(_COUNT, "all"),
     # matching
-    "cross_check": _one_of("mutual", "opencv_legacy", "none"),
+    "cross_check": _one_of("mutual", "opencv_legacy", "none", "candidate"),
     "max_distance": _or(_DISTANCE, None),
     "max_matches": _or(_COUNT, None),
     "chunk_size": _or(_COUNT, None),

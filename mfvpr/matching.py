@@ -5,7 +5,7 @@ it is in cache (see `neighbors`), and never stored for more than one chunk of ca
 """
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from typing import Any, Literal
 
@@ -19,7 +19,7 @@ from mfvpr.neighbors import nearest, nearest_two
 from mfvpr.numerics import at_least_single, compiled, device_bytes, masked, safe_sqrt
 from mfvpr.types import Array, Features, Matches, per_keypoint, per_match
 
-CrossCheck = Literal["mutual", "opencv_legacy", "none"]
+CrossCheck = Literal["mutual", "opencv_legacy", "none", "candidate"]
 MEMORY_SHARE = 1 / 256  # of a device's own memory, for the similarities that exist at the same time
 
 
@@ -28,21 +28,26 @@ def match(
 ) -> Matches:
     """Nearest neighbors of one pair of images (paper, section IV-A).
 
-    Slot k of the result belongs to keypoint k of image 0 (K = N0); the first index wins a tie.
+    Slot k of the result belongs to keypoint k of image 0 (K = N0), or of image 1 (K = N1) where cross_check is
+    `candidate`; the first index wins a tie.
 
     Args:
         features0: query, keypoints `[N0, 2]`; padding may hold anything.
         features1: candidate, keypoints `[N1, 2]`.
         cross_check: `mutual` keeps i, j where each is the other's nearest. `opencv_legacy` is OpenCV's BFMatcher
             before 2019: every candidate keypoint picks its nearest query keypoint, which keeps the closest of its
-            suitors. `none` keeps the nearest of every query keypoint. (The paper says cross-check.)
+            suitors. `none` keeps the nearest of every query keypoint, `candidate` that of every candidate keypoint,
+            as SSM-VPR does. (The paper says cross-check.)
         with_ratio: also give the ratio of the distances to the nearest and the second nearest descriptor of the
-            candidate, matched or not (Lowe, IJCV 2004): 1 where both are 0 or there is no second.
+            candidate, matched or not (Lowe, IJCV 2004): 1 where both are 0 or there is no second. With `candidate`,
+            the two are descriptors of the query.
 
     Returns:
-        Matches with K = N0 slots. A descriptor that is not finite matches nothing.
+        Matches with K = N0 slots (`candidate`: N1). A descriptor that is not finite matches nothing.
     """
     require_word("cross_check", cross_check, CrossCheck)
+    if cross_check == "candidate":
+        return _exchanged(match(features1, features0, cross_check="none", with_ratio=with_ratio))
     features0, features1 = ready(features0), ready(at_least_one(features1))
     similarity = _similarity(features0, features1)
     nearest1, valid = _neighbors(similarity, cross_check)
@@ -82,7 +87,7 @@ def match_candidates(
             processor's own cache, or a small part of an accelerator's memory.
 
     Returns:
-        Matches with leading axis C and K = N0 slots.
+        Matches with leading axis C and slots as of `match`.
     """
     if np.ndim(query.mask) != 1 or np.ndim(candidates.mask) != 2:
         shapes = f"{np.shape(query.mask)} and {np.shape(candidates.mask)}"
@@ -122,7 +127,7 @@ def match_pairs(
         chunk_size: as in `match_candidates`.
 
     Returns:
-        Matches with leading axis P and K = N0 slots; pairs beyond `count` have none.
+        Matches with leading axis P and slots as of `match`; pairs beyond `count` have none.
     """
     return _match_pairs(
         queries, candidates, pairs, count, max_distance, cross_check=cross_check, max_matches=max_matches,
@@ -206,6 +211,13 @@ def ready(features: Features) -> Features:
     """On the device, in at least single precision: products of half ones flip near-ties, sums of points overflow."""
     wide = {name: at_least_single(values) for name, values in per_keypoint(features).items() if name != "mask"}
     return replace(features, **wide, mask=jnp.asarray(features.mask), image_size=at_least_single(features.image_size))
+
+
+def _exchanged(matches: Matches) -> Matches:
+    """The same matches, the images in each other's place."""
+    sides = [(f.name, f"{f.name[:-1]}1") for f in fields(matches) if f.name.endswith("0")]
+    others = {name0: getattr(matches, name1) for name0, name1 in sides}
+    return replace(matches, **others, **{name1: getattr(matches, name0) for name0, name1 in sides})
 
 
 def slot_numbers(features: Features) -> Array:

@@ -42,9 +42,9 @@ def _first_argmax(values):
 
 
 def nearest(descriptors0, descriptors1, crosscheck="mutual"):
-    """Nearest neighbors with cross-check, first index wins ties: [(i, j, distance)] sorted by i."""
+    """Nearest neighbors with cross-check, first index wins ties: [(i, j, distance)] sorted by i, or by j."""
     rows0, rows1 = _rows(descriptors0), _rows(descriptors1)
-    if crosscheck not in ("mutual", "opencv_legacy", "none"):
+    if crosscheck not in ("mutual", "opencv_legacy", "none", "candidate"):
         raise ValueError(f"unknown crosscheck: {crosscheck}")
     if not rows0 or not rows1:
         return []
@@ -52,6 +52,8 @@ def nearest(descriptors0, descriptors1, crosscheck="mutual"):
     forward = [_first_argmax(row) for row in similarity]
     backward = [_first_argmax([row[j] for row in similarity]) for j in range(len(rows1))]
 
+    if crosscheck == "candidate":
+        return [(i, j, math.dist(rows0[i], rows1[j])) for j, i in enumerate(backward)]
     matches = []
     for i in range(len(rows0)):
         if crosscheck == "none":

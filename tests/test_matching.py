@@ -15,7 +15,7 @@ from mfvpr.types import per_match, per_pair
 from tests import oracles
 from tests.builders import make_features, random_matches, unit
 
-MODES = ["mutual", "opencv_legacy", "none"]
+MODES = ["mutual", "opencv_legacy", "none", "candidate"]
 # Compiled as a whole, not operation by operation: seconds, where every test has its own shapes.
 match_once = jax.jit(match, static_argnames=("cross_check", "with_ratio"))
 match_candidates_once = jax.jit(match_candidates, static_argnames=("cross_check", "chunk_size"))
@@ -25,9 +25,9 @@ compact_once = jax.jit(compact, static_argnames="capacity")
 
 
 def found(matches):
-    """[(slot, points1, distance)] of the real slots."""
+    """[(index0, points1, distance)] of the real slots."""
     slots = np.flatnonzero(matches.mask)
-    return slots, np.asarray(matches.points1)[slots], np.asarray(matches.distance)[slots]
+    return tuple(np.asarray(values)[slots] for values in (matches.index0, matches.points1, matches.distance))
 
 
 @st.composite
@@ -47,8 +47,11 @@ def feature_pairs(draw):
 def test_agrees_with_the_oracle(pair, mode):
     features0, features1 = pair
     expected = oracles.nearest(features0.descriptors[features0.mask], features1.descriptors[features1.mask], mode)
-    slots, points1, distance = found(match_once(features0, features1, cross_check=mode))
-    assert list(slots) == [i for i, _, _ in expected]
+    matches = match_once(features0, features1, cross_check=mode)
+    index0, points1, distance = found(matches)
+    assert list(index0) == [i for i, _, _ in expected]
+    assert list(matches.index1[matches.mask]) == [j for _, j, _ in expected]
+    np.testing.assert_array_equal(matches.points0[matches.mask], features0.keypoints[index0])
     np.testing.assert_array_equal(points1, [features1.keypoints[j] for _, j, _ in expected] or np.zeros((0, 2)))
     np.testing.assert_allclose(distance, [d for _, _, d in expected], atol=1e-6)
 
@@ -146,7 +149,7 @@ def test_images_without_a_single_slot(mode, counts):
         match_candidates_once(features0, batch, cross_check=mode),
         match_pairs_once(jax.tree.map(lambda leaf: leaf[None], features0), batch, PAIRS, 2, cross_check=mode),
     ):
-        assert matches.mask.shape[-1] == counts[0]
+        assert matches.mask.shape[-1] == counts[mode == "candidate"]
         assert not matches.mask.any()
     assert compact_once(match_once(features0, features1), 4).mask.shape == (4,)
 

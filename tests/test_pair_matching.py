@@ -112,8 +112,9 @@ def assert_same(one, other):
         {"with_ratio": True, "cross_check": "none"},
         {"max_distance": 0.6, "max_matches": 7},
         {"cross_check": "opencv_legacy", "chunk_size": 3},
+        {"cross_check": "candidate", "with_ratio": True},
     ],
-    ids=["mutual", "ratio", "filtered", "chunks"],
+    ids=["mutual", "ratio", "filtered", "chunks", "candidate"],
 )
 @pytest.mark.parametrize("memory", [None, SMALL], ids=["all fits", "few slots"])
 def test_every_pair_is_matched_as_alone(options, memory):
