@@ -20,7 +20,8 @@ from mfvpr.features.aliked import AlikedFeatures
 from mfvpr.features.d2net import D2NetFeatures
 from mfvpr.features.mixvpr import MixVprDescriptor
 from mfvpr.features.network import compiled
-from mfvpr.models.d2net import extract, preprocess
+from mfvpr.models.d2net import extract
+from mfvpr.models.imagenet import preprocess
 from mfvpr.weights.files import is_installed, load
 from mfvpr.weights.networks import blueprint, network_of
 from mfvpr.weights.registry import entry_of
@@ -107,7 +108,7 @@ def _random(path: str, shape: tuple[int, ...]) -> np.ndarray:
 def of_d2net(images: np.ndarray) -> list[Entry]:
     """The dense map, and keypoints from host to host; of mfvpr also those that stay on the device."""
     model, arrays = make_network(D2NET)
-    dense = compiled(model, lambda model, batch: model(preprocess(batch)))
+    dense = compiled(model, lambda model, batch: model(preprocess(batch, "caffe")))
     on_device = compiled(model, partial(extract, share=0.3))
     extractor = partial(D2NetFeatures, model, image_size=images.shape[2:0:-1])
     steps = {

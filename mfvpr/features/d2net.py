@@ -11,7 +11,8 @@ from mfvpr.data.images import Interpolation
 from mfvpr.errors import InputError
 from mfvpr.features import Description, Scale
 from mfvpr.features.network import compiled, in_batches
-from mfvpr.models.d2net import SCALES, STRIDE, D2Net, Detections, Preprocessing, extract, map_size
+from mfvpr.models.d2net import SCALES, STRIDE, D2Net, Detections, extract, map_size
+from mfvpr.models.imagenet import Preprocessing
 from mfvpr.types import Features
 
 _SHARE = 0.3  # keypoint slots per position of a map; photographs take about a tenth

@@ -7,7 +7,7 @@ descriptor. Positions of the map are (row, column); those of the image are (x, y
 
 import math
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,11 +15,9 @@ import numpy as np
 from flax import nnx
 from jax import Array, lax
 
-from mfvpr.models.imagenet import DEVIATION, MEAN
+from mfvpr.models.imagenet import Preprocessing, preprocess
 from mfvpr.models.sampling import between, neighbors
 from mfvpr.models.vgg import Vgg16
-
-Preprocessing = Literal["caffe", "torch"]
 
 STRIDE = 4  # px between positions of the map
 SCALES = (0.5, 1.0, 2.0)  # of the multi-scale detection, in this order
@@ -94,36 +92,6 @@ def map_size(pixels: int) -> int:
     return pixels // STRIDE - 1
 
 
-def preprocess(images: Array, preprocessing: Preprocessing = "caffe") -> Array:
-    """RGB images `[B, H, W, 3]` from 0 to 255 -> what the network takes, float32.
-
-    "caffe" is what the published weights want: BGR minus the mean. "torch" is RGB in [0, 1], minus ImageNet's mean,
-    over its deviation. Of uint8 every bit is the original's.
-    """
-    ordered = images[..., ::-1] if preprocessing == "caffe" else images
-    if images.dtype == jnp.uint8:
-        table = jnp.asarray(_TABLES[preprocessing])
-        return jnp.stack([table[channel][ordered[..., channel]] for channel in range(3)], axis=-1)
-    scale, mean, deviation = (jnp.asarray(values, jnp.float32) for values in _STATISTICS[preprocessing])
-    return (ordered / scale - mean[None, None, None]) / deviation[None, None, None]
-
-
-# Scale, mean and deviation, in the network's order of the channels.
-_STATISTICS = {
-    "caffe": (1.0, np.array([103.939, 116.779, 123.68]), np.ones(3)),
-    "torch": (255.0, np.array(MEAN), np.array(DEVIATION)),
-}
-
-
-def _table(scale: float, mean: np.ndarray, deviation: np.ndarray) -> np.ndarray:
-    """`[3, 256]` of all bytes: subtracted in float64 and rounded, as in the original; a device has no float64."""
-    byte = np.arange(256, dtype=np.float32) / np.float32(scale)
-    return ((byte[None] - mean[:, None]) / deviation[:, None]).astype(np.float32)
-
-
-_TABLES = {name: _table(*statistics) for name, statistics in _STATISTICS.items()}
-
-
 def extract(
     model: D2Net,
     images: Array,
@@ -137,7 +105,7 @@ def extract(
     Args:
         model: the network.
         images: RGB, 0 .. 255, at least 12 px high and wide at every scale.
-        preprocessing: see `preprocess`.
+        preprocessing: of the pixels; "caffe" is what the published weights want.
         scales: of the images, see `detect`; `SCALES` are the original's.
         share: slots per position of a map; 1 holds whatever is found.
     """

@@ -1,4 +1,41 @@
-"""Statistics of ImageNet's training images, RGB in 0 .. 1: what networks trained on them, or from them, subtract."""
+"""What networks trained on ImageNet's images, or from such networks, take for pixels."""
 
-MEAN = (0.485, 0.456, 0.406)
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+Preprocessing = Literal["caffe", "torch"]
+
+MEAN = (0.485, 0.456, 0.406)  # of the training images, RGB in 0 .. 1
 DEVIATION = (0.229, 0.224, 0.225)
+
+
+def preprocess(images: Array, preprocessing: Preprocessing) -> Array:
+    """RGB images `[B, H, W, 3]` from 0 to 255 -> what the network takes, float32.
+
+    "caffe" is BGR minus the mean. "torch" is RGB in [0, 1], minus the mean, over the deviation. Bytes are rounded once.
+    """
+    ordered = images[..., ::-1] if preprocessing == "caffe" else images
+    if images.dtype == jnp.uint8:
+        table = jnp.asarray(_TABLES[preprocessing])
+        return jnp.stack([table[channel][ordered[..., channel]] for channel in range(3)], axis=-1)
+    scale, mean, deviation = (jnp.asarray(values, jnp.float32) for values in _STATISTICS[preprocessing])
+    return (ordered / scale - mean[None, None, None]) / deviation[None, None, None]
+
+
+# Scale, mean and deviation, in the network's order of the channels.
+_STATISTICS = {
+    "caffe": (1.0, np.array([103.939, 116.779, 123.68]), np.ones(3)),
+    "torch": (255.0, np.array(MEAN), np.array(DEVIATION)),
+}
+
+
+def _table(scale: float, mean: np.ndarray, deviation: np.ndarray) -> np.ndarray:
+    """`[3, 256]` of all bytes: subtracted in float64 and rounded, as D2-Net's code does; a device has no float64."""
+    byte = np.arange(256, dtype=np.float32) / np.float32(scale)
+    return ((byte[None] - mean[:, None]) / deviation[:, None]).astype(np.float32)
+
+
+_TABLES = {name: _table(*statistics) for name, statistics in _STATISTICS.items()}

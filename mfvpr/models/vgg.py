@@ -1,5 +1,6 @@
 """VGG16's convolutions (Simonyan & Zisserman, ICLR 2015) up to a named one: a backbone that several networks share."""
 
+from collections.abc import Sequence
 from typing import Literal
 
 import jax
@@ -8,7 +9,7 @@ from flax import nnx
 
 from mfvpr.models.convolution import Conv3x3
 
-Pool = Literal["max", "average"]
+Pool = Literal["max", "max_ceil", "average"]
 
 _WIDTHS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
 LAYERS = {
@@ -24,6 +25,7 @@ class Vgg16(nnx.Module):
     Args:
         last: the last convolution, whose output is returned before its ReLU.
         pools: after block 1, 2, ...: "max" halves the map (2 x 2, stride 2, an odd last row or column is dropped);
+            "max_ceil" as well, and an odd last row or column is pooled by itself;
             "average" smooths it (2 x 2, stride 1, no padding: one row and one column fewer).
         dilations: of the convolutions of block 1, 2, ...
         precision: of the products where the hardware offers less than float32.
@@ -49,13 +51,25 @@ class Vgg16(nnx.Module):
 
     def __call__(self, images: jax.Array, uniform: jax.Array | bool = False) -> jax.Array:
         """`[B, H, W, 3]` float32 -> `[B, h, w, D]`, before the last layer's ReLU; `uniform` as of `Conv3x3`."""
-        first, *others = self.layers
-        x = getattr(self, first)(images, uniform)
-        for name in others:
-            starts_block = name.endswith("_1")
-            x = _POOLS[self.pools[_block(name) - 2]](x) if starts_block else nnx.relu(x)
+        (last,) = self.maps(images, self.layers[-1:], uniform)
+        return last
+
+    def maps(
+        self, images: jax.Array, layers: Sequence[str], uniform: jax.Array | bool = False
+    ) -> tuple[jax.Array, ...]:
+        """What these layers give before their ReLU, each `[B, h, w, D]`; layers behind the last of them do not run."""
+        found = {}
+        x = images
+        for name in self.layers:
+            if name != self.layers[0]:
+                starts_block = name.endswith("_1")
+                x = _POOLS[self.pools[_block(name) - 2]](x) if starts_block else nnx.relu(x)
             x = getattr(self, name)(x, uniform)
-        return x
+            if name in layers:
+                found[name] = x
+            if len(found) == len(layers):
+                break
+        return tuple(found[name] for name in layers)
 
 
 def _block(name: str) -> int:
@@ -73,9 +87,15 @@ def _max_pool(x: jax.Array) -> jax.Array:
     return nnx.relu(jnp.maximum(rows[:, :, 0::2], rows[:, :, 1::2]))
 
 
+def _max_pool_ceil(x: jax.Array) -> jax.Array:
+    """As `_max_pool`; an odd last row or column is its own maximum."""
+    odd = ((0, 0), (0, x.shape[1] % 2), (0, x.shape[2] % 2), (0, 0))
+    return _max_pool(jnp.pad(x, odd, mode="edge"))
+
+
 def _average_pool(x: jax.Array) -> jax.Array:
     x = nnx.relu(x)
     return (x[:, :-1, :-1] + x[:, :-1, 1:] + x[:, 1:, :-1] + x[:, 1:, 1:]) / 4
 
 
-_POOLS = {"max": _max_pool, "average": _average_pool}
+_POOLS = {"max": _max_pool, "max_ceil": _max_pool_ceil, "average": _average_pool}

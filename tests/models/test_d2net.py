@@ -10,7 +10,8 @@ from mfvpr import InputError
 from mfvpr.features import d2net as features_d2net
 from mfvpr.features.d2net import D2NetFeatures
 from mfvpr.features.network import compiled
-from mfvpr.models.d2net import SCALES, D2Net, detect, extract, preprocess, select, survey
+from mfvpr.models.d2net import SCALES, D2Net, detect, extract, select, survey
+from mfvpr.models.imagenet import preprocess
 from mfvpr.weights.conversion import convert
 from mfvpr.weights.networks import blueprint
 from mfvpr.weights.registry import entry_of
@@ -85,23 +86,6 @@ def test_the_network_has_the_published_size():
         assert jax.eval_shape(model, image).shape == (1, side, side, 512)
 
 
-def test_bytes_are_preprocessed_to_the_last_bit():
-    image = np.arange(256, dtype=np.uint8)[None, :, None, None].repeat(3, axis=3)
-    mean = np.array([103.939, 116.779, 123.68])
-    expected = (image[..., ::-1].astype(np.float32) - mean).astype(np.float32)
-    np.testing.assert_array_equal(preprocess(image), expected)
-    np.testing.assert_allclose(preprocess(image.astype(np.float32)), expected, atol=1e-5)
-    mean, deviation = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
-    expected = ((image.astype(np.float32) / np.float32(255) - mean) / deviation).astype(np.float32)
-    np.testing.assert_array_equal(preprocess(image, "torch"), expected)
-    np.testing.assert_allclose(preprocess(image.astype(np.float32), "torch"), expected, atol=1e-5)
-
-
-def test_blue_comes_first_in_caffe():
-    image = np.array([10, 20, 30], np.uint8)[None, None, None]
-    np.testing.assert_allclose(preprocess(image)[0, 0, 0], [30 - 103.939, 20 - 116.779, 10 - 123.68], atol=1e-5)
-
-
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_maps_and_features_are_those_of_the_public_code(model, case):
     with np.load(GOLDEN) as file:
@@ -159,7 +143,7 @@ def test_neighbors_that_see_the_same_pixels_have_the_same_bits(model):
     tall[30:126, 2:94] = 200
     maps = compiled(model, lambda model, images: (model(images), nnx.relu(model.vgg(images, uniform=True))))
     (usual, wide, tall), (uniform, *_) = zip(
-        *(maps(preprocess(image[None])) for image in (image, wide, tall)), strict=True
+        *(maps(preprocess(image[None], "caffe")) for image in (image, wide, tall)), strict=True
     )
     np.testing.assert_array_equal(wide[0, 11, 18], wide[0, 11, 19])
     np.testing.assert_array_equal(tall[0, 18, 11], tall[0, 19, 11])
@@ -327,6 +311,6 @@ def test_relu_is_an_option(model, images):
     open_ended = nnx.merge(*nnx.split(model))
     open_ended.relu = False
     both = compiled(nnx.List([model, open_ended]), lambda models, images: [model(images) for model in models])
-    usual, dense = both(preprocess(images[:1, :24, :24]))
+    usual, dense = both(preprocess(images[:1, :24, :24], "caffe"))
     assert dense.min() < 0
     np.testing.assert_array_equal(usual, np.maximum(dense, 0))

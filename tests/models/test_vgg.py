@@ -51,3 +51,47 @@ def test_parameter_counts_are_the_published_ones(last, count):
     with jax.numpy_dtype_promotion("standard"):
         model = nnx.eval_shape(lambda: Vgg16(last, rngs=nnx.Rngs(0)))
     assert sum(leaf.size for leaf in jax.tree.leaves(nnx.state(model))) == count
+
+
+def halved(x, *, ceil):
+    """Maxima of 2 x 2, in loops; with `ceil` also of what is left at the ends."""
+    rows, columns = ((size + ceil) // 2 for size in x.shape[1:3])
+    result = np.zeros((len(x), rows, columns, x.shape[3]))
+    for row in range(rows):
+        for column in range(columns):
+            result[:, row, column] = x[:, 2 * row : 2 * row + 2, 2 * column : 2 * column + 2].max((1, 2))
+    return result
+
+
+@pytest.mark.parametrize("pool", ["max", "max_ceil"])
+@pytest.mark.parametrize("height, width", [(4, 6), (5, 6), (4, 7), (5, 7), (1, 3)])
+def test_odd_rows_and_columns_are_dropped_or_pooled_by_themselves(pool, height, width):
+    model = Vgg16("conv2_1", pools=(pool,), rngs=nnx.Rngs(0))
+    image = np.random.default_rng(0).normal(size=(1, height, width, 3)).astype(np.float32)
+    expected = image
+    for name in ("conv1_1", "conv1_2"):
+        expected = np.maximum(convolved(expected, np.asarray(getattr(model, name).kernel[...]), 1), 0)
+    expected = convolved(halved(expected, ceil=pool == "max_ceil"), np.asarray(model.conv2_1.kernel[...]), 1)
+    actual = model(image)
+    assert actual.shape == expected.shape
+    np.testing.assert_allclose(actual, expected, atol=1e-5 * max(np.abs(expected).max(initial=0), 1))
+
+
+def test_maps_are_those_of_networks_that_end_there():
+    model = Vgg16("conv3_1", rngs=nnx.Rngs(0))
+    image = np.random.default_rng(0).normal(size=(2, 9, 8, 3)).astype(np.float32)
+    last, first = model.maps(image, ("conv3_1", "conv1_2"))
+    np.testing.assert_array_equal(last, model(image))
+    ends = Vgg16("conv1_2", rngs=nnx.Rngs(0))
+    for name in ends.layers:
+        nnx.update(getattr(ends, name), nnx.state(getattr(model, name)))
+    np.testing.assert_array_equal(first, ends(image))
+
+
+def test_layers_behind_the_last_map_do_not_run():
+    with jax.numpy_dtype_promotion("standard"):
+        model = nnx.eval_shape(lambda: Vgg16("conv5_3", rngs=nnx.Rngs(0)))
+    graph, state = nnx.split(model)
+    image = jax.ShapeDtypeStruct((1, 32, 32, 3), jnp.float32)
+    run = jax.make_jaxpr(lambda state, image: nnx.merge(graph, state).maps(image, ("conv1_2",)))(state, image)
+    assert str(run).count("conv_general_dilated[") == 2

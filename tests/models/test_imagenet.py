@@ -1,0 +1,24 @@
+"""Pixels as the networks take them."""
+
+import numpy as np
+
+from mfvpr.models.imagenet import preprocess
+
+
+def test_bytes_are_preprocessed_to_the_last_bit():
+    image = np.arange(256, dtype=np.uint8)[None, :, None, None].repeat(3, axis=3)
+    mean = np.array([103.939, 116.779, 123.68])
+    expected = (image[..., ::-1].astype(np.float32) - mean).astype(np.float32)
+    np.testing.assert_array_equal(preprocess(image, "caffe"), expected)
+    np.testing.assert_allclose(preprocess(image.astype(np.float32), "caffe"), expected, atol=1e-5)
+    mean, deviation = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
+    expected = ((image.astype(np.float32) / np.float32(255) - mean) / deviation).astype(np.float32)
+    np.testing.assert_array_equal(preprocess(image, "torch"), expected)
+    np.testing.assert_allclose(preprocess(image.astype(np.float32), "torch"), expected, atol=1e-5)
+
+
+def test_blue_comes_first_in_caffe():
+    image = np.array([10, 20, 30], np.uint8)[None, None, None]
+    np.testing.assert_allclose(
+        preprocess(image, "caffe")[0, 0, 0], [30 - 103.939, 20 - 116.779, 10 - 123.68], atol=1e-5
+    )
