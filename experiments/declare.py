@@ -12,7 +12,7 @@ import yaml
 from experiments.settings import CONF
 from mfvpr.data.files import write_text
 from mfvpr.declaration import declared, summary
-from mfvpr.scoring import SCORERS
+from mfvpr.scoring import OF_CELLS, SCORERS
 
 _FIRST = "# Made by `make conf` from mfvpr/scoring: change it there.\n"
 
@@ -20,8 +20,8 @@ _FIRST = "# Made by `make conf` from mfvpr/scoring: change it there.\n"
 def files() -> dict[str, str]:
     """Texts by path below conf/."""
     made = {f"scorer/{name}.yaml": "\n".join(_scorer(name, scorer)) for name, scorer in SCORERS.items()}
-    every = "\n".join(f"  - {name}@{name}" for name in SCORERS)
-    made["scorer/all.yaml"] = f"# Every score, each with the paper's parameters.\ndefaults:\n{every}"
+    every = "\n".join(f"  - {name}@{name}" for name in SCORERS if name not in OF_CELLS)
+    made["scorer/all.yaml"] = f"# Every score of any features, each with the paper's parameters.\ndefaults:\n{every}"
     made["axes.yaml"] = "\n".join(_axes())
     limits = {
         name: {field: parameter.limits for field, parameter in declared(scorer).items()}

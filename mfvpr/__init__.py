@@ -19,6 +19,7 @@ from mfvpr.retrieval import retrieve
 from mfvpr.scoring import (
     AggregatedScore,
     AnchorPoints,
+    GridAnchors,
     HistogramOfShifts,
     MatchCount,
     Scorer,
@@ -41,6 +42,7 @@ __all__ = [
     "DescriptorDistanceWeight",
     "FeatureScoreWeight",
     "Features",
+    "GridAnchors",
     "HistogramOfShifts",
     "InputError",
     "MatchCount",

@@ -22,7 +22,9 @@ COUNTS = (0, 1, 2, 17, 40)
 TOLERANCE = 1e-4  # of the largest score: float32 sums in another order
 
 
-def check_scorer(scorer: Scorer, *, image_size: tuple[int, int] = (336, 336), seed: int = 0) -> None:
+def check_scorer(
+    scorer: Scorer, *, image_size: tuple[int, int] = (336, 336), num_keypoints: int | None = None, seed: int = 0
+) -> None:
     """Check that a scorer keeps the contract, on made-up matches.
 
     In this order: it is a value or a plain function; scores are scalars, float32 and finite, and exactly 0 without
@@ -32,13 +34,14 @@ def check_scorer(scorer: Scorer, *, image_size: tuple[int, int] = (336, 336), se
     Args:
         scorer: any; a sampling one must be reproducible, and may hold a key.
         image_size: (width, height) of the made-up images, px.
+        num_keypoints: of the made-up images, at least 40; None = three times as many as are matched.
         seed: of the made-up matches.
 
     Raises:
         AssertionError: it does not; the message says what broke, and the usual mend.
     """
     try:
-        _check(scorer, image_size, seed)
+        _check(scorer, image_size, num_keypoints, seed)
     except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
         raise AssertionError(
             f"{type(scorer).__name__} asks Python for a number that jit has not computed yet (if, while, float(), "
@@ -46,9 +49,12 @@ def check_scorer(scorer: Scorer, *, image_size: tuple[int, int] = (336, 336), se
         ) from error
 
 
-def _check(scorer: Scorer, image_size: tuple[int, int], seed: int) -> None:
+def _check(scorer: Scorer, image_size: tuple[int, int], num_keypoints: int | None, seed: int) -> None:
     _check_is_value(scorer)
-    pairs = [_made_up(np.random.default_rng([seed, count]), count, image_size) for count in COUNTS]
+    pairs = [
+        _made_up(np.random.default_rng([seed, count]), count, image_size, num_keypoints or 3 * count)
+        for count in COUNTS
+    ]
     scorer = fit(scorer, pairs[0].image_size0, pairs[0].image_size1)
     scores = np.array([_check_scalar(scorer, pair, count) for pair, count in zip(pairs, COUNTS, strict=True)])
     close = _Close(TOLERANCE * float(np.abs(scores).max()))
@@ -184,7 +190,7 @@ def _is_floating(leaf: Any) -> bool:
     return not callable(leaf) and jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
 
 
-def _made_up(rng: np.random.Generator, count: int, image_size: tuple[int, int]) -> Matches:
+def _made_up(rng: np.random.Generator, count: int, image_size: tuple[int, int], num_keypoints: int) -> Matches:
     """Matches of one pair, half of which share a shift; padding holds NaN."""
     size = np.array(image_size, np.float32)
     points0, anywhere = (rng.uniform(0, size, (count, 2)) for _ in range(2))
@@ -193,8 +199,8 @@ def _made_up(rng: np.random.Generator, count: int, image_size: tuple[int, int]) 
     unit = (rng.uniform(0.05, 0.95, count) for _ in range(5))
     entries = [np.asarray(values, np.float32) for values in (points0, points1, *unit)]
     points0, points1, distance, scores0, scores1, ratio, confidence = entries
-    indices = (rng.permutation(3 * count)[:count].astype(np.int32) for _ in range(2))
-    counts = np.full(2, 3 * count, np.int32)
+    indices = (rng.permutation(num_keypoints)[:count].astype(np.int32) for _ in range(2))
+    counts = np.full(2, num_keypoints, np.int32)
     real = np.ones(count, bool)
     pair = Matches(points0, points1, distance, scores0, scores1, real, size, size, ratio, confidence, *indices, *counts)
     return _padded(pair, np.nan, SLOTS)

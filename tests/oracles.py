@@ -299,6 +299,27 @@ def aggregated_score(shifts, weights, size, *, mean="unweighted", clamp=False, c
     return score
 
 
+def grid_anchors(index, side, *, patch=None, wrap=True, outside=-1000):
+    """SSM-VPR's score of `index`: by row and column of the candidate the query's cell, None = no match."""
+    size = int(0.75 * side) if patch is None else patch
+    half = (size - (size % 2 == 0)) // 2
+    score = 0
+    for row in range(side):
+        for column in range(side):
+            anchor = index[row][column]
+            if anchor is None:
+                continue
+            for down in range(-half, half + 1):
+                for right in range(-half, half + 1):
+                    inside = 0 <= row + down < side and 0 <= column + right < side
+                    other = index[row + down][column + right] if inside else outside
+                    if wrap:
+                        score += other == anchor + down * side + right
+                    elif inside and other is not None:
+                        score += divmod(other, side) == (anchor // side + down, anchor % side + right)
+    return score
+
+
 def match_count(n):
     """Number of mutual matches (re-ranking of SelaVPR)."""
     return float(n)

@@ -14,7 +14,7 @@ from experiments.settings import CONF
 from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, value
 from mfvpr.declaration import check_choices, choice, declared, flag, made, named, number, numbers, whole
 from mfvpr.learning.parameters import can_learn, starts
-from mfvpr.scoring import SCORERS, match_shifts
+from mfvpr.scoring import OF_CELLS, SCORERS, match_shifts
 from mfvpr.types import Array, Matches
 from mfvpr.weighting import WEIGHTS, UnitWeight, Weight, match_weights
 from tests.programs import ROOT, results, shared, small, typed
@@ -97,7 +97,7 @@ def test_conf_and_help_follow_from_the_class(near, monkeypatch, capsys):
     for line in (summary, *lines):
         assert f"\n  {line}\n" in stdout
     assert "Made by" not in stdout
-    assert "\n  scorer=near             all, anchor, count, histogram, sum\n" in stdout
+    assert "\n  scorer=near             all, anchor, count, grid, histogram, sum\n" in stdout
     assert "\n  radius: null  # near: px\n" in stdout
     assert "\n  norm: null  # near: sum, largest\n" in stdout
     assert f"\n  weight: null  # sum, anchor, histogram, near: {', '.join(WEIGHTS)}\n" in stdout
@@ -108,7 +108,7 @@ def test_conf_and_help_follow_from_the_class(near, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("program", "arguments", "words"),
     [
-        ("evaluate", ["scorer=neat"], "expected one of all, anchor, count, histogram, near, sum; the nearest is near"),
+        ("evaluate", ["scorer=neat"], "one of all, anchor, count, grid, histogram, near, sum; the nearest is near"),
         ("evaluate", ["scorer.near.radius=0"], "scorer.near.radius=0: expected a number above 0 (1e-6 to 1e12)"),
         ("evaluate", ["scorer.near.most=501"], "scorer.near.most=501: expected a number from 1 to 500, or null"),
         ("evaluate", ["scorer=near", "scorer.rounds=10"], "scorer.rounds=10: expected a whole number from 1 to 9"),
@@ -137,7 +137,7 @@ def test_rules_follow_from_the_class(near, monkeypatch, capsys, program, argumen
 def test_all_scores_contain_it(near):
     with hydra.initialize_config_dir(str(near), version_base="1.3"):
         found = build.scorers(hydra.compose("config", ["scorer.near.size=[1,2]", "scorer.near.norm=largest"])["scorer"])
-    assert [*found] == [*SCORERS]
+    assert [*found] == [name for name in SCORERS if name not in OF_CELLS]
     assert found["near"] == Nearness(size=(1.0, 2.0), norm="largest")
     assert found["near"].weight is WEIGHTS["unit"]
 

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from mfvpr.scoring.aggregate import AggregatedScore
 from mfvpr.scoring.anchor import AnchorPoints
 from mfvpr.scoring.counting import MatchCount
+from mfvpr.scoring.grid import GridAnchors
 from mfvpr.scoring.histogram import HistogramOfShifts, ShiftHistogram
 from mfvpr.scoring.shifts import image_sizes, match_shifts
 from mfvpr.types import Array, Matches
@@ -22,13 +23,19 @@ SCORERS: dict[str, type] = {
     "sum": AggregatedScore,
     "anchor": AnchorPoints,
     "histogram": HistogramOfShifts,
+    "grid": GridAnchors,
 }
 """The scores that programs know, by name. Their settings follow from their fields (`mfvpr.declaration`)."""
 
+OF_CELLS = frozenset({"grid"})
+"""Those that score features which are all cells of a grid, and no others: they are not among "all scores"."""
+
 __all__ = [
+    "OF_CELLS",
     "SCORERS",
     "AggregatedScore",
     "AnchorPoints",
+    "GridAnchors",
     "HistogramOfShifts",
     "MatchCount",
     "Scorer",
