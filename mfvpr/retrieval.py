@@ -13,6 +13,7 @@ from mfvpr.errors import InputError
 from mfvpr.evaluation.positives import Positives
 from mfvpr.numerics import at_least_single, compiled, device_of, free_bytes, masked
 from mfvpr.types import Array, Shortlist
+from mfvpr.whitening import Whitening, fit_whitening
 
 SHARE = 1 / 16  # of the free memory, for the similarities that exist at the same time
 
@@ -98,16 +99,10 @@ class WhitenedSearch:
             InputError: there are fewer finite descriptors, or fewer numbers in each, than components.
         """
         usable = database[np.isfinite(database).all(axis=1)]
-        if self.dimension >= len(usable) or self.dimension > usable.shape[1]:
-            raise InputError(f"whitening: expected more than {self.dimension} descriptors of as many numbers, got "
-                             f"{len(usable)} of {usable.shape[1]}; keep fewer components")  # fmt: skip
         rows = np.linspace(0, len(usable) - 1, min(len(usable), self.max_samples)).astype(int)
         sample = usable[rows].astype(np.float64)
-        mean = sample.mean(axis=0)
-        _, spread, axes = np.linalg.svd(sample - mean, full_matrices=False)
-        spread = np.maximum(spread[: self.dimension], 1e-6 * spread[0]) / np.sqrt(len(sample))
-        components = axes[: self.dimension] / spread[:, None]
-        return Whitened(mean.astype(np.float32), components.astype(np.float32), self.search)
+        fitted = fit_whitening(sample, self.dimension)
+        return Whitened(Whitening(*(part.astype(np.float32) for part in (fitted.mean, fitted.components))), self.search)
 
     def shortlist(
         self, queries: np.ndarray, database: np.ndarray, num_candidates: int, *, excluded: Positives | None = None
@@ -118,10 +113,9 @@ class WhitenedSearch:
 
 @dataclass(frozen=True)
 class Whitened:
-    """`WhitenedSearch` that knows its database: the mean `[D]` and the components `[D', D]`."""
+    """`WhitenedSearch` that knows its database."""
 
-    mean: np.ndarray
-    components: np.ndarray
+    whitening: Whitening
     search: Search
 
     def fit(self, database: np.ndarray) -> "Whitened":
@@ -136,7 +130,7 @@ class Whitened:
         return self.search.shortlist(queries, database, num_candidates, excluded=excluded)
 
     def _whitened(self, descriptors: np.ndarray) -> np.ndarray:
-        whitened = (descriptors - self.mean) @ self.components.T
+        whitened = self.whitening(descriptors)
         lengths = np.linalg.norm(whitened, axis=1, keepdims=True)
         return whitened / np.where(lengths > 0, lengths, 1)
 

@@ -26,7 +26,8 @@ ALLOWED = {
     "stores": {"data", "errors", "fingerprints", "match_sets", "stores", "threads", "types"},
     "pair_matching": {"match_sets", "matching", "numerics", "ragged", "sources", "threads", "types"},
     "scoring": {"declaration", "errors", "numerics", "types", "weighting", "scoring"},
-    "retrieval": {"errors", "evaluation", "numerics", "types"},
+    "whitening": {"errors"},
+    "retrieval": {"errors", "evaluation", "numerics", "types", "whitening"},
     "reranking": {"errors", "numerics", "types", "scoring"},
     "parameter_grids": {"matching", "numerics", "types", "scoring", "weighting", "reranking"},
     "sweeping": {

@@ -1,0 +1,74 @@
+"""Principal components against a full singular value decomposition."""
+
+import numpy as np
+import pytest
+
+from mfvpr import whitening
+from mfvpr.errors import InputError
+from mfvpr.whitening import fit_bytes, fit_whitening
+
+
+def samples(count, size, dtype=np.float64, rank=None):
+    """Vectors of falling variance around a mean that is not 0."""
+    rng = np.random.default_rng([count, size])
+    rank = rank or min(count - 1, size)
+    axes = np.linalg.qr(rng.normal(size=(size, rank)))[0]
+    return (rng.normal(size=(count, rank)) * 0.9 ** np.arange(rank) @ axes.T + rng.normal(size=size)).astype(dtype)
+
+
+def by_decomposition(sample, dimension):
+    """As scikit-learn: the signs by the largest entry of each axis."""
+    sample = sample.astype(np.float64)
+    mean = sample.mean(axis=0)
+    _, spread, axes = np.linalg.svd(sample - mean, full_matrices=False)
+    axes = axes[:dimension]
+    signs = np.sign(axes[np.arange(dimension), np.abs(axes).argmax(axis=1)])
+    return mean, signs[:, None] * axes / (spread[:dimension, None] / np.sqrt(len(sample) - 1))
+
+
+@pytest.mark.parametrize("shape", [(60, 25), (25, 60), (31, 30), (30, 30)], ids=str)
+@pytest.mark.parametrize("block", [7, 2**25])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-10), (np.float32, 1e-6)])
+def test_both_matrices_give_the_components_of_the_sample(shape, block, dtype, tolerance, monkeypatch):
+    monkeypatch.setattr(whitening, "_BLOCK", block)
+    sample = samples(*shape, dtype)
+    fitted, (mean, components) = fit_whitening(sample, 12), by_decomposition(sample, 12)
+    assert fitted.mean.dtype == fitted.components.dtype == dtype
+    np.testing.assert_allclose(fitted.mean, mean, atol=tolerance)
+    np.testing.assert_allclose(fitted.components, components, atol=tolerance * np.abs(components).max())
+    white = fitted(sample.astype(np.float64))
+    np.testing.assert_allclose(np.cov(white.T), np.eye(12), atol=100 * tolerance)
+
+
+@pytest.mark.parametrize("shape", [(60, 25), (25, 60)], ids=str)
+def test_a_component_without_variance_is_zero(shape):
+    """Where a division by its standard deviation would make rounding as large as all else."""
+    fitted = fit_whitening(samples(*shape, np.float32, rank=5), 8)
+    assert np.isfinite(fitted.components).all()
+    assert fitted.components[:5].any(axis=1).all()
+    assert not fitted.components[5:].any()
+
+
+@pytest.mark.parametrize(
+    ("count", "size", "dimension", "line"),
+    [(8, 20, 8, "more than 8 descriptors of as many numbers, got 8 of 20"),
+     (20, 7, 8, "more than 8 descriptors of as many numbers, got 20 of 7"),
+     (1, 7, 1, "got 1 of 7"), (9, 7, 0, "more than 0")],
+)  # fmt: skip
+def test_too_few_vectors_are_refused(count, size, dimension, line):
+    with pytest.raises(InputError, match=line):
+        fit_whitening(np.random.default_rng(0).normal(size=(count, size)), dimension)
+
+
+@pytest.mark.parametrize("value", [0.0, 0.1, 1e6])
+@pytest.mark.parametrize("shape", [(9, 4), (4, 9)], ids=str)
+def test_vectors_that_are_alike_are_refused(value, shape):
+    sample = np.full(shape, np.float32(value))
+    with pytest.raises(InputError, match="that differ"):
+        fit_whitening(sample, 2)
+
+
+def test_memory_is_that_of_the_sample_and_of_the_smaller_matrix():
+    """Of 250 images: 9000 windows of the first stage, 10000 of the second."""
+    gigabytes = [fit_bytes(9000, 41472, 4) / 1e9, fit_bytes(10000, 4608, 8) / 1e9]
+    np.testing.assert_allclose(gigabytes, [1.493 + 1.296 + 0.537, 0.369 + 0.340 + 0.537], rtol=0.01)
