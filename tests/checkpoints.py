@@ -134,6 +134,27 @@ def write_legacy(path: Path, content: Any) -> Path:
     return path
 
 
+HEADER = "{'descr': '|O', 'fortran_order': False, 'shape': (), }"
+
+
+def write_numpy(path: Path, content: Any, *, protocol: int = 4, header: str = HEADER) -> Path:
+    """A .npy file of one pickled object, in NumPy's way; of bytes, they are the pickle."""
+    start = header.ljust(117) + "\n"
+    if not isinstance(content, bytes):
+        content = pickle.dumps(np.array(content, dtype=object), protocol=protocol)
+    path.write_bytes(b"\x93NUMPY\x01\0" + struct.pack("<H", len(start)) + start.encode() + content)
+    return path
+
+
+def layered(tensors: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
+    """`layer.name` -> layer -> name, as SSM-VPR's .npy files have it."""
+    layers: dict[str, dict[str, np.ndarray]] = {}
+    for key, array in tensors.items():
+        layer, _, name = key.partition(".")
+        layers.setdefault(layer, {})[name] = array
+    return layers
+
+
 def random_checkpoint(shapes: Mapping[str, tuple[int, ...]], seed: int = 0) -> dict[str, np.ndarray]:
     """Plausible weights: each depends on its name, its shape and the seed alone."""
     return {name: _random(name, shape, seed) for name, shape in shapes.items()}
@@ -172,6 +193,22 @@ def d2net_shapes() -> dict[str, tuple[int, ...]]:
         shapes[f"dense_feature_extraction.model.{index}.weight"] = (outputs, inputs, 3, 3)
         shapes[f"dense_feature_extraction.model.{index}.bias"] = (outputs,)
     return shapes
+
+
+def places365_shapes(weights: str = "weights", *, full: bool = True) -> dict[str, tuple[int, ...]]:
+    """The tensors of vgg16_places365.npy, and of other files with Caffe's names; those SSM-VPR needs unless `full`."""
+    widths = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
+    shapes, inputs = {}, 3
+    for block, outputs in enumerate(widths, start=1):
+        for place, width in enumerate(outputs, start=1):
+            shapes[f"conv{block}_{place}"] = (width, inputs, 3, 3)
+            inputs = width
+    if full:
+        shapes |= {"fc6_1": (4096, 25_088), "fc7_1": (4096, 4096), "fc8a_1": (365, 4096)}
+    else:
+        del shapes["conv5_3"]
+    kinds = {weights: lambda shape: shape, "bias": lambda shape: shape[:1]}
+    return {f"{layer}.{name}": kind(shape) for layer, shape in shapes.items() for name, kind in kinds.items()}
 
 
 def mixvpr_shapes(out_channels: int = 1024, out_rows: int = 4) -> dict[str, tuple[int, ...]]:

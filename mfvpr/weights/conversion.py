@@ -6,7 +6,7 @@ once, every type and shape is checked. What is wrong is counted by kind, with an
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import NamedTuple
 
@@ -22,6 +22,7 @@ class Layout(Enum):
     COPY = None
     CONV = (2, 3, 1, 0)  # OIHW -> HWIO
     LINEAR = (1, 0)  # (out, in) -> (in, out)
+    VECTOR = (0,)  # (1, O, 1, 1) and the like -> (O,)
 
 
 class Rule(NamedTuple):
@@ -34,10 +35,17 @@ class Rule(NamedTuple):
 
 @dataclass(frozen=True)
 class Table:
-    """All keys of a network's checkpoint; `ignored` are patterns of keys that hold no parameters."""
+    """All keys of a network's checkpoint.
+
+    Args:
+        rules: where they go.
+        ignored: patterns of keys that the network does not need.
+        expected: patterns of those among them whose shape tells whether it is this network's checkpoint.
+    """
 
     rules: tuple[Rule, ...]
     ignored: tuple[str, ...] = ()
+    expected: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
 
 def convert(
@@ -62,6 +70,9 @@ def convert(
 
     for key, value in source.items():
         if _is_ignored(key, table):
+            for pattern, shape in table.expected.items():
+                if re.fullmatch(pattern, key) and value.shape != shape:
+                    wrong("of another shape", f"{key}: expected {shape}, got {value.shape}")
             continue
         targets = _targets(key, table)
         if len(targets) > 1:
@@ -75,6 +86,8 @@ def convert(
             wrong("twice", f"{key} and {origin[target]}")
             continue
         origin[target] = key
+        if layout is Layout.VECTOR:
+            value = np.atleast_1d(value.squeeze())
         expected = _source_shape(shapes[target], layout)
         if value.shape != expected:
             wrong("of another shape", f"{key}: expected {expected}, got {value.shape}")

@@ -13,7 +13,7 @@ from mfvpr.errors import InputError
 from mfvpr.weights.conversion import Rule, Table, convert, share_known
 from mfvpr.weights.pickles import excerpt
 from mfvpr.weights.registry import REGISTRY, Entry
-from mfvpr.weights.tables import ALIKED, D2NET, MIXVPR
+from mfvpr.weights.tables import ALIKED, D2NET, MIXVPR, SSM
 
 if TYPE_CHECKING:
     from flax import nnx
@@ -40,6 +40,12 @@ def _mixvpr(out_channels: int, out_rows: int) -> Callable[..., "nnx.Module"]:
     return partial(MixVPR, out_channels=out_channels, out_rows=out_rows)
 
 
+def _ssm() -> Callable[..., "nnx.Module"]:
+    from mfvpr.models.ssm import SsmVgg
+
+    return SsmVgg
+
+
 def _aliked(variant: str) -> Callable[..., "nnx.Module"]:
     from mfvpr.models.aliked import Aliked
 
@@ -57,6 +63,7 @@ NETWORKS: dict[str, Network] = {
     "mixvpr_4096": Network(partial(_mixvpr, 1024, 4), MIXVPR),
     "mixvpr_512": Network(partial(_mixvpr, 256, 2), MIXVPR),
     "mixvpr_128": Network(partial(_mixvpr, 64, 2), MIXVPR),
+    "vgg16_places365": Network(_ssm, SSM),
     **{name: Network(partial(_aliked, name), ALIKED) for name in _ALIKED},
 }
 

@@ -1,54 +1,20 @@
-"""Reads what torch pickles, as data: an interpreter of the few instructions that checkpoints take, which calls nothing.
+"""Reads pickles as data: an interpreter of the instructions that hold data, which calls nothing.
 
-Python's own unpickler looks up and calls whatever a file names. Here a name stays a name: ordered dictionaries, tensors
-and parameters are known by theirs, a training's notes beside them are left unread, and all else is refused.
+Python's own unpickler looks up and calls whatever a file names. Here a name stays a name: a reader of one kind of file
+says what the few that it knows stand for, and all else is refused.
 """
 
+import os
 import pickletools
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, BinaryIO, NamedTuple
+from types import SimpleNamespace
+from typing import Any, BinaryIO, Protocol
 
 from mfvpr.errors import InputError
 
-_LARGEST = 1 << 22  # bytes of a pickle, which holds names and shapes; values lie elsewhere
-_NOTES = {  # the command line and the losses, as D2-Net's training keeps them
-    "argparse.Namespace",
-    "_codecs.encode",
-    "numpy.dtype",
-    *(f"numpy.{core}.multiarray.scalar" for core in ("core", "_core")),
-}
-_MEND = "nothing was executed, use the official file"
-
-
-@dataclass(frozen=True)
-class Storage:
-    """Where a tensor's values lie."""
-
-    kind: str  # torch's name of its type: FloatStorage, ...
-    key: str
-    count: int  # values
-
-
-@dataclass(frozen=True)
-class Tensor:
-    """A strided view of a storage; offset and strides count values."""
-
-    storage: Storage
-    offset: int
-    shape: tuple[int, ...]
-    strides: tuple[int, ...]
-
-
-class Content(NamedTuple):
-    """Of a pickle: numbers, strings, tuples, lists, dictionaries and Tensors; and the storages of these by key."""
-
-    value: Any
-    storages: dict[str, Storage]
-
-
-class Unread:
-    """A note that nobody asks for."""
+_MOST = 1 << 20  # instructions, of which each makes one object; strings hold as much as the file at most
+MEND = "nothing was executed, use the official file"
 
 
 @dataclass(frozen=True)
@@ -62,13 +28,48 @@ class Name:
         return f"{self.module}.{self.name}"
 
 
+class Vocabulary(Protocol):
+    """What the names of one kind of file stand for.
+
+    Each method raises InputError for what has no place there, and TypeError or ValueError for what is damaged.
+    """
+
+    def called(self, name: Name, arguments: tuple) -> Any:
+        """What a call of this name gives."""
+        ...
+
+    def built(self, instance: Any, state: Any) -> None:
+        """Fill what a call gave, in place."""
+        ...
+
+    def stored(self, identity: Any) -> Any:
+        """What lies outside of the pickle under this identity."""
+        ...
+
+
 def excerpt(text: str) -> str:
     """What a file says, short and on one line, for a message."""
     return repr(text if len(text) <= 60 else f"{text[:57]}...")[1:-1]
 
 
-def read_pickle(file: BinaryIO) -> Content:
-    """The next pickle of a file, which then stands behind it.
+def refused(name: Name, expected: str) -> InputError:
+    """That a pickle asks for this name where something else is expected."""
+    return InputError(f"it asks for {excerpt(str(name))}, where {expected} are expected; {MEND}")
+
+
+def file_size(file: BinaryIO) -> int:
+    """Bytes of an open file, which stays where it is."""
+    place = file.tell()
+    size = file.seek(0, os.SEEK_END)
+    file.seek(place)
+    return size
+
+
+def read_pickle(file: BinaryIO, vocabulary: Vocabulary) -> Any:
+    """What the next pickle of a file holds; the file then stands behind it.
+
+    Protocols 0 to 4, without the strings of Python 2's protocol 0. Those of its other protocols, which may be text or
+    bytes, become text in which each character is a byte.
 
     Raises:
         InputError: it asks for anything else, or is too large.
@@ -77,7 +78,6 @@ def read_pickle(file: BinaryIO) -> Content:
     stack: list[Any] = []
     marks: list[int] = []
     memo: dict[int, Any] = {}
-    storages: dict[str, Storage] = {}
 
     def popped(count: int) -> list[Any]:
         start = len(stack) - count
@@ -90,15 +90,18 @@ def read_pickle(file: BinaryIO) -> Content:
     def above_mark() -> list[Any]:
         return popped(len(stack) - marks.pop())
 
-    start = file.tell()
-    instructions: Iterator[tuple[Any, Any, Any]] = pickletools.genops(file)
-    for instruction, argument, position in instructions:
-        if position - start > _LARGEST:
-            raise InputError(f"its pickle has more than {_LARGEST:,} bytes; {_MEND}")
+    instructions: Iterator[tuple[Any, Any, Any]] = pickletools.genops(_bounded(file))
+    for count, (instruction, argument, _) in enumerate(instructions):
+        if count >= _MOST:
+            raise InputError(f"its pickle has more than {_MOST:,} instructions; {MEND}")
         match instruction.name:
-            case "PROTO":
+            case "PROTO" | "FRAME":
                 pass
-            case "BININT" | "BININT1" | "BININT2" | "LONG1" | "BINFLOAT" | "BINUNICODE":
+            case "INT" | "BININT" | "BININT1" | "BININT2" | "LONG" | "LONG1" | "FLOAT" | "BINFLOAT":
+                stack.append(argument)
+            case "UNICODE" | "BINUNICODE" | "SHORT_BINUNICODE" | "BINUNICODE8" | "BINSTRING" | "SHORT_BINSTRING":
+                stack.append(argument)
+            case "BINBYTES" | "SHORT_BINBYTES" | "BINBYTES8":
                 stack.append(argument)
             case "NONE" | "NEWTRUE" | "NEWFALSE":
                 stack.append({"NONE": None, "NEWTRUE": True, "NEWFALSE": False}[instruction.name])
@@ -110,78 +113,73 @@ def read_pickle(file: BinaryIO) -> Content:
                 stack.append(tuple(above_mark()))
             case "TUPLE1" | "TUPLE2" | "TUPLE3":
                 stack.append(tuple(popped(int(instruction.name[-1]))))
+            case "LIST":
+                stack.append(above_mark())
+            case "DICT":
+                stack.append(_entries(above_mark()))
             case "APPEND" | "APPENDS":
                 items = popped(1) if instruction.name == "APPEND" else above_mark()
-                _as(list, stack[-1]).extend(items)
+                of_type(list, stack[-1]).extend(items)
             case "SETITEM" | "SETITEMS":
                 items = popped(2) if instruction.name == "SETITEM" else above_mark()
-                keys = [key if type(key) is int else _as(str, key) for key in items[::2]]
-                _as(dict, stack[-1]).update(zip(keys, items[1::2], strict=True))
-            case "BINPUT" | "LONG_BINPUT":
+                of_type(dict, stack[-1]).update(_entries(items))
+            case "PUT" | "BINPUT" | "LONG_BINPUT":
                 memo[argument] = stack[-1]
-            case "BINGET" | "LONG_BINGET":
+            case "MEMOIZE":
+                memo[len(memo)] = stack[-1]
+            case "GET" | "BINGET" | "LONG_BINGET":
                 stack.append(memo[argument])
             case "GLOBAL":
                 stack.append(Name(*argument.split(" ")))
+            case "STACK_GLOBAL":
+                stack.append(Name(*(of_type(str, part) for part in popped(2))))
             case "BINPERSID":
-                storage = _storage(*popped(1))
-                if storages.setdefault(storage.key, storage) != storage:
-                    raise ValueError
-                stack.append(storage)
+                stack.append(vocabulary.stored(*popped(1)))
             case "REDUCE" | "NEWOBJ":
-                stack.append(_made(*popped(2)))
-            case "BUILD":  # fills a note, or adds one to an ordered dictionary
-                popped(1)
-                if type(stack[-1]) not in (dict, Unread):
-                    raise TypeError
+                name, arguments = popped(2)
+                stack.append(vocabulary.called(of_type(Name, name), of_type(tuple, arguments)))
+            case "BUILD":
+                (state,) = popped(1)
+                vocabulary.built(stack[-1], state)
             case "STOP":
                 (value,) = popped(1)
-                return Content(value, storages)
+                return value
             case name:
-                raise InputError(f"its pickle is more than data ({name}); {_MEND}")
+                raise InputError(f"its pickle is more than data ({name}); {MEND}")
     raise EOFError
 
 
-def _made(name: Any, arguments: Any) -> Any:
-    """What a call of this name with these arguments stands for."""
-    match str(_as(Name, name)), _as(tuple, arguments):
-        case "collections.OrderedDict", ():
-            return {}
-        case "torch._utils._rebuild_tensor_v2", (Storage() as storage, offset, shape, strides, _, _):
-            return Tensor(storage, _count(offset), _counts(shape), _counts(strides))
-        case "torch._utils._rebuild_parameter", (Tensor() as tensor, _, _):
-            return tensor
-        case note, _ if note in _NOTES:
-            return Unread()
-    raise _refused(name)
+def of_type(kind: type, value: Any) -> Any:
+    """The value, where it is of this type and no other.
 
-
-def _storage(identity: Any) -> Storage:
-    match identity:
-        case ("storage", Name("torch" | "torch.storage", kind), str(key), _, count, *rest):
-            if rest not in ([], [None]):  # of older files: a view of another storage
-                raise InputError(f"expected plain dense tensors, got one in a part of another's storage; {_MEND}")
-            return Storage(kind, key, _count(count))
-        case ("module", Name() as name, *_):
-            raise _refused(name)
-    raise TypeError
-
-
-def _refused(name: Name) -> InputError:
-    return InputError(f"it asks for {excerpt(str(name))}, where plain dense tensors are expected; {_MEND}")
-
-
-def _as(kind: type, value: Any) -> Any:
+    Raises:
+        TypeError: it is not.
+    """
     if type(value) is not kind:
         raise TypeError
     return value
 
 
-def _count(value: Any) -> int:
-    if _as(int, value) < 0:
+def natural(value: Any) -> int:
+    """The value, where it is a number of things.
+
+    Raises:
+        TypeError, ValueError: it is not.
+    """
+    if of_type(int, value) < 0:
         raise ValueError
     return value
 
 
-def _counts(values: Any) -> tuple[int, ...]:
-    return tuple(_count(value) for value in _as(tuple, values))
+def _entries(items: list[Any]) -> dict[int | str, Any]:
+    """A dictionary of alternating keys and values."""
+    keys = [key if type(key) is int else of_type(str, key) for key in items[::2]]
+    return dict(zip(keys, items[1::2], strict=True))
+
+
+def _bounded(file: BinaryIO) -> Any:
+    """The file as `pickletools` reads it; a length that the pickle states takes no more memory than the file has."""
+    end = file_size(file)
+    return SimpleNamespace(
+        read=lambda count: file.read(min(count, end - file.tell())), readline=file.readline, tell=file.tell
+    )

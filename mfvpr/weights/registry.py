@@ -74,6 +74,22 @@ def _aliked(variant: str, parameters: int, size: int, sha256: str) -> Entry:
     )
 
 
+def _ssm() -> Entry:
+    return Entry(
+        name="vgg16_places365",
+        network="ssm",
+        file="vgg16_places365.npy",
+        source="https://imr.ciirc.cvut.cz/uploads/Datasets/checkpoints.zip, or the Caffe model it was made from, "
+        "http://places2.csail.mit.edu/models_places365/vgg16_places365.caffemodel",
+        size=None,
+        sha256=None,
+        code_license="MIT (SSM-VPR)",
+        weights_license="CC BY (Places365)",
+        cite="Zhou et al., Places: A 10 Million Image Database for Scene Recognition, TPAMI 2017",
+        parameters=12_354_880,
+    )
+
+
 def _patchnetvlad(training: str, outputs: int, size: int | None, sha256: str) -> Entry:
     clusters = 16 if training == "mapillary" else 64
     vgg, vlad, projection = 14_714_688, 2 * 512 * clusters, (512 * clusters + 1) * outputs
@@ -104,6 +120,7 @@ _ENTRIES = (
     _aliked("n16", 677_356, 2_738_091, "5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2"),
     _aliked("n16rot", 677_356, 2_738_325, "ddf3abbf38e86f6a74540d214e1a9712c54b2d8551abc864542199f2347d7332"),
     _aliked("n32", 979_500, 3_946_667, "055283fd1624d3ab46a05c3b617b1a79a3f28d1f551737eef2d653e8c8232890"),
+    _ssm(),
     _patchnetvlad("mapillary", 128, 67_319_611, "5b6de8a5537061bbe7a477b62bb687b042d92d472e5231e2072026ecc59ec4b1"),
     _patchnetvlad("mapillary", 512, 92_488_008, "acbe2597c1c23c95482883c05969006a74bf7e68c4151dbb4ab5d67b69e8e346"),
     _patchnetvlad("mapillary", 4096, 327_398_210, "4b22ad1619bb7f085a5229d35f0f865740f2cdad2bced2ddbc7b28791c5b1542"),

@@ -14,21 +14,39 @@ def _linear(source: str, target: str) -> tuple[Rule, ...]:
     return Rule(rf"{source}\.weight", f"{target}.kernel", Layout.LINEAR), Rule(rf"{source}\.bias", f"{target}.bias")
 
 
+def _convolution(source: str, target: str) -> tuple[Rule, ...]:
+    return (
+        Rule(rf"{source}\.weight", f"{target}.kernel", Layout.CONV),
+        Rule(rf"{source}\.bias", f"{target}.bias"),
+    )
+
+
 # Positions of VGG16's convolutions in the public Sequential; pooling and ReLU lie between.
 _VGG = {
     0: "conv1_1", 2: "conv1_2", 5: "conv2_1", 7: "conv2_2", 10: "conv3_1", 12: "conv3_2", 14: "conv3_3",
-    17: "conv4_1", 19: "conv4_2", 21: "conv4_3",
+    17: "conv4_1", 19: "conv4_2", 21: "conv4_3", 24: "conv5_1", 26: "conv5_2", 28: "conv5_3",
 }  # fmt: skip
 
-D2NET = Table(
-    tuple(
-        rule
-        for position, name in _VGG.items()
-        for rule in (
-            Rule(rf"dense_feature_extraction\.model\.{position}\.weight", f"vgg.{name}.kernel", Layout.CONV),
-            Rule(rf"dense_feature_extraction\.model\.{position}\.bias", f"vgg.{name}.bias"),
-        )
-    )
+
+def _vgg(source: str) -> tuple[Rule, ...]:
+    layers = (_convolution(rf"{source}\.{position}", f"vgg.{name}") for position, name in _VGG.items())
+    return tuple(rule for rules in layers for rule in rules)
+
+
+D2NET = Table(_vgg(r"dense_feature_extraction\.model"))
+
+# SSM-VPR's own file and torch files of the same Caffe model, with Caffe's names or with torchvision's.
+SSM = Table(
+    (
+        Rule(r"(conv\d_\d)\.weights?", r"vgg.\1.kernel", Layout.CONV),
+        Rule(r"(conv\d_\d)\.bias", r"vgg.\1.bias", Layout.VECTOR),
+        *_vgg("features"),
+    ),
+    ignored=(  # layers behind the last map
+        r"(conv5_3|fc[678]\w*)\.(weights?|bias)",
+        r"(features\.28|classifier\.\d)\.(weight|bias)",
+    ),
+    expected={r"fc8\w*\.weights?|classifier\.6\.weight": (365, 4096)},  # ImageNet's networks have 1000 classes
 )
 
 _BLOCK = r"backbone\.model\.(layer\d\.\d)"

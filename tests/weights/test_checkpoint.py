@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from mfvpr.errors import InputError
+from mfvpr.weights import pickles
 from mfvpr.weights.checkpoint import read_checkpoint
 from tests.checkpoints import ALIKED, Call, Global, View, Writer, random_checkpoint, write_legacy, write_zip
 from tests.weights.conftest import SOURCE_SHAPES
@@ -222,7 +223,7 @@ MKDIR = b"cos\nmkdir\n"
         b"}" + MKDIR + b"K\x01s",  # a name as a key
         b"}" + 60 * b"2\x86" + b"K\x01s",  # a tuple of tuples of ..., whose hash takes years
         b"\x82\x01",  # the registry of extensions
-        b"\x8c\x02os\x8c\x05mkdir\x93",  # names by the stack
+        b"\x8c\x02os\x8c\x05mkdir\x93)R",  # names by the stack
         b"Pos.mkdir\n",  # an identity in text
         b"X\x02\0\0\0osQ",  # an identity that is no storage
         b"t",  # no mark
@@ -239,7 +240,7 @@ def test_instructions_out_of_place_are_refused(path, instructions):
     assert "damaged" in message or "nothing was executed" in message
 
 
-def test_nothing_grows_beyond_the_file(path):
+def test_nothing_grows_beyond_the_file(path, monkeypatch):
     array = np.ones(3, np.float32)
     put = b"]r\xff\xff\xff\x7f0"  # memo 2,147,483,647 of a list that is dropped
     nested = b"X\x01\0\0\0n" + 20_000 * b"(" + b"N" + 20_000 * b"t"
@@ -252,12 +253,14 @@ def test_nothing_grows_beyond_the_file(path):
         refused(write_zip(path, {"a": View(array, count=2**31 - 1)}))
         refused(write_zip(path, {"a": View(array, 0, (10**12, 10**12), (0, 0))}))
         refused(write_legacy(path, {"a": View(array, count=2**31 - 1)}))
+        refused(write_legacy(path, b"X\xff\xff\xff\x7f"))  # a string of 2 GB
         assert tracemalloc.get_traced_memory()[1] < 20e6
     finally:
         tracemalloc.stop()
+    monkeypatch.setattr(pickles, "_MOST", 1000)
     with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("file/data.pkl", Writer().pickled((1 << 22) * "long"))
-    assert "its pickle has more than 4,194,304 bytes" in refused(path)
+        archive.writestr("file/data.pkl", Writer().pickled(b"](" + 1000 * b"N" + b"e"))
+    assert "its pickle has more than 1,000 instructions" in refused(path)
 
 
 @pytest.mark.parametrize(

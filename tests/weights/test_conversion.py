@@ -10,7 +10,7 @@ from mfvpr.weights.checkpoint import read_checkpoint
 from mfvpr.weights.conversion import Layout, Rule, Table, convert
 from mfvpr.weights.networks import NETWORKS, blueprint, network_of, resemblance
 from mfvpr.weights.registry import REGISTRY, entry_of
-from tests.checkpoints import ALIKED, d2net_shapes, mixvpr_shapes, random_checkpoint
+from tests.checkpoints import ALIKED, d2net_shapes, mixvpr_shapes, places365_shapes, random_checkpoint
 from tests.weights.conftest import PARAMETERS, SHAPES, SOURCE_SHAPES, TABLE, tiny_entry
 
 PUBLIC = {
@@ -18,6 +18,7 @@ PUBLIC = {
     "mixvpr_4096": mixvpr_shapes(1024, 4),
     "mixvpr_512": mixvpr_shapes(256, 2),
     "mixvpr_128": mixvpr_shapes(64, 2),
+    "vgg16_places365": places365_shapes(),
 }
 
 
@@ -132,9 +133,70 @@ def test_a_blueprint_can_be_filled_twice(folder, arrays):
 def test_published_layouts_fit_the_networks(name):
     """By names and shapes alone: each parameter of the network comes from one key of the checkpoint."""
     plan = blueprint(entry_of(name))
-    found = convert({key: np.zeros(shape) for key, shape in PUBLIC[name].items()}, NETWORKS[name].table, plan.shapes)
+    found = convert(vacant(PUBLIC[name]), NETWORKS[name].table, plan.shapes)
     assert found.keys() == plan.shapes.keys()
     assert plan.parameters == entry_of(name).parameters
+
+
+TORCHVISION = {name: f"features.{place}" for place, name in (
+    (0, "conv1_1"), (2, "conv1_2"), (5, "conv2_1"), (7, "conv2_2"), (10, "conv3_1"), (12, "conv3_2"), (14, "conv3_3"),
+    (17, "conv4_1"), (19, "conv4_2"), (21, "conv4_3"), (24, "conv5_1"), (26, "conv5_2"), (28, "conv5_3"),
+)} | {"fc6_1": "classifier.0", "fc7_1": "classifier.3", "fc8a_1": "classifier.6"}  # fmt: skip
+
+
+def with_names_of_torchvision(source):
+    parts = ((key.split("."), value) for key, value in source.items())
+    return {f"{TORCHVISION[layer]}.{name}": value for (layer, name), value in parts}
+
+
+def vacant(shapes):
+    """Arrays of these shapes that take no memory."""
+    return {key: np.broadcast_to(np.float32(0), shape) for key, shape in shapes.items()}
+
+
+def places365(source):
+    return convert(source, NETWORKS["vgg16_places365"].table, blueprint(entry_of("vgg16_places365")).shapes)
+
+
+@pytest.mark.parametrize("full", [True, False])
+@pytest.mark.parametrize("change", [lambda source: source, with_names_of_torchvision])
+def test_places365_in_files_of_torch(change, full):
+    """Whole or pruned, with the names of Caffe or of torchvision."""
+    source = vacant(places365_shapes("weight", full=full))
+    source["conv5_2.bias"] = np.arange(512, dtype=np.float32)
+    source["conv1_1.weight"] = np.arange(64 * 27, dtype=np.float32).reshape(64, 3, 3, 3)
+    found = places365(change(source))
+    assert sum(value.size for value in found.values()) == 12_354_880
+    np.testing.assert_array_equal(found["vgg.conv5_2.bias"], np.arange(512))
+    assert found["vgg.conv1_1.kernel"][1, 2, 0, 5] == source["conv1_1.weight"][5, 0, 1, 2]
+
+
+def test_biases_of_places365_may_have_more_axes():
+    shapes = {key: (1, *shape, 1, 1) if "bias" in key else shape for key, shape in places365_shapes(full=False).items()}
+    source = {key: np.arange(np.prod(shape), dtype=np.float32).reshape(shape) if "bias" in key else value
+              for (key, value), shape in zip(vacant(shapes).items(), shapes.values(), strict=True)}  # fmt: skip
+    np.testing.assert_array_equal(places365(source)["vgg.conv1_1.bias"], np.arange(64))
+    source["conv1_1.bias"] = np.zeros((8, 8))
+    with pytest.raises(InputError, match=r"1 of another shape \(conv1_1.bias: expected \(64,\), got \(8, 8\)\)"):
+        places365(source)
+
+
+@pytest.mark.parametrize("change", [lambda source: source, with_names_of_torchvision])
+def test_vgg16_of_other_classes_is_not_that_of_places365(change):
+    source = change(vacant(places365_shapes("weight")))
+    layer = "fc8a_1" if "fc8a_1.weight" in source else "classifier.6"
+    source |= vacant({f"{layer}.weight": (1000, 4096), f"{layer}.bias": (1000,)})
+    with pytest.raises(InputError, match=r"weight: expected \(365, 4096\), got \(1000, 4096\)"):
+        places365(source)
+
+
+def test_unknown_layers_of_places365_are_refused():
+    source = vacant(places365_shapes() | {"conv6_1.weights": (2, 2), "conv1_1.scale": (64,)})
+    with pytest.raises(InputError, match=r"2 unknown \(conv6_1.weights\)"):
+        places365(source)
+    both = vacant(places365_shapes()) | vacant(places365_shapes("weight"))
+    with pytest.raises(InputError, match=r"12 twice \(conv1_1.weight and conv1_1.weights\)"):
+        places365(both)
 
 
 @pytest.mark.skipif(not ALIKED.is_dir(), reason="no ../shared/weights: weights do not ship with the project")

@@ -16,7 +16,16 @@ from experiments.errors import one_line
 from experiments.weights import main
 from mfvpr.weights.files import load_model, save
 from mfvpr.weights.registry import REGISTRY
-from tests.checkpoints import ALIKED, d2net_shapes, random_checkpoint, write_legacy, write_zip
+from tests.checkpoints import (
+    ALIKED,
+    d2net_shapes,
+    layered,
+    places365_shapes,
+    random_checkpoint,
+    write_legacy,
+    write_numpy,
+    write_zip,
+)
 from tests.weights.conftest import PARAMETERS, SOURCE_SHAPES, tiny_entry
 
 ROOT = Path(__file__).parent.parent.parent
@@ -337,3 +346,29 @@ def test_d2net_from_checkpoint_to_network(program, tmp_path):
     assert stdout.endswith("d2_tf, 7,635,264 parameters\n")
     kernel = load_model("d2_tf").vgg.conv4_3.kernel[...]
     assert (kernel == arrays["dense_feature_extraction.model.21.weight"].transpose(2, 3, 1, 0)).all()
+
+
+def test_places365_from_numpys_file_to_network(program, refused, folder, tmp_path):
+    arrays = random_checkpoint(places365_shapes(full=False))
+    path = write_numpy(tmp_path / "vgg16_places365.npy", layered(arrays))
+    code, stdout, _ = program("convert", path)
+    assert code == 0
+    assert stdout == f"{folder}/vgg16_places365.safetensors: vgg16_places365, 12,354,880 parameters\n"
+    model = load_model("vgg16_places365")
+    assert (model.vgg.conv5_2.kernel[...] == arrays["conv5_2.weights"].transpose(2, 3, 1, 0)).all()
+    assert program("verify") == (0, "vgg16_places365: good, 12,354,880 parameters as converted\n", "")
+    write_numpy(path, {"conv1_1": {"weights": Path("/")}})
+    refused("vgg16_places365.npy: it asks for pathlib.PosixPath, where arrays of numbers are expected", "convert", path)
+    write_numpy(path, layered(random_checkpoint(SOURCE_SHAPES)))
+    refused(
+        "expected the keys of another network, got those of tiny; use the official vgg16_places365", "convert", path
+    )
+
+
+def test_where_places365_is_to_be_had(refused, program):
+    where = (
+        "get vgg16_places365.npy from https://imr.ciirc.cvut.cz/uploads/Datasets/checkpoints.zip, or the Caffe model"
+    )
+    refused(where, "download", "vgg16_places365")
+    line = next(line for line in program("list")[1].splitlines() if line.startswith("vgg16_places365"))
+    assert " ".join(line.split()[1:]) == "ssm vgg16_places365.npy MIT (SSM-VPR) CC BY (Places365) no -"
