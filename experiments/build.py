@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,13 @@ from mfvpr.data.datasets import Dataset, folder_dataset, sequences_dataset
 from mfvpr.data.ground_truth import CHOICES
 from mfvpr.data.streets import streets_folder
 from mfvpr.declaration import made
-from mfvpr.evaluations import Fusion
 from mfvpr.features import Aggregated, Extractor
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
 from mfvpr.filters import Filter, Retrieval
+from mfvpr.frame_correlation import FrameCorrelation
 from mfvpr.imported import DescriptorFiles, FeatureFiles, File, ShortlistFiles
+from mfvpr.rankings import Fusion
 from mfvpr.retrieval import ExactSearch, WhitenedSearch
 from mfvpr.scoring import SCORERS, Scorer
 
@@ -64,9 +65,12 @@ def extractor(settings: dict[str, Any], data: Dataset | None) -> Extractor | Fea
     # Here, since Flax takes half a second.
     from mfvpr.features.aliked import AlikedFeatures
     from mfvpr.features.d2net import D2NetFeatures
+    from mfvpr.features.ssm import STAGE2_FITTING, SsmCells
 
-    made = {"aliked": AlikedFeatures, "d2net": D2NetFeatures}[name]
+    made = {"aliked": AlikedFeatures, "d2net": D2NetFeatures, "ssm": SsmCells}[name]
     weights = options.pop("weights", None)
+    if name == "ssm":
+        options["whitening"] = _fitting(options, STAGE2_FITTING)
     return made(_network("features", name, weights), **_only(options, made, f"features={name}"))
 
 
@@ -74,6 +78,8 @@ def filter(settings: dict[str, Any], local: Extractor | FeatureFiles, data: Data
     """What finds candidates; VLAD takes the local features that are matched as well."""
     if settings["name"] == "pairs":
         return ShortlistFiles(_files("retrieval", {"database": None} | settings, data), settings["database_prefix"])
+    if settings["name"] == "ssm":
+        return _voting({name: value for name, value in settings.items() if name != "name"})
     options = {name: value for name, value in settings.items() if name not in ("name", "whiten")}
     search = ExactSearch() if settings["whiten"] is None else WhitenedSearch(settings["whiten"])
     if settings["name"] == "import":
@@ -86,6 +92,23 @@ def filter(settings: dict[str, Any], local: Extractor | FeatureFiles, data: Data
     if tuple(size) != IMAGE_SIZE:
         raise SettingsError(f"retrieval.image_size={size}: MixVPR takes {list(IMAGE_SIZE)} only, as its weights do")
     return Retrieval(MixVprDescriptor(_network("retrieval", "mixvpr", options.pop("weights")), **options), search)
+
+
+def _voting(options: dict[str, Any]) -> Filter:
+    from mfvpr.features.ssm import STAGE1_FITTING, STAGE1_SIZE, SsmWindows
+    from mfvpr.voting import SsmVoting
+
+    size, weights, whitening = options.pop("image_size"), options.pop("weights"), _fitting(options, STAGE1_FITTING)
+    if tuple(size) != STAGE1_SIZE:
+        raise SettingsError(f"retrieval.image_size={size}: SSM-VPR's filter takes {list(STAGE1_SIZE)} only")
+    describer = SsmWindows(_network("retrieval", "ssm", weights), whitening=whitening, **options)
+    return SsmVoting(describer)
+
+
+def _fitting(options: dict[str, Any], published: Any) -> Any:
+    """How the whitening is learned, of the options that say so, which are taken out."""
+    own = {field.name for field in fields(published)} & options.keys()
+    return replace(published, **{name: options.pop(name) for name in own})
 
 
 def _files(group: str, settings: dict[str, Any], data: Dataset | None) -> dict[Path, File]:
@@ -131,6 +154,12 @@ def fusion(settings: dict[str, Any]) -> Fusion:
     """How the filter's score is added to another."""
     c = settings["fusion"]["c"]
     return Fusion(None if c == "auto" else float(c), settings["fusion"]["filter_score"])
+
+
+def frames(settings: dict[str, Any]) -> FrameCorrelation | None:
+    """How the queries before take part; None = not at all."""
+    previous = settings["previous_queries"]
+    return FrameCorrelation(previous) if previous else None
 
 
 def _network(group: str, name: str, weights: str | None) -> Any:

@@ -1,6 +1,6 @@
 """The main job: images -> features -> shortlist and matches -> scores -> rankings -> recall, in a run folder."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +10,10 @@ from experiments.settings import SettingsError
 from mfvpr import evaluations
 from mfvpr.data.datasets import Dataset
 from mfvpr.evaluation import Unit
-from mfvpr.evaluations import FILTER, Stopwatch
+from mfvpr.evaluations import Stopwatch
 from mfvpr.report import runs
 from mfvpr.report.evaluations import Figure, Judged, figures, recall_table, write_rankings, write_skipped
+from mfvpr.results import FILTER, FRAMES
 from mfvpr.scoring import HistogramOfShifts
 
 _THRESHOLDS: dict[Unit, str] = {"frames": "tolerance", "m": "radius"}  # their names in results
@@ -47,15 +48,17 @@ def evaluated(settings: dict[str, Any]) -> Outcome:
     shown = asked_figures(settings["figures"], images.dataset)
     main = "histogram" if "histogram" in scorers else next(iter(scorers))
     combined, group, histogram = f"{main} + {FILTER}", settings["scorer"], scorers.get("histogram")
+    headline, frames = combined if settings["final"] == "combined" else main, build.frames(settings)
     result = evaluations.evaluate(
         images.dataset, tools.extractor, tools.filter, scorers, candidates=settings["candidates"],
-        matching=tools.matching, fused={main: build.fusion(settings)}, ties=settings["ties"], archive=tools.archive,
-        watch=watch, **tools.where,
+        matching=tools.matching, fused={main: build.fusion(settings)}, correlated={headline: frames} if frames else {},
+        ties=settings["ties"], archive=tools.archive, watch=watch, **tools.where,
     )  # fmt: skip
     parameters = {name: group if "method" in group else group[name] for name in scorers}
     parameters = {FILTER: {}} | parameters | {combined: parameters[main] | settings["fusion"]}
+    if frames:
+        parameters[f"{headline} + {FRAMES}"] = parameters[headline] | asdict(frames)
     thresholds = truth.thresholds(settings, images.dataset.sequences[0].truth)
-    headline = combined if settings["final"] == "combined" else main
     judged = Judged(result, thresholds, sorted(set(settings["recall"]["ks"])), headline)
     histogram = histogram if isinstance(histogram, HistogramOfShifts) else None
     drawn = figures(judged, tools.extractor, shown, histogram)
@@ -115,7 +118,7 @@ def result_rows(outcome: Outcome) -> list[dict[str, Any]]:
     }
     rows = []
     for name, parameters in outcome.parameters.items():
-        system = {"system": name, "scorer": name.removesuffix(" + filter"), "parameters": parameters}
+        system = {"system": name, "scorer": name.partition(" + ")[0], "parameters": parameters}
         system |= {"scorer": "none"} if name == "filter" else {}
         rows += [system | judgment | common for judgment in _judgments(judged, name)]
     return rows

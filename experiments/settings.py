@@ -110,8 +110,8 @@ RULES: dict[str, Rule] = {
     "dataset.name": Rule(
         lambda value: isinstance(value, str) and bool(re.fullmatch(r"[\w-][\w.-]*", value)), "letters, digits, - and _"
     ),
-    "features.name": _one_of("sift", "d2net", "aliked", "import"),
-    "retrieval.name": _one_of("vlad", "mixvpr", "import", "pairs"),
+    "features.name": _one_of("sift", "d2net", "aliked", "ssm", "import"),
+    "retrieval.name": _one_of("vlad", "mixvpr", "ssm", "import", "pairs"),
     "features.image_size": _or(_list_of(_SIDE, 2), None),
     # data
     "seed": _INDEX,
@@ -132,7 +132,7 @@ RULES: dict[str, Rule] = {
     "bits": _or(_between(8, 16), None),
     # features and filter
     "image_size": _list_of(_SIDE, 2),
-    "interpolation": _one_of("pil_bilinear", "pil_bicubic", "cv2_linear", "cv2_area", "torch_bilinear"),
+    "interpolation": _one_of("pil_bilinear", "pil_bicubic", "cv2_linear", "cv2_area", "cv2_cubic", "torch_bilinear"),
     "weights": _TEXT,
     "preprocessing": _one_of("caffe", "torch"),
     "multiscale": _FLAG,
@@ -145,6 +145,11 @@ RULES: dict[str, Rule] = {
     "power": _POSITIVE,
     "max_samples": _COUNT,
     "whiten": _or(_between(1, 4096), None),
+    "dimension": _between(1, 4096),
+    "max_images": _or(_COUNT, None),
+    "max_windows": _or(_COUNT, None),
+    "zero_row": _FLAG,
+    "stride": _between(1, 8),
     "candidates": _or(_COUNT, "all"),
     "memory": _or(_POSITIVE, None),
     "devices": _or(_COUNT, "all"),
@@ -158,6 +163,7 @@ RULES: dict[str, Rule] = {
     "ties": _one_of("filter", "index"),
     "c": _or(_NOT_NEGATIVE, "auto"),
     "final": _one_of("score", "combined"),
+    "previous_queries": _between(0, 1000),
     # report
     "tolerances": _list_of(_INDEX),
     "radius": _POSITIVE,
@@ -196,6 +202,8 @@ def check(settings: Mapping[str, Any]) -> None:
         if not rule.holds(value):
             raise SettingsError(f"{path}={_shown(value)}: expected {rule.expected}")
     _check_vocabulary(settings.get("retrieval", {}))
+    if method == "grid":
+        _check_cells(settings)
 
 
 def _rule(path: str, method: str) -> Rule | None:
@@ -235,6 +243,18 @@ def _check_vocabulary(settings: Mapping[str, Any]) -> None:
     words, samples = (settings.get(name, 1) for name in ("num_words", "max_samples"))
     if samples < words:
         raise SettingsError(f"retrieval.max_samples={samples}: expected at least retrieval.num_words={words}")
+
+
+def _check_cells(settings: Mapping[str, Any]) -> None:
+    """That features are cells of a grid, and as many as the score of such cells expects."""
+    features, side = settings["features"], settings["scorer"]["side"]
+    if features["name"] not in ("ssm", "import"):
+        raise SettingsError(f"scorer=grid: expected features=ssm, whose features are cells, got {features['name']}")
+    if features["name"] == "ssm":
+        sides = [(-(-pixels // 8) - 3) // features["stride"] + 1 for pixels in features["image_size"]]
+        if sides != [side, side]:
+            raise SettingsError(f"scorer.side={side}: expected the cells of features.image_size="
+                                f"{features['image_size']}, which are {sides[0]} x {sides[1]}")  # fmt: skip
 
 
 def _shown(value: Any) -> str:

@@ -1,7 +1,7 @@
 """What an evaluation is asked for, and what filters and scorers of others give: told in one line."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,20 +13,22 @@ from mfvpr.features import Extractor, Source
 from mfvpr.filters import Filtered
 from mfvpr.matching import CrossCheck
 from mfvpr.reranking import FilterScore, Ties
-from mfvpr.results import FILTER, Matched, Ranked
+from mfvpr.results import FILTER, FRAMES, Matched, Ranked
 from mfvpr.scoring import SCORERS
 from mfvpr.sources import FeatureSet
 from mfvpr.types import Shortlist
 
 
 def check_request(
-    scorers: Mapping[str, Any], fused: Mapping[str, FilterScore], ties: Ties, memory: float | None
-) -> None:
+    scorers: Mapping[str, Any], fused: Mapping[str, FilterScore], correlated: Iterable[str], ties: Ties,
+    memory: float | None,
+) -> None:  # fmt: skip
     """What `mfvpr.evaluate` is asked to do with matches.
 
     Args:
         scorers: by name.
         fused: the filter's score that is added to some of them, by name.
+        correlated: names of scorers, and of those that are fused.
         ties: see there.
         memory: see there.
 
@@ -41,8 +43,13 @@ def check_request(
         if name not in scorers:
             known = ", ".join(scorers) or "there are none"
             raise InputError(f"fused: expected names of scorers ({known}), got {name}")
+    several = {*scorers, *(f"{name} + {FILTER}" for name in fused)}
+    if unknown := [name for name in correlated if name not in several]:
+        raise InputError(f"correlated: expected names of scorers ({', '.join(several) or 'there are none'}), got "
+                         f"{unknown[0]}")  # fmt: skip
+    made = {FILTER, *(f"{other} + {FILTER}" for other in fused), *(f"{other} + {FRAMES}" for other in correlated)}
     for name, scorer in scorers.items():
-        if name in {FILTER, *(f"{other} + {FILTER}" for other in fused)}:
+        if name in made:
             raise InputError(f"scorers: {name} is the name of another system; choose another one")
         if type(scorer) in SCORERS.values():
             check_bounds(scorer)

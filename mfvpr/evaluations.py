@@ -25,15 +25,16 @@ from mfvpr.data.files import write_text
 from mfvpr.features import Extractor, Source
 from mfvpr.filters import Filter, Filtered
 from mfvpr.fingerprints import recipe_of
+from mfvpr.fitting import fitted
+from mfvpr.frame_correlation import FrameCorrelation
 from mfvpr.matching import CrossCheck
 from mfvpr.numerics import Device
-from mfvpr.progress import Track, untracked
-from mfvpr.reranking import FilterScore, Ties, fuse_shortlist, rank_shortlist
-from mfvpr.results import FILTER, Matched, Ranked, Result
+from mfvpr.rankings import Fusion, rank_sequence
+from mfvpr.reranking import Ties
+from mfvpr.results import Matched, Result
 from mfvpr.scoring import Scorer
 from mfvpr.sources import FeatureSet
 from mfvpr.stores.matches import MatchStore
-from mfvpr.types import Shortlist
 
 _REMARKS = "images.json"  # beside the matches: which images are bad
 
@@ -46,14 +47,6 @@ class Matching:
     max_distance: float | None = None
     max_matches: int | None = None
     chunk_size: int | None = None
-
-
-@dataclass(frozen=True)
-class Fusion:
-    """How the filter's score is added to another: `c` times (None = as much as balances both per query), and which."""
-
-    c: float | None = None
-    filter_score: FilterScore = "cosine"
 
 
 @dataclass
@@ -78,6 +71,7 @@ def evaluate(
     candidates: int | Literal["all"] = 50,
     matching: Matching = Matching(),
     fused: Mapping[str, Fusion] | None = None,
+    correlated: Mapping[str, FrameCorrelation] | None = None,
     ties: Ties = "filter",
     archive: Archive | None = None,
     memory: float | None = None,
@@ -94,6 +88,8 @@ def evaluate(
         candidates: that the filter proposes for each query.
         matching: options of the matches.
         fused: scorers, by name, that are ranked together with the filter's score as well, as `name + filter`.
+        correlated: scorers and those that are fused, by name, that are ranked by their scores with frame correlation as
+            well, as `name + frames`.
         ties: equal scores keep the order of the filter, or go by the row of the database: "filter", "index".
         archive: where features and matches are kept; None = in memory.
         memory: GB that features of the database may take on the devices, and matches that are kept in memory; None = a
@@ -105,7 +101,8 @@ def evaluate(
         InputError: arguments, images, stores or features that cannot be used, or what an extractor, a filter or a
             scorer gives; one line says which, and the mend.
     """
-    check_request(scorers, {name: how.filter_score for name, how in (fused or {}).items()}, ties, memory)
+    fused, correlated = fused or {}, correlated or {}
+    check_request(scorers, {name: how.filter_score for name, how in fused.items()}, correlated, ties, memory)
     archive, watch = archive or Archive(), watch or Stopwatch()
     matched = [
         match_sequence(
@@ -116,7 +113,7 @@ def evaluate(
     ]  # fmt: skip
     with watch("scores"):
         options = {"devices": devices, "track": archive.track("scores")}
-        ranked = [rank_sequence(sequence, scorers, fused or {}, ties, **options) for sequence in matched]
+        ranked = [rank_sequence(sequence, scorers, fused, correlated, ties, **options) for sequence in matched]
     for line in nan_scores(matched, ranked):
         archive.warn(line)
     systems = {name: [by_system[name] for by_system in ranked] for name in ranked[0]}
@@ -154,6 +151,8 @@ def match_sequence(
     """
     check_matching(candidates, extractor, matching.cross_check)
     archive, watch, database = archive or Archive(), watch or Stopwatch(), dataset.database
+    with watch("filter"):
+        extractor, filter = fitted(extractor, database, archive), fitted(filter, database, archive)
     num_candidates = len(database) if candidates == "all" else min(int(candidates), len(database))
     with ExitStack() as held:
         stores = []
@@ -239,41 +238,15 @@ def _remark(stores: Sequence[MatchStore], archive: Archive, remarks: Mapping[str
         archive.warn(line)
 
 
-def rank_sequence(
-    matched: Matched,
-    scorers: Mapping[str, Scorer],
-    fused: Mapping[str, Fusion],
-    ties: Ties,
-    *,
-    devices: Sequence[Device] | None = None,
-    track: Track = untracked,
-) -> dict[str, Ranked]:
-    """Rankings of a sequence by name of the system: the filter alone, each scorer, and those that are fused with it."""
-    candidates = matched.candidates
-    scores = pipeline.score(scorers, matched.by_scale, candidates, devices=devices, track=track)
-    combined = {
-        f"{name} + {FILTER}": fuse_shortlist(candidates, scores[name], how.c, filter_score=how.filter_score)
-        for name, how in fused.items()
-    }
-    return {
-        name: _ranked(candidates, values, ties)
-        for name, values in ({FILTER: candidates.scores} | scores | combined).items()
-    }
-
-
-def _ranked(candidates: Shortlist, scores: np.ndarray, ties: Ties) -> Ranked:
-    order = rank_shortlist(candidates, scores, ties=ties)
-    return Ranked(*(np.take_along_axis(values, order, axis=1) for values in (candidates.indices, scores)))
-
-
 def matches_recipe(
     dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, filter: Filter, num_candidates: int,
     matching: Matching, archive: Archive,
 ) -> dict[str, Any]:  # fmt: skip
     """All that changes a shortlist and its matches: both sides' images and features, the filter, and the matching."""
-    excluded = sequence.excluded
+    excluded, database = sequence.excluded, dataset.database
+    extractor, filter = fitted(extractor, database, archive), fitted(filter, database, archive)
     return {
-        "database": archive.recipe(dataset.database, extractor),
+        "database": archive.recipe(database, extractor),
         "query": archive.recipe(sequence.images, extractor),
         "filter": archive.recipe_of(filter),
         "candidates": num_candidates,
@@ -288,8 +261,9 @@ def _match_stores(
 ) -> Iterator[AbstractContextManager[MatchStore]]:
     """A store for the matches of each scale."""
     several = len(extractor.scales) > 1
+    share = 1 if recipe["matching"]["cross_check"] in ("none", "candidate") else 3
     for number, scale in enumerate(extractor.scales):
         yield archive.matches(
             {**recipe, "scale": number} if several else recipe, len(sequence.images), recipe["candidates"],
-            typical=scale.typical_count // 3, label=f"{sequence.name} matches",
+            typical=scale.typical_count // share, label=f"{sequence.name} matches",
         )  # fmt: skip

@@ -12,6 +12,7 @@ from mfvpr.match_sets import MatchSet, Scales
 from mfvpr.types import Shortlist
 
 FILTER = "filter"  # the name of the filter's own ranking
+FRAMES = "frames"  # in the names of those that the queries before take part in
 
 
 @dataclass(frozen=True)

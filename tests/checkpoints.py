@@ -177,9 +177,10 @@ def _random(name: str, shape: tuple[int, ...], seed: int) -> np.ndarray:
 
 
 def at_hand() -> Iterator[tuple[str, dict[str, np.ndarray]]]:
-    """(name, tensors): random ones of D2-Net and MixVPR, and ALIKED's real ones where they are."""
+    """(name, tensors): random ones of D2-Net, MixVPR and SSM-VPR, and ALIKED's real ones where they are."""
     yield "d2_tf", random_checkpoint(d2net_shapes())
     yield "mixvpr_4096", random_checkpoint(mixvpr_shapes())
+    yield "vgg16_places365", random_checkpoint(places365_shapes(full=False))
     for path in sorted(ALIKED.glob("*.pth")):
         yield path.stem, read_checkpoint(path)
 

@@ -14,15 +14,18 @@ from mfvpr.archive import Archive
 from mfvpr.data.datasets import folder_dataset, image_folder
 from mfvpr.data.ground_truth import FrameTruth
 from mfvpr.errors import InputError
-from mfvpr.evaluations import Fusion, Matching
+from mfvpr.evaluations import Matching
 from mfvpr.features import Aggregated, Description
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
 from mfvpr.filters import Filtered, Retrieval
+from mfvpr.frame_correlation import FrameCorrelation
+from mfvpr.rankings import Fusion
 from mfvpr.retrieval import EXACT, WhitenedSearch
 from mfvpr.types import Shortlist
 
 SIFT = Sift(max_keypoints=20, image_size=(160, 120))
+FRAMES = FrameCorrelation()
 HISTOGRAM = {"histogram": mfvpr.HistogramOfShifts()}
 
 
@@ -89,6 +92,9 @@ def evaluated(dataset, extractor=SIFT, chosen=None, scorers=HISTOGRAM, **options
         ({"memory": -1}, "memory=-1: expected GB above 0, or None"),
         ({"memory": np.nan}, "memory=nan: expected GB"),
         ({"fused": {"nope": Fusion()}}, r"fused: expected names of scorers \(histogram\), got nope"),
+        ({"correlated": {"filter": FRAMES}}, r"correlated: expected names of scorers \(histogram\), got filter"),
+        ({"scorers": HISTOGRAM | {"histogram + frames": mfvpr.MatchCount()}, "correlated": {"histogram": FRAMES}},
+         r"histogram \+ frames is the name of another system"),
         ({"scorers": {"filter": mfvpr.MatchCount()}}, "filter is the name of another system"),
         ({"scorers": HISTOGRAM | {"histogram + filter": mfvpr.MatchCount()}, "fused": {"histogram": Fusion()}},
          r"histogram \+ filter is the name of another system"),

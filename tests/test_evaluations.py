@@ -14,15 +14,17 @@ from mfvpr.archive import Archive
 from mfvpr.data.datasets import folder_dataset, sequences_dataset
 from mfvpr.errors import InputError
 from mfvpr.evaluation import Positives
-from mfvpr.evaluations import Fusion, match_sequence
+from mfvpr.evaluations import match_sequence
 from mfvpr.exchange import write_features, write_global_descriptors, write_shortlist
 from mfvpr.features import Aggregated
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
 from mfvpr.filters import Retrieval
 from mfvpr.fingerprints import fingerprint
+from mfvpr.frame_correlation import FrameCorrelation
 from mfvpr.imported import DescriptorFiles, FeatureFiles, File, ShortlistFiles
 from mfvpr.progress import untracked
+from mfvpr.rankings import Fusion, rank_sequence
 from mfvpr.report.evaluations import Judged, recall_table, write_rankings
 from mfvpr.retrieval import WhitenedSearch
 from tests.programs import typed
@@ -69,6 +71,25 @@ def test_systems_and_their_recall(dataset, result):
     expected = [[mfvpr.recall_at_k(ranked.rows, dataset.truth.positives(t), [k])[0] for k in (1, 5)] for t in (0, 1)]
     np.testing.assert_allclose(recall.by_sequence, [expected])
     np.testing.assert_array_equal(recall.mean, recall.pooled)
+
+
+def test_frame_correlation_is_a_ranking_more(result):
+    """Of a scorer, or of one that is fused; all others are what they are without it."""
+    [matched] = result.matched
+    correlated = {"histogram": FrameCorrelation(1), "histogram + filter": FrameCorrelation()}
+    systems = rank_sequence(matched, SCORERS, {"histogram": Fusion(c=10.0)}, correlated, "filter")
+    assert [*systems] == [*result.systems, "histogram + frames", "histogram + filter + frames"]
+    for name, [ranked] in result.systems.items():
+        np.testing.assert_array_equal(systems[name].rows, ranked.rows)
+        np.testing.assert_array_equal(systems[name].scores, ranked.scores)
+    for name, how in correlated.items():
+        alone = systems[name]
+        expected = how(alone.shortlist, alone.scores)
+        order = np.argsort(-expected, axis=1, kind="stable")
+        got = systems[f"{name} + frames"]
+        np.testing.assert_array_equal(got.scores, np.take_along_axis(expected, order, axis=1))
+        np.testing.assert_array_equal(got.rows, np.take_along_axis(alone.rows, order, axis=1))
+        assert (got.scores != alone.scores).any()
 
 
 def test_sequences_are_evaluated_by_themselves_with_their_means(dataset, split, small_street, result):

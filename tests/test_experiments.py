@@ -25,11 +25,35 @@ CHOICES = [
 
 @pytest.mark.parametrize(("group", "choice"), CHOICES)
 def test_every_conf_composes_and_passes_its_own_checks(group, choice):
-    paths = {"folder": ["dataset.database=a", "dataset.queries=b"]}
+    paths = {"folder": ["dataset.database=a", "dataset.queries=b"], "grid": ["features=ssm"]}
     needs = paths.get(choice, ["dataset.root=r"] if choice in ("grief_season", "corridor") else [])
     programs = {"experiment": ["sweep"], "system": ["config", "sweep", "learn"], "grid": ["learn"]}
     for config in programs.get(group, ["config"]):
         settings.check(composed(f"{group}={choice}", *needs, config=config))
+
+
+@pytest.mark.parametrize("features", ["sift", "aliked"])
+def test_features_of_a_named_system_may_be_replaced(features):
+    found = composed("system=ssm_hist", f"features={features}")
+    settings.check(found)
+    assert (found["features"]["name"], found["retrieval"]["name"]) == (features, "ssm")
+    assert found["features"]["image_size"] == [336, 336]
+    assert (found["candidates"], found["scorer"]["method"]) == (50, "histogram")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["system=ssm_vpr", "features=sift"], "scorer=grid: expected features=ssm, whose features are cells, got sift"),
+        (["system=ssm_vpr", "features.image_size=[224,224]"], "scorer.side=40: expected the cells of .* 26 x 26"),
+        (["system=ssm_vpr", "features.image_size=[336,320]"], "which are 40 x 38"),
+        (["system=ssm_vpr_ras2020", "features.stride=1"], "scorer.side=25: .* 50 x 50"),
+    ],
+)
+def test_cells_must_be_as_many_as_their_score_expects(arguments, words):
+    with pytest.raises(SettingsError, match=words):
+        settings.check(composed(*arguments))
+    settings.check(composed("system=ssm_vpr", "features.image_size=[224,224]", "scorer.side=26"))
 
 
 def test_scorers_of_conf_are_the_papers():

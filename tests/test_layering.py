@@ -68,7 +68,7 @@ ALLOWED = {
     "data": {"errors", "evaluation", "numerics", "threads", "types", "data"},
     "models": {"errors", "numerics", "types", "models"},
     "weights": {"errors", "data", "models", "weights"},
-    "features": {"errors", "types", "numerics", "data", "models", "ragged", "sources", "features"},
+    "features": {"errors", "types", "numerics", "data", "models", "ragged", "sources", "whitening", "features"},
     "extraction": {"errors", "types", "numerics", "data", "features", "progress", "sources", "threads"},
     "exchange": {"errors", "types", "data", "exchange"},
     "checks": {

@@ -1,4 +1,4 @@
-"""The main job with networks: systems, stores and mistakes. D2-Net and MixVPR have random weights here."""
+"""The main job with networks: systems, stores and mistakes. D2-Net, MixVPR and SSM-VPR have random weights here."""
 
 import json
 
@@ -52,6 +52,23 @@ def test_the_papers_system_runs_and_is_read_from_its_stores_ever_after(evaluate,
 
 
 @pytest.mark.slow
+def test_ssm_vpr_runs_on_what_it_learned_from_the_database(evaluate, small_street, tmp_path, monkeypatch):
+    monkeypatch.setenv("MFVPR_CACHE", str(tmp_path / "cache"))
+    few = ("features.max_images=3", "retrieval.max_images=4", "features.dimension=20", "retrieval.dimension=30")
+    more = ("scorer.side=18", "previous_queries=2", "candidates=4", *few)
+    told = evaluate(*system("ssm_vpr", small_street, tmp_path / "out", *more))
+    made = sorted(path.name.rpartition("-")[0] for path in (tmp_path / "cache" / "features").glob("*-*"))
+    learned = ["SsmCells-whitening", "SsmWindows-whitening"]
+    assert made == ["SsmCells", "SsmCells", learned[0], "SsmWindows", "SsmWindows", learned[1], "matches"]
+    assert "SsmWindows: whitening of 30 dimensions: " in told
+    rows = json.loads((tmp_path / "out" / "results.json").read_text())
+    parameters = {row["system"]: row["parameters"] for row in rows}
+    assert list(parameters) == ["filter", "grid", "grid + filter", "grid + frames"]
+    assert parameters["grid + frames"] == parameters["grid"] | {"previous": 2, "reach": 15.0, "gain": 0.4}
+    assert rows[-1]["scorer"] == "grid"
+
+
+@pytest.mark.slow
 @pytest.mark.skipif(not checkpoints.ALIKED.is_dir(), reason="no ../shared/weights: ALIKED's are not shipped")
 def test_aliked_recognizes_the_street(evaluate, small_street, tmp_path):
     evaluate(*system("mix_hist_aliked_50", small_street, tmp_path / "out", "features.image_size=[320,320]"))
@@ -82,6 +99,7 @@ def refused(tmp_path, monkeypatch, capsys):
         (["retrieval=mixvpr"], "weights none stated"),
         (["features=d2net", "features.weights=mixvpr_512"], "features.weights=mixvpr_512: expected weights of d2net"),
         (["retrieval=mixvpr", "retrieval.image_size=[224,224]"], "MixVPR takes [320, 320] only"),
+        (["retrieval=ssm", "retrieval.image_size=[336,336]"], "SSM-VPR's filter takes [224, 224] only"),
         (["features=aliked", "features.weights=alikd-n16"], "expected weights of aliked: one of"),
         (["features=aliked", "features.clahe_clip=2"], "features.clahe_clip: unknown setting"),
         (["system=mix_hist_20"], "system=mix_hist_20: expected one of mix_hist_10, mix_hist_50"),

@@ -21,9 +21,9 @@ from mfvpr.errors import InputError
 MAX_PIXELS = 64_000_000
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
 
-Interpolation = Literal["pil_bilinear", "pil_bicubic", "cv2_linear", "cv2_area", "torch_bilinear"]
+Interpolation = Literal["pil_bilinear", "pil_bicubic", "cv2_linear", "cv2_area", "cv2_cubic", "torch_bilinear"]
 _PIL = {"pil_bilinear": Image.Resampling.BILINEAR, "pil_bicubic": Image.Resampling.BICUBIC}
-_CV2 = {"cv2_linear": cv2.INTER_LINEAR, "cv2_area": cv2.INTER_AREA}
+_CV2 = {"cv2_linear": cv2.INTER_LINEAR, "cv2_area": cv2.INTER_AREA, "cv2_cubic": cv2.INTER_CUBIC}
 
 _GRAY, _COLOR = ("I", "I;16", "I;16L", "I;16B", "I;16N"), ("RGB", "RGBA", "LA")  # Pillow's modes of 16-bit files
 _ORIENTATION = 0x0112
@@ -119,7 +119,7 @@ def resize(image: np.ndarray, size: tuple[int, int], interpolation: Interpolatio
     | interpolation | as | result |
     | :-- | :-- | :-- |
     | `pil_bilinear`, `pil_bicubic` | Pillow, antialiased; torch's of uint8, but for a level in 1 % of values | uint8 |
-    | `cv2_linear`, `cv2_area` | OpenCV; `cv2_linear` is not antialiased | uint8 |
+    | `cv2_linear`, `cv2_area`, `cv2_cubic` | OpenCV; only `cv2_area` is antialiased | uint8 |
     | `torch_bilinear` | torch's antialiasing of floats, not rounded | float32, 0 .. 255 |
 
     Networks take both types; SIFT refuses floats.

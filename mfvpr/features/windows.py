@@ -1,0 +1,171 @@
+"""Windows of a network's maps, whitened: how both stages of SSM-VPR describe images (Camara & Preucil, RAS 2020).
+
+The whitening is learned from windows of the database's images; see `mfvpr.fitting`. It is linear, so that a window's
+descriptor is a convolution of the map, and no windows are formed once it is known.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Literal, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mfvpr.errors import InputError
+from mfvpr.features import Extractor
+from mfvpr.numerics import free_host_bytes
+from mfvpr.types import Array
+from mfvpr.whitening import Whitening, fit_bytes, fit_whitening
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Where the windows of a map are: rows from the top, each from the left.
+
+    Attributes:
+        shape: (rows, columns, channels) of the map.
+        size: of a window, positions per side.
+        stride: from window to window.
+    """
+
+    shape: tuple[int, int, int]
+    size: int
+    stride: int = 1
+
+    def __post_init__(self) -> None:
+        if min(self.shape[:2]) < self.size:
+            raise InputError(f"windows of {self.size} x {self.size}: expected a map of as many positions, got "
+                             f"{self.shape[0]} x {self.shape[1]}; take larger images")  # fmt: skip
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """(rows, columns) of windows."""
+        rows, columns = ((side - self.size) // self.stride + 1 for side in self.shape[:2])
+        return rows, columns
+
+    @property
+    def count(self) -> int:
+        """V, windows of a map."""
+        return self.grid[0] * self.grid[1]
+
+    @property
+    def dimension(self) -> int:
+        """D, numbers of a window, (row, column, channel)."""
+        return self.size**2 * self.shape[2]
+
+    @property
+    def corners(self) -> np.ndarray:
+        """`[V, 2]` (row, column) of each window's first position."""
+        return self.stride * np.stack(np.divmod(np.arange(self.count), self.grid[1]), axis=1)
+
+    def take(self, maps: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+        """`[n, D]` some windows of one map."""
+        parts = [maps[row : row + self.size, column : column + self.size] for row, column in self.corners[numbers]]
+        return np.reshape(parts, (len(numbers), self.dimension))
+
+
+@dataclass(frozen=True)
+class WindowFitting:
+    """How the whitening is learned: from windows that are drawn from images that are drawn from the database.
+
+    Attributes:
+        dimension: D' of what comes out.
+        max_images: of the database, at most; None = all.
+        max_windows: of theirs, at most; None = all.
+        zero_row: a window of zeros more, as in the public code's second stage.
+        dtype: of the windows and of the result. Sums are in double precision either way.
+        seed: of the draws. (The public code has none.)
+    """
+
+    dimension: int
+    max_images: int | None = 250
+    max_windows: int | None = 10_000
+    zero_row: bool = False
+    dtype: Literal["float32", "float64"] = "float32"
+    seed: int = 0
+
+    def drawn(self, num_images: int) -> list[int]:
+        """Rows of the images that are looked at."""
+        rows = np.random.default_rng([self.seed, 0]).permutation(num_images)
+        return sorted(rows[: self.max_images].tolist())
+
+    def fit(self, maps: Iterable[Mapping[int, np.ndarray]], windows: Windows, rows: list[int]) -> Whitening:
+        """Learned from maps `[rows, columns, channels]` by row, some at a time, of those that were `drawn`.
+
+        Raises:
+            InputError: they do not fit into memory, or there are fewer windows than dimensions.
+        """
+        total = len(rows) * windows.count
+        chosen = np.arange(total)
+        if self.max_windows is not None and total > self.max_windows:
+            rng = np.random.default_rng([self.seed, 1])
+            chosen = np.sort(rng.choice(total, self.max_windows, replace=False))
+        count = len(chosen) + self.zero_row
+        needed = fit_bytes(count, windows.dimension, np.dtype(self.dtype).itemsize)
+        if needed > (free := free_host_bytes()):
+            raise InputError(
+                f"whitening of {count} windows of {windows.dimension} numbers: takes {needed / 1e9:.1f} GB of memory, "
+                f"but {free / 1e9:.1f} GB are free; lower max_images or max_windows"
+            )
+        sample, filled = np.zeros((count, windows.dimension), self.dtype), 0
+        place = {row: windows.count * number for number, row in enumerate(rows)}
+        for some in maps:
+            for row, one in some.items():
+                first, end = np.searchsorted(chosen, [place[row], place[row] + windows.count])
+                sample[filled : filled + end - first] = windows.take(one, chosen[first:end] - place[row])
+                filled += end - first
+        return fit_whitening(sample[: filled + self.zero_row], self.dimension)
+
+
+@runtime_checkable
+class WindowExtractor(Protocol):
+    """An extractor of whitened windows, which must see the database first: a dataclass, of which `replace` makes it."""
+
+    @property
+    def whitening(self) -> WindowFitting | Whitening:
+        """How it is to be learned, or what was."""
+        ...
+
+    @property
+    def windows(self) -> Windows:
+        """Of its maps."""
+        ...
+
+    @property
+    def maps(self) -> Extractor:
+        """What gives the maps that windows are taken from, as the images' vectors."""
+        ...
+
+
+def known(extractor: WindowExtractor) -> Whitening:
+    """The whitening that was learned.
+
+    Raises:
+        InputError: none was.
+    """
+    if not isinstance(extractor.whitening, Whitening):
+        raise InputError(f"{type(extractor).__name__}: has not seen the database; take mfvpr.fitting.fitted(...) of it")
+    return extractor.whitening
+
+
+def kernels(whitening: Whitening, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
+    """The whitening as a convolution: `[size, size, channels, D']`, and `[D']` to subtract, float32."""
+    components = whitening.components.reshape(-1, windows.size, windows.size, windows.shape[2])
+    offset = whitening.components.astype(np.float64) @ whitening.mean
+    return np.moveaxis(components, 0, -1).astype(np.float32), offset.astype(np.float32)
+
+
+def whitened(maps: Array, kernel: Array, offset: Array, *, stride: int) -> Array:
+    """`[B, V, D']` descriptors of all windows of maps `[B, rows, columns, channels]`."""
+    found = jax.lax.conv_general_dilated(
+        maps, kernel, (stride, stride), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        precision=jax.lax.Precision.HIGHEST,
+    )  # fmt: skip
+    return found.reshape(len(maps), -1, found.shape[-1]) - offset[None, None]
+
+
+def normalized(maps: Array) -> Array:
+    """Maps `[..., channels]` of unit length at every position; zero stays zero."""
+    length = jnp.sqrt(jnp.sum(maps * maps, axis=-1, keepdims=True))
+    return maps / jnp.where(length > 0, length, 1.0)

@@ -1,0 +1,286 @@
+"""SSM-VPR's windows and cells: what they are, how they are learned from a database, and that they are of no other."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import numpy as np
+import pytest
+from flax import nnx
+
+import mfvpr
+from mfvpr.archive import Archive
+from mfvpr.data.datasets import ImageFolder, folder_dataset, sequences_dataset
+from mfvpr.errors import InputError
+from mfvpr.evaluations import Matching, match_sequence, matches_recipe
+from mfvpr.features import Aggregated, windows
+from mfvpr.features.sift import Sift
+from mfvpr.features.ssm import SsmCells, SsmMaps, SsmWindows
+from mfvpr.features.vlad import VladFitting
+from mfvpr.features.windows import WindowFitting, Windows, kernels, normalized, whitened
+from mfvpr.filters import Retrieval
+from mfvpr.fingerprints import difference, fingerprint
+from mfvpr.fitting import fitted, whitening_recipe
+from mfvpr.models.ssm import SsmVgg
+from mfvpr.scoring import GridAnchors
+from mfvpr.voting import SsmVoting
+from mfvpr.whitening import Whitening, fit_whitening
+from tests.builders import local
+
+SMALL = (48, 40)  # px: 4 x 3 cells
+FILTER = Retrieval(Aggregated(Sift(max_keypoints=60, image_size=(160, 120)), VladFitting(num_words=8)))
+CANDIDATE = Matching(cross_check="candidate")
+
+
+def network(seed=0):
+    """Random weights, no JAX program but those of the maps."""
+    shapes, rng = nnx.eval_shape(lambda: SsmVgg(rngs=nnx.Rngs(0))), np.random.default_rng(seed)
+    graph, state = nnx.split(shapes)
+    fill = lambda leaf: (rng.normal(size=leaf.shape) / np.sqrt(np.prod(leaf.shape[:-1]) / 2)).astype(np.float32)  # noqa: E731
+    return nnx.merge(graph, jax.tree.map(fill, state))
+
+
+@pytest.fixture(scope="module")
+def model():
+    return network()
+
+
+@pytest.fixture(scope="module")
+def cells(model):
+    return SsmCells(model, SMALL, whitening=WindowFitting(6, seed=1))
+
+
+@pytest.fixture(scope="module")
+def dataset(small_street):
+    return folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
+
+
+# Windows
+
+
+@pytest.mark.parametrize(("shape", "size", "stride"), [((5, 7, 2), 3, 1), ((8, 5, 3), 3, 2), ((4, 4, 1), 4, 1)])
+def test_windows_are_those_of_the_loops(shape, size, stride):
+    one, found = np.random.default_rng(0).normal(size=shape), Windows(shape, size, stride)
+    expected = [
+        one[row : row + size, column : column + size].reshape(-1)
+        for row in range(0, shape[0] - size + 1, stride)
+        for column in range(0, shape[1] - size + 1, stride)
+    ]
+    assert found.count == len(expected) == np.prod(found.grid)
+    np.testing.assert_array_equal(found.take(one, np.arange(found.count)), expected)
+    np.testing.assert_array_equal(
+        found.take(one, np.array([1, 0]) % found.count), np.take(expected, [1, 0], 0, mode="wrap")
+    )
+
+
+def test_a_convolution_is_the_whitening_of_every_window():
+    rng = np.random.default_rng(1)
+    maps, found = rng.normal(size=(2, 6, 7, 4)).astype(np.float32), Windows((6, 7, 4), 3, 2)
+    sample = np.concatenate([found.take(one, np.arange(found.count)) for one in maps])
+    learned = fit_whitening(np.concatenate([sample, rng.normal(size=(40, 36))]), 5)
+    got = jax.jit(partial(whitened, stride=2))(maps, *kernels(learned, found))
+    np.testing.assert_allclose(np.reshape(got, (-1, 5)), learned(sample), atol=1e-5)
+
+
+def test_maps_are_of_unit_length_where_there_is_something():
+    maps = np.random.default_rng(2).normal(size=(1, 3, 3, 8)).astype(np.float32)
+    maps[0, 1, 1] = 0
+    lengths = np.linalg.norm(np.asarray(normalized(maps)), axis=-1)
+    np.testing.assert_allclose(lengths, np.where(np.arange(9).reshape(1, 3, 3) == 4, 0, 1), atol=1e-6)
+
+
+@pytest.mark.parametrize(("windows_at_most", "zero_row"), [(None, False), (None, True), (30, False), (30, True)])
+def test_the_whitening_is_that_of_the_windows_that_are_drawn(windows_at_most, zero_row):
+    rng, found = np.random.default_rng(3), Windows((6, 6, 2), 3)
+    how = WindowFitting(4, 5, windows_at_most, zero_row, "float64", seed=7)
+    rows = how.drawn(9)
+    assert rows == sorted(set(rows))
+    assert len(rows) == 5
+    maps = {row: rng.normal(size=(6, 6, 2)) for row in rows}
+    learned = how.fit([{rows[0]: maps[rows[0]]}, {row: maps[row] for row in rows[1:]}], found, rows)
+    every = np.concatenate([found.take(maps[row], np.arange(16)) for row in rows])
+    chosen = np.arange(80) if windows_at_most is None else np.random.default_rng([7, 1]).choice(80, 30, replace=False)
+    sample = np.concatenate([every[np.sort(chosen)], np.zeros((int(zero_row), 18))])
+    expected = fit_whitening(sample, 4)
+    np.testing.assert_array_equal(learned.components, expected.components)
+    np.testing.assert_array_equal(learned.mean, expected.mean)
+    assert replace(how, max_images=None).drawn(9) == [*range(9)]
+    assert replace(how, seed=8).drawn(9) != rows
+
+
+def test_images_that_cannot_be_read_have_no_windows():
+    rng, found, how = np.random.default_rng(4), Windows((4, 4, 2), 3), WindowFitting(3, dtype="float64")
+    maps = {row: rng.normal(size=(4, 4, 2)) for row in range(6) if row != 2}
+    learned = how.fit([maps], found, how.drawn(6))
+    expected = fit_whitening(np.concatenate([found.take(one, np.arange(4)) for one in maps.values()]), 3)
+    np.testing.assert_array_equal(learned.components, expected.components)
+
+
+def test_more_windows_than_memory_has_room_for_are_refused(monkeypatch):
+    monkeypatch.setattr(windows, "free_host_bytes", lambda: 3 * 10**9)
+    rows = [*range(250)]
+    with pytest.raises(InputError, match=r"9000 windows of 41472 numbers: takes 3\.3 GB .* lower max_images"):
+        WindowFitting(125).fit([], Windows((14, 14, 512), 9), rows)
+
+
+def test_fewer_windows_than_dimensions_are_refused(cells, dataset):
+    one = ImageFolder(dataset.database.root, dataset.database.names[:1])
+    few = replace(cells, whitening=WindowFitting(12))
+    with pytest.raises(InputError, match="expected more than 12 descriptors of as many numbers, got 12 of 4608"):
+        fitted(few, one, Archive())
+    assert np.isfinite(fitted(replace(cells, whitening=WindowFitting(11)), one, Archive()).whitening.components).all()
+
+
+# Images
+
+
+def test_cells_are_whitened_windows_at_their_places(model, cells, dataset):
+    learned = fitted(cells, dataset.database, Archive())
+    images = np.random.default_rng(0).integers(0, 256, (2, 40, 48, 3), np.uint8)
+    maps = [one.vector.reshape(5, 6, 512).astype(np.float64) for one in SsmMaps(model, 2, SMALL)(images)]
+    found = Windows((5, 6, 512), 3)
+    assert cells.scales == learned.scales == ((6, 12),)
+    for features, one in zip(local(learned(images)), maps, strict=True):
+        expected = learned.whitening(found.take(one, np.arange(12)))
+        np.testing.assert_allclose(features.descriptors, expected, atol=1e-4 * np.abs(expected).max())
+        assert features.descriptors.dtype == features.keypoints.dtype == np.float32
+        # The middle of 8 x 8 px is between two of them.
+        np.testing.assert_array_equal(features.keypoints[[0, 1, 4]], [[11.5, 11.5], [19.5, 11.5], [11.5, 19.5]])
+        np.testing.assert_array_equal(features.scores, np.ones(12))
+        np.testing.assert_array_equal(features.image_size, SMALL)
+    np.testing.assert_allclose(np.linalg.norm(maps[0], axis=-1), 1, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "stride", "grid"),
+    [(224, 1, (26, 26)), (336, 1, (40, 40)), (448, 1, (54, 54)), (416, 2, (25, 25))],
+)
+def test_the_grids_are_the_published_ones(model, pixels, stride, grid):
+    assert SsmCells(model, (pixels, pixels), stride=stride).windows.grid == grid
+
+
+def test_the_filter_has_36_windows_of_125_numbers(model):
+    assert SsmWindows(model).windows.count == 36
+    assert SsmWindows(model).windows.dimension == 41472
+    assert SsmWindows(model).vector_size == 36 * 125
+
+
+def test_what_has_no_cells_or_has_not_seen_the_database_is_refused(model, cells):
+    with pytest.raises(InputError, match="windows of 3 x 3: expected a map of as many positions, got 2 x 6"):
+        SsmCells(model, (48, 16))
+    with pytest.raises(InputError, match="stride=0"):
+        SsmCells(model, stride=0)
+    with pytest.raises(InputError, match="SsmCells: has not seen the database; take"):
+        cells(np.zeros((1, 40, 48, 3), np.uint8))
+
+
+# What is learned
+
+
+def kept(root):
+    return sorted(root.glob("*whitening*.npz"))
+
+
+def test_what_is_learned_is_kept_and_made_once(cells, dataset, tmp_path):
+    labels = []
+
+    def archive():
+        return Archive(tmp_path, track=lambda label: labels.append(label) or (lambda items, total=None: items))
+
+    first = fitted(cells, dataset.database, archive())
+    assert labels == ["SsmCells whitening"]
+    again = fitted(cells, dataset.database, archive())
+    assert labels == ["SsmCells whitening"]
+    assert fitted(again, dataset.database, archive()) is again
+    np.testing.assert_array_equal(again.whitening.components, first.whitening.components)
+    np.testing.assert_array_equal(fitted(cells, dataset.database, Archive()).whitening.mean, first.whitening.mean)
+    [path] = kept(tmp_path)
+    assert {*np.load(path).files} == {"mean", "components", "recipe"}
+
+
+def test_it_is_of_no_other_data_network_or_settings(model, cells, dataset, tmp_path):
+    archive, how, other = Archive(tmp_path), cells.whitening, network(1)
+    learned = [fitted(cells, folder, archive) for folder in (dataset.database, dataset.queries)]
+    assert len(kept(tmp_path)) == 2
+    assert not np.array_equal(*(one.whitening.components for one in learned))
+    # A hash of it is part of all that is computed with it.
+    recipes = [archive.recipe(dataset.database, replace(cells, whitening=one.whitening)) for one in learned]
+    assert "whitening" in difference(*recipes)
+    variants = [
+        cells, replace(cells, model=other), replace(cells, preprocessing="caffe"), replace(cells, stride=2),
+        replace(cells, image_size=(40, 48)), replace(cells, interpolation="cv2_area"), SsmWindows(model),
+        *(replace(cells, whitening=replace(how, **change)) for change in (
+            {"dimension": 5}, {"seed": 2}, {"zero_row": True}, {"max_images": 9}, {"max_windows": 99},
+            {"dtype": "float64"},
+        )),
+    ]  # fmt: skip
+    recipes = [whitening_recipe(one, one.whitening, dataset.database, archive) for one in variants]
+    assert len({*map(fingerprint, recipes)}) == len(variants)
+    same = replace(cells, batch_size=1)
+    assert whitening_recipe(same, how, dataset.database, archive) == recipes[0]
+
+
+def test_files_that_are_damaged_or_exchanged_are_refused(cells, dataset, tmp_path):
+    fitted(cells, dataset.database, Archive(tmp_path))
+    [path] = kept(tmp_path)
+    fitted(cells, dataset.queries, Archive(tmp_path))
+    [other] = {*kept(tmp_path)} - {path}
+    content = path.read_bytes()
+    for wrong in (other.read_bytes(), content[:-100] + bytes(100), b""):
+        path.write_bytes(wrong)
+        with pytest.raises(InputError, match="expected arrays as they were written here") as told:
+            fitted(cells, dataset.database, Archive(tmp_path))
+        assert "\n" not in str(told.value)
+
+
+def test_parts_of_filters_are_learned_as_well(cells, model, dataset):
+    of_cells = fitted(Retrieval(Aggregated(cells, VladFitting(num_words=4))), dataset.database, Archive())
+    assert isinstance(of_cells.describer.extractor.whitening, Whitening)
+    assert fitted(FILTER, dataset.database, Archive()) is FILTER
+
+
+# The whole way
+
+
+def test_the_database_is_looked_at_once_for_all_sequences(cells, small_street, dataset, tmp_path):
+    labels = []
+    archive = Archive(tmp_path, track=lambda label: labels.append(label) or (lambda items, total=None: items))
+    root = small_street / "queries"
+    several = sequences_dataset(small_street / "database", [root, small_street / "database"], ground_truth="none")
+    found = mfvpr.evaluate(
+        several, cells, FILTER, {"grid": GridAnchors(3), "count": mfvpr.MatchCount()}, candidates=3,
+        matching=CANDIDATE, archive=archive,
+    )  # fmt: skip
+    assert labels.count("SsmCells whitening") == 1
+    [first, second] = found.matched
+    assert (first.matches[0].counts == 12).all()
+    # Cells are 4 x 3, no square: as many as none of 3 x 3, which is told, not scored.
+    assert all(np.isnan(ranked.scores).all() for ranked in found.systems["grid"])
+    np.testing.assert_array_equal(found.systems["count"][1].scores, np.full((10, 3), 12))
+    assert second.matches[0].counts.shape == (10, 3)
+
+
+def test_an_image_is_found_by_itself_with_every_cell(model, dataset, tmp_path):
+    """4 x 4 cells, each of which is nearest to itself, so that each agrees with all others."""
+    square = SsmCells(model, SMALL[:1] * 2, whitening=WindowFitting(15))
+    own = replace(dataset, sequences=(replace(dataset.only, images=dataset.database),))
+    options = {"matching": CANDIDATE, "archive": Archive(tmp_path)}
+    found = mfvpr.evaluate(own, square, FILTER, {"grid": GridAnchors(4, 3)}, candidates=4, **options)
+    [ranked] = found.systems["grid"]
+    np.testing.assert_array_equal(ranked.rows[:, 0], np.arange(10))
+    np.testing.assert_array_equal(ranked.scores[:, 0], np.full(10, (2 + 3 + 3 + 2) ** 2))
+    recipes = [matches_recipe(own, own.only, square, FILTER, 4, CANDIDATE, Archive(tmp_path))]
+    recipes.append(recipes[0] | {"database": Archive().recipe(own.database, square)})
+    assert "whitening" in difference(*recipes)
+
+
+@pytest.mark.slow
+def test_the_only_votes_of_the_nearest_windows_are_an_images_own(model, dataset, tmp_path):
+    few = ImageFolder(dataset.database.root, dataset.database.names[:3])
+    sequence = replace(dataset.only, images=ImageFolder(few.root, few.names[1:2]))
+    filter = SsmVoting(SsmWindows(model, whitening=WindowFitting(20)))
+    [candidates] = filter.shortlist(sequence, few, 1, Archive(tmp_path)).candidates.indices
+    assert candidates == [1]
+    assert len(kept(tmp_path)) == 1
+    found = match_sequence(replace(dataset, database=few), sequence, FILTER.describer.extractor, filter, 3)
+    np.testing.assert_array_equal(found.candidates.scores.sum(1), [36 * 3])

@@ -1,0 +1,77 @@
+"""Votes of windows against loops over all of them."""
+
+import math
+
+import numpy as np
+import pytest
+
+from mfvpr.evaluation import Positives
+from mfvpr.retrieval import ExactSearch
+from mfvpr.voting import voted
+
+
+def by_loops(queries, database, num_candidates, excluded=()):
+    """Candidates and votes of each query, as lists: the nearest windows by distance, the first of equal ones."""
+    listed = []
+    for number, query in enumerate(queries):
+        hidden = excluded[number] if excluded else ()
+        usable = [row for row, image in enumerate(database) if row not in hidden and np.isfinite(image).all()]
+        votes = dict.fromkeys(usable, 0)
+        for window in query if np.isfinite(query).all() else ():
+            distances = [(math.dist(window, other), row) for row in usable for other in database[row]]
+            for _, row in sorted(distances, key=lambda one: one[0])[:num_candidates]:
+                votes[row] += 1
+        order = sorted(usable, key=lambda row: (-votes[row], row)) if np.isfinite(query).all() else []
+        listed.append([(row, votes[row]) for row in order[:num_candidates]])
+    return listed
+
+
+def assert_lists(shortlist, expected, num_candidates):
+    assert shortlist.indices.shape == (len(expected), num_candidates)
+    for indices, scores, mask, own in zip(shortlist.indices, shortlist.scores, shortlist.mask, expected, strict=True):
+        assert list(zip(indices[mask].tolist(), scores[mask].tolist(), strict=True)) == own
+        assert mask.sum() == len(own)
+        assert (indices[~mask] == -1).all()
+        assert (scores[~mask] == 0).all()
+
+
+def windows(seed, images, per_image=4, dimension=5):
+    return np.random.default_rng([seed, images]).normal(size=(images, per_image, dimension)).astype(np.float32)
+
+
+@pytest.mark.parametrize("memory", [None, 2e-6], ids=["at once", "few at a time"])
+@pytest.mark.parametrize("num_candidates", [1, 3, 9, 12])
+def test_agrees_with_the_loop(num_candidates, memory):
+    queries, database = windows(0, 7), windows(0, 9)
+    database[4], queries[2, 1, 0] = np.nan, np.inf
+    got = voted(queries, database, num_candidates, search=ExactSearch(memory))
+    assert_lists(got, by_loops(queries, database, num_candidates), num_candidates)
+
+
+def test_excluded_images_neither_get_votes_nor_fill_up():
+    queries, database = windows(1, 5), windows(1, 8)
+    excluded = [[0, 1, 2], [], [7], [*range(8)], [3]]
+    got = voted(queries, database, 8, excluded=Positives.from_rows(excluded, 8))
+    assert_lists(got, by_loops(queries, database, 8, excluded), 8)
+    assert not got.mask[3].any()
+
+
+def test_more_queries_than_go_together():
+    queries, database = windows(2, 70), windows(2, 6)
+    got = voted(queries, database, 2, excluded=Positives.from_rows([[row % 6] for row in range(70)], 6))
+    assert_lists(got, by_loops(queries, database, 2, [[row % 6] for row in range(70)]), 2)
+
+
+def test_equal_votes_go_by_row_and_equal_windows_by_image():
+    database = np.zeros((3, 2, 4), np.float32)
+    got = voted(np.ones((1, 2, 4), np.float32), database, 3)
+    np.testing.assert_array_equal(got.indices, [[0, 1, 2]])
+    np.testing.assert_array_equal(got.scores, [[4, 2, 0]])
+
+
+def test_a_database_of_one_image():
+    for num_candidates in (1, 5):
+        got = voted(windows(3, 2), windows(3, 1), num_candidates)
+        np.testing.assert_array_equal(got.indices[:, 0], [0, 0])
+        np.testing.assert_array_equal(got.mask.sum(1), [1, 1])
+        np.testing.assert_array_equal(got.scores[:, 0], [4 * min(num_candidates, 4)] * 2)
