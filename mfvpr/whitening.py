@@ -1,13 +1,16 @@
 """Principal components of unit variance, out of the smaller of two matrices: covariance, or Gram matrix."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import eigh
+from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 
 from mfvpr.errors import InputError
 
+FEW = 10  # times as many dimensions there must be as components for Lanczos' method
 SMALLEST = 1e-6  # of the largest standard deviation, below which there is but rounding
 _BLOCK = 2**25  # numbers in double precision at a time
 
@@ -56,12 +59,10 @@ def fit_whitening(sample: np.ndarray, dimension: int) -> Whitening:
                          f"{size}; keep fewer components")  # fmt: skip
     mean = sample.mean(axis=0, dtype=np.float64)
     by_rows = size <= count
-    order, products = min(count, size), np.zeros((min(count, size),) * 2)
+    products = np.zeros((min(count, size),) * 2)
     for part in _centered(sample, mean, by_rows=by_rows):
         products += part.T @ part if by_rows else part @ part.T
-    kept = (order - dimension, order - 1)
-    squares, vectors = eigh(products, subset_by_index=kept, overwrite_a=True, check_finite=False)
-    squares, vectors = squares[::-1], vectors[:, ::-1]
+    squares, vectors = _largest(products, dimension)
     if squares[0] <= count * (SMALLEST**2 * 1e-4) * (mean @ mean):
         raise InputError(f"whitening: expected descriptors that differ, got {count} that are alike; use other images")
     if not by_rows:
@@ -78,6 +79,20 @@ def fit_bytes(count: int, size: int, itemsize: int) -> int:
     """Memory that a sample of `count` vectors and their fit take, about."""
     matrix = 8 * min(count, size) ** 2
     return itemsize * count * size + 2 * matrix + 2 * 8 * min(_BLOCK, count * size)
+
+
+def _largest(products: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
+    """The largest eigenvalues `[number]` of a symmetric matrix, the largest first, and their vectors in columns."""
+    order = len(products)
+    if FEW * number < order:  # to the last bits as well, in a small part of the time
+        with suppress(ArpackNoConvergence):
+            start = np.random.default_rng(0).normal(size=order)
+            squares, vectors = eigsh(products, k=number, which="LA", v0=start)
+            descending = np.argsort(-squares)
+            return squares[descending], vectors[:, descending]
+    kept = (order - number, order - 1)
+    squares, vectors = eigh(products, subset_by_index=kept, overwrite_a=True, check_finite=False)
+    return squares[::-1], vectors[:, ::-1]
 
 
 def _centered(sample: np.ndarray, mean: np.ndarray, *, by_rows: bool) -> Iterator[np.ndarray]:

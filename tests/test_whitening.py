@@ -26,7 +26,7 @@ def by_decomposition(sample, dimension):
     return mean, signs[:, None] * axes / (spread[:dimension, None] / np.sqrt(len(sample) - 1))
 
 
-@pytest.mark.parametrize("shape", [(60, 25), (25, 60), (31, 30), (30, 30)], ids=str)
+@pytest.mark.parametrize("shape", [(60, 25), (25, 60), (31, 30), (30, 30), (200, 150), (130, 140)], ids=str)
 @pytest.mark.parametrize("block", [7, 2**25])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-10), (np.float32, 1e-6)])
 def test_both_matrices_give_the_components_of_the_sample(shape, block, dtype, tolerance, monkeypatch):
@@ -40,7 +40,7 @@ def test_both_matrices_give_the_components_of_the_sample(shape, block, dtype, to
     np.testing.assert_allclose(np.cov(white.T), np.eye(12), atol=100 * tolerance)
 
 
-@pytest.mark.parametrize("shape", [(60, 25), (25, 60)], ids=str)
+@pytest.mark.parametrize("shape", [(60, 25), (25, 60), (90, 100), (110, 90)], ids=str)
 def test_a_component_without_variance_is_zero(shape):
     """Where a division by its standard deviation would make rounding as large as all else."""
     fitted = fit_whitening(samples(*shape, np.float32, rank=5), 8)
@@ -72,3 +72,10 @@ def test_memory_is_that_of_the_sample_and_of_the_smaller_matrix():
     """Of 250 images: 9000 windows of the first stage, 10000 of the second."""
     gigabytes = [fit_bytes(9000, 41472, 4) / 1e9, fit_bytes(10000, 4608, 8) / 1e9]
     np.testing.assert_allclose(gigabytes, [1.493 + 1.296 + 0.537, 0.369 + 0.340 + 0.537], rtol=0.01)
+
+
+def test_a_flat_spectrum_is_solved_as_well():
+    """Where Lanczos' method gains little, or does not converge."""
+    sample = np.random.default_rng(0).normal(size=(400, 120))
+    fitted, (_, components) = fit_whitening(sample, 11), by_decomposition(sample, 11)
+    np.testing.assert_allclose(fitted.components, components, atol=1e-9 * np.abs(components).max())
