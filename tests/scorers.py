@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 import mfvpr
-from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, MatchCount, UnitWeight
+from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, Homography, MatchCount, UnitWeight
 
 
 def plain(matches):
@@ -65,6 +65,7 @@ OWN = [
     AggregatedScore(),
     AggregatedScore(mean="median"),
     MatchCount(),
+    Homography(max_iterations=100.0),
     HistogramOfShifts(temperature=0.05),
     AnchorPoints(num_bins=8, temperature=0.2),
     AggregatedScore(mean="weighted", clamp=True, temperature=30.0),

@@ -19,11 +19,12 @@ import numpy as np
 from mfvpr import parameter_grids, reranking
 from mfvpr.data.arrays import read_arrays, write_arrays
 from mfvpr.errors import InputError
-from mfvpr.fingerprints import content_hash
+from mfvpr.fingerprints import content_hash, recipe_of
 from mfvpr.match_sets import MatchSet, Scales, queries_that_fit, scales, shapes
 from mfvpr.numerics import Device, compiled
 from mfvpr.progress import Track, untracked
 from mfvpr.reranking import FilterScore, Ties, filter_scores, indexed
+from mfvpr.scoring import on_host
 from mfvpr.sweeping.scores import PaddedBatch, all_batches, fuse_all, scored
 from mfvpr.sweeping.settings import FUSION, Group, Setting, distinct, groups
 from mfvpr.types import Array, Matches, Shortlist, per_match
@@ -237,6 +238,8 @@ def _fingerprint(part: Work, block: Group, cs: Sequence[Any]) -> str:
 
 def _program(work: Work, group: Group) -> str:
     """What the scorer computes of batches of these shapes: a user's code may change while its class keeps its name."""
+    if on_host(group.scorer):
+        return str(recipe_of(group.scorer))
 
     def text(matches: Matches, size: int, pairs: int) -> str:
         entries = per_match(matches).items()
