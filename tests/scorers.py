@@ -4,7 +4,16 @@ import jax
 import jax.numpy as jnp
 
 import mfvpr
-from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, MatchCount, UnitWeight
+from mfvpr import (
+    AggregatedScore,
+    AnchorPoints,
+    HistogramOfShifts,
+    LostScore,
+    MatchCount,
+    RapidSpatialScore,
+    UnitWeight,
+    VisualPhrases,
+)
 
 
 def plain(matches):
@@ -65,6 +74,14 @@ OWN = [
     AggregatedScore(),
     AggregatedScore(mean="median"),
     MatchCount(),
+    RapidSpatialScore(),
+    RapidSpatialScore(reach="largest_coordinate", per_feature=True),
+    RapidSpatialScore(reach="largest_shift"),
+    VisualPhrases(),
+    VisualPhrases(length=3, cell_size=40.0, align="zero_edge"),
+    LostScore(),
+    LostScore(form="unweighted", mirrored=True),
+    LostScore(form="described"),
     HistogramOfShifts(temperature=0.05),
     AnchorPoints(num_bins=8, temperature=0.2),
     AggregatedScore(mean="weighted", clamp=True, temperature=30.0),

@@ -97,7 +97,8 @@ def test_conf_and_help_follow_from_the_class(near, monkeypatch, capsys):
     for line in (summary, *lines):
         assert f"\n  {line}\n" in stdout
     assert "Made by" not in stdout
-    assert "\n  scorer=near             all, anchor, count, histogram, sum\n" in stdout
+    others = ", ".join(sorted({*SCORERS, "all"} - {"near"}))
+    assert f"\n  scorer=near             {others}\n" in stdout
     assert "\n  radius: null  # near: px\n" in stdout
     assert "\n  norm: null  # near: sum, largest\n" in stdout
     assert f"\n  weight: null  # sum, anchor, histogram, near: {', '.join(WEIGHTS)}\n" in stdout
@@ -108,7 +109,7 @@ def test_conf_and_help_follow_from_the_class(near, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("program", "arguments", "words"),
     [
-        ("evaluate", ["scorer=neat"], "expected one of all, anchor, count, histogram, near, sum; the nearest is near"),
+        ("evaluate", ["scorer=neat"], f"expected one of {', '.join(sorted({*SCORERS, 'all', 'near'}))}; the nearest is near"),
         ("evaluate", ["scorer.near.radius=0"], "scorer.near.radius=0: expected a number above 0 (1e-6 to 1e12)"),
         ("evaluate", ["scorer.near.most=501"], "scorer.near.most=501: expected a number from 1 to 500, or null"),
         ("evaluate", ["scorer=near", "scorer.rounds=10"], "scorer.rounds=10: expected a whole number from 1 to 9"),
@@ -118,7 +119,7 @@ def test_conf_and_help_follow_from_the_class(near, monkeypatch, capsys):
         ("evaluate", ["scorer=near", "scorer.strict=1"], "scorer.strict=1: expected one of true, false"),
         ("evaluate", ["scorer=near", "scorer.radios=1"], "unknown setting; the nearest is scorer.radius"),
         ("evaluate", ["scorer=near", "scorer.method=sum"], "scorer=sum has no setting radius; see --help"),
-        ("evaluate", ["scorer=near", "scorer.method=[1]"], "scorer.method=[1]: expected one of count, sum, anchor"),
+        ("evaluate", ["scorer=near", "scorer.method=[1]"], f"scorer.method=[1]: expected one of {', '.join(SCORERS)}"),
         ("evaluate", ["scorer.near.method=sum"], "scorer.near.method=sum: expected near; choose with scorer=near"),
         ("sweep", ["scorer=near", "grid.radius=[-1]"], "radius=[-1]: expected a list of one or more, each a number"),
         ("sweep", ["scorer=near", "grid.most=[null,501]"], "each a number from 1 to 500, or null"),

@@ -34,10 +34,21 @@ def test_every_conf_composes_and_passes_its_own_checks(group, choice):
 
 def test_scorers_of_conf_are_the_papers():
     from experiments import build
-    from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, MatchCount
+    from mfvpr import (
+        AggregatedScore,
+        AnchorPoints,
+        HistogramOfShifts,
+        LostScore,
+        MatchCount,
+        RapidSpatialScore,
+        VisualPhrases,
+    )
 
     expected = {
         "count": MatchCount(),
+        "rapid": RapidSpatialScore(),
+        "phrases": VisualPhrases(),
+        "lost": LostScore(),
         "sum": AggregatedScore(),
         "anchor": AnchorPoints(),
         "histogram": HistogramOfShifts(),
@@ -171,8 +182,8 @@ def test_demo_ranks_histogram_above_count_above_filter(demo):
 @pytest.mark.slow
 def test_demo_prints_its_table_and_leaves_a_run_folder(demo):
     done, folder = demo
-    systems = ["filter", "count", "sum", "anchor", "histogram", "histogram + filter"]
-    header, _, *lines = done.stdout[done.stdout.index("system") :].splitlines()[:8]
+    systems = ["filter", *SCORERS, "histogram + filter"]
+    header, _, *lines = done.stdout[done.stdout.index("system") :].splitlines()[: 2 + len(systems)]
     assert [line[:20].strip() for line in lines] == systems
     assert header.split("  ")[0] == "system"
     assert folder.name in done.stdout

@@ -6,6 +6,9 @@ from mfvpr.scoring.aggregate import AggregatedScore
 from mfvpr.scoring.anchor import AnchorPoints
 from mfvpr.scoring.counting import MatchCount
 from mfvpr.scoring.histogram import HistogramOfShifts, ShiftHistogram
+from mfvpr.scoring.lost import LostScore
+from mfvpr.scoring.phrases import VisualPhrases
+from mfvpr.scoring.rapid import RapidSpatialScore
 from mfvpr.scoring.shifts import image_sizes, match_shifts
 from mfvpr.types import Array, Matches
 
@@ -19,6 +22,9 @@ traced and learned, and its programs are kept. `mfvpr.testing.check_scorer` chec
 
 SCORERS: dict[str, type] = {
     "count": MatchCount,
+    "rapid": RapidSpatialScore,
+    "phrases": VisualPhrases,
+    "lost": LostScore,
     "sum": AggregatedScore,
     "anchor": AnchorPoints,
     "histogram": HistogramOfShifts,
@@ -30,9 +36,12 @@ __all__ = [
     "AggregatedScore",
     "AnchorPoints",
     "HistogramOfShifts",
+    "LostScore",
     "MatchCount",
+    "RapidSpatialScore",
     "Scorer",
     "ShiftHistogram",
+    "VisualPhrases",
     "image_sizes",
     "match_shifts",
 ]
