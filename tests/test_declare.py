@@ -42,6 +42,7 @@ class Nearness:
         return jnp.sum(jnp.where(length < self.radius, match_weights(self.weight, matches), 0.0))
 
 
+EVERY = sorted({*SCORERS, "all", "near"})
 TEXT = """\
 # Made by `make conf` from mfvpr/scoring: change it there.
 # A scorer is declared once: settings, rules, help and axes follow from its class.
@@ -97,7 +98,7 @@ def test_conf_and_help_follow_from_the_class(near, monkeypatch, capsys):
     for line in (summary, *lines):
         assert f"\n  {line}\n" in stdout
     assert "Made by" not in stdout
-    others = ", ".join(sorted({*SCORERS, "all"} - {"near"}))
+    others = ", ".join(name for name in EVERY if name != "near")
     assert f"\n  scorer=near             {others}\n" in stdout
     assert "\n  radius: null  # near: px\n" in stdout
     assert "\n  norm: null  # near: sum, largest\n" in stdout
@@ -109,7 +110,7 @@ def test_conf_and_help_follow_from_the_class(near, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("program", "arguments", "words"),
     [
-        ("evaluate", ["scorer=neat"], f"expected one of {', '.join(sorted({*SCORERS, 'all', 'near'}))}; the nearest is near"),
+        ("evaluate", ["scorer=neat"], f"expected one of {', '.join(EVERY)}; the nearest is near"),
         ("evaluate", ["scorer.near.radius=0"], "scorer.near.radius=0: expected a number above 0 (1e-6 to 1e12)"),
         ("evaluate", ["scorer.near.most=501"], "scorer.near.most=501: expected a number from 1 to 500, or null"),
         ("evaluate", ["scorer=near", "scorer.rounds=10"], "scorer.rounds=10: expected a whole number from 1 to 9"),

@@ -1,4 +1,4 @@
-"""Rapid spatial score of Patch-NetVLAD (Hausler et al., CVPR 2021): the further from the mean shift, the less."""
+"""Rapid spatial score of Patch-NetVLAD (CVPR 2021): matches count less, the further they are from the mean shift."""
 
 import jax.numpy as jnp
 
