@@ -26,7 +26,7 @@ from mfvpr.progress import Track, untracked
 from mfvpr.reranking import FilterScore, Ties, filter_scores, indexed
 from mfvpr.sweeping.scores import PaddedBatch, all_batches, fuse_all, scored
 from mfvpr.sweeping.settings import FUSION, Group, Setting, distinct, groups
-from mfvpr.types import Array, Matches, Shortlist, per_match
+from mfvpr.types import Array, Matches, Shortlist, per_match, per_pair
 
 SETTINGS_PER_BLOCK = 64
 _ALONE = "alone"  # the c of a score that is not fused
@@ -239,10 +239,11 @@ def _program(work: Work, group: Group) -> str:
     """What the scorer computes of batches of these shapes: a user's code may change while its class keeps its name."""
 
     def text(matches: Matches, size: int, pairs: int) -> str:
-        entries = per_match(matches).items()
+        entries, of_pair = per_match(matches).items(), per_pair(matches).items()
         example = {name: np.zeros((pairs, size, *values.shape[1:]), values.dtype) for name, values in entries}
-        image_size = np.ones((pairs, 2), np.float32)
-        batch = Matches(**example, mask=np.ones((pairs, size), bool), image_size0=image_size, image_size1=image_size)
+        for name, values in of_pair:  # those of candidates have an axis for them
+            example[name] = np.ones((pairs, *np.shape(values)[name.endswith("1") :]), values.dtype)
+        batch = Matches(**example, mask=np.ones((pairs, size), bool))
         settings = {name: axis[:1] for name, axis in group.settings.items()}
         return jax.jit(parameter_grids.score_settings).lower(group.scorer, batch, settings, group.weightings).as_text()
 
