@@ -8,7 +8,7 @@ from mfvpr.scoring.shifts import image_sizes
 from mfvpr.types import Array, Matches, value
 from mfvpr.weighting import match_confidence
 
-_SMALLEST = 1e-12  # what float32 resolves of a cosine distance
+_SMALLEST = 1e-12  # what float32 resolves of a cosine distance, and less than any distance of descriptors but 0
 
 
 @value
@@ -55,11 +55,12 @@ def _weighted(x0: Array, x1: Array, distance: Array, confidence: Array) -> tuple
     """n |v|, and the cosine distance of v x0 and v x1."""
     real = confidence > 0
     largest = jnp.max(distance, initial=0.0, where=real)
-    # max d - d but for the sum of d, by which n |v| is divided below; as a product it is 0 of the largest, and exact.
-    closeness = masked((largest - distance) * (largest + distance) / 2, real)
-    mean = masked_mean(distance**2 / 2, real, confidence)
-    spread = safe_sqrt(jnp.sum(confidence * closeness**2))
-    return spread / jnp.where(mean > 0, mean, 1.0), _cosine_distance(x0, x1, confidence * closeness**2)
+    unit = jnp.where(largest > _SMALLEST, largest, 1.0)  # of the distances, on which L does not depend
+    mean = masked_mean((distance / unit) ** 2, real, confidence)
+    # n |v| is |max d - d| / mean d. As a product of differences it is exactly 0 of the largest.
+    closeness = masked((largest - distance) / unit * ((largest + distance) / unit), real)
+    length = safe_sqrt(jnp.sum(confidence * closeness**2))
+    return length / jnp.where(mean > 0, mean, 1.0), _cosine_distance(x0, x1, confidence * closeness**2)
 
 
 def _unweighted(x0: Array, x1: Array, _: Array, confidence: Array) -> tuple[Array, Array]:

@@ -251,6 +251,32 @@ def test_misspelt_choices_are_refused(wrong):
         wrong()
 
 
+EVERY = [RapidSpatialScore(), RapidSpatialScore("largest_coordinate"), RapidSpatialScore("largest_shift", (9.0, 1.0)),
+         VisualPhrases(1), VisualPhrases(8, 1e-6), VisualPhrases(3, 1e12), LostScore(), LostScore("unweighted", True),
+         LostScore("described")]  # fmt: skip
+gradients = jax.jit(jax.value_and_grad(lambda rows, scorer, matches: scorer(replace(matches, **rows))))
+
+
+@given(
+    st.sampled_from(EVERY),
+    st.sampled_from([1, 2, 3, 7]),
+    st.tuples(*[st.sampled_from([0.0, 1e-20, 1e-6, 1.0, 300.0, 1e6, 1e12])] * 2),
+    st.lists(st.sampled_from([0.0, 1e-30, 1e-10, 1e-4, 0.3, 2.0]), min_size=7, max_size=7),
+    st.lists(st.sampled_from([0.0, 1e-6, 0.3, 1.0]), min_size=7, max_size=7),
+    st.booleans(),
+)
+def test_hostile_numbers_leave_finite_scores_and_gradients(scorer, count, scales, distance, confidence, alike):
+    rng = np.random.default_rng(count)
+    points0, points1 = (scale * rng.uniform(-0.2, 1, (1 if alike else count, 2)) for scale in scales)
+    points0, points1 = (np.broadcast_to(points, (count, 2)) for points in (points0, points1))
+    matches = make_matches(points0, points1, distance=distance[:count], confidence=confidence[:count], capacity=8)
+    rows = {name: getattr(matches, name) for name in ("points0", "points1", "distance", "confidence")}
+    value, found = gradients(rows, scorer, matches)
+    assert np.isfinite(value)
+    assert value >= 0
+    assert all(np.isfinite(gradient).all() for gradient in found.values())
+
+
 @pytest.mark.parametrize("broken", [np.nan, np.inf])
 @pytest.mark.parametrize("field", ["points0", "points1"])
 def test_a_point_that_is_no_number_leaves_no_score(field, broken):
