@@ -17,18 +17,17 @@ class LostScore:
 
     L = (1 - cos(v x0, v x1)) / (n |v|) over the n matches, with x0 and x1 their positions along x in both images, px,
     and v = max d - d, where d are the cosine distances of the descriptors, distance^2 / 2, divided by their sum. A
-    match counts with its confidence in all of these sums. LoST multiplies L by the distance of the images' global
-    descriptors, which matches do not hold: it is 1 / (e^s - 1). It knows matches by semantic labels and channels;
-    here they are what they are.
+    match counts with its confidence in all of these sums. L is 1 / (e^s - 1); LoST multiplies it by the distance of
+    the images' global descriptors, which matches do not hold, and has its matches by channels and semantic labels.
 
     Where all distances are equal, as of a single match, v is 0 and L infinite, so that s = 0. Two matches are perfect
-    wherever they are, since the further descriptors weigh nothing. A cosine distance is at least 1e-12, and that of
-    positions of which all that weigh are 0 is 1.
+    wherever they are, since the further descriptors weigh nothing: with few matches the score says little. What 1 - cos
+    or the described L is below 1e-12 counts as that; 1 - cos is 1 where all positions that weigh are 0.
 
     Attributes:
-        form: `weighted` is the L above; `unweighted` is (1 - cos(x0, x1)) / n, which LoST's program has without dense
-            descriptors, and so by its own settings; `described` is sum |x1 - x0| distance^2 / 2, by which the seed
-            paper describes LoST: the more matches the worse.
+        form: `weighted` is the L above; `unweighted` is (1 - cos(x0, x1)) / n, LoST's own without descriptors of
+            points, as its program calls it; `described` is sum |x1 - x0| distance^2 / 2, as the paper describes LoST:
+            the more matches, the worse.
         mirrored: count the query's x from the right, W - 1 - x, for images that look the other way.
     """
 

@@ -17,8 +17,8 @@ class VisualPhrases:
     """s = sum over cells of C(m, length), the phrases that the m matches with a shift in one cell make.
 
     The plane of shifts, points1 - points0, is divided into square cells. Length 1 counts the matches, length 2 the
-    pairs that agree. A match with a confidence stands for that much of each of its phrases, which count the product of
-    their matches' confidences: whoever has fewer than `length` matches in every cell scores 0.
+    pairs that agree. A phrase counts the product of its matches' confidences, so that m need not be whole: matches of
+    confidence 0 are none, and where no cell has `length` matches the score is 0.
 
     The score is smooth in the confidences; where the points are it notices only by cells, with a gradient of 0. Matches
     are sorted by cell, so that time and memory are those of the matches, whatever the number of cells.

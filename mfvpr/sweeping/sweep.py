@@ -241,9 +241,9 @@ def _program(work: Work, group: Group) -> str:
     def text(matches: Matches, size: int, pairs: int) -> str:
         entries, of_pair = per_match(matches).items(), per_pair(matches).items()
         example = {name: np.zeros((pairs, size, *values.shape[1:]), values.dtype) for name, values in entries}
-        for name, values in of_pair:  # those of candidates have an axis for them
-            example[name] = np.ones((pairs, *np.shape(values)[name.endswith("1") :]), values.dtype)
-        batch = Matches(**example, mask=np.ones((pairs, size), bool))
+        shape = {name: np.shape(values)[name.endswith("1") :] for name, values in of_pair}  # of one candidate
+        ones = {name: np.ones((pairs, *shape[name]), values.dtype) for name, values in of_pair}
+        batch = Matches(**example, **ones, mask=np.ones((pairs, size), bool))
         settings = {name: axis[:1] for name, axis in group.settings.items()}
         return jax.jit(parameter_grids.score_settings).lower(group.scorer, batch, settings, group.weightings).as_text()
 
