@@ -121,7 +121,7 @@ def test_conf_and_help_follow_from_the_class(near, monkeypatch, capsys):
         ("evaluate", ["scorer=near", "scorer.strict=1"], "scorer.strict=1: expected one of true, false"),
         ("evaluate", ["scorer=near", "scorer.radios=1"], "unknown setting; the nearest is scorer.radius"),
         ("evaluate", ["scorer=near", "scorer.method=sum"], "scorer=sum has no setting radius; see --help"),
-        ("evaluate", ["scorer=near", "scorer.method=[1]"], "scorer.method=[1]: expected one of count, sum, anchor"),
+        ("evaluate", ["scorer=near", "scorer.method=[1]"], "scorer.method=[1]: expected one of count, rapid, phrases"),
         ("evaluate", ["scorer=all", "scorer.near.method=sum"], "near.method=sum: expected near; choose with scorer="),
         ("sweep", ["scorer=near", "grid.radius=[-1]"], "radius=[-1]: expected a list of one or more, each a number"),
         ("sweep", ["scorer=near", "grid.most=[null,501]"], "each a number from 1 to 500, or null"),

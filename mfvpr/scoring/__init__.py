@@ -9,6 +9,9 @@ from mfvpr.scoring.counting import MatchCount
 from mfvpr.scoring.histogram import HistogramOfShifts, ShiftHistogram
 from mfvpr.scoring.homography import Estimate, Homography
 from mfvpr.scoring.homography_opencv import OpenCvHomography
+from mfvpr.scoring.lost import LostScore
+from mfvpr.scoring.phrases import VisualPhrases
+from mfvpr.scoring.rapid import RapidSpatialScore
 from mfvpr.scoring.shifts import image_sizes, match_shifts
 from mfvpr.types import Array, Matches
 
@@ -31,6 +34,9 @@ def on_host(scorer: Any) -> bool:
 
 SCORERS: dict[str, type] = {
     "count": MatchCount,
+    "rapid": RapidSpatialScore,
+    "phrases": VisualPhrases,
+    "lost": LostScore,
     "sum": AggregatedScore,
     "anchor": AnchorPoints,
     "histogram": HistogramOfShifts,
@@ -54,10 +60,13 @@ __all__ = [
     "Estimate",
     "HistogramOfShifts",
     "Homography",
+    "LostScore",
     "MatchCount",
     "OpenCvHomography",
+    "RapidSpatialScore",
     "Scorer",
     "ShiftHistogram",
+    "VisualPhrases",
     "image_sizes",
     "match_shifts",
     "on_host",
