@@ -31,7 +31,7 @@ def as_final(settings: dict[str, Any]) -> dict[str, Any]:
 def axes(settings: dict[str, Any]) -> Axes:
     """The checked axes of one scorer."""
     if "method" not in settings["scorer"]:
-        raise SettingsError("scorer=all: a sweep takes one scorer at a time; choose with scorer=histogram, or several "
+        raise SettingsError("scorer: a sweep takes one scorer at a time; choose with scorer=histogram, or several "
                             "with -m scorer=sum,anchor,histogram")  # fmt: skip
     [(method, scorer)] = build.scorers(settings["scorer"]).items()
     known = {*declared(scorer), *OF_MATCHES}
@@ -65,7 +65,7 @@ def searchable(settings: dict[str, Any]) -> Axes:
 
 def learnable(settings: dict[str, Any]) -> Axes:
     """What the grid-searched rows vary, of a scorer that can be learned."""
-    method = settings["scorer"].get("method", "all")
+    method = settings["scorer"].get("method", "several")
     known = [name for name, scorer in SCORERS.items() if can_learn(scorer)]
     if method not in known:
         raise SettingsError(f"scorer={method}: expected one to learn, of {', '.join(known)}")

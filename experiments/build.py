@@ -177,7 +177,7 @@ def scorers(settings: dict[str, Any]) -> dict[str, Scorer]:
     """The chosen scorer, or all of a group, by name."""
     chosen = {settings["method"]: settings} if "method" in settings else settings
     return {
-        name: made(SCORERS[name], {field: plain for field, plain in values.items() if field != "method"})
+        name: made(SCORERS[values["method"]], {field: plain for field, plain in values.items() if field != "method"})
         for name, values in chosen.items()
     }
 

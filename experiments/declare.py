@@ -3,7 +3,7 @@
 They are files, not made when a program starts, because --help and a wrong setting must not wait for JAX.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +12,33 @@ import yaml
 from experiments.settings import CONF
 from mfvpr.data.files import write_text
 from mfvpr.declaration import declared, summary
-from mfvpr.scoring import OF_CELLS, SCORERS
+from mfvpr.scoring import ALONE, PAPER, SCORERS
 
 _FIRST = "# Made by `make conf` from mfvpr/scoring: change it there.\n"
 
 
+# Scores with other values than their fields' defaults, by name.
+_VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
+    "homography_8": ("homography", {"threshold": 8.0}),
+    "homography_24": ("homography", {"threshold": 24.0}),
+    "magsac_8": ("homography_opencv", {"threshold": 8.0, "estimator": "magsac"}),
+}
+
+
 def files() -> dict[str, str]:
     """Texts by path below conf/."""
-    made = {f"scorer/{name}.yaml": "\n".join(_scorer(name, scorer)) for name, scorer in SCORERS.items()}
-    every = "\n".join(f"  - {name}@{name}" for name in SCORERS if name not in OF_CELLS)
-    made["scorer/all.yaml"] = f"# Every score of any features, each with the paper's parameters.\ndefaults:\n{every}"
+    scorers = {name: (name, {}) for name in SCORERS} | _VARIANTS
+    made = {f"scorer/{name}.yaml": "\n".join(_scorer(*one)) for name, one in scorers.items()}
+    every = [name for name in SCORERS if name not in ALONE]
+    beside = [name for name in every if name != "homography"]
+    made |= {
+        f"scorer/{name}.yaml": f"# {what}\ndefaults:\n" + "\n".join(f"  - {one}@{one}" for one in members)
+        for name, what, members in (
+            ("paper", "The paper's scores, each with its parameters, and the number of matches.", PAPER),
+            ("all", "Every score of any features but OpenCV's, each with the parameters of its paper.", every),
+            ("compared", "Every score, and homographies as the paper has them beside MAGSAC.", [*beside, *_VARIANTS]),
+        )
+    }
     made["axes.yaml"] = "\n".join(_axes())
     limits = {
         name: {field: parameter.limits for field, parameter in declared(scorer).items()}
@@ -40,13 +57,12 @@ def write(conf: Path) -> None:
         path.unlink()
 
 
-def _scorer(name: str, scorer: type) -> Iterator[str]:
-    yield f"# {summary(scorer)}"
-    yield f"method: {name}"
-    for field, parameter in declared(scorer).items():
-        yield _line(
-            field, parameter.default, "; ".join(filter(None, (parameter.unit, parameter.note, parameter.words)))
-        )
+def _scorer(method: str, values: Mapping[str, Any]) -> Iterator[str]:
+    yield f"# {summary(SCORERS[method])}"
+    yield f"method: {method}"
+    for field, parameter in declared(SCORERS[method]).items():
+        comment = "; ".join(filter(None, (parameter.unit, parameter.note, parameter.words)))
+        yield _line(field, values.get(field, parameter.default), comment)
 
 
 def _axes() -> Iterator[str]:

@@ -192,9 +192,11 @@ RULES: dict[str, Rule] = {
 
 def check(settings: Mapping[str, Any]) -> None:
     """Raise a SettingsError for the first value that its rule does not allow."""
-    method = str(settings.get("scorer", {}).get("method") or "")  # "" of all
+    scorer = settings.get("scorer", {})
+    method = str(scorer.get("method") or "")  # "" of several
+    methods = {name: str(one.get("method")) for name, one in scorer.items() if isinstance(one, Mapping)}
     for path, value in _leaves(settings, ""):
-        rule = _rule(path, method)
+        rule = _rule(path, methods | {"scorer": method})
         if rule is None and method and path.startswith("scorer."):
             raise SettingsError(f"scorer={method} has no setting {path.removeprefix('scorer.')}; see --help")
         if rule is None:
@@ -206,11 +208,11 @@ def check(settings: Mapping[str, Any]) -> None:
         _check_cells(settings)
 
 
-def _rule(path: str, method: str) -> Rule | None:
-    """Of a setting; None for a group of settings."""
+def _rule(path: str, methods: Mapping[str, str]) -> Rule | None:
+    """Of a setting, given the method of each system's scorer; None for a group of settings."""
     *_, group, name = f".{path}".split(".")
-    scorers = scorer_rules(CONF / "rules.yaml")
-    own = scorers.get(method if group == "scorer" else group, {})
+    scorers, method = scorer_rules(CONF / "rules.yaml"), methods["scorer"]
+    own = scorers.get(group if group in scorers else methods.get(group, ""), {})
     if path.startswith("scorer."):
         return own.get(name) or (_one_of(*scorers) if path == "scorer.method" else None)
     if group == "grid":

@@ -15,6 +15,8 @@ from jax.core import Tracer
 from jax.tree_util import Partial
 from jax.typing import ArrayLike
 
+from mfvpr.errors import NoGradientError
+
 if TYPE_CHECKING:  # which of jax's names is a class for whoever checks types
     from jaxlib._jax import Device
 else:
@@ -78,6 +80,24 @@ def safe_sqrt(squared: Array) -> Array:
     """Square root of max(x, 0) whose gradient at 0 is 0 instead of infinite."""
     positive = squared > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
+
+
+def without_gradient(why: str, values: Tree) -> Tree:
+    """The values, of which nobody can ask for a derivative.
+
+    Raises:
+        NoGradientError: somebody does; `why` is what he is told.
+    """
+
+    @jax.custom_jvp
+    def same(values: Tree) -> Tree:
+        return values
+
+    @same.defjvp
+    def refuse(*_: Any) -> Any:
+        raise NoGradientError(why)
+
+    return same(values)
 
 
 def round_up(size: int, multiple: int) -> int:

@@ -17,7 +17,7 @@ import numpy as np
 from mfvpr.matching import filter_matches
 from mfvpr.numerics import available_cpus, compiled, held, holds_function, is_concrete, knows_own_context, platform
 from mfvpr.reranking import BIN_STEP, check_candidates, matched_sizes
-from mfvpr.scoring import HistogramOfShifts
+from mfvpr.scoring import HistogramOfShifts, on_host
 from mfvpr.scoring.parameters import fit, numbers, whole_numbers, with_parameters
 from mfvpr.types import Array, Matches
 from mfvpr.weighting import ChosenWeight, Weight, match_weights
@@ -101,7 +101,6 @@ def by_capacity(
     return [(fitted, np.array(rows)) for fitted, rows in groups.values()]
 
 
-@compiled
 def score_settings(
     scorer: Any, matches: Matches, settings: Mapping[str, Array], weightings: Mapping[str, Array]
 ) -> Array:
@@ -117,6 +116,28 @@ def score_settings(
         weightings: `[W]` values of what only says how much a match counts, which is cheap to vary: `max_distance`
             (matches further apart do not count) and `weight` (an option of the scorer's `ChosenWeight`); none: W = 1.
     """
+    return (_on_host if on_host(scorer) else _in_jax)(scorer, matches, settings, weightings)
+
+
+def _on_host(
+    scorer: Any, matches: Matches, settings: Mapping[str, Array], weightings: Mapping[str, Array]
+) -> np.ndarray:
+    def rows(values: Mapping[str, Array]) -> list[dict[str, Any]]:
+        return [dict(zip(values, row, strict=True)) for row in zip(*map(np.asarray, values.values()), strict=True)] or [
+            {}
+        ]
+
+    return np.stack([
+        np.stack([
+            chosen.score_pairs(near)
+            for chosen, near in (_weighted(with_parameters(scorer, setting), matches, one) for one in rows(weightings))
+        ])
+        for setting in rows(settings)
+    ])  # fmt: skip
+
+
+@compiled
+def _in_jax(scorer: Any, matches: Matches, settings: Mapping[str, Array], weightings: Mapping[str, Array]) -> Array:
     own = isinstance(scorer, HistogramOfShifts) and type(scorer).__call__ is HistogramOfShifts.__call__
     if own:  # its Gaussians are the same for all weightings; a class on top of it may score otherwise
         weights = jax.vmap(partial(_weights_of, scorer, weightings))(matches)

@@ -4,6 +4,7 @@ What is checked is what the library relies on when it pads, batches, sweeps and 
 """
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mfvpr.errors import NoGradientError
 from mfvpr.numerics import holds_function
 from mfvpr.reranking import score_candidates
 from mfvpr.scoring import Scorer
@@ -29,7 +31,7 @@ def check_scorer(
 
     In this order: it is a value or a plain function; scores are scalars, float32 and finite, and exactly 0 without
     matches; padding and the order of the matches change nothing; a batch scores as its pairs do; jit scores as without,
-    with one trace for all numbers; gradients are finite.
+    with one trace for all numbers; gradients are finite, or refused with a `NoGradientError`.
 
     Args:
         scorer: any; a sampling one must be reproducible, and may hold a key.
@@ -66,8 +68,9 @@ def _check(scorer: Scorer, image_size: tuple[int, int], num_keypoints: int | Non
     _check_batch(scorer, pairs, scores, close)
     _check_one_trace(scorer, pairs[-1], close)
     gradients = jax.jit(_gradients(scorer))
-    for pair in pairs:
-        _check_gradients(type(scorer).__name__, gradients, pair)
+    with suppress(NoGradientError):  # which says so in one line
+        for pair in pairs:
+            _check_gradients(type(scorer).__name__, gradients, pair)
 
 
 def _check_is_value(scorer: Any) -> None:

@@ -4,7 +4,17 @@ import jax
 import jax.numpy as jnp
 
 import mfvpr
-from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, MatchCount, UnitWeight
+from mfvpr import (
+    AggregatedScore,
+    AnchorPoints,
+    HistogramOfShifts,
+    Homography,
+    LostScore,
+    MatchCount,
+    RapidSpatialScore,
+    UnitWeight,
+    VisualPhrases,
+)
 
 
 def plain(matches):
@@ -65,6 +75,15 @@ OWN = [
     AggregatedScore(),
     AggregatedScore(mean="median"),
     MatchCount(),
+    Homography(max_iterations=100.0),
+    RapidSpatialScore(),
+    RapidSpatialScore(reach="largest_coordinate", per_feature=True),
+    RapidSpatialScore(reach="largest_shift"),
+    VisualPhrases(),
+    VisualPhrases(length=3, cell_size=40.0, align="zero_edge"),
+    LostScore(),
+    LostScore(form="unweighted", mirrored=True),
+    LostScore(form="described"),
     HistogramOfShifts(temperature=0.05),
     AnchorPoints(num_bins=8, temperature=0.2),
     AggregatedScore(mean="weighted", clamp=True, temperature=30.0),

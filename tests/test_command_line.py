@@ -112,7 +112,7 @@ def test_version(monkeypatch, capsys, program):
         ("evaluate", ["features.image_size=[336]"], "features.image_size=[336]: expected a list of 2"),
         ("evaluate", ["dataset=folder"], "dataset.database: this setting has no default; give dataset.database=VALUE"),
         ("evaluate", ["dataset=grief_season"], "dataset.root: this setting has no default"),
-        ("evaluate", ["scorer=histgram"], "count, grid, histogram, sum; the nearest is histogram"),
+        ("evaluate", ["scorer=histgram"], "sum; the nearest is histogram"),
         ("evaluate", [*OWN], "dataset.ground_truth: nothing is assumed of your"),
         ("evaluate", [*OWN, "dataset.bits=7"], "whole number from 8 to 16, or"),
         ("evaluate", [*OWN, "dataset.ground_truth=none"], "a: expected a folder of images"),

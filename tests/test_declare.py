@@ -14,7 +14,7 @@ from experiments.settings import CONF
 from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, value
 from mfvpr.declaration import check_choices, choice, declared, flag, made, named, number, numbers, whole
 from mfvpr.learning.parameters import can_learn, starts
-from mfvpr.scoring import OF_CELLS, SCORERS, match_shifts
+from mfvpr.scoring import ALONE, SCORERS, match_shifts
 from mfvpr.types import Array, Matches
 from mfvpr.weighting import WEIGHTS, UnitWeight, Weight, match_weights
 from tests.programs import ROOT, results, shared, small, typed
@@ -70,7 +70,9 @@ def near(tmp_path, monkeypatch):
 
 def test_the_files_of_conf_are_those_that_follow_from_the_scores():
     made = declare.files()
-    assert {path.name for path in (CONF / "scorer").iterdir()} == {f"{name}.yaml" for name in (*SCORERS, "all")}
+    assert {path.name for path in (CONF / "scorer").iterdir()} == {
+        f"{name}.yaml" for name in (*SCORERS, "paper", "all", "compared", "homography_8", "homography_24", "magsac_8")
+    }
     for path, text in made.items():
         assert (CONF / path).read_text(encoding="utf-8") == text, f"conf/{path} is not up to date: make conf"
 
@@ -97,20 +99,21 @@ def test_conf_and_help_follow_from_the_class(near, monkeypatch, capsys):
     for line in (summary, *lines):
         assert f"\n  {line}\n" in stdout
     assert "Made by" not in stdout
-    assert "\n  scorer=near             all, anchor, count, grid, histogram, sum\n" in stdout
+    others = ", ".join(sorted({path.stem for path in (near / "scorer").iterdir()} - {"near"}))
+    assert f"\n  scorer=near             {others}\n" in stdout
     assert "\n  radius: null  # near: px\n" in stdout
     assert "\n  norm: null  # near: sum, largest\n" in stdout
     assert f"\n  weight: null  # sum, anchor, histogram, near: {', '.join(WEIGHTS)}\n" in stdout
     assert "\n  size: null\n" not in stdout[stdout.index("\ngrid:") :]
-    assert "\n  near:\n    # A scorer" in typed(monkeypatch, capsys, "evaluate", "--help")[1]
+    assert "\n  near:\n    # A scorer" in typed(monkeypatch, capsys, "evaluate", "--help", "scorer=all")[1]
 
 
 @pytest.mark.parametrize(
     ("program", "arguments", "words"),
     [
-        ("evaluate", ["scorer=neat"], "one of all, anchor, count, grid, histogram, near, sum; the nearest is near"),
-        ("evaluate", ["scorer.near.radius=0"], "scorer.near.radius=0: expected a number above 0 (1e-6 to 1e12)"),
-        ("evaluate", ["scorer.near.most=501"], "scorer.near.most=501: expected a number from 1 to 500, or null"),
+        ("evaluate", ["scorer=neat"], "the nearest is near"),
+        ("evaluate", ["scorer=all", "scorer.near.radius=0"], "near.radius=0: expected a number above 0 (1e-6 to 1e12)"),
+        ("evaluate", ["scorer=all", "scorer.near.most=501"], "near.most=501: expected a number from 1 to 500, or null"),
         ("evaluate", ["scorer=near", "scorer.rounds=10"], "scorer.rounds=10: expected a whole number from 1 to 9"),
         ("evaluate", ["scorer=near", "scorer.norm=both"], "scorer.norm=both: expected one of sum, largest"),
         ("evaluate", ["scorer=near", "scorer.weight=heavy"], f"expected one of {', '.join(WEIGHTS)}"),
@@ -118,8 +121,8 @@ def test_conf_and_help_follow_from_the_class(near, monkeypatch, capsys):
         ("evaluate", ["scorer=near", "scorer.strict=1"], "scorer.strict=1: expected one of true, false"),
         ("evaluate", ["scorer=near", "scorer.radios=1"], "unknown setting; the nearest is scorer.radius"),
         ("evaluate", ["scorer=near", "scorer.method=sum"], "scorer=sum has no setting radius; see --help"),
-        ("evaluate", ["scorer=near", "scorer.method=[1]"], "scorer.method=[1]: expected one of count, sum, anchor"),
-        ("evaluate", ["scorer.near.method=sum"], "scorer.near.method=sum: expected near; choose with scorer=near"),
+        ("evaluate", ["scorer=near", "scorer.method=[1]"], "scorer.method=[1]: expected one of count, rapid, phrases"),
+        ("evaluate", ["scorer=all", "scorer.near.method=sum"], "near.method=sum: expected near; choose with scorer="),
         ("sweep", ["scorer=near", "grid.radius=[-1]"], "radius=[-1]: expected a list of one or more, each a number"),
         ("sweep", ["scorer=near", "grid.most=[null,501]"], "each a number from 1 to 500, or null"),
         ("sweep", ["scorer=near", "grid.sigma=[1]"], "no such parameter; it has radius, most, rounds"),
@@ -136,8 +139,10 @@ def test_rules_follow_from_the_class(near, monkeypatch, capsys, program, argumen
 
 def test_all_scores_contain_it(near):
     with hydra.initialize_config_dir(str(near), version_base="1.3"):
-        found = build.scorers(hydra.compose("config", ["scorer.near.size=[1,2]", "scorer.near.norm=largest"])["scorer"])
-    assert [*found] == [name for name in SCORERS if name not in OF_CELLS]
+        found = build.scorers(
+            hydra.compose("config", ["scorer=all", "scorer.near.size=[1,2]", "scorer.near.norm=largest"])["scorer"]
+        )
+    assert [*found] == [name for name in SCORERS if name not in ALONE]
     assert found["near"] == Nearness(size=(1.0, 2.0), norm="largest")
     assert found["near"].weight is WEIGHTS["unit"]
 

@@ -13,6 +13,7 @@ from PIL import Image
 
 from experiments import settings
 from experiments.settings import CONF, SettingsError
+from mfvpr.scoring import ALONE, PAPER, SCORERS, Homography, OpenCvHomography
 from tests.programs import QUICK, ROOT, composed, folder, run, typed
 
 CHOICES = [
@@ -56,17 +57,15 @@ def test_cells_must_be_as_many_as_their_score_expects(arguments, words):
     settings.check(composed("system=ssm_vpr", "features.image_size=[224,224]", "scorer.side=26"))
 
 
-def test_scorers_of_conf_are_the_papers():
+def test_scorers_of_conf_are_as_their_fields_say():
     from experiments import build
-    from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, MatchCount
 
-    expected = {
-        "count": MatchCount(),
-        "sum": AggregatedScore(),
-        "anchor": AnchorPoints(),
-        "histogram": HistogramOfShifts(),
-    }
-    assert build.scorers(composed()["scorer"]) == expected
+    assert build.scorers(composed()["scorer"]) == {name: SCORERS[name]() for name in PAPER}
+    every = build.scorers(composed("scorer=all")["scorer"])
+    assert every == {name: scorer() for name, scorer in SCORERS.items() if name not in ALONE}
+    compared = build.scorers(composed("scorer=compared")["scorer"])
+    assert compared["homography_8"] == Homography(8.0)
+    assert compared["magsac_8"] == OpenCvHomography(8.0, estimator="magsac")
 
 
 @pytest.mark.parametrize("value", [0, -1, float("nan"), float("inf"), "abc", None, True, [1]])
@@ -195,8 +194,8 @@ def test_demo_ranks_histogram_above_count_above_filter(demo):
 @pytest.mark.slow
 def test_demo_prints_its_table_and_leaves_a_run_folder(demo):
     done, folder = demo
-    systems = ["filter", "count", "sum", "anchor", "histogram", "histogram + filter"]
-    header, _, *lines = done.stdout[done.stdout.index("system") :].splitlines()[:8]
+    systems = ["filter", *PAPER, "histogram + filter"]
+    header, _, *lines = done.stdout[done.stdout.index("system") :].splitlines()[: 2 + len(systems)]
     assert [line[:20].strip() for line in lines] == systems
     assert header.split("  ")[0] == "system"
     assert folder.name in done.stdout

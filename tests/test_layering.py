@@ -10,7 +10,7 @@ ROOT = Path(__file__).parent.parent
 ALLOWED = {
     "errors": set(),
     "declaration": {"errors"},
-    "numerics": set(),
+    "numerics": {"errors"},
     "types": set(),
     "weighting": {"numerics", "types"},
     "neighbors": {"types"},
@@ -84,7 +84,7 @@ ALLOWED = {
         "sources",
         "types",
     },
-    "testing": {"numerics", "reranking", "scoring", "types"},
+    "testing": {"errors", "numerics", "reranking", "scoring", "types"},
     "report": {
         "archive",
         "results",
@@ -102,7 +102,7 @@ ALLOWED = {
     },
 }
 HOMES = {
-    "cv2": {"data", "features"},
+    "cv2": {"data", "features", "scoring"},
     "PIL": {"data"},
     "matplotlib": {"report"},
     "hydra": set(),

@@ -14,6 +14,7 @@ from experiments.launch import version
 # Each is the module of this name, whose `run(rounds, out)` prints a table and writes it as JSON.
 BENCHMARKS = {
     "scores": "matching and scoring of one query with 50 candidates (15 rounds)",
+    "homographies": "RANSAC of 50 pairs beside OpenCV's (7 rounds)",
     "sweeps": "grids of a score's parameters on cached matches (7 rounds)",
     "networks": "D2-Net, MixVPR and ALIKED (5 rounds)",
     "scale": "databases of 1,000 to 10,000 images on disk: time per query and peak memory (3 rounds)",
@@ -25,7 +26,7 @@ def main() -> None:
     parser = Parser(
         prog="python -m experiments.benchmark",
         description=__doc__,
-        epilog="\n".join(["benchmarks:", *(f"  {name:<9} {about}" for name, about in BENCHMARKS.items())]),
+        epilog="\n".join(["benchmarks:", *(f"  {name:<12} {about}" for name, about in BENCHMARKS.items())]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("what", nargs="?", choices=BENCHMARKS, default="scores", help="default: scores")

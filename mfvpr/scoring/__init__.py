@@ -1,12 +1,18 @@
 """Scores of one pair of images from its matches alone: values that map Matches to a scalar, one method per file."""
 
 from collections.abc import Callable
+from typing import Any
 
 from mfvpr.scoring.aggregate import AggregatedScore
 from mfvpr.scoring.anchor import AnchorPoints
 from mfvpr.scoring.counting import MatchCount
 from mfvpr.scoring.grid import GridAnchors
 from mfvpr.scoring.histogram import HistogramOfShifts, ShiftHistogram
+from mfvpr.scoring.homography import Estimate, Homography
+from mfvpr.scoring.homography_opencv import OpenCvHomography
+from mfvpr.scoring.lost import LostScore
+from mfvpr.scoring.phrases import VisualPhrases
+from mfvpr.scoring.rapid import RapidSpatialScore
 from mfvpr.scoring.shifts import image_sizes, match_shifts
 from mfvpr.types import Array, Matches
 
@@ -16,30 +22,55 @@ for a pair without matches, and the same whatever the order of the matches, how 
 
 Any callable will do. A class decorated with `mfvpr.value` gets more than a plain function: its numbers may be swept,
 traced and learned, and its programs are kept. `mfvpr.testing.check_scorer` checks all of this.
+
+What JAX cannot compute, such as another library's score, has a method `score_pairs(matches) -> [P]` as well, NumPy,
+of pairs `[P, K, ...]`, by which it is scored outside of `jit`.
 """
+
+
+def on_host(scorer: Any) -> bool:
+    """Whether pairs are scored by `score_pairs`, outside of `jit`."""
+    return callable(getattr(type(scorer), "score_pairs", None))
+
 
 SCORERS: dict[str, type] = {
     "count": MatchCount,
+    "rapid": RapidSpatialScore,
+    "phrases": VisualPhrases,
+    "lost": LostScore,
     "sum": AggregatedScore,
     "anchor": AnchorPoints,
     "histogram": HistogramOfShifts,
     "grid": GridAnchors,
+    "homography": Homography,
+    "homography_opencv": OpenCvHomography,
 }
 """The scores that programs know, by name. Their settings follow from their fields (`mfvpr.declaration`)."""
 
-OF_CELLS = frozenset({"grid"})
-"""Those that score features which are all cells of a grid, and no others: they are not among "all scores"."""
+PAPER = ("count", "sum", "anchor", "histogram")
+"""Those that are compared where nobody chooses."""
+
+ALONE = ("homography_opencv", "grid")
+"""Those that are not among all: OpenCV takes a second for a query, and not all features are cells of a grid."""
 
 __all__ = [
-    "OF_CELLS",
+    "ALONE",
+    "PAPER",
     "SCORERS",
     "AggregatedScore",
     "AnchorPoints",
+    "Estimate",
     "GridAnchors",
     "HistogramOfShifts",
+    "Homography",
+    "LostScore",
     "MatchCount",
+    "OpenCvHomography",
+    "RapidSpatialScore",
     "Scorer",
     "ShiftHistogram",
+    "VisualPhrases",
     "image_sizes",
     "match_shifts",
+    "on_host",
 ]

@@ -15,7 +15,7 @@ from mfvpr.numerics import Device, available_cpus, compiled, held, knows_own_con
 from mfvpr.parameter_grids import score_settings
 from mfvpr.progress import Track, untracked
 from mfvpr.reranking import BIN_STEP, fuse_scales
-from mfvpr.scoring import Scorer
+from mfvpr.scoring import Scorer, on_host
 from mfvpr.scoring.parameters import fit
 from mfvpr.threads import ordered_map
 from mfvpr.types import Array, Matches, Shortlist
@@ -110,8 +110,14 @@ def fuse_all(match_set: MatchSet | Scales, scores: np.ndarray, mask: np.ndarray)
     return np.asarray(fuse_scales(np.moveaxis(scores, 0, -1), mask, weights, normalize=match_set.normalize))
 
 
-@compiled
 def _score_all(matches: Matches, scorers: dict[str, Scorer]) -> dict[str, Array]:
+    elsewhere = {name: scorer for name, scorer in scorers.items() if on_host(scorer)}
+    scores = _in_jax(matches, {name: scorer for name, scorer in scorers.items() if name not in elsewhere})
+    return scores | {name: scorer.score_pairs(matches) for name, scorer in elsewhere.items()}
+
+
+@compiled
+def _in_jax(matches: Matches, scorers: dict[str, Scorer]) -> dict[str, Array]:
     scores = {name: score_settings(scorer, matches, {}, {})[0, 0] for name, scorer in scorers.items()}
     for name, values in scores.items():
         if values.shape != matches.mask.shape[:1]:

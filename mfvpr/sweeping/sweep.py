@@ -19,14 +19,15 @@ import numpy as np
 from mfvpr import parameter_grids, reranking
 from mfvpr.data.arrays import read_arrays, write_arrays
 from mfvpr.errors import InputError
-from mfvpr.fingerprints import content_hash
+from mfvpr.fingerprints import content_hash, recipe_of
 from mfvpr.match_sets import MatchSet, Scales, queries_that_fit, scales, shapes
 from mfvpr.numerics import Device, compiled
 from mfvpr.progress import Track, untracked
 from mfvpr.reranking import FilterScore, Ties, filter_scores, indexed
+from mfvpr.scoring import on_host
 from mfvpr.sweeping.scores import PaddedBatch, all_batches, fuse_all, scored
 from mfvpr.sweeping.settings import FUSION, Group, Setting, distinct, groups
-from mfvpr.types import Array, Matches, Shortlist, per_match
+from mfvpr.types import Array, Matches, Shortlist, per_match, per_pair
 
 SETTINGS_PER_BLOCK = 64
 _ALONE = "alone"  # the c of a score that is not fused
@@ -237,12 +238,15 @@ def _fingerprint(part: Work, block: Group, cs: Sequence[Any]) -> str:
 
 def _program(work: Work, group: Group) -> str:
     """What the scorer computes of batches of these shapes: a user's code may change while its class keeps its name."""
+    if on_host(group.scorer):
+        return str(recipe_of(group.scorer))
 
     def text(matches: Matches, size: int, pairs: int) -> str:
-        entries = per_match(matches).items()
+        entries, of_pair = per_match(matches).items(), per_pair(matches).items()
         example = {name: np.zeros((pairs, size, *values.shape[1:]), values.dtype) for name, values in entries}
-        image_size = np.ones((pairs, 2), np.float32)
-        batch = Matches(**example, mask=np.ones((pairs, size), bool), image_size0=image_size, image_size1=image_size)
+        shape = {name: np.shape(values)[name.endswith("1") :] for name, values in of_pair}  # of one candidate
+        ones = {name: np.ones((pairs, *shape[name]), values.dtype) for name, values in of_pair}
+        batch = Matches(**example, **ones, mask=np.ones((pairs, size), bool))
         settings = {name: axis[:1] for name, axis in group.settings.items()}
         return jax.jit(parameter_grids.score_settings).lower(group.scorer, batch, settings, group.weightings).as_text()
 

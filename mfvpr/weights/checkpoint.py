@@ -10,6 +10,7 @@ from mfvpr.weights.numpy_files import MAGIC, read_layers
 from mfvpr.weights.torch_files import read_legacy, read_zip
 
 _DAMAGE = (ArithmeticError, LookupError, TypeError, ValueError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile)
+_DAMAGE += (Warning,)  # raised where warnings are errors
 # By the first bytes; the last is that of every binary pickle.
 _READERS = {b"PK": read_zip, MAGIC: read_layers, b"\x80": read_legacy}
 

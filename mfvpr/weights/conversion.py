@@ -69,7 +69,7 @@ def convert(
         problems.setdefault(kind, []).append(example)
 
     for key, value in source.items():
-        if _is_ignored(key, table):
+        if is_ignored(key, table):
             for pattern, shape in table.expected.items():
                 if re.fullmatch(pattern, key) and value.shape != shape:
                     wrong("of another shape", f"{key}: expected {shape}, got {value.shape}")
@@ -106,11 +106,12 @@ def convert(
 
 def share_known(keys: Iterable[str], table: Table) -> float:
     """How many of the keys the table names, from 0 to 1."""
-    known = [_is_ignored(key, table) or bool(_targets(key, table)) for key in keys]
+    known = [is_ignored(key, table) or bool(_targets(key, table)) for key in keys]
     return sum(known) / max(len(known), 1)
 
 
-def _is_ignored(key: str, table: Table) -> bool:
+def is_ignored(key: str, table: Table) -> bool:
+    """Whether the network does not need this tensor of its checkpoint."""
     return any(re.fullmatch(pattern, key) for pattern in table.ignored)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from mfvpr.data.files import replacing, write_text
 from mfvpr.errors import InputError
 from mfvpr.weights.checkpoint import read_checkpoint
-from mfvpr.weights.conversion import convert
+from mfvpr.weights.conversion import convert, is_ignored
 from mfvpr.weights.registry import REGISTRY, Entry, entry_of
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ class Manifest:
     source_file: str
     source_sha256: str
     format: int = FORMAT
-    rounded: int = 0  # of the source's tensors, from float64 to float32
+    rounded: int = 0  # of the tensors taken from the source, from float64 to float32
 
 
 class WeightsError(InputError):
@@ -71,7 +71,8 @@ def install(checkpoint: Path, name: str, folder: Path | None = None) -> Path:
     except InputError as error:
         reason = resemblance(list(tensors), network) or error
         raise InputError(f"{checkpoint}: {reason}; use the official {entry.file}") from error
-    rounded = sum(tensor.dtype == np.float64 for tensor in tensors.values())
+    needed = (tensor for key, tensor in tensors.items() if not is_ignored(key, network.table))
+    rounded = sum(tensor.dtype == np.float64 for tensor in needed)
     return save(name, arrays, checkpoint, parameters=plan.parameters, rounded=rounded, folder=folder)
 
 

@@ -1,4 +1,6 @@
-"""SSM-VPR's two maps."""
+"""SSM-VPR's two maps against the public code's numbers (tests/golden), and what the network promises."""
+
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -7,33 +9,73 @@ import pytest
 from flax import nnx
 
 from mfvpr.models import imagenet
-from mfvpr.models.ssm import SsmVgg
+from mfvpr.models.ssm import STAGE1_STRIDE, STAGE2_STRIDE, SsmVgg
+from mfvpr.weights.conversion import convert
+from mfvpr.weights.networks import blueprint
+from mfvpr.weights.registry import entry_of
+from mfvpr.weights.tables import SSM
+from tests.golden.make_d2net import samples
+from tests.golden.make_ssm_maps import CASES, GOLDEN, checkpoint
+
+RELATIVE = 1e-5  # of the map's largest value
 
 
 @pytest.fixture(scope="module")
-def model():
-    return SsmVgg(rngs=nnx.Rngs(0))
+def golden():
+    return dict(np.load(GOLDEN))
 
 
-@pytest.mark.parametrize(
-    "pixels, first, second",
-    [((224, 224), (14, 14), (28, 28)), ((336, 336), (21, 21), (42, 42)), ((448, 448), (28, 28), (56, 56)),
-     ((416, 416), (26, 26), (52, 52)), ((101, 33), (7, 3), (13, 5))],
-)  # fmt: skip
-def test_sizes_of_the_maps(model, pixels, first, second):
-    graph, state = nnx.split(model)
-    images = jax.ShapeDtypeStruct((2, *pixels, 3), jnp.float32)
-    both = jax.eval_shape(lambda state, images: nnx.merge(graph, state)(images), state, images)
-    assert [maps.shape for maps in both] == [(2, *first, 512), (2, *second, 512)]
+@cache
+def published(seed):
+    """The network with random weights, through the published keys."""
+    network = blueprint(entry_of("vgg16_places365"))
+    return network.filled(convert(checkpoint(seed), SSM, network.shapes))
 
 
-def test_one_pass_gives_what_each_stage_gives(model):
-    image = np.random.default_rng(0).normal(size=(1, 37, 24, 3)).astype(np.float32)
-    first, second = model(image)
-    assert (first < 0).any()
-    assert (second < 0).any()
-    np.testing.assert_array_equal(first, model.stage1(image))
-    np.testing.assert_array_equal(second, model.stage2(image))
+@jax.jit
+def stage1(model, images):
+    return model.stage1(model.preprocess(images))
+
+
+@jax.jit
+def stage2(model, images):
+    return model.stage2(model.preprocess(images))
+
+
+@jax.jit
+def both(model, images):
+    return model(model.preprocess(images))
+
+
+def assert_same_map(dense, name, golden):
+    assert dense.shape == tuple(golden[f"{name}/shape"])
+    tolerance = RELATIVE * golden[f"{name}/largest"]
+    np.testing.assert_allclose(samples(np.asarray(dense)), golden[name], rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("case", [case for case in CASES if case.width == 224], ids=str)
+def test_one_pass_gives_both_maps_of_the_public_code(case, golden):
+    (first,), (second,) = both(published(case.seed), case.image[None])
+    assert_same_map(first, f"{case}/stage1", golden)
+    assert_same_map(second, f"{case}/stage2", golden)
+
+
+@pytest.mark.parametrize("case", [case for case in CASES if case.width != 224], ids=str)
+def test_each_map_alone_is_the_public_codes(case, golden):
+    """The last of images that do not see each other."""
+    images = np.stack([case.image[::-1], case.image]) if 1 in case.stages else case.image[None]
+    for stage in case.stages:
+        *_, dense = {1: stage1, 2: stage2}[stage](published(case.seed), images)
+        assert_same_map(dense, f"{case}/stage{stage}", golden)
+
+
+@pytest.mark.parametrize("width, height", [(224, 224), (336, 336), (448, 448), (416, 416), (33, 101), (1, 1)])
+def test_sizes_of_the_maps(width, height):
+    graph, state = nnx.split(published(0))
+    images = jax.ShapeDtypeStruct((2, height, width, 3), jnp.float32)
+    maps = jax.eval_shape(lambda state, images: nnx.merge(graph, state)(images), state, images)
+    for dense, stride in zip(maps, (STAGE1_STRIDE, STAGE2_STRIDE), strict=True):
+        assert dense.shape == (2, -(-height // stride), -(-width // stride), 512)
 
 
 def test_pixels_are_torchs_unless_caffes_are_asked_for():

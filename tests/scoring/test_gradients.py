@@ -7,7 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mfvpr import AggregatedScore, AnchorPoints, DescriptorDistanceWeight, HistogramOfShifts, MatchCount, soft_match
+from mfvpr import (
+    AggregatedScore,
+    AnchorPoints,
+    DescriptorDistanceWeight,
+    HistogramOfShifts,
+    LostScore,
+    MatchCount,
+    RapidSpatialScore,
+    VisualPhrases,
+    soft_match,
+)
 from tests.builders import SIZE, double, make_features, make_matches, random_matches
 
 HARD = [
@@ -31,6 +41,16 @@ SOFT = [
     replace(HARD[5], temperature=20.0),
     replace(HARD[6], temperature=5.0),
     replace(HARD[7], temperature=20.0),
+]
+RELATIVES = [
+    RapidSpatialScore(),
+    RapidSpatialScore(reach="largest_coordinate"),
+    RapidSpatialScore(reach="largest_shift"),
+    VisualPhrases(length=1),
+    VisualPhrases(length=3, cell_size=90.0),
+    LostScore(),
+    LostScore(form="unweighted", mirrored=True),
+    LostScore(form="described"),
 ]
 NUMBERS = ("bin_size", "sigma", "tolerance", "temperature")  # not the window, which moves whole cells
 PER_MATCH = ("points0", "points1", "distance", "scores0", "scores1", "confidence")
@@ -62,7 +82,7 @@ def check_gradients(value_and_grad, tree, rng, step=1e-6):
         np.testing.assert_allclose(jnp.sum(gradient * direction), numeric, rtol=1e-5, atol=1e-8 * abs(float(value)))
 
 
-@named(HARD + SOFT)
+@named(HARD + SOFT + RELATIVES)
 def test_gradients_are_central_differences(scorer):
     rng = np.random.default_rng(0)
     matches = random_matches(rng, 20, capacity=24)
@@ -103,7 +123,7 @@ gradients = jax.jit(
 )
 
 
-@named(HARD[3:8] + SOFT[5:6] + SOFT[8:] + COLD)  # cold or warm, it is the same program
+@named(HARD[3:8] + SOFT[5:6] + SOFT[8:] + COLD + RELATIVES)  # cold or warm, it is the same program
 def test_degenerate_pairs_have_finite_gradients(scorer):
     """Empty, single, all alike, at a corner, without any weight or confidence; in single precision, beside NaN."""
     corner = {"distance": [0.0] * 4, "scores0": [0.0] * 4, "scores1": [0.0] * 4, "confidence": [0.0] * 4}

@@ -72,6 +72,9 @@ CASES = [
     (mfvpr.AnchorPoints(), {"num_bins": [6, 8], "window": [4, 6], "tolerance": [1, 2.5], "weight": [DMF, FS]}),
     (mfvpr.AggregatedScore(), {"weight": [FS, DMF], "max_distance": [1.0, 2.0], "mean": ["unweighted", "median"]}),
     (mfvpr.MatchCount(), {"max_distance": [0.5, 1.0, 1.5]}),
+    (mfvpr.RapidSpatialScore(), {"reach": ["image_size", "largest_shift"], "per_feature": [True], "c": [None, 1.0]}),
+    (mfvpr.VisualPhrases(), {"length": [1, 3], "cell_size": [9.0, 30.0], "align": ["zero_center", "zero_edge"]}),
+    (mfvpr.LostScore(), {"form": ["weighted", "described"], "mirrored": [False, True], "max_distance": [0.8, 2.0]}),
     (Wrapped(), {"inner.sigma": [9.0, 22.5], "inner.bin_size": [14.0, 16.0], "inner.align": ["min_edge", "zero_edge"]}),
     *((scorer, {"max_distance": [0.8, 3.0], "c": [None, 0.0]}) for scorer in FOREIGN),
 ]
@@ -283,6 +286,20 @@ def test_nor_are_those_of_other_views_options_or_scorers_of_one_name(data, tmp_p
         expected = sweeping.sweep(mfvpr.MatchCount(), fused, *data, filter_score=kind)
         kept = sweeping.sweep(mfvpr.MatchCount(), fused, *data, filter_score=kind, folder=tmp_path)
         np.testing.assert_array_equal(kept, expected)
+
+
+def test_scores_by_the_number_of_keypoints_are_kept(data, tmp_path):
+    """The numbers of one data set are not those of another."""
+    match_set, candidates = data
+    scorer, settings = mfvpr.RapidSpatialScore(per_feature=True), [{"c": 1e5}]
+    fewer = [replace(matches, count0=np.int32(1)) for matches in match_set.matches]
+    expected = []
+    for matches in (match_set.matches, fewer):
+        expected.append(sweeping.sweep(scorer, settings, replace(match_set, matches=matches), candidates))
+        for _ in range(2):
+            kept = sweeping.sweep(scorer, settings, replace(match_set, matches=matches), candidates, folder=tmp_path)
+            np.testing.assert_array_equal(kept, expected[-1])
+    assert (expected[0] != expected[1]).any()
 
 
 def test_whole_numbers_and_keys_are_swept_and_kept(data, tmp_path):

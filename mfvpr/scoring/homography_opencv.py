@@ -1,0 +1,73 @@
+"""OpenCV's findHomography as a score, the paper's SSM-RAN: pair by pair on the processor's threads, as a reference."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import numpy as np
+
+from mfvpr.declaration import check_choices, choice, number
+from mfvpr.errors import InputError
+from mfvpr.numerics import available_cpus, is_concrete
+from mfvpr.types import Array, Matches, value
+
+
+@value
+class OpenCvHomography:
+    """s = number of inliers that cv2.findHomography says, from the candidate's points to the query's.
+
+    A score of the host: everything of the library takes it that takes scores, but `jit`, `vmap` and gradients do not.
+    (JAX's callbacks may wait for each other forever.) Matches are taken in the order of the query's keypoints where
+    they say their numbers, else of their coordinates, since OpenCV's samples depend on it. A match of confidence 0 is
+    none, others count fully. OpenCV 4 counts the inliers before its last least squares, version 5 after it.
+
+    Attributes:
+        threshold: of an inlier, px of the query's image; the paper's are 8 and 24.
+        max_iterations: of RANSAC; a whole number.
+        confidence: when it stops.
+        estimator: `ransac`, the paper's, or `magsac` (USAC_MAGSAC; Barath et al., CVPR 2020).
+        few: score of less than 4 matches, `count` (re-ranking-for-VPR) or `zero` (Patch-NetVLAD).
+    """
+
+    threshold: float | Array = number(24.0, "px")
+    max_iterations: float | Array = number(2000.0, "samples", "at most", bounds=(1.0, 1e6))
+    confidence: float | Array = number(0.995, "", "that a sample was all inliers", bounds=(1e-6, 0.999999))
+    estimator: str = choice("ransac", "magsac")
+    few: str = choice("count", "zero", note="less than 4 matches")
+
+    def __post_init__(self) -> None:
+        check_choices(self)
+
+    def __call__(self, matches: Matches) -> np.ndarray:
+        """Score of one pair, `[]` float32."""
+        if not is_concrete((self, matches)):
+            raise InputError("homography_opencv: expected matches that neither jit nor vmap nor grad traces, since "
+                             "OpenCV runs outside of JAX; call score_candidates, or take Homography")  # fmt: skip
+        points = np.concatenate([matches.points1, matches.points0], axis=-1, dtype=np.float32, casting="unsafe")
+        real = np.asarray(matches.mask)
+        if matches.confidence is not None:
+            real = real & (np.asarray(matches.confidence) > 0)
+        points = points[real]
+        keys = points.T[::-1] if matches.index0 is None else [np.asarray(matches.index0)[real]]
+        return np.array(self._score(points[np.lexsort([*keys])]), np.float32)
+
+    def score_pairs(self, matches: Matches) -> np.ndarray:
+        """Scores `[P]` float32 of pairs `[P, K, ...]`."""
+        host, count = jax.tree.map(np.asarray, matches), len(matches.mask)
+        pairs = (jax.tree.map(lambda leaf, pair=pair: leaf[pair], host) for pair in range(count))
+        with ThreadPoolExecutor(available_cpus()) as pool:  # OpenCV lets go of Python's lock
+            return np.fromiter(pool.map(self, pairs), np.float32, count)
+
+    def _score(self, points: np.ndarray) -> float:
+        """Of real matches `[n, 4]`, the candidate's points first."""
+        import cv2  # here, since whoever imports the library need not wait for it
+
+        if not np.isfinite(points).all():
+            return np.nan
+        if len(points) < 4:
+            return len(points) if self.few == "count" else 0
+        estimator = {"ransac": cv2.RANSAC, "magsac": cv2.USAC_MAGSAC}[self.estimator]
+        _, inliers = cv2.findHomography(
+            points[:, :2], points[:, 2:], estimator, float(self.threshold), maxIters=round(float(self.max_iterations)),
+            confidence=float(self.confidence),
+        )  # fmt: skip
+        return 0 if inliers is None else inliers.sum()

@@ -1,0 +1,69 @@
+"""Rapid spatial score of Patch-NetVLAD (CVPR 2021): matches count less, the further they are from the mean shift."""
+
+import jax.numpy as jnp
+
+from mfvpr.declaration import check_choices, choice, flag, numbers
+from mfvpr.errors import InputError
+from mfvpr.numerics import at_least_single, masked, masked_mean, where_finite
+from mfvpr.scoring.shifts import image_sizes, match_shifts
+from mfvpr.types import Array, Matches, value
+from mfvpr.weighting import match_confidence
+
+
+@value
+class RapidSpatialScore:
+    """s = sum_k ((X - |x_k - mean x|)^2 + (Y - |y_k - mean y|)^2) over the shifts, in px^2.
+
+    A match counts with its confidence, in the means as in the sum. A shift further than X from the mean counts more
+    again. With X and Y the image's size it is `AggregatedScore` with the weight 1.
+
+    Attributes:
+        reach: what X and Y are. `image_size`: width and height of the query, as Patch-NetVLAD's code takes the largest
+            index of its grid of patches. `largest_coordinate`: largest x and y of the matched points of both images,
+            as re-ranking-for-VPR takes those of all keypoints, which matches do not hold. `largest_shift`: |max x_k|
+            and |max y_k|, Patch-NetVLAD's equation as printed, which rewards the largest outlier.
+        size: (X, Y) px where they are known, instead: of patches on a grid, the largest index times their step.
+        per_feature: divide by the number of the query's keypoints, matched or not, as both codes do. The ranking of
+            a query's candidates stays; scores of scales with more and with fewer patches become alike.
+    """
+
+    reach: str = choice("image_size", "largest_coordinate", "largest_shift")
+    size: tuple[float, float] | None = numbers(None, 2, "[x, y] px", "None = what reach says")
+    per_feature: bool = flag(False)
+
+    def __post_init__(self) -> None:
+        check_choices(self)
+
+    def __call__(self, matches: Matches) -> Array:
+        """Score of one pair, `[]` float32.
+
+        Raises:
+            InputError: `per_feature`, and the matches do not know the query's keypoints.
+        """
+        confidence, shifts = match_confidence(matches), match_shifts(matches)
+        residuals = jnp.abs(shifts - masked_mean(shifts, matches.mask, confidence)[None])
+        closeness = self._reach(matches, shifts, confidence > 0)[None] - residuals
+        score = jnp.sum(confidence * jnp.sum(masked(closeness, matches.mask) ** 2, axis=-1))
+        if self.per_feature:
+            if matches.count0 is None:
+                raise InputError("per_feature=True: expected matches that know how many keypoints the query has "
+                                 "(count0), got None")  # fmt: skip
+            score = score / jnp.maximum(jnp.asarray(matches.count0, score.dtype), 1.0)
+        return where_finite(score, confidence, shifts)
+
+    def _reach(self, matches: Matches, shifts: Array, real: Array) -> Array:
+        """`[2]` X and Y; 0 where they are the largest of no match."""
+        if self.size is not None:
+            return jnp.asarray(self.size, shifts.dtype)
+        if self.reach == "image_size":
+            return image_sizes(matches)[0]
+
+        def largest(values: Array) -> Array:
+            return jnp.max(masked(values, real, -jnp.inf), axis=0, initial=-jnp.inf)
+
+        if self.reach == "largest_shift":
+            found = jnp.abs(largest(shifts))
+        else:
+            points = (masked(at_least_single(points), matches.mask) for points in (matches.points0, matches.points1))
+            found = jnp.maximum(*map(largest, points))
+        return jnp.where(jnp.any(real), found, 0.0)

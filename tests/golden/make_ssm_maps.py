@@ -1,0 +1,79 @@
+"""Makes ssm_maps.npz: SSM-VPR's maps with random weights. `python -m tests.golden.make_ssm_maps CLONE`
+
+CLONE is a clone of https://github.com/Chicone/SSM-VPR, whose network is run, by torch and in float64, so that the file
+holds no rounding errors but its own. The tests read it without either.
+"""
+
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from tests.checkpoints import layered, places365_shapes, random_checkpoint
+from tests.golden.make_d2net import samples, texture
+
+GOLDEN = Path(__file__).parent / "ssm_maps.npz"
+SEEDS = (0, 1, 2)
+MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # torchvision's Normalize, as the public code calls it
+
+
+class Case(NamedTuple):
+    """An image, the seed of the weights, and the stages that look at it."""
+
+    seed: int
+    width: int
+    height: int
+    stages: tuple[int, ...]
+
+    def __str__(self) -> str:
+        return f"{self.seed}-{self.width}x{self.height}"
+
+    @property
+    def image(self) -> np.ndarray:
+        """`[height, width, 3]` uint8."""
+        return texture(self.width, self.height, self.seed)
+
+
+CASES = (
+    *(Case(seed, 224, 224, (1, 2)) for seed in SEEDS),
+    *(Case(seed, 336, 336, (2,)) for seed in SEEDS),
+    Case(0, 151, 229, (1, 2)),  # odd before each pooling but the third
+)
+
+
+def checkpoint(seed: int) -> dict[str, np.ndarray]:
+    """The tensors that the maps need, by the names of the public file."""
+    return random_checkpoint(places365_shapes(full=False), seed)
+
+
+def main(clone: str) -> None:
+    sys.path.insert(0, clone)
+    import torch
+    import vgg16_model
+
+    unused = {name: np.zeros(shape, np.float32) for name, shape in places365_shapes().items()}
+    golden = {}
+    for seed in SEEDS:
+        weights = unused | checkpoint(seed)
+        vgg16_model.load_weights = lambda _, weights=weights: layered(weights)
+        network = vgg16_model.VGG16Model("").double().eval()
+        for case in CASES:
+            if case.seed != seed:
+                continue
+            pixels = (case.image / 255 - np.array(MEAN)) / np.array(DEVIATION)
+            with torch.inference_mode():
+                batch = torch.from_numpy(pixels.transpose(2, 0, 1)[None])
+                for stage in case.stages:
+                    dense = (network.forward1 if stage == 1 else network.forward2)(batch)[0].numpy().transpose(1, 2, 0)
+                    golden |= {
+                        f"{case}/stage{stage}": samples(dense),
+                        f"{case}/stage{stage}/largest": np.float32(np.abs(dense).max()),
+                        f"{case}/stage{stage}/shape": np.array(dense.shape),
+                    }
+                    print(f"{case}, stage {stage}: {dense.shape}, largest {np.abs(dense).max():.3g}")
+    np.savez_compressed(GOLDEN, **golden)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,66 @@
+"""RANSAC by loops in double precision, sample by sample, from the samples that the library draws."""
+
+import itertools
+import math
+
+import jax
+import numpy as np
+
+from mfvpr.scoring import quads
+
+
+def estimate(points1, points0, *, threshold, max_iterations=2000, confidence=0.995, seed=0):
+    """(inliers `[n]` bool, samples looked at, errors `[n]`) of real matches in the order of their samples, px."""
+    points1, points0 = np.asarray(points1, np.float64), np.asarray(points0, np.float64)
+    count = len(points1)
+    best, samples, limit = (np.zeros(count, bool), np.full(count, np.inf)), 0, max_iterations
+    for round_number in itertools.count():
+        drawn = np.asarray(quads.draw(jax.random.key(seed), round_number, np.int32(count)))
+        accepted = [four for four in drawn.T if keeps_orientation(points1[four], points0[four])][: quads.ROUND]
+        for four in accepted:
+            if samples >= limit:
+                return best[0], samples, best[1]
+            samples += 1
+            errors = np.linalg.norm(mapped(through(points1[four], points0[four]), points1) - points0, axis=1)
+            inliers = errors <= threshold
+            if inliers.sum() > max(best[0].sum(), 3):
+                best, limit = (inliers, errors), needed(inliers.sum() / count, confidence, max_iterations)
+        if not accepted or samples >= limit:
+            return best[0], samples, best[1]
+
+
+def needed(share, confidence, max_iterations):
+    """As in OpenCV's RANSACUpdateNumIters."""
+    if share == 1:
+        return 0
+    wrong = math.log(1 - share**4)
+    return (
+        max_iterations
+        if -math.log(1 - confidence) >= -max_iterations * wrong
+        else round(math.log(1 - confidence) / wrong)
+    )
+
+
+def keeps_orientation(first, second):
+    """Whether the triangles of four points all keep, or all change, their orientation, and none is flat."""
+    signs = []
+    for triangle in itertools.combinations(range(4), 3):
+        areas = [np.cross(*(np.append(points[triangle[k]] - points[triangle[0]], 0) for k in (1, 2)))[2]
+                 for points in (first, second)]  # fmt: skip
+        signs.append(np.sign(areas[0]) * np.sign(areas[1]))
+    return abs(sum(signs)) == 4
+
+
+def through(first, second):
+    """`[3, 3]` homography through four matches: eight linear equations."""
+    rows, right = [], []
+    for (x, y), (u, v) in zip(first, second, strict=True):
+        rows += [[x, y, 1, 0, 0, 0, -u * x, -u * y], [0, 0, 0, x, y, 1, -v * x, -v * y]]
+        right += [u, v]
+    return np.append(np.linalg.solve(rows, right), 1).reshape(3, 3)
+
+
+def mapped(matrix, points):
+    """`[n, 2]` where a homography takes points."""
+    moved = np.concatenate([points, np.ones((len(points), 1))], axis=1) @ np.asarray(matrix).T
+    return moved[:, :2] / moved[:, 2:]

@@ -1,0 +1,222 @@
+"""RANSAC in one batch: against loops in double precision, OpenCV, and what no sampling may change."""
+
+from dataclasses import replace
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+import mfvpr
+from mfvpr import Homography, score_candidates, score_grid
+from mfvpr.errors import NoGradientError
+from mfvpr.numerics import masked
+from mfvpr.scoring import quads
+from mfvpr.types import per_match
+from tests import ransac_oracle
+from tests.builders import SIZE, make_matches
+
+PLANE = np.array([[1.05, 0.05, 8.0], [-0.03, 0.97, -5.0], [1e-4, -5e-5, 1.0]])  # candidate -> query
+estimate = jax.jit(lambda scorer, matches: scorer.estimate(matches))
+
+
+def plane_points(seed, count, share, *, noise=2.0):
+    """(points of the candidate, points of the query) `[n, 2]`, a share of which one plane explains up to noise."""
+    rng = np.random.default_rng(seed)
+    points1 = rng.uniform(0, SIZE, (count, 2))
+    points0 = ransac_oracle.mapped(PLANE, points1) + rng.normal(0, noise, (count, 2))
+    wrong = rng.permutation(count)[round(share * count) :]
+    points0[wrong] = rng.uniform(0, SIZE, (len(wrong), 2))
+    return points1.astype(np.float32), points0.astype(np.float32)
+
+
+def pair(seed, count, share, *, capacity=None, **options):
+    points1, points0 = plane_points(seed, count, share, **options)
+    return make_matches(points0, points1, capacity=capacity or count)
+
+
+def stacked(pairs):
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *pairs)
+
+
+@pytest.mark.parametrize(("count", "share"), [(5, 0.9), (8, 0.6), (40, 0.3), (120, 0.1), (120, 0.5), (300, 0.9)])
+@pytest.mark.parametrize("threshold", [8.0, 24.0])
+def test_it_is_the_search_sample_by_sample_in_double_precision(count, share, threshold):
+    for seed in range(4):
+        matches = pair([seed, count], count, share, capacity=320)
+        found = estimate(Homography(threshold, 500.0, seed=seed), matches)
+        order = sampled_order(matches)[:count]
+        points1, points0 = matches.points1[order], matches.points0[order]
+        inliers, samples, errors = ransac_oracle.estimate(
+            points1, points0, threshold=threshold, max_iterations=500, seed=seed
+        )
+        sure = np.abs(errors - threshold) > 1e-3 * threshold
+        assert (np.asarray(found.inliers)[order][sure] == inliers[sure]).all()
+        assert abs(int(found.score) - inliers.sum()) <= (~sure).sum()
+        assert int(found.samples) == samples
+
+
+def sampled_order(matches):
+    """The order in which a pair's samples count its matches."""
+    points = np.concatenate([matches.points1, matches.points0], axis=-1)
+    return np.asarray(quads.canonical_order(np.where(matches.mask[:, None], points, 0), matches.mask))
+
+
+def test_draws_are_distinct_and_every_set_is_as_likely():
+    drawn = np.sort(np.asarray(quads.draw(jax.random.key(1), 0, np.int32(6))), axis=0)
+    assert (np.diff(drawn, axis=0) > 0).all()
+    assert (drawn.min(), drawn.max()) == (0, 5)
+    _, counts = np.unique(drawn, axis=1, return_counts=True)
+    expected = drawn.shape[1] / 15
+    assert len(counts) == 15
+    assert ((counts - expected) ** 2 / expected).sum() < 36  # chi-square of 14 degrees: p = 0.001
+
+
+def test_samples_are_the_first_draws_that_a_camera_can_see():
+    points = np.concatenate(plane_points(5, 30, 0.5), axis=1) / 168 - 1
+    points[5:10] = np.linspace(0, 0.75, 5, dtype=np.float32)[:, None]  # on a line in both images
+    key = jax.random.key(7)
+    samples, count = quads.accepted(jnp.asarray(points), key, 3, np.int32(30))
+    drawn = np.asarray(quads.draw(key, 3, np.int32(30))).T
+    kept = [four for four in drawn if ransac_oracle.keeps_orientation(points[four, :2], points[four, 2:])]
+    assert int(count) == min(len(kept), quads.ROUND)
+    expected = points[np.array(kept[: int(count)])]
+    np.testing.assert_array_equal(np.moveaxis(np.asarray(samples), 0, 2)[:, : int(count)].swapaxes(0, 1), expected)
+
+
+def test_company_order_and_padding_change_no_bit():
+    pairs = [pair(seed, count, share, capacity=128) for seed, (count, share) in enumerate(
+        [(100, 0.1), (3, 1.0), (0, 1.0), (60, 0.9), (128, 0.3)])]  # fmt: skip
+    together = np.asarray(score_candidates(Homography(), stacked(pairs)))
+    for matches, score in zip(pairs, together, strict=True):
+        shuffle = np.random.default_rng(0).permutation(128)
+        shuffled = replace(matches, mask=matches.mask[shuffle], **{
+            name: values[shuffle] for name, values in per_match(matches).items()})  # fmt: skip
+        wider = make_matches(matches.points0[matches.mask], matches.points1[matches.mask], capacity=205)
+        for same in (matches, shuffled, wider):
+            assert float(estimate(Homography(), same).score) == score
+        assert score_candidates(Homography(), stacked([matches] * 3)).tolist() == [score] * 3
+
+
+def test_a_plane_without_noise_is_found_to_a_pixels_thousandth():
+    matches = pair(3, 50, 1.0, noise=0.0)
+    found = estimate(Homography(1.0, refit=True), matches)
+    assert int(found.score) == 50
+    np.testing.assert_allclose(found.matrix, PLANE / PLANE[2, 2], rtol=2e-3, atol=2e-5)
+    assert np.abs(ransac_oracle.mapped(found.matrix, matches.points1) - matches.points0).max() < 1e-2
+
+
+def test_least_squares_are_those_of_scipy():
+    matches = pair(4, 200, 0.6)
+    plain, refit = (estimate(Homography(8.0, refit=again), matches) for again in (False, True))
+    inliers = np.asarray(plain.inliers)
+    points1, points0 = matches.points1[inliers].astype(float), matches.points0[inliers].astype(float)
+
+    def misses(free):
+        return (ransac_oracle.mapped(np.append(free, 1).reshape(3, 3), points1) - points0).ravel()
+
+    best = least_squares(misses, np.asarray(plain.matrix, float).ravel()[:8], x_scale="jac", xtol=1e-15, ftol=1e-15)
+    cost = np.sum(misses(np.asarray(refit.matrix, float).ravel()[:8] / float(refit.matrix[2, 2])) ** 2)
+    assert cost <= 2 * best.cost * (1 + 1e-4)
+    errors = np.linalg.norm(
+        ransac_oracle.mapped(np.append(best.x, 1).reshape(3, 3), matches.points1) - matches.points0, axis=1
+    )
+    assert abs(int(refit.score) - (errors <= 8).sum()) <= 1
+    assert int(refit.score) > int(plain.score)
+
+
+def test_msac_prefers_the_closer_of_two_models_with_as_many_inliers():
+    matches = pair(6, 200, 0.5)
+    counted, close = (estimate(Homography(24.0, measure=measure), matches) for measure in ("inliers", "msac"))
+    errors = np.linalg.norm(ransac_oracle.mapped(close.matrix, matches.points1) - matches.points0, axis=1)
+    inliers = errors <= 24
+    np.testing.assert_allclose(close.score, np.sum(1 - (errors[inliers] / 24) ** 2), rtol=1e-3)
+    other = np.linalg.norm(ransac_oracle.mapped(counted.matrix, matches.points1) - matches.points0, axis=1)
+    assert float(close.score) >= np.sum(1 - (other[other <= 24] / 24) ** 2) - 1e-2
+
+
+def test_as_many_inliers_as_opencv():
+    pairs = [plane_points(seed, 200, 0.4, noise=1.0) for seed in range(30)]
+    expected = [
+        cv2.findHomography(*points, cv2.RANSAC, 24.0, maxIters=2000, confidence=0.995)[1].sum() for points in pairs
+    ]
+    batch = stacked([make_matches(points0, points1) for points1, points0 in pairs])
+    difference = np.asarray(score_candidates(Homography(24.0, refit=True), batch)) - expected
+    assert np.median(difference) == 0
+    assert np.mean(np.abs(difference) <= 2) >= 0.95
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 4])
+def test_few_matches(count):
+    matches = pair(8, count, 1.0, capacity=6)
+    assert float(Homography()(matches)) == count
+    assert float(Homography(few="zero")(matches)) == (4 if count == 4 else 0)
+    assert np.isnan(estimate(Homography(), matches).matrix).all() == (count < 4)
+
+
+LINE = np.stack([np.linspace(0, 300, 20), np.linspace(10, 200, 20)], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("points1", "points0"),
+    [(LINE, LINE), (LINE, LINE[::-1]), (np.full((20, 2), 7.0), LINE), (np.full((20, 2), 7.0), np.full((20, 2), 9.0))],
+)
+def test_no_homography_explains_a_line_or_a_point(points1, points0):
+    found = estimate(Homography(), make_matches(points0, points1))
+    assert (float(found.score), int(found.samples)) == (0, 0)
+    assert np.isnan(found.matrix).all()
+    assert not np.asarray(found.inliers).any()
+
+
+@pytest.mark.parametrize("threshold", [0.0, -1.0, 1e-6, 1e12, np.inf])
+def test_any_threshold_scores(threshold):
+    score = float(Homography(threshold)(pair(9, 40, 0.5)))
+    assert 0 <= score <= (40 if threshold > 1 else 8)
+    assert np.isnan(Homography(np.nan)(pair(9, 40, 0.5)))
+
+
+def test_a_point_that_is_no_number_is_no_score():
+    matches = pair(9, 40, 0.5)
+    broken = matches.points0.copy()
+    broken[3] = np.nan
+    assert np.isnan(Homography()(replace(matches, points0=broken)))
+    assert np.isfinite(Homography()(replace(matches, points0=broken, mask=np.arange(40) != 3)))
+
+
+def test_a_match_counts_with_its_confidence():
+    matches = pair(10, 60, 1.0, noise=0.5)
+    confidence = np.random.default_rng(0).choice([0.0, 0.25, 1.0], 60).astype(np.float32)
+    sure = replace(matches, confidence=confidence)
+    assert float(Homography()(sure)) == confidence.sum()
+    without = replace(matches, mask=confidence > 0, confidence=np.where(confidence > 0, 1, np.nan).astype(np.float32))
+    assert float(Homography()(without)) == (confidence > 0).sum()
+
+
+def test_thresholds_and_iterations_are_swept_in_one_program():
+    batch = stacked([pair(seed, 80, 0.3) for seed in range(3)])
+    grid = np.asarray(score_grid(Homography(), batch, threshold=[4.0, 8.0, 24.0], max_iterations=[20, 300]))
+    for row, threshold in enumerate([4.0, 8.0, 24.0]):
+        for column, iterations in enumerate([20.0, 300.0]):
+            expected = score_candidates(Homography(threshold, iterations), batch)
+            np.testing.assert_array_equal(grid[row, column], expected)
+    assert (grid[:, 1] >= grid[:, 0]).all()
+
+
+def test_nobody_gets_a_gradient_of_it():
+    matches = pair(11, 20, 0.8)
+    for wanted in (
+        lambda: jax.grad(lambda threshold: Homography(threshold)(matches))(8.0),
+        lambda: jax.grad(lambda points: Homography()(replace(matches, points0=points)))(matches.points0),
+    ):
+        with pytest.raises(NoGradientError, match="homography: the number of inliers has no gradient; take a score"):
+            wanted()
+    beside = jax.grad(lambda scores: Homography()(matches) + jnp.sum(masked(scores, matches.mask)))(matches.scores0)
+    assert (np.asarray(beside) == 1).all()
+
+
+def test_a_word_that_is_none():
+    with pytest.raises(ValueError, match=r"Homography\(measure='most'\): expected one of inliers, msac"):
+        Homography(measure="most")
+    assert mfvpr.Homography is Homography
