@@ -139,3 +139,15 @@ def test_help_needs_no_jax():
     assert done.returncode == 0
     assert all(f"{name} " in done.stdout and about in done.stdout for name, about in BENCHMARKS.items())
     assert " jax\n" not in done.stderr
+
+
+def test_cells_are_matched_and_scored_as_by_the_public_program(monkeypatch):
+    from experiments.benchmark import cells
+
+    for name, value in {"CANDIDATES": 3, "SIDE": 8, "CELLS": 64, "DIMENSION": 12}.items():
+        monkeypatch.setattr(cells, name, value)
+    results = {(step, who): run() for step, who, run in cells.entries(*cells.made_up())}
+    ours, theirs = results["matching", "mfvpr"], results["matching", "NumPy, inner product"]
+    np.testing.assert_array_equal(ours.index0, theirs)
+    np.testing.assert_array_equal(results["score", "mfvpr"], results["score", "NumPy, patch by patch"])
+    assert (np.asarray(results["score", "mfvpr"]) > 100).all()

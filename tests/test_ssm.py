@@ -23,6 +23,7 @@ from mfvpr.fingerprints import difference, fingerprint
 from mfvpr.fitting import fitted, whitening_recipe
 from mfvpr.models.ssm import SsmVgg
 from mfvpr.scoring import GridAnchors
+from mfvpr.stores.features import _pack, forecast_bytes
 from mfvpr.voting import SsmVoting
 from mfvpr.whitening import Whitening, fit_whitening
 from tests.builders import local
@@ -172,9 +173,45 @@ def test_what_has_no_cells_or_has_not_seen_the_database_is_refused(model, cells)
         SsmCells(model, stride=0)
     with pytest.raises(InputError, match="SsmCells: has not seen the database; take"):
         cells(np.zeros((1, 40, 48, 3), np.uint8))
+    with pytest.raises(InputError, match="SsmCells: expected a whitening of 4608 numbers, got one of 41472"):
+        replace(cells, whitening=nothing(41472, 3))(np.zeros((1, 40, 48, 3), np.uint8))
+
+
+@pytest.mark.parametrize(("images", "printed"), [(220, 161.5), (1415, 911.4)])
+def test_databases_are_of_the_published_size(model, images, printed, tmp_path):
+    """In MiB: vectors of both stages in float32, and both whitenings, the second in float64."""
+    arrays, whitenings = 0, 0
+    for extractor, vectors in ((SsmWindows(model), 36), (SsmCells(model), 1600)):
+        how, found = extractor.whitening, extractor.windows
+        learned = Whitening(
+            *(np.zeros(shape, how.dtype) for shape in (found.dimension, (how.dimension, found.dimension)))
+        )
+        assert found.count == vectors
+        arrays += np.zeros((found.count, learned.dimension), np.float32).nbytes
+        whitenings += learned.mean.nbytes + learned.components.nbytes
+    assert (images * arrays + whitenings) / 2**20 == pytest.approx(printed, rel=0.01)
+    assert whitenings / 2**20 == pytest.approx(19.93 + 3.55, rel=0.01)
+
+
+def test_stores_take_little_more_than_half_of_it(cells, dataset, tmp_path):
+    """Directions of cells in float16, beside their lengths, places and scores."""
+    archive = Archive(tmp_path)
+    [found] = archive.local(
+        dataset.database, fitted(replace(cells, whitening=WindowFitting(100)), dataset.database, archive)
+    )
+    [(_, one)] = found.read([0])
+    parts = _pack(one)
+    assert one.descriptors.nbytes == 12 * 100 * 4
+    assert sum(part.nbytes for part in parts.values()) == 12 * (100 * 2 + 4 + 8 + 4) + 8
+    assert forecast_bytes(1, 1600, 100) / (1600 * 100 * 4) == pytest.approx(0.55, abs=0.01)
 
 
 # What is learned
+
+
+def nothing(size, dimension, dtype="float32"):
+    """A whitening of the right shapes."""
+    return Whitening(np.zeros(size, dtype), np.zeros((dimension, size), dtype))
 
 
 def kept(root):

@@ -14,6 +14,7 @@ from experiments.launch import version
 # Each is the module of this name, whose `run(rounds, out)` prints a table and writes it as JSON.
 BENCHMARKS = {
     "scores": "matching and scoring of one query with 50 candidates (15 rounds)",
+    "cells": "SSM-VPR's matching and score of 50 candidates (9 rounds)",
     "homographies": "RANSAC of 50 pairs beside OpenCV's (7 rounds)",
     "sweeps": "grids of a score's parameters on cached matches (7 rounds)",
     "networks": "D2-Net, MixVPR and ALIKED (5 rounds)",

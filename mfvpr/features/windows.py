@@ -142,11 +142,15 @@ def known(extractor: WindowExtractor) -> Whitening:
     """The whitening that was learned.
 
     Raises:
-        InputError: none was.
+        InputError: none was, or that of other windows.
     """
-    if not isinstance(extractor.whitening, Whitening):
-        raise InputError(f"{type(extractor).__name__}: has not seen the database; take mfvpr.fitting.fitted(...) of it")
-    return extractor.whitening
+    who, whitening, expected = type(extractor).__name__, extractor.whitening, extractor.windows.dimension
+    if not isinstance(whitening, Whitening):
+        raise InputError(f"{who}: has not seen the database; take mfvpr.fitting.fitted(...) of it")
+    if len(whitening.mean) != expected:
+        raise InputError(f"{who}: expected a whitening of {expected} numbers, got one of {len(whitening.mean)}; learn "
+                         "it from windows of these maps")  # fmt: skip
+    return whitening
 
 
 def kernels(whitening: Whitening, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
