@@ -16,6 +16,7 @@ BENCHMARKS = {
     "scores": "matching and scoring of one query with 50 candidates (15 rounds)",
     "cells": "SSM-VPR's matching and score of 50 candidates (9 rounds)",
     "homographies": "RANSAC of 50 pairs beside OpenCV's (7 rounds)",
+    "real": "all scores on the same matches of real images: recall with intervals, time per query (2 rounds)",
     "sweeps": "grids of a score's parameters on cached matches (7 rounds)",
     "networks": "D2-Net, MixVPR and ALIKED (5 rounds)",
     "scale": "databases of 1,000 to 10,000 images on disk: time per query and peak memory (3 rounds)",
@@ -34,13 +35,16 @@ def main() -> None:
     parser.add_argument("--rounds", type=positive, help="timed calls of each contestant (default: see below)")
     parser.add_argument("--out", type=Path, help="JSON file to write (default runs/benchmark_WHAT.json)")
     parser.add_argument("--stores", type=Path, help="of scale: folder that keeps its features (default: 6 GB, deleted)")
+    parser.add_argument("--data", type=Path, help="of real: folder with grief_season and corridor")
     parser.add_argument("--version", action="version", version=version(), help="print it and exit")
     arguments = parser.parse_args()
     with one_line():
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # leaves torch its part of a GPU
-        if arguments.stores and arguments.what != "scale":
-            parser.error("--stores is for scale alone")
-        options = {"stores": arguments.stores} if arguments.stores else {}
+        own = {"stores": ("scale", arguments.stores), "data": ("real", arguments.data)}
+        options = {name: value for name, (_, value) in own.items() if value}
+        for name in options:
+            if arguments.what != own[name][0]:
+                parser.error(f"--{name} is for {own[name][0]} alone")
         benchmark = import_module(f"experiments.benchmark.{arguments.what}")
         benchmark.run(arguments.rounds, arguments.out or Path(f"runs/benchmark_{arguments.what}.json"), **options)
 

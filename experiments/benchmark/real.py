@@ -1,0 +1,98 @@
+"""Every score on the same matches of real images: recall with its interval, and what it takes per query."""
+
+import json
+import platform
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments import build
+from experiments.console import tell, track
+from mfvpr import Homography, OpenCvHomography, pipeline
+from mfvpr.archive import Archive
+from mfvpr.data.datasets import folder_dataset
+from mfvpr.data.files import write_text
+from mfvpr.errors import InputError
+from mfvpr.evaluation import frame_positives
+from mfvpr.evaluation.statistics import estimate
+from mfvpr.evaluations import match_sequence
+from mfvpr.features import Aggregated, Extractor
+from mfvpr.features.aliked import AlikedFeatures
+from mfvpr.features.sift import Sift
+from mfvpr.features.vlad import VladFitting
+from mfvpr.filters import Retrieval
+from mfvpr.numerics import available_cpus
+from mfvpr.report.runs import versions
+from mfvpr.report.tables import Table
+from mfvpr.reranking import rank_shortlist
+from mfvpr.results import FILTER, Matched
+from mfvpr.scoring import SCORERS
+from mfvpr.weights.files import load_model
+
+FOLDERS = {"grief_season": ("database", "queries"), "corridor": ("ref", "query")}
+SIZE = (336, 336)
+TOLERANCES = (1, 2, 5)  # frames
+SCORES: dict[str, Any] = {
+    **{name: SCORERS[name]() for name in ("count", "rapid", "phrases", "lost", "sum", "anchor", "histogram")},
+    "homography, 8 px": Homography(8.0),
+    "homography, 24 px": Homography(24.0),
+    "MAGSAC, 8 px": OpenCvHomography(8.0, estimator="magsac"),
+}
+
+
+def run(rounds: int | None, out: Path, data: Path | None = None) -> None:
+    """Both data sets below `data`, SIFT's and ALIKED n16's matches with all images; the last of `rounds` is timed."""
+    if data is None:
+        raise InputError(f"real: expected --data DIR, a folder that has {' and '.join(FOLDERS)}")
+    archive = Archive(build.expanded("~/.cache/mfvpr/features"), track=track, tell=tell)
+    tables = []
+    for name, (database, queries) in FOLDERS.items():
+        dataset = folder_dataset(data / name / database, data / name / queries, name=name, ground_truth="order")
+        for features, extractor in _extractors().items():
+            filter = Retrieval(Aggregated(extractor, VladFitting()))
+            matched = match_sequence(dataset, dataset.sequences[0], extractor, filter, "all", archive=archive)
+            rows = [*judged(matched, rounds or 2)]
+            tables.append({"dataset": name, "features": features, "rows": rows})
+            matches = np.mean(matched.matches[0].counts)
+            print(f"\n{name}, {features}, {matches:.0f} matches a pair\n\n{_table(rows).text()}")
+    machine = {"cores": available_cpus(), "processor": platform.machine()}
+    write_text(out, json.dumps({"machine": machine, "versions": versions(), "tables": tables}, indent=1) + "\n")
+    print(f"results: {out}")
+
+
+def _extractors() -> dict[str, Extractor]:
+    aliked: Any = load_model("aliked-n16")
+    return {"SIFT": Sift(image_size=SIZE), "ALIKED n16": AlikedFeatures(aliked, image_size=SIZE)}
+
+
+def judged(matched: Matched, rounds: int) -> Iterator[dict[str, Any]]:
+    """By score: recall and its interval at every tolerance, and milliseconds per query."""
+    candidates, frames = matched.candidates, np.arange(len(matched.candidates.mask))
+    right = {tolerance: frame_positives(frames, frames, tolerance=tolerance) for tolerance in TOLERANCES}
+    for name in (FILTER, *SCORES):
+        start, scores = time.perf_counter(), candidates.scores
+        for _ in range(rounds if name in SCORES else 0):
+            start = time.perf_counter()  # the first call compiles
+            [scores] = pipeline.score({name: SCORES[name]}, matched.by_scale, candidates).values()
+        took = time.perf_counter() - start
+        first = np.take_along_axis(candidates.indices, rank_shortlist(candidates, scores)[:, :1], axis=1)[:, 0]
+        found = {tolerance: estimate(np.asarray(positives)[frames, first]) for tolerance, positives in right.items()}
+        yield {
+            "score": name, "ms_per_query": 1e3 * took / len(frames) if name in SCORES else None,
+            "recall": {tolerance: one._asdict() for tolerance, one in found.items()},
+        }  # fmt: skip
+
+
+def _table(rows: list[dict[str, Any]]) -> Table:
+    def cell(one: dict[str, Any]) -> str:
+        low, high = one["interval"]
+        return f"{100 * one['recall']:.1f} [{100 * low:.0f}, {100 * high:.0f}]"
+
+    return Table(
+        ["score", *(f"R@1 ±{tolerance}" for tolerance in TOLERANCES), "ms/query"],
+        [[row["score"], *map(cell, row["recall"].values()),
+          "" if row["ms_per_query"] is None else f"{row['ms_per_query']:.1f}"] for row in rows],
+    )  # fmt: skip
