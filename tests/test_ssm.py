@@ -1,5 +1,6 @@
 """SSM-VPR's windows and cells: what they are, how they are learned from a database, and that they are of no other."""
 
+import shutil
 from dataclasses import replace
 from functools import partial
 
@@ -9,6 +10,7 @@ import pytest
 from flax import nnx
 
 import mfvpr
+from mfvpr import Features, Shortlist, pipeline
 from mfvpr.archive import Archive
 from mfvpr.data.datasets import ImageFolder, folder_dataset, sequences_dataset
 from mfvpr.errors import InputError
@@ -23,6 +25,7 @@ from mfvpr.fingerprints import difference, fingerprint
 from mfvpr.fitting import fitted, whitening_recipe
 from mfvpr.models.ssm import SsmVgg
 from mfvpr.scoring import GridAnchors
+from mfvpr.sources import FeatureSet
 from mfvpr.stores.features import _pack, forecast_bytes
 from mfvpr.voting import SsmVoting
 from mfvpr.whitening import Whitening, fit_whitening
@@ -268,6 +271,32 @@ def test_files_that_are_damaged_or_exchanged_are_refused(cells, dataset, tmp_pat
         with pytest.raises(InputError, match="expected arrays as they were written here") as told:
             fitted(cells, dataset.database, Archive(tmp_path))
         assert "\n" not in str(told.value)
+
+
+def test_images_that_cannot_be_read_are_left_out_only_where_they_may_be(cells, dataset, tmp_path):
+    for name in dataset.database.names[:3]:
+        shutil.copy(dataset.database.root / name, tmp_path)
+    (tmp_path / dataset.database.names[1]).write_bytes(b"no image")
+    folder = ImageFolder(tmp_path, dataset.database.names[:3])
+    with pytest.raises(InputError, match=r"0001\.png: cannot be read as an image .*, or skip bad images"):
+        fitted(cells, folder, Archive(tmp_path / "strict"))
+    assert not kept(tmp_path / "strict")
+    learned = fitted(cells, folder, Archive(tmp_path / "s", skip_bad=True))
+    few = fitted(cells, ImageFolder(tmp_path, (folder.names[0], folder.names[2])), Archive())
+    np.testing.assert_array_equal(learned.whitening.components, few.whitening.components)
+
+
+def test_candidates_without_cells_score_zero():
+    vectors, size = np.eye(16, dtype=np.float32), np.full(2, 48, np.float32)
+    image = Features(np.zeros((16, 2), np.float32), vectors, np.ones(16, np.float32), np.ones(16, bool), size)
+    empty = jax.tree.map(lambda leaf: leaf[:0], image)
+    empty = replace(empty, image_size=size)
+    queries, database = (FeatureSet.of(images, unit_length=False) for images in ([image, empty], [empty, image]))
+    indices = np.array([[0, 1]] * 2, np.int32)
+    candidates = Shortlist(indices, np.zeros((2, 2), np.float32), indices >= 0)
+    matches = pipeline.match(queries, database, candidates, cross_check="candidate")
+    scores = pipeline.score({"grid": GridAnchors(4, 3)}, matches, candidates)["grid"]
+    np.testing.assert_array_equal(scores, [[0, 100], [0, 0]])
 
 
 def test_parts_of_filters_are_learned_as_well(cells, model, dataset):

@@ -190,8 +190,8 @@ class SsmCells:
         Raises:
             InputError: it has not seen the database.
         """
-        found = in_batches(self._program, images, self.batch_size)
-        return [Description(local=(self._features(vectors),)) for vectors in found]
+        cells = in_batches(self._program, images, self.batch_size)
+        return [Description(local=(self._features(vectors),)) for vectors in cells]
 
     @cached_property
     def _program(self) -> Callable[..., Any]:

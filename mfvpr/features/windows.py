@@ -111,9 +111,9 @@ class WindowFitting:
         sample, filled = np.zeros((count, windows.dimension), self.dtype), 0
         place = {row: windows.count * number for number, row in enumerate(rows)}
         for some in maps:
-            for row, one in some.items():
+            for row, of_image in some.items():
                 first, end = np.searchsorted(chosen, [place[row], place[row] + windows.count])
-                sample[filled : filled + end - first] = windows.take(one, chosen[first:end] - place[row])
+                sample[filled : filled + end - first] = windows.take(of_image, chosen[first:end] - place[row])
                 filled += end - first
         return fit_whitening(sample[: filled + self.zero_row], self.dimension)
 
@@ -162,11 +162,11 @@ def kernels(whitening: Whitening, windows: Windows) -> tuple[np.ndarray, np.ndar
 
 def whitened(maps: Array, kernel: Array, offset: Array, *, stride: int) -> Array:
     """`[B, V, D']` descriptors of all windows of maps `[B, rows, columns, channels]`."""
-    found = jax.lax.conv_general_dilated(
+    descriptors = jax.lax.conv_general_dilated(
         maps, kernel, (stride, stride), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC"),
         precision=jax.lax.Precision.HIGHEST,
     )  # fmt: skip
-    return found.reshape(len(maps), -1, found.shape[-1]) - offset[None, None]
+    return descriptors.reshape(len(maps), -1, descriptors.shape[-1]) - offset[None, None]
 
 
 def normalized(maps: Array) -> Array:
