@@ -72,7 +72,7 @@ def patch_by_patch(index: np.ndarray) -> int:
     expected = index.reshape(-1, 1, 1) + (side * offsets[:, None] + offsets)
     padded = np.pad(index, size // 2, constant_values=-1000)
     patches = np.lib.stride_tricks.sliding_window_view(padded, (size, size)).reshape(-1, size, size)
-    return np.count_nonzero(patches == expected)
+    return int(np.count_nonzero(patches == expected))
 
 
 def _of_torch(query: np.ndarray, candidates: np.ndarray) -> list[Entry]:
