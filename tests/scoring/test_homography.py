@@ -177,6 +177,15 @@ def test_any_threshold_scores(threshold):
     assert np.isnan(Homography(np.nan)(pair(9, 40, 0.5)))
 
 
+@pytest.mark.parametrize("far", [1e5, 1e7, 1e9, 1e20])
+def test_far_points_do_not_make_inliers_of_the_others(far):
+    rng = np.random.default_rng(0)
+    points1, points0 = rng.uniform(0, SIZE, (2, 60, 2))
+    points0[:30] = points1[:30] + 5
+    points1[-1], points0[-1] = far, (far, -far)
+    assert float(estimate(Homography(8.0), make_matches(points0, points1)).score) <= 34
+
+
 def test_a_point_that_is_no_number_is_no_score():
     matches = pair(9, 40, 0.5)
     broken = matches.points0.copy()
