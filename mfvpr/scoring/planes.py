@@ -85,7 +85,7 @@ def through(four: Array) -> Array:
 
 
 def _shares(x: Array, y: Array) -> tuple[Array, Array, Array]:
-    """l_0, l_1, l_2 of the fourth point, in one unit, that of their sum of sizes: areas may be too small to multiply."""
+    """l_0, l_1, l_2 of the fourth point, in a unit in which they may be multiplied: areas may be too small."""
     _, a013, a023, a123 = areas(x, y)
     size = jnp.abs(a013) + jnp.abs(a023) + jnp.abs(a123)
     return a123 / size, -a023 / size, a013 / size

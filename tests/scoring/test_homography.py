@@ -203,6 +203,36 @@ def test_a_match_counts_with_its_confidence():
     assert float(Homography()(without)) == (confidence > 0).sum()
 
 
+def test_a_plane_counts_however_little_its_matches_do():
+    matches = replace(pair(10, 60, 1.0, noise=0.5), confidence=np.full(60, 2.0**-6, np.float32))
+    assert float(estimate(Homography(), matches).score) == 60 / 64
+
+
+def test_no_generator_of_jax_draws_otherwise_in_a_batch():
+    pairs = [pair(seed, 60, 0.2, capacity=64) for seed in range(3)]
+    expected = [float(estimate(Homography(8.0), matches).score) for matches in pairs]
+    with jax.default_prng_impl("rbg"):
+        assert [float(estimate(Homography(8.0), matches).score) for matches in pairs] == expected
+        assert score_candidates(Homography(8.0), stacked(pairs)).tolist() == expected
+
+
+@pytest.mark.parametrize(
+    "limits", [{"max_iterations": np.nan}, {"max_iterations": 0.0}, {"confidence": np.nan}, {"confidence": 1.5},
+               {"confidence": 0.0}]
+)  # fmt: skip
+def test_limits_that_are_none_score_nothing(limits):
+    assert np.isnan(estimate(Homography(**limits), pair(9, 40, 0.5)).score)
+
+
+@pytest.mark.parametrize("measure", ["inliers", "msac"])
+def test_matches_of_several_types_are_scored(measure):
+    matches, scorer = pair(9, 40, 0.5), Homography(8.0, measure=measure)
+    expected = estimate(scorer, matches).score
+    with jax.enable_x64(True):
+        found = estimate(scorer, replace(matches, distance=matches.distance.astype(np.float64))).score
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
 def test_thresholds_and_iterations_are_swept_in_one_program():
     batch = stacked([pair(seed, 80, 0.3) for seed in range(3)])
     grid = np.asarray(score_grid(Homography(), batch, threshold=[4.0, 8.0, 24.0], max_iterations=[20, 300]))
