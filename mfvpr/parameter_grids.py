@@ -17,7 +17,7 @@ import numpy as np
 from mfvpr.matching import filter_matches
 from mfvpr.numerics import available_cpus, compiled, held, holds_function, is_concrete, knows_own_context, platform
 from mfvpr.reranking import BIN_STEP, check_candidates, matched_sizes
-from mfvpr.scoring import HistogramOfShifts, on_host
+from mfvpr.scoring import HistogramOfShifts, check_host, on_host, score_pairs
 from mfvpr.scoring.parameters import fit, numbers, whole_numbers, with_parameters
 from mfvpr.types import Array, Matches
 from mfvpr.weighting import ChosenWeight, Weight, match_weights
@@ -46,6 +46,7 @@ def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> 
         raise ValueError("score_grid: expected at least one axis, such as sigma=[10.0, 22.5]")
     check_candidates(matches)
     refuse_own_names(scorer, axes)
+    check_host(scorer)
     weights = _weights(scorer, axes)
     if weights:
         scorer, axes["weight"] = replace(scorer, weight=ChosenWeight(weights, 0)), np.arange(len(weights))
@@ -129,7 +130,7 @@ def _on_host(
 
     return np.stack([
         np.stack([
-            chosen.score_pairs(near)
+            score_pairs(chosen, near)
             for chosen, near in (_weighted(with_parameters(scorer, setting), matches, one) for one in rows(weightings))
         ])
         for setting in rows(settings)

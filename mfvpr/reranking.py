@@ -12,7 +12,7 @@ import numpy as np
 
 from mfvpr.errors import InputError, require_word
 from mfvpr.numerics import as_float, compiled, is_concrete, masked, masked_mean, masked_std
-from mfvpr.scoring import Scorer, on_host
+from mfvpr.scoring import Scorer, check_host, on_host, score_pairs
 from mfvpr.scoring.parameters import fit
 from mfvpr.types import Array, Matches, Ranking, Shortlist
 
@@ -30,8 +30,9 @@ def score_candidates(scorer: Scorer, matches: Matches) -> Array:
     it must have one before (`max_bins` of the histogram).
     """
     check_candidates(matches)
+    check_host(scorer)
     if on_host(scorer):
-        return jnp.asarray(scorer.score_pairs(matches))
+        return jnp.asarray(score_pairs(scorer, matches))
     return _score_candidates(fit(scorer, *matched_sizes(matches), multiple=BIN_STEP), matches)
 
 

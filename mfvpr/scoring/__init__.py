@@ -3,6 +3,10 @@
 from collections.abc import Callable
 from typing import Any
 
+import jax
+import numpy as np
+
+from mfvpr.errors import InputError
 from mfvpr.scoring.aggregate import AggregatedScore
 from mfvpr.scoring.anchor import AnchorPoints
 from mfvpr.scoring.counting import MatchCount
@@ -24,13 +28,33 @@ Any callable will do. A class decorated with `mfvpr.value` gets more than a plai
 traced and learned, and its programs are kept. `mfvpr.testing.check_scorer` checks all of this.
 
 What JAX cannot compute, such as another library's score, has a method `score_pairs(matches) -> [P]` as well, NumPy,
-of pairs `[P, K, ...]`, by which it is scored outside of `jit`.
+of pairs `[P, K, ...]`, by which it is scored outside of `jit`; its class is a value.
 """
 
 
 def on_host(scorer: Any) -> bool:
     """Whether pairs are scored by `score_pairs`, outside of `jit`."""
     return callable(getattr(type(scorer), "score_pairs", None))
+
+
+def check_host(scorer: Any) -> None:
+    """Raise an InputError where a scorer of the host is no value: what programs hold of it has no `score_pairs`."""
+    if on_host(scorer) and jax.tree_util.all_leaves([scorer]):
+        raise InputError(f"{type(scorer).__name__}: expected a class with score_pairs that is a value; decorate it "
+                         "with @mfvpr.value")  # fmt: skip
+
+
+def score_pairs(scorer: Any, matches: Matches) -> np.ndarray:
+    """Scores `[P]` float32 of pairs `[P, K, ...]` by a scorer of the host.
+
+    Raises:
+        InputError: it gives anything but a number for each pair.
+    """
+    scores = np.asarray(scorer.score_pairs(matches), np.float32)
+    if scores.shape != (len(matches.mask),):
+        raise InputError(f"{type(scorer).__name__}.score_pairs: expected a number for each of {len(matches.mask)} "
+                         f"pairs, got an array {list(scores.shape)}")  # fmt: skip
+    return scores
 
 
 SCORERS: dict[str, type] = {
@@ -70,7 +94,9 @@ __all__ = [
     "Scorer",
     "ShiftHistogram",
     "VisualPhrases",
+    "check_host",
     "image_sizes",
     "match_shifts",
     "on_host",
+    "score_pairs",
 ]

@@ -46,7 +46,7 @@ class Homography:
         threshold: of an inlier, px of the query's image; the paper's are 8 and 24.
         max_iterations: samples, at most; degenerate ones do not count.
         confidence: RANSAC stops after so many samples that one of them was all inliers with this probability, if there
-            are as many inliers as the best model has.
+            are as many inliers as the best model has. Not above 0 or beyond 1 scores NaN, as less than 1 sample does.
         measure: `inliers` counts them; `msac` sums 1 - (error / threshold)^2 (Torr & Zisserman, CVIU 2000).
         refit: fit the best model to its inliers by least squares, and count again, as OpenCV 5 does. OpenCV 4, of the
             paper's time, refines the homography after it has counted.
@@ -77,6 +77,7 @@ class Homography:
             (points, match_confidence(matches), self.threshold, self.max_iterations, self.confidence),
         )
         threshold, max_iterations, sureness = (jnp.asarray(limit, points.dtype) for limit in limits)
+        counts = counts.astype(points.dtype)
         real = counts > 0
         if len(real) == 0:
             return Estimate(jnp.full((3, 3), jnp.nan, points.dtype), real, jnp.sum(counts), jnp.zeros((), jnp.int32))
@@ -85,8 +86,10 @@ class Homography:
         threshold = jnp.maximum(threshold, 0.0) / frame.scale[1]
         order = quads.canonical_order(masked(points, real), real)
         number = jnp.sum(real, dtype=jnp.int32)
-        search = _Search(self.measure, inside[order], counts[order], number, threshold, max_iterations, sureness)
-        model, samples = search(jax.random.key(self.seed))
+        whole = matches.confidence is None
+        search = _Search(self.measure, whole, inside[order], counts[order], number, threshold, max_iterations, sureness)
+        # Other generators draw otherwise in a batch than alone.
+        model, samples = search(jax.random.key(self.seed, impl="threefry2x32"))
         if self.refit:
             model = planes.least_squares(
                 model, masked(inside, real), masked(counts, planes.is_inlier(model, inside, threshold))
@@ -96,13 +99,15 @@ class Homography:
         few = jnp.sum(counts) if self.few == "count" else jnp.zeros_like(score)
         score = jnp.where(number == 4, jnp.sum(counts), jnp.where(number < 4, few, score))
         finite = where_finite(score, masked(points, real), counts)
-        return Estimate(frame.outside(model), inliers, jnp.where(jnp.isnan(threshold), jnp.nan, finite), samples)
+        usable = ~jnp.isnan(threshold) & (max_iterations >= 1) & (sureness > 0) & (sureness <= 1)
+        return Estimate(frame.outside(model), inliers, jnp.where(usable, finite, jnp.nan), samples)
 
 
 class _Search(NamedTuple):
     """RANSAC among matches `[K]` in the order that samples are drawn from, in the coordinates of a frame."""
 
     measure: str
+    whole: bool  # whether each match counts 1
     points: Array  # [K, 4]
     counts: Array  # [K]
     number: Array  # of real matches
@@ -121,8 +126,8 @@ class _Search(NamedTuple):
         def one_round(state: _State) -> _State:
             four, drawn = quads.accepted(self.points, key, state.round, jnp.maximum(self.number, 4))
             models, place = planes.through(four), jnp.arange(quads.ROUND, dtype=jnp.int32)
-            quality, inliers = self._compare(models)
-            quality = jnp.where((place < drawn) & (inliers > 3), quality, 0.0)
+            quality, inliers, number = self._compare(models)
+            quality = jnp.where((place < drawn) & (number > 3), quality, 0.0)
             # As one after the other: what comes after the sample where that search stops was not looked at.
             better = quality > _before(quality, state.quality)
             known = _before(masked(inliers, better), state.inliers)
@@ -147,8 +152,8 @@ class _Search(NamedTuple):
         error, limit = planes.miss(model, points, self.threshold)
         return 1.0 - error / jnp.where(limit > 0, limit, 1.0)
 
-    def _compare(self, models: Array) -> tuple[Array, Array]:
-        """(quality `[R]`, inliers `[R]`) of models `[9, R]`, each match with its count.
+    def _compare(self, models: Array) -> tuple[Array, Array, Array]:
+        """(quality `[R]`, inliers `[R]`) of models `[9, R]`, each match with its count; and the inliers' number `[R]`.
 
         Some matches at a time: all would leave the cache, and one would be a step too short.
         """
@@ -156,19 +161,21 @@ class _Search(NamedTuple):
         points = jnp.pad(self.points, (padding, (0, 0)), constant_values=jnp.nan).reshape(-1, _TOGETHER, 4)
         counts = jnp.pad(self.counts, padding).reshape(-1, _TOGETHER)
 
-        def some(step: Array, sums: tuple[Array, Array]) -> tuple[Array, Array]:
-            quality, inliers = sums
+        def some(step: Array, sums: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            quality, inliers, number = sums
             for point, count in zip(points[step], counts[step], strict=True):
                 error, limit = planes.miss(models, point, self.threshold)
                 inlier = error <= limit
                 inliers = inliers + jnp.where(inlier, count, 0.0)
+                if not self.whole:
+                    number = number + inlier.astype(number.dtype)
                 if self.measure == "msac":
                     quality = quality + jnp.where(inlier, count * (1.0 - error / jnp.where(limit > 0, limit, 1.0)), 0.0)
-            return quality, inliers
+            return quality, inliers, number
 
         none = jnp.zeros_like(models[0])
-        quality, inliers = jax.lax.fori_loop(0, len(points), some, (none, none))
-        return (inliers if self.measure == "inliers" else quality), inliers
+        quality, inliers, number = jax.lax.fori_loop(0, len(points), some, (none, none, none))
+        return inliers if self.measure == "inliers" else quality, inliers, inliers if self.whole else number
 
     def _needed(self, inliers: Array) -> Array:
         """Samples after which one of them was all inliers with the confidence, at most `max_iterations`."""

@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import numpy as np
 
-from mfvpr.declaration import check_choices, choice, number
+from mfvpr.declaration import check_bounds, check_choices, choice, number
 from mfvpr.errors import InputError
 from mfvpr.numerics import available_cpus, is_concrete
 from mfvpr.types import Array, Matches, value
@@ -38,13 +38,20 @@ class OpenCvHomography:
         check_choices(self)
 
     def __call__(self, matches: Matches) -> np.ndarray:
-        """Score of one pair, `[]` float32."""
+        """Score of one pair, `[]` float32.
+
+        Raises:
+            InputError: something is traced, or a number is beyond its bounds.
+        """
         if not is_concrete((self, matches)):
             raise InputError("homography_opencv: expected matches that neither jit nor vmap nor grad traces, since "
                              "OpenCV runs outside of JAX; call score_candidates, or take Homography")  # fmt: skip
+        check_bounds(self)  # OpenCV takes 3 px for a threshold of 0
         points = np.concatenate([matches.points1, matches.points0], axis=-1, dtype=np.float32, casting="unsafe")
         real = np.asarray(matches.mask)
         if matches.confidence is not None:
+            if np.isnan(np.asarray(matches.confidence)[real]).any():
+                return np.array(np.nan, np.float32)
             real = real & (np.asarray(matches.confidence) > 0)
         points = points[real]
         keys = points.T[::-1] if matches.index0 is None else [np.asarray(matches.index0)[real]]

@@ -81,13 +81,14 @@ def through(four: Array) -> Array:
         for value, base in zip(row, bottom, strict=True)
     ]
     size = jnp.abs(bottom[0]) + jnp.abs(bottom[1]) + jnp.abs(bottom[2])
-    return jnp.stack([*model, *bottom]) / jnp.where(size > 0, size, 1.0)[None]
+    return jnp.stack([*model, *bottom]) / size[None]  # NaN where rounding left nothing: 0 would miss nothing
 
 
 def _shares(x: Array, y: Array) -> tuple[Array, Array, Array]:
-    """l_0, l_1, l_2 of the fourth point, in one unit."""
+    """l_0, l_1, l_2 of the fourth point, in a unit in which they may be multiplied: areas may be too small."""
     _, a013, a023, a123 = areas(x, y)
-    return a123, -a023, a013
+    size = jnp.abs(a013) + jnp.abs(a023) + jnp.abs(a123)
+    return a123 / size, -a023 / size, a013 / size
 
 
 def miss(model: Array, points: Array, threshold: Array) -> tuple[Array, Array]:

@@ -15,7 +15,7 @@ from mfvpr.numerics import Device, available_cpus, compiled, held, knows_own_con
 from mfvpr.parameter_grids import score_settings
 from mfvpr.progress import Track, untracked
 from mfvpr.reranking import BIN_STEP, fuse_scales
-from mfvpr.scoring import Scorer, on_host
+from mfvpr.scoring import Scorer, check_host, on_host, score_pairs
 from mfvpr.scoring.parameters import fit
 from mfvpr.threads import ordered_map
 from mfvpr.types import Array, Matches, Shortlist
@@ -41,6 +41,8 @@ def score(
     """
     if not scorers:
         return {}
+    for scorer in scorers.values():
+        check_host(scorer)
     num_queries, sets = len(candidates.mask), scales(match_set)
     size = queries_that_fit(match_set, len(scorers))
     parts = [range(start, min(start + size, num_queries)) for start in range(0, num_queries, size)]
@@ -113,7 +115,7 @@ def fuse_all(match_set: MatchSet | Scales, scores: np.ndarray, mask: np.ndarray)
 def _score_all(matches: Matches, scorers: dict[str, Scorer]) -> dict[str, Array]:
     elsewhere = {name: scorer for name, scorer in scorers.items() if on_host(scorer)}
     scores = _in_jax(matches, {name: scorer for name, scorer in scorers.items() if name not in elsewhere})
-    return scores | {name: scorer.score_pairs(matches) for name, scorer in elsewhere.items()}
+    return scores | {name: score_pairs(scorer, matches) for name, scorer in elsewhere.items()}
 
 
 @compiled

@@ -19,12 +19,12 @@ import numpy as np
 from mfvpr import parameter_grids, reranking
 from mfvpr.data.arrays import read_arrays, write_arrays
 from mfvpr.errors import InputError
-from mfvpr.fingerprints import content_hash, recipe_of
+from mfvpr.fingerprints import content_hash
 from mfvpr.match_sets import MatchSet, Scales, queries_that_fit, scales, shapes
 from mfvpr.numerics import Device, compiled
 from mfvpr.progress import Track, untracked
 from mfvpr.reranking import FilterScore, Ties, filter_scores, indexed
-from mfvpr.scoring import on_host
+from mfvpr.scoring import check_host, on_host
 from mfvpr.sweeping.scores import PaddedBatch, all_batches, fuse_all, scored
 from mfvpr.sweeping.settings import FUSION, Group, Setting, distinct, groups
 from mfvpr.types import Array, Matches, Shortlist, per_match, per_pair
@@ -100,13 +100,14 @@ def sweep(
         queries_per_block: by default what 256 MB hold.
         folder: where finished blocks are kept, to be read instead of being computed again; None = nowhere. Blocks of
             other matches, shortlists, values or scorers, by what their code computes, may lie there as well. A scorer
-            that calls back to Python is computed anew, since nobody sees what that does.
+            that calls back to Python, or scores on the host, is computed anew: nobody sees what that does.
         devices: that share the batches of pairs; no bit of the scores depends on it. None = the one that JAX takes.
         track: progress over blocks.
 
     Returns:
         `[V, S, Q, depth]` int32 database rows, best first, -1 where there is none.
     """
+    check_host(scorer)
     names = {name for setting in settings for name in setting}
     parameter_grids.refuse_own_names(scorer, names, reserved=(*parameter_grids.WEIGHTINGS, FUSION))
     num_queries = len(candidates.mask)
@@ -239,7 +240,7 @@ def _fingerprint(part: Work, block: Group, cs: Sequence[Any]) -> str:
 def _program(work: Work, group: Group) -> str:
     """What the scorer computes of batches of these shapes: a user's code may change while its class keeps its name."""
     if on_host(group.scorer):
-        return str(recipe_of(group.scorer))
+        return "callback"
 
     def text(matches: Matches, size: int, pairs: int) -> str:
         entries, of_pair = per_match(matches).items(), per_pair(matches).items()

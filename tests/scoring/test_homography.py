@@ -177,6 +177,15 @@ def test_any_threshold_scores(threshold):
     assert np.isnan(Homography(np.nan)(pair(9, 40, 0.5)))
 
 
+@pytest.mark.parametrize("far", [1e5, 1e7, 1e9, 1e20])
+def test_far_points_do_not_make_inliers_of_the_others(far):
+    rng = np.random.default_rng(0)
+    points1, points0 = rng.uniform(0, SIZE, (2, 60, 2))
+    points0[:30] = points1[:30] + 5
+    points1[-1], points0[-1] = far, (far, -far)
+    assert float(estimate(Homography(8.0), make_matches(points0, points1)).score) <= 34
+
+
 def test_a_point_that_is_no_number_is_no_score():
     matches = pair(9, 40, 0.5)
     broken = matches.points0.copy()
@@ -192,6 +201,36 @@ def test_a_match_counts_with_its_confidence():
     assert float(Homography()(sure)) == confidence.sum()
     without = replace(matches, mask=confidence > 0, confidence=np.where(confidence > 0, 1, np.nan).astype(np.float32))
     assert float(Homography()(without)) == (confidence > 0).sum()
+
+
+def test_a_plane_counts_however_little_its_matches_do():
+    matches = replace(pair(10, 60, 1.0, noise=0.5), confidence=np.full(60, 2.0**-6, np.float32))
+    assert float(estimate(Homography(), matches).score) == 60 / 64
+
+
+def test_no_generator_of_jax_draws_otherwise_in_a_batch():
+    pairs = [pair(seed, 60, 0.2, capacity=64) for seed in range(3)]
+    expected = [float(estimate(Homography(8.0), matches).score) for matches in pairs]
+    with jax.default_prng_impl("rbg"):
+        assert [float(estimate(Homography(8.0), matches).score) for matches in pairs] == expected
+        assert score_candidates(Homography(8.0), stacked(pairs)).tolist() == expected
+
+
+@pytest.mark.parametrize(
+    "limits", [{"max_iterations": np.nan}, {"max_iterations": 0.0}, {"confidence": np.nan}, {"confidence": 1.5},
+               {"confidence": 0.0}]
+)  # fmt: skip
+def test_limits_that_are_none_score_nothing(limits):
+    assert np.isnan(estimate(Homography(**limits), pair(9, 40, 0.5)).score)
+
+
+@pytest.mark.parametrize("measure", ["inliers", "msac"])
+def test_matches_of_several_types_are_scored(measure):
+    matches, scorer = pair(9, 40, 0.5), Homography(8.0, measure=measure)
+    expected = estimate(scorer, matches).score
+    with jax.enable_x64(True):
+        found = estimate(scorer, replace(matches, distance=matches.distance.astype(np.float64))).score
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
 def test_thresholds_and_iterations_are_swept_in_one_program():

@@ -72,6 +72,19 @@ def test_jax_cannot_look_into_it(trace):
         trace(lambda points, matches: OpenCvHomography()(replace(matches, points0=points)))(points, matches)
 
 
+@pytest.mark.parametrize(
+    "wrong", [{"threshold": 0.0}, {"threshold": np.nan}, {"confidence": 1.0}, {"max_iterations": 0.0}]
+)
+def test_numbers_that_opencv_would_replace_are_refused(wrong):
+    with pytest.raises(InputError, match=f"{next(iter(wrong))}=.*: expected numbers from"):
+        score_candidates(OpenCvHomography(**wrong), BATCH)
+
+
+def test_a_confidence_that_is_no_number_is_no_score():
+    points1, points0 = POINTS[0]
+    assert np.isnan(OpenCvHomography()(make_matches(points0, points1, confidence=np.full(60, np.nan))))
+
+
 def test_few_matches_and_broken_ones():
     points1, points0 = plane_points(3, 4, 1.0)
     for count in range(4):
