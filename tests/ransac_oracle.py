@@ -43,12 +43,17 @@ def needed(share, confidence, max_iterations):
 
 def keeps_orientation(first, second):
     """Whether the triangles of four points all keep, or all change, their orientation, and none is flat."""
-    signs = []
+    first, second = first.tolist(), second.tolist()
+    signs = set()
     for triangle in itertools.combinations(range(4), 3):
-        areas = [np.cross(*(np.append(points[triangle[k]] - points[triangle[0]], 0) for k in (1, 2)))[2]
-                 for points in (first, second)]  # fmt: skip
-        signs.append(np.sign(areas[0]) * np.sign(areas[1]))
-    return abs(sum(signs)) == 4
+        turns = [area(*(points[corner] for corner in triangle)) for points in (first, second)]
+        signs.add(math.copysign(1, turns[0] * turns[1]) if all(turns) else 0)
+    return signs in ({1}, {-1})
+
+
+def area(a, b, c):
+    """Twice the signed area of a triangle."""
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
 def through(first, second):

@@ -16,7 +16,7 @@ BENCHMARKS = {
     "scores": "matching and scoring of one query with 50 candidates (15 rounds)",
     "cells": "SSM-VPR's matching and score of 50 candidates (9 rounds)",
     "homographies": "RANSAC of 50 pairs beside OpenCV's (7 rounds)",
-    "real": "all scores on the same matches of real images: recall with intervals, time per query (2 rounds)",
+    "real": "all scores on the same matches of real images: recall with intervals, time per query (1 round)",
     "sweeps": "grids of a score's parameters on cached matches (7 rounds)",
     "networks": "D2-Net, MixVPR and ALIKED (5 rounds)",
     "scale": "databases of 1,000 to 10,000 images on disk: time per query and peak memory (3 rounds)",

@@ -81,7 +81,9 @@ class Homography:
         real = counts > 0
         if len(real) == 0:
             return Estimate(jnp.full((3, 3), jnp.nan, points.dtype), real, jnp.sum(counts), jnp.zeros((), jnp.int32))
-        frame = planes.Frame.of(points, real)
+        frame = planes.Frame.of(
+            *(jnp.asarray(size, points.dtype) for size in (matches.image_size1, matches.image_size0))
+        )
         inside = masked(frame.inside(points), real, jnp.nan)  # NaN is nobody's inlier
         threshold = jnp.maximum(threshold, 0.0) / frame.scale[1]
         order = quads.canonical_order(masked(points, real), real)
@@ -129,15 +131,19 @@ class _Search(NamedTuple):
             quality, inliers, number = self._compare(models)
             quality = jnp.where((place < drawn) & (number > 3), quality, 0.0)
             # As one after the other: what comes after the sample where that search stops was not looked at.
-            better = quality > _before(quality, state.quality)
-            known = _before(masked(inliers, better), state.inliers)
+            leading = masked(inliers, quality > _before(quality, state.quality))  # of each model that was the best
+            known = _before(leading, state.inliers)
             looked = (place < drawn) & (state.samples + place < self._needed(known))
             quality = masked(quality, looked)
             best = jnp.argmax(quality)
-            chosen = state._replace(quality=quality[best], inliers=inliers[best], model=models[:, best])
-            state = jax.tree.map(lambda new, old: jnp.where(quality[best] > state.quality, new, old), chosen, state)
-            samples = state.samples + jnp.sum(looked, dtype=jnp.int32)
-            return state._replace(round=state.round + 1, samples=samples, some=drawn > 0)
+            return _State(
+                round=state.round + 1,
+                samples=state.samples + jnp.sum(looked, dtype=jnp.int32),
+                quality=jnp.maximum(quality[best], state.quality),
+                inliers=jnp.maximum(jnp.max(masked(leading, looked)), state.inliers),
+                model=jnp.where(quality[best] > state.quality, models[:, best], state.model),
+                some=drawn > 0,
+            )
 
         nothing = jnp.zeros((), dtype)
         start = jnp.zeros((), jnp.int32)
@@ -190,7 +196,7 @@ class _State(NamedTuple):
     round: Array
     samples: Array
     quality: Array
-    inliers: Array
+    inliers: Array  # the most of any model that was the best
     model: Array  # [9]
     some: Array  # whether the last round had a sample
 

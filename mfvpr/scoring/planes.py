@@ -9,7 +9,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mfvpr.numerics import masked
 from mfvpr.scoring.quads import areas
 from mfvpr.types import Array
 
@@ -19,7 +18,9 @@ _EXACT = jax.lax.Precision.HIGHEST
 
 
 class Frame(NamedTuple):
-    """Coordinates in which the real points of either image are from -1 to 1: single precision is enough there.
+    """Coordinates in which the points of an image are from -1 to 1: single precision is enough there.
+
+    Of the images' sizes, not of the points: one far outside would cost the others their digits.
 
     center: `[4]`, px; scale: `[2]`, px.
     """
@@ -28,15 +29,12 @@ class Frame(NamedTuple):
     scale: Array
 
     @classmethod
-    def of(cls, points: Array, real: Array) -> "Frame":
-        """From the smallest and largest coordinates, which no order of summing changes."""
-        low, high = (
-            reduce(masked(points, real, fill), axis=0) for reduce, fill in ((jnp.min, jnp.inf), (jnp.max, -jnp.inf))
-        )
-        some = jnp.any(real)
-        low, high = jnp.where(some, low, 0.0), jnp.where(some, high, 0.0)
-        half = jnp.max((high - low).reshape(2, 2), axis=1) / 2
-        return cls((low + high) / 2, jnp.where(half > 0, half, 1.0))
+    def of(cls, size1: Array, size0: Array) -> "Frame":
+        """Of both images' sizes `[2]`, px; what is no size moves and scales nothing."""
+        sizes = jnp.stack([size1, size0])
+        half = jnp.where(jnp.isfinite(sizes) & (sizes > 0), sizes, 0.0) / 2
+        scale = jnp.max(half, axis=1)
+        return cls(half.reshape(4), jnp.where(scale > 0, scale, 1.0))
 
     def inside(self, points: Array) -> Array:
         """`[K, 4]` px in these coordinates."""

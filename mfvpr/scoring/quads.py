@@ -25,8 +25,8 @@ def canonical_order(points: Array, real: Array) -> Array:
     code = jnp.zeros(real.shape, jnp.uint32)
     for column in range(4):
         code = _mixed(code ^ bits[:, column])
-    *_, slots = jax.lax.sort((~real, code, jnp.arange(len(real), dtype=jnp.int32)), num_keys=2, is_stable=True)
-    return slots
+    keys = ~real, code, *bits.T  # the coordinates themselves where two codes are one
+    return jax.lax.sort((*keys, jnp.arange(len(real), dtype=jnp.int32)), num_keys=len(keys))[-1]
 
 
 def draw(key: Array, round_number: Array, count: Array) -> Array:
