@@ -204,6 +204,9 @@ def check(settings: Mapping[str, Any]) -> None:
         if not rule.holds(value):
             raise SettingsError(f"{path}={_shown(value)}: expected {rule.expected}")
     _check_vocabulary(settings.get("retrieval", {}))
+    features = settings.get("features", {})
+    if features.get("name") == "ssm" and features["image_size"] is None:
+        raise SettingsError("features.image_size=null: expected width and height for features=ssm, such as [336,336]")
     if method == "grid":
         _check_cells(settings)
 

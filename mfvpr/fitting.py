@@ -16,7 +16,7 @@ from mfvpr.archive import Archive
 from mfvpr.data.arrays import read_arrays, write_arrays
 from mfvpr.data.datasets import ImageFolder
 from mfvpr.extraction import described
-from mfvpr.features.windows import WindowExtractor, WindowFitting
+from mfvpr.features.windows import WindowExtractor, WindowFitting, origin
 from mfvpr.fingerprints import fingerprint
 from mfvpr.whitening import Whitening
 
@@ -74,7 +74,7 @@ def _whitening(extractor: WindowExtractor, how: WindowFitting, database: ImageFo
             f"{name}: whitening of {learned.dimension} dimensions: {path.stat().st_size / _MB:.1f} MB in {path}"
         )
     kept = read_arrays(path, about)
-    return Whitening(kept["mean"], kept["components"])
+    return Whitening(kept["mean"], kept["components"], origin(extractor))
 
 
 def _learned(extractor: WindowExtractor, how: WindowFitting, database: ImageFolder, archive: Archive) -> Whitening:
@@ -88,4 +88,4 @@ def _learned(extractor: WindowExtractor, how: WindowFitting, database: ImageFold
                 for row, description in batch.items() if description.vector is not None
             }  # fmt: skip
 
-    return how.fit(maps(), extractor.windows, rows)
+    return replace(how.fit(maps(), extractor.windows, rows), origin=origin(extractor))

@@ -31,9 +31,9 @@ class FrameCorrelation:
     gain: float = 0.4
 
     def __post_init__(self) -> None:
-        if self.previous < 1 or not self.reach > 0 or not self.gain >= 0:
+        if self.previous < 1 or not 0 < self.reach < np.inf or not 0 <= self.gain < np.inf:
             raise InputError(f"FrameCorrelation(previous={self.previous}, reach={self.reach}, gain={self.gain}): "
-                             "expected at least one query, a reach above 0, and a gain from 0")  # fmt: skip
+                             "expected at least one query, a finite reach above 0, a finite gain from 0")  # fmt: skip
 
     def __call__(self, candidates: Shortlist, scores: np.ndarray) -> np.ndarray:
         """Scores `[Q, C]` of a sequence's candidates, NumPy float32, out of those of each query by itself.

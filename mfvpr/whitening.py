@@ -22,10 +22,12 @@ class Whitening:
     Attributes:
         mean: `[D]`.
         components: `[D', D]`, most variance first; 0 where there is none.
+        origin: hash of what makes such vectors, which no other may be whitened with; "" = any of as many numbers may.
     """
 
     mean: np.ndarray
     components: np.ndarray
+    origin: str = ""
 
     @property
     def dimension(self) -> int:

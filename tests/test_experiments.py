@@ -48,6 +48,8 @@ def test_features_of_a_named_system_may_be_replaced(features):
         (["system=ssm_vpr", "features=sift"], "scorer=grid: expected features=ssm, whose features are cells, got sift"),
         (["system=ssm_vpr", "features.image_size=[224,224]"], "scorer.side=40: expected the cells of .* 26 x 26"),
         (["system=ssm_vpr", "features.image_size=[336,320]"], "which are 40 x 38"),
+        (["system=ssm_vpr", "features.image_size=null"], "features.image_size=null: expected width and height"),
+        (["features=ssm", "features.image_size=null"], "features.image_size=null: expected width and height"),
         (["system=ssm_vpr_ras2020", "features.stride=1"], "scorer.side=25: .* 50 x 50"),
     ],
 )

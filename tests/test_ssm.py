@@ -260,6 +260,18 @@ def test_it_is_of_no_other_data_network_or_settings(model, cells, dataset, tmp_p
     assert whitening_recipe(same, how, dataset.database, archive) == recipes[0]
 
 
+def test_it_is_refused_by_other_networks_images_and_windows(cells, dataset, tmp_path):
+    learned, image = fitted(cells, dataset.database, Archive(tmp_path)), np.zeros((1, 40, 48, 3), np.uint8)
+    for change in (
+        {"model": network(1)}, {"preprocessing": "caffe"}, {"interpolation": "cv2_area"}, {"stride": 2},
+        {"image_size": (40, 48)},
+    ):  # fmt: skip
+        with pytest.raises(InputError, match="SsmCells: expected a whitening of its own network, images and windows"):
+            replace(learned, **change)(image)
+    assert len(replace(learned, batch_size=1)(image)) == 1
+    assert fitted(cells, dataset.database, Archive()).whitening.origin == learned.whitening.origin != ""
+
+
 def test_files_that_are_damaged_or_exchanged_are_refused(cells, dataset, tmp_path):
     fitted(cells, dataset.database, Archive(tmp_path))
     [path] = kept(tmp_path)

@@ -5,6 +5,7 @@ descriptor is a convolution of the map, and no windows are formed once it is kno
 """
 
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from mfvpr.errors import InputError
 from mfvpr.features import Extractor
+from mfvpr.fingerprints import fingerprint, recipe_of
 from mfvpr.numerics import free_host_bytes
 from mfvpr.types import Array
 from mfvpr.whitening import Whitening, fit_bytes, fit_whitening
@@ -142,7 +144,7 @@ def known(extractor: WindowExtractor) -> Whitening:
     """The whitening that was learned.
 
     Raises:
-        InputError: none was, or that of other windows.
+        InputError: none was, or that of other windows, or of another network or preprocessing.
     """
     who, whitening, expected = type(extractor).__name__, extractor.whitening, extractor.windows.dimension
     if not isinstance(whitening, Whitening):
@@ -150,7 +152,20 @@ def known(extractor: WindowExtractor) -> Whitening:
     if len(whitening.mean) != expected:
         raise InputError(f"{who}: expected a whitening of {expected} numbers, got one of {len(whitening.mean)}; learn "
                          "it from windows of these maps")  # fmt: skip
+    if whitening.origin and whitening.origin != origin(extractor):
+        raise InputError(f"{who}: expected a whitening of its own network, images and windows, got one that was "
+                         "learned with others; replace it by a WindowFitting")  # fmt: skip
     return whitening
+
+
+def origin(extractor: WindowExtractor) -> str:
+    """Hash of what makes the windows of an image: the network, what it is fed with, and where windows are.
+
+    "" where that has no recipe.
+    """
+    with suppress(TypeError):
+        return fingerprint(recipe_of([extractor.maps, extractor.windows]))
+    return ""
 
 
 def kernels(whitening: Whitening, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
