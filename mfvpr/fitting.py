@@ -33,7 +33,7 @@ def fitted(tool: Tool, database: ImageFolder, archive: Archive) -> Tool:
     that makes it what it is; a hash of it is part of the recipe of whatever is computed with it.
 
     Args:
-        tool: what is there already stays.
+        tool: what is learned already stays, also where somebody learned it from another database on purpose.
         database: whose images it learns from.
         archive: see `Archive`.
 
@@ -46,7 +46,7 @@ def fitted(tool: Tool, database: ImageFolder, archive: Archive) -> Tool:
         return replace(tool, whitening=learned)  # pyright: ignore[reportArgumentType, reportCallIssue, reportReturnType]
     if not is_dataclass(tool) or isinstance(tool, type):
         return tool
-    parts = {part.name: getattr(tool, part.name) for part in fields(tool)}
+    parts = {part.name: getattr(tool, part.name) for part in fields(tool) if part.init}
     learned = {name: fitted(part, database, archive) for name, part in parts.items()}
     changed = {name: part for name, part in learned.items() if part is not parts[name]}
     return replace(tool, **changed) if changed else tool

@@ -26,7 +26,10 @@ CHOICES = [
 
 @pytest.mark.parametrize(("group", "choice"), CHOICES)
 def test_every_conf_composes_and_passes_its_own_checks(group, choice):
-    paths = {"folder": ["dataset.database=a", "dataset.queries=b"], "grid": ["features=ssm"]}
+    paths = {
+        "folder": ["dataset.database=a", "dataset.queries=b"],
+        "grid": ["features=ssm", "matching.cross_check=candidate"],
+    }
     needs = paths.get(choice, ["dataset.root=r"] if choice in ("grief_season", "corridor") else [])
     programs = {"experiment": ["sweep"], "system": ["config", "sweep", "learn"], "grid": ["learn"]}
     for config in programs.get(group, ["config"]):
@@ -50,6 +53,10 @@ def test_features_of_a_named_system_may_be_replaced(features):
         (["system=ssm_vpr", "features.image_size=[336,320]"], "which are 40 x 38"),
         (["system=ssm_vpr", "features.image_size=null"], "features.image_size=null: expected width and height"),
         (["features=ssm", "features.image_size=null"], "features.image_size=null: expected width and height"),
+        (
+            ["system=ssm_vpr", "matching.cross_check=mutual"],
+            "cross_check=mutual: expected candidate, since scorer=grid",
+        ),
         (["system=ssm_vpr_ras2020", "features.stride=1"], "scorer.side=25: .* 50 x 50"),
     ],
 )
