@@ -256,8 +256,8 @@ def _check_cells(settings: Mapping[str, Any]) -> None:
     if features["name"] not in ("ssm", "import"):
         raise SettingsError(f"scorer=grid: expected features=ssm, whose features are cells, got {features['name']}")
     if (check := settings["matching"]["cross_check"]) != "candidate":
-        raise SettingsError(f"matching.cross_check={check}: expected candidate, since scorer=grid takes a match of every "
-                            "cell of the candidate")  # fmt: skip
+        raise SettingsError(f"matching.cross_check={check}: expected candidate, since scorer=grid takes a match of "
+                            "every cell of the candidate")  # fmt: skip
     if features["name"] == "ssm":
         sides = [(-(-pixels // 8) - 3) // features["stride"] + 1 for pixels in features["image_size"]]
         if sides != [side, side]:

@@ -102,7 +102,8 @@ class WhitenedSearch:
         rows = np.linspace(0, len(usable) - 1, min(len(usable), self.max_samples)).astype(int)
         sample = usable[rows].astype(np.float64)
         fitted = fit_whitening(sample, self.dimension)
-        return Whitened(Whitening(*(part.astype(np.float32) for part in (fitted.mean, fitted.components))), self.search)
+        single = Whitening(fitted.mean.astype(np.float32), fitted.components.astype(np.float32))
+        return Whitened(single, self.search)
 
     def shortlist(
         self, queries: np.ndarray, database: np.ndarray, num_candidates: int, *, excluded: Positives | None = None
