@@ -77,12 +77,14 @@ def heading(outcome: Outcome) -> str:
     queries = sum(len(sequence.images) for sequence in dataset.sequences)
     bad_queries = sum(len(one.bad_queries) for one in matched)
     bad_database = len({row for one in matched for row in one.bad_database})
+    check = settings["matching"]["cross_check"]
+    check = "" if check == "mutual" else f", cross_check={check}"
     several = f" in {len(dataset.sequences)} sequences" if len(dataset.sequences) > 1 else ""
     return (
         f"{dataset.name}: {queries} queries{several}{_skipped(bad_queries)}, "
         f"{len(dataset.database)} database images{_skipped(bad_database)}, "
         f"{_num_candidates(outcome)} candidates ({settings['retrieval']['name']}), "
-        f"{settings['features']['name']} features; {truth.in_words(settings, dataset)}"
+        f"{settings['features']['name']} features{check}; {truth.in_words(settings, dataset)}"
     )
 
 

@@ -119,7 +119,16 @@ def wrong_with(folder: ImageFolder, features: FeatureSet, bad: Mapping[int, str]
 
 
 def nan_scores(matched: Sequence[Matched], ranked: Sequence[Mapping[str, Ranked]]) -> Iterator[str]:
-    """Scorers of one's own may divide by 0."""
+    """Scorers of one's own may divide by 0.
+
+    Raises:
+        InputError: a system scores nothing but NaN, and 0 where nothing matches: its ranking would be another's.
+    """
+    for name in ranked[0]:
+        values = np.concatenate([systems[name].scores[systems[name].rows >= 0] for systems in ranked])
+        if np.isnan(values).any() and not values[~np.isnan(values)].any():
+            raise InputError(f"{name}: every score of a pair that has matches is NaN; check what the scorer expects of "
+                             "features and sizes")  # fmt: skip
     for sequence, systems in zip(matched, ranked, strict=True):
         for name, system in systems.items():
             if number := int(np.isnan(system.scores[system.rows >= 0]).sum()):

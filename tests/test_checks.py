@@ -157,9 +157,19 @@ def test_a_scorer_on_top_of_ours_scores_as_it_says(dataset):
 
 def test_scores_that_are_nan_are_told(dataset):
     lines = []
-    scorers = {"n": lambda matches: jnp.nan * jnp.sum(matches.distance)}
+    counts = [matched.matches[0].counts for matched in evaluated(dataset).matched]
+    few = float(np.median(counts[0][counts[0] > 0]))
+    scorers = {
+        "n": lambda matches: jnp.where(matches.mask.sum() > few, jnp.nan, matches.mask.sum().astype(jnp.float32))
+    }
     evaluated(dataset, scorers=scorers, archive=Archive(tell=lines.append))
     assert any("of n are NaN, and rank last" in line for line in lines)
+
+
+@pytest.mark.parametrize("scorer", [lambda matches: jnp.nan * jnp.sum(matches.distance), mfvpr.GridAnchors()])
+def test_a_scorer_of_nothing_but_nan_is_refused(dataset, scorer):
+    with pytest.raises(InputError, match="n: every score of a pair that has matches is NaN; check what"):
+        evaluated(dataset, scorers={"n": scorer})
 
 
 def test_a_ground_truth_of_other_images_is_told(dataset):

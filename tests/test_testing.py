@@ -18,6 +18,10 @@ def test_what_keeps_the_contract_passes(scorer, monkeypatch):
     check_scorer(scorer)
 
 
+def test_a_score_of_the_host_passes_as_far_as_jax_can_see():
+    check_scorer(mfvpr.OpenCvHomography())
+
+
 def test_other_images_and_seeds_pass():
     check_scorer(mfvpr.HistogramOfShifts(), image_size=(640, 480), seed=5)
 

@@ -60,7 +60,7 @@ class Homography:
     measure: str = choice("inliers", "msac")
     refit: bool = flag(False, "count again after least squares")
     few: str = choice("count", "zero", note="less than 4 matches")
-    seed: int = whole(0, "", "of the samples", bounds=(0, 2**31 - 1))
+    seed: int = whole(0, "", "of the samples", bounds=(0, 2**31 - 1), swept=False)
 
     def __post_init__(self) -> None:
         check_choices(self)
@@ -85,7 +85,7 @@ class Homography:
             *(jnp.asarray(size, points.dtype) for size in (matches.image_size1, matches.image_size0))
         )
         inside = masked(frame.inside(points), real, jnp.nan)  # NaN is nobody's inlier
-        threshold = jnp.maximum(threshold, 0.0) / frame.scale[1]
+        threshold = threshold / frame.scale[1]
         order = quads.canonical_order(masked(points, real), real)
         number = jnp.sum(real, dtype=jnp.int32)
         whole = matches.confidence is None
@@ -101,7 +101,7 @@ class Homography:
         few = jnp.sum(counts) if self.few == "count" else jnp.zeros_like(score)
         score = jnp.where(number == 4, jnp.sum(counts), jnp.where(number < 4, few, score))
         finite = where_finite(score, masked(points, real), counts)
-        usable = ~jnp.isnan(threshold) & (max_iterations >= 1) & (sureness > 0) & (sureness <= 1)
+        usable = (threshold >= 0) & (max_iterations >= 1) & (sureness > 0) & (sureness <= 1)
         return Estimate(frame.outside(model), inliers, jnp.where(usable, finite, jnp.nan), samples)
 
 

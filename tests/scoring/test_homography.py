@@ -174,10 +174,10 @@ def test_no_homography_explains_a_line_or_a_point(points1, points0):
     assert not np.asarray(found.inliers).any()
 
 
-@pytest.mark.parametrize("threshold", [0.0, -1.0, 1e-6, 1e12, np.inf])
+@pytest.mark.parametrize("threshold", [0.0, 1e-6, 1e12, np.inf])
 def test_any_threshold_scores(threshold):
     assert 0 <= score(pair(9, 40, 0.5), threshold) <= (40 if threshold > 1 else 8)
-    assert np.isnan(score(pair(9, 40, 0.5), np.nan))
+    assert np.isnan(score(pair(9, 40, 0.5), -threshold or np.nan))
 
 
 @pytest.mark.parametrize("far", [1e5, 1e7, 1e9, 1e20])
