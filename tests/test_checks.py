@@ -159,9 +159,12 @@ def test_scores_that_are_nan_are_told(dataset):
     lines = []
     counts = [matched.matches[0].counts for matched in evaluated(dataset).matched]
     few = float(np.median(counts[0][counts[0] > 0]))
-    scorers = {
-        "n": lambda matches: jnp.where(matches.mask.sum() > few, jnp.nan, matches.mask.sum().astype(jnp.float32))
-    }
+
+    def scorer(matches):
+        count = matches.mask.sum().astype(jnp.float32)
+        return jnp.where(count > few, jnp.nan, count)
+
+    scorers = {"n": scorer}
     evaluated(dataset, scorers=scorers, archive=Archive(tell=lines.append))
     assert any("of n are NaN, and rank last" in line for line in lines)
 
