@@ -65,10 +65,11 @@ def searchable(settings: dict[str, Any]) -> Axes:
 
 def learnable(settings: dict[str, Any]) -> Axes:
     """What the grid-searched rows vary, of a scorer that can be learned."""
-    method = settings["scorer"].get("method", "several")
+    method = settings["scorer"].get("method")
     known = [name for name, scorer in SCORERS.items() if can_learn(scorer)]
     if method not in known:
-        raise SettingsError(f"scorer={method}: expected one to learn, of {', '.join(known)}")
+        what = f"scorer={method}" if method else "scorer"
+        raise SettingsError(f"{what}: expected one to learn, of {', '.join(known)}")
     varied = axes(settings)
     if settings["split"] is None:
         raise SettingsError("split=null: what is learned is never reported on the same queries; expected first_half, "

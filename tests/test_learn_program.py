@@ -258,7 +258,7 @@ def test_a_loss_that_turns_infinite_is_told(root, tmp_path, monkeypatch, capsys,
         (["split=null"], "split=null: what is learned is never reported on the same queries"),
         (["scorer=count"], "scorer=count: expected one to learn, of sum, anchor, histogram"),
         (["scorer=lost"], "scorer=lost: expected one to learn, of sum, anchor, histogram"),
-        (["scorer=all"], "scorer=all: expected one to learn"),
+        (["scorer=all"], "scorer: expected one to learn"),
         (
             ["scorer=anchor", "grid.sigma=[10]"],
             "grid.sigma: scorer=anchor has no such parameter; it has num_bins, window, tolerance, ",

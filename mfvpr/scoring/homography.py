@@ -77,6 +77,7 @@ class Homography:
             (points, match_confidence(matches), self.threshold, self.max_iterations, self.confidence),
         )
         threshold, max_iterations, sureness = (jnp.asarray(limit, points.dtype) for limit in limits)
+        sureness = jnp.minimum(sureness, 1.0)  # as OpenCV
         counts = counts.astype(points.dtype)
         real = counts > 0
         if len(real) == 0:
@@ -101,7 +102,7 @@ class Homography:
         few = jnp.sum(counts) if self.few == "count" else jnp.zeros_like(score)
         score = jnp.where(number == 4, jnp.sum(counts), jnp.where(number < 4, few, score))
         finite = where_finite(score, masked(points, real), counts)
-        usable = (threshold >= 0) & (max_iterations >= 1) & (sureness > 0) & (sureness <= 1)
+        usable = (threshold >= 0) & (max_iterations >= 1) & (sureness > 0)
         return Estimate(frame.outside(model), inliers, jnp.where(usable, finite, jnp.nan), samples)
 
 

@@ -220,7 +220,7 @@ def test_no_generator_of_jax_draws_otherwise_in_a_batch():
 
 
 @pytest.mark.parametrize(
-    "limits", [{"max_iterations": np.nan}, {"max_iterations": 0.0}, {"confidence": np.nan}, {"confidence": 1.5},
+    "limits", [{"max_iterations": np.nan}, {"max_iterations": 0.0}, {"confidence": np.nan}, {"confidence": -1.0},
                {"confidence": 0.0}]
 )  # fmt: skip
 def test_limits_that_are_none_score_nothing(limits):
