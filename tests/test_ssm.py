@@ -325,17 +325,15 @@ def test_the_database_is_looked_at_once_for_all_sequences(cells, small_street, d
     archive = Archive(tmp_path, track=lambda label: labels.append(label) or (lambda items, total=None: items))
     root = small_street / "queries"
     several = sequences_dataset(small_street / "database", [root, small_street / "database"], ground_truth="none")
-    found = mfvpr.evaluate(
-        several, cells, FILTER, {"grid": GridAnchors(3), "count": mfvpr.MatchCount()}, candidates=3,
-        matching=CANDIDATE, archive=archive,
-    )  # fmt: skip
+    options = {"candidates": 3, "matching": CANDIDATE, "archive": archive}
+    found = mfvpr.evaluate(several, cells, FILTER, {"count": mfvpr.MatchCount()}, **options)
     assert labels.count("SsmCells whitening") == 1
     [first, second] = found.matched
     assert (first.matches[0].counts == 12).all()
-    # Cells are 4 x 3, no square: as many as none of 3 x 3, which is told, not scored.
-    assert all(np.isnan(ranked.scores).all() for ranked in found.systems["grid"])
     np.testing.assert_array_equal(found.systems["count"][1].scores, np.full((10, 3), 12))
     assert second.matches[0].counts.shape == (10, 3)
+    with pytest.raises(InputError, match="grid: every score of a pair that has matches is NaN"):  # of 4 x 3 cells
+        mfvpr.evaluate(several, cells, FILTER, {"grid": GridAnchors(3)}, **options)
 
 
 def test_an_image_is_found_by_itself_with_every_cell(model, dataset, tmp_path):
