@@ -123,18 +123,16 @@ def score_settings(
 def _on_host(
     scorer: Any, matches: Matches, settings: Mapping[str, Array], weightings: Mapping[str, Array]
 ) -> np.ndarray:
-    def rows(values: Mapping[str, Array]) -> list[dict[str, Any]]:
-        return [dict(zip(values, row, strict=True)) for row in zip(*map(np.asarray, values.values()), strict=True)] or [
-            {}
-        ]
+    """The same by a scorer that JAX cannot look into."""
 
-    return np.stack([
-        np.stack([
-            score_pairs(chosen, near)
-            for chosen, near in (_weighted(with_parameters(scorer, setting), matches, one) for one in rows(weightings))
-        ])
-        for setting in rows(settings)
-    ])  # fmt: skip
+    def rows(values: Mapping[str, Array]) -> list[dict[str, Any]]:
+        columns = [np.asarray(axis) for axis in values.values()]
+        return [dict(zip(values, row, strict=True)) for row in zip(*columns, strict=True)] if columns else [{}]
+
+    def score(setting: dict[str, Any], weighting: dict[str, Any]) -> np.ndarray:
+        return score_pairs(*_weighted(with_parameters(scorer, setting), matches, weighting))
+
+    return np.array([[score(setting, weighting) for weighting in rows(weightings)] for setting in rows(settings)])
 
 
 @compiled

@@ -1,17 +1,21 @@
 """Every score on the same matches of real images: recall with its interval, and what it takes per query."""
 
 import json
+import os
 import platform
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from experiments import build
 from experiments.console import tell, track
-from mfvpr import Homography, OpenCvHomography, pipeline
+from experiments.groups import defaults
+from experiments.settings import CONF
+from mfvpr import pipeline
 from mfvpr.archive import Archive
 from mfvpr.data.datasets import folder_dataset
 from mfvpr.data.files import write_text
@@ -29,32 +33,27 @@ from mfvpr.report.runs import versions
 from mfvpr.report.tables import Table
 from mfvpr.reranking import rank_shortlist
 from mfvpr.results import FILTER, Matched
-from mfvpr.scoring import SCORERS
+from mfvpr.scoring import Scorer
 from mfvpr.weights.files import load_model
 
 FOLDERS = {"grief_season": ("database", "queries"), "corridor": ("ref", "query")}
 SIZE = (336, 336)
 TOLERANCES = (1, 2, 5)  # frames
-SCORES: dict[str, Any] = {
-    **{name: SCORERS[name]() for name in ("count", "rapid", "phrases", "lost", "sum", "anchor", "histogram")},
-    "homography, 8 px": Homography(8.0),
-    "homography, 24 px": Homography(24.0),
-    "MAGSAC, 8 px": OpenCvHomography(8.0, estimator="magsac"),
-}
 
 
 def run(rounds: int | None, out: Path, data: Path | None = None) -> None:
     """Both data sets below `data`, SIFT's and ALIKED n16's matches with all images; `rounds` calls are timed."""
     if data is None:
         raise InputError(f"real: expected --data DIR, a folder that has {' and '.join(FOLDERS)}")
-    archive = Archive(build.expanded("~/.cache/mfvpr/features"), track=track, tell=tell)
+    cache = build.expanded(os.environ.get("MFVPR_CACHE") or "~/.cache/mfvpr") / "features"  # as in conf/common.yaml
+    archive, scorers = Archive(cache, track=track, tell=tell), compared()
     tables = []
     for name, (database, queries) in FOLDERS.items():
         dataset = folder_dataset(data / name / database, data / name / queries, name=name, ground_truth="order")
         for features, extractor in _extractors().items():
             filter = Retrieval(Aggregated(extractor, VladFitting()))
             matched = match_sequence(dataset, dataset.sequences[0], extractor, filter, "all", archive=archive)
-            rows = [*judged(matched, rounds or 1)]
+            rows = [*judged(matched, scorers, rounds or 1)]
             tables.append({"dataset": name, "features": features, "rows": rows})
             matches = np.mean(matched.matches[0].counts)
             print(f"\n{name}, {features}, {matches:.0f} matches a pair\n\n{_table(rows).text()}")
@@ -63,20 +62,27 @@ def run(rounds: int | None, out: Path, data: Path | None = None) -> None:
     print(f"results: {out}")
 
 
+def compared() -> dict[str, Scorer]:
+    """The scorers of `scorer=compared`, by name."""
+    group = CONF / "scorer"
+    names = [entry.partition("@")[2] for entry in defaults(group / "compared.yaml")]
+    return build.scorers({name: yaml.safe_load((group / f"{name}.yaml").read_text(encoding="utf-8")) for name in names})
+
+
 def _extractors() -> dict[str, Extractor]:
     aliked: Any = load_model("aliked-n16")
     return {"SIFT": Sift(image_size=SIZE), "ALIKED n16": AlikedFeatures(aliked, image_size=SIZE)}
 
 
-def judged(matched: Matched, rounds: int) -> Iterator[dict[str, Any]]:
+def judged(matched: Matched, scorers: Mapping[str, Scorer], rounds: int) -> Iterator[dict[str, Any]]:
     """By score: recall and its interval at every tolerance, and milliseconds per query."""
     candidates, truth = matched.candidates, matched.sequence.truth
     assert truth is not None  # of data sets whose order it is
-    for name in (FILTER, *SCORES):
+    for name in (FILTER, *scorers):
         scores, taken = candidates.scores, []
-        for _ in range(1 + rounds if name in SCORES else 0):
+        for _ in range(1 + rounds if name in scorers else 0):
             start = time.perf_counter()
-            [scores] = pipeline.score({name: SCORES[name]}, matched.by_scale, candidates).values()
+            [scores] = pipeline.score({name: scorers[name]}, matched.by_scale, candidates).values()
             taken.append((time.perf_counter() - start) / len(scores))
         rows = np.take_along_axis(candidates.indices, rank_shortlist(candidates, scores), axis=1)
         found = {tolerance: estimate(hits(rows, truth.positives(tolerance))) for tolerance in TOLERANCES}

@@ -26,7 +26,7 @@ class Estimate(NamedTuple):
     matrix: `[3, 3]` maps (x, y, 1) of the candidate to the query's, px, with 1 as its last number; NaN = there is none.
     inliers: `[K]` bool.
     score: `[]`.
-    samples: `[]` int32, how many models were compared, in whole rounds.
+    samples: `[]` int32, how many were looked at before the search stopped.
     """
 
     matrix: Array
@@ -44,9 +44,10 @@ class Homography:
 
     Attributes:
         threshold: of an inlier, px of the query's image; the paper's are 8 and 24.
-        max_iterations: samples, at most; degenerate ones do not count.
+        max_iterations: samples, at most; less than 1 scores NaN. Degenerate draws do not count, but where almost all
+            are (49 of 50), the search ends before.
         confidence: RANSAC stops after so many samples that one of them was all inliers with this probability, if there
-            are as many inliers as the best model has. Not above 0 or beyond 1 scores NaN, as less than 1 sample does.
+            are as many inliers as the best model has; from 1 it never stops early, not above 0 scores NaN.
         measure: `inliers` counts them; `msac` sums 1 - (error / threshold)^2 (Torr & Zisserman, CVIU 2000).
         refit: fit the best model to its inliers by least squares, and count again, as OpenCV 5 does. OpenCV 4, of the
             paper's time, refines the homography after it has counted.
@@ -89,8 +90,10 @@ class Homography:
         threshold = threshold / frame.scale[1]
         order = quads.canonical_order(masked(points, real), real)
         number = jnp.sum(real, dtype=jnp.int32)
-        whole = matches.confidence is None
-        search = _Search(self.measure, whole, inside[order], counts[order], number, threshold, max_iterations, sureness)
+        search = _Search(
+            self.measure, matches.confidence is None, inside[order], counts[order], number, threshold, max_iterations,
+            sureness,
+        )  # fmt: skip
         # Other generators draw otherwise in a batch than alone.
         model, samples = search(jax.random.key(self.seed, impl="threefry2x32"))
         if self.refit:
@@ -110,7 +113,7 @@ class _Search(NamedTuple):
     """RANSAC among matches `[K]` in the order that samples are drawn from, in the coordinates of a frame."""
 
     measure: str
-    whole: bool  # whether each match counts 1
+    each_counts_one: bool
     points: Array  # [K, 4]
     counts: Array  # [K]
     number: Array  # of real matches
@@ -156,8 +159,7 @@ class _Search(NamedTuple):
         """`[K]` what matches that are inliers of a model add to its quality."""
         if self.measure == "inliers":
             return jnp.ones_like(points[:, 0])
-        error, limit = planes.miss(model, points, self.threshold)
-        return 1.0 - error / jnp.where(limit > 0, limit, 1.0)
+        return _closeness(*planes.miss(model, points, self.threshold))
 
     def _compare(self, models: Array) -> tuple[Array, Array, Array]:
         """(quality `[R]`, inliers `[R]`) of models `[9, R]`, each match with its count; and the inliers' number `[R]`.
@@ -174,15 +176,15 @@ class _Search(NamedTuple):
                 error, limit = planes.miss(models, point, self.threshold)
                 inlier = error <= limit
                 inliers = inliers + jnp.where(inlier, count, 0.0)
-                if not self.whole:
+                if not self.each_counts_one:
                     number = number + inlier.astype(number.dtype)
                 if self.measure == "msac":
-                    quality = quality + jnp.where(inlier, count * (1.0 - error / jnp.where(limit > 0, limit, 1.0)), 0.0)
+                    quality = quality + jnp.where(inlier, count * _closeness(error, limit), 0.0)
             return quality, inliers, number
 
         none = jnp.zeros_like(models[0])
         quality, inliers, number = jax.lax.fori_loop(0, len(points), some, (none, none, none))
-        return inliers if self.measure == "inliers" else quality, inliers, inliers if self.whole else number
+        return inliers if self.measure == "inliers" else quality, inliers, inliers if self.each_counts_one else number
 
     def _needed(self, inliers: Array) -> Array:
         """Samples after which one of them was all inliers with the confidence, at most `max_iterations`."""
@@ -191,6 +193,11 @@ class _Search(NamedTuple):
         samples = jnp.round(jnp.log1p(-self.confidence) / jnp.where(wrong < 0, wrong, -1.0))
         samples = jnp.where(wrong < 0, jnp.minimum(samples, self.max_iterations), self.max_iterations)
         return samples.astype(jnp.int32)
+
+
+def _closeness(error: Array, limit: Array) -> Array:
+    """1 of no error, 0 of one at the threshold; both squared, and in one unit."""
+    return 1.0 - error / jnp.where(limit > 0, limit, 1.0)
 
 
 class _State(NamedTuple):

@@ -56,20 +56,10 @@ def accepted(points: Array, key: Array, round_number: Array, count: Array) -> tu
         count: real matches, at least 4.
     """
     index = jax.lax.optimization_barrier(draw(key, round_number, count))  # or each coordinate draws again
-    refused = _turn(_of(points, index))
-    number = _running_count(~refused)
+    number = _running_count(~_refused(_of(points, index)))
     chosen = jnp.searchsorted(number, jnp.arange(1, ROUND + 1, dtype=number.dtype), method="scan_unrolled")
     index = index.at[:, jnp.minimum(chosen, _DRAWN - 1)].get(mode="promise_in_bounds")
     return _of(points, index), jnp.minimum(number[-1].astype(jnp.int32), ROUND)
-
-
-def _is_flat(x: Array, y: Array) -> Array:
-    """`[S]` whether three of four points `[4, S]` of a frame lie on a line, up to the rounding of their coordinates."""
-    flat = []
-    for area, (corner, *others) in zip(areas(x, y), _TRIANGLES, strict=True):
-        sides = sum(jnp.abs(values[other] - values[corner]) for values in (x, y) for other in others)
-        flat.append(jnp.abs(area) <= _FLAT * sides)
-    return jnp.any(jnp.stack(flat), axis=0)
 
 
 def areas(x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
@@ -84,12 +74,17 @@ def _of(points: Array, index: Array) -> Array:
     return jnp.moveaxis(points.at[index].get(mode="promise_in_bounds"), 2, 0)
 
 
-def _turn(samples: Array) -> Array:
-    """`[S]` whether samples are to be refused."""
+def _refused(samples: Array) -> Array:
+    """`[S]` whether samples turn a triangle over, or have a flat one, up to the rounding of their coordinates."""
     x1, y1, x0, y0 = samples
-    agree = [first * second for first, second in zip(areas(x1, y1), areas(x0, y0), strict=True)]
-    keep, change = (jnp.all(jnp.stack([side * product > 0 for product in agree]), axis=0) for side in (1, -1))
-    return ~(keep | change) | _is_flat(x1, y1) | _is_flat(x0, y0)
+    kept, flat = [], []
+    for area1, area0, (corner, *others) in zip(areas(x1, y1), areas(x0, y0), _TRIANGLES, strict=True):
+        kept.append(area1 * area0 > 0)
+        for area, x, y in ((area1, x1, y1), (area0, x0, y0)):
+            sides = sum(jnp.abs(values[other] - values[corner]) for values in (x, y) for other in others)
+            flat.append(jnp.abs(area) <= _FLAT * sides)
+    number = jnp.sum(jnp.stack(kept), axis=0)
+    return ((number != 0) & (number != len(kept))) | jnp.any(jnp.stack(flat), axis=0)
 
 
 def _running_count(chosen: Array) -> Array:
