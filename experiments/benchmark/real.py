@@ -6,7 +6,7 @@ import platform
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import yaml
@@ -43,23 +43,28 @@ TOLERANCES = (1, 2, 5)  # frames
 
 def run(rounds: int | None, out: Path, data: Path | None = None) -> None:
     """Both data sets below `data`, SIFT's and ALIKED n16's matches with all images; `rounds` calls are timed."""
+    scorers, tables = compared(), []
+    for name, matched in matched_sets(data, "all"):
+        rows = [*judged(matched, scorers, rounds or 1)]
+        tables.append({"matches": name, "rows": rows})
+        print(f"\n{name}, {np.mean(matched.matches[0].counts):.0f} matches a pair\n\n{_table(rows).text()}")
+    machine = {"cores": available_cpus(), "processor": platform.machine()}
+    write_text(out, json.dumps({"machine": machine, "versions": versions(), "tables": tables}, indent=1) + "\n")
+    print(f"results: {out}")
+
+
+def matched_sets(data: Path | None, candidates: int | Literal["all"]) -> Iterator[tuple[str, Matched]]:
+    """(what is matched, its matches) of both data sets below `data` with both kinds of features; they are kept."""
     if data is None:
-        raise InputError(f"real: expected --data DIR, a folder that has {' and '.join(FOLDERS)}")
+        raise InputError(f"expected --data DIR, a folder that has {' and '.join(FOLDERS)}")
     cache = build.expanded(os.environ.get("MFVPR_CACHE") or "~/.cache/mfvpr") / "features"  # as in conf/common.yaml
-    archive, scorers = Archive(cache, track=track, tell=tell), compared()
-    tables = []
+    archive = Archive(cache, track=track, tell=tell)
     for name, (database, queries) in FOLDERS.items():
         dataset = folder_dataset(data / name / database, data / name / queries, name=name, ground_truth="order")
         for features, extractor in _extractors().items():
             filter = Retrieval(Aggregated(extractor, VladFitting()))
-            matched = match_sequence(dataset, dataset.sequences[0], extractor, filter, "all", archive=archive)
-            rows = [*judged(matched, scorers, rounds or 1)]
-            tables.append({"dataset": name, "features": features, "rows": rows})
-            matches = np.mean(matched.matches[0].counts)
-            print(f"\n{name}, {features}, {matches:.0f} matches a pair\n\n{_table(rows).text()}")
-    machine = {"cores": available_cpus(), "processor": platform.machine()}
-    write_text(out, json.dumps({"machine": machine, "versions": versions(), "tables": tables}, indent=1) + "\n")
-    print(f"results: {out}")
+            matched = match_sequence(dataset, dataset.only, extractor, filter, candidates, archive=archive)
+            yield f"{name}, {features}", matched
 
 
 def compared() -> dict[str, Scorer]:
