@@ -51,6 +51,9 @@ def check_request(
     for name, scorer in scorers.items():
         if name in made:
             raise InputError(f"scorers: {name} is the name of another system; choose another one")
+        if isinstance(scorer, type) or not callable(scorer):
+            got = f"the class {scorer.__name__}; write {scorer.__name__}(...)" if isinstance(scorer, type) else scorer
+            raise InputError(f"scorers: expected {name} to map Matches to a score, got {got}")
         if type(scorer) in SCORERS.values():
             check_bounds(scorer)
 

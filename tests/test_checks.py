@@ -98,6 +98,8 @@ def evaluated(dataset, extractor=SIFT, chosen=None, scorers=HISTOGRAM, **options
         ({"scorers": {"filter": mfvpr.MatchCount()}}, "filter is the name of another system"),
         ({"scorers": HISTOGRAM | {"histogram + filter": mfvpr.MatchCount()}, "fused": {"histogram": Fusion()}},
          r"histogram \+ filter is the name of another system"),
+        ({"scorers": {"h": mfvpr.MatchCount}}, r"expected h to map Matches .*, got the class MatchCount; write MatchC"),
+        ({"scorers": {"h": 5}}, "scorers: expected h to map Matches to a score, got 5"),
         ({"scorers": {"h": mfvpr.HistogramOfShifts(sigma=-1.0)}}, "sigma=-1.0: expected numbers from"),
         ({"scorers": {"v": lambda matches: matches.points0[:, 0]}}, "v: expected a number for each pair"),
         ({"matching": Matching(cross_check="x")}, "cross_check='x': expected one of"),

@@ -6,6 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special, stats
 
+from mfvpr.errors import InputError
+
 _PSEUDO_EVENTS = 1.0  # of a default autocorrelation: a path with hits only, or misses only, does not show its own
 
 
@@ -54,8 +56,13 @@ def recall_interval(hits: np.ndarray, *, level: float = 0.95) -> tuple[float, fl
 
     Returns:
         (low, high), fractions; (0, 1) without queries.
+
+    Raises:
+        InputError: hits of another rank.
     """
     hits = np.asarray(hits, bool)
+    if hits.ndim != 1:
+        raise InputError(f"hits: expected [Q], one of every query, got {list(hits.shape)}; call it for each row")
     if len(hits) == 0:
         return 0.0, 1.0
     worth = len(hits) / design_effect(hits)

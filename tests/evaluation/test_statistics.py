@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from mfvpr.errors import InputError
 from mfvpr.evaluation.statistics import design_effect, mcnemar, recall_interval
 
 
@@ -105,6 +106,11 @@ def test_the_recall_is_inside_and_misses_mirror_hits():
 
 def test_no_queries_tell_nothing():
     assert recall_interval(np.zeros(0)) == (0.0, 1.0)
+
+
+def test_hits_of_several_systems_are_told():
+    with pytest.raises(InputError, match=r"hits: expected \[Q\], one of every query, got \[2, 5\]"):
+        recall_interval(np.ones((2, 5), bool))
 
 
 @pytest.mark.parametrize(("only_first", "only_second"), [(0, 0), (1, 0), (3, 3), (9, 2), (2, 9), (0, 12)])
