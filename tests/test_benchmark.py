@@ -11,6 +11,8 @@ import pytest
 
 from experiments.benchmark.__main__ import BENCHMARKS
 from mfvpr.features import Description
+from mfvpr.features.sift import Sift
+from mfvpr.scoring import MatchCount
 
 ROOT = Path(__file__).parent.parent
 
@@ -151,3 +153,67 @@ def test_cells_are_matched_and_scored_as_by_the_public_program(monkeypatch):
     np.testing.assert_array_equal(ours.index0, theirs)
     np.testing.assert_array_equal(results["score", "mfvpr"], results["score", "NumPy, patch by patch"])
     assert (np.asarray(results["score", "mfvpr"]) > 100).all()
+
+
+def test_every_ransac_counts_the_plane(monkeypatch):
+    from experiments.benchmark import homographies
+
+    for name, value in {"PAIRS": 3, "SHARES": (0.6,), "THRESHOLDS": (8.0,)}.items():
+        monkeypatch.setattr(homographies, name, value)
+    counts = {who: np.asarray(run()) for _, who, run in homographies.entries()}
+    assert len(counts) == 5
+    on_plane = 0.6 * homographies.MATCHES
+    for found in counts.values():
+        assert (np.abs(found - on_plane) < 0.1 * on_plane).all()
+    np.testing.assert_array_equal(counts["OpenCV RANSAC"], counts["OpenCV RANSAC, on threads"])
+
+
+@pytest.fixture
+def two_places(small_street, tmp_path, monkeypatch):
+    """The folders that real images are expected in, and one kind of features."""
+    from experiments.benchmark import real
+
+    for name, (database, queries) in real.FOLDERS.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / database).symlink_to(small_street / "database")
+        (tmp_path / name / queries).symlink_to(small_street / "queries")
+    monkeypatch.setattr(real, "_extractors", lambda: {"SIFT": Sift(image_size=(160, 120), max_keypoints=100)})
+    return tmp_path
+
+
+def test_all_scores_are_judged_on_the_same_matches(two_places, monkeypatch, capsys):
+    from experiments.benchmark import real
+
+    assert {"histogram", "anchor", "sum", "count", "homography_8"} <= real.compared().keys()
+    monkeypatch.setattr(real, "compared", lambda: {"count": MatchCount()})
+    real.run(None, two_places / "out.json", two_places)
+    tables = json.loads((two_places / "out.json").read_text())["tables"]
+    assert [table["matches"] for table in tables] == ["grief_season, SIFT", "corridor, SIFT"]
+    for table in tables:
+        by_score = {row["score"]: row for row in table["rows"]}
+        assert by_score["filter"]["ms_per_query"] is None
+        assert by_score["count"]["ms_per_query"] > 0
+        for row in by_score.values():
+            recalls = [row["recall"][str(tolerance)]["recall"] for tolerance in real.TOLERANCES]
+            assert recalls == sorted(recalls)
+    assert "R@1 ±2" in capsys.readouterr().out
+
+
+def test_ransac_beside_opencv_s_is_pooled_over_places(two_places, monkeypatch, capsys):
+    from experiments.benchmark import agreement
+
+    monkeypatch.setattr(agreement, "THRESHOLDS", (8.0,))
+    agreement.run(2, two_places / "out.json", two_places)
+    rows = json.loads((two_places / "out.json").read_text())["rows"]
+    assert [(row["matches"], row["queries"], len(row["mfvpr"])) for row in rows] == [
+        ("grief_season, SIFT", 10, 2), ("corridor, SIFT", 10, 2),
+    ]  # fmt: skip
+    for row in rows:
+        low, middle, high = row["difference"]
+        assert low <= middle <= high
+        assert -2 <= middle <= 2
+        assert 0 <= row["opencv"] <= row["queries"]
+    [both] = agreement.pooled(rows)
+    assert both["queries"] == 20
+    assert both["mfvpr"] == [2 * right for right in rows[0]["mfvpr"]]
+    assert "all, SIFT, 8 px" in capsys.readouterr().out

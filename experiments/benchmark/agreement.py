@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from experiments.benchmark.real import matched_sets
+from experiments.console import track
 from mfvpr import Homography, OpenCvHomography, pipeline
 from mfvpr.data.files import write_text
 from mfvpr.evaluation import hits
@@ -36,10 +37,9 @@ def compared(name: str, matched: Matched, seeds: int) -> Iterator[dict[str, Any]
     for threshold in THRESHOLDS:
         plain = Homography(threshold)
         refit = replace(plain, refit=True)  # counts what OpenCV 5 counts: inliers of the last least squares
-        opencv, fitted, *ours = (
-            _scores(matched, one)
-            for one in (OpenCvHomography(threshold), refit, *(replace(plain, seed=seed) for seed in range(seeds)))
-        )
+        scorers = {"OpenCV": OpenCvHomography(threshold), "refit": refit}
+        scorers |= {f"seed {seed}": replace(plain, seed=seed) for seed in range(seeds)}
+        opencv, fitted, *ours = (_scores(matched, f"{threshold:g} px, {who}", one) for who, one in scorers.items())
         found = matched.candidates.mask
         difference, allowed = (fitted - opencv)[found], np.maximum(2, 0.05 * opencv[found])
         yield {
@@ -61,8 +61,9 @@ def pooled(rows: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
         yield {"matches": f"all, {features}", "threshold": threshold, **summed, "mfvpr": by_seed}
 
 
-def _scores(matched: Matched, scorer: Scorer) -> np.ndarray:
-    return pipeline.score({"homography": scorer}, matched.by_scale, matched.candidates)["homography"]
+def _scores(matched: Matched, label: str, scorer: Scorer) -> np.ndarray:
+    [scores] = pipeline.score({label: scorer}, matched.by_scale, matched.candidates, track=track(label)).values()
+    return scores
 
 
 def _right(matched: Matched, scores: np.ndarray) -> int:
