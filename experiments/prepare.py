@@ -88,13 +88,11 @@ def _images(settings: dict[str, Any], archive: Archive) -> Images:
     return images
 
 
-def matched(
-    settings: dict[str, Any], tools: Tools, images: Images, watch: Stopwatch, *, with_ratio: bool = False
-) -> tuple[MatchSet, Shortlist]:
+def matched(settings: dict[str, Any], tools: Tools, images: Images, watch: Stopwatch) -> tuple[MatchSet, Shortlist]:
     """Matches and shortlist of the only sequence, from their store where they are all there."""
     result = match_sequence(
         images.dataset, images.dataset.only, tools.extractor, tools.filter, settings["candidates"],
-        matching=tools.matching, archive=tools.archive, watch=watch, with_ratio=with_ratio, **tools.where,
+        matching=tools.matching, archive=tools.archive, watch=watch, **tools.where,
     )  # fmt: skip
     return result.matches[0], result.candidates
 

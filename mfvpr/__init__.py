@@ -34,7 +34,14 @@ from mfvpr.scoring import (
 )
 from mfvpr.soft_matching import soft_match
 from mfvpr.types import Features, Matches, Ranking, Shortlist, value
-from mfvpr.weighting import DescriptorDistanceWeight, FeatureScoreWeight, UnitWeight, Weight, match_weights
+from mfvpr.weighting import (
+    DescriptorDistanceWeight,
+    FeatureScoreWeight,
+    RatioWeight,
+    UnitWeight,
+    Weight,
+    match_weights,
+)
 
 if TYPE_CHECKING:
     from mfvpr.evaluations import evaluate
@@ -57,6 +64,7 @@ __all__ = [
     "OpenCvHomography",
     "Ranking",
     "RapidSpatialScore",
+    "RatioWeight",
     "Scorer",
     "ShiftHistogram",
     "Shortlist",

@@ -130,7 +130,6 @@ def match_sequence(
     matching: Matching = Matching(),
     archive: Archive | None = None,
     watch: Stopwatch | None = None,
-    with_ratio: bool = False,
     **where: Any,
 ) -> Matched:
     """Candidates and matches of one sequence's queries; features of no other database images than candidates are taken.
@@ -146,7 +145,6 @@ def match_sequence(
         matching: see there.
         archive: see there.
         watch: gets the seconds of the stages.
-        with_ratio: see `mfvpr.match`; matches that are kept always have the ratio.
         **where: `memory` and `devices` of `pipeline.match`.
     """
     check_matching(candidates, extractor, matching.cross_check)
@@ -168,7 +166,7 @@ def match_sequence(
         with watch("features"):
             sides, bad = _features(dataset, sequence, extractor, filtered, archive)
         _remark(stores, archive, bad)
-        options = {**asdict(matching), "with_ratio": with_ratio, "track": archive.track("matching"), **where}
+        options = {**asdict(matching), "track": archive.track("matching"), **where}
         with watch("matching"):
             matches = tuple(
                 pipeline.match(*scale, filtered.candidates, store=store, **options)

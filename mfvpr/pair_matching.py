@@ -81,7 +81,6 @@ def matched(
     *,
     memory: float | None,
     devices: Sequence[Device],
-    with_ratio: bool,
     **options: Any,
 ) -> Iterator[tuple[int, QueryMatches]]:
     """(row, all of that query), in their order, NumPy.
@@ -93,8 +92,7 @@ def matched(
         todo: rows of the queries that are to be matched.
         memory: GB for features of the database, see `sources.memory_budget`.
         devices: that share the queries.
-        with_ratio: see `match_pairs`.
-        **options: likewise.
+        **options: see `match_pairs`; the ratio is always there.
     """
     indices, scores = np.asarray(candidates.indices), np.asarray(candidates.scores)
     counts0, counts1, rows = queries.counts, database.counts, np.asarray(todo, int)
@@ -112,7 +110,7 @@ def matched(
     staged = ordered_map(lambda part: (part, sides[part.device].stage(part)), parts, workers=1)
     for step in itertools.chain(staged, [None]):
         if step is not None:
-            begun.append((step[0], sides[step[0].device].begin(step[1], with_ratio=with_ratio, **options)))
+            begun.append((step[0], sides[step[0].device].begin(step[1], with_ratio=True, **options)))
         while len(begun) > (0 if step is None else len(devices)):
             part, calls = begun.popleft()
             for call in calls:
@@ -120,7 +118,7 @@ def matched(
             for query in part.ends.tolist():
                 of_query = [pairs.pop((query, place), None) for place in range(indices.shape[1])]
                 keypoints = np.where(indices[query] >= 0, counts1[indices[query]], 0).astype(np.int32)
-                matches = _joined(of_query, with_ratio)
+                matches = _joined(of_query)
                 matches = replace(matches, count0=counts0[query].astype(np.int32), count1=keypoints)
                 counts = np.array([0 if pair is None else len(pair.matches["index0"]) for pair in of_query], np.int32)
                 yield query, QueryMatches(matches, counts, indices[query], scores[query])
@@ -149,10 +147,10 @@ def _collected(part: Part, members: np.ndarray, matches: Matches) -> Iterator[tu
         yield (query, place), Pair(row, *sizes)
 
 
-def _joined(pairs: Sequence[Pair | None], with_ratio: bool) -> Matches:
+def _joined(pairs: Sequence[Pair | None]) -> Matches:
     """All candidates' matches, one after the other; an image that was not matched is of 1 x 1 px, as nobody looks."""
     some = [pair for pair in pairs if pair is not None]
-    rows = ragged.joined([pair.matches for pair in some] or [_nothing(with_ratio)])
+    rows = ragged.joined([pair.matches for pair in some] or [_nothing()])
     unknown = np.ones(2, np.float32)
     return Matches(
         **rows,
@@ -162,9 +160,8 @@ def _joined(pairs: Sequence[Pair | None], with_ratio: bool) -> Matches:
     )
 
 
-def _nothing(with_ratio: bool) -> Row:
+def _nothing() -> Row:
     """The entries of no match."""
     points, numbers, rows = np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros(0, np.int32)
-    ratio = {"ratio": numbers} if with_ratio else {}
-    scalars = {"distance": numbers, "scores0": numbers, "scores1": numbers}
-    return {"points0": points, "points1": points, "index0": rows, "index1": rows} | scalars | ratio
+    scalars = dict.fromkeys(("distance", "ratio", "scores0", "scores1"), numbers)
+    return {"points0": points, "points1": points, "index0": rows, "index1": rows} | scalars

@@ -42,13 +42,12 @@ def match(
     max_distance: float | None = None,
     max_matches: int | None = None,
     chunk_size: int | None = None,
-    with_ratio: bool = False,
     memory: float | None = None,
     devices: Sequence[Device] | None = None,
     store: MatchStore | None = None,
     track: Track = untracked,
 ) -> MatchSet:
-    """Matches of every query with its candidates.
+    """Matches of every query with its candidates, with their ratio: weights may ask for it.
 
     Args:
         queries: Q images.
@@ -58,7 +57,6 @@ def match(
         max_distance: see there.
         max_matches: see there.
         chunk_size: see there.
-        with_ratio: see there; a store always has the ratio.
         memory: GB that features of the database may take on the devices, and, of a store, the matches in memory; None
             = a third of what is free.
         devices: that share the queries; None = the one that JAX takes.
@@ -78,12 +76,12 @@ def match(
         max_matches=max_matches, memory=memory, devices=devices or [device_of(())], chunk_size=chunk_size,
     )  # fmt: skip
     if store is None:
-        rows = [row for _, row in track(made(range(len(queries)), with_ratio=with_ratio), len(queries))]
+        rows = [row for _, row in track(made(range(len(queries))), len(queries))]
         return MatchSet.of([row.matches for row in rows], np.array([row.counts for row in rows]))
     if missing := np.flatnonzero(~store.done).tolist():
         before = {query: row.indices for query, row in store.read()}
         _require_same(store, candidates, before)  # then nothing is written
-        tracked = iter(track(made(missing, with_ratio=True), len(missing)))
+        tracked = iter(track(made(missing), len(missing)))
         while batch := dict(itertools.islice(tracked, STORE_BATCH)):
             store.write(batch)
     match_set, listed = stored_matches(store, memory=memory)

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 
+from mfvpr.errors import InputError
 from mfvpr.numerics import as_float, at_least_single, masked
 from mfvpr.types import INDICES, Array, Matches, per_match, value
 
@@ -28,6 +29,30 @@ class DescriptorDistanceWeight:
 
     def __call__(self, matches: Matches) -> Array:
         return 2.0 - matches.distance
+
+
+@value
+class RatioWeight:
+    """w = (1 - ratio)^exponent, in [0, 1], of the ratio of distances to the nearest and the second nearest descriptor.
+
+    The ratio is how ambiguous a match is (Lowe, IJCV 2004, section 7.1): a keypoint that resembles two of the
+    candidate's as much counts nothing. It is not the paper's.
+
+    Attributes:
+        exponent: 1 is as good as others; larger ones count clear matches more.
+    """
+
+    exponent: float | Array = 1.0
+
+    def __call__(self, matches: Matches) -> Array:
+        """`[K]`.
+
+        Raises:
+            InputError: the matches have no ratio.
+        """
+        lead = jnp.maximum(1.0 - match_ratio(matches), 0.0)
+        none = lead <= 0  # where the power's derivatives are infinite
+        return jnp.where(none, 0.0, jnp.where(none, 1.0, lead) ** jnp.asarray(self.exponent, lead.dtype))
 
 
 @value
@@ -52,6 +77,7 @@ class ChosenWeight:
 WEIGHTS: dict[str, Weight] = {
     "fs": FeatureScoreWeight(),
     "dmf": DescriptorDistanceWeight(),
+    "ratio": RatioWeight(),
     "unit": UnitWeight(),
 }
 
@@ -65,6 +91,17 @@ def match_weights(weight: Weight, matches: Matches) -> Array:
     }
     weights = masked(at_least_single(weight(replace(matches, **clean))), matches.mask)
     return weights if matches.confidence is None else weights * match_confidence(matches)
+
+
+def match_ratio(matches: Matches) -> Array:
+    """`[..., K]` the matches' ratio.
+
+    Raises:
+        InputError: they have none.
+    """
+    if matches.ratio is None:
+        raise InputError("expected matches with a ratio, got none; match them with_ratio=True")
+    return as_float(matches.ratio)
 
 
 def match_confidence(matches: Matches) -> Array:

@@ -81,6 +81,11 @@ def dmf_weight(distance):
     return np.array([2.0 - d for d in _values(distance)], np.float64)
 
 
+def ratio_weight(ratio, exponent=1):
+    """w = (1 - ratio)^exponent."""
+    return np.array([(1.0 - r) ** exponent for r in _values(ratio)], np.float64)
+
+
 # --- histogram of shifts ------------------------------------------------------------------------------------
 
 

@@ -109,12 +109,12 @@ def assert_same(one, other):
     "options",
     [
         {},
-        {"with_ratio": True, "cross_check": "none"},
+        {"cross_check": "none"},
         {"max_distance": 0.6, "max_matches": 7},
         {"cross_check": "opencv_legacy", "chunk_size": 3},
-        {"cross_check": "candidate", "with_ratio": True},
+        {"cross_check": "candidate"},
     ],
-    ids=["mutual", "ratio", "filtered", "chunks", "candidate"],
+    ids=["mutual", "none", "filtered", "chunks", "candidate"],
 )
 @pytest.mark.parametrize("memory", [None, SMALL], ids=["all fits", "few slots"])
 def test_every_pair_is_matched_as_alone(options, memory):
@@ -259,7 +259,7 @@ def test_eight_devices_give_what_one_gives(tmp_path):
 
 @pytest.fixture(scope="module")
 def match_set():
-    return pipeline.match(*sets(), shortlist_of(), with_ratio=True)
+    return pipeline.match(*sets(), shortlist_of())
 
 
 def test_a_querys_matches_are_padded_to_the_capacity(match_set):
@@ -331,7 +331,7 @@ def test_some_queries_are_matched_as_all_of_them():
     database = FeatureSet.of([make_features(rng, count) for count in (30, 25, 300, 220)])
     indices = np.array([[0, 1], [2, 3], [3, 2]], np.int32)
     listed = Shortlist(indices, np.zeros(indices.shape, np.float32), indices >= 0)
-    options = {"memory": None, "devices": jax.local_devices()[:1], "with_ratio": True}
+    options = {"memory": None, "devices": jax.local_devices()[:1]}
     sizes, call = [], pair_matching.match_pairs
 
     def counted(first, second, *rest, **more):

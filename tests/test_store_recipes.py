@@ -78,21 +78,19 @@ def test_another_shortlist_is_refused_before_anything_is_written(drawn, candidat
     with opened() as store:
         assert_same(
             pipeline.match(drawn, drawn, candidates, store=store),
-            pipeline.match(drawn, drawn, candidates, with_ratio=True),
+            pipeline.match(drawn, drawn, candidates),
         )
         np.testing.assert_array_equal(pipeline.stored_matches(store)[1].indices, candidates.indices)
 
 
 def test_matching_without_a_store_is_the_same(drawn, candidates, opened):
-    """To the last bit; the ratio where it is asked for."""
+    """To the last bit, the ratio included."""
     plain = pipeline.match(drawn, drawn, candidates)
-    assert plain.matches[0].ratio is None
-    asked = pipeline.match(drawn, drawn, candidates, with_ratio=True)
+    assert plain.matches[0].ratio is not None
     for _ in range(2):
         with opened() as store:
             kept = pipeline.match(drawn, drawn, candidates, store=store)
-        assert_same(kept, asked)
-        assert_same(kept, plain, ratio=False)
+        assert_same(kept, plain)
 
 
 # The programs' stores

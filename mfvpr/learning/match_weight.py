@@ -8,6 +8,7 @@ import numpy as np
 
 from mfvpr.numerics import as_float, masked
 from mfvpr.types import Array, Matches, value
+from mfvpr.weighting import match_ratio
 
 FEATURE_NAMES = ("scores0", "scores1", "distance", "ratio", "x0", "y0", "x1", "y1")
 _UNIT_BIAS = math.log(math.e - 1)  # softplus of it is 1
@@ -46,7 +47,7 @@ class LearnedWeight:
             hidden: H.
 
         Raises:
-            ValueError: the matches have no ratio.
+            InputError: the matches have no ratio.
         """
         real = np.asarray(jax.jit(_raw_inputs)(matches), np.float64)[np.asarray(matches.mask)]
         shape = (len(FEATURE_NAMES), hidden)
@@ -65,7 +66,7 @@ class LearnedWeight:
         """`[K]` weights of one pair; finite on padding.
 
         Raises:
-            ValueError: the matches have no ratio.
+            InputError: the matches have no ratio.
         """
         exact = jax.lax.Precision.HIGHEST
         hidden = jnp.tanh(jnp.matmul(self.inputs(matches), self.hidden, precision=exact) + self.hidden_bias[None])
@@ -79,7 +80,7 @@ class LearnedWeight:
         standardization.
 
         Raises:
-            ValueError: the matches have no ratio.
+            InputError: the matches have no ratio.
         """
         center, scale = jax.lax.stop_gradient((jnp.asarray(self.center), jnp.asarray(self.scale)))
         return (_raw_inputs(matches) - center[None]) / scale[None]
@@ -87,9 +88,7 @@ class LearnedWeight:
 
 def _raw_inputs(matches: Matches) -> Array:
     """`[..., K, F]`; 0 on padding."""
-    if matches.ratio is None:
-        raise ValueError("LearnedWeight: expected matches with a ratio, got none; match them with_ratio=True")
-    columns = (matches.scores0, matches.scores1, matches.distance, matches.ratio)
+    columns = (matches.scores0, matches.scores1, matches.distance, match_ratio(matches))
     scalars = jnp.stack([masked(as_float(column), matches.mask) for column in columns], axis=-1)
     places0 = _places(matches.points0, matches.image_size0, matches.mask)
     places1 = _places(matches.points1, matches.image_size1, matches.mask)

@@ -16,6 +16,7 @@ from mfvpr import (
     HistogramOfShifts,
     Homography,
     MatchCount,
+    RatioWeight,
     UnitWeight,
     score_candidates,
     score_grid,
@@ -202,13 +203,14 @@ def test_a_function_that_changes_is_not_taken_for_what_it_was():
 
 
 @pytest.mark.parametrize("broken", [np.nan, np.inf])
-@pytest.mark.parametrize("field", ["points1", "scores0", "distance"])
+@pytest.mark.parametrize("field", ["points1", "scores0", "distance", "ratio"])
 def test_one_match_that_is_no_number_leaves_no_score(field, broken):
     """Whoever asks: for one pair, in a batch, and in a grid; else such a pair would rank somewhere."""
     pair = random_matches(np.random.default_rng(15), 20, capacity=24)
     getattr(pair, field)[3] = broken
     batch = stack([pair, random_matches(np.random.default_rng(16), 20, capacity=24)])
-    weight = DescriptorDistanceWeight() if field == "distance" else FeatureScoreWeight()
+    weights = {"distance": DescriptorDistanceWeight(), "ratio": RatioWeight()}
+    weight = weights.get(field, FeatureScoreWeight())
     few, many = AnchorPoints(weight=weight), AnchorPoints(num_bins=3, weight=weight)
     for scorer, axis in (
         (HistogramOfShifts(weight=weight), {"sigma": [22.5]}),

@@ -15,6 +15,7 @@ from mfvpr import (
     LostScore,
     MatchCount,
     RapidSpatialScore,
+    RatioWeight,
     VisualPhrases,
     soft_match,
 )
@@ -24,6 +25,7 @@ HARD = [
     HistogramOfShifts(bin_size=20.0, max_bins=36),
     HistogramOfShifts(bin_size=17.0, sigma=300.0, sigma_is_variance=True, shift_range=(100.0, 50.0), max_bins=14),
     HistogramOfShifts(bin_size=20.0, align="zero_center", weight=DescriptorDistanceWeight(), max_bins=36),
+    HistogramOfShifts(bin_size=20.0, weight=RatioWeight(1.5), max_bins=36),
     AnchorPoints(6, 4.0, 2.5),
     AnchorPoints(6, 4.0, 2.5, first="candidate", cell_weight="cell_sum", include_self=False),
     AggregatedScore(),
@@ -35,12 +37,12 @@ SOFT = [
     replace(HARD[0], temperature=0.3),
     replace(HARD[1], temperature=0.05),
     replace(HARD[2], temperature=0.5),
-    replace(HARD[3], temperature=0.1),
-    replace(HARD[4], temperature=0.5),
-    replace(HARD[3], temperature=1.5, cell_weight="ones", weight=DescriptorDistanceWeight()),
-    replace(HARD[5], temperature=20.0),
-    replace(HARD[6], temperature=5.0),
-    replace(HARD[7], temperature=20.0),
+    replace(HARD[4], temperature=0.1),
+    replace(HARD[5], temperature=0.5),
+    replace(HARD[4], temperature=1.5, cell_weight="ones", weight=DescriptorDistanceWeight()),
+    replace(HARD[6], temperature=20.0),
+    replace(HARD[7], temperature=5.0),
+    replace(HARD[8], temperature=20.0),
 ]
 RELATIVES = [
     RapidSpatialScore(),
@@ -52,8 +54,8 @@ RELATIVES = [
     LostScore(form="unweighted", mirrored=True),
     LostScore(form="described"),
 ]
-NUMBERS = ("bin_size", "sigma", "tolerance", "temperature")  # not the window, which moves whole cells
-PER_MATCH = ("points0", "points1", "distance", "scores0", "scores1", "confidence")
+NUMBERS = ("bin_size", "sigma", "tolerance", "temperature", "weight")  # not the window, which moves whole cells
+PER_MATCH = ("points0", "points1", "distance", "scores0", "scores1", "ratio", "confidence")
 PER_KEYPOINT = ("keypoints", "descriptors", "scores")
 
 
@@ -117,22 +119,32 @@ def test_gradients_through_soft_matching_are_central_differences():
             check_gradients(total, (jnp.asarray(temperature), *fields), rng)
 
 
-COLD = [replace(HARD[0], temperature=1e-4), replace(HARD[3], temperature=1e-3), replace(HARD[6], temperature=1e-4)]
+COLD = [replace(HARD[0], temperature=1e-4), replace(HARD[4], temperature=1e-3), replace(HARD[7], temperature=1e-4)]
 gradients = jax.jit(
     jax.value_and_grad(lambda scorer, rows, matches: scorer(replace(matches, **rows)), argnums=(0, 1)),
 )
 
 
-@named(HARD[3:8] + SOFT[5:6] + SOFT[8:] + COLD + RELATIVES)  # cold or warm, it is the same program
+@named(HARD[3:9] + SOFT[5:6] + SOFT[8:] + COLD + RELATIVES)  # cold or warm, it is the same program
 def test_degenerate_pairs_have_finite_gradients(scorer):
     """Empty, single, all alike, at a corner, without any weight or confidence; in single precision, beside NaN."""
-    corner = {"distance": [0.0] * 4, "scores0": [0.0] * 4, "scores1": [0.0] * 4, "confidence": [0.0] * 4}
+    corner = {
+        "distance": [0.0] * 4,
+        "ratio": [1.0] * 4,
+        "scores0": [0.0] * 4,
+        "scores1": [0.0] * 4,
+        "confidence": [0.0] * 4,
+    }
     pairs = [
-        make_matches([], [], capacity=6, confidence=[]),
-        make_matches([[20, 30]], [[20, 30]], capacity=6, distance=[0.0], confidence=[1.0]),
-        make_matches([[20, 30]] * 4, [[50, 60]] * 4, capacity=6, distance=[0.0] * 4, confidence=[1.0] * 4),
+        make_matches([], [], capacity=6, confidence=[], ratio=[]),
+        make_matches([[20, 30]], [[20, 30]], capacity=6, distance=[0.0], confidence=[1.0], ratio=[0.0]),
+        make_matches(
+            [[20, 30]] * 4, [[50, 60]] * 4, capacity=6, distance=[0.0] * 4, confidence=[1.0] * 4, ratio=[1.0] * 4
+        ),
         make_matches([[0, 0], [SIZE, SIZE]] * 2, [[SIZE, SIZE], [0, 0]] * 2, capacity=6, **corner),
-        make_matches([[0, 0], [SIZE, SIZE]] * 2, [[SIZE, SIZE], [0, 0]] * 2, capacity=6, confidence=[1e-12] * 4),
+        make_matches(
+            [[0, 0], [SIZE, SIZE]] * 2, [[SIZE, SIZE], [0, 0]] * 2, capacity=6, confidence=[1e-12] * 4, ratio=[0.5] * 4
+        ),
     ]
     for matches in pairs:
         value, found = gradients(jax.tree.map(float, scorer), chosen(matches, PER_MATCH), matches)

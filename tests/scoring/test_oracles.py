@@ -15,15 +15,18 @@ from mfvpr import (
     FeatureScoreWeight,
     HistogramOfShifts,
     MatchCount,
+    RatioWeight,
     UnitWeight,
 )
 from tests import oracles
 from tests.builders import make_matches, random_matches, real
 
 WEIGHTS = {
-    "fs": (FeatureScoreWeight(), lambda d, s0, s1: oracles.fs_weight(s0, s1)),
-    "dmf": (DescriptorDistanceWeight(), lambda d, s0, s1: oracles.dmf_weight(d)),
-    "unit": (UnitWeight(), lambda d, s0, s1: np.ones(len(d))),
+    "fs": (FeatureScoreWeight(), lambda d, s0, s1, r: oracles.fs_weight(s0, s1)),
+    "dmf": (DescriptorDistanceWeight(), lambda d, s0, s1, r: oracles.dmf_weight(d)),
+    "ratio": (RatioWeight(), lambda d, s0, s1, r: oracles.ratio_weight(r)),
+    "ratio, squared": (RatioWeight(2.0), lambda d, s0, s1, r: oracles.ratio_weight(r, 2)),
+    "unit": (UnitWeight(), lambda d, s0, s1, r: np.ones(len(d))),
 }
 dominant_shift = jax.jit(HistogramOfShifts.dominant_shift, static_argnames="refine")
 CAPACITY = 41  # bins along an axis that all examples need: one shape of arrays for all of them
@@ -40,7 +43,7 @@ def pairs(draw):
     if draw(st.booleans()):  # ties: few places, equal weights
         for points in (matches.points0, matches.points1):
             points[mask] = rng.integers(0, 4, (mask.sum(), 2)) * 42 + 21.0
-        for values in (matches.distance, matches.scores0, matches.scores1):
+        for values in (matches.distance, matches.scores0, matches.scores1, matches.ratio):
             values[mask] = 0.5
     if draw(st.booleans()):  # duplicates
         matches.points0[mask] = matches.points0[0]
@@ -57,8 +60,9 @@ def oracle_inputs(matches, weight):
     """Points and weights of the matches with any confidence: one of confidence 0 is none."""
     points0, points1, distance, scores0, scores1 = real(matches)
     confidence = certainty(matches)
+    ratio = None if matches.ratio is None else matches.ratio[matches.mask].astype(float)
     some = confidence > 0
-    return points0[some], points1[some], (WEIGHTS[weight][1](distance, scores0, scores1) * confidence)[some]
+    return points0[some], points1[some], (WEIGHTS[weight][1](distance, scores0, scores1, ratio) * confidence)[some]
 
 
 @given(
