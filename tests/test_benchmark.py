@@ -203,6 +203,7 @@ def test_ransac_beside_opencv_s_is_pooled_over_places(two_places, monkeypatch, c
     from experiments.benchmark import agreement
 
     monkeypatch.setattr(agreement, "THRESHOLDS", (8.0,))
+    monkeypatch.setattr(agreement, "CANDIDATES", 3)
     agreement.run(2, two_places / "out.json", two_places)
     rows = json.loads((two_places / "out.json").read_text())["rows"]
     assert [(row["matches"], row["queries"], len(row["mfvpr"])) for row in rows] == [
