@@ -171,13 +171,15 @@ def test_every_ransac_counts_the_plane(monkeypatch):
 @pytest.fixture
 def two_places(small_street, tmp_path, monkeypatch):
     """The folders that real images are expected in, and one kind of features."""
-    from experiments.benchmark import real
+    from experiments.benchmark import agreement, real, weights
 
     for name, (database, queries) in real.FOLDERS.items():
         (tmp_path / name).mkdir()
         (tmp_path / name / database).symlink_to(small_street / "database")
         (tmp_path / name / queries).symlink_to(small_street / "queries")
-    monkeypatch.setattr(real, "_extractors", lambda: {"SIFT": Sift(image_size=(160, 120), max_keypoints=100)})
+    sift = {"SIFT": Sift(image_size=(160, 120), max_keypoints=100)}
+    for module in (agreement, real, weights):
+        monkeypatch.setattr(module, "extractors", lambda *_: sift)
     return tmp_path
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.benchmark.real import matched_sets
+from experiments.benchmark.real import extractors, matched_sets
 from experiments.console import track
 from mfvpr import Homography, OpenCvHomography, pipeline
 from mfvpr.data.files import write_text
@@ -26,7 +26,9 @@ THRESHOLDS = (8.0, 24.0)  # px
 def run(rounds: int | None, out: Path, data: Path | None = None) -> None:
     """Both data sets below `data`, SIFT's and ALIKED n16's matches; `rounds` (at least 2) seeds of ours."""
     rows = [
-        row for name, matched in matched_sets(data, CANDIDATES) for row in compared(name, matched, max(rounds or 4, 2))
+        row
+        for name, matched in matched_sets(data, CANDIDATES, extractors())
+        for row in compared(name, matched, max(rounds or 4, 2))
     ]
     print(f"\n{_table([*rows, *pooled(rows)]).text()}\n")
     write_text(out, json.dumps({"versions": versions(), "rows": rows}, indent=1) + "\n")

@@ -4,7 +4,7 @@ import json
 import os
 import platform
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -44,7 +44,7 @@ TOLERANCES = (1, 2, 5)  # frames
 def run(rounds: int | None, out: Path, data: Path | None = None) -> None:
     """Both data sets below `data`, SIFT's and ALIKED n16's matches with all images; `rounds` calls are timed."""
     scorers, tables = compared(), []
-    for name, matched in matched_sets(data, "all"):
+    for name, matched in matched_sets(data, "all", extractors()):
         rows = [*judged(matched, scorers, rounds or 1)]
         tables.append({"matches": name, "rows": rows})
         print(f"\n{name}, {np.mean(matched.matches[0].counts):.0f} matches a pair\n\n{_table(rows).text()}")
@@ -53,15 +53,17 @@ def run(rounds: int | None, out: Path, data: Path | None = None) -> None:
     print(f"results: {out}")
 
 
-def matched_sets(data: Path | None, candidates: int | Literal["all"]) -> Iterator[tuple[str, Matched]]:
-    """(what is matched, its matches) of both data sets below `data` with both kinds of features; they are kept."""
+def matched_sets(
+    data: Path | None, candidates: int | Literal["all"], extractors: Mapping[str, Extractor]
+) -> Iterator[tuple[str, Matched]]:
+    """("data set, features", its matches) of both data sets below `data`; features and matches are kept."""
     if data is None:
         raise InputError(f"expected --data DIR, a folder that has {' and '.join(FOLDERS)}")
     cache = build.expanded(os.environ.get("MFVPR_CACHE") or "~/.cache/mfvpr") / "features"  # as in conf/common.yaml
     archive = Archive(cache, track=track, tell=tell)
     for name, (database, queries) in FOLDERS.items():
         dataset = folder_dataset(data / name / database, data / name / queries, name=name, ground_truth="order")
-        for features, extractor in _extractors().items():
+        for features, extractor in extractors.items():
             filter = Retrieval(Aggregated(extractor, VladFitting()))
             matched = match_sequence(dataset, dataset.only, extractor, filter, candidates, archive=archive)
             yield f"{name}, {features}", matched
@@ -74,9 +76,11 @@ def compared() -> dict[str, Scorer]:
     return build.scorers({name: yaml.safe_load((group / f"{name}.yaml").read_text(encoding="utf-8")) for name in names})
 
 
-def _extractors() -> dict[str, Extractor]:
-    aliked: Any = load_model("aliked-n16")
-    return {"SIFT": Sift(image_size=SIZE), "ALIKED n16": AlikedFeatures(aliked, image_size=SIZE)}
+def extractors(size: tuple[int, int] = SIZE, variants: Sequence[str] = ("n16",)) -> dict[str, Extractor]:
+    """SIFT, and variants of ALIKED, of images of one size."""
+    networks: dict[str, Any] = {f"ALIKED {variant}": load_model(f"aliked-{variant}") for variant in variants}
+    aliked = {name: AlikedFeatures(network, image_size=size) for name, network in networks.items()}
+    return {"SIFT": Sift(image_size=size), **aliked}
 
 
 def judged(matched: Matched, scorers: Mapping[str, Scorer], rounds: int) -> Iterator[dict[str, Any]]:
