@@ -73,7 +73,7 @@ def _tools(settings: dict[str, Any], archive: Archive, dataset: Dataset | None) 
 
 def _images(settings: dict[str, Any], archive: Archive) -> Images:
     """The data set that the settings name."""
-    dataset, neighbors = _dataset(settings["dataset"]), settings["dataset"].get("exclude_neighbors")
+    dataset, neighbors = dataset_of(settings["dataset"]), settings["dataset"].get("exclude_neighbors")
     sides = {"database": archive.contents(dataset.database)}
     several, sequences, own = len(dataset.sequences) > 1, [], []
     for sequence in dataset.sequences:
@@ -105,7 +105,7 @@ def recipe(tools: Tools, images: Images, num_candidates: int) -> dict[str, Any]:
     )  # fmt: skip
 
 
-def _dataset(settings: dict[str, Any]) -> Dataset:
+def dataset_of(settings: dict[str, Any]) -> Dataset:
     bars: list[tqdm] = []
 
     def progress(done: int, total: int) -> None:

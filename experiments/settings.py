@@ -49,7 +49,7 @@ def _or(rule: Rule, *choices: Any) -> Rule:
     return Rule(lambda value: rule.holds(value) or other.holds(value), f"{rule.expected}, or {words}")
 
 
-def _list_of(rule: Rule, length: int | None = None) -> Rule:
+def _list_of(rule: Rule, length: int = 0) -> Rule:
     def holds(value: Any) -> bool:
         return (
             isinstance(value, list)
@@ -240,7 +240,7 @@ def _within(*, length: int = 0, optional: bool = False, **limits: list[Any]) -> 
     """The rule of `mfvpr.declaration.Parameter.limits`."""
     [(kind, values)] = limits.items()
     rule = {"choices": _one_of, "whole": _between, "number": _number}[kind](*values)
-    rule = _list_of(rule, length) if length else rule
+    rule = _list_of(rule, max(length, 0)) if length else rule
     return _or(rule, None) if optional else rule
 
 

@@ -16,6 +16,7 @@ from mfvpr.errors import InputError
 
 POSITIVE = (1e-6, 1e12)  # beyond these bounds float32 would fail, without a word
 SCORE = "units of the score"
+ANY = -1  # length of a list: one or more
 _KEY = "parameter"  # of the field's metadata
 
 
@@ -30,7 +31,7 @@ class Parameter:
         choices: the only values; none = numbers within `bounds`.
         bounds: smallest and largest number.
         whole: numbers are whole.
-        length: of a list of numbers; 0 = one number.
+        length: of a list of numbers; 0 = one number, ANY = a list of one or more.
         optional: None may be written as well.
         none: the field's value where None is written.
         named: the field's values by the words of `choices`.
@@ -90,6 +91,12 @@ def numbers(
     plain = None if default is None else list(default)
     optional = default is None
     return _field(default, Parameter(plain, unit, note, bounds=bounds, length=length, optional=optional, swept=False))
+
+
+def several(default: Sequence[float], unit: str = "", note: str = "", *, bounds: tuple[float, float] = POSITIVE) -> Any:
+    """A tuple of one or more numbers, which chooses a program."""
+    declared = Parameter([*default], unit, note, bounds=bounds, length=ANY, swept=False)
+    return _field(tuple(default), declared, static=True)
 
 
 def whole(default: int | None, unit: str = "", note: str = "", *, bounds: tuple[int, int], swept: bool = True) -> Any:

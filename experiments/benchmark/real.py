@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 
-from experiments import build
+from experiments import build, prepare
 from experiments.console import tell, track
 from experiments.groups import defaults
 from experiments.settings import CONF
@@ -54,19 +54,25 @@ def run(rounds: int | None, out: Path, data: Path | None = None) -> None:
 
 
 def matched_sets(
-    data: Path | None, candidates: int | Literal["all"], extractors: Mapping[str, Extractor]
+    data: Path | None, candidates: int | Literal["all"], extractors: Mapping[str, Extractor], *, streets: bool = False
 ) -> Iterator[tuple[str, Matched]]:
-    """("data set, features", its matches) of both data sets below `data`; features and matches are kept."""
+    """("data set, features", its matches) of both data sets below `data`, and of the drawn street where it is asked
+    for; features and matches are kept."""
     if data is None:
         raise InputError(f"expected --data DIR, a folder that has {' and '.join(FOLDERS)}")
-    cache = build.expanded(os.environ.get("MFVPR_CACHE") or "~/.cache/mfvpr") / "features"  # as in conf/common.yaml
-    archive = Archive(cache, track=track, tell=tell)
-    for name, (database, queries) in FOLDERS.items():
-        dataset = folder_dataset(data / name / database, data / name / queries, name=name, ground_truth="order")
+    cache = build.expanded(os.environ.get("MFVPR_CACHE") or "~/.cache/mfvpr")  # as in conf/common.yaml
+    archive = Archive(cache / "features", track=track, tell=tell)
+    datasets = [
+        folder_dataset(data / name / database, data / name / queries, name=name, ground_truth="order")
+        for name, (database, queries) in FOLDERS.items()
+    ]
+    if streets:
+        datasets.append(prepare.dataset_of({"name": "streets", "cache": str(cache), "seed": 0}))
+    for dataset in datasets:
         for features, extractor in extractors.items():
             filter = Retrieval(Aggregated(extractor, VladFitting()))
             matched = match_sequence(dataset, dataset.only, extractor, filter, candidates, archive=archive)
-            yield f"{name}, {features}", matched
+            yield f"{dataset.name}, {features}", matched
 
 
 def compared() -> dict[str, Scorer]:

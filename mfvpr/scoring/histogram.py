@@ -13,17 +13,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mfvpr.declaration import SCORE, check_choices, choice, flag, named, number, numbers, whole
+from mfvpr.declaration import SCORE, check_choices, choice, flag, named, number, numbers, several, whole
 from mfvpr.errors import InputError
-from mfvpr.numerics import compiled, is_concrete, masked, positive, round_up
-from mfvpr.scoring.lattice import Lattice, bins, of_all_bins, tallest, votes
-from mfvpr.scoring.shifts import image_sizes, match_shifts
+from mfvpr.numerics import compiled, is_concrete, positive, round_up
+from mfvpr.scoring.lattice import Lattice, bins, climb, mapped, of_all_bins, smooth_tallest, tallest, votes
+from mfvpr.scoring.shifts import image_sizes, match_shifts, zoomed
 from mfvpr.scoring.tallest import tallest_bins
 from mfvpr.types import Array, Matches, value
 from mfvpr.weighting import WEIGHTS, Weight, match_weights
 
 MAX_BINS = 1024  # per axis, where nobody asks for more: the histograms of 50 pairs then take 200 MB
-_MEAN_SHIFT_STEPS = 30
 
 
 class ShiftHistogram(NamedTuple):
@@ -59,6 +58,11 @@ class HistogramOfShifts:
         max_bins: capacity of bins per axis; by default as many as concrete values ask for, at most 1024. Where image
             sizes or bins are traced it must be set before `jit` or `vmap`, as `with_capacity` does; a histogram that
             then needs more scores NaN, never a wrong number.
+        scales: how many times as large the candidate may show the place as the query, a vote for each: the score is
+            the largest of their tallest bins. Where a camera drives along its way, the right image differs in scale;
+            the paper has 1 alone.
+        scale_deviation: octaves; the votes at scale z count exp(-(log2 z)^2 / (2 scale_deviation^2)), since with more
+            scales the wrong pairs have more chances as well.
         temperature: in units of the score; T > 0 scores T log(mean over bins of e^(s_ij / T)), at most the maximum
             and smooth in everything but the number of bins. None is the paper's maximum; not above 0 scores NaN.
     """
@@ -76,6 +80,10 @@ class HistogramOfShifts:
     max_bins: int | None = whole(
         None, "capacity per axis", "None = what the image size needs", bounds=(1, MAX_BINS), swept=False
     )
+    scales: tuple[float, ...] = several(
+        (1.0,), "", "of the place, candidate over query; [1] = the paper's", bounds=(0.1, 10.0)
+    )
+    scale_deviation: float | Array = number(math.inf, "octaves", "of the scales' prior; None = all count alike")
     temperature: float | Array | None = number(
         None, SCORE, "above 0 is smooth; None = the paper's", learned=True, start=0.1
     )
@@ -92,8 +100,9 @@ class HistogramOfShifts:
         shifts, lattice, capacity = self._planes(matches), self._lattice_of(matches), self._capacity(matches)
         pool = tallest
         if self.temperature is not None:
-            pool = partial(_smooth_max, temperature=positive(self.temperature, shifts.dtype))
-        found = of_all_bins(shifts, weights, lattice, capacity, pool)
+            pool = partial(smooth_tallest, temperature=positive(self.temperature, shifts.dtype))
+        found = mapped(lambda shifts: of_all_bins(shifts, weights, lattice, capacity, pool), shifts)
+        found = jax.vmap(lambda of_scales: pool(of_scales, jnp.ones_like(of_scales, bool)))(self._expected(found).T)
         return _where_usable(found, matches, shifts, weights, lattice.usable(capacity))
 
     def all_reweighted(self, matches: Matches, weights: Array) -> Array:
@@ -110,13 +119,15 @@ class HistogramOfShifts:
     def _pair_by_pair(self, matches: Matches, weights: Array) -> Array:
         capacity, shifts = self._capacity(matches), jax.vmap(self._planes)(matches)
         lattice = jax.vmap(self._lattice_of)(matches)
-        found = tallest_bins(shifts, weights, lattice, capacity)
+        by_scale = jnp.swapaxes(shifts, 0, 1)
+        found = mapped(lambda shifts: tallest_bins(shifts, weights, lattice, capacity), by_scale)
+        found = jnp.max(self._expected(found), axis=0)
         usable = jax.vmap(lambda lattice: lattice.usable(capacity))(lattice)
         return jax.vmap(_where_usable)(found, matches, shifts, weights, usable)
 
     def histogram(self, matches: Matches) -> ShiftHistogram:
-        """All bins of one pair with their centers."""
-        scores, lattice, usable = self._vote(matches)
+        """All bins of one pair with their centers, at the scale of the tallest."""
+        scores, lattice, usable, _ = self._vote(matches)
         x, y = (lattice.centers(axis, jnp.arange(len(scores), dtype=scores.dtype)) for axis in (0, 1))
         return ShiftHistogram(jnp.where(usable, scores, jnp.nan), x, y)
 
@@ -125,13 +136,18 @@ class HistogramOfShifts:
 
         The center of the tallest bin, the first in row-major order on a tie. With `refine` the peak between bin
         centers: the maximum of the same sum of Gaussians over all shifts, reached from that bin by mean shift
-        (Comaniciu & Meer, PAMI 2002).
+        (Comaniciu & Meer, PAMI 2002). With several scales it is that of the images' centers, at the dominant one.
         """
         return _dominant_shift(self._for(matches), matches, refine=refine)
 
+    def dominant_scale(self, matches: Matches) -> Array:
+        """`[]` of the `scales` that of the tallest bin, the first on a tie: how much larger the candidate shows the
+        place than the query does."""
+        return _dominant_scale(self._for(matches), matches)
+
     def agrees(self, matches: Matches, shift: Array) -> Array:
         """`[K]` bool: real matches whose shift lies within two standard deviations of `shift` `[2]` along both axes."""
-        shifts = self._shifts(matches)
+        shifts = self._planes(matches)[self._vote(matches)[-1] if len(self.scales) > 1 else 0].T
         near = jnp.all(jnp.abs(shifts - shift[None]) <= 2 * self._deviation(shifts.dtype), axis=-1)
         return near & matches.mask
 
@@ -179,13 +195,21 @@ class HistogramOfShifts:
             return replace(self, max_bins=self.max_bins or min(self._needed(*image_sizes(matches)), MAX_BINS))
         return self.fitted(matches.image_size0, matches.image_size1)
 
-    def _vote(self, matches: Matches) -> tuple[Array, Lattice, Array]:
-        """Scores `[B, B]` (y, x), -inf of bins that there are not; the lattice, and whether they are usable `[]`."""
+    def _vote(self, matches: Matches) -> tuple[Array, Lattice, Array, Array]:
+        """Scores `[B, B]` (y, x), -inf of bins that there are not; the lattice, whether they are usable `[]`, and the
+        number of the scale `[]` that has the tallest."""
         lattice, capacity = self._lattice_of(matches), self._capacity(matches)
         shifts, weights = self._planes(matches), match_weights(self.weight, matches)
-        scores = bins(*votes(shifts, lattice, capacity), weights)
+        scores = self._expected(mapped(lambda shifts: bins(*votes(shifts, lattice, capacity), weights), shifts))
+        scores = jnp.where(lattice.inside(capacity)[None], scores, -jnp.inf)
+        scale = jnp.argmax(jnp.max(scores, axis=(1, 2)))
         usable = lattice.usable(capacity) & _are_numbers(shifts, weights[None])[0]
-        return jnp.where(lattice.inside(capacity), scores, -jnp.inf), lattice, usable
+        return scores[scale], lattice, usable, scale
+
+    def _expected(self, found: Array) -> Array:
+        """What was found at every scale `[S, ...]`, by how likely the scale is."""
+        octaves = jnp.log2(jnp.asarray(self.scales, found.dtype)) / positive(self.scale_deviation, found.dtype)
+        return found * jnp.exp(-0.5 * octaves**2).reshape(-1, *(1,) * (found.ndim - 1))
 
     def _lattice_of(self, matches: Matches) -> Lattice:
         """Of one pair."""
@@ -226,9 +250,10 @@ class HistogramOfShifts:
         return shifts if self.direction == "candidate_minus_query" else -shifts
 
     def _planes(self, matches: Matches) -> Array:
-        """`[2, K]` shifts along x and along y."""
+        """`[S, 2, K]` shifts along x and along y, at every scale."""
+        planes = [self._shifts(zoomed(matches, scale)).T for scale in self.scales]
         # Contiguous for good: strided coordinates would keep the exponentials from being vectorized.
-        return jax.lax.optimization_barrier(self._shifts(matches).T)
+        return jax.lax.optimization_barrier(jnp.stack(planes))
 
     def _deviation(self, dtype: Any) -> Array:
         sigma = positive(self.sigma, dtype)
@@ -237,26 +262,21 @@ class HistogramOfShifts:
 
 @partial(compiled, static_argnames="refine")  # or the loop would be compiled at every call
 def _dominant_shift(scorer: HistogramOfShifts, matches: Matches, *, refine: bool) -> Array:
-    scores, lattice, usable = scorer._vote(matches)
+    scores, lattice, usable, scale = scorer._vote(matches)
     row, column = jnp.unravel_index(jnp.argmax(scores), scores.shape)
     shift = jnp.stack([lattice.centers(axis, bin.astype(scores.dtype)) for axis, bin in enumerate((column, row))])
-    shifts, weights = scorer._shifts(matches), match_weights(scorer.weight, matches)
+    shifts, weights = scorer._planes(matches)[scale].T, match_weights(scorer.weight, matches)
     if refine:
-        shift = _climb(shift, shifts, weights, scorer._deviation(shifts.dtype))
+        shift = climb(shift, shifts, weights, scorer._deviation(shifts.dtype))
     shift = jnp.where(jnp.max(scores) > 0, shift, 0.0)
     return _where_usable(shift, matches, shifts, weights[None], usable)
 
 
-def _climb(start: Array, shifts: Array, weights: Array, deviation: Array) -> Array:
-    """Fixed-point iteration to the mode of sum_k w_k exp(-|s - s_k|^2 / (2 sigma^2))."""
-
-    def step(_: int, shift: Array) -> Array:
-        distance = jnp.sum((shifts - shift[None]) ** 2, axis=-1)
-        pull = weights * jnp.exp(-0.5 * distance / deviation**2)
-        total = jnp.sum(pull)
-        return jnp.where(total > 0, pull @ shifts / jnp.where(total > 0, total, 1.0), shift)
-
-    return jax.lax.fori_loop(0, _MEAN_SHIFT_STEPS, step, start)
+@compiled
+def _dominant_scale(scorer: HistogramOfShifts, matches: Matches) -> Array:
+    scores, _, usable, scale = scorer._vote(matches)
+    voted = jnp.where(jnp.max(scores) > 0, jnp.asarray(scorer.scales, scores.dtype)[scale], 1.0)
+    return jnp.where(usable | ~jnp.any(matches.mask), voted, jnp.nan)
 
 
 def _where_usable(found: Array, matches: Matches, shifts: Array, weights: Array, usable: Array) -> Array:
@@ -269,11 +289,3 @@ def _where_usable(found: Array, matches: Matches, shifts: Array, weights: Array,
 def _are_numbers(shifts: Array, weights: Array) -> Array:
     """`[W]` whether all shifts and the weights `[W, K]` are finite."""
     return jnp.all(jnp.isfinite(shifts)) & jnp.all(jnp.isfinite(weights), axis=1)
-
-
-def _smooth_max(values: Array, mask: Array, *, temperature: Array) -> Array:
-    """T log(mean of e^(v / T)) of the values where `mask`."""
-    # Relative to the maximum nothing overflows or cancels; its own gradient would be 0, since it drops out.
-    largest = jax.lax.stop_gradient(jnp.max(values))
-    below = (masked(values, mask, largest) - largest) / temperature
-    return largest + temperature * jnp.log(jnp.mean(jnp.exp(below), where=mask))

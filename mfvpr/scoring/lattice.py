@@ -1,4 +1,4 @@
-"""The bins of a histogram of shifts, and the votes of matches for them. Lengths are pixels."""
+"""The bins of a histogram of shifts, the votes of matches for them, and the peak between bins. Lengths are pixels."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -6,7 +6,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from mfvpr.numerics import masked
 from mfvpr.types import Array
+
+_MEAN_SHIFT_STEPS = 30
 
 
 class Lattice(NamedTuple):
@@ -71,6 +74,14 @@ def tallest(scores: Array, _: Array) -> Array:
     return jnp.max(scores)  # without a mask, which would cost as much as the product and is not needed
 
 
+def smooth_tallest(values: Array, mask: Array, *, temperature: Array) -> Array:
+    """T log(mean of e^(v / T)) of the values where `mask`."""
+    # Relative to the maximum nothing overflows or cancels; its own gradient would be 0, since it drops out.
+    largest = jax.lax.stop_gradient(jnp.max(values))
+    below = (masked(values, mask, largest) - largest) / temperature
+    return largest + temperature * jnp.log(jnp.mean(jnp.exp(below), where=mask))
+
+
 def of_all_bins(
     shifts: Array,
     weights: Array,
@@ -88,4 +99,21 @@ def of_all_bins(
     def one(weights: Array) -> Array:
         return pool(bins(votes_x, votes_y, weights), inside)
 
-    return one(weights[0])[None] if len(weights) == 1 else jax.lax.map(one, weights)
+    return mapped(one, weights)
+
+
+def mapped(function: Callable[[Array], Array], rows: Array) -> Array:
+    """`function` of every row, one at a time; of an only one without a loop."""
+    return function(rows[0])[None] if len(rows) == 1 else jax.lax.map(function, rows)
+
+
+def climb(start: Array, shifts: Array, weights: Array, deviation: Array) -> Array:
+    """Fixed-point iteration to the mode of sum_k w_k exp(-|s - s_k|^2 / (2 sigma^2))."""
+
+    def step(_: int, shift: Array) -> Array:
+        distance = jnp.sum((shifts - shift[None]) ** 2, axis=-1)
+        pull = weights * jnp.exp(-0.5 * distance / deviation**2)
+        total = jnp.sum(pull)
+        return jnp.where(total > 0, pull @ shifts / jnp.where(total > 0, total, 1.0), shift)
+
+    return jax.lax.fori_loop(0, _MEAN_SHIFT_STEPS, step, start)

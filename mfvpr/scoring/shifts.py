@@ -1,5 +1,8 @@
 """The shifts that scores are made of, and the sizes that bound them."""
 
+import math
+from dataclasses import replace
+
 import jax.numpy as jnp
 
 from mfvpr.numerics import at_least_single, masked
@@ -10,6 +13,24 @@ def match_shifts(matches: Matches) -> Array:
     """`[K, 2]` points1 - points0 of one pair, px; 0 on padding."""
     start, end = (masked(at_least_single(points), matches.mask) for points in (matches.points0, matches.points1))
     return end - start
+
+
+def zoomed(matches: Matches, scale: float) -> Matches:
+    """One pair's matches as they would be if the candidate did not show the place `scale` times as large as the query.
+
+    Points move about the centers of their images, of the candidate by 1 / sqrt(scale), of the query by sqrt(scale): so
+    it is the same whichever image is the query, and errors of a position count alike on both sides.
+    """
+    if scale == 1:
+        return matches
+    root = math.sqrt(scale)
+    points0 = _about_center(matches.points0, matches.image_size0, root)
+    return replace(matches, points0=points0, points1=_about_center(matches.points1, matches.image_size1, 1 / root))
+
+
+def _about_center(points: Array, image_size: Array, factor: float) -> Array:
+    center = at_least_single(image_size)[None] / 2
+    return center + factor * (at_least_single(points) - center)
 
 
 def image_sizes(matches: Matches) -> tuple[Array, Array]:

@@ -43,6 +43,7 @@ SOFT = [
     replace(HARD[6], temperature=20.0),
     replace(HARD[7], temperature=5.0),
     replace(HARD[8], temperature=20.0),
+    replace(HARD[0], temperature=0.3, scales=(0.8, 1.0, 1.25), scale_deviation=0.4),
 ]
 RELATIVES = [
     RapidSpatialScore(),
@@ -54,7 +55,14 @@ RELATIVES = [
     LostScore(form="unweighted", mirrored=True),
     LostScore(form="described"),
 ]
-NUMBERS = ("bin_size", "sigma", "tolerance", "temperature", "weight")  # not the window, which moves whole cells
+NUMBERS = (
+    "bin_size",
+    "sigma",
+    "scale_deviation",
+    "tolerance",
+    "temperature",
+    "weight",
+)  # not the window, which moves whole cells
 PER_MATCH = ("points0", "points1", "distance", "scores0", "scores1", "ratio", "confidence")
 PER_KEYPOINT = ("keypoints", "descriptors", "scores")
 
