@@ -106,6 +106,7 @@ def recipe(tools: Tools, images: Images, num_candidates: int) -> dict[str, Any]:
 
 
 def dataset_of(settings: dict[str, Any]) -> Dataset:
+    """The data set, with progress where it is drawn."""
     bars: list[tqdm] = []
 
     def progress(done: int, total: int) -> None:
