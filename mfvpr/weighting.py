@@ -50,8 +50,8 @@ class RatioWeight:
         Raises:
             InputError: the matches have no ratio.
         """
-        lead = jnp.maximum(1.0 - match_ratio(matches), 0.0)
-        none = lead <= 0  # where the power's derivatives are infinite
+        lead = 1.0 - match_ratio(matches)
+        none = (lead <= 0) & jnp.isfinite(lead)  # there the power's derivatives are infinite
         return jnp.where(none, 0.0, jnp.where(none, 1.0, lead) ** jnp.asarray(self.exponent, lead.dtype))
 
 
