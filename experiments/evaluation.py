@@ -12,6 +12,7 @@ from mfvpr.data.datasets import Dataset
 from mfvpr.evaluation import Unit
 from mfvpr.evaluations import Stopwatch
 from mfvpr.report import runs
+from mfvpr.report.differences import write_gains
 from mfvpr.report.evaluations import Figure, Judged, figures, recall_table, write_rankings, write_skipped
 from mfvpr.results import FILTER, FRAMES
 from mfvpr.scoring import HistogramOfShifts
@@ -98,6 +99,7 @@ def write(folder: Path, outcome: Outcome) -> None:
     if outcome.judged.thresholds:
         runs.write_table(folder, recall_table(outcome.judged), heading(outcome))
     write_rankings(folder, outcome.judged)
+    write_gains(folder, outcome.judged)
     write_skipped(folder, outcome.judged.result)
 
 

@@ -14,6 +14,7 @@ from mfvpr.archive import Archive
 from mfvpr.data.datasets import folder_dataset, sequences_dataset
 from mfvpr.errors import InputError
 from mfvpr.evaluation import Positives
+from mfvpr.evaluation.statistics import block_sign_flips
 from mfvpr.evaluations import match_sequence
 from mfvpr.exchange import write_features, write_global_descriptors, write_shortlist
 from mfvpr.features import Aggregated
@@ -25,6 +26,7 @@ from mfvpr.frame_correlation import FrameCorrelation
 from mfvpr.imported import DescriptorFiles, FeatureFiles, File, ShortlistFiles
 from mfvpr.progress import untracked
 from mfvpr.rankings import Fusion, rank_sequence
+from mfvpr.report.differences import differences, write_gains
 from mfvpr.report.evaluations import Judged, recall_table, write_rankings
 from mfvpr.retrieval import WhitenedSearch
 from tests.programs import typed
@@ -92,7 +94,7 @@ def test_frame_correlation_is_a_ranking_more(result):
         assert (got.scores != alone.scores).any()
 
 
-def test_sequences_are_evaluated_by_themselves_with_their_means(dataset, split, small_street, result):
+def test_sequences_are_evaluated_by_themselves_with_their_means(dataset, split, small_street, result, tmp_path):
     several = sequences_dataset(
         small_street / "database", split, ground_truth="index", index_file="truth.csv", widen_index=True
     )
@@ -104,8 +106,16 @@ def test_sequences_are_evaluated_by_themselves_with_their_means(dataset, split, 
     np.testing.assert_allclose(recall.pooled, result.recall([0, 1], [1])["count"].pooled)
     np.testing.assert_allclose(recall.mean, recall.by_sequence.mean(axis=0))
     assert recall.queries.tolist() == [3, 7]
-    table = recall_table(Judged(found, [0, 1], [1], "count"))
+    judged = Judged(found, [0, 1], [1], "count")
+    table = recall_table(judged)
     assert [line[:2] for line in table.rows[:4]] == [["filter", name] for name in ("first", "second", "mean", "pooled")]
+    write_gains(tmp_path, judged)
+    gains = [(tmp_path / "sequences" / name / "gains.csv").read_text().splitlines() for name in ("first", "second")]
+    assert list(map(len, gains)) == [4, 8]
+    hits = {name: np.concatenate([judged.is_right(name, place)[:, 0] for place in (0, 1)]) for name in found.systems}
+    for first, second, counts, flips in differences(judged):
+        assert counts.only_first == (hits[first] > hits[second]).sum()
+        assert flips == block_sign_flips(hits[first], hits[second], sequences=[3, 7])
     with pytest.raises(InputError, match="expected one query sequence, got 2; choose one of first, second"):
         several.queries  # noqa: B018
     with pytest.raises(InputError, match="sequences of different names, got first twice"):

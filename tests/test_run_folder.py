@@ -1,6 +1,7 @@
 """What a run leaves, and what it leaves when something goes wrong: claims, full disks, foreign names."""
 
 import csv
+import itertools
 import json
 import os
 import resource
@@ -24,12 +25,14 @@ from mfvpr.data.images import read_image
 from mfvpr.data.streets import streets_folder
 from mfvpr.errors import InputError
 from mfvpr.evaluation import Positives
+from mfvpr.evaluation.statistics import block_sign_flips, mcnemar
 from mfvpr.report import runs
 from mfvpr.report.evaluations import _Page
 from mfvpr.scoring import HistogramOfShifts
 from tests.programs import CANDIDATES, QUERIES, ROOT, composed, shared, small, typed
 
 LINES = ("scorer=histogram", "figures=4")
+SYSTEMS = ("filter", "histogram", "histogram + filter")
 
 
 @pytest.fixture(scope="session")
@@ -93,6 +96,28 @@ def test_failures_are_the_wrong_first_answers(evaluated, system):
                 first["rank"], first["database"], first["score"])  # fmt: skip
             margin = float(lines[0]["score"]) - float(first["score"])
             assert float(line["margin"]) == pytest.approx(margin, abs=1e-5)
+
+
+def test_gains_are_what_the_predictions_say_of_each_query(evaluated):
+    gains, hits = rows(evaluated / "gains.csv"), {}
+    assert len(gains) == QUERIES
+    for system in SYSTEMS:
+        lines = rows(evaluated / "predictions" / f"{system.replace(' + ', '_')}.csv")
+        for line in gains:
+            right = [one["rank"] for one in lines if one["query"] == line["query"] and one["right"] == "1"]
+            assert line[f"{system} rank"] == (right[0] if right else "")
+            assert line[system] == str(int(right[:1] == ["1"]))
+        hits[system] = np.array([line[system] == "1" for line in gains])
+    assert {line["histogram rank"] for line in gains} > {"", "1"}
+    for line, pair in zip(rows(evaluated / "differences.csv"), itertools.combinations(SYSTEMS, 2), strict=True):
+        assert (line["system"], line["other"]) == pair
+        first, second = (hits[name] for name in pair)
+        assert [line["only_system"], line["only_other"]] == [str((first > second).sum()), str((first < second).sum())]
+        assert float(line["mcnemar_p"]) == pytest.approx(mcnemar(first, second).p_value, rel=1e-6)
+        assert float(line["blocks_p"]) == pytest.approx(block_sign_flips(first, second).p_value, rel=1e-6)
+    header, _, _, line, _ = (evaluated / "differences.md").read_text().splitlines()
+    assert header == "| only this is right, not | filter | histogram | histogram + filter |"
+    assert line.startswith(f"| histogram | {(hits['histogram'] > hits['filter']).sum()} (p ")
 
 
 def test_without_ground_truth_nothing_is_right_or_failed(root, tmp_path):

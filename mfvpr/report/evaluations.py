@@ -70,6 +70,10 @@ class Judged:
         right = self.right[place]
         return None if right is None else right.contains(self.result.systems[system][place].rows)
 
+    def folder(self, run: Path, place: int) -> Path:
+        """Where a sequence's files are: `sequences/<name>/` of several, as a name may be that of any other file."""
+        return run / "sequences" / self.sequences[place].name if len(self.sequences) > 1 else run
+
 
 def recall_table(judged: Judged) -> Table:
     """R@first k at every threshold, and all ks at the middle one; a line for each system, and sequence."""
@@ -87,13 +91,10 @@ def recall_table(judged: Judged) -> Table:
 
 
 def write_rankings(folder: Path, judged: Judged) -> None:
-    """`predictions/` and `failures/` of every system, those of the headline's in the folder itself.
-
-    Of several sequences each has a folder with its own, `sequences/<name>/`: a name may be that of any other file.
-    """
+    """`predictions/` and `failures/` of every system, those of the headline's in the folder itself."""
     database = judged.result.dataset.database.names
     for place, sequence in enumerate(judged.sequences):
-        own = folder / "sequences" / sequence.name if len(judged.sequences) > 1 else folder
+        own = judged.folder(folder, place)
         for name, ranked in judged.result.systems.items():
             answers = ranked[place]
             rankings = Rankings(
