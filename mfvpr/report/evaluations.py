@@ -1,7 +1,7 @@
 """An evaluation as a table, as files of rankings, and as figures of some queries."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -90,8 +90,14 @@ def recall_table(judged: Judged) -> Table:
     return Table(["system", *(["sequence"] if several else []), *labels], lines, text_columns=1 + several)
 
 
-def write_rankings(folder: Path, judged: Judged) -> None:
-    """`predictions/` and `failures/` of every system, those of the headline's in the folder itself."""
+def write_rankings(folder: Path, judged: Judged, refused: Sequence[np.ndarray] | None = None) -> None:
+    """`predictions/` and `failures/` of every system, those of the headline's in the folder itself.
+
+    Args:
+        folder: of the run.
+        judged: what is written.
+        refused: `[Q]` bool of each sequence, what is not answered in the headline's predictions; None = none.
+    """
     database = judged.result.dataset.database.names
     for place, sequence in enumerate(judged.sequences):
         own = judged.folder(folder, place)
@@ -104,7 +110,8 @@ def write_rankings(folder: Path, judged: Judged) -> None:
             write_predictions(own / "predictions" / file, rankings)
             write_failures(own / "failures" / file, rankings)
             if name == judged.headline:
-                write_predictions(own / "predictions.csv", rankings)
+                answered = rankings if refused is None else replace(rankings, refused=refused[place])
+                write_predictions(own / "predictions.csv", answered)
                 write_failures(own / "failures.csv", rankings)
 
 

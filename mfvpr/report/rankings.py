@@ -10,6 +10,8 @@ import numpy as np
 
 from mfvpr.data.files import replacing
 
+NO_PLACE = "no place"  # the answer to a query whose place the database is thought not to show
+
 
 @dataclass(frozen=True)
 class Rankings:
@@ -21,6 +23,7 @@ class Rankings:
         rows: `[Q, C]` database rows, best first, -1 = none.
         scores: `[Q, C]` in that order.
         right: `[Q, C]` bool in that order; None = unknown.
+        refused: `[Q]` bool, answered `NO_PLACE`; None = none.
     """
 
     queries: Sequence[str]
@@ -28,17 +31,21 @@ class Rankings:
     rows: np.ndarray
     scores: np.ndarray
     right: np.ndarray | None
+    refused: np.ndarray | None = None
 
 
 def write_predictions(path: Path, rankings: Rankings) -> None:
     """CSV with a line per query and candidate, best first: `query,rank,database,score,right`.
 
-    `right` is 1 or 0, or empty where it is unknown.
+    `right` is 1 or 0, or empty where it is unknown. Of a query that is refused there is one line, `NO_PLACE`.
     """
+    refused = np.zeros(len(rankings.rows), bool) if rankings.refused is None else rankings.refused
     lines = (
+        [rankings.queries[query], 1, NO_PLACE, "", ""] if refused[query] else
         [rankings.queries[query], rank + 1, rankings.database[row], number(rankings.scores[query, rank]),
          "" if rankings.right is None else int(rankings.right[query, rank])]
-        for (query, rank), row in np.ndenumerate(rankings.rows) if row >= 0
+        for (query, rank), row in np.ndenumerate(rankings.rows)
+        if (rank == 0 if refused[query] else row >= 0)
     )  # fmt: skip
     write_csv(path, ("query", "rank", "database", "score", "right"), lines)
 
