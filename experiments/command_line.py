@@ -26,7 +26,7 @@ from experiments.wording import in_settings
 
 PATHS = {"dataset.database", "dataset.queries", "dataset.root", "dataset.index_file", "dataset.cache"}
 PATHS |= {"dataset.database_labels", "dataset.query_labels"}
-PATHS |= {"store", "out", "checkpoints"}
+PATHS |= {"store", "out", "checkpoints", "confidence"}
 PATHS |= {f"{group}.{side}" for group in ("features", "retrieval") for side in ("database", "queries")}
 MULTIRUN = ("-m", "--multirun")
 _NAME = r"[A-Za-z_][\w/@]*(?:\.\w+)*"  # of a setting, or of a group

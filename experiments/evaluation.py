@@ -4,7 +4,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments import build, prepare, run_folder, truth
+from experiments import build, confidences, prepare, run_folder, truth
 from experiments.prepare import Images, Tools
 from experiments.settings import SettingsError
 from mfvpr import evaluations
@@ -12,6 +12,8 @@ from mfvpr.data.datasets import Dataset
 from mfvpr.evaluation import Unit
 from mfvpr.evaluations import Stopwatch
 from mfvpr.report import runs
+from mfvpr.report.confidences import Assured, confidence_figures, confidence_table, write_confidence
+from mfvpr.report.differences import write_gains
 from mfvpr.report.evaluations import Figure, Judged, figures, recall_table, write_rankings, write_skipped
 from mfvpr.results import FILTER, FRAMES
 from mfvpr.scoring import HistogramOfShifts
@@ -27,6 +29,7 @@ class Outcome:
     images: Images
     tools: Tools
     judged: Judged
+    assured: Assured
     parameters: dict[str, dict[str, Any]]
     figures: list[Figure]
 
@@ -43,12 +46,13 @@ def evaluate(settings: dict[str, Any]) -> None:
 
 def evaluated(settings: dict[str, Any]) -> Outcome:
     """The filter alone, each scorer, and the best of them (the paper: histogram) combined with the filter."""
-    scorers, watch = build.scorers(settings["scorer"]), Stopwatch()
+    scorers, watch, confidence = build.scorers(settings["scorer"]), Stopwatch(), confidences.read(settings)
     tools, images = prepare.begun(settings, watch)
     shown = asked_figures(settings["figures"], images.dataset)
     main = "histogram" if "histogram" in scorers else next(iter(scorers))
     combined, group, histogram = f"{main} + {FILTER}", settings["scorer"], scorers.get("histogram")
     headline, frames = combined if settings["final"] == "combined" else main, build.frames(settings)
+    confidences.check(confidence, headline, images)
     result = evaluations.evaluate(
         images.dataset, tools.extractor, tools.filter, scorers, candidates=settings["candidates"],
         matching=tools.matching, fused={main: build.fusion(settings)}, correlated={headline: frames} if frames else {},
@@ -61,14 +65,17 @@ def evaluated(settings: dict[str, Any]) -> Outcome:
     thresholds = truth.thresholds(settings, images.dataset.sequences[0].truth)
     judged = Judged(result, thresholds, sorted(set(settings["recall"]["ks"])), headline)
     histogram = histogram if isinstance(histogram, HistogramOfShifts) else None
-    drawn = figures(judged, tools.extractor, shown, histogram)
-    return Outcome(settings, images, tools, judged, parameters, drawn)
+    assured = Assured(judged, confidence and confidence.systems, settings["threshold"])
+    drawn = [*figures(judged, tools.extractor, shown, histogram), *(confidence_figures(assured) if shown else [])]
+    return Outcome(settings, images, tools, judged, assured, parameters, drawn)
 
 
 def text(outcome: Outcome) -> str:
     """For the terminal: what was evaluated, and the table."""
-    table = f"\n{recall_table(outcome.judged).text()}" if outcome.judged.thresholds else ""
-    return f"{heading(outcome)}\n{table}"
+    tables = [recall_table(outcome.judged)] if outcome.judged.thresholds else []
+    if tables and outcome.settings["confidence"]:
+        tables.append(confidence_table(outcome.assured))
+    return "\n".join([f"{heading(outcome)}\n", *(table.text() for table in tables)])
 
 
 def heading(outcome: Outcome) -> str:
@@ -97,7 +104,9 @@ def write(folder: Path, outcome: Outcome) -> None:
     runs.write_json(folder / "results.json", result_rows(outcome))
     if outcome.judged.thresholds:
         runs.write_table(folder, recall_table(outcome.judged), heading(outcome))
-    write_rankings(folder, outcome.judged)
+    write_rankings(folder, outcome.judged, outcome.assured.refused_of_headline)
+    write_gains(folder, outcome.judged)
+    write_confidence(folder, outcome.assured, confidences.made(outcome.settings, outcome.images, outcome.judged))
     write_skipped(folder, outcome.judged.result)
 
 

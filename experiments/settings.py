@@ -164,6 +164,8 @@ RULES: dict[str, Rule] = {
     "c": _or(_NOT_NEGATIVE, "auto"),
     "final": _one_of("score", "combined"),
     "previous_queries": _between(0, 1000),
+    ".confidence": _or(_PATH, None),
+    ".threshold": _or(_number(0, 1), None),
     # report
     "tolerances": _list_of(_INDEX),
     "radius": _POSITIVE,
@@ -209,6 +211,9 @@ def check(settings: Mapping[str, Any]) -> None:
         raise SettingsError("features.image_size=null: expected width and height for features=ssm, such as [336,336]")
     if method == "grid":
         _check_cells(settings)
+    if settings.get("threshold") is not None and settings["confidence"] is None:
+        raise SettingsError(f"threshold={settings['threshold']}: expected confidence=FILE as well, the confidence.json "
+                            "of a run on other images with ground truth")  # fmt: skip
 
 
 def _rule(path: str, methods: Mapping[str, str]) -> Rule | None:

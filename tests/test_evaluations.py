@@ -11,9 +11,11 @@ from PIL import Image
 
 import mfvpr
 from mfvpr.archive import Archive
+from mfvpr.confidence import confidence_inputs, fit_confidence
 from mfvpr.data.datasets import folder_dataset, sequences_dataset
 from mfvpr.errors import InputError
-from mfvpr.evaluation import Positives
+from mfvpr.evaluation import Positives, halves
+from mfvpr.evaluation.statistics import block_sign_flips
 from mfvpr.evaluations import match_sequence
 from mfvpr.exchange import write_features, write_global_descriptors, write_shortlist
 from mfvpr.features import Aggregated
@@ -25,6 +27,8 @@ from mfvpr.frame_correlation import FrameCorrelation
 from mfvpr.imported import DescriptorFiles, FeatureFiles, File, ShortlistFiles
 from mfvpr.progress import untracked
 from mfvpr.rankings import Fusion, rank_sequence
+from mfvpr.report.confidences import Assured
+from mfvpr.report.differences import differences, write_gains
 from mfvpr.report.evaluations import Judged, recall_table, write_rankings
 from mfvpr.retrieval import WhitenedSearch
 from tests.programs import typed
@@ -92,7 +96,7 @@ def test_frame_correlation_is_a_ranking_more(result):
         assert (got.scores != alone.scores).any()
 
 
-def test_sequences_are_evaluated_by_themselves_with_their_means(dataset, split, small_street, result):
+def test_sequences_are_evaluated_by_themselves_with_their_means(dataset, split, small_street, result, tmp_path):
     several = sequences_dataset(
         small_street / "database", split, ground_truth="index", index_file="truth.csv", widen_index=True
     )
@@ -104,8 +108,28 @@ def test_sequences_are_evaluated_by_themselves_with_their_means(dataset, split, 
     np.testing.assert_allclose(recall.pooled, result.recall([0, 1], [1])["count"].pooled)
     np.testing.assert_allclose(recall.mean, recall.by_sequence.mean(axis=0))
     assert recall.queries.tolist() == [3, 7]
-    table = recall_table(Judged(found, [0, 1], [1], "count"))
+    judged = Judged(found, [0, 1], [1], "count")
+    table = recall_table(judged)
     assert [line[:2] for line in table.rows[:4]] == [["filter", name] for name in ("first", "second", "mean", "pooled")]
+    write_gains(tmp_path, judged)
+    gains = [(tmp_path / "sequences" / name / "gains.csv").read_text().splitlines() for name in ("first", "second")]
+    assert list(map(len, gains)) == [4, 8]
+    hits = {name: np.concatenate([judged.is_right(name, place)[:, 0] for place in (0, 1)]) for name in found.systems}
+    for first, second, counts, flips in differences(judged):
+        assert counts.only_first == (hits[first] > hits[second]).sum()
+        assert flips == block_sign_flips(hits[first], hits[second], sequences=[3, 7])
+    assured, start, parts = Assured(judged), 0, []
+    for sequence in several.sequences:
+        parts.append([[start + half.tune, start + half.report] for half in halves(sequence.truth.positives(1))])
+        start += len(sequence.images)
+    inputs = np.concatenate(
+        [confidence_inputs(*pair) for pair in zip(found.systems["count"], found.systems["filter"], strict=True)]
+    )
+    for one, other in zip(*parts, strict=True):
+        tune, report = (np.concatenate(both) for both in zip(one, other, strict=True))
+        expected = fit_confidence(inputs[tune], hits["count"][tune]).probability(inputs[report])
+        np.testing.assert_allclose(assured.probabilities["count"][report], expected)
+    assert [len(part) for part in assured.by_sequence(assured.scores("count"))] == [3, 7]
     with pytest.raises(InputError, match="expected one query sequence, got 2; choose one of first, second"):
         several.queries  # noqa: B018
     with pytest.raises(InputError, match="sequences of different names, got first twice"):

@@ -215,7 +215,10 @@ def test_demo_prints_its_table_and_leaves_a_run_folder(demo):
     tables = {"table.md", "table.csv", "table.tex", "predictions.csv", "failures.csv"}
     assert {"results.json", "run.json"} | tables <= files
     figures = [path for path in files if path.startswith("figures/")]
-    assert {name.split("/")[1].split("_")[0] for name in figures} == {"right", "wrong"}
+    queries = {name for name in figures if name[-8:-4].isdigit()}
+    assert {name.split("/")[1].split("_")[0] for name in queries} == {"right", "wrong"}
+    curves = {f"figures/{name}.png" for name in ("precision_recall", "reliability", "rerank_share")}
+    assert set(figures) == queries | curves
     for name in figures:
         image = np.asarray(Image.open(folder / name).convert("L"))
         assert image.shape[0] > 300

@@ -96,8 +96,10 @@ ALLOWED = {
         "types",
     },
     "testing": {"errors", "numerics", "reranking", "scoring", "types"},
+    "confidence": {"data", "errors", "results"},
     "report": {
         "archive",
+        "confidence",
         "results",
         "data",
         "errors",

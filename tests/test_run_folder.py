@@ -1,6 +1,7 @@
 """What a run leaves, and what it leaves when something goes wrong: claims, full disks, foreign names."""
 
 import csv
+import itertools
 import json
 import os
 import resource
@@ -24,12 +25,14 @@ from mfvpr.data.images import read_image
 from mfvpr.data.streets import streets_folder
 from mfvpr.errors import InputError
 from mfvpr.evaluation import Positives
+from mfvpr.evaluation.statistics import block_sign_flips, mcnemar
 from mfvpr.report import runs
 from mfvpr.report.evaluations import _Page
 from mfvpr.scoring import HistogramOfShifts
 from tests.programs import CANDIDATES, QUERIES, ROOT, composed, shared, small, typed
 
 LINES = ("scorer=histogram", "figures=4")
+SYSTEMS = ("filter", "histogram", "histogram + filter")
 
 
 @pytest.fixture(scope="session")
@@ -95,6 +98,28 @@ def test_failures_are_the_wrong_first_answers(evaluated, system):
             assert float(line["margin"]) == pytest.approx(margin, abs=1e-5)
 
 
+def test_gains_are_what_the_predictions_say_of_each_query(evaluated):
+    gains, hits = rows(evaluated / "gains.csv"), {}
+    assert len(gains) == QUERIES
+    for system in SYSTEMS:
+        lines = rows(evaluated / "predictions" / f"{system.replace(' + ', '_')}.csv")
+        for line in gains:
+            right = [one["rank"] for one in lines if one["query"] == line["query"] and one["right"] == "1"]
+            assert line[f"{system} rank"] == (right[0] if right else "")
+            assert line[system] == str(int(right[:1] == ["1"]))
+        hits[system] = np.array([line[system] == "1" for line in gains])
+    assert {line["histogram rank"] for line in gains} > {"", "1"}
+    for line, pair in zip(rows(evaluated / "differences.csv"), itertools.combinations(SYSTEMS, 2), strict=True):
+        assert (line["system"], line["other"]) == pair
+        first, second = (hits[name] for name in pair)
+        assert [line["only_system"], line["only_other"]] == [str((first > second).sum()), str((first < second).sum())]
+        assert float(line["mcnemar_p"]) == pytest.approx(mcnemar(first, second).p_value, rel=1e-6)
+        assert float(line["blocks_p"]) == pytest.approx(block_sign_flips(first, second).p_value, rel=1e-6)
+    header, _, _, line, _ = (evaluated / "differences.md").read_text().splitlines()
+    assert header == "| only this is right, not | filter | histogram | histogram + filter |"
+    assert line.startswith(f"| histogram | {(hits['histogram'] > hits['filter']).sum()} (p ")
+
+
 def test_without_ground_truth_nothing_is_right_or_failed(root, tmp_path):
     none = ("dataset.ground_truth=none", "dataset.index_file=null", "figures=2", f"out={tmp_path}/out")
     evaluation.evaluate(composed(*small(root), *LINES, *none))
@@ -141,7 +166,7 @@ def test_a_run_says_how_it_was_made(root, tmp_path, monkeypatch, capsys):
 
 
 def test_a_wrong_figure_has_the_right_image_below(evaluated, outcome):
-    heights = {path.name: len(read_image(path)) for path in (evaluated / "figures").iterdir()}
+    heights = {path.name: len(read_image(path)) for path in (evaluated / "figures").glob("*_0*.png")}
     assert len(heights) == 4
     assert min(height for name, height in heights.items() if name.startswith("wrong")) > 700
     assert max(height for name, height in heights.items() if name.startswith("right")) < 600
@@ -342,7 +367,7 @@ def test_names_that_are_no_utf8_cost_nothing(root, tmp_path, monkeypatch, capsys
     assert code == 0, stderr
     assert stdout.endswith("out\\udcff\n")
     assert "warning" not in stderr
-    assert len(list((out / "figures").iterdir())) == 2
+    assert len(list((out / "figures").glob("*_0*.png"))) == 2
     assert b"\xfe0000.png,1,\xfe000" in (out / "predictions.csv").read_bytes()
     run = json.loads((out / "run.json").read_text(encoding="utf-8"))
     assert run["settings"]["out"] == str(out)

@@ -114,11 +114,15 @@ def test_the_best_setting_is_chosen_and_told(swept):
         test = line["mcnemar"]
         gain = QUERIES * (line["chosen"]["recall"] - line["own"]["recall"])
         assert test["only_first"] - test["only_second"] == pytest.approx(gain)
+        assert 0 < line["sign_flips"]["p_value"] <= 1
+        assert line["sign_flips"]["blocks"] <= -(-QUERIES // line["sign_flips"]["block"])
     text = (out / "summary.txt").read_text()
     assert "neighbors" not in text  # all 8 settings stand above
     assert f"chosen: sigma = {chosen['sigma']:g}, weight = {chosen['weight']}, c = {chosen['c']}" in text
     assert f"24 queries, {CANDIDATES} candidates of 24 database images" in text
     assert "this flatters" in text
+    flips = found["report"][1]["sign_flips"]
+    assert f"by {flips['blocks']} blocks of {flips['block']} queries p = {flips['p_value']:.2g}" in text
 
 
 def test_heat_maps_are_pictures(swept):

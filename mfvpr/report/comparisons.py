@@ -12,7 +12,7 @@ import numpy as np
 
 from mfvpr.data.files import replacing
 from mfvpr.evaluation import threshold_words
-from mfvpr.evaluation.statistics import estimate, mcnemar, recall_interval
+from mfvpr.evaluation.statistics import block_sign_flips, estimate, mcnemar, recall_interval
 from mfvpr.learning.comparison import Comparison, Row
 from mfvpr.learning.match_weight import FEATURE_NAMES, LearnedWeight
 from mfvpr.learning.training import Fit
@@ -24,19 +24,24 @@ SHOWN_QUERIES = 20  # whose matches the figure of the weights counts
 
 
 def table(comparison: Comparison) -> Table:
-    """Recall at 1 of every row, its interval at the threshold that decides, and how it differs from the first row."""
+    """Recall at 1 of every row, its interval at the threshold that decides, and how it differs from the first row.
+
+    p is McNemar's, which takes queries for independent, and that of blocks of the path.
+    """
     judge = comparison.judge
     lines, first = [], None
     for name, hits, _ in comparison.rows():
         first = hits if first is None else first
         low, high = estimate(hits[judge.main]).interval
-        test = mcnemar(hits[judge.main], first[judge.main])
-        compared = ("", "") if hits is first else (f"+{test.only_first} -{test.only_second}", f"{test.p_value:.2g}")
+        pair = hits[judge.main], first[judge.main]
+        test, flips = mcnemar(*pair), block_sign_flips(*pair)
+        compared = [f"+{test.only_first} -{test.only_second}", f"{test.p_value:.2g}", f"{flips.p_value:.2g}"]
+        compared = [""] * 3 if hits is first else compared
         recall = (f"{100 * one.mean():.1f}" for one in hits)
         lines.append([name, *recall, f"[{100 * low:.1f}, {100 * high:.1f}]", *compared])
     words = threshold_words(judge.unit, judge.thresholds[judge.main])
     header = [judge.label(1, threshold) for threshold in judge.thresholds]
-    return Table(["score", *header, f"95 % at{words}" if words else "95 %", "against paper", "p"], lines)
+    return Table(["score", *header, f"95 % at{words}" if words else "95 %", "against paper", "p", "p by blocks"], lines)
 
 
 def text(comparison: Comparison) -> str:
@@ -48,11 +53,13 @@ def results(comparison: Comparison) -> dict[str, Any]:
     """All of it as JSON values."""
     judge = comparison.judge
     labels = [f"{threshold:g}" for threshold in judge.thresholds]
+    first = next(comparison.rows())[1]
     rows = [
         {
             "score": name,
             "recall_at_1": dict(zip(labels, hits.mean(axis=1).tolist(), strict=True)),
             "interval": dict(zip(labels, map(recall_interval, hits), strict=True)),
+            "against_first": dict(zip(labels, map(_difference, hits, first), strict=True)),
             "halves": {row.half: _half(row) for row in halves},
         }
         for name, hits, halves in comparison.rows()
@@ -99,6 +106,13 @@ def _remarks(comparison: Comparison) -> Iterator[str]:
                 values = ", ".join(f"{key} = {written(value)}" for key, value in row.values.items())
                 steps = f"; best after {row.fitted.step} steps, {row.fitted.ended}" if row.fitted else ""
                 yield f"{name}, {row.half}: {values}{steps}"
+
+
+def _difference(hits: np.ndarray, first: np.ndarray) -> dict[str, Any]:
+    return {
+        "mcnemar": mcnemar(hits, first)._asdict(),
+        "sign_flips": block_sign_flips(hits, first)._asdict(),
+    }
 
 
 def _half(row: Row) -> dict[str, Any]:

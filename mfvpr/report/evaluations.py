@@ -1,7 +1,7 @@
 """An evaluation as a table, as files of rankings, and as figures of some queries."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -70,6 +70,10 @@ class Judged:
         right = self.right[place]
         return None if right is None else right.contains(self.result.systems[system][place].rows)
 
+    def folder(self, run: Path, place: int) -> Path:
+        """Where a sequence's files are: `sequences/<name>/` of several, as a name may be that of any other file."""
+        return run / "sequences" / self.sequences[place].name if len(self.sequences) > 1 else run
+
 
 def recall_table(judged: Judged) -> Table:
     """R@first k at every threshold, and all ks at the middle one; a line for each system, and sequence."""
@@ -86,14 +90,17 @@ def recall_table(judged: Judged) -> Table:
     return Table(["system", *(["sequence"] if several else []), *labels], lines, text_columns=1 + several)
 
 
-def write_rankings(folder: Path, judged: Judged) -> None:
+def write_rankings(folder: Path, judged: Judged, refused: Sequence[np.ndarray] | None = None) -> None:
     """`predictions/` and `failures/` of every system, those of the headline's in the folder itself.
 
-    Of several sequences each has a folder with its own, `sequences/<name>/`: a name may be that of any other file.
+    Args:
+        folder: of the run.
+        judged: what is written.
+        refused: `[Q]` bool of each sequence, what is not answered in the headline's predictions; None = none.
     """
     database = judged.result.dataset.database.names
     for place, sequence in enumerate(judged.sequences):
-        own = folder / "sequences" / sequence.name if len(judged.sequences) > 1 else folder
+        own = judged.folder(folder, place)
         for name, ranked in judged.result.systems.items():
             answers = ranked[place]
             rankings = Rankings(
@@ -103,7 +110,8 @@ def write_rankings(folder: Path, judged: Judged) -> None:
             write_predictions(own / "predictions" / file, rankings)
             write_failures(own / "failures" / file, rankings)
             if name == judged.headline:
-                write_predictions(own / "predictions.csv", rankings)
+                answered = rankings if refused is None else replace(rankings, refused=refused[place])
+                write_predictions(own / "predictions.csv", answered)
                 write_failures(own / "failures.csv", rankings)
 
 

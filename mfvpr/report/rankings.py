@@ -10,6 +10,8 @@ import numpy as np
 
 from mfvpr.data.files import replacing
 
+NO_PLACE = "no place"  # the answer to a query whose place the database is thought not to show
+
 
 @dataclass(frozen=True)
 class Rankings:
@@ -21,6 +23,7 @@ class Rankings:
         rows: `[Q, C]` database rows, best first, -1 = none.
         scores: `[Q, C]` in that order.
         right: `[Q, C]` bool in that order; None = unknown.
+        refused: `[Q]` bool, answered `NO_PLACE`; None = none.
     """
 
     queries: Sequence[str]
@@ -28,19 +31,23 @@ class Rankings:
     rows: np.ndarray
     scores: np.ndarray
     right: np.ndarray | None
+    refused: np.ndarray | None = None
 
 
 def write_predictions(path: Path, rankings: Rankings) -> None:
     """CSV with a line per query and candidate, best first: `query,rank,database,score,right`.
 
-    `right` is 1 or 0, or empty where it is unknown.
+    `right` is 1 or 0, or empty where it is unknown. Of a query that is refused there is one line, `NO_PLACE`.
     """
+    refused = np.zeros(len(rankings.rows), bool) if rankings.refused is None else rankings.refused
     lines = (
-        [rankings.queries[query], rank + 1, rankings.database[row], _written(rankings.scores[query, rank]),
+        [rankings.queries[query], 1, NO_PLACE, "", ""] if refused[query] else
+        [rankings.queries[query], rank + 1, rankings.database[row], number(rankings.scores[query, rank]),
          "" if rankings.right is None else int(rankings.right[query, rank])]
-        for (query, rank), row in np.ndenumerate(rankings.rows) if row >= 0
+        for (query, rank), row in np.ndenumerate(rankings.rows)
+        if (rank == 0 if refused[query] else row >= 0)
     )  # fmt: skip
-    _write_csv(path, ("query", "rank", "database", "score", "right"), lines)
+    write_csv(path, ("query", "rank", "database", "score", "right"), lines)
 
 
 def write_failures(path: Path, rankings: Rankings) -> None:
@@ -56,7 +63,7 @@ def write_failures(path: Path, rankings: Rankings) -> None:
         row = int(rankings.rows[query, 0])
         answer = rankings.database[row] if row >= 0 else ""
         lines.append([rankings.queries[query], answer, *_first_right(rankings, rankings.right[query], query)])
-    _write_csv(path, ("query", "answer", "rank", "right_answer", "score", "margin"), lines)
+    write_csv(path, ("query", "answer", "rank", "right_answer", "score", "margin"), lines)
 
 
 def _first_right(rankings: Rankings, right: np.ndarray, query: int) -> list[str | int]:
@@ -64,14 +71,15 @@ def _first_right(rankings: Rankings, right: np.ndarray, query: int) -> list[str 
         return [""] * 4
     rank, scores = int(np.argmax(right)), rankings.scores[query]
     name = rankings.database[int(rankings.rows[query, rank])]
-    return [rank + 1, name, _written(scores[rank]), _written(scores[0] - scores[rank])]
+    return [rank + 1, name, number(scores[rank]), number(scores[0] - scores[rank])]
 
 
-def _written(value: Any) -> str:
+def number(value: Any) -> str:
+    """A number in a CSV file."""
     return f"{value:.7g}"
 
 
-def _write_csv(path: Path, header: Sequence[str], lines: Iterable[Sequence[str | int]]) -> None:
-    # Names as the very bytes that the file system has, so that they can be looked up again.
+def write_csv(path: Path, header: Sequence[str], lines: Iterable[Sequence[str | int]]) -> None:
+    """Names in it are the very bytes that the file system has, so that they can be looked up again."""
     with replacing(path) as temporary, temporary.open("w", encoding="utf-8", errors="surrogateescape") as file:
         csv.writer(file, lineterminator="\n").writerows([header, *lines])

@@ -58,7 +58,8 @@ def results(outcome: Outcome) -> dict[str, Any]:
         "chosen": [outcome.settings[number] for number in outcome.chosen],
         "report": [
             {"threshold": verdict.threshold, "queries": verdict.queries, "chosen": verdict.chosen._asdict(),
-             "own": verdict.own._asdict(), "mcnemar": verdict.mcnemar._asdict()}
+             "own": verdict.own._asdict(), "mcnemar": verdict.mcnemar._asdict(),
+             "sign_flips": verdict.sign_flips._asdict()}
             for verdict in outcome.report
         ],
         "settings": [
@@ -105,7 +106,9 @@ def _verdicts(outcome: Outcome) -> Iterator[str]:
         yield (
             f"{judge.label(1, verdict.threshold)}: chosen {_with_interval(verdict.chosen)}, own values "
             f"{_with_interval(verdict.own)}; only one of them right: {verdict.mcnemar.only_first} and "
-            f"{verdict.mcnemar.only_second} queries, McNemar p = {verdict.mcnemar.p_value:.2g}"
+            f"{verdict.mcnemar.only_second} queries, McNemar p = {verdict.mcnemar.p_value:.2g}, by "
+            f"{verdict.sign_flips.blocks} blocks of {verdict.sign_flips.block} queries "
+            f"p = {verdict.sign_flips.p_value:.2g}"
         )
     if not judge.halves:
         yield (

@@ -9,7 +9,7 @@ import numpy as np
 
 from mfvpr import evaluation
 from mfvpr.evaluation import Judge
-from mfvpr.evaluation.statistics import Estimate, McNemar, estimate, mcnemar
+from mfvpr.evaluation.statistics import Estimate, McNemar, SignFlips, block_sign_flips, estimate, mcnemar
 from mfvpr.sweeping.axes import Axes
 
 
@@ -20,6 +20,7 @@ class Verdict(NamedTuple):
     queries: that are reported on.
     chosen, own: recall at 1.
     mcnemar: whether they differ; the chosen ones are first.
+    sign_flips: the same by blocks of the path.
     """
 
     threshold: float
@@ -27,6 +28,7 @@ class Verdict(NamedTuple):
     chosen: Estimate
     own: Estimate
     mcnemar: McNemar
+    sign_flips: SignFlips
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,9 @@ class Outcome:
         chosen = self.judge.reported(self.rows, self.chosen)
         own = self.judge.reported(self.rows, [self.own] * len(self.chosen))
         return [
-            Verdict(threshold, len(first), estimate(first), estimate(second), mcnemar(first, second))
+            Verdict(
+                threshold, len(first), estimate(first), estimate(second),
+                mcnemar(first, second), block_sign_flips(first, second),
+            )
             for threshold, first, second in zip(self.judge.thresholds, chosen, own, strict=True)
-        ]
+        ]  # fmt: skip

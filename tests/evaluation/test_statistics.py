@@ -1,13 +1,14 @@
 """Intervals and tests against closed forms, explicit loops and simulated paths."""
 
+import itertools
 import math
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import signal, stats
 
 from mfvpr.errors import InputError
-from mfvpr.evaluation.statistics import design_effect, mcnemar, recall_interval
+from mfvpr.evaluation.statistics import block_sign_flips, design_effect, mcnemar, recall_interval
 
 
 def paths(recall, correlation, queries, count=200, seed=0):
@@ -21,12 +22,25 @@ def paths(recall, correlation, queries, count=200, seed=0):
     return hits
 
 
-def effect_oracle(hits):
-    """The design effect, with loops over lags and queries."""
-    total, mean = len(hits), sum(hits) / len(hits)
+def latent_paths(recall, correlation, queries, count=200, systems=1, shared=0.0, seed=0):
+    """Hits `[systems, count, queries]` where Gaussian sequences, which share a part, stay below a threshold."""
+    rng = np.random.default_rng(seed)
+    noise = rng.standard_normal((systems + 1, count, queries))
+    noise[..., 1:] *= math.sqrt(1 - correlation**2)
+    common, *own = signal.lfilter([1], [1, -correlation], noise)
+    return math.sqrt(shared) * common + math.sqrt(1 - shared) * np.array(own) < stats.norm.ppf(recall)
+
+
+def effect_oracle(values, events, sequences=None):
+    """The design effect, with loops over lags and queries, of which so many tell something."""
+    total, mean = len(values), sum(values) / len(values)
+    ends = np.cumsum(sequences or [total])
+    owner = np.searchsorted(ends, np.arange(total), side="right")
     covariances = [
-        sum((hits[query] - mean) * (hits[query + lag] - mean) for query in range(total - lag)) for lag in range(total)
-    ]
+        sum((values[query] - mean) * (values[query + lag] - mean) for query in range(total - lag)
+            if owner[query] == owner[query + lag])
+        for lag in range(total)
+    ]  # fmt: skip
     correlations = [covariance / covariances[0] for covariance in covariances]
     bound = 2 * math.sqrt(math.log10(total) / total)
     half = 0
@@ -35,8 +49,7 @@ def effect_oracle(hits):
     half = max(half, 1)
     flat = 1 + 2 * sum(value * min(1, max(0, 2 - lag / half)) for lag, value in enumerate(correlations) if lag)
     first = min(max((total * correlations[1] + 1) / (total - 3), 0), 0.98)
-    rarer = min(sum(hits), total - sum(hits))
-    return (rarer * max(1, flat, (1 + first) / (1 - first)) + total ** (1 / 3)) / (rarer + 1)
+    return min((events * max(1, flat, (1 + first) / (1 - first)) + total ** (1 / 3)) / (events + 1), total)
 
 
 @pytest.mark.parametrize("correlation", [0, 0.6, 0.9])
@@ -44,7 +57,8 @@ def test_design_effect_equals_the_loops(correlation):
     for hits in paths(0.7, correlation, 80, count=10, seed=1):
         if hits.all() or not hits.any():
             continue
-        assert design_effect(hits) == pytest.approx(min(effect_oracle(hits.tolist()), 80), rel=1e-9)
+        rarer = min(hits.sum(), 80 - hits.sum())
+        assert design_effect(hits) == pytest.approx(effect_oracle(hits.tolist(), rarer), rel=1e-9)
 
 
 @pytest.mark.parametrize("level", [0.9, 0.95])
@@ -64,6 +78,13 @@ def test_along_a_path_the_recall_is_in_nine_of_ten_intervals(recall, queries):
     """At an autocorrelation of 0.8; blocks of the cube root of Q gave 34 to 78 of 100."""
     low, high = np.array([recall_interval(hits) for hits in paths(recall, 0.8, queries)]).T
     assert np.mean((low <= recall) & (recall <= high)) >= 0.9
+
+
+@pytest.mark.parametrize("recall", [0.5, 0.65, 0.8, 0.95])
+def test_so_it_is_where_hits_hang_together_longer_than_neighbors_say(recall):
+    """Thresholded Gaussian sequences of 101 queries; two standard errors are allowed for."""
+    low, high = np.array([recall_interval(hits) for hits in latent_paths(recall, 0.8, 101, count=400)[0]]).T
+    assert np.mean((low <= recall) & (recall <= high)) >= 0.9 - 2 * math.sqrt(0.9 * 0.1 / 400)
 
 
 def test_independent_queries_have_nearly_the_binomial_interval():
@@ -122,3 +143,81 @@ def test_mcnemar_is_a_fair_coin_on_the_queries_that_differ(only_first, only_seco
     got = mcnemar(first, second)
     assert got[:2] == (only_first, only_second)
     assert got.p_value == pytest.approx(min(1.0, 2 * tail))
+
+
+def flips_oracle(differences, sequences, block):
+    """Number of blocks in which one is ahead, and the share of all their flips that sum to as much, either way."""
+    sums, start = [], 0
+    for length in sequences:
+        path = differences[start : start + length]
+        start += length
+        sums += [sum(path[place : place + block]) for place in range(0, length, block)]
+    sums = [value for value in sums if value]
+    flips = [
+        abs(sum(sign * value for sign, value in zip(signs, sums, strict=True))) >= abs(sum(sums))
+        for signs in itertools.product((1, -1), repeat=len(sums))
+    ]
+    return len(sums), sum(flips) / len(flips)
+
+
+@pytest.mark.parametrize("sequences", [[30], [13, 17], [1, 20, 0, 9]])
+@pytest.mark.parametrize("block", [3, 4, 50])
+def test_block_sign_flips_count_all_flips_of_blocks_within_a_sequence(sequences, block):
+    for first, second in latent_paths(0.7, 0.6, 30, count=8, systems=2).swapaxes(0, 1):
+        expected = flips_oracle((first.astype(int) - second).tolist(), sequences, block)
+        got = block_sign_flips(first, second, block=block, sequences=sequences)
+        assert got == (block, expected[0], pytest.approx(expected[1], rel=1e-12))
+        assert block_sign_flips(second, first, block=block, sequences=sequences) == got
+
+
+def test_blocks_of_one_query_are_mcnemars():
+    for first, second in latent_paths(0.8, 0.5, 300, count=10, systems=2).swapaxes(0, 1):
+        expected = mcnemar(first, second)
+        got = block_sign_flips(first, second, block=1)
+        assert got.p_value == pytest.approx(expected.p_value, rel=1e-9)
+        assert got.blocks == expected.only_first + expected.only_second
+
+
+@pytest.mark.parametrize("sequences", [[101], [60, 41]])
+def test_blocks_are_longer_where_neighbors_differ_together(sequences):
+    lengths = {}
+    for correlation in (0, 0.8):
+        pairs = latent_paths(0.7, correlation, 101, count=10, systems=2, shared=0.3).swapaxes(0, 1)
+        lengths[correlation] = [block_sign_flips(*pair, sequences=sequences).block for pair in pairs]
+        for (first, second), length in zip(pairs, lengths[correlation], strict=True):
+            differences = first.astype(int) - second
+            effect = effect_oracle(differences.tolist(), np.count_nonzero(differences), sequences)
+            assert length == min(math.ceil(101 ** (1 / 3) * effect), 101)
+    assert np.median(lengths[0]) < 8
+    assert np.median(lengths[0.8]) > 12
+
+
+@pytest.mark.parametrize("recall", [0.5, 0.8])
+def test_equal_systems_seldom_differ_by_blocks_and_often_by_mcnemar(recall):
+    """At 5 %; at most 8 % are promised."""
+    pairs = latent_paths(recall, 0.8, 101, count=300, systems=2, shared=0.3).swapaxes(0, 1)
+    flips, coins = ([test(*pair).p_value <= 0.05 for pair in pairs] for test in (block_sign_flips, mcnemar))
+    assert np.mean(flips) <= 0.08
+    assert np.mean(coins) > 0.25
+
+
+def test_a_gain_all_along_the_path_is_significant():
+    """As on real images: ten queries gained of 101, none lost; eleven blocks of which only one is ahead."""
+    first = np.random.default_rng(0).random(101) < 0.8
+    second = first.copy()
+    second[np.flatnonzero(first)[::8][:10]] = False
+    assert block_sign_flips(first, second, block=9) == (9, 10, 2 / 2**10)
+
+
+def test_systems_that_agree_do_not_differ():
+    hits = np.arange(20) < 15
+    assert block_sign_flips(hits, hits) == (8, 0, 1.0)  # the cube root, squared
+    assert block_sign_flips(hits[:0], hits[:0]) == (1, 0, 1.0)
+
+
+@pytest.mark.parametrize("options", [{"sequences": [3, 3]}, {"sequences": [6, -1]}, {"block": 0}])
+def test_blocks_of_other_queries_are_refused(options):
+    with pytest.raises(InputError, match="expected"):
+        block_sign_flips(np.ones(5), np.ones(5), **options)
+    with pytest.raises(InputError, match=r"got \[5\], \[4\]"):
+        block_sign_flips(np.ones(5), np.ones(4))

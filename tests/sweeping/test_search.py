@@ -97,11 +97,14 @@ def test_each_half_is_reported_by_what_was_chosen_on_the_other(outcome):
         assert chosen == best_setting(tuned, WEIGHTS)
         first += hits(outcome.rows[0][chosen], right)[half.report].tolist()
         own += hits(outcome.rows[0][4], right)[half.report].tolist()
+    path = np.argsort(np.concatenate([half.report for half in outcome.judge.halves]))
+    first, own = np.array(first)[path], np.array(own)[path]
     verdict = outcome.report[1]
     assert (verdict.threshold, verdict.queries) == (TOLERANCES[1], QUERIES)
-    assert verdict.chosen == statistics.estimate(np.array(first)) == (np.mean(first), verdict.chosen.interval)
-    assert verdict.chosen.interval == statistics.recall_interval(np.array(first))
-    assert verdict.mcnemar == statistics.mcnemar(np.array(first), np.array(own))
+    assert verdict.chosen == statistics.estimate(first) == (np.mean(first), verdict.chosen.interval)
+    assert verdict.chosen.interval == statistics.recall_interval(first)
+    assert verdict.mcnemar == statistics.mcnemar(first, own)
+    assert verdict.sign_flips == statistics.block_sign_flips(first, own)
 
 
 def test_optuna_draws_within_the_axes():

@@ -1,0 +1,88 @@
+"""Precision against recall, whether p means what it says, and recall against the share of queries re-ranked."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from mfvpr.data.files import replacing
+from mfvpr.evaluation.precision import PrecisionRecall, Reliability
+
+
+def precision_recall_figure(path: Path, curves: Mapping[str, Mapping[str, PrecisionRecall]]) -> None:
+    """A panel for what answers are held by (the score, p), in it a curve for each system.
+
+    Args:
+        path: image file to write.
+        curves: by system, and what its answers are held by.
+    """
+    kinds = list(dict.fromkeys(kind for by in curves.values() for kind in by))
+    figure, panels = _panels(len(kinds), width=5.0)
+    for panel, kind in zip(panels, kinds, strict=False):
+        for name, by in curves.items():
+            if kind in by:
+                curve = by[kind]
+                label = f"{name}: AP {100 * curve.average_precision:.1f}"
+                panel.plot(curve.recall, curve.precision, label=label, linewidth=1.2)
+        panel.set_title(f"by {kind}", fontsize=9)
+        _label(panel, "recall of the queries that have an answer", "precision of the answers")
+        panel.legend(fontsize=7, loc="lower left")
+    _save(figure, path)
+
+
+def reliability_figure(path: Path, reliabilities: Mapping[str, Reliability]) -> None:
+    """A panel for each system: how often answers of a probability are right, the areas by how many there are.
+
+    Args:
+        path: image file to write.
+        reliabilities: by system.
+    """
+    figure, panels = _panels(len(reliabilities), width=2.6)
+    for panel, (name, found) in zip(panels, reliabilities.items(), strict=False):
+        panel.plot([0, 1], [0, 1], color="gray", linewidth=0.8)
+        panel.scatter(found.probability, found.right, s=200 * found.count / max(found.count.sum(), 1) + 4, alpha=0.8)
+        panel.set_title(f"{name}: ECE {100 * found.calibration_error:.1f} %", fontsize=8)
+        _label(panel, "p(right)", "right")
+    _save(figure, path)
+
+
+def shares_figure(path: Path, shares: Sequence[float], recall: Mapping[str, np.ndarray]) -> None:
+    """Recall at 1 against the share of queries that are re-ranked, those first that the filter is the least sure of.
+
+    Args:
+        path: image file to write.
+        shares: of all queries.
+        recall: `[shares]` by system.
+    """
+    figure, [panel] = _panels(1, width=5.0)
+    for name, values in recall.items():
+        panel.plot(shares, values, label=name, linewidth=1.2)
+    _label(panel, "share of queries re-ranked", "recall at 1")
+    panel.legend(fontsize=7)
+    _save(figure, path)
+
+
+def _panels(number: int, *, width: float) -> tuple[Figure, list[Axes]]:
+    columns = min(4, number)
+    rows = -(-number // columns)
+    figure = Figure(figsize=(width * columns, width * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = [*figure.subplots(rows, columns, squeeze=False).reshape(-1)]
+    for panel in panels[number:]:
+        panel.set_axis_off()
+    return figure, panels[:number]
+
+
+def _label(panel: Axes, x: str, y: str) -> None:
+    panel.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
+    panel.set_xlabel(x, fontsize=8)
+    panel.set_ylabel(y, fontsize=8)
+    panel.grid(alpha=0.3)
+
+
+def _save(figure: Figure, path: Path) -> None:
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)

@@ -1,0 +1,84 @@
+"""Where systems differ: for every query whether each is right, and for every two of them whether that is luck."""
+
+import itertools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from mfvpr.data.files import write_text
+from mfvpr.evaluation.statistics import McNemar, SignFlips, block_sign_flips, mcnemar
+from mfvpr.report.evaluations import Judged
+from mfvpr.report.rankings import number, write_csv
+from mfvpr.report.tables import Table
+
+
+class Difference(NamedTuple):
+    """Two systems on all queries of all sequences, by their first answers."""
+
+    first: str
+    second: str
+    mcnemar: McNemar
+    sign_flips: SignFlips
+
+
+def differences(judged: Judged) -> list[Difference]:
+    """Of every two systems, in their order; none without ground truth."""
+    if not judged.thresholds:
+        return []
+    places = range(len(judged.sequences))
+    hits = {name: np.concatenate([_right(judged, name, place)[:, 0] for place in places])
+            for name in judged.result.systems}  # fmt: skip
+    sequences = [len(sequence.images) for sequence in judged.sequences]
+    return [
+        Difference(first, second, mcnemar(hits[first], hits[second]),
+                   block_sign_flips(hits[first], hits[second], sequences=sequences))
+        for first, second in itertools.combinations(hits, 2)
+    ]  # fmt: skip
+
+
+def differences_table(judged: Judged) -> Table:
+    """System x system: how many queries only that of the row gets right, and p by blocks of the path."""
+    cells = {}
+    for first, second, counts, flips in differences(judged):
+        cells[first, second] = f"{counts.only_first} (p {flips.p_value:.2g})"
+        cells[second, first] = f"{counts.only_second} (p {flips.p_value:.2g})"
+    names = [*judged.result.systems]
+    rows = [[name, *(cells.get((name, other), "") for other in names)] for name in names]
+    return Table(["only this is right, not", *names], rows)
+
+
+def write_gains(folder: Path, judged: Judged) -> None:
+    """`gains.csv` of every sequence, where its predictions are, and of all `differences.csv` and `differences.md`.
+
+    Nothing is written without ground truth.
+    """
+    if not judged.thresholds:
+        return
+    columns = [column for name in judged.result.systems for column in (name, f"{name} rank")]
+    for place in range(len(judged.sequences)):
+        write_csv(judged.folder(folder, place) / "gains.csv", ["query", *columns], _gains(judged, place))
+    write_csv(
+        folder / "differences.csv",
+        ["system", "other", "only_system", "only_other", "mcnemar_p", "block", "blocks", "blocks_p"],
+        [[first, second, counts.only_first, counts.only_second, *(number(value) for value in (
+            counts.p_value, flips.block, flips.blocks, flips.p_value))]
+         for first, second, counts, flips in differences(judged)],
+    )  # fmt: skip
+    write_text(folder / "differences.md", differences_table(judged).markdown())
+
+
+def _gains(judged: Judged, place: int) -> Iterator[list[str | int]]:
+    """By query: for every system whether its first answer is right, and the rank of the first right one."""
+    right = [_right(judged, system, place) for system in judged.result.systems]
+    for query, name in enumerate(judged.sequences[place].images.names):
+        line: list[str | int] = [name]
+        for answers in (one[query] for one in right):
+            line += [int(answers[0]), int(np.argmax(answers)) + 1 if answers.any() else ""]
+        yield line
+
+
+def _right(judged: Judged, system: str, place: int) -> np.ndarray:
+    """`[Q, C]` bool in the order of a system's ranking, with ground truth."""
+    return np.asarray(judged.is_right(system, place), bool)

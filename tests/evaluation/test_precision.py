@@ -1,0 +1,85 @@
+"""Precision, recall and calibration against explicit loops and closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+
+from mfvpr.errors import InputError
+from mfvpr.evaluation.precision import chance_calibration_error, precision_recall, reliability
+
+
+def made_up(seed=0, queries=40):
+    """Confidences with equal ones and some without an answer, hits, and queries that have an answer."""
+    rng = np.random.default_rng(seed)
+    confidence = rng.integers(0, 12, queries) / 11
+    right, has_answer = rng.random(queries) < confidence, rng.random(queries) < 0.9
+    confidence[rng.random(queries) < 0.1] = np.nan
+    return confidence, right & has_answer & ~np.isnan(confidence), has_answer
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_curve_is_that_of_counting_answers_at_every_threshold(seed):
+    confidence, right, has_answer = made_up(seed)
+    curve = precision_recall(confidence, right, has_answer)
+    thresholds = sorted({value for value in confidence.tolist() if not math.isnan(value)}, reverse=True)
+    assert curve.thresholds.tolist() == thresholds
+    area, before = 0.0, 0.0
+    for threshold, precision, recall in zip(*curve, strict=True):
+        answered = [query for query in range(40) if confidence[query] >= threshold]
+        hits = sum(right[query] for query in answered)
+        assert precision == pytest.approx(hits / len(answered))
+        assert recall == pytest.approx(hits / sum(has_answer))
+        area, before = area + (recall - before) * precision, recall
+    assert curve.average_precision == pytest.approx(area)
+    for wanted in (1.0, 0.9, 0.5):
+        reached = [recall for _, precision, recall in zip(*curve, strict=True) if precision >= wanted]
+        assert curve.recall_at(wanted) == max(reached, default=0)
+
+
+def test_perfect_and_hopeless_confidences():
+    right = np.arange(10) < 6
+    perfect = precision_recall(-np.arange(10.0), right, right)
+    assert (perfect.average_precision, perfect.recall_at(1.0)) == (1.0, 1.0)
+    assert precision_recall(np.arange(10.0), right).recall_at(1.0) == 0
+    assert precision_recall(-np.arange(10.0), right).recall_at(1.0) == 0.6
+    same = precision_recall(np.ones(10), right, right)  # all or none
+    assert (same.precision.tolist(), same.recall.tolist()) == ([0.6], [1.0])
+    none = precision_recall(np.full(10, np.nan), ~right & right)
+    assert (none.average_precision, none.recall_at(0.5), len(none.thresholds)) == (0.0, 0.0, 0)
+
+
+def test_answers_to_queries_without_a_place_cost_precision_and_no_recall():
+    confidence, right = np.array([0.9, 0.8, 0.7]), np.array([True, False, True])
+    curve = precision_recall(confidence, right, np.array([True, False, True]))
+    assert curve.recall.tolist() == [0.5, 0.5, 1.0]
+    np.testing.assert_allclose(curve.precision, [1, 1 / 2, 2 / 3])
+    with pytest.raises(InputError, match="no right answers to queries that have none"):
+        precision_recall(confidence, ~right, np.array([True, False, True]))
+
+
+@pytest.mark.parametrize("bins", [1, 4, 10])
+def test_reliability_is_that_of_loops_over_bins(bins):
+    confidence, right, _ = made_up(5)
+    found = reliability(confidence, right, bins=bins)
+    error, total = 0.0, 0
+    for number in range(bins):
+        last = number == bins - 1
+        inside = [query for query in range(40) if number / bins <= confidence[query] < (number + 1) / bins
+                  or (last and confidence[query] == 1)]  # fmt: skip
+        assert found.count[number] == len(inside)
+        if inside:
+            mean, share = (sum(values[query] for query in inside) / len(inside) for values in (confidence, right))
+            assert found.probability[number] == pytest.approx(mean)
+            assert found.right[number] == pytest.approx(share)
+            error, total = error + len(inside) * abs(mean - share), total + len(inside)
+        else:
+            assert np.isnan([found.probability[number], found.right[number]]).all()
+    assert found.calibration_error == pytest.approx(error / total)
+
+
+def test_calibration_error_by_chance_is_that_of_probabilities_that_are_true():
+    """One bin of p = 1/2: the mean distance of a fair coin's share of heads, sqrt(2 / (pi n)) / 2 of n throws."""
+    assert chance_calibration_error(np.full(100, 0.5)) == pytest.approx(math.sqrt(2 / (math.pi * 100)) / 2, rel=0.1)
+    assert chance_calibration_error(np.array([0.0, 1.0, np.nan])) == 0
+    assert np.isnan(reliability(np.full(3, np.nan), np.zeros(3)).calibration_error)

@@ -1,0 +1,158 @@
+"""p(right) of first answers: its inputs against explicit loops, its fit, its file."""
+
+import json
+import math
+import statistics
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import special
+
+from mfvpr.confidence import confidence_inputs, fit_confidence, read_confidences, write_confidences
+from mfvpr.errors import InputError
+from mfvpr.results import Ranked
+
+NAMES = ("margin", "height", "filter", "score")
+
+
+def ranked(scores, rows):
+    """Sorted, those without a candidate (-1) last."""
+    scores = np.where(rows < 0, -np.inf, scores)
+    order = np.argsort(-scores, axis=1, kind="stable")
+    return Ranked(*(np.take_along_axis(values, order, axis=1) for values in (rows, scores)))
+
+
+@pytest.fixture(scope="module")
+def rankings():
+    """Of a system and of the filter: 30 queries, 20 of 60 images, some lists shorter, one empty, one of one place."""
+    rng = np.random.default_rng(0)
+    rows = np.argsort(rng.random((30, 60)), axis=1)[:, :20]
+    rows[rng.random(rows.shape) < 0.1] = -1
+    rows[3] = -1
+    rows[4] = np.arange(20) // 5
+    scores = rng.gamma(2.0, 5.0, (2, 30, 20))
+    return ranked(scores[0], rows), ranked(scores[1], rows)
+
+
+@pytest.mark.parametrize("apart", [0, 5])
+def test_inputs_are_those_of_loops_over_candidates(rankings, apart):
+    system, filtered = rankings
+    found = confidence_inputs(system, filtered, inputs=NAMES, apart=apart)
+    for query, (rows, scores) in enumerate(zip(system.rows.tolist(), system.scores.tolist(), strict=True)):
+        if rows[0] < 0:
+            assert np.isnan(found[query]).all()
+            continue
+        others = [score for row, score in zip(rows, scores, strict=True) if row >= 0 and abs(row - rows[0]) > apart]
+        spread = max(statistics.pstdev(others), 1e-3 * scores[0]) if others else 1
+        margin = math.log(1 + (scores[0] - max(others)) / spread) if others else 0
+        height = math.log(1 + (scores[0] - statistics.fmean(others)) / spread) if others else 0
+        place = [row >= 0 and abs(row - rows[0]) <= apart for row in filtered.rows[query].tolist()]
+        expected = [margin, height, -math.log(1 + place.index(True)), math.asinh(scores[0])]
+        np.testing.assert_allclose(found[query], expected, rtol=1e-9)
+    assert (found[4, :2] == 0).all() == (apart == 5)
+
+
+def test_margins_and_heights_have_no_unit(rankings):
+    system, filtered = rankings
+    other = replace(system, scores=250 * system.scores + 30)
+    np.testing.assert_allclose(*(confidence_inputs(one, filtered) for one in (system, other)), rtol=1e-6)
+
+
+def test_what_stands_behind_the_candidates_does_not_matter(rankings):
+    system, filtered = rankings
+    padded = [Ranked(np.pad(one.rows, ((0, 0), (0, 3)), constant_values=-1),
+                     np.pad(one.scores, ((0, 0), (0, 3)), constant_values=np.nan)) for one in rankings]  # fmt: skip
+    expected = confidence_inputs(system, filtered, inputs=NAMES)
+    np.testing.assert_allclose(confidence_inputs(*padded, inputs=NAMES), expected, rtol=1e-12)
+
+
+def test_scores_that_are_all_equal_are_sure_of_nothing():
+    rows = np.arange(20)[None]
+    same = Ranked(rows, np.full((1, 20), 7.0))
+    assert confidence_inputs(same, same).tolist() == [[0.0, 0.0]]
+    alone = Ranked(rows, np.where(rows == 0, 7.0, 3.0))  # above scores without a spread: a thousandth of its own
+    np.testing.assert_allclose(confidence_inputs(alone, alone), np.log1p(4 / 7e-3))
+
+
+def drawn(weights, bias, queries=4000, seed=1):
+    rng = np.random.default_rng(seed)
+    values = rng.gamma(2.0, 0.5, (queries, len(weights)))
+    return values, rng.random(queries) < special.expit(values @ np.array(weights) + bias)
+
+
+def test_the_model_that_answers_were_drawn_from_is_found():
+    values, right = drawn([2.0, 0.7], -1.5)
+    found = fit_confidence(values, right)
+    weights = np.array(found.weights) / np.array(found.scale)
+    np.testing.assert_allclose(weights, [2.0, 0.7], atol=0.25)
+    assert found.bias - weights @ np.array(found.center) == pytest.approx(-1.5, abs=0.25)
+    other, hits = drawn([2.0, 0.7], -1.5, seed=2)
+    sure = found.probability(other) > 0.9
+    assert np.mean(hits[sure]) == pytest.approx(np.mean(found.probability(other)[sure]), abs=0.03)
+
+
+def test_no_weights_around_the_fitted_ones_are_more_probable():
+    values, right = drawn([1.0, 0.5], -1.0, queries=60)
+    found = fit_confidence(values, right)
+    columns = (values - values.mean(axis=0)) / values.std(axis=0)
+
+    def loss(bias, *weights):
+        odds = [bias + sum(w * x for w, x in zip(weights, row, strict=True)) for row in columns]
+        total = sum(math.log1p(math.exp(-z if hit else z)) for z, hit in zip(odds, right, strict=True))
+        half = (math.log1p(math.exp(bias)) + math.log1p(math.exp(-bias))) / 2
+        return total + half + sum(w**2 for w in weights) / 2
+
+    best = loss(found.bias, *found.weights)
+    for step in ([0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01], [0.01, 0.01, -0.01]):
+        for sign in (-1, 1):
+            assert loss(*(np.array([found.bias, *found.weights]) + sign * np.array(step))) > best
+
+
+def test_a_surer_input_never_makes_an_answer_less_probable():
+    values, right = drawn([-2.0, 1.0], 0.0)
+    weights = fit_confidence(values, right).weights
+    assert weights[0] == 0 < weights[1]
+
+
+@pytest.mark.parametrize("right", [True, False])
+def test_where_all_answers_are_right_or_wrong_p_is_not_certain(right):
+    values, _ = drawn([1.0, 1.0], 0.0, queries=50)
+    probability = fit_confidence(np.vstack([values, [[np.nan, np.nan]]]), np.full(51, right)).probability(values)
+    probability = probability if right else 1 - probability
+    np.testing.assert_allclose(probability, 50.5 / 51, rtol=1e-3)
+    with pytest.raises(InputError, match="expected answers to fit it on"):
+        fit_confidence(np.full((2, 2), np.nan), np.zeros(2))
+
+
+def test_what_is_written_is_read(rankings, tmp_path):
+    values = confidence_inputs(*rankings, inputs=NAMES, apart=3)
+    model = fit_confidence(values, values[:, 0] > 0.3, inputs=NAMES, apart=3)
+    assert np.isnan(model(*rankings)).sum() == 1
+    write_confidences(tmp_path / "confidence.json", {"histogram + filter": model}, {"dataset": "ä"})
+    systems, made = read_confidences(tmp_path / "confidence.json")
+    assert (systems, made) == ({"histogram + filter": model}, {"dataset": "ä"})
+    np.testing.assert_array_equal(systems["histogram + filter"](*rankings), model(*rankings))
+
+
+def broken(**changes):
+    one = {"inputs": ["margin"], "apart": 5, "center": [0.0], "scale": [1.0], "weights": [1.0], "bias": 0.0}
+    return {"format": "mfvpr confidence 1", "made": {}, "systems": {"histogram": one | changes}}
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["", "[]", '{"format": 3}', *(json.dumps(broken(**changes)) for changes in (
+        {"inputs": ["else"]}, {"center": [0, 1]}, {"scale": [0]}, {"bias": float("nan")}, {"weights": ["a"]},
+        {"more": [1]}, {"apart": -1}, {"bias": None}))],
+)  # fmt: skip
+def test_other_files_are_refused_in_one_line(content, tmp_path):
+    path = tmp_path / "confidence.json"
+    path.write_text(content)
+    with pytest.raises(
+        InputError, match=r"confidence.json: expected the confidence.json that .* wrote \(.*\); "
+    ) as told:
+        read_confidences(path)
+    assert "\n" not in str(told.value)
+    with pytest.raises(InputError, match="No such file"):
+        read_confidences(tmp_path / "none.json")

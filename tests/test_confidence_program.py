@@ -1,0 +1,161 @@
+"""How sure answers are, in the run folder: curves, what is refused, and what re-ranking the unsure gives."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mfvpr.confidence import read_confidences
+from mfvpr.evaluation.precision import precision_recall, reliability
+from tests.programs import QUERIES, shared, small, typed
+
+SYSTEMS = ("filter", "histogram", "histogram + filter")
+LINES = ("scorer=histogram", "figures=1")
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    return shared(tmp_path_factory)
+
+
+@pytest.fixture
+def evaluate(root, tmp_path, monkeypatch, capsys):
+    def run(name, *more):
+        code, stdout, stderr = typed(
+            monkeypatch, capsys, "evaluate", *small(root), *LINES, f"out={tmp_path}/{name}", *more
+        )
+        return tmp_path / name, code, stdout, stderr
+
+    return run
+
+
+def rows(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_run_says_how_sure_its_answers_are(evaluate):
+    out, code, stdout, stderr = evaluate("first")
+    assert code == 0, stderr
+    assert "ECE" not in stdout  # said in files, until it is asked for
+    gains, answers = rows(out / "gains.csv"), rows(out / "answers.csv")
+    hits = {system: np.array([line[system] == "1" for line in gains]) for system in SYSTEMS}
+    predictions = [line for line in rows(out / "predictions.csv") if line["rank"] == "1"]
+    assert [(line["query"], line["answer"], line["score"], line["right"]) for line in answers] == [
+        (line["query"], line["database"], line["score"], line["right"]) for line in predictions
+    ]
+    probability = np.array([float(line["p"]) for line in answers])
+    assert len(np.unique(probability)) > QUERIES / 2
+    table = {line["system"]: line for line in rows(out / "confidence.csv")}
+    assert tuple(table) == SYSTEMS
+    curves = rows(out / "precision_recall.csv")
+    for system in SYSTEMS:
+        file = out / "predictions" / f"{system.replace(' + ', '_')}.csv"
+        scores = np.array([float(line["score"]) for line in rows(file) if line["rank"] == "1"])
+        curve = precision_recall(scores, hits[system])
+        written = [line for line in curves if (line["system"], line["by"]) == (system, "score")]
+        points = [[float(line[name]) for line in written] for name in ("threshold", "precision", "recall")]
+        np.testing.assert_allclose(points, curve, rtol=1e-6)
+        assert table[system]["AP by score"] == f"{100 * curve.average_precision:.1f}"
+        assert table[system]["R@100P by score"] == f"{100 * curve.recall_at(1):.1f}"
+    error = reliability(probability, hits["histogram"]).calibration_error
+    assert table["histogram"]["ECE of p"] == f"{100 * error:.1f}"
+    assert (
+        table["histogram"]["AP by p"]
+        == f"{100 * precision_recall(probability, hits['histogram']).average_precision:.1f}"
+    )
+    shares = rows(out / "rerank_share.csv")
+    for line, system in ((shares[0], "filter"), (shares[-1], "histogram")):
+        assert line["histogram"] == f"{100 * hits[system].mean():.1f}"
+    for name in ("precision_recall", "reliability", "rerank_share"):
+        picture = np.asarray(Image.open(out / "figures" / f"{name}.png").convert("L"))
+        assert min(picture.shape) > 200
+        assert picture.std() > 10
+
+
+def test_below_the_threshold_the_answer_is_no_place(evaluate):
+    first, *_ = evaluate("first")
+    systems, made = read_confidences(first / "confidence.json")
+    assert tuple(systems) == SYSTEMS
+    assert (made["queries"], made["right_within"], made["ground_truth"]["thresholds"]) == (QUERIES, 1, [0, 1])
+    given = (f"confidence={first}/confidence.json", "threshold=0.8")
+    out, code, stdout, stderr = evaluate("second", *given)
+    assert code == 0, stderr
+    assert "was fitted on these very images, so that it flatters" in stderr
+    header = stdout[stdout.index("AP by score") :].splitlines()[0]
+    assert header.endswith("right  wrong  refused  of these right")
+    answers = rows(out / "answers.csv")
+    probability, score = (np.array([float(line[name]) for line in answers]) for name in ("p", "score"))
+    refused = probability < 0.8
+    assert 0 < refused.sum() < QUERIES
+    assert score[~refused].mean() > score[refused].mean()
+    assert [line["answer"] == "no place" for line in answers] == refused.tolist()
+    assert {line["right"] for line, none in zip(answers, refused, strict=True) if none} == {"0"}  # all have a place
+    right = np.array([line["histogram"] == "1" for line in rows(out / "gains.csv")])
+    line = next(line for line in rows(out / "confidence.csv") if line["system"] == "histogram")
+    counts = [int(line[name]) for name in ("right", "wrong", "refused", "of these right")]
+    assert counts == [(right & ~refused).sum(), (~right & ~refused).sum(), refused.sum(), (right & refused).sum()]
+    predictions = rows(out / "predictions.csv")
+    none = [line for line in predictions if line["database"] == "no place"]
+    assert [line["query"] for line in none] == [line["query"] for line in answers if line["answer"] == "no place"]
+    assert [(line["rank"], line["score"], line["right"]) for line in none] == [("1", "", "")] * len(none)
+    every = rows(out / "predictions" / "histogram.csv")
+    refusing = {line["query"] for line in none}
+    assert [line for line in predictions if line not in none] == [
+        line for line in every if line["query"] not in refusing
+    ]
+    unknown, code, _, stderr = evaluate(
+        "third", *given, "dataset.ground_truth=none", "dataset.index_file=null", "figures=0"
+    )
+    assert code == 0, stderr
+    assert [{**line, "right": ""} for line in answers] == rows(unknown / "answers.csv")
+    assert not (unknown / "confidence.csv").exists()
+
+
+def test_no_place_is_right_where_the_database_does_not_show_it(evaluate, root, tmp_path):
+    """Ground truth without the first query's place: it is a negative, and its refusal is right."""
+    first, *_ = evaluate("first", "figures=0")
+    index = next(setting for setting in small(root) if setting.startswith("dataset.index_file=")).partition("=")[2]
+    header, line, *lines = Path(index).read_text().splitlines()
+    (tmp_path / "index.csv").write_text("\n".join([header, f"{line.partition(',')[0]},", *lines]))
+    out, code, _, stderr = evaluate(
+        "second", f"confidence={first}/confidence.json", "threshold=1", "figures=0",
+        f"dataset.index_file={tmp_path}/index.csv",
+    )  # fmt: skip
+    assert code == 0, stderr
+    answers = rows(out / "answers.csv")
+    assert {line["answer"] for line in answers} == {"no place"}
+    assert [line["right"] for line in answers] == ["1"] + ["0"] * (QUERIES - 1)
+    last = [line for line in rows(out / "precision_recall.csv") if line["system"] == "histogram"][-1]
+    right = sum(line["histogram"] == "1" for line in rows(out / "gains.csv"))
+    assert float(last["recall"]) == pytest.approx(right / (QUERIES - 1))
+    assert float(last["precision"]) == pytest.approx(right / QUERIES)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (["threshold=0.5"], "threshold=0.5: expected confidence=FILE as well"),
+        (["threshold=2"], "threshold=2: expected a number from 0 to 1"),
+        (["confidence=/none.json"], "/none.json: expected the confidence.json that an evaluation wrote (No such file"),
+    ],
+)
+def test_what_cannot_say_how_sure_answers_are_is_refused(evaluate, settings, words):
+    out, code, _, stderr = evaluate("out", *settings)
+    assert code == 2
+    assert words in stderr.splitlines()[-1]
+    assert not out.exists()
+
+
+def test_confidence_of_other_systems_is_refused(evaluate, tmp_path):
+    first, *_ = evaluate("first", "figures=0")
+    found = json.loads((first / "confidence.json").read_text())
+    del found["systems"]["histogram"]
+    (tmp_path / "other.json").write_text(json.dumps(found))
+    _, code, _, stderr = evaluate("out", f"confidence={tmp_path}/other.json")
+    assert code == 2
+    words = "expected one of the system that decides, histogram, got filter, histogram + filter; make it with"
+    assert words in stderr.splitlines()[-1]
