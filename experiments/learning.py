@@ -21,7 +21,7 @@ def learn(settings: dict[str, Any]) -> None:
         watch = Stopwatch()
         tools, images = prepare.begun(settings, watch)
         judge = truth.judge(settings, images.dataset)
-        matches, candidates = prepare.matched(settings, tools, images, watch, with_ratio=True)
+        matches, candidates = prepare.matched(settings, tools, images, watch)
         checkpoints = _checkpoints(settings, prepare.recipe(tools, images, candidates.mask.shape[1]), judge)
         with watch("learning"):
             options = {"checkpoints": checkpoints, "track": console.track}

@@ -36,12 +36,11 @@ def opened(tmp_path):
     return lambda: open_match_store(tmp_path / "s", {"of": "any"}, **sizes)
 
 
-def assert_same(got, expected, *, ratio=True):
+def assert_same(got, expected):
     np.testing.assert_array_equal(got.counts, expected.counts)
     for one, other in zip(got.matches, expected.matches, strict=True):
         for part in fields(Matches):
-            if ratio or part.name != "ratio":
-                np.testing.assert_array_equal(getattr(one, part.name), getattr(other, part.name))
+            np.testing.assert_array_equal(getattr(one, part.name), getattr(other, part.name))
 
 
 class Interrupted(Exception):
@@ -78,21 +77,19 @@ def test_another_shortlist_is_refused_before_anything_is_written(drawn, candidat
     with opened() as store:
         assert_same(
             pipeline.match(drawn, drawn, candidates, store=store),
-            pipeline.match(drawn, drawn, candidates, with_ratio=True),
+            pipeline.match(drawn, drawn, candidates),
         )
         np.testing.assert_array_equal(pipeline.stored_matches(store)[1].indices, candidates.indices)
 
 
 def test_matching_without_a_store_is_the_same(drawn, candidates, opened):
-    """To the last bit; the ratio where it is asked for."""
+    """To the last bit, the ratio too."""
     plain = pipeline.match(drawn, drawn, candidates)
-    assert plain.matches[0].ratio is None
-    asked = pipeline.match(drawn, drawn, candidates, with_ratio=True)
+    assert plain.matches[0].ratio is not None
     for _ in range(2):
         with opened() as store:
             kept = pipeline.match(drawn, drawn, candidates, store=store)
-        assert_same(kept, asked)
-        assert_same(kept, plain, ratio=False)
+        assert_same(kept, plain)
 
 
 # The programs' stores

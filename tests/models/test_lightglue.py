@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from mfvpr.errors import InputError
-from mfvpr.models.lightglue import LightGlue, assignment
+from mfvpr.models.lightglue import LightGlue
+from mfvpr.models.lightglue_assignment import assignment
 from mfvpr.types import per_keypoint
 from mfvpr.weights.checkpoint import read_checkpoint
 from mfvpr.weights.conversion import convert
