@@ -74,16 +74,21 @@ class Rotation(NamedTuple):
 def within(block: Block, states: Array, mask: Array, rotation: Rotation) -> Array:
     """States `[N, D]` after the keypoints of one image, real where `mask` `[N]`, have seen each other."""
     queries, keys, values = _heads(block.inputs(states), 3, 2 * rotation.cosine.shape[1])
-    logits = product(rotation(queries), rotation(keys).swapaxes(1, 2))
-    return block.updated(states, _context(logits, values, mask))
+    weights, total = _weights(product(rotation(queries), rotation(keys).swapaxes(1, 2)), mask, 2)
+    return block.updated(states, product(weights, values) / total)
 
 
 def across(block: Block, states: Sides, masks: Sides, head: int) -> Sides:
-    """States of both sides after the keypoints of each have seen the other's; heads of `head` numbers."""
+    """States of both sides after the keypoints of each have seen the other's; heads of `head` numbers.
+
+    Weights over columns are taken as they lie: transposed first, they would take several times longer on a CPU.
+    """
     (keys0, values0), (keys1, values1) = (_heads(block.inputs(side), 2, head) for side in states)
     logits = product(keys0, keys1.swapaxes(1, 2))
-    context0 = _context(logits, values1, masks[1])
-    context1 = _context(logits.swapaxes(1, 2), values0, masks[0])
+    weights, total = _weights(logits, masks[1], 2)
+    context0 = product(weights, values1) / total
+    weights, total = _weights(logits, masks[0], 1)
+    context1 = (product(values0.swapaxes(1, 2), weights) / total).swapaxes(1, 2)
     return block.updated(states[0], context0), block.updated(states[1], context1)
 
 
@@ -97,8 +102,9 @@ def _heads(values: Array, parts: int, head: int) -> Array:
     return jnp.moveaxis(values.reshape(len(values), parts, -1, head), 0, 2)
 
 
-def _context(logits: Array, values: Array, mask: Array) -> Array:
-    """`[H, N, d]` means of values `[H, M, d]` under the softmax of `[H, N, M]` over those where `mask` `[M]`."""
-    logits = jnp.where(mask[None, None], logits, jnp.finfo(logits.dtype).min)  # -inf gives NaN where none is real
-    weights = jnp.exp(logits - jnp.max(logits, axis=2, keepdims=True))
-    return product(weights, values) / jnp.sum(weights, axis=2, keepdims=True)
+def _weights(logits: Array, mask: Array, axis: int) -> tuple[Array, Array]:
+    """Softmax of `[H, N, M]` along an axis, over those where `mask`, as numerators and their sums, the axis kept."""
+    real = jnp.expand_dims(mask, (0, 3 - axis))
+    logits = jnp.where(real, logits, jnp.finfo(logits.dtype).min)  # -inf gives NaN where none is real
+    weights = jnp.exp(logits - jnp.max(logits, axis=axis, keepdims=True))
+    return weights, jnp.sum(weights, axis=axis, keepdims=True)
