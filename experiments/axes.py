@@ -45,7 +45,7 @@ def axes(settings: dict[str, Any]) -> Axes:
     if not values:
         raise SettingsError("grid: expected at least one axis, such as 'grid.sigma=[10,22.5]', or an experiment=; see "
                             "--help")  # fmt: skip
-    own = settings["scorer"] | {"c": settings["fusion"]["c"], "max_distance": settings["matching"]["max_distance"]}
+    own = settings["scorer"] | {"c": settings["fusion"]["c"], "max_distance": settings["matching"].get("max_distance")}
     return Axes(scorer, values, {name: own.get(name) for name in values})
 
 

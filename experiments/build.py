@@ -19,6 +19,8 @@ from mfvpr.features.vlad import VladFitting
 from mfvpr.filters import Filter, Retrieval
 from mfvpr.frame_correlation import FrameCorrelation
 from mfvpr.imported import DescriptorFiles, FeatureFiles, File, ShortlistFiles
+from mfvpr.lightglue import LightGlueMatching
+from mfvpr.matchers import Matcher, Matching
 from mfvpr.rankings import Fusion
 from mfvpr.retrieval import ExactSearch, WhitenedSearch
 from mfvpr.scoring import SCORERS, Scorer
@@ -92,6 +94,16 @@ def filter(settings: dict[str, Any], local: Extractor | FeatureFiles, data: Data
     if tuple(size) != IMAGE_SIZE:
         raise SettingsError(f"retrieval.image_size={size}: MixVPR takes {list(IMAGE_SIZE)} only, as its weights do")
     return Retrieval(MixVprDescriptor(_network("retrieval", "mixvpr", options.pop("weights")), **options), search)
+
+
+def matching(settings: dict[str, Any]) -> Matcher:
+    """What matches a pair of images."""
+    name, options = settings["name"], {name: value for name, value in settings.items() if name != "name"}
+    weights = options.pop("weights", None)
+    options = _only(options, Matching if name == "neighbors" else LightGlueMatching, f"matching={name}")
+    if name == "neighbors":
+        return Matching(**options)
+    return LightGlueMatching.of(_network("matching", "lightglue", weights), **options)
 
 
 def _voting(options: dict[str, Any]) -> Filter:

@@ -84,8 +84,9 @@ def heading(outcome: Outcome) -> str:
     queries = sum(len(sequence.images) for sequence in dataset.sequences)
     bad_queries = sum(len(one.bad_queries) for one in matched)
     bad_database = len({row for one in matched for row in one.bad_database})
-    check = settings["matching"]["cross_check"]
-    check = "" if check == "mutual" else f", cross_check={check}"
+    matching = settings["matching"]
+    check = f"cross_check={matching['cross_check']}" if "cross_check" in matching else matching["name"]
+    check = "" if check == "cross_check=mutual" else f", {check}"
     several = f" in {len(dataset.sequences)} sequences" if len(dataset.sequences) > 1 else ""
     return (
         f"{dataset.name}: {queries} queries{several}{_skipped(bad_queries)}, "

@@ -14,10 +14,11 @@ from mfvpr.data.contents import Contents
 from mfvpr.data.datasets import Dataset, QuerySequence
 from mfvpr.data.sequences import OwnRows, own_rows, without_neighbors
 from mfvpr.evaluation import threshold_words
-from mfvpr.evaluations import Matching, Stopwatch, match_sequence, matches_recipe
+from mfvpr.evaluations import Stopwatch, match_sequence, matches_recipe
 from mfvpr.features import Extractor, Source
 from mfvpr.filters import Filter
 from mfvpr.match_sets import MatchSet
+from mfvpr.matchers import Matcher
 from mfvpr.types import Shortlist
 
 __all__ = ["Images", "Tools", "begun", "matched", "recipe"]
@@ -47,7 +48,7 @@ class Tools:
 
     extractor: Extractor | Source
     filter: Filter
-    matching: Matching
+    matching: Matcher
     archive: Archive
     where: Mapping[str, Any]  # memory and devices
 
@@ -68,7 +69,7 @@ def begun(settings: dict[str, Any], watch: Stopwatch) -> tuple[Tools, Images]:
 def _tools(settings: dict[str, Any], archive: Archive, dataset: Dataset | None) -> Tools:
     extractor = build.extractor(settings["features"], dataset)
     retrieval = build.filter(settings["retrieval"], extractor, dataset)
-    return Tools(extractor, retrieval, Matching(**settings["matching"]), archive, build.where(settings))
+    return Tools(extractor, retrieval, build.matching(settings["matching"]), archive, build.where(settings))
 
 
 def _images(settings: dict[str, Any], archive: Archive) -> Images:

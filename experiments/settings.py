@@ -154,6 +154,9 @@ RULES: dict[str, Rule] = {
     "memory": _or(_POSITIVE, None),
     "devices": _or(_COUNT, "all"),
     # matching
+    "matching.name": _one_of("neighbors", "lightglue"),
+    "filter_threshold": _number(0, 1),
+    "depth_confidence": _or(_number(0, 1), None),
     "cross_check": _one_of("mutual", "opencv_legacy", "none", "candidate"),
     "max_distance": _or(_DISTANCE, None),
     "max_matches": _or(_COUNT, None),
@@ -260,7 +263,8 @@ def _check_cells(settings: Mapping[str, Any]) -> None:
     features, side = settings["features"], settings["scorer"]["side"]
     if features["name"] not in ("ssm", "import"):
         raise SettingsError(f"scorer=grid: expected features=ssm, whose features are cells, got {features['name']}")
-    if (check := settings["matching"]["cross_check"]) != "candidate":
+    matching = settings["matching"]
+    if (check := matching.get("cross_check", matching["name"])) != "candidate":
         raise SettingsError(f"matching.cross_check={check}: expected candidate, since scorer=grid takes a match of "
                             "every cell of the candidate")  # fmt: skip
     if features["name"] == "ssm":

@@ -20,6 +20,7 @@ WORDS = {
     r"called by their paths below their folder\)": "called by their paths below their folder, behind "
     "GROUP.database_prefix and GROUP.query_prefix)",
     r"or lower num_words$": "or lower retrieval.num_words",
+    r"extract these, or match nearest neighbors$": "set features=aliked, or matching=neighbors",
     r"give it as image_size=$": "give it as features.image_size=[W,H]",
     r"lengths='(normalize|keep)'": r"GROUP.lengths=\1",
 }

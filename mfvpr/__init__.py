@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from mfvpr.errors import InputError
 from mfvpr.evaluation import frame_positives, radius_positives, recall_at_k
+from mfvpr.lightglue import LightGlueMatching
+from mfvpr.matchers import Matcher, Matching, match_pairs
 from mfvpr.matching import compact, filter_matches, match, match_candidates
 from mfvpr.numerics import masked, masked_mean, masked_median, safe_sqrt
 from mfvpr.parameter_grids import score_grid
@@ -58,9 +60,12 @@ __all__ = [
     "HistogramOfShifts",
     "Homography",
     "InputError",
+    "LightGlueMatching",
     "LostScore",
     "MatchCount",
+    "Matcher",
     "Matches",
+    "Matching",
     "OpenCvHomography",
     "Ranking",
     "RapidSpatialScore",
@@ -83,6 +88,7 @@ __all__ = [
     "masked_median",
     "match",
     "match_candidates",
+    "match_pairs",
     "match_shifts",
     "match_weights",
     "radius_positives",

@@ -10,7 +10,10 @@ from mfvpr.data.datasets import ImageFolder
 from mfvpr.declaration import check_bounds
 from mfvpr.errors import InputError, require_word
 from mfvpr.features import Extractor, Source
+from mfvpr.features.sift import Sift
 from mfvpr.filters import Filtered
+from mfvpr.lightglue import LightGlueMatching
+from mfvpr.matchers import Matcher, Matching
 from mfvpr.matching import CrossCheck
 from mfvpr.reranking import FilterScore, Ties
 from mfvpr.results import FILTER, FRAMES, Matched, Ranked
@@ -58,7 +61,7 @@ def check_request(
             check_bounds(scorer)
 
 
-def check_matching(candidates: Any, extractor: Extractor | Source, cross_check: CrossCheck) -> None:
+def check_matching(candidates: Any, extractor: Extractor | Source, matching: Matcher) -> None:
     """What is asked of the matches of a sequence.
 
     Raises:
@@ -69,7 +72,18 @@ def check_matching(candidates: Any, extractor: Extractor | Source, cross_check: 
         raise InputError(f"candidates={candidates!r}: expected a whole number from 1, or 'all'")
     if not extractor.scales:
         raise InputError(f"{type(extractor).__name__}: gives no local features; expected an extractor that does")
-    require_word("cross_check", cross_check, CrossCheck)
+    if isinstance(matching, type) or not callable(matching):
+        got = f"the class {matching.__name__}" if isinstance(matching, type) else repr(matching)
+        raise InputError(f"matching: expected what maps the features of two images to Matches, got {got}; see "
+                         "mfvpr.Matcher")  # fmt: skip
+    if isinstance(matching, Matching):
+        require_word("cross_check", matching.cross_check, CrossCheck)
+    if isinstance(matching, LightGlueMatching):
+        dimensions = [scale.dimension for scale in extractor.scales if scale.dimension]  # 0 = not known
+        if isinstance(extractor, Sift) or {*dimensions} - {matching.dimension}:
+            got = f"{type(extractor).__name__} of {', '.join(map(str, dimensions))}"
+            raise InputError(f"LightGlue: expected ALIKED's features, of {matching.dimension} dimensions, got {got}; "
+                             "extract these, or match nearest neighbors")  # fmt: skip
 
 
 def checked_candidates(filtered: Any, who: str, num_queries: int, num_database: int, num_candidates: int) -> Filtered:

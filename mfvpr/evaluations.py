@@ -12,7 +12,7 @@ import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -27,7 +27,7 @@ from mfvpr.filters import Filter, Filtered
 from mfvpr.fingerprints import recipe_of
 from mfvpr.fitting import fitted
 from mfvpr.frame_correlation import FrameCorrelation
-from mfvpr.matching import CrossCheck
+from mfvpr.matchers import NEIGHBORS, Matcher
 from mfvpr.numerics import Device
 from mfvpr.rankings import Fusion, rank_sequence
 from mfvpr.reranking import Ties
@@ -37,16 +37,6 @@ from mfvpr.sources import FeatureSet
 from mfvpr.stores.matches import MatchStore
 
 _REMARKS = "images.json"  # beside the matches: which images are bad
-
-
-@dataclass(frozen=True)
-class Matching:
-    """Options of the matches, see `mfvpr.matching`; `chunk_size` changes memory and the last bits alone."""
-
-    cross_check: CrossCheck = "mutual"
-    max_distance: float | None = None
-    max_matches: int | None = None
-    chunk_size: int | None = None
 
 
 @dataclass
@@ -69,7 +59,7 @@ def evaluate(
     scorers: Mapping[str, Scorer],
     *,
     candidates: int | Literal["all"] = 50,
-    matching: Matching = Matching(),
+    matching: Matcher = NEIGHBORS,
     fused: Mapping[str, Fusion] | None = None,
     correlated: Mapping[str, FrameCorrelation] | None = None,
     ties: Ties = "filter",
@@ -86,7 +76,7 @@ def evaluate(
         filter: what finds candidates.
         scorers: by name.
         candidates: that the filter proposes for each query.
-        matching: options of the matches.
+        matching: what matches a pair.
         fused: scorers, by name, that are ranked together with the filter's score as well, as `name + filter`.
         correlated: scorers and those that are fused, by name, that are ranked by their scores with frame correlation as
             well, as `name + frames`.
@@ -127,7 +117,7 @@ def match_sequence(
     filter: Filter,
     candidates: int | Literal["all"] = 50,
     *,
-    matching: Matching = Matching(),
+    matching: Matcher = NEIGHBORS,
     archive: Archive | None = None,
     watch: Stopwatch | None = None,
     **where: Any,
@@ -147,7 +137,7 @@ def match_sequence(
         watch: gets the seconds of the stages.
         **where: `memory` and `devices` of `pipeline.match`.
     """
-    check_matching(candidates, extractor, matching.cross_check)
+    check_matching(candidates, extractor, matching)
     archive, watch, database = archive or Archive(), watch or Stopwatch(), dataset.database
     with watch("filter"):
         extractor, filter = fitted(extractor, database, archive), fitted(filter, database, archive)
@@ -166,10 +156,10 @@ def match_sequence(
         with watch("features"):
             sides, bad = _features(dataset, sequence, extractor, filtered, archive)
         _remark(stores, archive, bad)
-        options = {**asdict(matching), "track": archive.track("matching"), **where}
+        options = {"track": archive.track("matching"), **where}
         with watch("matching"):
             matches = tuple(
-                pipeline.match(*scale, filtered.candidates, store=store, **options)
+                pipeline.match(*scale, filtered.candidates, matching, store=store, **options)
                 for scale, store in zip(sides, stores or [None] * len(sides), strict=True)
             )
     return _looked_at(Matched(sequence, filtered.candidates, matches, bad["queries"], bad["database"]), archive)
@@ -238,7 +228,7 @@ def _remark(stores: Sequence[MatchStore], archive: Archive, remarks: Mapping[str
 
 def matches_recipe(
     dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, filter: Filter, num_candidates: int,
-    matching: Matching, archive: Archive,
+    matching: Matcher, archive: Archive,
 ) -> dict[str, Any]:  # fmt: skip
     """All that changes a shortlist and its matches: both sides' images and features, the filter, and the matching."""
     excluded, database = sequence.excluded, dataset.database
@@ -248,7 +238,7 @@ def matches_recipe(
         "query": archive.recipe(sequence.images, extractor),
         "filter": archive.recipe_of(filter),
         "candidates": num_candidates,
-        "matching": recipe_of(matching),
+        "matching": archive.recipe_of(matching),
         "skip_bad": archive.skip_bad,
         "excluded": None if excluded is None else recipe_of([excluded.rows, excluded.offsets]),
     }
@@ -259,7 +249,7 @@ def _match_stores(
 ) -> Iterator[AbstractContextManager[MatchStore]]:
     """A store for the matches of each scale."""
     several = len(extractor.scales) > 1
-    share = 1 if recipe["matching"]["cross_check"] in ("none", "candidate") else 3
+    share = 1 if recipe["matching"].get("cross_check") in ("none", "candidate") else 3
     for number, scale in enumerate(extractor.scales):
         yield archive.matches(
             {**recipe, "scale": number} if several else recipe, len(sequence.images), recipe["candidates"],

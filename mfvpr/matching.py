@@ -51,21 +51,8 @@ def match(
     features0, features1 = ready(features0), ready(at_least_one(features1))
     similarity = _similarity(features0, features1)
     nearest1, valid = _neighbors(similarity, cross_check)
-    return Matches(
-        points0=features0.keypoints,
-        points1=features1.keypoints[nearest1],
-        distance=_distance(features0, features1, nearest1, valid),
-        scores0=features0.scores,
-        scores1=features1.scores[nearest1],
-        mask=valid,
-        image_size0=features0.image_size,
-        image_size1=features1.image_size,
-        ratio=_ratio(features0, features1, similarity) if with_ratio else None,
-        index0=slot_numbers(features0),
-        index1=nearest1,
-        count0=keypoint_count(features0),
-        count1=keypoint_count(features1),
-    )
+    ratio = _ratio(features0, features1, similarity) if with_ratio else None
+    return paired(features0, features1, nearest1, valid, ratio=ratio)
 
 
 def match_candidates(
@@ -92,7 +79,7 @@ def match_candidates(
     if np.ndim(query.mask) != 1 or np.ndim(candidates.mask) != 2:
         shapes = f"{np.shape(query.mask)} and {np.shape(candidates.mask)}"
         raise ValueError(f"expected one query [N0] and candidates [C, N1], got masks of shapes {shapes}; see match")
-    chunk_size = _chunk_size(chunk_size, query, candidates)
+    chunk_size = pairs_at_once(chunk_size, query, candidates)
     return _match_candidates(query, candidates, cross_check=cross_check, with_ratio=with_ratio, chunk_size=chunk_size)
 
 
@@ -101,73 +88,8 @@ def _match_candidates(query: Features, candidates: Features, *, chunk_size: int,
     return _chunked_map(lambda candidate: match(query, candidate, **options), candidates, chunk_size)
 
 
-def match_pairs(
-    queries: Features,
-    candidates: Features,
-    pairs: Array,
-    count: int | Array,
-    *,
-    cross_check: CrossCheck = "mutual",
-    max_distance: float | Array | None = None,
-    max_matches: int | None = None,
-    with_ratio: bool = False,
-    chunk_size: int | None = None,
-) -> Matches:
-    """`match` of pairs, whatever query they belong to; how many is no shape, so it costs neither time nor a program.
-
-    Args:
-        queries: keypoints `[B, N0, 2]`.
-        candidates: keypoints `[S, N1, 2]`.
-        pairs: `[P, 2]` int32 rows of both.
-        count: the first so many of the pairs are matched.
-        cross_check: as in `match`.
-        max_distance: as in `filter_matches`.
-        max_matches: as in `filter_matches`.
-        with_ratio: as in `match`.
-        chunk_size: as in `match_candidates`.
-
-    Returns:
-        Matches with leading axis P and slots as of `match`; pairs beyond `count` have none.
-    """
-    return _match_pairs(
-        queries, candidates, pairs, count, max_distance, cross_check=cross_check, max_matches=max_matches,
-        with_ratio=with_ratio, chunk_size=min(_chunk_size(chunk_size, queries, candidates), len(pairs)),
-    )  # fmt: skip
-
-
-@partial(compiled, static_argnames=("cross_check", "max_matches", "with_ratio", "chunk_size"))
-def _match_pairs(
-    queries: Features,
-    candidates: Features,
-    pairs: Array,
-    count: Array,
-    max_distance: Array | None,
-    *,
-    max_matches: int | None,
-    chunk_size: int,
-    **options: Any,
-) -> Matches:
-    def one(pair: Array) -> Matches:
-        query, candidate = (
-            jax.tree.map(lambda field: jnp.asarray(field)[row], features)  # noqa: B023
-            for features, row in ((queries, pair[0]), (candidates, pair[1]))
-        )
-        return filter_matches(match(query, candidate, **options), max_distance=max_distance, max_matches=max_matches)
-
-    def chunk(number: Array, matches: Matches) -> Matches:
-        start = jnp.minimum(number * chunk_size, len(pairs) - chunk_size)  # the last may do some again
-        part = jax.lax.dynamic_slice_in_dim(jnp.asarray(pairs), start, chunk_size)
-        new = jax.vmap(one)(part) if chunk_size > 1 else jax.tree.map(lambda leaf: leaf[None], one(part[0]))
-        return jax.tree.map(partial(jax.lax.dynamic_update_slice_in_dim, start_index=start, axis=0), matches, new)
-
-    shapes = jax.eval_shape(jax.vmap(one), pairs)
-    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    matches = jax.lax.fori_loop(0, -(-count // chunk_size), chunk, nothing)
-    return replace(matches, mask=matches.mask & (jnp.arange(len(pairs)) < count)[:, None])
-
-
-def _chunk_size(asked: int | None, query: Features, candidates: Features) -> int:
-    """Pairs at a time: one where its similarities then stay in a processor's cache; else what MEMORY_SHARE holds."""
+def pairs_at_once(asked: int | None, query: Features, candidates: Features) -> int:
+    """As asked for; else one where its similarities then stay in a processor's cache; else what MEMORY_SHARE holds."""
     if asked is None:
         available = device_bytes((query, candidates))
         matrix = 4 * query.mask.shape[-1] * candidates.mask.shape[-1] + 1
@@ -213,6 +135,33 @@ def ready(features: Features) -> Features:
     return replace(features, **wide, mask=jnp.asarray(features.mask), image_size=at_least_single(features.image_size))
 
 
+def paired(features0: Features, features1: Features, index1: Array, real: Array, **more: Array | None) -> Matches:
+    """Matches of every keypoint of image 0, N0 slots, where it is `real`.
+
+    Args:
+        features0: query, `ready`.
+        features1: candidate, `ready`, with one slot or more.
+        index1: `[N0]` int32, the candidate's keypoint of each match.
+        real: `[N0]` bool.
+        **more: further fields of the matches.
+    """
+    return Matches(
+        points0=features0.keypoints,
+        points1=features1.keypoints[index1],
+        distance=_distance(features0, features1, index1, real),
+        scores0=features0.scores,
+        scores1=features1.scores[index1],
+        mask=real,
+        image_size0=features0.image_size,
+        image_size1=features1.image_size,
+        index0=slot_numbers(features0),
+        index1=index1,
+        count0=keypoint_count(features0),
+        count1=keypoint_count(features1),
+        **more,
+    )
+
+
 def _exchanged(matches: Matches) -> Matches:
     """The same matches, the images in each other's place."""
     sides = [(f.name, f"{f.name[:-1]}1") for f in fields(matches) if f.name.endswith("0")]
@@ -253,6 +202,11 @@ def _distance(features0: Features, features1: Features, index1: Array, real: Arr
     # The difference, not sqrt(2 - 2 cos): in float32 that would turn a distance of 0 into up to 3.5e-4.
     difference = masked(features0.descriptors - features1.descriptors[index1], real)
     return safe_sqrt(jnp.sum(difference * difference, axis=-1))
+
+
+def distance_ratio(features0: Features, features1: Features) -> Array:
+    """`[N0]` as `match` gives it, of features that are `ready`."""
+    return _ratio(features0, features1, _similarity(features0, features1))
 
 
 def _ratio(features0: Features, features1: Features, similarity: Array) -> Array:

@@ -4,19 +4,19 @@ import itertools
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
 from mfvpr import ragged
 from mfvpr.match_sets import QueryMatches, compacted
-from mfvpr.matching import match_pairs
+from mfvpr.matchers import Matcher, match_pairs
 from mfvpr.numerics import Device
 from mfvpr.ragged import Row
 from mfvpr.sources import FeatureSet, Slots, Staged, memory_budget
 from mfvpr.threads import ordered_map
-from mfvpr.types import Matches, Shortlist
+from mfvpr.types import Features, Matches, Shortlist, per_match
 
 QUERIES = 8  # of a batch: they share the candidates that are read for them
 PAIRS = 128  # of a call
@@ -56,7 +56,7 @@ class Sides:
         """Read what is not there."""
         return self.queries.stage(part.pairs[:, 0]), self.database.stage(part.pairs[:, 2])
 
-    def begin(self, staged: tuple[Staged, Staged], **options: Any) -> Calls:
+    def begin(self, staged: tuple[Staged, Staged], matcher: Matcher) -> Calls:
         """Hand a part's pairs to the device, a call for every `PAIRS` of the same capacities."""
         arrays0, arrays1 = self.queries.put(staged[0]), self.database.put(staged[1])
         capacities, slots = (
@@ -69,7 +69,7 @@ class Sides:
             for start in range(0, len(members), PAIRS):
                 some = members[start : start + PAIRS]
                 pairs = ragged.filled(slots[some], PAIRS)
-                calls.append((some, match_pairs(*sides, pairs, np.int32(len(some)), **options)))
+                calls.append((some, match_pairs(*sides, pairs, np.int32(len(some)), matcher)))
         return calls
 
 
@@ -78,10 +78,10 @@ def matched(
     database: FeatureSet,
     candidates: Shortlist,
     todo: Sequence[int],
+    matcher: Matcher,
     *,
     memory: float | None,
     devices: Sequence[Device],
-    **options: Any,
 ) -> Iterator[tuple[int, QueryMatches]]:
     """(row, all of that query), in their order, NumPy.
 
@@ -90,9 +90,9 @@ def matched(
         database: M images.
         candidates: `[Q, C]` rows of the database.
         todo: rows of the queries that are to be matched.
+        matcher: of one pair.
         memory: GB for features of the database, see `sources.memory_budget`.
         devices: that share the queries.
-        **options: see `match_pairs`; the ratio is always there.
     """
     indices, scores = np.asarray(candidates.indices), np.asarray(candidates.scores)
     counts0, counts1, rows = queries.counts, database.counts, np.asarray(todo, int)
@@ -104,13 +104,14 @@ def matched(
         )
         for device in devices
     }
+    nothing = _nothing(queries, database, matcher)
     pairs: dict[tuple[int, int], Pair] = {}  # by query and place, until the query's last
     begun: deque[tuple[Part, Calls]] = deque()
     parts = _parts(counts0, counts1, indices, rows, sides)
     staged = ordered_map(lambda part: (part, sides[part.device].stage(part)), parts, workers=1)
     for step in itertools.chain(staged, [None]):
         if step is not None:
-            begun.append((step[0], sides[step[0].device].begin(step[1], with_ratio=True, **options)))
+            begun.append((step[0], sides[step[0].device].begin(step[1], matcher)))
         while len(begun) > (0 if step is None else len(devices)):
             part, calls = begun.popleft()
             for call in calls:
@@ -118,9 +119,9 @@ def matched(
             for query in part.ends.tolist():
                 of_query = [pairs.pop((query, place), None) for place in range(indices.shape[1])]
                 keypoints = np.where(indices[query] >= 0, counts1[indices[query]], 0).astype(np.int32)
-                matches = _joined(of_query)
+                matches = _joined(of_query, nothing)
                 matches = replace(matches, count0=counts0[query].astype(np.int32), count1=keypoints)
-                counts = np.array([0 if pair is None else len(pair.matches["index0"]) for pair in of_query], np.int32)
+                counts = np.array([0 if pair is None else len(pair.matches["points0"]) for pair in of_query], np.int32)
                 yield query, QueryMatches(matches, counts, indices[query], scores[query])
 
 
@@ -147,21 +148,25 @@ def _collected(part: Part, members: np.ndarray, matches: Matches) -> Iterator[tu
         yield (query, place), Pair(row, *sizes)
 
 
-def _joined(pairs: Sequence[Pair | None]) -> Matches:
+def _joined(pairs: Sequence[Pair | None], nothing: Row) -> Matches:
     """All candidates' matches, one after the other; an image that was not matched is of 1 x 1 px, as nobody looks."""
     some = [pair for pair in pairs if pair is not None]
-    rows = ragged.joined([pair.matches for pair in some] or [_nothing()])
+    rows = ragged.joined([pair.matches for pair in some] or [nothing])
     unknown = np.ones(2, np.float32)
     return Matches(
         **rows,
-        mask=np.ones(len(rows["index0"]), bool),
+        mask=np.ones(len(rows["points0"]), bool),
         image_size0=some[0].image_size0 if some else unknown,
         image_size1=np.array([unknown if pair is None else pair.image_size1 for pair in pairs]).reshape(-1, 2),
     )
 
 
-def _nothing() -> Row:
-    """The entries of no match."""
-    points, numbers, rows = np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros(0, np.int32)
-    scalars = dict.fromkeys(("distance", "ratio", "scores0", "scores1"), numbers)
-    return {"points0": points, "points1": points, "index0": rows, "index1": rows} | scalars
+def _nothing(queries: FeatureSet, database: FeatureSet, matcher: Matcher) -> Row:
+    """The entries of no match, of the fields that the matcher gives."""
+    known = [side.dimension for side in (queries, database) if (side.counts > 0).any()]
+    dimension = known[0] if known else getattr(matcher, "dimension", 1)
+    shapes = {"keypoints": (1, 2), "descriptors": (1, dimension), "scores": (1,), "image_size": (2,)}
+    arrays = {name: np.ones(shape, np.float32) for name, shape in shapes.items()}
+    image = Features(**arrays, mask=np.ones(1, bool))
+    fields = per_match(jax.eval_shape(matcher, image, image))
+    return {name: np.zeros((0, *leaf.shape[1:]), leaf.dtype) for name, leaf in fields.items()}

@@ -16,7 +16,7 @@ import numpy as np
 from mfvpr import pair_matching
 from mfvpr.errors import InputError
 from mfvpr.match_sets import MatchSet, Scales
-from mfvpr.matching import CrossCheck
+from mfvpr.matchers import NEIGHBORS, Matcher
 from mfvpr.numerics import Device, compiled, device_of
 from mfvpr.progress import Track, untracked
 from mfvpr.reranking import BIN_STEP
@@ -37,11 +37,8 @@ def match(
     queries: FeatureSet,
     database: FeatureSet,
     candidates: Shortlist,
+    matcher: Matcher = NEIGHBORS,
     *,
-    cross_check: CrossCheck = "mutual",
-    max_distance: float | None = None,
-    max_matches: int | None = None,
-    chunk_size: int | None = None,
     memory: float | None = None,
     devices: Sequence[Device] | None = None,
     store: MatchStore | None = None,
@@ -53,14 +50,11 @@ def match(
         queries: Q images.
         database: M images.
         candidates: `[Q, C]` rows of the database.
-        cross_check: as `max_distance`, `max_matches` and `chunk_size` in `mfvpr.matching`.
-        max_distance: see there.
-        max_matches: see there.
-        chunk_size: see there.
+        matcher: of one pair.
         memory: GB that features of the database may take on the devices, and, of a store, the matches in memory; None
             = a third of what is free.
         devices: that share the queries; None = the one that JAX takes.
-        store: of these features, candidates and options. Only queries that it lacks are matched; some at a time are on
+        store: of these features, candidates and matcher. Only queries that it lacks are matched; some at a time are on
             disk before the next are begun; and what comes back was read from it.
         track: progress, over queries.
 
@@ -72,8 +66,8 @@ def match(
         raise InputError(f"features: expected as many dimensions on both sides, got {queries.dimension} "
                          f"and {database.dimension} (database); extract all images alike")  # fmt: skip
     made = partial(
-        pair_matching.matched, queries, database, candidates, cross_check=cross_check, max_distance=max_distance,
-        max_matches=max_matches, memory=memory, devices=devices or [device_of(())], chunk_size=chunk_size,
+        pair_matching.matched, queries, database, candidates, matcher=matcher, memory=memory,
+        devices=devices or [device_of(())],
     )  # fmt: skip
     if store is None:
         rows = [row for _, row in track(made(range(len(queries))), len(queries))]

@@ -14,7 +14,8 @@ import numpy as np
 
 from mfvpr.weights.checkpoint import read_checkpoint
 
-ALIKED = Path(__file__).parent.parent.parent / "shared" / "weights" / "aliked"
+SHARED = Path(__file__).parent.parent.parent / "shared" / "weights"
+ALIKED, LIGHTGLUE = SHARED / "aliked", SHARED / "lightglue" / "aliked_lightglue.pth"
 KINDS = {
     "f4": "FloatStorage",
     "f8": "DoubleStorage",
@@ -177,11 +178,11 @@ def _random(name: str, shape: tuple[int, ...], seed: int) -> np.ndarray:
 
 
 def at_hand() -> Iterator[tuple[str, dict[str, np.ndarray]]]:
-    """(name, tensors): random ones of D2-Net, MixVPR and SSM-VPR, and ALIKED's real ones where they are."""
+    """(name, tensors): random ones of D2-Net, MixVPR and SSM-VPR, and the real ones of ALIKED and LightGlue."""
     yield "d2_tf", random_checkpoint(d2net_shapes())
     yield "mixvpr_4096", random_checkpoint(mixvpr_shapes())
     yield "vgg16_places365", random_checkpoint(places365_shapes(full=False))
-    for path in sorted(ALIKED.glob("*.pth")):
+    for path in sorted([*ALIKED.glob("*.pth"), *LIGHTGLUE.parent.glob(LIGHTGLUE.name)]):
         yield path.stem, read_checkpoint(path)
 
 
@@ -234,6 +235,26 @@ def mixvpr_shapes(out_channels: int = 1024, out_rows: int = 4) -> dict[str, tupl
             shapes |= {f"{prefix}.{layer}.weight": (400, 400), f"{prefix}.{layer}.bias": (400,)}
     shapes |= {"aggregator.channel_proj.weight": (out_channels, 1024), "aggregator.channel_proj.bias": (out_channels,)}
     return shapes | {"aggregator.row_proj.weight": (out_rows, 400), "aggregator.row_proj.bias": (out_rows,)}
+
+
+def lightglue_shapes(
+    inputs: int = 128, width: int = 256, layers: int = 9, heads: int = 4
+) -> dict[str, tuple[int, ...]]:
+    """The tensors of LightGlue's checkpoints for features without orientations, such as aliked_lightglue.pth."""
+    linear = {"input_proj": (width, inputs)}
+    shapes = {"posenc.Wr.weight": (width // heads // 2, 2)}
+    for layer in range(layers):
+        within, across = (f"transformers.{layer}.{kind}_attn" for kind in ("self", "cross"))
+        linear |= {f"{within}.Wqkv": (3 * width, width), f"{within}.out_proj": (width, width)}
+        linear |= {f"{across}.{name}": (width, width) for name in ("to_qk", "to_v", "to_out")}
+        for block in (within, across):
+            linear |= {f"{block}.ffn.0": (2 * width, 2 * width), f"{block}.ffn.3": (width, 2 * width)}
+            shapes |= {f"{block}.ffn.1.{name}": (2 * width,) for name in ("weight", "bias")}
+        linear |= {f"log_assignment.{layer}.{name}": (size, width) for name, size in
+                   (("final_proj", width), ("matchability", 1))}  # fmt: skip
+    linear |= {f"token_confidence.{layer}.token.0": (1, width) for layer in range(layers - 1)}
+    weights = {f"{name}.weight": shape for name, shape in linear.items()}
+    return shapes | weights | {f"{name}.bias": shape[:1] for name, shape in linear.items()}
 
 
 def _norm(prefix: str, width: int) -> dict[str, tuple[int, ...]]:

@@ -14,12 +14,12 @@ from mfvpr.archive import Archive
 from mfvpr.data.datasets import folder_dataset, image_folder
 from mfvpr.data.ground_truth import FrameTruth
 from mfvpr.errors import InputError
-from mfvpr.evaluations import Matching
 from mfvpr.features import Aggregated, Description
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
 from mfvpr.filters import Filtered, Retrieval
 from mfvpr.frame_correlation import FrameCorrelation
+from mfvpr.matchers import Matching
 from mfvpr.rankings import Fusion
 from mfvpr.retrieval import EXACT, WhitenedSearch
 from mfvpr.types import Shortlist

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import Features, compact, filter_matches, match, match_candidates, matching, retrieve
-from mfvpr.matching import match_pairs
+from mfvpr.matchers import Matching, match_pairs
 from mfvpr.types import per_match, per_pair
 from tests import oracles
 from tests.builders import make_features, random_matches, unit
@@ -19,7 +19,7 @@ MODES = ["mutual", "opencv_legacy", "none", "candidate"]
 # Compiled as a whole, not operation by operation: seconds, where every test has its own shapes.
 match_once = jax.jit(match, static_argnames=("cross_check", "with_ratio"))
 match_candidates_once = jax.jit(match_candidates, static_argnames=("cross_check", "chunk_size"))
-match_pairs_once = jax.jit(match_pairs, static_argnames="cross_check")
+match_pairs_once = jax.jit(match_pairs)
 PAIRS = np.array([(0, 1), (0, 0)], np.int32)
 compact_once = jax.jit(compact, static_argnames="capacity")
 
@@ -147,7 +147,7 @@ def test_images_without_a_single_slot(mode, counts):
     for matches in (
         match_once(features0, features1, cross_check=mode),
         match_candidates_once(features0, batch, cross_check=mode),
-        match_pairs_once(jax.tree.map(lambda leaf: leaf[None], features0), batch, PAIRS, 2, cross_check=mode),
+        match_pairs_once(jax.tree.map(lambda leaf: leaf[None], features0), batch, PAIRS, 2, Matching(mode)),
     ):
         assert matches.mask.shape[-1] == counts[mode == "candidate"]
         assert not matches.mask.any()
@@ -228,7 +228,7 @@ def test_whoever_calls_it_matching_compiles_once(compilations):
     calls = [
         lambda limit: match_candidates(query, batch),
         lambda limit: match_candidates(query, batch, with_ratio=True),
-        lambda limit: match_pairs(batch, batch, PAIRS, int(limit) + 1, max_distance=limit, max_matches=7),
+        lambda limit: match_pairs(batch, batch, PAIRS, int(limit) + 1, Matching(max_distance=limit, max_matches=7)),
         lambda limit: retrieve(query.descriptors, batch.descriptors[0], num_candidates=3),
     ]
     for call in calls:
@@ -249,9 +249,8 @@ def test_pairs_are_matched_as_each_of_them(chunk_size):
     pairs = np.array([(0, 0), (1, 2), (0, 1), (1, 0), (0, 2), (0, 0), (1, 1)], np.int32)
     stacks = [jax.tree.map(lambda *leaves: np.stack(leaves), *side) for side in (queries, candidates)]
     for count in (0, 1, 5, 7):
-        got = match_pairs(
-            *stacks, pairs, count, with_ratio=True, max_distance=1.1, max_matches=3, chunk_size=chunk_size
-        )
+        matcher = Matching(max_distance=1.1, max_matches=3, chunk_size=chunk_size)
+        got = match_pairs(*stacks, pairs, count, matcher)
         for place, (query, candidate) in enumerate(pairs[:count]):
             alone = match_once(queries[query], candidates[candidate], with_ratio=True)
             expected = filter_matches(alone, max_distance=1.1, max_matches=3)
@@ -284,8 +283,8 @@ def test_a_chunk_is_what_fits_where_the_data_are(monkeypatch):
     batch = jax.tree.map(lambda leaf: leaf[None], make_features(rng, 30))
     for memory, expected in ((None, 1), (80 * 2**30, 80 * 2**30 // 256 // (4 * 20 * 30 + 1)), (10**5, 1)):
         monkeypatch.setattr(matching, "device_bytes", lambda tree: memory)  # noqa: B023
-        assert matching._chunk_size(None, make_features(rng, 20), batch) == expected
-        assert matching._chunk_size(7, make_features(rng, 20), batch) == 7
+        assert matching.pairs_at_once(None, make_features(rng, 20), batch) == expected
+        assert matching.pairs_at_once(7, make_features(rng, 20), batch) == 7
     with pytest.raises(ValueError, match="chunk_size=0: expected a whole number above 0"):
         match_candidates(make_features(rng, 20), batch, chunk_size=0)
 

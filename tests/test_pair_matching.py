@@ -15,6 +15,7 @@ import pytest
 import mfvpr
 from mfvpr import Matches, pair_matching, pipeline, ragged
 from mfvpr.match_sets import MatchSet, batches, compacted, shapes, slots
+from mfvpr.matchers import Matching
 from mfvpr.matching import filter_matches
 from mfvpr.pair_matching import QUERIES
 from mfvpr.reranking import rank_shortlist
@@ -67,7 +68,7 @@ def expected_of(queries, database, candidates, *, max_distance=None, max_matches
     for query, row in np.ndindex(candidates.indices.shape):
         index = candidates.indices[query, row]
         if index >= 0 and queries.counts[query] and database.counts[index]:
-            matches = alone(queries[query], database[index], **options)
+            matches = alone(queries[query], database[index], with_ratio=True, **options)
             matches = filter_matches(matches, max_distance=max_distance, max_matches=max_matches)
             real = np.asarray(matches.mask)
             found[query, row] = {name: np.asarray(values)[real] for name, values in per_match(matches).items()}
@@ -120,7 +121,7 @@ def assert_same(one, other):
 def test_every_pair_is_matched_as_alone(options, memory):
     queries, database = sets()
     candidates = shortlist_of()
-    found = pipeline.match(queries, database, candidates, memory=memory, **options)
+    found = pipeline.match(queries, database, candidates, Matching(**options), memory=memory)
     options = {name: value for name, value in options.items() if name != "chunk_size"}
     expected = expected_of(queries, database, candidates, **options)
     assert found.counts.sum() > 300
@@ -207,7 +208,7 @@ def test_another_data_set_of_the_same_capacities_compiles_nothing(compilations):
     def matched(seed, change):
         counts0, counts1 = ([max(0, count - change) for count in counts] for counts in (COUNTS0, COUNTS1))
         some = (FeatureSet.of(images_of(counts, seed)) for counts in (counts0, counts1))
-        return pipeline.match(*some, shortlist_of(seed), max_distance=1.0 - change / 10)
+        return pipeline.match(*some, shortlist_of(seed), Matching(max_distance=1.0 - change / 10))
 
     matched(0, 0)
     compilations.reset()
@@ -331,7 +332,7 @@ def test_some_queries_are_matched_as_all_of_them():
     database = FeatureSet.of([make_features(rng, count) for count in (30, 25, 300, 220)])
     indices = np.array([[0, 1], [2, 3], [3, 2]], np.int32)
     listed = Shortlist(indices, np.zeros(indices.shape, np.float32), indices >= 0)
-    options = {"memory": None, "devices": jax.local_devices()[:1]}
+    options = {"matcher": Matching(), "memory": None, "devices": jax.local_devices()[:1]}
     sizes, call = [], pair_matching.match_pairs
 
     def counted(first, second, *rest, **more):

@@ -14,7 +14,7 @@ from mfvpr import Features, Shortlist, pipeline
 from mfvpr.archive import Archive
 from mfvpr.data.datasets import ImageFolder, folder_dataset, sequences_dataset
 from mfvpr.errors import InputError
-from mfvpr.evaluations import Matching, match_sequence, matches_recipe
+from mfvpr.evaluations import match_sequence, matches_recipe
 from mfvpr.features import Aggregated, windows
 from mfvpr.features.sift import Sift
 from mfvpr.features.ssm import SsmCells, SsmMaps, SsmWindows
@@ -23,6 +23,7 @@ from mfvpr.features.windows import WindowFitting, Windows, kernels, normalized, 
 from mfvpr.filters import Retrieval
 from mfvpr.fingerprints import difference, fingerprint
 from mfvpr.fitting import fitted, whitening_recipe
+from mfvpr.matchers import Matching
 from mfvpr.models.ssm import SsmVgg
 from mfvpr.scoring import GridAnchors
 from mfvpr.sources import FeatureSet
@@ -306,7 +307,7 @@ def test_candidates_without_cells_score_zero():
     queries, database = (FeatureSet.of(images, unit_length=False) for images in ([image, empty], [empty, image]))
     indices = np.array([[0, 1]] * 2, np.int32)
     candidates = Shortlist(indices, np.zeros((2, 2), np.float32), indices >= 0)
-    matches = pipeline.match(queries, database, candidates, cross_check="candidate")
+    matches = pipeline.match(queries, database, candidates, CANDIDATE)
     scores = pipeline.score({"grid": GridAnchors(4, 3)}, matches, candidates)["grid"]
     np.testing.assert_array_equal(scores, [[0, 100], [0, 0]])
 

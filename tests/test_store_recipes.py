@@ -36,12 +36,11 @@ def opened(tmp_path):
     return lambda: open_match_store(tmp_path / "s", {"of": "any"}, **sizes)
 
 
-def assert_same(got, expected, *, ratio=True):
+def assert_same(got, expected):
     np.testing.assert_array_equal(got.counts, expected.counts)
     for one, other in zip(got.matches, expected.matches, strict=True):
         for part in fields(Matches):
-            if ratio or part.name != "ratio":
-                np.testing.assert_array_equal(getattr(one, part.name), getattr(other, part.name))
+            np.testing.assert_array_equal(getattr(one, part.name), getattr(other, part.name))
 
 
 class Interrupted(Exception):
@@ -84,7 +83,7 @@ def test_another_shortlist_is_refused_before_anything_is_written(drawn, candidat
 
 
 def test_matching_without_a_store_is_the_same(drawn, candidates, opened):
-    """To the last bit, the ratio included."""
+    """To the last bit, the ratio too."""
     plain = pipeline.match(drawn, drawn, candidates)
     assert plain.matches[0].ratio is not None
     for _ in range(2):

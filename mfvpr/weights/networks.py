@@ -13,7 +13,7 @@ from mfvpr.errors import InputError
 from mfvpr.weights.conversion import Rule, Table, convert, share_known
 from mfvpr.weights.pickles import excerpt
 from mfvpr.weights.registry import REGISTRY, Entry
-from mfvpr.weights.tables import ALIKED, D2NET, MIXVPR, SSM
+from mfvpr.weights.tables import ALIKED, D2NET, LIGHTGLUE, MIXVPR, SSM
 
 if TYPE_CHECKING:
     from flax import nnx
@@ -52,6 +52,12 @@ def _aliked(variant: str) -> Callable[..., "nnx.Module"]:
     return partial(Aliked, variant)
 
 
+def _lightglue() -> Callable[..., "nnx.Module"]:
+    from mfvpr.models.lightglue import LightGlue
+
+    return LightGlue
+
+
 _ALIKED = ("aliked-t16", "aliked-n16", "aliked-n16rot", "aliked-n32")
 
 _MOST = 0.5  # of the keys tell whose they are
@@ -65,6 +71,7 @@ NETWORKS: dict[str, Network] = {
     "mixvpr_128": Network(partial(_mixvpr, 64, 2), MIXVPR),
     "vgg16_places365": Network(_ssm, SSM),
     **{name: Network(partial(_aliked, name), ALIKED) for name in _ALIKED},
+    "aliked_lightglue": Network(_lightglue, LIGHTGLUE),
 }
 
 
@@ -127,11 +134,14 @@ def blueprint(entry: Entry) -> Blueprint:
     Raises:
         InputError: it is not part of this version.
     """
-    network = network_of(entry)
+    return planned(network_of(entry).builder())  # imported before tracing, or the module's constants would be traced
+
+
+def planned(build: Callable[..., "nnx.Module"]) -> Blueprint:
+    """The shapes of the network that `build` makes of `rngs`."""
     import jax
     from flax import nnx
 
-    build = network.builder()  # before tracing, or constants of the model's module would be traced
     with jax.numpy_dtype_promotion("standard"):  # Flax's initializers mix types
         module = nnx.eval_shape(lambda: build(rngs=nnx.Rngs(0)))
     graph, state = nnx.split(module)

@@ -74,6 +74,21 @@ def _aliked(variant: str, parameters: int, size: int, sha256: str) -> Entry:
     )
 
 
+def _lightglue() -> Entry:
+    return Entry(
+        name="aliked_lightglue",
+        network="lightglue",
+        file="aliked_lightglue.pth",
+        source="https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/aliked_lightglue.pth",
+        size=47_632_827,
+        sha256="d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
+        code_license="Apache-2.0",
+        weights_license="Apache-2.0",
+        cite="Lindenberger, Sarlin, Pollefeys, LightGlue: Local Feature Matching at Light Speed, ICCV 2023",
+        parameters=11_884_625,
+    )
+
+
 def _ssm() -> Entry:
     return Entry(
         name="vgg16_places365",
@@ -120,6 +135,7 @@ _ENTRIES = (
     _aliked("n16", 677_356, 2_738_091, "5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2"),
     _aliked("n16rot", 677_356, 2_738_325, "ddf3abbf38e86f6a74540d214e1a9712c54b2d8551abc864542199f2347d7332"),
     _aliked("n32", 979_500, 3_946_667, "055283fd1624d3ab46a05c3b617b1a79a3f28d1f551737eef2d653e8c8232890"),
+    _lightglue(),
     _ssm(),
     _patchnetvlad("mapillary", 128, 67_319_611, "5b6de8a5537061bbe7a477b62bb687b042d92d472e5231e2072026ecc59ec4b1"),
     _patchnetvlad("mapillary", 512, 92_488_008, "acbe2597c1c23c95482883c05969006a74bf7e68c4151dbb4ab5d67b69e8e346"),

@@ -93,3 +93,31 @@ ALIKED = Table(
     ),
     ignored=(_COUNTERS,),
 )
+
+_LAYER = r"(?:transformers\.(\d)\.{0}_attn|{0}_attn\.(\d))"  # the latter in older files; the other group is empty
+
+
+def _attention(source: str, target: str, parts: dict[str, str]) -> tuple[Rule, ...]:
+    layer, ours = _LAYER.format(source), rf"layers.\1\2.{target}"
+    parts = parts | {r"ffn\.0": "feed_forward.hidden", r"ffn\.3": "feed_forward.update"}
+    linear = (_linear(rf"{layer}\.{theirs}", f"{ours}.{name}") for theirs, name in parts.items())
+    norm = rf"{layer}\.ffn\.1", f"{ours}.feed_forward.norm"
+    return (
+        *(rule for rules in linear for rule in rules),
+        Rule(rf"{norm[0]}\.weight", f"{norm[1]}.scale"),
+        Rule(rf"{norm[0]}\.bias", f"{norm[1]}.bias"),
+    )
+
+
+LIGHTGLUE = Table(
+    (
+        *_linear("input_proj", "input"),
+        Rule(r"posenc\.Wr\.weight", "position.kernel", Layout.LINEAR),
+        *_attention("self", "self_attention", {"Wqkv": "qkv", "out_proj": "message"}),
+        *_attention("cross", "cross_attention", {"to_qk": "key", "to_v": "value", "to_out": "message"}),
+        *_linear(r"log_assignment\.(\d)\.final_proj", r"layers.\1.projection"),
+        *_linear(r"log_assignment\.(\d)\.matchability", r"layers.\1.matchability"),
+        *_linear(r"token_confidence\.(\d)\.token\.0", r"confidences.\1"),
+    ),
+    ignored=("confidence_thresholds",),  # follow from the number of layers
+)

@@ -10,7 +10,15 @@ from mfvpr.weights.checkpoint import read_checkpoint
 from mfvpr.weights.conversion import Layout, Rule, Table, convert
 from mfvpr.weights.networks import NETWORKS, blueprint, network_of, resemblance
 from mfvpr.weights.registry import REGISTRY, entry_of
-from tests.checkpoints import ALIKED, d2net_shapes, mixvpr_shapes, places365_shapes, random_checkpoint
+from tests.checkpoints import (
+    ALIKED,
+    LIGHTGLUE,
+    d2net_shapes,
+    lightglue_shapes,
+    mixvpr_shapes,
+    places365_shapes,
+    random_checkpoint,
+)
 from tests.weights.conftest import PARAMETERS, SHAPES, SOURCE_SHAPES, TABLE, tiny_entry
 
 PUBLIC = {
@@ -19,6 +27,7 @@ PUBLIC = {
     "mixvpr_512": mixvpr_shapes(256, 2),
     "mixvpr_128": mixvpr_shapes(64, 2),
     "vgg16_places365": places365_shapes(),
+    "aliked_lightglue": lightglue_shapes(),
 }
 
 
@@ -201,13 +210,14 @@ def test_unknown_layers_of_places365_are_refused():
 
 @pytest.mark.skipif(not ALIKED.is_dir(), reason="no ../shared/weights: weights do not ship with the project")
 @pytest.mark.parametrize("name", [name for name in REGISTRY if name.startswith("aliked")])
-def test_real_aliked_weights_are_the_registrys_and_convert(name):
+def test_real_weights_are_the_registrys_and_convert(name):
     entry = entry_of(name)
-    content = (ALIKED / entry.file).read_bytes()
+    file = (LIGHTGLUE.parent if name == LIGHTGLUE.stem else ALIKED) / entry.file
+    content = file.read_bytes()
     assert len(content) == entry.size
     assert hashlib.sha256(content).hexdigest() == entry.sha256
     plan = blueprint(entry)
-    found = convert(read_checkpoint(ALIKED / entry.file), NETWORKS[name].table, plan.shapes)
+    found = convert(read_checkpoint(file), NETWORKS[name].table, plan.shapes)
     assert found.keys() == plan.shapes.keys()
     assert all(np.isfinite(array).all() for array in found.values())
     assert plan.parameters == entry.parameters
@@ -218,7 +228,7 @@ def test_registry():
     assert len({entry.file for entry in REGISTRY.values()}) == len(REGISTRY)
     assert NETWORKS.keys() == {entry.name for entry in REGISTRY.values() if entry.network != "patchnetvlad"}
     hashes = [entry.sha256 for entry in REGISTRY.values() if entry.sha256]
-    assert len(set(hashes)) == len(hashes) == 11
+    assert len(set(hashes)) == len(hashes) == 12
     assert all(len(digest) == 64 and int(digest, 16) for digest in hashes)
     with pytest.raises(InputError, match="network patchnetvlad is not part of this version"):
         network_of(entry_of("patchnetvlad_pitts_128"))

@@ -1,0 +1,217 @@
+"""LightGlue as a matcher: what becomes of an assignment, alone and in batches, in evaluations and in stores."""
+
+from dataclasses import replace
+from functools import cache, partial
+
+import jax
+import numpy as np
+import pytest
+
+import mfvpr
+from mfvpr import InputError, LightGlueMatching, Matching, Shortlist, pipeline, ragged
+from mfvpr.checks import check_matching
+from mfvpr.features import Scale
+from mfvpr.features.sift import Sift
+from mfvpr.fingerprints import recipe_of
+from mfvpr.models.lightglue import LightGlue
+from mfvpr.models.lightglue_assignment import assignment
+from mfvpr.sources import FeatureSet, stacked
+from mfvpr.stores.matches import open_match_store
+from mfvpr.types import per_keypoint, per_match
+from mfvpr.weights.conversion import convert
+from mfvpr.weights.networks import planned
+from mfvpr.weights.tables import LIGHTGLUE
+from tests.golden.make_lightglue import SIZES, SMALL, checkpoint, pair
+
+INPUTS = SMALL["inputs"]
+COUNTS = SIZES[0]
+OPTIONS = {"filter_threshold": 1e-3}  # random weights are sure of little
+
+
+@cache
+def network(seed=0, sure=None):
+    plan = planned(partial(LightGlue, *SMALL.values()))
+    return plan.filled(convert(checkpoint(seed, sure), LIGHTGLUE, plan.shapes))
+
+
+@cache
+def matcher(sure=None, **options):
+    return LightGlueMatching.of(network(0, sure), **OPTIONS | options)
+
+
+matched = jax.jit(lambda matcher, features0, features1: matcher(features0, features1))
+
+
+def slots(features, capacity, garbage=np.nan):
+    """The same image with more slots, whose padding holds garbage."""
+    image = jax.tree.map(lambda leaf: leaf[0].copy(), stacked([features], capacity))
+    for values in (image.keypoints, image.descriptors, image.scores):
+        values[len(features.mask) :] = garbage
+    return image
+
+
+def empty(features):
+    """The image without a single slot."""
+    return replace(features, **{name: values[:0] for name, values in per_keypoint(features).items()})
+
+
+def rows(matches):
+    """The real matches, field by field."""
+    real = np.asarray(matches.mask)
+    return {name: np.asarray(values)[real] for name, values in per_match(matches).items()}
+
+
+def assert_same_rows(found, expected):
+    assert found.keys() == expected.keys()
+    for name, values in expected.items():
+        np.testing.assert_allclose(found[name], values, rtol=0, atol=1e-5, err_msg=name)
+
+
+def test_matches_are_the_largest_of_their_row_and_column_and_above_the_threshold():
+    features0, features1 = pair(COUNTS, INPUTS, 0)
+    matches = matched(matcher(), features0, features1)
+    assigned = np.exp(np.asarray(jax.jit(assignment)(matcher().weights, features0, features1)))
+    expected = [
+        (row, column)
+        for row, column in np.ndindex(assigned.shape)
+        if assigned[row, column] == max(assigned[row].max(), assigned[:, column].max()) and assigned[row, column] > 1e-3
+    ]
+    found = rows(matches)
+    assert len(expected) > 3
+    assert [*zip(found["index0"], found["index1"], strict=True)] == expected
+    row, column = np.array(expected).T
+    np.testing.assert_allclose(found["confidence"], assigned[row, column], rtol=1e-6)
+    np.testing.assert_array_equal(found["points1"], features1.keypoints[column])
+    np.testing.assert_array_equal(found["scores0"], features0.scores[row])
+    difference = features0.descriptors[row] - features1.descriptors[column]
+    np.testing.assert_allclose(found["distance"], np.linalg.norm(difference, axis=1), atol=1e-6)
+    alone = jax.jit(partial(mfvpr.match, with_ratio=True))(features0, features1)
+    np.testing.assert_array_equal(matches.ratio, alone.ratio)
+    fewer = rows(matched(matcher(filter_threshold=float(np.median(found["confidence"]))), features0, features1))
+    assert 0 < len(fewer["index0"]) < len(expected)
+
+
+@pytest.mark.parametrize("chunk_size", [None, 3])
+def test_a_pair_depends_neither_on_its_batch_nor_on_its_padding(chunk_size):
+    """Also where some pairs of a chunk stop early, and what is padding holds NaN."""
+    images = [side for counts in (COUNTS, (9, 30), (24, 1)) for side in pair(counts, INPUTS, 4)]
+    numbers = np.array([(0, 1), (2, 3), (4, 5), (0, 3), (2, 1), (4, 1), (0, 5)], np.int32)
+    sure = matcher(0, depth_confidence=0.95, chunk_size=chunk_size)
+    for capacity, garbage in ((31, np.nan), (64, np.inf)):
+        batch = jax.tree.map(lambda *leaves: np.stack(leaves), *(slots(one, capacity, garbage) for one in images))
+        found = mfvpr.match_pairs(batch, batch, numbers, 6, sure)
+        assert found.mask.sum() > 10
+        assert not found.mask[6].any()
+        for place, (query, candidate) in enumerate(numbers[:6]):
+            alone = rows(matched(sure, slots(images[query], 40, -1e9), slots(images[candidate], 40, 0)))
+            one = jax.tree.map(lambda leaf, place=place: np.asarray(leaf)[place], found)
+            assert_same_rows(rows(one), alone)
+            assert (one.count0, one.count1) == (len(images[query].mask), len(images[candidate].mask))
+
+
+def test_images_without_keypoints_have_no_matches():
+    features0, features1 = pair(COUNTS, INPUTS, 0)
+    nobody = replace(features1, mask=np.zeros(COUNTS[1], bool))
+    for some in (nobody, empty(features1)):
+        assert not matched(matcher(), features0, some).mask.any()
+        assert not matched(matcher(), some, features0).mask.any()
+
+
+# In evaluations and stores
+
+
+def sets():
+    sides = zip(*(pair(counts, INPUTS, 7) for counts in ((20, 31), (12, 25), (30, 8))), strict=True)
+    queries, database = ([*side] for side in sides)
+    queries.append(empty(queries[0]))
+    return FeatureSet.of(queries), FeatureSet.of(database)
+
+
+def shortlist():
+    indices = np.array([[0, 2], [1, 0], [-1, -1], [0, 1]], np.int32)
+    return Shortlist(indices, np.zeros(indices.shape, np.float32), indices >= 0)
+
+
+def test_stores_keep_the_confidence_for_the_scorers(tmp_path):
+    queries, database = sets()
+    in_memory = pipeline.match(queries, database, shortlist(), matcher())
+    with open_match_store(tmp_path / "m", {"of": "any"}, num_queries=4, num_candidates=2) as store:
+        kept = pipeline.match(queries, database, shortlist(), matcher(), store=store)
+    for match_set in (in_memory, kept):
+        assert match_set.counts[:2].all()
+        assert not match_set.counts[2:].any()
+        for query, place in np.ndindex(2, 2):
+            row = shortlist().indices[query, place]
+            alone = rows(matched(matcher(), slots(queries[query], 32), slots(database[row], 32)))
+            found = ragged.split(per_match(match_set.matches[query]), match_set.counts[query])[place]
+            assert_same_rows(found, alone)
+        sure = replace(match_set, matches=[replace(one, confidence=None) for one in match_set.matches])
+        scorers = {"histogram": mfvpr.HistogramOfShifts()}
+        found, more = (pipeline.score(scorers, one, shortlist())["histogram"] for one in (match_set, sure))
+        assert (found[:2] < more[:2]).all()
+
+
+def test_what_changes_matches_changes_their_recipe():
+    others = [
+        Matching(),
+        matcher(),
+        LightGlueMatching.of(network(1), **OPTIONS),
+        matcher(filter_threshold=0.2),
+        matcher(depth_confidence=0.9),
+    ]
+    recipes = [str(recipe_of(one)) for one in others]
+    assert len({*recipes}) == len(others)
+    assert recipes[1] == str(recipe_of(matcher(chunk_size=5)))
+    assert recipes[1] == str(recipe_of(LightGlueMatching.of(network(), **OPTIONS)))
+
+
+class Extractor:
+    def __init__(self, *dimensions):
+        self.scales = tuple(Scale(dimension, 100) for dimension in dimensions)
+
+
+def test_features_of_another_kind_are_one_line():
+    expected = (
+        "LightGlue: expected ALIKED's features, of 16 dimensions, got {}; extract these, or match nearest neighbors"
+    )
+    for extractor, got in ((Sift(), "Sift of 128"), (Extractor(16, 64), "Extractor of 16, 64")):
+        with pytest.raises(InputError, match=f"^{expected.format(got)}$"):
+            check_matching(50, extractor, matcher())
+        check_matching(50, extractor, Matching())
+    check_matching(50, Extractor(16), matcher())
+    check_matching(50, Extractor(0), matcher())  # not known before they are read
+    with pytest.raises(InputError, match=r"^LightGlue: expected descriptors of 16 dimensions, got 8; take"):
+        matched(matcher(), *pair(COUNTS, 8, 0))
+    with pytest.raises(
+        InputError, match=r"^matching: expected what maps .* got the class Matching; see mfvpr.Matcher$"
+    ):
+        check_matching(50, Extractor(16), Matching)
+
+
+# Matchers of one's own
+
+
+@mfvpr.value
+class InOrder:
+    """Keypoints of the same number, as far as there are any; of what is optional, nothing."""
+
+    limit: float = 5.0
+
+    def __call__(self, features0, features1):
+        number = np.arange(features0.mask.shape[-1])
+        other = np.minimum(number, features1.mask.shape[-1] - 1)
+        mask = features0.mask & features1.mask[other] & (number == other) & (number.astype(np.float32) < self.limit)
+        return mfvpr.Matches(
+            features0.keypoints, features1.keypoints[other], features0.scores, features0.scores,
+            features1.scores[other], mask, features0.image_size, features1.image_size,
+        )  # fmt: skip
+
+
+def test_a_matcher_of_ones_own_matches_whole_shortlists():
+    queries, database = sets()
+    found = pipeline.match(queries, database, shortlist(), InOrder(4.0))
+    np.testing.assert_array_equal(found.counts, [[4, 4], [4, 4], [0, 0], [0, 0]])
+    assert all(one.confidence is None and one.ratio is None and one.index0 is None for one in found.matches)
+    np.testing.assert_array_equal(found.matches[1].points1[:4], database[1].keypoints[:4])
+    scores = pipeline.score({"count": mfvpr.MatchCount()}, found, shortlist())["count"]
+    np.testing.assert_array_equal(scores[shortlist().mask], found.counts[shortlist().mask])
