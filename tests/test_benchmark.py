@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from experiments.benchmark.__main__ import BENCHMARKS
+from mfvpr.data.datasets import folder_dataset
 from mfvpr.features import Description
 from mfvpr.features.sift import Sift
 from mfvpr.scoring import MatchCount
@@ -171,14 +172,14 @@ def test_every_ransac_counts_the_plane(monkeypatch):
 @pytest.fixture
 def two_places(small_street, tmp_path, monkeypatch):
     """The folders that real images are expected in, and one kind of features."""
-    from experiments.benchmark import agreement, real, weights
+    from experiments.benchmark import agreement, real, weights, zoom
 
     for name, (database, queries) in real.FOLDERS.items():
         (tmp_path / name).mkdir()
         (tmp_path / name / database).symlink_to(small_street / "database")
         (tmp_path / name / queries).symlink_to(small_street / "queries")
     sift = {"SIFT": Sift(image_size=(160, 120), max_keypoints=100)}
-    for module in (agreement, real, weights):
+    for module in (agreement, real, weights, zoom):
         monkeypatch.setattr(module, "extractors", lambda *_: sift)
     return tmp_path
 
@@ -220,3 +221,40 @@ def test_ransac_beside_opencv_s_is_pooled_over_places(two_places, monkeypatch, c
     assert both["queries"] == 20
     assert both["mfvpr"] == [2 * right for right in rows[0]["mfvpr"]]
     assert "all, SIFT, 8 px" in capsys.readouterr().out
+
+
+def test_the_paper_s_weights_gain_nothing_over_themselves(two_places):
+    from experiments.benchmark import weights
+
+    weights.run(None, two_places / "out.json", two_places)
+    [table] = json.loads((two_places / "out.json").read_text())["tables"]
+    by_name = {(row["system"], row["weight"]): row for row in table["rows"]}
+    assert len(by_name) == len(table["rows"]) == 6 * len(weights.WEIGHTS)
+    for system, weight in (("histogram", "fs"), ("anchor + filter", "fs"), ("sum", "dmf")):
+        row = by_name[system, weight]
+        assert (row["gained"], row["lost"], row["sign_flips"]["p_value"]) == (0, 0, 1)
+        assert row["recall"]["grief_season"] == row["recall"]["corridor"] == row["recall"]["all"] > 0.5
+    gains = by_name["sum", "ratio"]
+    more = (gains["recall"]["all"] - by_name["sum", "dmf"]["recall"]["all"]) * 20
+    assert gains["gained"] - gains["lost"] == pytest.approx(more)
+
+
+def test_a_thinned_database_has_fewer_right_images(two_places, small_street, monkeypatch):
+    from experiments.benchmark import real, zoom
+
+    street = folder_dataset(
+        small_street / "database", small_street / "queries", name="streets", ground_truth="order"
+    )  # fmt: skip
+    monkeypatch.setattr(real.prepare, "dataset_of", lambda _: street)
+    monkeypatch.setattr(zoom, "THINNED", {1: 2, 100: 2})
+    monkeypatch.setattr(zoom, "SCORERS", {name: zoom.SCORERS[name] for name in ("fs", "fs, 7 scales, prior")})
+    zoom.run(None, two_places / "out.json", two_places)
+    rows = json.loads((two_places / "out.json").read_text())["rows"]
+    places = ("grief_season", "corridor", "streets")
+    names = [(f"{place}, SIFT", scorer) for place in places for scorer in zoom.SCORERS]
+    assert [(row["matches"], row["scorer"]) for row in rows] == names
+    for row in rows:
+        every, first = row["recall"]
+        assert 0.5 < every <= 1
+        assert first == pytest.approx(0.3)  # of ten queries three are near the only image that is left
+        assert row["ms_per_query"] > 0

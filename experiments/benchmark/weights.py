@@ -12,7 +12,7 @@ from experiments.benchmark.real import extractors, matched_sets
 from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, pipeline
 from mfvpr.data.files import write_text
 from mfvpr.evaluation import hits
-from mfvpr.evaluation.statistics import mcnemar
+from mfvpr.evaluation.statistics import block_sign_flips, mcnemar
 from mfvpr.report.runs import versions
 from mfvpr.report.tables import Table
 from mfvpr.reranking import fuse_shortlist, rank_shortlist
@@ -62,18 +62,20 @@ def rows(places: Mapping[str, Hits]) -> Iterator[dict[str, Any]]:
         for weight in WEIGHTS:
             found = [answers[system][weight] for answers in places.values()]
             before = [answers[system][paper] for answers in places.values()]
-            lost, gained, p_value = mcnemar(np.concatenate(before), np.concatenate(found))
+            joined = np.concatenate(before), np.concatenate(found)
+            lost, gained, p_value = mcnemar(*joined)
+            flips = block_sign_flips(*joined, sequences=[len(one) for one in found])
             recall = {place: float(np.mean(one)) for place, one in zip(places, found, strict=True)}
             yield {
                 "system": system, "weight": weight, "recall": recall | {"all": float(np.mean(np.concatenate(found)))},
-                "gained": gained, "lost": lost, "p_value": p_value,
+                "gained": gained, "lost": lost, "mcnemar": p_value, "sign_flips": flips._asdict(),
             }  # fmt: skip
 
 
 def _table(rows: list[dict[str, Any]]) -> Table:
     lines = [
         [row["system"], row["weight"], *(f"{100 * one:.1f}" for one in row["recall"].values()),
-         f"+{row['gained']} -{row['lost']}", f"{row['p_value']:.2g}"]
+         f"+{row['gained']} -{row['lost']}", f"{row['sign_flips']['p_value']:.2g}"]
         for row in rows
     ]  # fmt: skip
     header = [
