@@ -12,7 +12,7 @@ ALLOWED = {
     "declaration": {"errors"},
     "numerics": {"errors"},
     "types": set(),
-    "weighting": {"numerics", "types"},
+    "weighting": {"errors", "numerics", "types"},
     "neighbors": {"types"},
     "ragged": set(),
     "progress": set(),
