@@ -18,6 +18,7 @@ BENCHMARKS = {
     "homographies": "RANSAC of 50 pairs beside OpenCV's (7 rounds)",
     "agreement": "RANSAC on matches of real images beside OpenCV's: recall and inliers (4 seeds; half an hour)",
     "real": "all scores on the same matches of real images: recall with intervals, time per query (1 round)",
+    "shifts": "dominant shifts on drawn streets: errors and intervals in px (1 street)",
     "sweeps": "grids of a score's parameters on cached matches (7 rounds)",
     "networks": "D2-Net, MixVPR and ALIKED (5 rounds)",
     "scale": "databases of 1,000 to 10,000 images on disk: time per query and peak memory (3 rounds)",
