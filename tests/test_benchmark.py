@@ -258,3 +258,20 @@ def test_a_thinned_database_has_fewer_right_images(two_places, small_street, mon
         assert 0.5 < every <= 1
         assert first == pytest.approx(0.3)  # of ten queries three are near the only image that is left
         assert row["ms_per_query"] > 0
+
+
+@pytest.mark.slow
+def test_shifts_of_a_drawn_street_are_near_the_true_ones(tmp_path, monkeypatch, capsys):
+    from experiments.benchmark import shifts
+
+    monkeypatch.setenv("MFVPR_CACHE", str(tmp_path))
+    monkeypatch.setattr(shifts, "FRAMES", 5)
+    shifts.run(1, tmp_path / "shifts.json")
+    rows = json.loads((tmp_path / "shifts.json").read_text())["rows"]
+    assert [row["histogram"] for row in rows] == list(shifts.SCORERS)
+    for row in rows:
+        assert row["refined"]["gross"] == 0
+        assert max(row["refined"]["median"]) < 10
+        assert min(row["0.95"]["coverage"]) > 0.5
+        assert np.all(np.less(row["0.68"]["width"], row["0.95"]["width"]))
+    assert "5 px bins, sigma 10" in capsys.readouterr().out

@@ -20,6 +20,7 @@ BENCHMARKS = {
     "real": "all scores on the same matches of real images: recall with intervals, time per query (1 round)",
     "weights": "every score with every match weight on the same matches of real images: recall",
     "zoom": "the histogram's vote over several scales, on real and drawn images: recall, time per query (1 round)",
+    "shifts": "dominant shifts on drawn streets: errors and intervals in px (1 street)",
     "sweeps": "grids of a score's parameters on cached matches (7 rounds)",
     "networks": "D2-Net, MixVPR and ALIKED (5 rounds)",
     "scale": "databases of 1,000 to 10,000 images on disk: time per query and peak memory (3 rounds)",

@@ -7,7 +7,7 @@ import numpy as np
 from mfvpr.errors import InputError
 
 BINS = 10
-_DRAWS = 1000
+_DRAWS = 400
 
 
 class PrecisionRecall(NamedTuple):
@@ -92,5 +92,6 @@ def reliability(probability: np.ndarray, right: np.ndarray, *, bins: int = BINS)
 def chance_calibration_error(probability: np.ndarray, *, bins: int = BINS, seed: int = 0) -> float:
     """The `calibration_error` that perfectly calibrated probabilities `[Q]` have on average, by so few queries."""
     probability = np.asarray(probability, np.float64)
-    draws = np.random.default_rng(seed).random((_DRAWS, len(probability))) < probability
+    rng = np.random.default_rng(seed)
+    draws = (rng.random(len(probability)) < probability for _ in range(_DRAWS))
     return float(np.mean([reliability(probability, right, bins=bins).calibration_error for right in draws]))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mfvpr import AggregatedScore, AnchorPoints, DescriptorDistanceWeight, HistogramOfShifts, UnitWeight
+from mfvpr.errors import InputError
 from tests.builders import SIZE, make_matches, random_matches
 
 histogram = jax.jit(HistogramOfShifts.histogram)
@@ -189,3 +190,25 @@ def test_rounding_adds_no_bin_that_holds_nothing(count, align):
     bins = histogram(replace(scorer, max_bins=63), matches)
     assert int((bins.scores > -np.inf).any(axis=0).sum()) == count
     np.testing.assert_allclose(bins.centers_x[0], -SIZE + SIZE / count, rtol=1e-5)
+
+
+def test_interval_of_equal_shifts_is_that_of_a_gaussian_and_holds_two_peaks_where_there_are_two():
+    points = np.full((12, 2), 150.0)
+    scorer = HistogramOfShifts(bin_size=1.0, sigma=24.0)
+    low, high = scorer.shift_interval(make_matches(points, points + [30, -7]), sharpness=16.0)
+    np.testing.assert_allclose([low, high], np.add([30, -7], [[-1.96 * 6], [1.96 * 6]]), atol=0.05)
+    shifts = np.where(np.arange(12)[:, None] % 2, [60, 0], [-60, 0])
+    low, high = scorer.shift_interval(make_matches(points, points + shifts))
+    assert low[0] < -60 < 60 < high[0]
+    assert -12 < low[1] < 0 < high[1] < 12
+
+
+def test_interval_where_nothing_votes_is_of_all_shifts_and_too_few_bins_have_none():
+    matches = random_matches(np.random.default_rng(0), 20)
+    none = replace(matches, mask=np.zeros_like(matches.mask))
+    low, high = HistogramOfShifts(bin_size=1.0).shift_interval(none, level=0.5)
+    np.testing.assert_allclose([low, high], [[-SIZE / 2] * 2, [SIZE / 2] * 2], atol=1)
+    small = jax.jit(lambda one: HistogramOfShifts(max_bins=8).shift_interval(one))
+    assert np.isnan(small(matches)).all()
+    with pytest.raises(InputError, match="level=95: expected a number between 0 and 1"):
+        HistogramOfShifts().shift_interval(matches, level=95)

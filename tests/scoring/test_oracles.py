@@ -156,6 +156,30 @@ def test_dominant_shift(matches, sizes):
     np.testing.assert_allclose(histogram[row, column], histogram.max(), rtol=1e-5)  # rounding may choose among equals
 
 
+@given(pairs(), st.sampled_from([(15.0, 22.5), (20.0, 8.0)]), st.sampled_from([(0.68, 24.0), (0.95, 3.0)]))
+@settings(max_examples=25)
+def test_shift_interval_is_the_middle_of_the_mass(matches, sizes, mass):
+    bin_size, sigma = sizes
+    level, sharpness = mass
+    points0, points1, weights = oracle_inputs(matches, "fs")
+    scorer = HistogramOfShifts(bin_size=bin_size, sigma=sigma, max_bins=CAPACITY)
+    found = np.asarray(scorer.shift_interval(matches, level=level, sharpness=sharpness))
+    assert (found[0] < found[1]).all()
+    if not len(weights):
+        return
+    histogram, *centers = oracles.histogram_of_shifts(
+        points1 - points0, weights, matches.image_size0, matches.image_size1, bin_size=bin_size, sigma=sigma
+    )
+    mass = (histogram / histogram.max()) ** sharpness if histogram.max() > 0 else np.ones_like(histogram)
+    for axis in (0, 1):
+        along = mass.sum(axis=axis) / mass.sum()
+        for edge, share in zip(found[:, axis], ((1 - level) / 2, (1 + level) / 2), strict=True):
+            below = 0.0  # of the mass before the edge, a part of the bin that it is in
+            for center, part in zip(centers[axis], along, strict=True):
+                below += part * min(max((edge - center) / bin_size + 0.5, 0), 1)
+            assert below == pytest.approx(share, abs=1e-4)
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_refined_shift_is_the_mode_that_mean_shift_finds(seed):
     rng = np.random.default_rng(seed)
