@@ -17,19 +17,8 @@ from mfvpr.declaration import SCORE, check_choices, choice, flag, named, number,
 from mfvpr.errors import InputError
 from mfvpr.numerics import compiled, is_concrete, positive, round_up
 from mfvpr.scoring.intervals import mass_interval
-from mfvpr.scoring.lattice import (
-    Lattice,
-    are_numbers,
-    bins,
-    climb,
-    mapped,
-    of_all_bins,
-    smooth_tallest,
-    tallest,
-    votes,
-    where_usable,
-)  # fmt: skip
-from mfvpr.scoring.shifts import image_sizes, match_shifts, zoomed
+from mfvpr.scoring.lattice import Lattice, bins, climb, mapped, of_all_bins, smooth_tallest, tallest, votes
+from mfvpr.scoring.shifts import are_numbers, image_sizes, match_shifts, where_usable, zoomed
 from mfvpr.scoring.tallest import tallest_bins
 from mfvpr.types import Array, Matches, value
 from mfvpr.weighting import WEIGHTS, Weight, match_weights

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from mfvpr.numerics import masked
-from mfvpr.types import Array, Matches
+from mfvpr.types import Array
 
 _MEAN_SHIFT_STEPS = 30
 
@@ -117,15 +117,3 @@ def climb(start: Array, shifts: Array, weights: Array, deviation: Array) -> Arra
         return jnp.where(total > 0, pull @ shifts / jnp.where(total > 0, total, 1.0), shift)
 
     return jax.lax.fori_loop(0, _MEAN_SHIFT_STEPS, step, start)
-
-
-def where_usable(found: Array, matches: Matches, shifts: Array, weights: Array, usable: Array) -> Array:
-    """What was `found` by weights `[W, K]` of one pair, `[W]` or of the only one; 0 without matches, and NaN where the
-    lattice is not usable, a shift or a weight no number: else the tallest bin would be anything."""
-    usable = usable & are_numbers(shifts, weights)
-    return jnp.where(jnp.any(matches.mask), jnp.where(usable, found, jnp.nan), 0.0)
-
-
-def are_numbers(shifts: Array, weights: Array) -> Array:
-    """`[W]` whether all shifts and the weights `[W, K]` are finite."""
-    return jnp.all(jnp.isfinite(shifts)) & jnp.all(jnp.isfinite(weights), axis=1)

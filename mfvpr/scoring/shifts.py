@@ -39,3 +39,15 @@ def image_sizes(matches: Matches) -> tuple[Array, Array]:
     size0, size1 = at_least_single(matches.image_size0), at_least_single(matches.image_size1)
     usable = lambda size: some | ((size > 0) & jnp.isfinite(size))  # noqa: E731
     return masked(size0, usable(size0), 1.0), masked(size1, usable(size1), 1.0)
+
+
+def where_usable(found: Array, matches: Matches, shifts: Array, weights: Array, usable: Array) -> Array:
+    """What was `found` by weights `[W, K]` of one pair, `[W]` or of the only one; 0 without matches, and NaN where the
+    lattice is not usable, a shift or a weight no number: else the tallest bin would be anything."""
+    usable = usable & are_numbers(shifts, weights)
+    return jnp.where(jnp.any(matches.mask), jnp.where(usable, found, jnp.nan), 0.0)
+
+
+def are_numbers(shifts: Array, weights: Array) -> Array:
+    """`[W]` whether all shifts and the weights `[W, K]` are finite."""
+    return jnp.all(jnp.isfinite(shifts)) & jnp.all(jnp.isfinite(weights), axis=1)
