@@ -79,6 +79,9 @@ def check_matching(candidates: Any, extractor: Extractor | Source, matching: Mat
     if isinstance(matching, Matching):
         require_word("cross_check", matching.cross_check, CrossCheck)
     if isinstance(matching, LightGlueMatching):
+        for name in ("filter_threshold", "depth_confidence"):
+            if (share := getattr(matching, name)) is not None and not 0 <= share <= 1:
+                raise InputError(f"{name}={share}: expected a number from 0 to 1")
         dimensions = [scale.dimension for scale in extractor.scales if scale.dimension]  # 0 = not known
         if isinstance(extractor, Sift) or {*dimensions} - {matching.dimension}:
             got = f"{type(extractor).__name__} of {', '.join(map(str, dimensions))}"

@@ -76,7 +76,7 @@ def evaluate(
         filter: what finds candidates.
         scorers: by name.
         candidates: that the filter proposes for each query.
-        matching: what matches a pair.
+        matching: what matches a pair, see `mfvpr.Matcher`.
         fused: scorers, by name, that are ranked together with the filter's score as well, as `name + filter`.
         correlated: scorers and those that are fused, by name, that are ranked by their scores with frame correlation as
             well, as `name + frames`.

@@ -10,10 +10,17 @@ import numpy as np
 import pytest
 
 from experiments.benchmark.__main__ import BENCHMARKS
+<<<<<<< HEAD
 from mfvpr.data.datasets import folder_dataset
+=======
+from mfvpr.errors import InputError
+>>>>>>> lightglue
 from mfvpr.features import Description
 from mfvpr.features.sift import Sift
 from mfvpr.scoring import MatchCount
+from mfvpr.weights.networks import blueprint, network_of
+from mfvpr.weights.registry import entry_of
+from tests import checkpoints
 
 ROOT = Path(__file__).parent.parent
 
@@ -223,6 +230,7 @@ def test_ransac_beside_opencv_s_is_pooled_over_places(two_places, monkeypatch, c
     assert "all, SIFT, 8 px" in capsys.readouterr().out
 
 
+<<<<<<< HEAD
 def test_the_paper_s_weights_gain_nothing_over_themselves(two_places):
     from experiments.benchmark import weights
 
@@ -275,3 +283,27 @@ def test_shifts_of_a_drawn_street_are_near_the_true_ones(tmp_path, monkeypatch, 
         assert min(row["0.95"]["coverage"]) > 0.5
         assert np.all(np.less(row["0.68"]["width"], row["0.95"]["width"]))
     assert "5 px bins, sigma 10" in capsys.readouterr().out
+=======
+@pytest.mark.slow
+def test_lightglue_matches_what_candidates_have_in_common(monkeypatch):
+    """Early stop or not; of the keypoints that are moved all alike, most."""
+    from experiments.benchmark import lightglue
+    from mfvpr.weights.checkpoint import read_checkpoint
+    from mfvpr.weights.conversion import convert
+
+    if not checkpoints.LIGHTGLUE.is_file():
+        pytest.skip("no ../shared/weights: weights do not ship with the project")
+    for name, value in {"CANDIDATES": 1, "KEYPOINTS": 60, "COMMON": 30}.items():
+        monkeypatch.setattr(lightglue, name, value)
+    entry = entry_of(lightglue.NAME)
+    arrays = convert(read_checkpoint(checkpoints.LIGHTGLUE), network_of(entry).table, blueprint(entry).shapes)
+    results = {(step, who): run() for step, who, run in lightglue.entries(lightglue.made_up(), arrays, None)}
+    assert [len(found) for found in results.values()] == [1, 1, 1, 1]
+    for found in results.values():
+        for rows in found:
+            common = rows[rows[:, 0] < 30]
+            assert len(common) > 20
+            assert (common[:, 0] == common[:, 1]).all()
+    with pytest.raises(InputError, match=r"nowhere: expected a clone of https://github.com/cvg/LightGlue$"):
+        list(lightglue.entries(lightglue.made_up(), arrays, Path("nowhere")))
+>>>>>>> lightglue

@@ -57,6 +57,10 @@ def test_features_of_a_named_system_may_be_replaced(features):
             ["system=ssm_vpr", "matching.cross_check=mutual"],
             "cross_check=mutual: expected candidate, since",
         ),
+        (
+            ["scorer=grid", "features=ssm", "matching=lightglue"],
+            "cross_check=lightglue: expected candidate, since",
+        ),
         (["system=ssm_vpr_ras2020", "features.stride=1"], "scorer.side=25: .* 50 x 50"),
     ],
 )

@@ -77,6 +77,31 @@ def test_aliked_recognizes_the_street(evaluate, small_street, tmp_path):
     assert recall >= 0.8
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(not checkpoints.LIGHTGLUE.is_file(), reason="no ../shared/weights: LightGlue's are not shipped")
+def test_lightglue_matches_the_street_and_its_store_is_its_own(evaluate, small_street, tmp_path, monkeypatch):
+    monkeypatch.setenv("MFVPR_CACHE", str(tmp_path / "cache"))
+    folders = [f"dataset.{side}={small_street}/{side}" for side in ("database", "queries")]
+    places = ("dataset=folder", *folders, "dataset.ground_truth=order", "candidates=3", "figures=0")
+    features = ("features=aliked", "features.image_size=[160,160]", "retrieval.num_words=8")
+    told, seen = [], {}
+    for name in ("neighbors", "lightglue", "lightglue"):
+        out = tmp_path / f"out{len(told)}"
+        told.append(evaluate(*places, *features, f"matching={name}", f"out={out}"))
+        seen[name] = json.loads((out / "results.json").read_text())
+    assert "10 of 10 queries to match" in told[1]
+    assert "matches: all 10 queries from" in told[2]
+    assert seen["lightglue"][0]["matching"]["weights"] == "aliked_lightglue"
+    assert len([*(tmp_path / "cache" / "features").glob("matches-*")]) == 2
+    recall = {
+        (name, row["system"]): row["recall_at"]["1"]
+        for name, rows in seen.items()
+        for row in rows
+        if row.get("tolerance") == 1
+    }
+    assert recall["lightglue", "count"] >= recall["neighbors", "count"]
+
+
 @pytest.fixture
 def refused(tmp_path, monkeypatch, capsys):
     """What a command line is answered with, one line, by the weights in a folder."""
@@ -101,6 +126,7 @@ def refused(tmp_path, monkeypatch, capsys):
         (["retrieval=mixvpr", "retrieval.image_size=[224,224]"], "MixVPR takes [320, 320] only"),
         (["retrieval=ssm", "retrieval.image_size=[336,336]"], "SSM-VPR's filter takes [224, 224] only"),
         (["features=aliked", "features.weights=alikd-n16"], "expected weights of aliked: one of"),
+        (["matching=lightglue"], "install it: python -m experiments.weights download aliked_lightglue"),
         (["features=aliked", "features.clahe_clip=2"], "features.clahe_clip: unknown setting"),
         (["system=mix_hist_20"], "system=mix_hist_20: expected one of mix_hist_10, mix_hist_50"),
         (["features.interpolation=torch_bilinear"], "SIFT takes whole numbers"),
@@ -119,6 +145,15 @@ def test_a_store_that_is_a_file_is_refused(refused, small_street, weights):
     )
     assert error.startswith("error: ")
     assert "README.md" in error
+
+
+@pytest.mark.skipif(not checkpoints.LIGHTGLUE.is_file(), reason="no ../shared/weights: LightGlue's are not shipped")
+def test_features_that_lightglue_was_not_trained_for_are_refused(refused, small_street, weights):
+    places = (f"dataset.database={small_street}/database", f"dataset.queries={small_street}/queries")
+    error = refused(
+        weights, "dataset=folder", *places, "dataset.ground_truth=order", "candidates=10", "matching=lightglue"
+    )
+    assert error.endswith("got Sift of 128; set features=aliked, or matching=neighbors\n")
 
 
 def test_sizes_that_networks_cannot_take_are_refused_with_those_they_can(refused, weights):
