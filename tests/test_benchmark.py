@@ -10,11 +10,8 @@ import numpy as np
 import pytest
 
 from experiments.benchmark.__main__ import BENCHMARKS
-<<<<<<< HEAD
 from mfvpr.data.datasets import folder_dataset
-=======
 from mfvpr.errors import InputError
->>>>>>> lightglue
 from mfvpr.features import Description
 from mfvpr.features.sift import Sift
 from mfvpr.scoring import MatchCount
@@ -230,7 +227,6 @@ def test_ransac_beside_opencv_s_is_pooled_over_places(two_places, monkeypatch, c
     assert "all, SIFT, 8 px" in capsys.readouterr().out
 
 
-<<<<<<< HEAD
 def test_the_paper_s_weights_gain_nothing_over_themselves(two_places):
     from experiments.benchmark import weights
 
@@ -283,7 +279,8 @@ def test_shifts_of_a_drawn_street_are_near_the_true_ones(tmp_path, monkeypatch, 
         assert min(row["0.95"]["coverage"]) > 0.5
         assert np.all(np.less(row["0.68"]["width"], row["0.95"]["width"]))
     assert "5 px bins, sigma 10" in capsys.readouterr().out
-=======
+
+
 @pytest.mark.slow
 def test_lightglue_matches_what_candidates_have_in_common(monkeypatch):
     """Early stop or not; of the keypoints that are moved all alike, most."""
@@ -306,4 +303,3 @@ def test_lightglue_matches_what_candidates_have_in_common(monkeypatch):
             assert (common[:, 0] == common[:, 1]).all()
     with pytest.raises(InputError, match=r"nowhere: expected a clone of https://github.com/cvg/LightGlue$"):
         list(lightglue.entries(lightglue.made_up(), arrays, Path("nowhere")))
->>>>>>> lightglue

@@ -18,13 +18,10 @@ BENCHMARKS = {
     "homographies": "RANSAC of 50 pairs beside OpenCV's (7 rounds)",
     "agreement": "RANSAC on matches of real images beside OpenCV's: recall and inliers (4 seeds; half an hour)",
     "real": "all scores on the same matches of real images: recall with intervals, time per query (1 round)",
-<<<<<<< HEAD
     "weights": "every score with every match weight on the same matches of real images: recall",
     "zoom": "the histogram's vote over several scales, on real and drawn images: recall, time per query (1 round)",
     "shifts": "dominant shifts on drawn streets: errors and intervals in px (1 street)",
-=======
     "lightglue": "LightGlue of one query with 50 candidates, beside the public code in torch with --peer (3 rounds)",
->>>>>>> lightglue
     "sweeps": "grids of a score's parameters on cached matches (7 rounds)",
     "networks": "D2-Net, MixVPR and ALIKED (5 rounds)",
     "scale": "databases of 1,000 to 10,000 images on disk: time per query and peak memory (3 rounds)",
@@ -43,26 +40,18 @@ def main() -> None:
     parser.add_argument("--rounds", type=positive, help="timed calls of each contestant (default: see below)")
     parser.add_argument("--out", type=Path, help="JSON file to write (default runs/benchmark_WHAT.json)")
     parser.add_argument("--stores", type=Path, help="of scale: folder that keeps its features (default: 6 GB, deleted)")
-<<<<<<< HEAD
     parser.add_argument(
         "--data", type=Path, help="of real, weights, zoom, agreement: folder with grief_season and corridor"
     )
-=======
-    parser.add_argument("--data", type=Path, help="of real and agreement: folder with grief_season and corridor")
     parser.add_argument("--peer", type=Path, help="of lightglue: a clone of https://github.com/cvg/LightGlue")
->>>>>>> lightglue
     parser.add_argument("--version", action="version", version=version(), help="print it and exit")
     arguments = parser.parse_args()
     with one_line():
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # leaves torch its part of a GPU
         own = {
             "stores": (["scale"], arguments.stores),
-<<<<<<< HEAD
             "data": (["real", "weights", "zoom", "agreement"], arguments.data),
-=======
-            "data": (["real", "agreement"], arguments.data),
             "peer": (["lightglue"], arguments.peer),
->>>>>>> lightglue
         }
         options = {name: value for name, (_, value) in own.items() if value}
         for name in options:
