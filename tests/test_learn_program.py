@@ -95,7 +95,7 @@ def test_pictures_and_weights(learned):
 
 
 def test_hand_set_and_searched_rows_are_those_of_a_sweep(root, learned, tmp_path):
-    grid = ("scorer=sum", "split=first_half", "grid.weight=[fs,dmf,unit]")
+    grid = ("scorer=sum", "split=first_half", "grid.weight=[fs,dmf,ratio,unit]")
     search.sweep(composed(*small(root), *grid, f"out={tmp_path}/out", config="sweep"))
     swept = results(tmp_path / "out")
     rows = {row["score"]: row for row in learned[1]["rows"]}
