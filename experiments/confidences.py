@@ -11,6 +11,8 @@ from mfvpr.confidence import Confidence, read_confidences
 from mfvpr.report import runs
 from mfvpr.report.evaluations import Judged
 
+_NAMES = ("features", "retrieval", "scorer", "matching", "candidates", "fusion", "previous_queries")  # of settings
+
 
 class Given(NamedTuple):
     """What the settings name: the confidence of each system, and how they were made."""
@@ -26,8 +28,9 @@ def read(settings: Mapping[str, Any]) -> Given | None:
     return None if path is None else Given(path, *read_confidences(build.expanded(path)))
 
 
-def check(given: Given | None, headline: str, images: Images) -> None:
-    """Refuse a file that does not know the system that decides; say that one of these very images flatters."""
+def check(given: Given | None, headline: str, settings: Mapping[str, Any], images: Images) -> None:
+    """Refuse a file that does not know the system that decides; say that one of these very images flatters, and what
+    the system had otherwise where it was fitted."""
     if given is None:
         return
     if headline not in given.systems:
@@ -35,18 +38,30 @@ def check(given: Given | None, headline: str, images: Images) -> None:
                             f"{', '.join(given.systems)}; make it with the same scorer and final")  # fmt: skip
     if given.made.get("data_fingerprint") == images.fingerprints:
         tell(f"warning: confidence={given.path} was fitted on these very images, so that it flatters")
+    before, now = (_of_system(one, headline) for one in (given.made.get("settings"), settings))
+    if other := [name for name in _NAMES if before.get(name) != now[name]]:
+        tell(f"warning: confidence={given.path} was fitted with other settings of {', '.join(other)}: p may mean "
+             "nothing here")  # fmt: skip
+
+
+def _of_system(settings: Any, system: str) -> dict[str, Any]:
+    """The settings that its scores depend on, of several scorers those of its own."""
+    if not isinstance(settings, Mapping):
+        return {}
+    scorer, own = settings.get("scorer"), system.partition(" + ")[0]
+    alone = scorer[own] if isinstance(scorer, Mapping) and own in scorer else scorer
+    return {**settings, "scorer": alone}
 
 
 def made(settings: Mapping[str, Any], images: Images, judged: Judged) -> dict[str, Any]:
     """How the confidence of a run was made."""
-    names = ("features", "retrieval", "scorer", "matching", "candidates", "fusion", "previous_queries")
     return {
         "dataset": images.dataset.name,
         "data_fingerprint": images.fingerprints,
         "queries": sum(len(sequence.images) for sequence in judged.sequences),
         "right_within": judged.threshold if judged.thresholds else None,
         "ground_truth": truth.described(settings, images.dataset),
-        "settings": {name: settings[name] for name in names},
+        "settings": {name: settings[name] for name in _NAMES},
         "command": settings.get("command"),
         "versions": runs.versions(),
     }

@@ -52,7 +52,7 @@ def evaluated(settings: dict[str, Any]) -> Outcome:
     main = "histogram" if "histogram" in scorers else next(iter(scorers))
     combined, group, histogram = f"{main} + {FILTER}", settings["scorer"], scorers.get("histogram")
     headline, frames = combined if settings["final"] == "combined" else main, build.frames(settings)
-    confidences.check(confidence, headline, images)
+    confidences.check(confidence, headline, settings, images)
     result = evaluations.evaluate(
         images.dataset, tools.extractor, tools.filter, scorers, candidates=settings["candidates"],
         matching=tools.matching, fused={main: build.fusion(settings)}, correlated={headline: frames} if frames else {},

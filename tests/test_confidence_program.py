@@ -85,6 +85,7 @@ def test_below_the_threshold_the_answer_is_no_place(evaluate):
     out, code, stdout, stderr = evaluate("second", *given)
     assert code == 0, stderr
     assert "was fitted on these very images, so that it flatters" in stderr
+    assert "other settings" not in stderr
     header = stdout[stdout.index("AP by score") :].splitlines()[0]
     assert header.endswith("right  wrong  refused  of these right")
     answers = rows(out / "answers.csv")
@@ -159,3 +160,14 @@ def test_confidence_of_other_systems_is_refused(evaluate, tmp_path):
     assert code == 2
     words = "expected one of the system that decides, histogram, got filter, histogram + filter; make it with"
     assert words in stderr.splitlines()[-1]
+
+
+def test_confidence_of_other_settings_is_said(evaluate):
+    first, *_ = evaluate("first", "figures=0")
+    given = (f"confidence={first}/confidence.json", "figures=0")
+    _, code, _, stderr = evaluate("second", *given, "scorer.weight=ratio", "fusion.c=2")
+    assert code == 0, stderr
+    assert "confidence.json was fitted with other settings of scorer, fusion: p may mean nothing here" in stderr
+    _, code, _, stderr = evaluate("third", *given, "scorer=paper")
+    assert code == 0, stderr
+    assert "other settings" not in stderr  # the histogram is the same beside others

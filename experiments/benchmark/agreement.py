@@ -7,14 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from experiments.benchmark.real import extractors, matched_sets
+from experiments.benchmark.real import answered, extractors, matched_sets
 from experiments.console import track
 from mfvpr import Homography, OpenCvHomography, pipeline
 from mfvpr.data.files import write_text
-from mfvpr.evaluation import hits
 from mfvpr.report.runs import versions
 from mfvpr.report.tables import Table
-from mfvpr.reranking import rank_shortlist
 from mfvpr.results import Matched
 from mfvpr.scoring import Scorer
 
@@ -75,10 +73,7 @@ def _scores(matched: Matched, label: str, scorer: Scorer) -> np.ndarray:
 
 def _right(matched: Matched, scores: np.ndarray) -> int:
     """How many queries have a right image first."""
-    candidates, truth = matched.candidates, matched.sequence.truth
-    assert truth is not None  # of data sets whose order it is
-    rows = np.take_along_axis(candidates.indices, rank_shortlist(candidates, scores), axis=1)
-    return int(np.sum(hits(rows, truth.positives(TOLERANCE))))
+    return int(answered(matched, scores, TOLERANCE).sum())
 
 
 def _table(rows: list[dict[str, Any]]) -> Table:

@@ -5,6 +5,7 @@ import os
 import platform
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -91,20 +92,27 @@ def extractors(size: tuple[int, int] = SIZE, variants: Sequence[str] = ("n16",))
 
 def judged(matched: Matched, scorers: Mapping[str, Scorer], rounds: int) -> Iterator[dict[str, Any]]:
     """By score: recall and its interval at every tolerance, and milliseconds per query."""
-    candidates, truth = matched.candidates, matched.sequence.truth
-    assert truth is not None  # of data sets whose order it is
+    candidates = matched.candidates
     for name in (FILTER, *scorers):
         scores, taken = candidates.scores, []
         for _ in range(1 + rounds if name in scorers else 0):
             start = time.perf_counter()
             [scores] = pipeline.score({name: scorers[name]}, matched.by_scale, candidates).values()
             taken.append((time.perf_counter() - start) / len(scores))
-        rows = np.take_along_axis(candidates.indices, rank_shortlist(candidates, scores), axis=1)
-        found = {tolerance: estimate(hits(rows, truth.positives(tolerance))) for tolerance in TOLERANCES}
+        found = {tolerance: estimate(answered(matched, scores, tolerance)) for tolerance in TOLERANCES}
         yield {
             "score": name, "ms_per_query": 1e3 * float(np.median(taken[1:])) if taken else None,  # the first compiles
             "recall": {tolerance: one._asdict() for tolerance, one in found.items()},
         }  # fmt: skip
+
+
+def answered(matched: Matched, scores: np.ndarray, tolerance: float, there: np.ndarray | None = None) -> np.ndarray:
+    """`[Q]` bool, whether the first answer by scores `[Q, C]` is right; of the candidates that are `there`, or all."""
+    candidates, truth = matched.candidates, matched.sequence.truth
+    assert truth is not None  # of data sets whose order it is
+    candidates = candidates if there is None else replace(candidates, mask=candidates.mask & there)
+    rows = np.take_along_axis(candidates.indices, rank_shortlist(candidates, scores), axis=1)
+    return hits(rows, truth.positives(tolerance))
 
 
 def _table(rows: list[dict[str, Any]]) -> Table:

@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from experiments.benchmark.real import extractors, matched_sets
+from experiments.benchmark.real import answered, extractors, matched_sets
 from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, pipeline
 from mfvpr.data.files import write_text
-from mfvpr.evaluation import hits
 from mfvpr.evaluation.statistics import block_sign_flips, mcnemar
 from mfvpr.report.runs import versions
 from mfvpr.report.tables import Table
-from mfvpr.reranking import fuse_shortlist, rank_shortlist
+from mfvpr.reranking import fuse_shortlist
 from mfvpr.results import Matched
 from mfvpr.weighting import WEIGHTS
 
@@ -31,7 +30,7 @@ def run(rounds: int | None, out: Path, data: Path | None = None) -> None:
     by_features: dict[str, dict[str, Hits]] = {}
     for name, matched in matched_sets(data, "all", extractors(SIZE, VARIANTS)):
         place, _, features = name.partition(", ")
-        by_features.setdefault(features, {})[place] = answered(matched)
+        by_features.setdefault(features, {})[place] = all_answered(matched)
     tables = [{"features": features, "rows": [*rows(places)]} for features, places in by_features.items()]
     for table in tables:
         print(f"\n{table['features']}\n\n{_table(table['rows']).text()}")
@@ -39,10 +38,9 @@ def run(rounds: int | None, out: Path, data: Path | None = None) -> None:
     print(f"results: {out}")
 
 
-def answered(matched: Matched) -> Hits:
+def all_answered(matched: Matched) -> Hits:
     """Whether the first answer is right, of each score alone and with the filter, balanced."""
-    candidates, truth = matched.candidates, matched.sequence.truth
-    assert truth is not None  # of data sets whose order it is
+    candidates = matched.candidates
     scorers = {
         f"{name} {weight}": replace(SCORERS[name], weight=WEIGHTS[weight]) for name in SCORERS for weight in WEIGHTS
     }
@@ -50,8 +48,7 @@ def answered(matched: Matched) -> Hits:
     found: Hits = {}
     for (name, _, weight), alone in ((key.partition(" "), values) for key, values in scores.items()):
         for system, values in {name: alone, f"{name} + filter": fuse_shortlist(candidates, alone, None)}.items():
-            rows = np.take_along_axis(candidates.indices, rank_shortlist(candidates, values), axis=1)
-            found.setdefault(system, {})[weight] = hits(rows, truth.positives(TOLERANCE))
+            found.setdefault(system, {})[weight] = answered(matched, values, TOLERANCE)
     return found
 
 

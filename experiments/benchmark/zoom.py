@@ -3,19 +3,16 @@
 import json
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from experiments.benchmark.real import extractors, matched_sets
+from experiments.benchmark.real import answered, extractors, matched_sets
 from mfvpr import HistogramOfShifts, pipeline
 from mfvpr.data.files import write_text
-from mfvpr.evaluation import hits
 from mfvpr.report.runs import versions
 from mfvpr.report.tables import Table
-from mfvpr.reranking import rank_shortlist
 from mfvpr.results import Matched
 from mfvpr.weighting import WEIGHTS
 
@@ -56,12 +53,7 @@ def judged(matched: Matched, rounds: int) -> Iterator[dict[str, Any]]:
 
 def recall_of(matched: Matched, scores: np.ndarray, every: int, tolerance: int) -> float:
     """R@1 among the images of the database whose number is a multiple of `every`."""
-    truth = matched.sequence.truth
-    assert truth is not None  # of data sets whose order it is
-    there = matched.candidates.mask & (matched.candidates.indices % every == 0)
-    thinned = replace(matched.candidates, mask=there)
-    rows = np.take_along_axis(thinned.indices, rank_shortlist(thinned, scores), axis=1)
-    return float(np.mean(hits(rows, truth.positives(tolerance))))
+    return float(np.mean(answered(matched, scores, tolerance, matched.candidates.indices % every == 0)))
 
 
 def _table(rows: Sequence[dict[str, Any]]) -> Table:

@@ -143,8 +143,7 @@ class HistogramOfShifts:
         return _dominant_shift(self._for(matches), matches, refine=refine)
 
     def dominant_scale(self, matches: Matches) -> Array:
-        """`[]` of the `scales` that of the tallest bin, the first on a tie: how much larger the candidate shows the
-        place than the query does."""
+        """`[]` that of the `scales` which has the tallest bin, the first on a tie; 1 where nothing votes."""
         return _dominant_scale(self._for(matches), matches)
 
     def shift_interval(self, matches: Matches, *, level: float = 0.95, sharpness: float = 24.0) -> Array:
