@@ -1,12 +1,13 @@
 """Wrong input and interruption, for every program: one line and an exit code, never a traceback."""
 
 import argparse
+import atexit
 import os
 import shlex
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import TYPE_CHECKING, NoReturn
 
@@ -34,7 +35,7 @@ def one_line() -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         print(_INTERRUPTED, end="", file=sys.stderr)
-        sys.exit(130)
+        _unwound(130)
     except BrokenPipeError:  # whoever read our output has left: `| head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)
@@ -87,4 +88,17 @@ def leave(*_: object) -> NoReturn:
 
 def unwind_on_sigterm() -> None:
     """Let SIGTERM unwind the stack, so that temporary files go."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    signal.signal(signal.SIGTERM, lambda *_: _unwound(143))
+
+
+def _unwound(code: int) -> NoReturn:
+    """Exit where a computation of XLA's may be under way, which would abort an interpreter that ends around it."""
+    atexit.register(_leave_at_once, code)  # asked when the threads of Python's have been joined
+    sys.exit(code)
+
+
+def _leave_at_once(code: int) -> NoReturn:
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError):  # whoever read it has left
+            stream.flush()
+    os._exit(code)

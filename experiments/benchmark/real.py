@@ -18,7 +18,7 @@ from experiments.groups import defaults
 from experiments.settings import CONF
 from mfvpr import pipeline
 from mfvpr.archive import Archive
-from mfvpr.data.datasets import folder_dataset
+from mfvpr.data.datasets import Dataset, folder_dataset
 from mfvpr.data.files import write_text
 from mfvpr.errors import InputError
 from mfvpr.evaluation import hits
@@ -29,6 +29,7 @@ from mfvpr.features.aliked import AlikedFeatures
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
 from mfvpr.filters import Retrieval
+from mfvpr.matchers import NEIGHBORS, Matcher
 from mfvpr.numerics import available_cpus
 from mfvpr.report.runs import versions
 from mfvpr.report.tables import Table
@@ -55,25 +56,38 @@ def run(rounds: int | None, out: Path, data: Path | None = None) -> None:
 
 
 def matched_sets(
-    data: Path | None, candidates: int | Literal["all"], extractors: Mapping[str, Extractor], *, streets: bool = False
-) -> Iterator[tuple[str, Matched]]:
+    data: Path | None, candidates: int | Literal["all"], extractors: Mapping[str, Extractor], *,
+    matching: Matcher = NEIGHBORS, streets: bool = False,
+) -> Iterator[tuple[str, Matched]]:  # fmt: skip
     """("data set, features", its matches) of both data sets below `data`, and of the drawn street where it is asked
     for; features and matches are kept."""
+    archive = kept()
+    for dataset in datasets(data, streets=streets):
+        for features, extractor in extractors.items():
+            filter = Retrieval(Aggregated(extractor, VladFitting()))
+            options = {"matching": matching, "archive": archive}
+            matched = match_sequence(dataset, dataset.only, extractor, filter, candidates, **options)
+            yield f"{dataset.name}, {features}", matched
+
+
+def datasets(data: Path | None, *, streets: bool = False) -> list[Dataset]:
+    """Both below `data`, and the drawn street where it is asked for."""
     if data is None:
         raise InputError(f"expected --data DIR, a folder that has {' and '.join(FOLDERS)}")
-    cache = build.expanded(os.environ.get("MFVPR_CACHE") or "~/.cache/mfvpr")  # as in conf/common.yaml
-    archive = Archive(cache / "features", track=track, tell=tell)
-    datasets = [
+    found = [
         folder_dataset(data / name / database, data / name / queries, name=name, ground_truth="order")
         for name, (database, queries) in FOLDERS.items()
     ]
-    if streets:
-        datasets.append(prepare.dataset_of({"name": "streets", "cache": str(cache), "seed": 0}))
-    for dataset in datasets:
-        for features, extractor in extractors.items():
-            filter = Retrieval(Aggregated(extractor, VladFitting()))
-            matched = match_sequence(dataset, dataset.only, extractor, filter, candidates, archive=archive)
-            yield f"{dataset.name}, {features}", matched
+    return [*found, prepare.dataset_of({"name": "streets", "cache": str(_cache()), "seed": 0})] if streets else found
+
+
+def kept() -> Archive:
+    """Where programs keep features and matches."""
+    return Archive(_cache() / "features", track=track, tell=tell)
+
+
+def _cache() -> Path:
+    return build.expanded(os.environ.get("MFVPR_CACHE") or "~/.cache/mfvpr")  # as in conf/common.yaml
 
 
 def compared() -> dict[str, Scorer]:
@@ -115,11 +129,13 @@ def answered(matched: Matched, scores: np.ndarray, tolerance: float, there: np.n
     return hits(rows, truth.positives(tolerance))
 
 
-def _table(rows: list[dict[str, Any]]) -> Table:
-    def cell(one: dict[str, Any]) -> str:
-        low, high = one["interval"]
-        return f"{100 * one['recall']:.1f} [{100 * low:.0f}, {100 * high:.0f}]"
+def cell(one: Mapping[str, Any]) -> str:
+    """A recall and its interval, %."""
+    low, high = one["interval"]
+    return f"{100 * one['recall']:.1f} [{100 * low:.0f}, {100 * high:.0f}]"
 
+
+def _table(rows: list[dict[str, Any]]) -> Table:
     return Table(
         ["score", *(f"R@1 ±{tolerance}" for tolerance in TOLERANCES), "ms/query"],
         [[row["score"], *map(cell, row["recall"].values()),

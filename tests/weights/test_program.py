@@ -198,6 +198,7 @@ def test_ctrl_c_while_converting_leaves_nothing(program, folder, tiny_checkpoint
         raise KeyboardInterrupt
 
     monkeypatch.setattr("mfvpr.weights.files.write_text", interrupted)
+    monkeypatch.setattr("atexit.register", lambda *_: None)  # or this process would end so
     code, stdout, stderr = program("convert", tiny_checkpoint)
     assert (code, stdout) == (130, "")
     assert "interrupted; nothing half-written was left" in stderr
