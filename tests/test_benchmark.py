@@ -272,7 +272,8 @@ def test_shifts_of_a_drawn_street_are_near_the_true_ones(tmp_path, monkeypatch, 
     monkeypatch.setattr(shifts, "FRAMES", 5)
     shifts.run(1, tmp_path / "shifts.json")
     rows = json.loads((tmp_path / "shifts.json").read_text())["rows"]
-    assert [row["histogram"] for row in rows] == list(shifts.SCORERS)
+    expected = [(image, scorer) for image in shifts.SEEN for scorer in shifts.SCORERS]
+    assert [(row["image"], row["histogram"]) for row in rows] == expected
     for row in rows:
         assert row["refined"]["gross"] == 0
         assert max(row["refined"]["median"]) < 10
