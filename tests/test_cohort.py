@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 import mfvpr
+from experiments import settings
+from experiments.settings import SettingsError
 from mfvpr import pipeline
 from mfvpr.archive import Archive
 from mfvpr.cohort import PRIOR, by_hubness, cohort_sequence, hubness, scored_hubness
@@ -232,6 +234,15 @@ def test_a_run_names_its_cohort(root, tmp_path, monkeypatch, capsys):
 
 def test_there_is_no_cohort_unless_it_is_asked_for():
     assert composed()["cohort"] is None
+
+
+def test_a_list_of_pairs_must_be_of_database_images_as_well():
+    pairs = ["dataset=folder", "dataset.database=a", "retrieval=pairs", "retrieval.queries=pairs.txt"]
+    words = "cohort=0: expected a filter that finds candidates of database images as well, got retrieval=pairs, a list"
+    with pytest.raises(SettingsError, match=words):
+        settings.check(composed(*pairs, "cohort=0", "dataset.queries=b"))
+    settings.check(composed(*pairs, "cohort=0", "dataset.queries=a"))
+    settings.check(composed(*pairs, "dataset.queries=b"))
 
 
 @pytest.mark.parametrize(

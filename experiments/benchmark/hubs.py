@@ -80,7 +80,7 @@ def choices(streets: Sequence[Scored]) -> Iterator[dict[str, Any]]:
     """By what is made of scores: R@1 by candidates and tolerance, the mean over scorers and streets."""
     ways: dict[str, Way] = {"nothing": as_they_are}
     ways |= {
-        f"hubs by the mean, {neighbors} frames, {listed}": partial(hubs_divided, neighbors=neighbors, most=most)
+        f"hubs by the mean, {neighbors} frames, {listed}": partial(hubs_divided, most=most, neighbors=neighbors)
         for neighbors, (listed, most) in product((2, NEIGHBORS, 10, 20), CANDIDATES.items())
     }
     ways |= {f"all by the mean, {listed}": partial(all_divided, most=most) for listed, most in CANDIDATES.items()}
@@ -101,7 +101,7 @@ def rows(places: Mapping[str, Sequence[Scored]]) -> Iterator[dict[str, Any]]:
     for name, (listed, most) in product(SCORERS, CANDIDATES.items()):
         ways: dict[str, Way] = {
             "nothing": as_they_are,
-            "hubs by database": partial(hubs_divided, most=most),
+            "hubs by database": partial(hubs_divided, most=most, neighbors=NEIGHBORS),
             "all by database": partial(all_divided, most=most),
             "all by queries": partial(divided_by_queries, most=most),  # what is promised, of all queries at once
         }
@@ -134,7 +134,7 @@ def as_they_are(one: Scored, name: str) -> np.ndarray:
     return one.of_queries[name]
 
 
-def hubs_divided(one: Scored, name: str, most: int | None, neighbors: int = NEIGHBORS) -> np.ndarray:
+def hubs_divided(one: Scored, name: str, most: int | None, neighbors: int) -> np.ndarray:
     """As the library does."""
     return by_hubness(one.queries.candidates, one.of_queries[name], _of_database(one, name, most, neighbors))
 
