@@ -4,7 +4,8 @@
     strengths = scored_hubness(matched, {"histogram": HistogramOfShifts()})
     better = by_hubness(candidates, scores, strengths["histogram"])
 
-All but the last is done when the map is made: no query takes part.
+All but the last is done when the map is made: no query takes part. Images far apart in the drive count as other places:
+where it passes a place twice, its images score high with each other, and lose as hubs do.
 """
 
 from collections.abc import Mapping, Sequence
