@@ -215,11 +215,6 @@ def check(settings: Mapping[str, Any]) -> None:
         raise SettingsError("features.image_size=null: expected width and height for features=ssm, such as [336,336]")
     if method == "grid":
         _check_cells(settings)
-    if settings.get("cohort") is not None and settings["retrieval"]["name"] == "pairs":
-        data = settings["dataset"]
-        if data.get("queries") != data.get("database"):
-            raise SettingsError(f"cohort={settings['cohort']}: expected a filter that finds candidates of database "
-                                "images as well, got retrieval=pairs, a list of those of queries")  # fmt: skip
     if settings.get("threshold") is not None and settings["confidence"] is None:
         raise SettingsError(f"threshold={settings['threshold']}: expected confidence=FILE as well, the confidence.json "
                             "of a run on other images with ground truth")  # fmt: skip

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 import mfvpr
-from experiments import settings
-from experiments.settings import SettingsError
 from mfvpr import pipeline
 from mfvpr.archive import Archive
 from mfvpr.cohort import PRIOR, by_hubness, cohort_sequence, hubness, scored_hubness
@@ -23,7 +21,7 @@ from mfvpr.filters import Retrieval
 from mfvpr.frame_correlation import FrameCorrelation
 from mfvpr.rankings import Fusion
 from mfvpr.types import Shortlist
-from tests.programs import QUERIES, composed, shared, small, typed
+from tests.programs import QUERIES, composed, folder, shared, small, typed
 
 SIFT = Sift(max_keypoints=60, image_size=(160, 120))
 VLAD = Retrieval(Aggregated(SIFT, VladFitting(num_words=8)))
@@ -236,13 +234,12 @@ def test_there_is_no_cohort_unless_it_is_asked_for():
     assert composed()["cohort"] is None
 
 
-def test_a_list_of_pairs_must_be_of_database_images_as_well():
-    pairs = ["dataset=folder", "dataset.database=a", "retrieval=pairs", "retrieval.queries=pairs.txt"]
-    words = "cohort=0: expected a filter that finds candidates of database images as well, got retrieval=pairs, a list"
-    with pytest.raises(SettingsError, match=words):
-        settings.check(composed(*pairs, "cohort=0", "dataset.queries=b"))
-    settings.check(composed(*pairs, "cohort=0", "dataset.queries=a"))
-    settings.check(composed(*pairs, "dataset.queries=b"))
+def test_a_list_of_pairs_must_be_of_database_images_as_well(small_street, tmp_path, monkeypatch, capsys):
+    code, _, stderr = typed(monkeypatch, capsys, "evaluate", *folder(small_street), "retrieval=pairs", "cohort=2",
+                            "retrieval.queries=pairs.txt", "store=null", f"out={tmp_path}/out")  # fmt: skip
+    assert code == 2
+    known = f"one of: {small_street}/queries; choose another retrieval, or no cohort\n"
+    assert stderr.endswith(f"{small_street}/database: expected a folder that a file was given of, {known}")
 
 
 @pytest.mark.parametrize(
