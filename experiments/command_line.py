@@ -12,22 +12,19 @@ from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from experiments.console import tell
+from experiments.data_sets import first_of
 from experiments.errors import on_interrupt, one_line
 from experiments.groups import PROGRAMS, check_choice, choices_with, groups
+from experiments.quoting import PATHS, as_typed
 from experiments.settings import CONF, Program, SettingsError, check
 from experiments.wording import in_settings
 
-PATHS = {"dataset.database", "dataset.queries", "dataset.root", "dataset.index_file", "dataset.cache"}
-PATHS |= {"dataset.database_labels", "dataset.query_labels"}
-PATHS |= {"store", "out", "checkpoints", "confidence"}
-PATHS |= {f"{group}.{side}" for group in ("features", "retrieval") for side in ("database", "queries")}
 MULTIRUN = ("-m", "--multirun")
 _NAME = r"[A-Za-z_][\w/@]*(?:\.\w+)*"  # of a setting, or of a group
 MOST_DIGITS = 300  # more are no number of float64, and Python refuses to read thousands
@@ -53,11 +50,12 @@ def run(program: Program, config: str) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises instead of printing and exiting with 1
     with _our_words(config):
         typed = sys.argv[1:]
-        for argument in typed:
-            _check_form(argument, config)
         many = sorted({*MULTIRUN} & {*typed})  # first, or Hydra takes no settings after it
-        settings = [argument for argument in typed if argument not in MULTIRUN]
-        sys.argv[1:] = many[:1] + [_as_typed(argument, several=bool(many)) for argument in settings]
+        arguments = first_of(typed) if config == "learn" and not many else typed
+        for argument in arguments:
+            _check_form(argument, config)
+        settings = [argument for argument in arguments if argument not in MULTIRUN]
+        sys.argv[1:] = many[:1] + [as_typed(argument, several=bool(many)) for argument in settings]
         hydra.main(version_base="1.3", config_path=str(CONF), config_name=config)(task)()
 
 
@@ -104,31 +102,6 @@ def _check_form(argument: str, config: str) -> None:
     if re.search(rf"\d{{{MOST_DIGITS},}}", value):
         raise SettingsError(f"{name}={value[:20]}...: expected a number of fewer than {MOST_DIGITS} digits")
     check_choice(name, value, config)
-
-
-def _as_typed(argument: str, several: bool) -> str:
-    """A setting quoted for Hydra where its grammar would not take the value as it was typed (paths, mostly).
-
-    Paths may stand in a list; where `several`, in a multirun, between commas.
-    """
-    name, equals, value = argument.partition("=")
-    is_path = name in PATHS and value not in ("", "null") and value[0] not in "'\""
-    if not equals or argument.startswith("-") or not (is_path or _unparsable(argument)):
-        return argument
-    for special in ("\\", "'", "${"):
-        value = value.replace(special, f"\\{special}")
-    if is_path and value[0] == "[" and value[-1] == "]":
-        return f"{name}=[" + ",".join(f"'{one}'" for one in value[1:-1].split(",")) + "]"
-    values = value.split(",") if several and is_path else [value]
-    return f"{name}=" + ",".join(f"'{one}'" for one in values)
-
-
-def _unparsable(argument: str) -> bool:
-    try:
-        OverridesParser.create().parse_override(argument)
-    except HydraException:
-        return True
-    return False
 
 
 @contextmanager

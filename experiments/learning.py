@@ -1,37 +1,57 @@
-"""The stages of learning: what is learned on one half of the path, beside what is set by hand, on the other half."""
+"""The stages of learning: what is learned on one half of the path, or on some data sets, beside what is set by hand."""
 
+import itertools
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from experiments import build, console, prepare, run_folder, truth
+from experiments import build, console, data_sets, prepare, run_folder, truth
 from experiments.axes import learnable, own_c
+from experiments.prepare import Images
+from experiments.settings import SettingsError
 from mfvpr.data.files import write_text
-from mfvpr.evaluation import Judge
+from mfvpr.data.sequences import own_rows
 from mfvpr.evaluations import Stopwatch
 from mfvpr.fingerprints import fingerprint
-from mfvpr.learning.comparison import Checkpoints, Options, compare
+from mfvpr.learning.comparison import Checkpoints, compare
+from mfvpr.learning.data_sets import Part, joined
 from mfvpr.learning.losses import LOSSES
+from mfvpr.learning.match_weight import ABSOLUTE, RELATIVE
+from mfvpr.learning.teaching import Options
 from mfvpr.report import comparisons, runs
+
+_INPUTS = {"relative": RELATIVE, "absolute": ABSOLUTE}
+
+
+class Prepared(NamedTuple):
+    """A data set with its matches; `recipe` is of these, `described` of what is right."""
+
+    part: Part
+    images: Images
+    recipe: dict[str, Any]
+    described: dict[str, Any]
 
 
 def learn(settings: dict[str, Any]) -> None:
-    """Matches -> learned, searched and hand-set scores on the half that none of them saw -> table, figures, files."""
+    """Matches -> learned, searched and hand-set scores on what none of them saw -> table, figures, files."""
     with run_folder.claimed(settings) as folder:
-        varied = learnable(settings)
-        watch = Stopwatch()
-        tools, images = prepare.begun(settings, watch)
-        judge = truth.judge(settings, images.dataset)
-        matches, candidates = prepare.matched(settings, tools, images, watch)
-        checkpoints = _checkpoints(settings, prepare.recipe(tools, images, candidates.mask.shape[1]), judge)
+        varied, watch = learnable(settings), Stopwatch()
+        sets = [_prepared(one, watch) for one in _each(settings)]
+        whole = sets[0].part
+        if settings["report"]:
+            taught = 1 + len(data_sets.composed("also", settings["also"]) if settings["also"] else [])
+            _check_apart(sets[:taught], sets[taught:])
+            whole = joined(*([one.part for one in some] for some in (sets[:taught], sets[taught:])))
         with watch("learning"):
-            options = {"checkpoints": checkpoints, "track": console.track}
-            comparison = compare(varied, judge, matches, candidates, _options(settings), **options)
-        heading, described = _heading(settings, images, judge), truth.described(settings, images.dataset)
+            options = {"checkpoints": _checkpoints(settings, whole, sets), "track": console.track}
+            data = varied, whole.judge, whole.match_set, whole.candidates
+            comparison = compare(*data, _options(settings), **options)
+        heading = _heading(settings, whole, sets)
         text = f"{heading}\n\n{comparisons.text(comparison)}"
         left_out = ("dataset", "store", "out", "checkpoints", "multirun", "command")
+        several = {"data_sets": [_about(one) for one in sets]} if settings["report"] else _about(sets[0])
         results = {
-            "dataset": images.dataset.name, "ground_truth": described,
-            "data_fingerprint": images.fingerprints, "reading": images.reading, **comparisons.results(comparison),
+            **several, **comparisons.results(comparison),
             "settings": {name: value for name, value in settings.items() if name not in left_out},
             "seconds": watch.seconds, "versions": runs.versions(),
         }  # fmt: skip
@@ -39,41 +59,85 @@ def learn(settings: dict[str, Any]) -> None:
         def write(new: Path) -> None:
             runs.write_table(new, comparisons.table(comparison), heading)
             runs.write_json(new / "results.json", results)
-            comparisons.write_weights(new / "weights", comparison)
+            made = {"command": settings.get("command"), "commit": runs.commit(Path()), **results}
+            del made["rows"], made["queries"], made["seconds"]
+            comparisons.write_weights(new / "weights", comparison, made)
             write_text(new / "summary.txt", f"{text}\n")
 
         figures = comparisons.figures(comparison)
-        run_folder.leave(folder, settings, described, text=text, write=write, figures=figures)
+        run_folder.leave(folder, settings, sets[0].described, text=text, write=write, figures=figures)
+
+
+def _each(settings: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """The settings of each data set: those to learn on, then those to report on."""
+    if not settings["report"]:
+        yield settings
+        return
+    others = [one for name in ("also", "report") if settings[name] for one in data_sets.composed(name, settings[name])]
+    for dataset in (settings["dataset"], *others):
+        yield settings | {"dataset": dataset, "split": None}
+
+
+def _prepared(settings: dict[str, Any], watch: Stopwatch) -> Prepared:
+    tools, images = prepare.begun(settings, watch)
+    judge = truth.judge(settings, images.dataset)
+    matches, candidates = prepare.matched(settings, tools, images, watch)
+    recipe = prepare.recipe(tools, images, candidates.mask.shape[1])
+    part = Part(data_sets.label(settings["dataset"]), judge, matches, candidates)
+    return Prepared(part, images, recipe, truth.described(settings, images.dataset))
+
+
+def _check_apart(teach: list[Prepared], report: list[Prepared]) -> None:
+    """Refuse to report on images that were learned on."""
+    for one in teach:
+        for other in report:
+            sides = itertools.product(other.images.contents.values(), one.images.contents.values())
+            if same := sum(bool(rows) for pair in sides for rows in own_rows(*pair)):
+                raise SettingsError(f"report={other.part.name}: expected other images than those of {one.part.name}, "
+                                    f"which is learned on; {same} are the same")  # fmt: skip
+
+
+def _about(one: Prepared) -> dict[str, Any]:
+    return {
+        "dataset": one.images.dataset.name, "ground_truth": one.described,
+        "data_fingerprint": one.images.fingerprints, "reading": one.images.reading,
+    }  # fmt: skip
 
 
 def _options(settings: dict[str, Any]) -> Options:
     names = ("ties", "steps", "every", "patience", "batch", "learning_rate", "hidden", "seed")
     return Options(
         c=own_c(settings), filter_score=settings["fusion"]["filter_score"], loss=LOSSES[settings["loss"]],
-        **{name: settings[name] for name in names},
+        inputs=_INPUTS[settings["inputs"]], **{name: settings[name] for name in names},
     )  # fmt: skip
 
 
-def _checkpoints(settings: dict[str, Any], matches: dict[str, Any], judge: Judge) -> Checkpoints | None:
+def _checkpoints(settings: dict[str, Any], whole: Part, sets: list[Prepared]) -> Checkpoints | None:
     """Where the trainings are kept, and what identifies them."""
     root = settings["checkpoints"] or settings["store"]
     if root is None:
         return None
-    names = ("scorer", "loss", "every", "patience", "batch", "learning_rate", "hidden", "seed")
+    names = ("scorer", "loss", "every", "patience", "batch", "learning_rate", "hidden", "inputs", "seed")
     recipe = {
-        "matches": matches,
+        "matches": [one.recipe for one in sets],
         "tolerances": settings["recall"], **{name: settings[name] for name in names},
-        "filter_score": settings["fusion"]["filter_score"], "positives": judge.fingerprint,
+        "filter_score": settings["fusion"]["filter_score"], "positives": whole.judge.fingerprint,
+        "reported": dict(whole.judge.reported_sets),
         "versions": {name: runs.versions()[name] for name in ("mfvpr", "jax", "numpy")},
     }  # fmt: skip
     own = "" if settings["checkpoints"] else f"{settings['dataset']['name']}_learning-{fingerprint(recipe)}"
     return Checkpoints(build.expanded(root) / own, recipe)
 
 
-def _heading(settings: dict[str, Any], images: prepare.Images, judge: Judge) -> str:
+def _heading(settings: dict[str, Any], whole: Part, sets: list[Prepared]) -> str:
+    judge = whole.judge
+    what = f"{settings['scorer']['method']} score, {settings['features']['name']} features"
+    right = truth.in_words(settings, sets[0].images.dataset)
+    if report := judge.reported_sets:
+        learned = ", ".join(one.part.name for one in sets[: len(sets) - len(report)])
+        return f"{learned}: {what}; what was learned here is reported on {', '.join(report)}; {right}"
     reported = sum(len(half.report) for half in judge.halves)
     return (
-        f"{images.dataset.name}: {settings['scorer']['method']} score, {settings['features']['name']} features; each "
-        f"of {reported} queries is reported on by what was learned on the other half of the path; "
-        f"{truth.in_words(settings, images.dataset)}"
+        f"{whole.name}: {what}; each of {reported} queries is reported on by what was learned on the other half of the "
+        f"path; {right}"
     )

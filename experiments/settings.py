@@ -190,6 +190,9 @@ RULES: dict[str, Rule] = {
     "batch": _between(1, 1024),
     "learning_rate": _POSITIVE,
     "hidden": _between(1, 1024),
+    "inputs": _one_of("relative", "absolute"),
+    "also": _or(_TEXT, None),
+    "report": _or(_TEXT, None),
     "checkpoints": _or(_PATH, None),
     "chunk.settings": _or(_COUNT, None),
     "chunk.queries": _or(_COUNT, None),
@@ -215,6 +218,11 @@ def check(settings: Mapping[str, Any]) -> None:
         raise SettingsError("features.image_size=null: expected width and height for features=ssm, such as [336,336]")
     if method == "grid":
         _check_cells(settings)
+    if settings.get("also") and not settings["report"]:
+        raise SettingsError(f"also={settings['also']}: expected report=DATASET,... as well, to learn on several data "
+                            "sets and report on others")  # fmt: skip
+    if settings.get("report") and settings["split"] != "both":
+        raise SettingsError(f"split={settings['split']}: expected none with report=, since the data sets are the split")
     if settings.get("threshold") is not None and settings["confidence"] is None:
         raise SettingsError(f"threshold={settings['threshold']}: expected confidence=FILE as well, the confidence.json "
                             "of a run on other images with ground truth")  # fmt: skip

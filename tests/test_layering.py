@@ -50,6 +50,7 @@ ALLOWED = {
         "weighting",
     },
     "learning": {
+        "data",
         "declaration",
         "errors",
         "evaluation",

@@ -9,15 +9,16 @@ import pytest
 from PIL import Image
 
 from experiments import evaluation, learning, search
-from mfvpr.learning import checkpoints, comparison
+from mfvpr.learning import checkpoints, teaching
 from mfvpr.learning.splits import TrainingSplit
 from mfvpr.learning.training import Fit, Record
+from mfvpr.learning.weight_files import read_weight
 from tests.programs import QUERIES, composed, results, shared, small, snapshot, typed
 
 SUM = ("scorer=sum",)
 SHORT = (*SUM, "split=first_half", "steps=4", "every=2", "batch=4", "learning_rate=0.05")
-ROWS = ["paper", "paper + filter", "grid search", "grid search + filter", "gradient", "gradient + filter",
-        "match weights", "match weights + filter"]  # fmt: skip
+ROWS = [name + filtered for name in ("paper", "1 - ratio", "grid search", "gradient", "match weights", "match labels")
+        for filtered in ("", " + filter")]  # fmt: skip
 WIDEST = 1  # frames
 
 
@@ -57,11 +58,11 @@ def untrained(monkeypatch):
             batches(step)
         return Fit(parameters, 0, (Record(0, None, 1.0),), "nothing was learned")
 
-    monkeypatch.setattr(comparison, "fit", start)
+    monkeypatch.setattr(teaching, "fit", start)
     return asked
 
 
-def test_eight_rows_in_every_file(learned):
+def test_all_rows_in_every_file(learned):
     out, found = learned
     assert [row["score"] for row in found["rows"]] == ROWS
     with (out / "table.csv").open() as file:
@@ -73,7 +74,7 @@ def test_eight_rows_in_every_file(learned):
         for tolerance, (low, high) in row["interval"].items():
             assert 0 <= low <= row["recall_at_1"][tolerance] <= high <= 1
     assert all(name in (out / "summary.txt").read_text() for name in ROWS)
-    trained = [row["halves"]["first_half"] for row in found["rows"][4:]]
+    trained = [row["halves"]["first_half"] for row in found["rows"][6:10]]
     for one in trained:
         assert [record[0] for record in one["history"]] == [0, 2, 4]
         assert one["steps"] in (0, 2, 4)
@@ -88,10 +89,11 @@ def test_pictures_and_weights(learned):
         picture = np.asarray(Image.open(out / "figures" / f"{name}.png").convert("L"))
         assert min(picture.shape) > 200
         assert picture.std() > 10
-    for name in ("first_half_match_weights", "first_half_match_weights_filter"):
-        with np.load(out / "weights" / f"{name}.npz", allow_pickle=False) as weight:
-            assert weight["hidden"].shape == (8, 16)
-            assert all(np.isfinite(array).all() for array in weight.values())
+    for name in ("match_weights", "match_weights_filter", "match_labels"):
+        weight, made = read_weight(out / "weights" / f"first_half_{name}.json")
+        assert weight.hidden.shape == (5, 16)
+        assert made["settings"]["seed"] == 0
+        assert made["training"].startswith("first_half: match ")
 
 
 def test_hand_set_and_searched_rows_are_those_of_a_sweep(root, learned, tmp_path):
@@ -223,14 +225,16 @@ def test_whatever_changes_the_result_changes_the_checkpoint(root, untrained, tmp
     monkeypatch.setattr(learning.comparisons, "figures", lambda *_: [])
     shifted = tmp_path / "shifted.csv"
     shifted.write_text("query,database\n" + "".join(f"{row},{(row + 1) % QUERIES}\n" for row in range(QUERIES)))
-    changes = ["seed=0", "seed=1", "hidden=4", "batch=3", "learning_rate=0.5", "loss=recall", "candidates=7", "every=1",
-               "fusion.filter_score=negative_euclidean", f"dataset.index_file={shifted}"]  # fmt: skip
+    changes = [
+        "seed=0", "seed=1", "hidden=4", "inputs=absolute", "batch=3", "learning_rate=0.5", "loss=recall",
+        "candidates=7", "every=1", "fusion.filter_score=negative_euclidean", f"dataset.index_file={shifted}",
+    ]  # fmt: skip
     for change in changes:
         fixed = (*SUM, "grid.c=[1]", "split=second_half", "steps=1", f"out={tmp_path}/out")
         learning.learn(composed(*small(root), *fixed, change, config="learn"))
         shutil.rmtree(tmp_path / "out")
-    assert len({asked["folder"] for asked in untrained}) == 4 * len(changes)
-    assert len({json.dumps(asked["recipe"]) for asked in untrained}) == 4 * len(changes)
+    assert len({asked["folder"] for asked in untrained}) == 5 * len(changes)
+    assert len({json.dumps(asked["recipe"]) for asked in untrained}) == 5 * len(changes)
 
 
 @pytest.mark.parametrize(

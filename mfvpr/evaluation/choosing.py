@@ -13,11 +13,13 @@ class Half(NamedTuple):
 
     tune: `[t]` query rows to choose on.  report: `[r]` query rows to report on.
     allowed: `[N]` bool, database rows that may be looked at while choosing.
+    paths: how many of the queries to choose on each path has, one behind the other, where there are several.
     """
 
     tune: np.ndarray
     report: np.ndarray
     allowed: np.ndarray
+    paths: tuple[int, ...] = ()
 
 
 def halves(positives: Positives) -> tuple[Half, Half]:

@@ -1,7 +1,7 @@
 """The protocol of choosing and reporting: which queries decide, which are reported on, and what counts as right."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -29,7 +29,9 @@ class Judge:
         places: images of a query's place at the widest threshold, also those that are no answer.
         halves: where to choose and where to report; none = both on all queries.
         views: candidates `[Q, C]` bool that are ranked: all, and for each half those that choosing may see.
-        split: which half to choose on, or both in turn; None = no halves.
+        split: which half to choose on, or both in turn; "other sets" where whole data sets are the halves, see
+            `mfvpr.learning.data_sets`; None = no halves.
+        reported_sets: queries of each data set that is reported on, by its name, where they are several sets.
     """
 
     thresholds: Sequence[float]
@@ -38,7 +40,8 @@ class Judge:
     places: Positives
     halves: Sequence[Half]
     views: Sequence[np.ndarray] = ()
-    split: Split | None = None
+    split: Split | Literal["other sets"] | None = None
+    reported_sets: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def main(self) -> int:

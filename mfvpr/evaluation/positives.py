@@ -160,6 +160,13 @@ class Positives:
         return np.unique(np.minimum(np.searchsorted(sizes, ends), len(self)))
 
 
+def side_by_side(parts: Sequence[Positives]) -> Positives:
+    """Of all queries and databases, one behind the other."""
+    starts = np.cumsum([0, *(part.num_database for part in parts)])
+    rows = np.concatenate([part.rows + int(start) for part, start in zip(parts, starts[:-1], strict=True)])
+    return Positives(rows.astype(np.int32), _offsets(np.concatenate([part.counts for part in parts])), int(starts[-1]))
+
+
 def rows_within(query_xy: np.ndarray, database_xy: np.ndarray, radius: float) -> Iterator[np.ndarray]:
     """For each query `[n]` int32, the database rows at most `radius` meters away; as `radius_positives`."""
     query_xy, database_xy = np.asarray(query_xy, np.float64), np.asarray(database_xy, np.float64)

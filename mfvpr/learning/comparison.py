@@ -5,60 +5,23 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
-import optax
 
 from mfvpr.errors import InputError
 from mfvpr.evaluation import Judge, best_setting, hits
-from mfvpr.learning.losses import Loss, cross_entropy
-from mfvpr.learning.match_weight import LearnedWeight
-from mfvpr.learning.models import Model, Parameters
+from mfvpr.learning.models import Model
 from mfvpr.learning.parameters import can_learn
-from mfvpr.learning.splits import Batch, TrainingSplit, training_splits
-from mfvpr.learning.training import Fit, fit
+from mfvpr.learning.splits import TrainingSplit, training_splits
+from mfvpr.learning.teaching import Options, of_matches, start, train
+from mfvpr.learning.training import Fit
 from mfvpr.match_sets import MatchSet
 from mfvpr.progress import untracked
-from mfvpr.reranking import FilterScore, Ties
-from mfvpr.scoring import Scorer, parameters
+from mfvpr.scoring import Scorer
 from mfvpr.sweeping import Axes, Setting, sweep
 from mfvpr.sweeping.search import Stages, untracked_stages
 from mfvpr.sweeping.settings import FUSION
 from mfvpr.types import Shortlist
-from mfvpr.weighting import UnitWeight
-
-FIRST_SHARE = 0.3  # of the filter where learning starts, in units of what balances it
-
-
-@dataclass(frozen=True)
-class Options:
-    """How scores are learned and compared.
-
-    Attributes:
-        c: weight of the filter where it is set by hand, None = balanced.
-        filter_score: the filter's part of a combined score, as in `mfvpr.reranking.fuse_shortlist`.
-        ties: as in `mfvpr.reranking.rank_shortlist`.
-        loss: of one query.
-        steps: updates of a training, at most.
-        every: steps from one validation to the next.
-        patience: validations without a gain after which to stop.
-        batch: queries of a step.
-        learning_rate: of Adam.
-        hidden: width of the network of match weights.
-        seed: of that network, and of the order of the queries.
-    """
-
-    c: float | None = None
-    filter_score: FilterScore = "cosine"
-    ties: Ties = "filter"
-    loss: Loss = cross_entropy
-    steps: int = 200
-    every: int = 5
-    patience: int = 10
-    batch: int = 8
-    learning_rate: float = 0.01
-    hidden: int = 16
-    seed: int = 0
+from mfvpr.weighting import RatioWeight
 
 
 class Checkpoints(NamedTuple):
@@ -117,9 +80,12 @@ def compare(
     axes: Axes, judge: Judge, match_set: MatchSet, candidates: Shortlist, options: Options | None = None, *,
     checkpoints: Checkpoints | None = None, track: Stages = untracked_stages,
 ) -> Comparison:  # fmt: skip
-    """The scorer as it is, the best of the grid, and what gradients find: each alone and fused with the filter.
+    """The scorer as it is, weighted by the ratio, the best of the grid, and what gradients find: each alone and fused.
 
-    Everything is chosen or learned on one half of the path, and reported on the other.
+    Everything is chosen or learned on one half of the path, and reported on the other; or on some data sets and
+    reported on others, see `mfvpr.learning.data_sets`. Gradients go through the ranking: "gradient" learns the scorer's
+    numbers, "match weights" the weights as well; "match labels" learns weights from the matches of right pairs
+    that agree with the dominant shift, and all others.
 
     Args:
         axes: the scorer, and the grid to search; an axis `c` is in units of the c that balances filter and score.
@@ -131,12 +97,12 @@ def compare(
         track: progress.
 
     Raises:
-        InputError: the scorer has nothing to learn, a setting cannot be scored, a half has too few queries, or the
-            checkpoints are of something else.
+        InputError: the scorer has nothing to learn or no match weight, a setting cannot be scored, a half has too few
+            queries, or the checkpoints are of something else.
         TrainingError: a loss is not finite.
     """
-    if not can_learn(axes.scorer):
-        raise InputError(f"{type(axes.scorer).__name__}: expected a scorer with numbers to learn")
+    if not can_learn(axes.scorer) or not hasattr(axes.scorer, "weight"):
+        raise InputError(f"{type(axes.scorer).__name__}: expected a scorer with numbers to learn and a match weight")
     axes.check(match_set.image_sizes)
     options = options or Options()
     splits = training_splits(match_set, candidates, judge, filter_score=options.filter_score)
@@ -156,9 +122,9 @@ class _Compared:
 
     def rows(self) -> Iterator[Row]:
         """Each is reported as soon as it is chosen or learned."""
-        own = self.axes.scorer
-        yield self.reported("paper", own, {})
-        yield self.reported("paper + filter", own, {FUSION: self.options.c})
+        own: Any = self.axes.scorer
+        yield from self.by_hand("paper", own)
+        yield from self.by_hand("1 - ratio", replace(own, weight=RatioWeight()))
         spread = self.split.spread(own)
         for fused in (False, True):
             name = "grid search" + " + filter" * fused
@@ -173,6 +139,15 @@ class _Compared:
                 setting = {FUSION: values[FUSION]} if fused else {}
                 row = self.reported(name, model.scorer_of(fitted.parameters), setting)
                 yield replace(row, values=values, fitted=fitted)
+        name, model = "match labels", of_matches(self.split, own, self.options)
+        fitted = self.learned(name, model)
+        for row in self.by_hand(name, model.scorer_of(fitted.parameters)):
+            yield replace(row, fitted=fitted)
+
+    def by_hand(self, name: str, scorer: Scorer) -> Iterator[Row]:
+        """Alone, and fused with the filter's weight that is set by hand."""
+        yield self.reported(name, scorer, {})
+        yield self.reported(f"{name} + filter", scorer, {FUSION: self.options.c})
 
     def reported(self, name: str, scorer: Scorer, setting: Setting) -> Row:
         """A scorer with the values of a setting, on the half that is reported on, with all candidates."""
@@ -215,55 +190,3 @@ class _Compared:
             recipe = {**self.checkpoints.recipe, "half": self.split.name, "model": name}
         track = self.track(f"{self.split.name}: {name}")
         return train(self.split, model, self.options, folder=folder, recipe=recipe, track=track)
-
-
-def start(
-    split: TrainingSplit, scorer: Any, options: Options, *, fused: bool = False, learned_weight: bool = False
-) -> Model:
-    """Where learning starts, from a hard scorer.
-
-    Args:
-        split: to learn on.
-        scorer: the hand-set one.
-        options: how to learn.
-        fused: whether the filter's weight is learned as well.
-        learned_weight: whether the match weight is, from 1 for every match.
-    """
-    weight = None
-    if learned_weight:
-        scorer = replace(scorer, weight=UnitWeight())  # what a learned weight starts as
-        sample = split.batch(split.train[: options.batch], options.batch)
-        weight = LearnedWeight.create(jax.random.key(options.seed), sample.matches, options.hidden)
-    spread = split.spread(scorer)
-    c = FIRST_SHARE * split.balance(spread) if fused else None
-    return Model.of(parameters.fit(scorer, *split.match_set.image_sizes), spread, c=c, weight=weight)
-
-
-def train(split: TrainingSplit, model: Model, options: Options, **keeping: Any) -> Fit:
-    """Learn a model's parameters on one half of the path.
-
-    Args:
-        split: to learn on.
-        model: the start.
-        options: how to learn.
-        keeping: `folder`, `recipe` and `track` of `mfvpr.learning.training.fit`.
-    """
-    size = options.batch
-    objective = model.objective(options.loss)
-    validated = jax.jit(objective)
-    parts = [split.validation[place : place + size] for place in range(0, len(split.validation), size)]
-    validation = [(split.batch(part, size), len(part)) for part in parts]
-
-    def batches(step: int) -> Batch:
-        """Every query once before any comes again, in an order that the step alone decides."""
-        epoch, place = divmod(step, -(-len(split.train) // size))
-        order = np.random.default_rng([options.seed, epoch]).permutation(split.train)
-        return split.batch(order[place * size : (place + 1) * size], size)
-
-    def validate(learned: Parameters) -> float:
-        return sum(float(validated(learned, batch)) * count for batch, count in validation) / len(split.validation)
-
-    return fit(
-        model.start, objective, batches, optimizer=optax.adam(options.learning_rate), steps=options.steps,
-        validate=validate, every=options.every, patience=options.patience, **keeping,
-    )  # fmt: skip

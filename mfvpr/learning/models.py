@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -12,10 +13,13 @@ from mfvpr.learning.losses import Loss
 from mfvpr.learning.match_weight import LearnedWeight
 from mfvpr.learning.parameters import from_logarithms, starts, to_logarithms
 from mfvpr.learning.splits import Batch
+from mfvpr.numerics import masked_mean
 from mfvpr.reranking import combine, score_candidates
-from mfvpr.types import Array
+from mfvpr.scoring import HistogramOfShifts
+from mfvpr.types import Array, Matches
 
 Parameters = dict[str, Any]  # `numbers` by name and `c` as logarithms, `sharpness`, `weight`
+Objective = Callable[["Parameters", Batch], Array]
 
 SHARPNESS = 2.0  # of the loss at the start, per unit of the scores
 LEAST_C = 1e-3  # of the filter at the start, in units of the scores
@@ -29,11 +33,14 @@ class Model:
         scorer: whose numbers are learned; its other parameters stay.
         start: the parameters to begin with.
         unit: spread of the scores at the start; what the loss sees is in this unit.
+        teacher: says which matches of a right pair are right, and these teach the match weight; None = the ranking
+            teaches.
     """
 
     scorer: Any
     start: Parameters
     unit: float
+    teacher: HistogramOfShifts | None = None
 
     @classmethod
     def of(cls, scorer: Any, unit: float, *, c: float | None = None, weight: LearnedWeight | None = None) -> "Model":
@@ -53,6 +60,17 @@ class Model:
             start["weight"] = weight
         return cls(scorer, start, unit)
 
+    @classmethod
+    def of_matches(cls, scorer: Any, weight: LearnedWeight, teacher: HistogramOfShifts) -> "Model":
+        """A model whose match weight alone is learned, match by match.
+
+        Args:
+            scorer: the hand-set one.
+            weight: to start with.
+            teacher: has a capacity.
+        """
+        return cls(scorer, {"numbers": {}, "weight": weight}, 1.0, teacher)
+
     def scorer_of(self, parameters: Parameters) -> Any:
         """The soft scorer."""
         numbers = from_logarithms(parameters["numbers"])
@@ -69,9 +87,11 @@ class Model:
         numbers = {name: float(getattr(scorer, name)) for name in parameters["numbers"]}
         return numbers if c is None else numbers | {"c": float(c)}
 
-    def objective(self, loss: Loss) -> Callable[[Parameters, Batch], Array]:
-        """Parameters and a batch -> mean loss of its queries."""
+    def objective(self, loss: Loss) -> Objective:
+        """Parameters and a batch -> mean loss of its queries; of its matches, where these teach."""
+        return self._of_ranking(loss) if self.teacher is None else partial(_of_matches, self.teacher)
 
+    def _of_ranking(self, loss: Loss) -> Objective:
         def mean(parameters: Parameters, batch: Batch) -> Array:
             scorer, c = self.scorer_of(parameters), self.c_of(parameters)
             scores = jax.vmap(lambda matches: score_candidates(scorer, matches))(batch.matches)
@@ -80,3 +100,16 @@ class Model:
             return losses.mean_loss(loss, logits, batch.positives, batch.mask)
 
         return mean
+
+
+def _of_matches(teacher: HistogramOfShifts, parameters: Parameters, batch: Batch) -> Array:
+    """Cross entropy of whether a match is right, where right and wrong ones count the same in all, `[]`, in nats."""
+    weight: LearnedWeight = parameters["weight"]
+
+    def judged(matches: Matches, positive: Array) -> tuple[Array, Array]:
+        peak = teacher.dominant_shift(matches, refine=True)
+        return weight.logits(matches), teacher.agrees(matches, peak) & positive
+
+    logits, right = (values.reshape(-1) for values in jax.vmap(jax.vmap(judged))(batch.matches, batch.positives))
+    wrong = (batch.matches.mask & batch.mask[..., None]).reshape(-1) & ~right
+    return (masked_mean(jax.nn.softplus(-logits), right) + masked_mean(jax.nn.softplus(logits), wrong)) / 2

@@ -16,7 +16,7 @@ from mfvpr.scoring import Scorer
 from mfvpr.sweeping.scores import score
 from mfvpr.types import Matches, Shortlist, value
 
-VALIDATION = 0.25  # of the queries to learn on, the end of their block
+VALIDATION = 0.25  # of the queries to learn on, the end of each path
 
 
 @value
@@ -124,8 +124,9 @@ def training_splits(
 
 
 def _split(match_set: MatchSet, candidates: Shortlist, judge: Judge, half: Half, name: str) -> TrainingSplit:
-    cut = len(half.tune) - round(VALIDATION * len(half.tune))
-    apart = separated(judge.places, half.tune[:cut], half.tune[cut:])
+    paths = np.split(half.tune, np.cumsum(half.paths[:-1]).astype(int)) if half.paths else [half.tune]
+    pieces = [np.split(path, [len(path) - round(VALIDATION * len(path))]) for path in paths]
+    apart = separated(judge.places, *(np.concatenate(same) for same in zip(*pieces, strict=True)))
     seen = candidates.mask & half.allowed[np.maximum(candidates.indices, 0)]
     split = TrainingSplit(match_set, candidates, judge, half, apart.tune, apart.report, seen, name)
     right, wrong = split.right & split.usable, ~split.right & split.usable

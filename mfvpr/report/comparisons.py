@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -10,12 +9,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from mfvpr.data.files import replacing
-from mfvpr.evaluation import threshold_words
-from mfvpr.evaluation.statistics import block_sign_flips, estimate, mcnemar, recall_interval
+from mfvpr.evaluation import Judge, threshold_words
+from mfvpr.evaluation.statistics import SignFlips, block_sign_flips, estimate, mcnemar, recall_interval
 from mfvpr.learning.comparison import Comparison, Row
-from mfvpr.learning.match_weight import FEATURE_NAMES, LearnedWeight
+from mfvpr.learning.match_weight import LearnedWeight
 from mfvpr.learning.training import Fit
+from mfvpr.learning.weight_files import write_weight
 from mfvpr.report.learning_figures import curves_figure, weights_figure
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table, written
@@ -28,20 +27,38 @@ def table(comparison: Comparison) -> Table:
 
     p is McNemar's, which takes queries for independent, and that of blocks of the path.
     """
-    judge = comparison.judge
+    judge, sets = comparison.judge, comparison.judge.reported_sets
     lines, first = [], None
     for name, hits, _ in comparison.rows():
         first = hits if first is None else first
         low, high = estimate(hits[judge.main]).interval
         pair = hits[judge.main], first[judge.main]
-        test, flips = mcnemar(*pair), block_sign_flips(*pair)
+        test, flips = mcnemar(*pair), _flips(judge, *pair)
         compared = [f"+{test.only_first} -{test.only_second}", f"{test.p_value:.2g}", f"{flips.p_value:.2g}"]
         compared = [""] * 3 if hits is first else compared
-        recall = (f"{100 * one.mean():.1f}" for one in hits)
-        lines.append([name, *recall, f"[{100 * low:.1f}, {100 * high:.1f}]", *compared])
+        recall = [*hits, *_by_set(judge, hits[judge.main]).values()]
+        lines.append(
+            [name, *(f"{100 * one.mean():.1f}" for one in recall), f"[{100 * low:.1f}, {100 * high:.1f}]", *compared]
+        )
     words = threshold_words(judge.unit, judge.thresholds[judge.main])
     header = [judge.label(1, threshold) for threshold in judge.thresholds]
+    header += [f"{name}{words}" for name in sets]
     return Table(["score", *header, f"95 % at{words}" if words else "95 %", "against paper", "p", "p by blocks"], lines)
+
+
+def _by_set(judge: Judge, hits: np.ndarray) -> dict[str, np.ndarray]:
+    """Hits `[R]` of each data set, where several are reported on."""
+    ends = np.cumsum([*judge.reported_sets.values()])
+    return dict(zip(judge.reported_sets, np.split(hits, ends[:-1]), strict=False)) if len(ends) else {}
+
+
+def _set_recalls(judge: Judge, hits: np.ndarray) -> list[np.ndarray]:
+    """`[thresholds]` recall of each data set, of hits `[thresholds, R]`."""
+    return [np.mean(one, axis=0) for one in _by_set(judge, hits.T).values()]
+
+
+def _flips(judge: Judge, hits: np.ndarray, first: np.ndarray) -> SignFlips:
+    return block_sign_flips(hits, first, sequences=[*judge.reported_sets.values()] or None)
 
 
 def text(comparison: Comparison) -> str:
@@ -59,7 +76,11 @@ def results(comparison: Comparison) -> dict[str, Any]:
             "score": name,
             "recall_at_1": dict(zip(labels, hits.mean(axis=1).tolist(), strict=True)),
             "interval": dict(zip(labels, map(recall_interval, hits), strict=True)),
-            "against_first": dict(zip(labels, map(_difference, hits, first), strict=True)),
+            "against_first": dict(zip(labels, map(partial(_difference, judge), hits, first), strict=True)),
+            "by_set": {
+                name: dict(zip(labels, map(float, recall), strict=True))
+                for name, recall in zip(judge.reported_sets, _set_recalls(judge, hits), strict=True)
+            },
             "halves": {row.half: _half(row) for row in halves},
         }
         for name, hits, halves in comparison.rows()
@@ -72,12 +93,10 @@ def results(comparison: Comparison) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def write_weights(folder: Path, comparison: Comparison) -> None:
-    """The arrays of every learned match weight, by name, as `.npz` files."""
+def write_weights(folder: Path, comparison: Comparison, made: Mapping[str, Any]) -> None:
+    """Every learned match weight by name, with how all of them were made; see `mfvpr.learning.weight_files`."""
     for name, weight in _weights(comparison).items():
-        with replacing(folder / f"{re.sub(r'[^a-z]+', '_', name)}.npz") as temporary:
-            arrays = {field.name: np.asarray(getattr(weight, field.name)) for field in fields(weight)}
-            np.savez(temporary, allow_pickle=False, **arrays)
+        write_weight(folder / f"{re.sub(r'[^a-z]+', '_', name)}.json", weight, {**made, "training": name})
 
 
 def figures(comparison: Comparison) -> list[Figure]:
@@ -108,10 +127,10 @@ def _remarks(comparison: Comparison) -> Iterator[str]:
                 yield f"{name}, {row.half}: {values}{steps}"
 
 
-def _difference(hits: np.ndarray, first: np.ndarray) -> dict[str, Any]:
+def _difference(judge: Judge, hits: np.ndarray, first: np.ndarray) -> dict[str, Any]:
     return {
         "mcnemar": mcnemar(hits, first)._asdict(),
-        "sign_flips": block_sign_flips(hits, first)._asdict(),
+        "sign_flips": _flips(judge, hits, first)._asdict(),
     }
 
 
@@ -135,7 +154,7 @@ def _weights_figure(path: Path, comparison: Comparison, weights: Mapping[str, Le
         for name, weight in weights.items():
             found[name].append(np.asarray(_weigh(weight, matches))[real])
     joined = {name: np.concatenate(values) for name, values in found.items()}
-    weights_figure(path, FEATURE_NAMES, np.concatenate(inputs), joined, np.concatenate(right))
+    weights_figure(path, next(iter(weights.values())).names, np.concatenate(inputs), joined, np.concatenate(right))
 
 
 _weigh = jax.jit(jax.vmap(lambda weight, matches: weight(matches), in_axes=(None, 0)))

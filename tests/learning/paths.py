@@ -20,9 +20,9 @@ def matches_of(query, candidates, rng, sizes):
     return of_query(pairs)
 
 
-def split(*, sizes=SIZES, half=0, only_right=()):
-    """One half to learn on; all frames are candidates of every query, in an order of its own; of some, one is."""
-    rng = np.random.default_rng(0)
+def path(*, sizes=SIZES, only_right=(), seed=0):
+    """Judge, matches, candidates: all frames are those of every query, in an order of its own; of some, one is."""
+    rng = np.random.default_rng(seed)
     indices = np.stack([rng.permutation(QUERIES) for _ in range(QUERIES)]).astype(np.int32)
     mask = ~np.isin(np.arange(QUERIES), only_right)[:, None] | (indices == np.arange(QUERIES)[:, None])
     scores = -np.sort(-rng.random(indices.shape).astype(np.float32), axis=1)
@@ -32,4 +32,10 @@ def split(*, sizes=SIZES, half=0, only_right=()):
     apart = np.abs(np.arange(QUERIES)[:, None] - np.arange(QUERIES))
     positives = [Positives.from_matrix(apart <= tolerance) for tolerance in TOLERANCES]
     judge = Judge(TOLERANCES, "frames", positives, positives[-1], halves(positives[-1]), split="both")
+    return judge, matches, candidates
+
+
+def split(*, half=0, **options):
+    """One half of it to learn on."""
+    judge, matches, candidates = path(**options)
     return training_splits(matches, candidates, judge)[half]

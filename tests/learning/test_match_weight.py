@@ -1,6 +1,7 @@
 """The learned match weight: its start, its inputs, its values against loops, its gradients."""
 
 import math
+import operator
 from dataclasses import fields, replace
 
 import jax
@@ -9,8 +10,8 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from mfvpr import AggregatedScore, HistogramOfShifts, Matches, UnitWeight, score_candidates
-from mfvpr.learning.match_weight import FEATURE_NAMES, LearnedWeight
+from mfvpr import AggregatedScore, HistogramOfShifts, InputError, Matches, UnitWeight, score_candidates
+from mfvpr.learning.match_weight import ABSOLUTE, INPUTS, RELATIVE, LearnedWeight
 from mfvpr.weighting import match_weights
 from tests.builders import make_matches, per_match, random_matches
 
@@ -29,9 +30,12 @@ scores = jax.jit(score_candidates)
 weigh = jax.jit(LearnedWeight.__call__)
 
 
-def trained(seed=1, hidden=5):
+both = pytest.mark.parametrize("names", [RELATIVE, ABSOLUTE])
+
+
+def trained(names=ABSOLUTE, seed=1, hidden=5):
     """A weight that is far from its start."""
-    start = LearnedWeight.create(KEY, pairs(), hidden)
+    start = LearnedWeight.create(KEY, pairs(), hidden, names=names)
     rng = np.random.default_rng(seed)
     learned = {
         name: np.float32(rng.normal(size=getattr(start, name).shape))
@@ -40,16 +44,30 @@ def trained(seed=1, hidden=5):
     return replace(start, **learned)
 
 
-def raw_oracle(matches, k):
-    """The inputs of one match before they are standardized, float64, in the order of FEATURE_NAMES."""
-    values = [matches.scores0[k], matches.scores1[k], matches.distance[k], matches.ratio[k]]
-    for points, size in ((matches.points0, matches.image_size0), (matches.points1, matches.image_size1)):
-        values += [(float(points[k][axis]) - float(size[axis]) / 2) / (float(size[axis]) / 2) for axis in (0, 1)]
-    return [float(value) for value in values]
+def raw_oracle(matches, k, names):
+    """The inputs of one match before they are standardized, float64."""
+    real = [other for other in range(len(matches.mask)) if matches.mask[other]]
+
+    def rank(values):
+        below, equal = (sum(test(values[other], values[k]) for other in real) for test in (operator.lt, operator.eq))
+        return (below + equal / 2) / len(real)
+
+    values = {
+        "scores0": matches.scores0[k], "scores1": matches.scores1[k], "distance": matches.distance[k],
+        "ratio": matches.ratio[k], "distance_rank": rank(matches.distance), "score0_rank": rank(matches.scores0),
+        "score1_rank": rank(matches.scores1),
+        "relative_distance": matches.distance[k] / np.median([matches.distance[other] for other in real]),
+    }  # fmt: skip
+    for side in "01":
+        points, size = getattr(matches, f"points{side}"), getattr(matches, f"image_size{side}")
+        for axis, name in enumerate("xy"):
+            half = float(size[axis]) / 2
+            values[f"{name}{side}"] = (float(points[k][axis]) - half) / half
+    return [float(values[name]) for name in names]
 
 
 def oracle(weight, matches, k):
-    raw = raw_oracle(matches, k)
+    raw = raw_oracle(matches, k, weight.names)
     inputs = [(raw[f] - float(weight.center[f])) / float(weight.scale[f]) for f in range(len(raw))]
     total = float(weight.output_bias)
     for unit in range(len(weight.output)):
@@ -66,64 +84,90 @@ def test_starts_as_the_unit_weight_in_a_scorer():
         np.testing.assert_allclose(learned, scores(replace(scorer, weight=UnitWeight()), matches), rtol=1e-6)
 
 
-def test_statistics_are_those_of_the_real_matches():
+@both
+def test_statistics_are_those_of_the_real_matches(names):
     matches = pairs()
-    weight = LearnedWeight.create(KEY, matches)
+    weight = LearnedWeight.create(KEY, matches, names=names)
     real = [
-        raw_oracle(jax.tree.map(lambda leaf: leaf[pair], matches), k)  # noqa: B023
+        raw_oracle(jax.tree.map(lambda leaf: leaf[pair], matches), k, names)  # noqa: B023
         for pair, k in np.argwhere(matches.mask)
     ]
     assert len(real) == 65
     np.testing.assert_allclose(weight.center, np.mean(real, axis=0), atol=1e-6)
     np.testing.assert_allclose(weight.scale, np.std(real, axis=0), rtol=1e-5)
-    assert weight.center.shape == (len(FEATURE_NAMES),)
+    assert weight.center.shape == (len(names),)
 
 
-def test_whole_pairs_of_padding_may_hold_anything():
+@both
+def test_whole_pairs_of_padding_may_hold_anything(names):
     matches = pairs()
     garbage = {f.name: getattr(matches, f.name).copy() for f in fields(matches)}
     for name, values in garbage.items():
         values[2] = False if name == "mask" else np.nan if np.issubdtype(values.dtype, np.floating) else -7
-    expected, got = LearnedWeight.create(KEY, matches), LearnedWeight.create(KEY, replace(matches, **garbage))
+    expected, got = (LearnedWeight.create(KEY, one, names=names) for one in (matches, replace(matches, **garbage)))
     jax.tree.map(np.testing.assert_array_equal, got, expected)
 
     @jax.jit
     def total(weight, padding):
         return jnp.sum(match_weights(weight, padding))
 
-    value, gradient = jax.value_and_grad(total)(trained(), Matches(**{n: values[2] for n, values in garbage.items()}))
+    value, gradient = jax.value_and_grad(total)(
+        trained(names), Matches(**{n: values[2] for n, values in garbage.items()})
+    )
     assert value == 0
     assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(gradient))
 
 
 def test_a_constant_input_and_no_match_at_all_divide_by_1():
     constant = make_matches([(10, 20), (30, 40)], [(1, 2), (3, 5)], scores0=[0.1, 0.1], ratio=[0.3, 0.9])
-    weight = LearnedWeight.create(KEY, constant)
-    assert weight.scale[FEATURE_NAMES.index("scores0")] == 1
-    assert weight.scale[FEATURE_NAMES.index("ratio")] == pytest.approx(0.3)
+    weight = LearnedWeight.create(KEY, constant, names=("scores0", "ratio"))
+    assert weight.scale[0] == 1
+    assert weight.scale[1] == pytest.approx(0.3)
     nothing = LearnedWeight.create(KEY, make_matches([], [], ratio=[], capacity=3))
     assert np.all(nothing.center == 0)
     assert np.all(nothing.scale == 1)
 
 
-def test_values_equal_the_loops():
-    matches, weight = jax.tree.map(lambda leaf: leaf[0], pairs(2)), trained()
+@both
+def test_values_equal_the_loops(names):
+    matches, weight = jax.tree.map(lambda leaf: leaf[0], pairs(2)), trained(names)
+    matches.distance[3] = matches.distance[5]  # equals share their ranks
     expected = [oracle(weight, matches, k) for k in range(40)]
     assert np.ptp(expected) > 0.5
     np.testing.assert_allclose(weigh(weight, matches)[:40], expected, rtol=2e-5)
     assert np.all(np.isfinite(weigh(weight, matches)))
 
 
-def test_inputs_are_standardized():
+@both
+def test_inputs_are_standardized(names):
     matches = pairs(3, counts=(50, 50))
-    weight = LearnedWeight.create(KEY, matches)
+    weight = LearnedWeight.create(KEY, matches, names=names)
     inputs = np.concatenate(jax.jit(jax.vmap(weight.inputs))(matches))
     np.testing.assert_allclose(inputs.mean(axis=0), 0, atol=1e-5)
     np.testing.assert_allclose(inputs.std(axis=0), 1, rtol=1e-4)
 
 
-def test_order_of_matches_moves_along():
-    matches, weight = jax.tree.map(lambda leaf: leaf[0], pairs(4)), trained()
+def test_relative_inputs_are_those_of_other_units():
+    """Another detector's scores, another length of descriptors; and more padding."""
+    matches, weight = jax.tree.map(lambda leaf: leaf[0], pairs(7)), trained(RELATIVE)
+    other = replace(matches, scores0=np.float32(8) * matches.scores0 ** 3, scores1=matches.scores1 + 5,
+                    distance=np.float32(4) * matches.distance)  # fmt: skip
+    np.testing.assert_allclose(weigh(weight, other)[:40], weigh(weight, matches)[:40], rtol=1e-5)
+    wider = per_match(
+        matches, lambda rows: np.concatenate([rows, np.full_like(rows, np.nan if rows.dtype == np.float32 else 0)])
+    )
+    np.testing.assert_allclose(weigh(weight, wider)[:40], weigh(weight, matches)[:40], rtol=1e-6)
+
+
+def test_inputs_by_name():
+    assert {*RELATIVE, *ABSOLUTE} == {*INPUTS}
+    with pytest.raises(InputError, match="LearnedWeight: unknown input depth; expected some of ratio, "):
+        LearnedWeight.create(KEY, pairs(), names=("ratio", "depth"))
+
+
+@both
+def test_order_of_matches_moves_along(names):
+    matches, weight = jax.tree.map(lambda leaf: leaf[0], pairs(4)), trained(names)
     order = np.random.default_rng(5).permutation(len(matches.mask))
     moved = per_match(matches, lambda rows: rows[order])
     np.testing.assert_allclose(weigh(weight, moved), weigh(weight, matches)[order], rtol=1e-6)
@@ -152,11 +196,12 @@ def test_gradients_are_finite_and_statistics_have_none():
     assert np.all(np.asarray(distance)[~matches.mask] == 0)
 
 
-def test_gradients_equal_finite_differences():
+@both
+def test_gradients_equal_finite_differences(names):
     with jax.enable_x64(True):
         double = lambda leaf: jnp.asarray(leaf, dtype=float) if leaf.dtype == np.float32 else leaf  # noqa: E731
         matches = jax.tree.map(double, random_matches(np.random.default_rng(6), 7, sizes=SIZES))
-        weight = jax.tree.map(double, trained())
+        weight = jax.tree.map(double, trained(names))
         free = {name: getattr(weight, name) for name in ("hidden", "hidden_bias", "output", "output_bias")}
 
         @jax.jit

@@ -10,7 +10,7 @@ import pytest
 
 from mfvpr import HistogramOfShifts, InputError, score_candidates
 from mfvpr.learning.losses import cross_entropy, mean_loss
-from mfvpr.learning.match_weight import LearnedWeight
+from mfvpr.learning.match_weight import ABSOLUTE, LearnedWeight
 from mfvpr.learning.parameters import from_logarithms, to_logarithms
 from mfvpr.learning.training import TrainingError, fit
 from tests.builders import make_matches
@@ -68,7 +68,7 @@ def test_a_learned_weight_finds_which_matches_count():
         scorer = HistogramOfShifts(bin_size=40.0, sigma=40.0, weight=weight, max_bins=17)
         return jax.vmap(lambda one: score_candidates(scorer, one))(matches)
 
-    start = LearnedWeight.create(jax.random.key(0), matches)
+    start = LearnedWeight.create(jax.random.key(0), matches, names=ABSOLUTE)
 
     @jax.jit
     def loss(weight, _):

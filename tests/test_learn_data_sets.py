@@ -1,0 +1,116 @@
+"""experiments.learn with several data sets: what is learned on some is reported on the others, each as it is alone."""
+
+import csv
+import json
+
+import pytest
+
+from experiments import data_sets, evaluation, learning
+from mfvpr.data.streets import streets_folder
+from tests.programs import QUERIES, composed, results, shared, small, typed
+
+SHORT = ("scorer=sum", "steps=2", "every=1", "batch=4", "grid.c=[1]", "grid.weight=[dmf,ratio]")
+
+
+def as_text(street, name):
+    """A drawn street's folder, in the words of a list of data sets."""
+    index = f"ground_truth=index:index_file={street}/ground_truth.csv:widen_index=true"
+    return f"folder:name={name}:database={street}/database:queries={street}/queries:{index}"
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    return shared(tmp_path_factory)
+
+
+@pytest.fixture(scope="module")
+def streets(root):
+    """The small data set's, and two more."""
+    drawn = [streets_folder(root, seed=seed, num_frames=QUERIES, image_size=(160, 120)) for seed in (0, 1, 2)]
+    return [as_text(street, f"street{seed}") for seed, street in enumerate(drawn)]
+
+
+@pytest.fixture(scope="module")
+def learned(root, streets, tmp_path_factory):
+    """On the small data set and another, reported on a third."""
+    out = tmp_path_factory.mktemp("learned")
+    common = (*SHORT, f"report='{streets[2]}'")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(learning.comparisons, "figures", lambda *_: [])
+        learning.learn(composed(*small(root), *common, f"also='{streets[1]}'", f"out={out}/out", config="learn"))
+    return out, results(out / "out")
+
+
+def test_the_reported_set_is_reported_as_it_is_alone(root, streets, learned, tmp_path):
+    found = learned[1]
+    [alone] = data_sets.composed("report", streets[2])
+    settings = composed(*small(root), "scorer=sum", "figures=0", f"out={tmp_path}/alone")
+    evaluation.evaluate(settings | {"dataset": alone})
+    rows = {row["score"]: row for row in found["rows"]}
+    expected = json.loads((tmp_path / "alone" / "results.json").read_text())
+    for system, name in (("sum", "paper"), ("sum + filter", "paper + filter")):
+        for row in (row for row in expected if row["system"] == system):
+            recall = rows[name]["by_set"]["street2"][str(row["tolerance"])]
+            assert recall == pytest.approx(row["recall_at"]["1"], abs=1e-6)
+            assert rows[name]["recall_at_1"][str(row["tolerance"])] == pytest.approx(recall)
+    assert [one["dataset"] for one in found["data_sets"]] == ["folder", "street1", "street2"]
+    assert len({json.dumps(one["data_fingerprint"]) for one in found["data_sets"]}) == 3
+    assert found["queries"]["reported"] == [list(range(2 * QUERIES, 3 * QUERIES))]
+    assert found["queries"]["chosen_on"] == [list(range(2 * QUERIES))]
+
+
+def test_the_table_names_the_sets(learned):
+    out, _ = learned
+    with (out / "out" / "table.csv").open() as file:
+        header = next(csv.reader(file))
+    assert header[:4] == ["score", "R@1 ±0", "R@1 ±1", "street2 ±1"]
+    summary = (out / "out" / "summary.txt").read_text()
+    assert summary.startswith(
+        "folder, street1: sum score, sift features; what was learned here is reported on street2; "
+    )
+    assert sorted(path.name for path in (out / "out" / "weights").iterdir())[0] == "other_sets_match_labels.json"
+
+
+def test_several_sets_as_they_are_typed(streets):
+    typed_so = data_sets.first_of([f"dataset={streets[0]},{streets[1]}", "report=corridor:root=/a,b:c", "steps=3"])
+    assert typed_so[:2] == ["dataset=folder", "dataset.name=street0"]
+    assert typed_so[-3:] == [f"also={streets[1]}", "report=corridor:root=/a,b:c", "steps=3"]
+    assert data_sets.first_of(["dataset=streets", "dataset.root=/a:b,c"]) == ["dataset=streets", "dataset.root=/a:b,c"]
+    assert data_sets.first_of(["dataset=streets:seed=3"]) == ["dataset=streets", "dataset.seed=3"]
+    [named] = data_sets.named("report", "corridor:root=/a,b:c")
+    assert named == ("corridor", [("root", "/a,b:c")])
+    [corridor, drawn] = data_sets.composed("report", "corridor:root=/a,b:c,streets:seed=4")
+    assert corridor["database"] == "/a,b:c/ref"
+    assert (drawn["name"], data_sets.label(drawn)) == ("streets", "streets 4")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["also=streets"], "also=streets: expected report=DATASET,... as well"),
+        (["report=streets", "split=first_half"], "split=first_half: expected none with report="),
+        (
+            ["report=street"],
+            "report=street: expected data sets such as streets:seed=1,corridor:root=DIR, of corridor, ",
+        ),
+        (["report=corridor"], "report=corridor: corridor has no default of root; write corridor:root=VALUE"),
+        (["report=streets:sed=1"], "report=streets:sed=1: streets has no setting sed; it has cache, name, seed"),
+        (["report=streets:seed=-1"], "dataset.seed=-1: expected a whole number not below 0"),
+    ],
+)
+def test_mistakes_are_one_line_and_exit_code_2(root, tmp_path, monkeypatch, capsys, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    code, stdout, stderr = typed(monkeypatch, capsys, "learn", *small(root), *arguments)
+    assert (code, stdout) == (2, "")
+    assert words in stderr
+    assert stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_images_that_were_learned_on_are_not_reported_on(root, streets, tmp_path, monkeypatch, capsys):
+    same = f"report={streets[0]}"
+    code, stdout, stderr = typed(monkeypatch, capsys, "learn", *small(root), *SHORT, same, f"out={tmp_path}/out")
+    assert (code, stdout) == (2, "")
+    last = stderr.splitlines()[-1]
+    assert last == (f"error: report=street0: expected other images than those of folder, which is learned on; "
+                    f"{2 * QUERIES} are the same")  # fmt: skip
