@@ -11,7 +11,7 @@ from mfvpr.confidence import Confidence, read_confidences
 from mfvpr.report import runs
 from mfvpr.report.evaluations import Judged
 
-_NAMES = ("features", "retrieval", "scorer", "matching", "candidates", "fusion", "previous_queries")  # of settings
+_NAMES = ("features", "retrieval", "scorer", "matching", "candidates", "fusion", "previous_queries", "cohort")
 
 
 class Given(NamedTuple):

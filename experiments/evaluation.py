@@ -15,7 +15,7 @@ from mfvpr.report import runs
 from mfvpr.report.confidences import Assured, confidence_figures, confidence_table, write_confidence
 from mfvpr.report.differences import write_gains
 from mfvpr.report.evaluations import Figure, Judged, figures, recall_table, write_rankings, write_skipped
-from mfvpr.results import FILTER, FRAMES
+from mfvpr.results import COHORT, FILTER, FRAMES
 from mfvpr.scoring import HistogramOfShifts
 
 _THRESHOLDS: dict[Unit, str] = {"frames": "tolerance", "m": "radius"}  # their names in results
@@ -45,21 +45,26 @@ def evaluate(settings: dict[str, Any]) -> None:
 
 
 def evaluated(settings: dict[str, Any]) -> Outcome:
-    """The filter alone, each scorer, and the best of them (the paper: histogram) combined with the filter."""
+    """The filter, each scorer, alone and with a cohort, and the best (the paper: histogram) with the filter."""
     scorers, watch, confidence = build.scorers(settings["scorer"]), Stopwatch(), confidences.read(settings)
     tools, images = prepare.begun(settings, watch)
     shown = asked_figures(settings["figures"], images.dataset)
     main = "histogram" if "histogram" in scorers else next(iter(scorers))
     combined, group, histogram = f"{main} + {FILTER}", settings["scorer"], scorers.get("histogram")
     headline, frames = combined if settings["final"] == "combined" else main, build.frames(settings)
+    cohort, alone = settings["cohort"], [main] if settings["cohort"] is None else [main, f"{main} + {COHORT}"]
     confidences.check(confidence, headline, settings, images)
     result = evaluations.evaluate(
         images.dataset, tools.extractor, tools.filter, scorers, candidates=settings["candidates"],
-        matching=tools.matching, fused={main: build.fusion(settings)}, correlated={headline: frames} if frames else {},
-        ties=settings["ties"], archive=tools.archive, watch=watch, **tools.where,
+        matching=tools.matching, fused={name: build.fusion(settings) for name in alone}, cohort=cohort,
+        correlated={headline: frames} if frames else {}, ties=settings["ties"], archive=tools.archive, watch=watch,
+        **tools.where,
     )  # fmt: skip
     parameters = {name: group if "method" in group else group[name] for name in scorers}
-    parameters = {FILTER: {}} | parameters | {combined: parameters[main] | settings["fusion"]}
+    if cohort is not None:
+        parameters |= {f"{name} + {COHORT}": own | {"cohort": cohort} for name, own in parameters.items()}
+    fused = {f"{name} + {FILTER}": parameters[name] | settings["fusion"] for name in alone}
+    parameters = {FILTER: {}} | parameters | fused
     if frames:
         parameters[f"{headline} + {FRAMES}"] = parameters[headline] | asdict(frames)
     thresholds = truth.thresholds(settings, images.dataset.sequences[0].truth)

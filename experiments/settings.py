@@ -167,6 +167,7 @@ RULES: dict[str, Rule] = {
     "c": _or(_NOT_NEGATIVE, "auto"),
     "final": _one_of("score", "combined"),
     "previous_queries": _between(0, 1000),
+    "cohort": _or(_INDEX, None),
     ".confidence": _or(_PATH, None),
     ".threshold": _or(_number(0, 1), None),
     # report

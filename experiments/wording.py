@@ -19,6 +19,7 @@ WORDS = {
     "GROUP.database_prefix=... and GROUP.query_prefix=...",
     r"called by their paths below their folder\)": "called by their paths below their folder, behind "
     "GROUP.database_prefix and GROUP.query_prefix)",
+    r"give one of this folder as well$": "choose another retrieval, or no cohort",  # others are asked for all folders
     r"or lower num_words$": "or lower retrieval.num_words",
     r"extract these, or match nearest neighbors$": "set features=aliked, or matching=neighbors",
     r"give it as image_size=$": "give it as features.image_size=[W,H]",

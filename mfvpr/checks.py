@@ -16,7 +16,7 @@ from mfvpr.lightglue import LightGlueMatching
 from mfvpr.matchers import Matcher, Matching
 from mfvpr.matching import CrossCheck
 from mfvpr.reranking import FilterScore, Ties
-from mfvpr.results import FILTER, FRAMES, Matched, Ranked
+from mfvpr.results import COHORT, FILTER, FRAMES, Matched, Ranked
 from mfvpr.scoring import SCORERS
 from mfvpr.sources import FeatureSet
 from mfvpr.types import Shortlist
@@ -24,7 +24,7 @@ from mfvpr.types import Shortlist
 
 def check_request(
     scorers: Mapping[str, Any], fused: Mapping[str, FilterScore], correlated: Iterable[str], ties: Ties,
-    memory: float | None,
+    memory: float | None, *, cohort: bool = False,
 ) -> None:  # fmt: skip
     """What `mfvpr.evaluate` is asked to do with matches.
 
@@ -34,6 +34,7 @@ def check_request(
         correlated: names of scorers, and of those that are fused.
         ties: see there.
         memory: see there.
+        cohort: whether there is one, so that scorers are ranked with it as well.
 
     Raises:
         InputError: one cannot be used.
@@ -41,16 +42,19 @@ def check_request(
     require_word("ties", ties, Ties)
     if memory is not None and not 0 < memory < math.inf:
         raise InputError(f"memory={memory!r}: expected GB above 0, or None")
+    with_cohort = [f"{name} + {COHORT}" for name in scorers] if cohort else []
+    alone = [*scorers, *with_cohort]
     for name, filter_score in fused.items():
         require_word("filter_score", filter_score, FilterScore)
-        if name not in scorers:
-            known = ", ".join(scorers) or "there are none"
+        if name not in alone:
+            known = ", ".join(alone) or "there are none"
             raise InputError(f"fused: expected names of scorers ({known}), got {name}")
-    several = {*scorers, *(f"{name} + {FILTER}" for name in fused)}
+    several = {*alone, *(f"{name} + {FILTER}" for name in fused)}
     if unknown := [name for name in correlated if name not in several]:
         raise InputError(f"correlated: expected names of scorers ({', '.join(several) or 'there are none'}), got "
                          f"{unknown[0]}")  # fmt: skip
-    made = {FILTER, *(f"{other} + {FILTER}" for other in fused), *(f"{other} + {FRAMES}" for other in correlated)}
+    made = {FILTER, *with_cohort}
+    made |= {*(f"{other} + {FILTER}" for other in fused), *(f"{other} + {FRAMES}" for other in correlated)}
     for name, scorer in scorers.items():
         if name in made:
             raise InputError(f"scorers: {name} is the name of another system; choose another one")

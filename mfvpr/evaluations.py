@@ -20,6 +20,7 @@ import numpy as np
 from mfvpr import pipeline
 from mfvpr.archive import Archive
 from mfvpr.checks import check_matching, check_request, checked_candidates, nan_scores, wrong_with
+from mfvpr.cohort import cohort_sequence, scored_hubness
 from mfvpr.data.datasets import Dataset, QuerySequence
 from mfvpr.data.files import write_text
 from mfvpr.features import Extractor, Source
@@ -62,6 +63,7 @@ def evaluate(
     matching: Matcher = NEIGHBORS,
     fused: Mapping[str, Fusion] | None = None,
     correlated: Mapping[str, FrameCorrelation] | None = None,
+    cohort: int | None = None,
     ties: Ties = "filter",
     archive: Archive | None = None,
     memory: float | None = None,
@@ -80,29 +82,38 @@ def evaluate(
         fused: scorers, by name, that are ranked together with the filter's score as well, as `name + filter`.
         correlated: scorers and those that are fused, by name, that are ranked by their scores with frame correlation as
             well, as `name + frames`.
+        cohort: all scorers are ranked with a cohort as well, as `name + cohort`: database images that score high with
+            other places lose as much (`mfvpr.cohort`). The number says how many frames on both sides of an image show
+            its place, and are left out; None = no cohort.
         ties: equal scores keep the order of the filter, or go by the row of the database: "filter", "index".
         archive: where features and matches are kept; None = in memory.
         memory: GB that features of the database may take on the devices, and matches that are kept in memory; None = a
             third of what is free.
         devices: that share the queries; None = the one that JAX takes.
-        watch: gets the seconds of the stages.
+        watch: gets the seconds of the stages; all that a cohort takes is a stage of its own.
 
     Raises:
         InputError: arguments, images, stores or features that cannot be used, or what an extractor, a filter or a
             scorer gives; one line says which, and the mend.
     """
     fused, correlated = fused or {}, correlated or {}
-    check_request(scorers, {name: how.filter_score for name, how in fused.items()}, correlated, ties, memory)
+    check_request(scorers, {name: how.filter_score for name, how in fused.items()}, correlated, ties, memory,
+                  cohort=cohort is not None)  # fmt: skip
     archive, watch = archive or Archive(), watch or Stopwatch()
+    how = {"matching": matching, "archive": archive, "memory": memory, "devices": devices}
+    strengths: dict[str, np.ndarray] = {}
+    if cohort is not None:
+        with watch("cohort"):
+            options = {"devices": devices, "track": archive.track("cohort scores")}
+            strengths = scored_hubness(
+                match_cohort(dataset, cohort, extractor, filter, candidates, **how), scorers, **options
+            )
     matched = [
-        match_sequence(
-            dataset, sequence, extractor, filter, candidates, matching=matching, archive=archive, watch=watch,
-            memory=memory, devices=devices,
-        )
+        match_sequence(dataset, sequence, extractor, filter, candidates, watch=watch, **how)
         for sequence in dataset.sequences
-    ]  # fmt: skip
+    ]
     with watch("scores"):
-        options = {"devices": devices, "track": archive.track("scores")}
+        options = {"hubness": strengths, "devices": devices, "track": archive.track("scores")}
         ranked = [rank_sequence(sequence, scorers, fused, correlated, ties, **options) for sequence in matched]
     for line in nan_scores(matched, ranked):
         archive.warn(line)
@@ -135,7 +146,7 @@ def match_sequence(
         matching: see there.
         archive: see there.
         watch: gets the seconds of the stages.
-        **where: `memory` and `devices` of `pipeline.match`.
+        **where: `memory`, `devices` and `track` of `pipeline.match`.
     """
     check_matching(candidates, extractor, matching)
     archive, watch, database = archive or Archive(), watch or Stopwatch(), dataset.database
@@ -163,6 +174,33 @@ def match_sequence(
                 for scale, store in zip(sides, stores or [None] * len(sides), strict=True)
             )
     return _looked_at(Matched(sequence, filtered.candidates, matches, bad["queries"], bad["database"]), archive)
+
+
+def match_cohort(
+    dataset: Dataset,
+    neighbors: int,
+    extractor: Extractor | Source,
+    filter: Filter,
+    candidates: int | Literal["all"] = 50,
+    *,
+    archive: Archive | None = None,
+    **how: Any,
+) -> Matched:
+    """Candidates and matches of the database images among each other, once for all sequences: see `mfvpr.cohort`.
+
+    Args:
+        dataset: whose database, in the order of the drive.
+        neighbors: frames on both sides of an image that show its place, and are none of its candidates.
+        extractor: see `evaluate`; and for all others `match_sequence`, which keeps the matches.
+        filter: see there.
+        candidates: see there.
+        archive: see there.
+        **how: see there.
+    """
+    archive = archive or Archive()
+    sequence = cohort_sequence(archive.contents(dataset.database), neighbors)
+    how = {"track": archive.track("cohort matching")} | how
+    return match_sequence(dataset, sequence, extractor, filter, candidates, archive=archive, **how)
 
 
 def _features(

@@ -121,7 +121,8 @@ def _file_of(files: Mapping[Path, File], folder: ImageFolder) -> File:
     """The file of a folder's images."""
     if folder.root not in files:
         known = ", ".join(map(str, files)) or "none"
-        raise InputError(f"{folder.root}: expected a folder that a file was given of, one of: {known}")
+        raise InputError(f"{folder.root}: expected a folder that a file was given of, one of: {known}; give one of "
+                         "this folder as well")  # fmt: skip
     return files[folder.root]
 
 

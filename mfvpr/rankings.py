@@ -6,11 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from mfvpr import pipeline
+from mfvpr.cohort import by_hubness
 from mfvpr.frame_correlation import FrameCorrelation
 from mfvpr.numerics import Device
 from mfvpr.progress import Track, untracked
 from mfvpr.reranking import FilterScore, Ties, fuse_shortlist, rank_shortlist
-from mfvpr.results import FILTER, FRAMES, Matched, Ranked
+from mfvpr.results import COHORT, FILTER, FRAMES, Matched, Ranked
 from mfvpr.scoring import Scorer
 from mfvpr.types import Shortlist
 
@@ -30,12 +31,17 @@ def rank_sequence(
     correlated: Mapping[str, FrameCorrelation],
     ties: Ties,
     *,
+    hubness: Mapping[str, np.ndarray] | None = None,
     devices: Sequence[Device] | None = None,
     track: Track = untracked,
 ) -> dict[str, Ranked]:
-    """Rankings of a sequence by name of the system, see `mfvpr.evaluate`."""
+    """Rankings of a sequence by name of the system, see `mfvpr.evaluate`; `hubness` `[N]` is by name of the scorer."""
     candidates = matched.candidates
     scores = pipeline.score(scorers, matched.by_scale, candidates, devices=devices, track=track)
+    scores |= {
+        f"{name} + {COHORT}": by_hubness(candidates, scores[name], strengths, who=name)
+        for name, strengths in (hubness or {}).items()
+    }
     scores |= {
         f"{name} + {FILTER}": fuse_shortlist(candidates, scores[name], how.c, filter_score=how.filter_score)
         for name, how in fused.items()

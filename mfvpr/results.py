@@ -13,6 +13,7 @@ from mfvpr.types import Shortlist
 
 FILTER = "filter"  # the name of the filter's own ranking
 FRAMES = "frames"  # in the names of those that the queries before take part in
+COHORT = "cohort"  # in the names of those that other places of the map take part in
 
 
 @dataclass(frozen=True)

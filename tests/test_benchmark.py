@@ -12,8 +12,11 @@ import pytest
 from experiments.benchmark.__main__ import BENCHMARKS
 from mfvpr.data.datasets import folder_dataset
 from mfvpr.errors import InputError
-from mfvpr.features import Description
+from mfvpr.evaluations import evaluate
+from mfvpr.features import Aggregated, Description
 from mfvpr.features.sift import Sift
+from mfvpr.features.vlad import VladFitting
+from mfvpr.filters import Retrieval
 from mfvpr.scoring import MatchCount
 from mfvpr.weights.networks import blueprint, network_of
 from mfvpr.weights.registry import entry_of
@@ -176,14 +179,14 @@ def test_every_ransac_counts_the_plane(monkeypatch):
 @pytest.fixture
 def two_places(small_street, tmp_path, monkeypatch):
     """The folders that real images are expected in, and one kind of features."""
-    from experiments.benchmark import agreement, real, weights, zoom
+    from experiments.benchmark import agreement, hubs, real, weights, zoom
 
     for name, (database, queries) in real.FOLDERS.items():
         (tmp_path / name).mkdir()
         (tmp_path / name / database).symlink_to(small_street / "database")
         (tmp_path / name / queries).symlink_to(small_street / "queries")
     sift = {"SIFT": Sift(image_size=(160, 120), max_keypoints=100)}
-    for module in (agreement, real, weights, zoom):
+    for module in (agreement, hubs, real, weights, zoom):
         monkeypatch.setattr(module, "extractors", lambda *_: sift)
     return tmp_path
 
@@ -262,6 +265,43 @@ def test_a_thinned_database_has_fewer_right_images(two_places, small_street, mon
         assert 0.5 < every <= 1
         assert first == pytest.approx(0.3)  # of ten queries three are near the only image that is left
         assert row["ms_per_query"] > 0
+
+
+def test_hubs_are_divided_as_an_evaluation_does_it(two_places, small_street, monkeypatch):
+    from experiments.benchmark import hubs, real
+
+    street = folder_dataset(
+        small_street / "database", small_street / "queries", name="streets", ground_truth="order"
+    )  # fmt: skip
+    monkeypatch.setattr(real.prepare, "dataset_of", lambda _: street)
+    scorers = {"histogram ratio": hubs.SCORERS["histogram ratio"], "sum ratio": hubs.SCORERS["sum ratio"]}
+    small = {"STREETS": (0,), "NEIGHBORS": 2, "CANDIDATES": {"all": None, "6": 6}, "SCORERS": scorers, "TOLERANCE": 0}
+    for name, value in small.items():
+        monkeypatch.setattr(hubs, name, value)
+    hubs.run(None, two_places / "out.json", two_places)
+    found = json.loads((two_places / "out.json").read_text())
+    ways = ["nothing", "hubs by database", "all by database", "all by queries"]
+    [table] = found["tables"]
+    by_name = {(row["score"], row["candidates"], row["divided"]): row for row in table["rows"]}
+    assert [*by_name] == [(name, listed, way) for name in scorers for listed in small["CANDIDATES"] for way in ways]
+    filter = Retrieval(Aggregated(*hubs.extractors().values(), VladFitting()))
+    for listed, candidates in (("all", "all"), ("6", 6)):
+        options = {"candidates": candidates, "cohort": 2, "archive": real.kept()}
+        recall = evaluate(street, filter.describer.extractor, filter, scorers, **options).recall([0], [1])
+        for name in scorers:
+            expected = {"nothing": recall[name], "hubs by database": recall[f"{name} + cohort"]}
+            for way, one in expected.items():
+                row = by_name[name, listed, way]
+                assert {*row["recall"].values()} == {one.pooled[0, 0]}
+                gain = one.pooled - recall[name].pooled
+                assert row["gained"] - row["lost"] == pytest.approx(20 * gain[0, 0])
+    drawn = {row["divided"]: row["recall"] for row in found["streets"]}
+    assert [*drawn["nothing"]] == ["all, ±1", "all, ±0", "6, ±1", "6, ±0"]
+    for listed in small["CANDIDATES"]:
+        some = [by_name[name, listed, "nothing"]["recall"]["streets"] for name in scorers]
+        assert drawn["nothing"][f"{listed}, ±0"] == pytest.approx(np.mean(some))
+        some = [by_name[name, listed, "all by database"]["recall"]["streets"] for name in scorers]
+        assert drawn[f"all by the mean, {listed}"][f"{listed}, ±0"] == pytest.approx(np.mean(some))
 
 
 @pytest.mark.slow

@@ -25,7 +25,9 @@ def folder(root, count=3):
     ],
 )
 def test_a_folder_without_a_file_is_refused_with_those_that_have_one(tmp_path, read):
-    with pytest.raises(InputError, match=r"/other: expected a folder that a file was given of, one of: .*/known$"):
+    with pytest.raises(
+        InputError, match=r"/other: expected a folder that a file was given of, one of: .*/known; give one of this"
+    ):
         read({tmp_path / "known": File(tmp_path / "a.npz")}, folder(tmp_path / "other"))
 
 

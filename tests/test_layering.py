@@ -85,6 +85,7 @@ ALLOWED = {
     },
     "extraction": {"errors", "types", "numerics", "data", "features", "progress", "sources", "threads"},
     "exchange": {"errors", "types", "data", "exchange"},
+    "cohort": {"data", "errors", "numerics", "pipeline", "progress", "results", "scoring", "types"},
     "checks": {
         "data",
         "declaration",

@@ -78,7 +78,12 @@ def datasets(data: Path | None, *, streets: bool = False) -> list[Dataset]:
         folder_dataset(data / name / database, data / name / queries, name=name, ground_truth="order")
         for name, (database, queries) in FOLDERS.items()
     ]
-    return [*found, prepare.dataset_of({"name": "streets", "cache": str(_cache()), "seed": 0})] if streets else found
+    return [*found, street(0)] if streets else found
+
+
+def street(seed: int) -> Dataset:
+    """A drawn one, which is drawn once."""
+    return prepare.dataset_of({"name": "streets", "cache": str(_cache()), "seed": seed})
 
 
 def kept() -> Archive:
