@@ -15,6 +15,7 @@ from mfvpr.report import runs
 from mfvpr.report.confidences import Assured, confidence_figures, confidence_table, write_confidence
 from mfvpr.report.differences import write_gains
 from mfvpr.report.evaluations import Figure, Judged, figures, recall_table, write_rankings, write_skipped
+from mfvpr.report.shifts import write_shifts
 from mfvpr.results import COHORT, FILTER, FRAMES
 from mfvpr.scoring import HistogramOfShifts
 
@@ -23,7 +24,7 @@ _THRESHOLDS: dict[Unit, str] = {"frames": "tolerance", "m": "radius"}  # their n
 
 @dataclass(frozen=True)
 class Outcome:
-    """Everything that one evaluation made; parameters by system."""
+    """Everything that one evaluation made; parameters by system, and the histogram where it decides."""
 
     settings: dict[str, Any]
     images: Images
@@ -31,6 +32,7 @@ class Outcome:
     judged: Judged
     assured: Assured
     parameters: dict[str, dict[str, Any]]
+    histogram: HistogramOfShifts | None
     figures: list[Figure]
 
 
@@ -72,7 +74,8 @@ def evaluated(settings: dict[str, Any]) -> Outcome:
     histogram = histogram if isinstance(histogram, HistogramOfShifts) else None
     assured = Assured(judged, confidence and confidence.systems, settings["threshold"])
     drawn = [*figures(judged, tools.extractor, shown, histogram), *(confidence_figures(assured) if shown else [])]
-    return Outcome(settings, images, tools, judged, assured, parameters, drawn)
+    deciding = histogram if main == "histogram" else None
+    return Outcome(settings, images, tools, judged, assured, parameters, deciding, drawn)
 
 
 def text(outcome: Outcome) -> str:
@@ -113,6 +116,8 @@ def write(folder: Path, outcome: Outcome) -> None:
     write_rankings(folder, outcome.judged, outcome.assured.refused_of_headline)
     write_gains(folder, outcome.judged)
     write_confidence(folder, outcome.assured, confidences.made(outcome.settings, outcome.images, outcome.judged))
+    if outcome.histogram is not None:
+        write_shifts(folder, outcome.judged, outcome.histogram)
     write_skipped(folder, outcome.judged.result)
 
 

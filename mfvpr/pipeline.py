@@ -30,6 +30,7 @@ from mfvpr.weighting import match_weights
 
 __all__ = ["Explanation", "FeatureSet", "MatchSet", "Scales", "explain", "match", "score", "stored_matches"]
 
+SHIFTS_AT_ONCE = 64  # pairs
 STORE_BATCH = 8  # queries whose matches may be lost when a run is killed
 
 
@@ -154,3 +155,42 @@ def _explain(scorer: HistogramOfShifts, matches: Matches) -> tuple[Any, ...]:
     shift, peak = scorer.dominant_shift(matches), scorer.dominant_shift(matches, refine=True)
     weights = match_weights(scorer.weight, matches)
     return scorer.histogram(matches), scorer(matches), shift, peak, weights, scorer.agrees(matches, peak)
+
+
+def dominant_shifts(
+    scorer: HistogramOfShifts, match_set: MatchSet, queries: np.ndarray, places: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Refined dominant shifts `[n, 2]` of pairs and their 95 % intervals `[n, 2, 2]` (low, high), px; one program.
+
+    Args:
+        scorer: whose histogram is taken.
+        match_set: of all queries.
+        queries: `[n]`.
+        places: `[n]` of the candidates in their shortlists.
+
+    Returns:
+        NaN where nothing matches.
+    """
+    fitted = fit(scorer, *match_set.image_sizes, multiple=BIN_STEP)
+    shifts, intervals = [np.zeros((0, 2))], [np.zeros((0, 2, 2))]
+    for start in range(0, len(queries), SHIFTS_AT_ONCE):
+        some = slice(start, start + SHIFTS_AT_ONCE)
+        pairs = match_set.pairs(queries[some], places[some], match_set.capacity, total=SHIFTS_AT_ONCE)
+        found = jax.tree.map(np.asarray, _dominant_shifts(fitted, pairs))
+        for parts, values in zip((shifts, intervals), found, strict=True):
+            parts.append(values[: len(queries[some])])
+    nothing = match_set.counts[queries, places] == 0
+    return (
+        np.where(nothing[:, None], np.nan, np.concatenate(shifts)),
+        np.where(nothing[:, None, None], np.nan, np.concatenate(intervals)),
+    )
+
+
+@compiled
+def _dominant_shifts(scorer: HistogramOfShifts, matches: Matches) -> tuple[Array, Array]:
+    """Of matches `[P, K, ...]`."""
+
+    def of_pair(one: Matches) -> tuple[Array, Array]:
+        return scorer.dominant_shift(one, refine=True), scorer.shift_interval(one)
+
+    return jax.vmap(of_pair)(matches)

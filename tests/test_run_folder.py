@@ -125,7 +125,7 @@ def test_without_ground_truth_nothing_is_right_or_failed(root, tmp_path):
     evaluation.evaluate(composed(*small(root), *LINES, *none))
     assert {line["right"] for line in rows(tmp_path / "out" / "predictions.csv")} == {""}
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert names == {"results.json", "run.json", "predictions.csv", "predictions", "figures"}
+    assert names == {"results.json", "run.json", "predictions.csv", "predictions", "shifts.csv", "figures"}
     assert {path.name.split("_")[0] for path in (tmp_path / "out" / "figures").iterdir()} == {"best"}
     assert json.loads((tmp_path / "out" / "run.json").read_text())["ground_truth"]["kind"] == "none"
 
