@@ -39,6 +39,7 @@ def files() -> dict[str, str]:
             ("compared", "Every score, and homographies as the paper has them beside MAGSAC.", [*beside, *_VARIANTS]),
         )
     }
+    made["scorer/ratio.yaml"] = "\n".join(_ratio())
     made["axes.yaml"] = "\n".join(_axes())
     limits = {
         name: {field: parameter.limits for field, parameter in declared(scorer).items()}
@@ -63,6 +64,14 @@ def _scorer(method: str, values: Mapping[str, Any]) -> Iterator[str]:
     for field, parameter in declared(SCORERS[method]).items():
         comment = "; ".join(filter(None, (parameter.unit, parameter.note, parameter.words)))
         yield _line(field, values.get(field, parameter.default), comment)
+
+
+def _ratio() -> Iterator[str]:
+    """A group whose members have another value than their own files."""
+    yield "# Anchor points and histogram of shifts, matches weighted by the ratio of distances (not the paper's)."
+    for name in ("anchor", "histogram"):
+        _, *lines = _scorer(name, {"weight": "ratio"})
+        yield from [f"{name}:", *(f"  {line}" for line in lines)]
 
 
 def _axes() -> Iterator[str]:

@@ -47,19 +47,21 @@ def evaluate(settings: dict[str, Any]) -> None:
 def evaluated(settings: dict[str, Any]) -> Outcome:
     """The filter alone, each scorer, and the best of them (the paper: histogram) combined with the filter."""
     scorers, watch, confidence = build.scorers(settings["scorer"]), Stopwatch(), confidences.read(settings)
+    fusion, main = build.fusion(settings), "histogram" if "histogram" in scorers else next(iter(scorers))
+    fusion.check(main, scorers)
     tools, images = prepare.begun(settings, watch)
     shown = asked_figures(settings["figures"], images.dataset)
-    main = "histogram" if "histogram" in scorers else next(iter(scorers))
-    combined, group, histogram = f"{main} + {FILTER}", settings["scorer"], scorers.get("histogram")
+    combined, histogram = fusion.system(main), scorers.get("histogram")
     headline, frames = combined if settings["final"] == "combined" else main, build.frames(settings)
     confidences.check(confidence, headline, settings, images)
     result = evaluations.evaluate(
         images.dataset, tools.extractor, tools.filter, scorers, candidates=settings["candidates"],
-        matching=tools.matching, fused={main: build.fusion(settings)}, correlated={headline: frames} if frames else {},
+        matching=tools.matching, fused={main: fusion}, correlated={headline: frames} if frames else {},
         ties=settings["ties"], archive=tools.archive, watch=watch, **tools.where,
     )  # fmt: skip
-    parameters = {name: group if "method" in group else group[name] for name in scorers}
-    parameters = {FILTER: {}} | parameters | {combined: parameters[main] | settings["fusion"]}
+    own, members = build.by_scorer(settings["scorer"]), fusion.members(main)
+    of_members = own[main] if members == [main] else {name: own[name] for name in members}
+    parameters = {FILTER: {}, **own, combined: of_members | settings["fusion"]}
     if frames:
         parameters[f"{headline} + {FRAMES}"] = parameters[headline] | asdict(frames)
     thresholds = truth.thresholds(settings, images.dataset.sequences[0].truth)
@@ -130,8 +132,8 @@ def result_rows(outcome: Outcome) -> list[dict[str, Any]]:
     }
     rows = []
     for name, parameters in outcome.parameters.items():
-        system = {"system": name, "scorer": name.partition(" + ")[0], "parameters": parameters}
-        system |= {"scorer": "none"} if name == "filter" else {}
+        scorers = [part for part in name.split(" + ") if part not in (FILTER, FRAMES)]
+        system = {"system": name, "scorer": " + ".join(scorers) or "none", "parameters": parameters}
         rows += [system | judgment | common for judgment in _judgments(judged, name)]
     return rows
 

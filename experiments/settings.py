@@ -165,6 +165,8 @@ RULES: dict[str, Rule] = {
     "filter_score": _one_of("cosine", "negative_euclidean"),
     "ties": _one_of("filter", "index"),
     "c": _or(_NOT_NEGATIVE, "auto"),
+    "fusion.c": _or(_NOT_NEGATIVE, "auto", "zscore"),
+    "fusion.weights": Rule(lambda value: value is None, "weights by name, such as {filter: 0.5, anchor: 1}, or null"),
     "final": _one_of("score", "combined"),
     "previous_queries": _between(0, 1000),
     ".confidence": _or(_PATH, None),
@@ -214,6 +216,9 @@ def check(settings: Mapping[str, Any]) -> None:
         raise SettingsError("features.image_size=null: expected width and height for features=ssm, such as [336,336]")
     if method == "grid":
         _check_cells(settings)
+    fusion = settings.get("fusion", {})
+    if fusion.get("weights") and fusion["c"] != "zscore":
+        raise SettingsError(f"fusion.weights={fusion['weights']}: expected fusion.c=zscore as well")
     if settings.get("threshold") is not None and settings["confidence"] is None:
         raise SettingsError(f"threshold={settings['threshold']}: expected confidence=FILE as well, the confidence.json "
                             "of a run on other images with ground truth")  # fmt: skip
@@ -221,6 +226,8 @@ def check(settings: Mapping[str, Any]) -> None:
 
 def _rule(path: str, methods: Mapping[str, str]) -> Rule | None:
     """Of a setting, given the method of each system's scorer; None for a group of settings."""
+    if path.startswith("fusion.weights."):  # names are checked where the scorers are
+        return _POSITIVE
     *_, group, name = f".{path}".split(".")
     scorers, method = scorer_rules(CONF / "rules.yaml"), methods["scorer"]
     own = scorers.get(group if group in scorers else methods.get(group, ""), {})

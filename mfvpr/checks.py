@@ -15,7 +15,8 @@ from mfvpr.filters import Filtered
 from mfvpr.lightglue import LightGlueMatching
 from mfvpr.matchers import Matcher, Matching
 from mfvpr.matching import CrossCheck
-from mfvpr.reranking import FilterScore, Ties
+from mfvpr.rankings import Fusion
+from mfvpr.reranking import Ties
 from mfvpr.results import FILTER, FRAMES, Matched, Ranked
 from mfvpr.scoring import SCORERS
 from mfvpr.sources import FeatureSet
@@ -23,14 +24,13 @@ from mfvpr.types import Shortlist
 
 
 def check_request(
-    scorers: Mapping[str, Any], fused: Mapping[str, FilterScore], correlated: Iterable[str], ties: Ties,
-    memory: float | None,
+    scorers: Mapping[str, Any], fused: Mapping[str, Fusion], correlated: Iterable[str], ties: Ties, memory: float | None
 ) -> None:  # fmt: skip
     """What `mfvpr.evaluate` is asked to do with matches.
 
     Args:
         scorers: by name.
-        fused: the filter's score that is added to some of them, by name.
+        fused: how the filter's score is added to some of them, by name.
         correlated: names of scorers, and of those that are fused.
         ties: see there.
         memory: see there.
@@ -41,16 +41,14 @@ def check_request(
     require_word("ties", ties, Ties)
     if memory is not None and not 0 < memory < math.inf:
         raise InputError(f"memory={memory!r}: expected GB above 0, or None")
-    for name, filter_score in fused.items():
-        require_word("filter_score", filter_score, FilterScore)
-        if name not in scorers:
-            known = ", ".join(scorers) or "there are none"
-            raise InputError(f"fused: expected names of scorers ({known}), got {name}")
-    several = {*scorers, *(f"{name} + {FILTER}" for name in fused)}
+    for name, how in fused.items():
+        how.check(name, scorers)
+    combined = [how.system(name) for name, how in fused.items()]
+    several = {*scorers, *combined}
     if unknown := [name for name in correlated if name not in several]:
         raise InputError(f"correlated: expected names of scorers ({', '.join(several) or 'there are none'}), got "
                          f"{unknown[0]}")  # fmt: skip
-    made = {FILTER, *(f"{other} + {FILTER}" for other in fused), *(f"{other} + {FRAMES}" for other in correlated)}
+    made = {FILTER, *combined, *(f"{other} + {FRAMES}" for other in correlated)}
     for name, scorer in scorers.items():
         if name in made:
             raise InputError(f"scorers: {name} is the name of another system; choose another one")

@@ -77,7 +77,8 @@ def evaluate(
         scorers: by name.
         candidates: that the filter proposes for each query.
         matching: what matches a pair, see `mfvpr.Matcher`.
-        fused: scorers, by name, that are ranked together with the filter's score as well, as `name + filter`.
+        fused: scorers, by name, that are ranked together with the filter's score as well, as `name + filter`, or with
+            other scorers' and the filter's, as `name + other + filter`; see `mfvpr.rankings.Fusion`.
         correlated: scorers and those that are fused, by name, that are ranked by their scores with frame correlation as
             well, as `name + frames`.
         ties: equal scores keep the order of the filter, or go by the row of the database: "filter", "index".
@@ -92,7 +93,7 @@ def evaluate(
             scorer gives; one line says which, and the mend.
     """
     fused, correlated = fused or {}, correlated or {}
-    check_request(scorers, {name: how.filter_score for name, how in fused.items()}, correlated, ties, memory)
+    check_request(scorers, fused, correlated, ties, memory)
     archive, watch = archive or Archive(), watch or Stopwatch()
     matched = [
         match_sequence(

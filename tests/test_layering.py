@@ -93,6 +93,7 @@ ALLOWED = {
         "lightglue",
         "matchers",
         "matching",
+        "rankings",
         "reranking",
         "results",
         "scoring",

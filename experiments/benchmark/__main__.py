@@ -19,6 +19,7 @@ BENCHMARKS = {
     "agreement": "RANSAC on matches of real images beside OpenCV's: recall and inliers (4 seeds; half an hour)",
     "real": "all scores on the same matches of real images: recall with intervals, time per query (1 round)",
     "weights": "every score with every match weight on the same matches of real images: recall",
+    "fusions": "scores fused with the filter's in every way on the same matches: recall, and what each may lose",
     "zoom": "the histogram's vote over several scales, on real and drawn images: recall, time per query (1 round)",
     "shifts": "dominant shifts on drawn streets: errors and intervals in px (1 street)",
     "matchers": "LightGlue beside mutual neighbors on real images: recall by score, time per query (an hour at first)",
@@ -42,7 +43,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="JSON file to write (default runs/benchmark_WHAT.json)")
     parser.add_argument("--stores", type=Path, help="of scale: folder that keeps its features (default: 6 GB, deleted)")
     parser.add_argument(
-        "--data", type=Path, help="of agreement, matchers, real, weights, zoom: folder with grief_season and corridor"
+        "--data",
+        type=Path,
+        help="of agreement, fusions, matchers, real, weights, zoom: folder with grief_season and corridor",
     )
     parser.add_argument("--peer", type=Path, help="of lightglue: a clone of https://github.com/cvg/LightGlue")
     parser.add_argument("--version", action="version", version=version(), help="print it and exit")
@@ -51,7 +54,7 @@ def main() -> None:
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # leaves torch its part of a GPU
         own = {
             "stores": (["scale"], arguments.stores),
-            "data": (["real", "weights", "zoom", "agreement", "matchers"], arguments.data),
+            "data": (["real", "weights", "fusions", "zoom", "agreement", "matchers"], arguments.data),
             "peer": (["lightglue"], arguments.peer),
         }
         options = {name: value for name, (_, value) in own.items() if value}
