@@ -17,7 +17,7 @@ from mfvpr.report import comparisons, runs
 def learn(settings: dict[str, Any]) -> None:
     """Matches -> learned, searched and hand-set scores on the half that none of them saw -> table, figures, files."""
     with run_folder.claimed(settings) as folder:
-        varied = learnable(settings)
+        varied, how = learnable(settings), _options(settings)
         watch = Stopwatch()
         tools, images = prepare.begun(settings, watch)
         judge = truth.judge(settings, images.dataset)
@@ -25,7 +25,7 @@ def learn(settings: dict[str, Any]) -> None:
         checkpoints = _checkpoints(settings, prepare.recipe(tools, images, candidates.mask.shape[1]), judge)
         with watch("learning"):
             options = {"checkpoints": checkpoints, "track": console.track}
-            comparison = compare(varied, judge, matches, candidates, _options(settings), **options)
+            comparison = compare(varied, judge, matches, candidates, how, **options)
         heading, described = _heading(settings, images, judge), truth.described(settings, images.dataset)
         text = f"{heading}\n\n{comparisons.text(comparison)}"
         left_out = ("dataset", "store", "out", "checkpoints", "multirun", "command")

@@ -13,6 +13,7 @@ from PIL import Image
 
 from experiments import settings
 from experiments.settings import CONF, SettingsError
+from mfvpr import AnchorPoints, HistogramOfShifts, RatioWeight
 from mfvpr.scoring import ALONE, PAPER, SCORERS, Homography, OpenCvHomography
 from tests.programs import QUICK, ROOT, composed, folder, run, typed
 
@@ -76,6 +77,8 @@ def test_scorers_of_conf_are_as_their_fields_say():
     assert build.scorers(composed()["scorer"]) == {name: SCORERS[name]() for name in PAPER}
     every = build.scorers(composed("scorer=all")["scorer"])
     assert every == {name: scorer() for name, scorer in SCORERS.items() if name not in ALONE}
+    ratio = {"anchor": AnchorPoints(weight=RatioWeight()), "histogram": HistogramOfShifts(weight=RatioWeight())}
+    assert build.scorers(composed("scorer=ratio")["scorer"]) == ratio
     compared = build.scorers(composed("scorer=compared")["scorer"])
     assert compared["homography_8"] == Homography(8.0)
     assert compared["magsac_8"] == OpenCvHomography(8.0, estimator="magsac")
