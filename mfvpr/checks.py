@@ -136,13 +136,20 @@ def wrong_with(folder: ImageFolder, features: FeatureSet, bad: Mapping[int, str]
                "scores are 0")  # fmt: skip
 
 
-def nan_scores(matched: Sequence[Matched], ranked: Sequence[Mapping[str, Ranked]]) -> Iterator[str]:
+def nan_scores(
+    matched: Sequence[Matched], ranked: Sequence[Mapping[str, Ranked]], scorers: Iterable[str]
+) -> Iterator[str]:
     """Scorers of one's own may divide by 0.
 
+    Args:
+        matched: by sequence.
+        ranked: by sequence and system.
+        scorers: the systems that are no sums of others, whose 0 may say that all are equal.
+
     Raises:
-        InputError: a system scores nothing but NaN, and 0 where nothing matches: its ranking would be another's.
+        InputError: a scorer gives nothing but NaN, and 0 where nothing matches: its ranking would be another's.
     """
-    for name in ranked[0]:
+    for name in scorers:
         values = np.concatenate([systems[name].scores[systems[name].rows >= 0] for systems in ranked])
         if np.isnan(values).any() and not values[~np.isnan(values)].any():
             raise InputError(f"{name}: every score of a pair that has matches is NaN; check what the scorer expects of "

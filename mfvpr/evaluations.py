@@ -105,7 +105,7 @@ def evaluate(
     with watch("scores"):
         options = {"devices": devices, "track": archive.track("scores")}
         ranked = [rank_sequence(sequence, scorers, fused, correlated, ties, **options) for sequence in matched]
-    for line in nan_scores(matched, ranked):
+    for line in nan_scores(matched, ranked, scorers):
         archive.warn(line)
     systems = {name: [by_system[name] for by_system in ranked] for name in ranked[0]}
     return Result(dataset, matched, systems, watch.seconds)

@@ -58,8 +58,8 @@ class Fusion:
         known = ", ".join(scorers) or "there are none"
         if main not in scorers:
             raise InputError(f"fused: expected names of scorers ({known}), got {main}")
-        if self.c not in (None, "zscore") and not _between(self.c, 0, np.finfo(np.float32).max):
-            raise InputError(f"c={self.c!r}: expected a number from 0, 'zscore', or None")
+        if self.c not in (None, "zscore") and not _between(self.c, 0, POSITIVE[1]):
+            raise InputError(f"c={self.c!r}: expected a number from 0 to {POSITIVE[1]:g}, 'zscore', or None")
         if self.weights and self.c != "zscore":
             raise InputError(f"weights: expected c='zscore' as well, got c={self.c!r}")
         for name, weight in self.weights.items():

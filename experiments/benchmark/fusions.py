@@ -88,7 +88,7 @@ def judged(places: Mapping[str, Mapping[System, float]]) -> Iterator[dict[str, A
 def _table(rows: Sequence[dict[str, Any]]) -> Table:
     lines = [
         [row["scores"], row["fusion"], *(f"{100 * one:.1f}" for one in (*row["recall"].values(), row["mean"])),
-         "" if row["fusion"] == ALONE else f"{100 * row['worst']:+.1f}"]
+         "" if row["scores"] == FILTER else f"{100 * row['worst']:+.1f}"]
         for row in rows
     ]  # fmt: skip
     return Table(["scores", "with the filter", *rows[0]["recall"], "mean", "worst"], lines, text_columns=2)
