@@ -25,7 +25,7 @@ class Fusion:
     Attributes:
         c: the main score gets c times the filter's; None = as much as balances both per query. "zscore" = the sum of
             all scores, each with mean 0 and standard deviation 1 over the query's candidates (where all are equal, 0):
-            of filter and main score it ranks as None does, but its values can be compared between queries. A score
+            of filter and main score it ranks as None does, but its values have the same unit for every query. A score
             that is not finite is its candidate's alone.
         filter_score: the filter's, see `mfvpr.reranking.filter_scores`.
         weights: of "zscore" only, above 0: of the filter (as `filter`) and of the main scorer, 1 where they are not

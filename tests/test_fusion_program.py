@@ -63,12 +63,12 @@ def test_of_filter_and_score_it_ranks_as_auto(root, tmp_path):
 
 def test_our_system_fuses_two_scores_and_the_filter():
     """With other features and weights as well; a score of it can be swept by itself."""
-    for arguments, features, weight in (
-        ([], "aliked", 0.5), (["features=sift", "fusion.weights.filter=1"], "sift", 1),
+    for arguments, features, side, weight in (
+        ([], "aliked", 320, 0.5), (["features=sift", "fusion.weights.filter=1"], "sift", 336, 1),
     ):  # fmt: skip
         found = composed("system=mfvpr", *arguments)
         settings.check(found)
-        assert (found["features"]["name"], found["features"]["image_size"]) == (features, [336, 336])
+        assert (found["features"]["name"], found["features"]["image_size"]) == (features, [side, side])
         fusion = build.fusion(found)
         assert (fusion.c, fusion.weights) == ("zscore", {"filter": weight, "anchor": 1})
         assert fusion.system("histogram") == SYSTEM
