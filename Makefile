@@ -6,7 +6,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 .PHONY: demo test setup check conf benchmark clean
 
 demo: setup
-	$(BIN)/python -m experiments.evaluate
+	$(BIN)/python -m experiments.evaluate scorer=demo
 
 test: .venv/.test
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile

@@ -25,7 +25,7 @@ def as_final(settings: dict[str, Any]) -> dict[str, Any]:
     grid = settings["grid"]
     if settings["final"] == "score" or grid["c"] is not None or not any(grid.values()):
         return settings
-    return settings | {"grid": grid | {"c": [settings["fusion"]["c"]]}}
+    return settings | {"grid": grid | {"c": [_plain_c(settings)]}}
 
 
 def axes(settings: dict[str, Any]) -> Axes:
@@ -45,7 +45,8 @@ def axes(settings: dict[str, Any]) -> Axes:
     if not values:
         raise SettingsError("grid: expected at least one axis, such as 'grid.sigma=[10,22.5]', or an experiment=; see "
                             "--help")  # fmt: skip
-    own = settings["scorer"] | {"c": settings["fusion"]["c"], "max_distance": settings["matching"].get("max_distance")}
+    own = settings["scorer"] | {"max_distance": settings["matching"].get("max_distance")}
+    own |= {"c": _plain_c(settings)} if "c" in values else {}
     return Axes(scorer, values, {name: own.get(name) for name in values})
 
 
@@ -79,8 +80,18 @@ def learnable(settings: dict[str, Any]) -> Axes:
 
 def own_c(settings: dict[str, Any]) -> float | None:
     """The filter's weight by hand, None = balanced."""
-    c = settings["fusion"]["c"]
+    c = _plain_c(settings)
     return None if c == "auto" else float(c)
+
+
+def _plain_c(settings: dict[str, Any]) -> Any:
+    """The same as it is written; a sum of several scores is for evaluations."""
+    if (c := settings["fusion"]["c"]) == "zscore":
+        raise SettingsError(
+            "fusion.c=zscore: expected a number or auto, as sweeps and learning add the filter to one score; set "
+            "fusion.c=auto fusion.weights=null, which ranks alike for weights of 1"
+        )
+    return c
 
 
 def require_memory(settings: dict[str, Any], varied: Axes, views: int, matches: MatchSet) -> None:

@@ -1,7 +1,7 @@
 """Checked settings -> the library's values. Plain tables of names; nothing of a user's YAML is ever called."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -163,9 +163,10 @@ def where(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def fusion(settings: dict[str, Any]) -> Fusion:
-    """How the filter's score is added to another."""
-    c = settings["fusion"]["c"]
-    return Fusion(None if c == "auto" else float(c), settings["fusion"]["filter_score"])
+    """How the filter's score, and those of further scorers, are added to another."""
+    c, filter_score, weights = (settings["fusion"][name] for name in ("c", "filter_score", "weights"))
+    c = {"auto": None, "zscore": c}[c] if isinstance(c, str) else float(c)
+    return Fusion(c, filter_score, weights or {})
 
 
 def frames(settings: dict[str, Any]) -> FrameCorrelation | None:
@@ -185,12 +186,16 @@ def _network(group: str, name: str, weights: str | None) -> Any:
     return load_model(weights)
 
 
-def scorers(settings: dict[str, Any]) -> dict[str, Scorer]:
+def by_scorer(settings: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The settings of the chosen scorer, or of all of a group, by name."""
+    return {settings["method"]: settings} if "method" in settings else settings
+
+
+def scorers(settings: Mapping[str, Any]) -> dict[str, Scorer]:
     """The chosen scorer, or all of a group, by name."""
-    chosen = {settings["method"]: settings} if "method" in settings else settings
     return {
         name: made(SCORERS[values["method"]], {field: plain for field, plain in values.items() if field != "method"})
-        for name, values in chosen.items()
+        for name, values in by_scorer(settings).items()
     }
 
 

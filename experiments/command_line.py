@@ -134,6 +134,9 @@ def _explain(error: Exception, config: str) -> str:
 def _meant(wrong: str, config: str) -> str:
     """What an unknown setting may be: one of its group, of another choice of its group, of the same name, or alike."""
     group, name, names = wrong.partition(".")[0], wrong.rpartition(".")[2], _setting_names(config)
+    outer = wrong.rpartition(".")[0]
+    if outer in names and not any(known.startswith(f"{outer}.") for known in names):  # null, or one value
+        return f"the nearest is {outer}, set as a whole"
     own = [known for known in names if known.startswith(f"{group}.")] if group in groups(config) else []
     same = [known for known in names if known.rpartition(".")[2] == name]
     same_of_own = [known for known in same if known in own]

@@ -35,7 +35,7 @@ def check(given: Given | None, headline: str, settings: Mapping[str, Any], image
         return
     if headline not in given.systems:
         raise SettingsError(f"confidence={given.path}: expected one of the system that decides, {headline}, got "
-                            f"{', '.join(given.systems)}; make it with the same scorer and final")  # fmt: skip
+                            f"{', '.join(given.systems)}; make it with the same scorer, final and fusion")  # fmt: skip
     if given.made.get("data_fingerprint") == images.fingerprints:
         tell(f"warning: confidence={given.path} was fitted on these very images, so that it flatters")
     before, now = (_of_system(one, headline) for one in (given.made.get("settings"), settings))
@@ -45,12 +45,11 @@ def check(given: Given | None, headline: str, settings: Mapping[str, Any], image
 
 
 def _of_system(settings: Any, system: str) -> dict[str, Any]:
-    """The settings that its scores depend on, of several scorers those of its own."""
-    if not isinstance(settings, Mapping):
+    """The settings that its scores depend on, of several scorers those that take part."""
+    if not isinstance(settings, Mapping) or not isinstance(settings.get("scorer"), Mapping):
         return {}
-    scorer, own = settings.get("scorer"), system.partition(" + ")[0]
-    alone = scorer[own] if isinstance(scorer, Mapping) and own in scorer else scorer
-    return {**settings, "scorer": alone}
+    scorers, members = build.by_scorer(settings["scorer"]), system.split(" + ")
+    return {**settings, "scorer": {name: own for name, own in scorers.items() if name in members}}
 
 
 def made(settings: Mapping[str, Any], images: Images, judged: Judged) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 They are files, not made when a program starts, because --help and a wrong setting must not wait for JAX.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,10 @@ _VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "homography_8": ("homography", {"threshold": 8.0}),
     "homography_24": ("homography", {"threshold": 24.0}),
     "magsac_8": ("homography_opencv", {"threshold": 8.0, "estimator": "magsac"}),
+    "anchor_ratio": ("anchor", {"weight": "ratio"}),
+    "histogram_ratio": ("histogram", {"weight": "ratio"}),
 }
+_HOMOGRAPHIES = ("homography_8", "homography_24", "magsac_8")
 
 
 def files() -> dict[str, str]:
@@ -32,13 +35,18 @@ def files() -> dict[str, str]:
     every = [name for name in SCORERS if name not in ALONE]
     beside = [name for name in every if name != "homography"]
     made |= {
-        f"scorer/{name}.yaml": f"# {what}\ndefaults:\n" + "\n".join(f"  - {one}@{one}" for one in members)
+        f"scorer/{name}.yaml": "\n".join([f"# {what}", "defaults:", *(f"  - {one}" for one in _placed(members))])
         for name, what, members in (
             ("paper", "The paper's scores, each with its parameters, and the number of matches.", PAPER),
             ("all", "Every score of any features but OpenCV's, each with the parameters of its paper.", every),
-            ("compared", "Every score, and homographies as the paper has them beside MAGSAC.", [*beside, *_VARIANTS]),
+            ("compared", "Every score, and homographies as the paper has them beside MAGSAC.",
+             [*beside, *_HOMOGRAPHIES]),
+            ("demo", "The paper's, and the histogram weighted by the ratio of distances (not the paper's).",
+             [*PAPER, "histogram_ratio"]),
+            ("ratio", "Anchor points and histogram of shifts, matches weighted by the ratio of distances (not the "
+             "paper's).", {"anchor": "anchor_ratio", "histogram": "histogram_ratio"}),
         )
-    }
+    }  # fmt: skip
     made["axes.yaml"] = "\n".join(_axes())
     limits = {
         name: {field: parameter.limits for field, parameter in declared(scorer).items()}
@@ -63,6 +71,12 @@ def _scorer(method: str, values: Mapping[str, Any]) -> Iterator[str]:
     for field, parameter in declared(SCORERS[method]).items():
         comment = "; ".join(filter(None, (parameter.unit, parameter.note, parameter.words)))
         yield _line(field, values.get(field, parameter.default), comment)
+
+
+def _placed(members: Sequence[str] | Mapping[str, str]) -> Iterator[str]:
+    """Files of scores, each under a name: its own, or that it has in a mapping."""
+    named = members if isinstance(members, Mapping) else {member: member for member in members}
+    yield from (f"{file}@{name}" for name, file in named.items())
 
 
 def _axes() -> Iterator[str]:

@@ -49,24 +49,28 @@ def evaluate(settings: dict[str, Any]) -> None:
 def evaluated(settings: dict[str, Any]) -> Outcome:
     """The filter, each scorer, alone and with a cohort, and the best (the paper: histogram) with the filter."""
     scorers, watch, confidence = build.scorers(settings["scorer"]), Stopwatch(), confidences.read(settings)
+    fusion, main = build.fusion(settings), "histogram" if "histogram" in scorers else next(iter(scorers))
+    fusion.check(main, scorers)
     tools, images = prepare.begun(settings, watch)
     shown = asked_figures(settings["figures"], images.dataset)
-    main = "histogram" if "histogram" in scorers else next(iter(scorers))
-    combined, group, histogram = f"{main} + {FILTER}", settings["scorer"], scorers.get("histogram")
+    combined, histogram = fusion.system(main), scorers.get("histogram")
     headline, frames = combined if settings["final"] == "combined" else main, build.frames(settings)
-    cohort, alone = settings["cohort"], [main] if settings["cohort"] is None else [main, f"{main} + {COHORT}"]
+    cohort, alone = settings["cohort"], [main]
+    if cohort is not None and fusion.members(main) == [main]:
+        alone.append(f"{main} + {COHORT}")
     confidences.check(confidence, headline, settings, images)
     result = evaluations.evaluate(
         images.dataset, tools.extractor, tools.filter, scorers, candidates=settings["candidates"],
-        matching=tools.matching, fused={name: build.fusion(settings) for name in alone}, cohort=cohort,
+        matching=tools.matching, fused=dict.fromkeys(alone, fusion), cohort=cohort,
         correlated={headline: frames} if frames else {}, ties=settings["ties"], archive=tools.archive, watch=watch,
         **tools.where,
     )  # fmt: skip
-    parameters = {name: group if "method" in group else group[name] for name in scorers}
+    own, members = {**build.by_scorer(settings["scorer"])}, fusion.members(main)
     if cohort is not None:
-        parameters |= {f"{name} + {COHORT}": own | {"cohort": cohort} for name, own in parameters.items()}
-    fused = {f"{name} + {FILTER}": parameters[name] | settings["fusion"] for name in alone}
-    parameters = {FILTER: {}} | parameters | fused
+        own |= {f"{name} + {COHORT}": values | {"cohort": cohort} for name, values in own.items()}
+    of_members = own[main] if members == [main] else {name: own[name] for name in members}
+    fused = {fusion.system(name): (of_members if name == main else own[name]) | settings["fusion"] for name in alone}
+    parameters = {FILTER: {}, **own, **fused}
     if frames:
         parameters[f"{headline} + {FRAMES}"] = parameters[headline] | asdict(frames)
     thresholds = truth.thresholds(settings, images.dataset.sequences[0].truth)
@@ -140,8 +144,8 @@ def result_rows(outcome: Outcome) -> list[dict[str, Any]]:
     }
     rows = []
     for name, parameters in outcome.parameters.items():
-        system = {"system": name, "scorer": name.partition(" + ")[0], "parameters": parameters}
-        system |= {"scorer": "none"} if name == "filter" else {}
+        scorers = [part for part in name.split(" + ") if part not in (COHORT, FILTER, FRAMES)]
+        system = {"system": name, "scorer": " + ".join(scorers) or "none", "parameters": parameters}
         rows += [system | judgment | common for judgment in _judgments(judged, name)]
     return rows
 

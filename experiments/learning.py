@@ -35,7 +35,7 @@ class Prepared(NamedTuple):
 def learn(settings: dict[str, Any]) -> None:
     """Matches -> learned, searched and hand-set scores on what none of them saw -> table, figures, files."""
     with run_folder.claimed(settings) as folder:
-        varied, watch = learnable(settings), Stopwatch()
+        varied, how, watch = learnable(settings), _options(settings), Stopwatch()
         sets = [_prepared(one, watch) for one in _each(settings)]
         whole = sets[0].part
         if settings["report"]:
@@ -45,7 +45,7 @@ def learn(settings: dict[str, Any]) -> None:
         with watch("learning"):
             options = {"checkpoints": _checkpoints(settings, whole, sets), "track": console.track}
             data = varied, whole.judge, whole.match_set, whole.candidates
-            comparison = compare(*data, _options(settings), **options)
+            comparison = compare(*data, how, **options)
         heading = _heading(settings, whole, sets)
         text = f"{heading}\n\n{comparisons.text(comparison)}"
         left_out = ("dataset", "store", "out", "checkpoints", "multirun", "command")

@@ -24,6 +24,8 @@ WORDS = {
     r"extract these, or match nearest neighbors$": "set features=aliked, or matching=neighbors",
     r"give it as image_size=$": "give it as features.image_size=[W,H]",
     r"lengths='(normalize|keep)'": r"GROUP.lengths=\1",
+    r"^weights: expected": "fusion.weights: expected",
+    r"score by it as well$": "choose scorer=all, or another group of scores that has it",
 }
 
 

@@ -15,7 +15,8 @@ from mfvpr.filters import Filtered
 from mfvpr.lightglue import LightGlueMatching
 from mfvpr.matchers import Matcher, Matching
 from mfvpr.matching import CrossCheck
-from mfvpr.reranking import FilterScore, Ties
+from mfvpr.rankings import Fusion
+from mfvpr.reranking import Ties
 from mfvpr.results import COHORT, FILTER, FRAMES, Matched, Ranked
 from mfvpr.scoring import SCORERS
 from mfvpr.sources import FeatureSet
@@ -23,14 +24,14 @@ from mfvpr.types import Shortlist
 
 
 def check_request(
-    scorers: Mapping[str, Any], fused: Mapping[str, FilterScore], correlated: Iterable[str], ties: Ties,
+    scorers: Mapping[str, Any], fused: Mapping[str, Fusion], correlated: Iterable[str], ties: Ties,
     memory: float | None, *, cohort: bool = False,
 ) -> None:  # fmt: skip
     """What `mfvpr.evaluate` is asked to do with matches.
 
     Args:
         scorers: by name.
-        fused: the filter's score that is added to some of them, by name.
+        fused: how the filter's score is added to some of them, by name.
         correlated: names of scorers, and of those that are fused.
         ties: see there.
         memory: see there.
@@ -44,17 +45,14 @@ def check_request(
         raise InputError(f"memory={memory!r}: expected GB above 0, or None")
     with_cohort = [f"{name} + {COHORT}" for name in scorers] if cohort else []
     alone = [*scorers, *with_cohort]
-    for name, filter_score in fused.items():
-        require_word("filter_score", filter_score, FilterScore)
-        if name not in alone:
-            known = ", ".join(alone) or "there are none"
-            raise InputError(f"fused: expected names of scorers ({known}), got {name}")
-    several = {*alone, *(f"{name} + {FILTER}" for name in fused)}
+    for name, how in fused.items():
+        how.check(name, alone)
+    combined = [how.system(name) for name, how in fused.items()]
+    several = {*alone, *combined}
     if unknown := [name for name in correlated if name not in several]:
         raise InputError(f"correlated: expected names of scorers ({', '.join(several) or 'there are none'}), got "
                          f"{unknown[0]}")  # fmt: skip
-    made = {FILTER, *with_cohort}
-    made |= {*(f"{other} + {FILTER}" for other in fused), *(f"{other} + {FRAMES}" for other in correlated)}
+    made = {FILTER, *with_cohort, *combined, *(f"{other} + {FRAMES}" for other in correlated)}
     for name, scorer in scorers.items():
         if name in made:
             raise InputError(f"scorers: {name} is the name of another system; choose another one")
@@ -142,13 +140,20 @@ def wrong_with(folder: ImageFolder, features: FeatureSet, bad: Mapping[int, str]
                "scores are 0")  # fmt: skip
 
 
-def nan_scores(matched: Sequence[Matched], ranked: Sequence[Mapping[str, Ranked]]) -> Iterator[str]:
+def nan_scores(
+    matched: Sequence[Matched], ranked: Sequence[Mapping[str, Ranked]], scorers: Iterable[str]
+) -> Iterator[str]:
     """Scorers of one's own may divide by 0.
 
+    Args:
+        matched: by sequence.
+        ranked: by sequence and system.
+        scorers: the systems that are no sums of others, whose 0 may say that all are equal.
+
     Raises:
-        InputError: a system scores nothing but NaN, and 0 where nothing matches: its ranking would be another's.
+        InputError: a scorer gives nothing but NaN, and 0 where nothing matches: its ranking would be another's.
     """
-    for name in ranked[0]:
+    for name in scorers:
         values = np.concatenate([systems[name].scores[systems[name].rows >= 0] for systems in ranked])
         if np.isnan(values).any() and not values[~np.isnan(values)].any():
             raise InputError(f"{name}: every score of a pair that has matches is NaN; check what the scorer expects of "

@@ -79,7 +79,8 @@ def evaluate(
         scorers: by name.
         candidates: that the filter proposes for each query.
         matching: what matches a pair, see `mfvpr.Matcher`.
-        fused: scorers, by name, that are ranked together with the filter's score as well, as `name + filter`.
+        fused: scorers, by name, that are ranked together with the filter's score as well, as `name + filter`, or with
+            other scorers' and the filter's, as `name + other + filter`; see `mfvpr.rankings.Fusion`.
         correlated: scorers and those that are fused, by name, that are ranked by their scores with frame correlation as
             well, as `name + frames`.
         cohort: all scorers are ranked with a cohort as well, as `name + cohort`: database images that score high with
@@ -97,8 +98,7 @@ def evaluate(
             scorer gives; one line says which, and the mend.
     """
     fused, correlated = fused or {}, correlated or {}
-    check_request(scorers, {name: how.filter_score for name, how in fused.items()}, correlated, ties, memory,
-                  cohort=cohort is not None)  # fmt: skip
+    check_request(scorers, fused, correlated, ties, memory, cohort=cohort is not None)
     archive, watch = archive or Archive(), watch or Stopwatch()
     how = {"matching": matching, "archive": archive, "memory": memory, "devices": devices}
     strengths: dict[str, np.ndarray] = {}
@@ -115,7 +115,7 @@ def evaluate(
     with watch("scores"):
         options = {"hubness": strengths, "devices": devices, "track": archive.track("scores")}
         ranked = [rank_sequence(sequence, scorers, fused, correlated, ties, **options) for sequence in matched]
-    for line in nan_scores(matched, ranked):
+    for line in nan_scores(matched, ranked, scorers):
         archive.warn(line)
     systems = {name: [by_system[name] for by_system in ranked] for name in ranked[0]}
     return Result(dataset, matched, systems, watch.seconds)

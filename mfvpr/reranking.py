@@ -116,7 +116,7 @@ def filter_scores(candidates: Shortlist, kind: FilterScore = "cosine") -> np.nda
 def fuse_scales(
     scores: Array, mask: Array, weights: Array | None = None, *, normalize: Literal["zscore", "none"] = "zscore"
 ) -> Array:
-    """Weighted sum `[..., C]` of the scores of S scales, as Patch-NetVLAD's; NaN where there is no candidate.
+    """Weighted sum `[..., C]` of the scores of S scales, as Patch-NetVLAD's, or scorers; NaN without a candidate.
 
     Args:
         scores: `[..., C, S]` of a query's candidates.

@@ -18,6 +18,7 @@ from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
 from mfvpr.filters import Retrieval
 from mfvpr.scoring import MatchCount
+from mfvpr.types import Shortlist
 from mfvpr.weights.networks import blueprint, network_of
 from mfvpr.weights.registry import entry_of
 from tests import checkpoints
@@ -179,14 +180,14 @@ def test_every_ransac_counts_the_plane(monkeypatch):
 @pytest.fixture
 def two_places(small_street, tmp_path, monkeypatch):
     """The folders that real images are expected in, and one kind of features."""
-    from experiments.benchmark import agreement, hubs, real, weights, zoom
+    from experiments.benchmark import agreement, fusions, hubs, real, weights, zoom
 
     for name, (database, queries) in real.FOLDERS.items():
         (tmp_path / name).mkdir()
         (tmp_path / name / database).symlink_to(small_street / "database")
         (tmp_path / name / queries).symlink_to(small_street / "queries")
     sift = {"SIFT": Sift(image_size=(160, 120), max_keypoints=100)}
-    for module in (agreement, hubs, real, weights, zoom):
+    for module in (agreement, fusions, hubs, real, weights, zoom):
         monkeypatch.setattr(module, "extractors", lambda *_: sift)
     return tmp_path
 
@@ -244,6 +245,35 @@ def test_the_paper_s_weights_gain_nothing_over_themselves(two_places):
     gains = by_name["sum", "ratio"]
     more = (gains["recall"]["all"] - by_name["sum", "dmf"]["recall"]["all"]) * 20
     assert gains["gained"] - gains["lost"] == pytest.approx(more)
+
+
+def test_fusions_are_held_against_what_they_are_made_of(two_places, small_street, monkeypatch, capsys):
+    from experiments.benchmark import fusions, real
+
+    street = folder_dataset(small_street / "database", small_street / "queries", name="streets", ground_truth="order")
+    monkeypatch.setattr(real.prepare, "dataset_of", lambda _: street)
+    fusions.run(None, two_places / "out.json", two_places)
+    rows = json.loads((two_places / "out.json").read_text())["rows"]
+    by_system = {(row["scores"], row["fusion"]): row for row in rows}
+    assert len(by_system) == len(rows) == 1 + 4 + 4 * 6 + 2 * 5
+    for (scores, fusion), row in by_system.items():
+        assert [*row["recall"]] == ["grief_season, SIFT", "corridor, SIFT", "streets, SIFT"]
+        [recall] = {*row["recall"].values()}  # three times the same images
+        assert row["mean"] == pytest.approx(recall)
+        best = max(by_system[name, "alone"]["mean"] for name in ("filter", *scores.split(" + ")))
+        assert row["worst"] == pytest.approx(row["mean"] - best)
+        assert row["worst"] == 0 or (scores, fusion) != ("filter", "alone")
+    assert "z, filter 0.25" in capsys.readouterr().out
+
+
+def test_reciprocal_ranks_are_summed():
+    from experiments.benchmark.fusions import reciprocal_ranks
+
+    there = np.array([[True, True, True, False]])
+    candidates = Shortlist(np.array([[4, 2, 9, -1]]), np.zeros((1, 4), np.float32), there)
+    parts = [np.array([[3.0, 2.0, 1.0, np.nan]]), np.array([[1.0, 5.0, 7.0, np.nan]])]
+    got = reciprocal_ranks(candidates, parts)
+    np.testing.assert_allclose(got[0, :3], [1 / 61 + 1 / 63, 2 / 62, 1 / 63 + 1 / 61])
 
 
 def test_a_thinned_database_has_fewer_right_images(two_places, small_street, monkeypatch):

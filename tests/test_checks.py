@@ -106,6 +106,19 @@ def evaluated(dataset, extractor=SIFT, chosen=None, scorers=HISTOGRAM, **options
         ({"fused": {"histogram": Fusion(1.0, "euclidean")}}, "filter_score='euclidean': expected one of"),
         ({"fused": {"histogram": Fusion(1.0, "negative_euclidean")}, "chosen": Fixed((0, 1, 2), 3.0)},
          "expected cosine similarities up to 1, got 3"),
+        ({"fused": {"histogram": Fusion("auto")}}, "c='auto': expected a number from 0 to .*, 'zscore', or None"),
+        ({"fused": {"histogram": Fusion(np.nan)}}, "c=nan: expected a number from 0"),
+        ({"fused": {"histogram": Fusion(-1.0)}}, "c=-1.0: expected a number from 0"),
+        ({"fused": {"histogram": Fusion(weights={"filter": 2.0})}}, "weights: expected c='zscore' as well, got c=None"),
+        ({"fused": {"histogram": Fusion("zscore", weights={"anchor": 1})}},
+         r"weights: expected filter or names of scorers \(histogram\), got anchor; score by it as well"),
+        *(({"fused": {"histogram": Fusion("zscore", weights={"filter": wrong})}},
+           rf"weights: expected numbers from 1e-06 to 1e\+12, got filter={wrong!r}")
+          for wrong in (0, -1.0, np.nan, np.inf, "1", None)),
+        ({"fused": {"histogram": Fusion("zscore")}, "scorers": HISTOGRAM | {"histogram + filter": mfvpr.MatchCount()}},
+         r"histogram \+ filter is the name of another system"),
+        ({"fused": {"histogram": Fusion("zscore", weights={"count": 1})}, "correlated": {"histogram + filter": FRAMES},
+          "scorers": HISTOGRAM | {"count": mfvpr.MatchCount()}}, "correlated: expected .* got histogram [+] filter"),
         ({"chosen": Fixed((0, 1, 99))}, "Fixed: expected rows of the database from 0 to 9, got 0 to 99"),
         ({"chosen": Fixed((0, 1, 1))}, "Fixed: expected every row of the database once, got 1 twice for query 0"),
         ({"chosen": Fixed((0, 1))}, r"Fixed: expected indices \(whole\), scores and mask \(bool\) of \[10, 3\] each"),
@@ -169,6 +182,10 @@ def test_scores_that_are_nan_are_told(dataset):
     scorers = {"n": scorer}
     evaluated(dataset, scorers=scorers, archive=Archive(tell=lines.append))
     assert any("of n are NaN, and rank last" in line for line in lines)
+    lines.clear()  # of a single candidate every z-score is 0
+    options = {"chosen": Fixed((4,)), "candidates": 1, "fused": {"n": Fusion("zscore")}}
+    evaluated(dataset, scorers=scorers, archive=Archive(tell=lines.append), **options)
+    assert any("of n + filter are NaN, and rank last" in line for line in lines)
 
 
 @pytest.mark.parametrize("scorer", [lambda matches: jnp.nan * jnp.sum(matches.distance), mfvpr.GridAnchors()])

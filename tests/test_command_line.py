@@ -74,6 +74,21 @@ def test_version(monkeypatch, capsys, program):
         ("sweep", ["system=mix_hist_50"], "grid: expected at least one axis"),
         ("sweep", ["system=mix_hist_comb_10", "experiment=anchor", "grid.sigma=[3]"], "grid.sigma: scorer=anchor has"),
         ("learn", ["system=mix_hist_50", "learning_rate=0"], "learning_rate=0: expected"),
+        ("sweep", ["system=mfvpr", "grid.sigma=[3]"], "fusion.c=zscore: expected a number or auto, as sweeps and"),
+        ("sweep", ["scorer=histogram", "grid.c=[zscore]"], "grid.c=['zscore']: expected a list of one or more, each a"),
+        ("learn", ["fusion.c=zscore"], "set fusion.c=auto fusion.weights=null, which ranks alike for weights of 1"),
+        ("evaluate", ["fusion.c=zscores"], "(at most 1e12), or auto, zscore"),
+        ("evaluate", ["fusion.weights={filter: 2}"], "fusion.weights={'filter': 2}: expected fusion.c=zscore as well"),
+        ("evaluate", ["system=mfvpr", "fusion.c=auto"], "'anchor': 1}: expected fusion.c=zscore as well"),
+        *(
+            ("evaluate", ["system=mfvpr", f"fusion.weights.filter={wrong}"], f".filter={wrong}: expected a number")
+            for wrong in (0, -1, "nan", "inf", "x")
+        ),
+        ("evaluate", ["fusion.weights.filter=2"], "unknown setting; the nearest is fusion.weights, set as a whole"),
+        ("evaluate", ["fusion.weights=[2]"], "expected weights by name, such as {filter: 0.5, anchor: 1}, or null"),
+        ("evaluate", ["fusion.c=zscore", "fusion.weights={ancor: 1}"], "fusion.weights: expected filter or names of"),
+        ("evaluate", ["system=mfvpr", "scorer=histogram"],
+         "(histogram), got anchor; choose scorer=all, or another group of scores that has it"),
         ("evaluate", ["=5"], "=5: expected name=value"),
         ("evaluate", [".=5"], ".=5: expected name=value"),
         ("evaluate", ["candidates =5"], "candidates =5: expected name=value"),

@@ -168,6 +168,12 @@ def test_confidence_of_other_settings_is_said(evaluate):
     _, code, _, stderr = evaluate("second", *given, "scorer.weight=ratio", "fusion.c=2")
     assert code == 0, stderr
     assert "confidence.json was fitted with other settings of scorer, fusion: p may mean nothing here" in stderr
+    fused = ("scorer=ratio", "fusion.c=zscore", "fusion.weights={anchor: 1}", "final=combined", "figures=0")
+    other, *_ = evaluate("fused", *fused)
+    for changed, told in (("scorer.anchor.window=6", True), ("scorer.anchor.window=10", False)):
+        _, code, _, stderr = evaluate(changed, f"confidence={other}/confidence.json", *fused, changed)
+        assert code == 0, stderr
+        assert ("was fitted with other settings of scorer: p" in stderr) == told
     _, code, _, stderr = evaluate("third", *given, "scorer=paper")
     assert code == 0, stderr
     assert "other settings" not in stderr  # the histogram is the same beside others

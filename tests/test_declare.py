@@ -71,7 +71,7 @@ def near(tmp_path, monkeypatch):
 def test_the_files_of_conf_are_those_that_follow_from_the_scores():
     made = declare.files()
     assert {path.name for path in (CONF / "scorer").iterdir()} == {
-        f"{name}.yaml" for name in (*SCORERS, "paper", "all", "compared", "homography_8", "homography_24", "magsac_8")
+        f"{name}.yaml" for name in (*SCORERS, *declare._VARIANTS, "paper", "all", "compared", "demo", "ratio")
     }
     for path, text in made.items():
         assert (CONF / path).read_text(encoding="utf-8") == text, f"conf/{path} is not up to date: make conf"

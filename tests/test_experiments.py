@@ -13,6 +13,7 @@ from PIL import Image
 
 from experiments import settings
 from experiments.settings import CONF, SettingsError
+from mfvpr import AnchorPoints, HistogramOfShifts, RatioWeight
 from mfvpr.scoring import ALONE, PAPER, SCORERS, Homography, OpenCvHomography
 from tests.programs import QUICK, ROOT, composed, folder, run, typed
 
@@ -76,6 +77,8 @@ def test_scorers_of_conf_are_as_their_fields_say():
     assert build.scorers(composed()["scorer"]) == {name: SCORERS[name]() for name in PAPER}
     every = build.scorers(composed("scorer=all")["scorer"])
     assert every == {name: scorer() for name, scorer in SCORERS.items() if name not in ALONE}
+    ratio = {"anchor": AnchorPoints(weight=RatioWeight()), "histogram": HistogramOfShifts(weight=RatioWeight())}
+    assert build.scorers(composed("scorer=ratio")["scorer"]) == ratio
     compared = build.scorers(composed("scorer=compared")["scorer"])
     assert compared["homography_8"] == Homography(8.0)
     assert compared["magsac_8"] == OpenCvHomography(8.0, estimator="magsac")
@@ -168,13 +171,13 @@ def test_bins_that_do_not_fit_are_refused(small_street, tmp_path, monkeypatch, c
         assert words in stderr.splitlines()[-1]
 
 
-def test_one_evaluation_compiles_at_most_six_programs(small_street, tmp_path, monkeypatch, compilations, capsys):
+def test_one_evaluation_compiles_at_most_seven_programs(small_street, tmp_path, monkeypatch, compilations, capsys):
     from experiments import evaluation as program
 
     monkeypatch.chdir(tmp_path)
     common = folder(small_street, "figures=2", "features.max_keypoints=120", "retrieval.num_words=8", "candidates=7")
     program.evaluate(composed(*common))
-    assert 1 <= compilations.count <= 6
+    assert 1 <= compilations.count <= 7
     compilations.reset()
     others = ["scorer.histogram.sigma=9", "scorer.histogram.bin_size=14.5", "scorer.anchor.tolerance=2",
               "scorer.anchor.window=6", "fusion.c=auto"]  # fmt: skip
@@ -187,7 +190,7 @@ def test_one_evaluation_compiles_at_most_six_programs(small_street, tmp_path, mo
 def demo(tmp_path_factory):
     """`make demo` after its installation, with an empty cache."""
     root = tmp_path_factory.mktemp("demo")
-    done = run(cwd=root, MFVPR_CACHE=str(root / "cache"))
+    done = run("scorer=demo", cwd=root, MFVPR_CACHE=str(root / "cache"))
     assert done.returncode == 0, done.stderr
     (folder,) = (root / "runs" / "streets").iterdir()
     return done, folder
@@ -207,7 +210,7 @@ def test_demo_ranks_histogram_above_count_above_filter(demo):
 @pytest.mark.slow
 def test_demo_prints_its_table_and_leaves_a_run_folder(demo):
     done, folder = demo
-    systems = ["filter", *PAPER, "histogram + filter"]
+    systems = ["filter", *PAPER, "histogram_ratio", "histogram + filter"]
     header, _, *lines = done.stdout[done.stdout.index("system") :].splitlines()[: 2 + len(systems)]
     assert [line[:20].strip() for line in lines] == systems
     assert header.split("  ")[0] == "system"
@@ -241,7 +244,7 @@ def test_results_say_what_made_them(demo):
     _, folder = demo
     text = (folder / "results.json").read_text()
     rows = json.loads(text, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
-    assert len(rows) == 18
+    assert len(rows) == 21
     for row in rows:
         assert set(row["recall_at"]) == {"1", "5", "10"}
         assert (row["queries"], row["database"], row["candidates"]) == (100, 100, 50)

@@ -95,6 +95,7 @@ ALLOWED = {
         "lightglue",
         "matchers",
         "matching",
+        "rankings",
         "reranking",
         "results",
         "scoring",

@@ -70,11 +70,17 @@ def test_ssm_vpr_runs_on_what_it_learned_from_the_database(evaluate, small_stree
 
 @pytest.mark.slow
 @pytest.mark.skipif(not checkpoints.ALIKED.is_dir(), reason="no ../shared/weights: ALIKED's are not shipped")
-def test_aliked_recognizes_the_street(evaluate, small_street, tmp_path):
-    evaluate(*system("mix_hist_aliked_50", small_street, tmp_path / "out", "features.image_size=[320,320]"))
+@pytest.mark.parametrize(
+    ("name", "decides"), [("mix_hist_aliked_50", "histogram"), ("mfvpr", "histogram + anchor + filter")]
+)
+def test_aliked_recognizes_the_street(evaluate, small_street, tmp_path, name, decides):
+    evaluate(*system(name, small_street, tmp_path / "out", "features.image_size=[320,320]"))
     rows = json.loads((tmp_path / "out" / "results.json").read_text())
-    (recall,) = (row["recall_at"]["1"] for row in rows if (row["system"], row.get("tolerance")) == ("histogram", 1))
+    (recall,) = (row["recall_at"]["1"] for row in rows if (row["system"], row.get("tolerance")) == (decides, 1))
     assert recall >= 0.8
+    out = tmp_path / "out"
+    file = f"predictions/{decides.replace(' + ', '_')}.csv"
+    assert (out / "predictions.csv").read_bytes() == (out / file).read_bytes()
 
 
 @pytest.mark.slow

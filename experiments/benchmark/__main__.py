@@ -20,6 +20,7 @@ BENCHMARKS = {
     "real": "all scores on the same matches of real images: recall with intervals, time per query (1 round)",
     "weights": "every score with every match weight on the same matches of real images: recall",
     "hubs": "scores divided by a database image's own with other places: recall on real images, choices on drawn ones",
+    "fusions": "scores fused with the filter's in every way on the same matches: recall, and what each may lose",
     "zoom": "the histogram's vote over several scales, on real and drawn images: recall, time per query (1 round)",
     "shifts": "dominant shifts on drawn streets: errors and intervals in px (1 street)",
     "matchers": "LightGlue beside mutual neighbors on real images: recall by score, time per query (an hour at first)",
@@ -45,7 +46,7 @@ def main() -> None:
     parser.add_argument(
         "--data",
         type=Path,
-        help="of agreement, hubs, matchers, real, weights, zoom: folder with grief_season and corridor",
+        help="of agreement, fusions, hubs, matchers, real, weights, zoom: folder with grief_season and corridor",
     )
     parser.add_argument("--peer", type=Path, help="of lightglue: a clone of https://github.com/cvg/LightGlue")
     parser.add_argument("--version", action="version", version=version(), help="print it and exit")
@@ -54,7 +55,7 @@ def main() -> None:
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # leaves torch its part of a GPU
         own = {
             "stores": (["scale"], arguments.stores),
-            "data": (["real", "weights", "hubs", "zoom", "agreement", "matchers"], arguments.data),
+            "data": (["real", "weights", "fusions", "hubs", "zoom", "agreement", "matchers"], arguments.data),
             "peer": (["lightglue"], arguments.peer),
         }
         options = {name: value for name, (_, value) in own.items() if value}

@@ -1,0 +1,79 @@
+"""Fusions as a user of the programs meets them: the systems of a run folder, and what can be swept of them."""
+
+import csv
+import json
+
+import pytest
+
+from experiments import axes, build, evaluation, settings
+from tests.programs import CANDIDATES, QUERIES, composed, shared, small
+
+FUSED = ("scorer=ratio", "fusion.c=zscore", "fusion.weights={filter: 0.5, anchor: 1}")
+SYSTEM = "histogram + anchor + filter"
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    return shared(tmp_path_factory)
+
+
+def ranked(out, name):
+    """Database images of every query and the scores, best first."""
+    with (out / "predictions" / f"{name}.csv").open(newline="") as file:
+        return [(line["query"], line["database"], float(line["score"])) for line in csv.DictReader(file)]
+
+
+def test_a_run_ranks_by_what_is_fused(root, tmp_path):
+    out = tmp_path / "out"
+    more = ("final=combined", "previous_queries=1", "figures=1", f"out={out}")
+    evaluation.evaluate(composed(*small(root), *FUSED, *more))
+    rows = json.loads((out / "results.json").read_text())
+    found = {row["system"]: row for row in rows if row["tolerance"] == 1}
+    assert [*found] == ["filter", "anchor", "histogram", SYSTEM, f"{SYSTEM} + frames"]
+    assert [row["scorer"] for row in found.values()] == [
+        "none", "anchor", "histogram", "histogram + anchor", "histogram + anchor",
+    ]  # fmt: skip
+    parameters = {name: row["parameters"] for name, row in found.items()}
+    assert parameters["anchor"]["weight"] == parameters["histogram"]["weight"] == "ratio"
+    assert parameters[SYSTEM] == {
+        "histogram": parameters["histogram"], "anchor": parameters["anchor"],
+        "c": "zscore", "filter_score": "cosine", "weights": {"filter": 0.5, "anchor": 1},
+    }  # fmt: skip
+    assert parameters[f"{SYSTEM} + frames"] == parameters[SYSTEM] | {"previous": 1, "reach": 15.0, "gain": 0.4}
+    decided = out / "predictions" / "histogram_anchor_filter.csv"
+    assert (out / "predictions.csv").read_bytes() == decided.read_bytes()
+    scores = [score for _, _, score in ranked(out, "histogram_anchor_filter")]
+    for query in range(QUERIES):  # standardized: their mean is 0
+        of_query = scores[query * CANDIDATES : (query + 1) * CANDIDATES]
+        assert sum(of_query) == pytest.approx(0, abs=1e-3)
+        assert max(of_query) > 0.5
+    assert f"\n{SYSTEM}," in (out / "table.csv").read_text()
+
+
+def test_of_filter_and_score_it_ranks_as_auto(root, tmp_path):
+    places = {}
+    for c in ("auto", "zscore"):
+        more = ("scorer=histogram", f"fusion.c={c}", "figures=0", f"out={tmp_path}/{c}")
+        evaluation.evaluate(composed(*small(root), *more))
+        places[c] = ranked(tmp_path / c, "histogram_filter")
+        row = json.loads((tmp_path / c / "results.json").read_text())[-1]
+        assert (row["system"], row["parameters"]["c"], row["parameters"]["weights"]) == ("histogram + filter", c, None)
+    assert [line[:2] for line in places["auto"]] == [line[:2] for line in places["zscore"]]
+
+
+def test_our_system_fuses_two_scores_and_the_filter():
+    """With other features and weights as well; a score of it can be swept by itself."""
+    for arguments, features, side, weight in (
+        ([], "aliked", 320, 0.5), (["features=sift", "fusion.weights.filter=1"], "sift", 336, 1),
+    ):  # fmt: skip
+        found = composed("system=mfvpr", *arguments)
+        settings.check(found)
+        assert (found["features"]["name"], found["features"]["image_size"]) == (features, [side, side])
+        fusion = build.fusion(found)
+        assert (fusion.c, fusion.weights) == ("zscore", {"filter": weight, "anchor": 1})
+        assert fusion.system("histogram") == SYSTEM
+        assert build.fusion(composed("system=mfvpr", "fusion.weights=null")).system("anchor") == "anchor + filter"
+    alone = ("scorer=histogram", "scorer.weight=ratio", "final=score", "grid.sigma=[10]")
+    found = composed("system=mfvpr", *alone, config="sweep")
+    settings.check(found)
+    assert axes.searchable(axes.as_final(found)).grid() == [{"sigma": 10}]

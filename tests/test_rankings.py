@@ -1,0 +1,174 @@
+"""Several scores of a query's candidates, the filter's among them, as one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import mfvpr
+from mfvpr.data.datasets import folder_dataset, sequences_dataset
+from mfvpr.evaluations import match_sequence
+from mfvpr.features import Aggregated
+from mfvpr.features.sift import Sift
+from mfvpr.features.vlad import VladFitting
+from mfvpr.filters import Retrieval
+from mfvpr.frame_correlation import FrameCorrelation
+from mfvpr.rankings import Fusion, rank_sequence
+from mfvpr.reranking import rank_shortlist
+from mfvpr.types import Shortlist
+from tests import oracles
+
+SIFT = Sift(max_keypoints=60, image_size=(160, 120))
+VLAD = Retrieval(Aggregated(SIFT, VladFitting(num_words=8)))
+SCORERS = {"histogram": mfvpr.HistogramOfShifts(), "count": mfvpr.MatchCount()}
+BOTH = Fusion("zscore", weights={"filter": 0.5, "count": 2.0})
+
+
+def made_up(num_queries=6, num_candidates=9):
+    """A shortlist with rows that are not full, and scores of two scorers in units of their own."""
+    rng = np.random.default_rng(0)
+    mask = np.arange(num_candidates) < rng.integers(2, num_candidates + 1, (num_queries, 1))
+    rows = rng.permuted(np.tile(np.arange(num_candidates), (num_queries, 1)), axis=1)
+    cosine = -np.sort(-rng.random((num_queries, num_candidates)), axis=1)
+    scores = {
+        name: np.where(mask, unit * rng.random(mask.shape), np.nan).astype(np.float32)
+        for name, unit in (("a", 3e4), ("b", 2e-3))
+    }
+    return Shortlist(np.where(mask, rows, -1), np.where(mask, cosine, 0).astype(np.float32), mask), scores
+
+
+def expected(candidates, parts, weights):
+    """In float64, query by query."""
+    stacked = np.stack(parts, axis=-1).astype(np.float64)
+    return np.array(
+        [oracles.fuse_scales(*one, weights, "zscore") for one in zip(stacked, candidates.mask, strict=True)]
+    )
+
+
+def test_scores_are_summed_as_standardized():
+    candidates, scores = made_up()
+    how = Fusion("zscore", weights={"filter": 0.5, "a": 3.0, "b": 0.25})
+    got = how("a", candidates, scores)
+    assert got.dtype == np.float32
+    np.testing.assert_allclose(
+        got, expected(candidates, [candidates.scores, scores["a"], scores["b"]], [0.5, 3.0, 0.25]), rtol=1e-4, atol=1e-5
+    )
+    one = Fusion("zscore", weights={"a": 3.0})("a", candidates, scores)  # the filter counts 1
+    np.testing.assert_allclose(
+        one, expected(candidates, [candidates.scores, scores["a"]], [1.0, 3.0]), rtol=1e-4, atol=1e-5
+    )
+
+
+def test_the_filter_s_score_may_be_a_distance():
+    candidates, scores = made_up()
+    got = Fusion("zscore", "negative_euclidean")("a", candidates, scores)
+    distance = -np.sqrt(2 - 2 * candidates.scores.astype(np.float64))
+    np.testing.assert_allclose(got, expected(candidates, [distance, scores["a"]], [1, 1]), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("unit", ["a", "b"])
+def test_it_ranks_as_a_balanced_c_and_has_no_unit(unit):
+    candidates, scores = made_up()
+    got = Fusion("zscore")(unit, candidates, scores)
+    balanced = Fusion()(unit, candidates, scores)
+    np.testing.assert_array_equal(rank_shortlist(candidates, got), rank_shortlist(candidates, balanced))
+    by_query = np.arange(1, 1 + len(got))[:, None]  # other units for every query
+    other = Fusion("zscore")(unit, candidates, {unit: 100 * by_query * scores[unit] - 7 * by_query})
+    np.testing.assert_allclose(other, got, rtol=1e-3, atol=1e-3)
+
+
+ROUGH = st.one_of(st.sampled_from([0.0, 3.0, np.nan, np.inf, -np.inf]), st.integers(-20, 20).map(float))
+
+
+@given(st.lists(ROUGH, min_size=10, max_size=10), st.integers(0, 5))
+def test_what_is_not_finite_is_its_candidate_s_alone(values, count):
+    candidates, _ = made_up(1, 5)
+    candidates = replace(candidates, mask=np.arange(5)[None] < count)
+    first, second = np.array(values, np.float32).reshape(2, 1, 5)
+    got = BOTH("a", candidates, {"a": first, "count": second})
+    with np.errstate(invalid="ignore"):
+        oracle = expected(candidates, [candidates.scores, first, second], [0.5, 1.0, 2.0])
+    np.testing.assert_allclose(got, oracle, rtol=1e-4, atol=1e-4)
+    finite = candidates.mask & np.isfinite(first) & np.isfinite(second)
+    np.testing.assert_array_equal(np.isfinite(got), finite)
+
+
+def test_equal_scores_say_nothing_and_equal_sums_keep_their_order():
+    candidates = Shortlist(np.array([[7, 3, 5]]), np.full((1, 3), 0.1, np.float32), np.ones((1, 3), bool))
+    score = np.array([[1.0, 2.0, 2.0]], np.float32)
+    got = Fusion("zscore")("a", candidates, {"a": score})
+    np.testing.assert_allclose(got, (score - score.mean()) / score.std(), rtol=1e-6)
+    assert rank_shortlist(candidates, got).tolist() == [[1, 2, 0]]
+    equal = Fusion("zscore")("a", candidates, {"a": np.full((1, 3), 0.3, np.float32)})
+    np.testing.assert_array_equal(equal, np.zeros((1, 3)))
+    assert rank_shortlist(candidates, equal).tolist() == [[0, 1, 2]]
+    assert rank_shortlist(candidates, equal, ties="index").tolist() == [[1, 2, 0]]
+
+
+@pytest.mark.parametrize(
+    ("weights", "system"),
+    [
+        ({}, "a + filter"),
+        ({"filter": 2.0, "a": 0.5}, "a + filter"),
+        ({"b": 1.0, "filter": 2.0}, "a + b + filter"),
+        ({"c": 1.0, "a": 1.0, "b": 1.0}, "a + c + b + filter"),
+    ],
+)
+def test_a_system_is_called_by_what_takes_part(weights, system):
+    assert Fusion("zscore", weights=weights).system("a") == system
+
+
+@pytest.fixture(scope="module")
+def dataset(small_street):
+    return folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
+
+
+@pytest.fixture(scope="module")
+def matched(dataset):
+    return match_sequence(dataset, dataset.only, SIFT, VLAD, 5)
+
+
+def test_systems_of_several_scores_are_ranked_beside_the_others(matched):
+    fused = {"histogram": BOTH, "count": Fusion("zscore")}
+    correlated = {"histogram + count + filter": FrameCorrelation(1)}
+    systems = rank_sequence(matched, SCORERS, fused, correlated, "filter")
+    assert [*systems] == ["filter", *SCORERS, "histogram + count + filter", "count + filter",
+                          "histogram + count + filter + frames"]  # fmt: skip
+    alone = rank_sequence(matched, SCORERS, {"count": Fusion()}, {}, "filter")
+    for name in ("filter", *SCORERS):
+        np.testing.assert_array_equal(systems[name].scores, alone[name].scores)
+    np.testing.assert_array_equal(systems["count + filter"].rows, alone["count + filter"].rows)
+
+    def listed(name):  # scores in the order of the shortlist
+        order = [[*rows].index(row) for rows, of in zip(systems[name].rows, matched.candidates.indices, strict=True)
+                 for row in of]  # fmt: skip
+        return np.take_along_axis(systems[name].scores, np.reshape(order, systems[name].rows.shape), axis=1)
+
+    parts = [matched.candidates.scores, listed("histogram"), listed("count")]
+    oracle = expected(matched.candidates, parts, [0.5, 1.0, 2.0])
+    np.testing.assert_allclose(listed("histogram + count + filter"), oracle, rtol=1e-4, atol=1e-4)
+
+
+def test_scores_of_several_scales_are_fused_again_with_the_filter(matched):
+    """They are standardized sums themselves."""
+    twice = replace(matched, matches=matched.matches * 2)
+    systems = rank_sequence(twice, SCORERS, {"histogram": Fusion("zscore")}, {}, "filter")
+    once = rank_sequence(matched, SCORERS, {"histogram": Fusion("zscore")}, {}, "filter")
+    name = "histogram + filter"
+    np.testing.assert_allclose(systems[name].scores, once[name].scores, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(systems["histogram"].scores.mean(axis=1), 0, atol=1e-5)
+
+
+def test_every_sequence_is_fused_by_itself(dataset, small_street, tmp_path):
+    folders = [tmp_path / name for name in ("first", "second")]
+    for folder in folders:
+        folder.symlink_to(small_street / "queries")
+    several = sequences_dataset(small_street / "database", folders, ground_truth="none")
+    options = {"candidates": 5, "fused": {"histogram": BOTH}}
+    one, both = (mfvpr.evaluate(data, SIFT, VLAD, SCORERS, **options) for data in (dataset, several))
+    [whole] = one.systems["histogram + count + filter"]
+    for ranked in both.systems["histogram + count + filter"]:
+        np.testing.assert_array_equal(ranked.rows, whole.rows)
+        np.testing.assert_array_equal(ranked.scores, whole.scores)
