@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from experiments import data_sets
+from experiments.quoting import as_typed
 from experiments.settings import CONF, RULES, check, scorer_rules
 from mfvpr.archive import Archive
 from mfvpr.data.datasets import image_folder
@@ -83,7 +85,10 @@ def test_commands_of_sweeps_and_learning_are_settings(program):
         chosen = [one.replace("=DIR", "=root") for one in arguments if one != "-m" and not one.startswith("hydra/")]
         if "-m" in arguments:  # the first of several values
             chosen = [re.sub(r"=(\[[^]]*\]|[^,\[]*),.*", r"=\1", one) for one in chosen]
-        check(composed(*chosen, config=program))
+        settings = composed(*map(as_typed, data_sets.first_of(chosen)), config=program)
+        check(settings)
+        for name in ("also", "report"):
+            assert not settings.get(name) or data_sets.composed(name, settings[name])
 
 
 @pytest.mark.slow
