@@ -68,6 +68,20 @@ def _computed(clone, tensors, features, **options) -> tuple[np.ndarray, int]:
     """The logarithm of the assignment `[N0, N1]`, and after how many layers."""
     import torch
 
+    network, read = public(clone, tensors, **options), []
+    for head in network.log_assignment:
+        head.register_forward_hook(lambda _, __, result: read.append(result[0]))
+    sides = as_tensors(features)
+    with torch.inference_mode():
+        found = network({"image0": sides[0], "image1": sides[1]})
+    [scores] = read
+    return scores[0, :-1, :-1].numpy(), found["stop"]
+
+
+def public(clone, tensors, **options):
+    """The public matcher with some weights, in float64."""
+    import torch
+
     sys.path.insert(0, f"{clone}/lightglue")  # one file: the package asks for the libraries of all extractors
     from lightglue import LightGlue
 
@@ -77,17 +91,17 @@ def _computed(clone, tensors, features, **options) -> tuple[np.ndarray, int]:
     options = {"depth_confidence": -1, "width_confidence": -1} | options
     network = LightGlue(None, input_dim=inputs, descriptor_dim=width, n_layers=layers, num_heads=heads, **options)
     network.load_state_dict({key: torch.tensor(array) for key, array in tensors.items()}, strict=False)
-    read = []
-    for head in network.log_assignment:
-        head.register_forward_hook(lambda _, __, result: read.append(result[0]))
+    return network.double().eval().requires_grad_(False)
+
+
+def as_tensors(features):
+    """What the public matcher takes of each image."""
+    import torch
+
     sides = [
         {"keypoints": one.keypoints, "descriptors": one.descriptors, "image_size": one.image_size} for one in features
     ]
-    sides = [{name: torch.tensor(array)[None].double() for name, array in side.items()} for side in sides]
-    with torch.inference_mode():
-        found = network.double().eval()({"image0": sides[0], "image1": sides[1]})
-    [scores] = read
-    return scores[0, :-1, :-1].numpy(), found["stop"]
+    return [{name: torch.tensor(array)[None].double() for name, array in side.items()} for side in sides]
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mfvpr.errors import InputError
+from mfvpr.lightglue import LightGlueMatching
 from mfvpr.models.lightglue import LightGlue
 from mfvpr.models.lightglue_assignment import assignment
 from mfvpr.types import per_keypoint
@@ -18,6 +19,7 @@ from mfvpr.weights.networks import blueprint, planned
 from mfvpr.weights.registry import entry_of
 from mfvpr.weights.tables import LIGHTGLUE
 from tests import checkpoints
+from tests.golden import make_lightglue_real
 from tests.golden.make_lightglue import DEPTH, GOLDEN, REAL, SEEDS, SIZES, SMALL, SURE, checkpoint, pair
 
 INPUTS = SMALL["inputs"]
@@ -35,6 +37,21 @@ def small(seed=0, sure=None, dtype=np.float32):
     plan = planned(partial(LightGlue, *SMALL.values()))
     model = plan.filled(convert(checkpoint(seed, sure), LIGHTGLUE, plan.shapes))
     return jax.jit(LightGlue.packed)(jax.tree.map(lambda leaf: leaf.astype(dtype), model))
+
+
+@pytest.fixture(scope="module")
+def real_golden():
+    return dict(np.load(make_lightglue_real.GOLDEN))
+
+
+@pytest.fixture(scope="module")
+def matcher():
+    """With the published weights."""
+    plan = blueprint(entry_of("aliked_lightglue"))
+    return LightGlueMatching.of(plan.filled(convert(read_checkpoint(checkpoints.LIGHTGLUE), LIGHTGLUE, plan.shapes)))
+
+
+match_one = jax.jit(lambda matcher, features0, features1: matcher(features0, features1))
 
 
 def as_double(features):
@@ -140,3 +157,16 @@ def test_older_names_of_the_published_tensors_are_known():
         convert(
             tensors | {"self_attn.0.Wqkv.bias": tensors["transformers.0.self_attn.Wqkv.bias"]}, LIGHTGLUE, plan.shapes
         )
+
+
+@pytest.mark.skipif(not checkpoints.LIGHTGLUE.is_file(), reason="no ../shared/weights: LightGlue's are not shipped")
+@pytest.mark.parametrize("name", make_lightglue_real.PAIRS)
+def test_photographs_are_matched_as_by_the_public_code(real_golden, matcher, name):
+    """The same pairs of keypoints with the same scores, whatever the padding."""
+    features0, features1 = (padded(one, 192) for one in make_lightglue_real.features(real_golden, name))
+    found = match_one(matcher, features0, features1)
+    real = np.asarray(found.mask)
+    pairs = np.stack([found.index0, found.index1], axis=1)[real]
+    np.testing.assert_array_equal(pairs, real_golden[f"{name}/matches"])
+    np.testing.assert_allclose(np.asarray(found.confidence)[real], real_golden[f"{name}/scores"], rtol=0, atol=1e-4)
+    assert len(pairs) > 20

@@ -1,0 +1,63 @@
+"""Makes lightglue_real.npz: ALIKED's features of photographs, and what the public code matches.
+
+    python -m tests.golden.make_lightglue_real CLONE WEIGHTS DATA
+
+CLONE is a clone of https://github.com/cvg/LightGlue, WEIGHTS the published ones for ALIKED, DATA a folder that has
+grief_season and corridor; aliked-n16 is installed. Numbers of features are kept, no image. The matcher runs in float64
+without pruning. The tests read the file without all of these but the weights.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from experiments.benchmark.real import FOLDERS, SIZE
+from mfvpr.data.images import read_image, resize
+from mfvpr.features.aliked import AlikedFeatures
+from mfvpr.types import Features
+from mfvpr.weights.checkpoint import read_checkpoint
+from mfvpr.weights.files import load_model
+from tests.golden.make_lightglue import as_tensors, public
+
+GOLDEN = Path(__file__).parent / "lightglue_real.npz"
+KEYPOINTS = 160
+QUERIES = (20, 70)  # of each place, with their own database images
+PAIRS = [f"{place}/{query}" for place in FOLDERS for query in QUERIES]
+
+
+def features(golden: dict[str, np.ndarray], pair: str) -> list[Features]:
+    """Of both images."""
+    made = []
+    for side in "01":
+        keypoints, descriptors = (golden[f"{pair}/{name}{side}"] for name in ("keypoints", "descriptors"))
+        ones = np.ones(len(keypoints), np.float32)
+        size = np.array(SIZE, np.float32)
+        made.append(Features(keypoints, descriptors.astype(np.float32), ones, ones.astype(bool), size))
+    return made
+
+
+def main(clone: str, weights: str, data: str) -> None:
+    extractor = AlikedFeatures(load_model("aliked-n16"), image_size=SIZE, max_keypoints=KEYPOINTS)  # pyright: ignore[reportArgumentType]
+    network, golden = public(clone, read_checkpoint(Path(weights))), {}
+    for pair in PAIRS:
+        place, query = pair.split("/")
+        for side, folder in zip("01", reversed(FOLDERS[place]), strict=True):
+            path = sorted((Path(data) / place / folder).iterdir(), key=lambda one: (len(one.name), one.name))[
+                int(query)
+            ]
+            [described] = extractor(resize(read_image(path), SIZE)[None])
+            found = described.features
+            golden[f"{pair}/keypoints{side}"] = np.asarray(found.keypoints)[np.asarray(found.mask)]
+            golden[f"{pair}/descriptors{side}"] = np.asarray(found.descriptors)[np.asarray(found.mask)].astype(
+                np.float16
+            )
+        matched = as_tensors(features(golden, pair))
+        result = network({"image0": matched[0], "image1": matched[1]})
+        golden[f"{pair}/matches"] = result["matches"][0].numpy().astype(np.int32)
+        golden[f"{pair}/scores"] = result["scores"][0].numpy().astype(np.float32)
+    np.savez_compressed(GOLDEN, **golden)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
