@@ -40,9 +40,11 @@ def choices(group: str) -> list[str]:
 
 
 def choices_with(group: str, name: str) -> list[str]:
-    """The choices of a group that have a setting, but for those that are made of other choices."""
+    """The choices of a group that have a setting, but for those that are made of other choices, or other scores' with
+    another value."""
     files = (CONF / group / f"{choice}.yaml" for choice in choices(group))
-    return [file.stem for file in files if name in _read(file) and not defaults(file)]
+    own = (file for file in files if _read(file).get("method", file.stem) == file.stem)
+    return [file.stem for file in own if name in _read(file) and not defaults(file)]
 
 
 def check_choice(name: str, value: str, config: str) -> None:

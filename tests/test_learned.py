@@ -134,7 +134,7 @@ def refused(tmp_path, monkeypatch, capsys):
         (["features=aliked", "features.weights=alikd-n16"], "expected weights of aliked: one of"),
         (["matching=lightglue"], "install it: python -m experiments.weights download aliked_lightglue"),
         (["features=aliked", "features.clahe_clip=2"], "features.clahe_clip: unknown setting"),
-        (["system=mix_hist_20"], "system=mix_hist_20: expected one of mix_hist_10, mix_hist_50"),
+        (["system=mix_hist_20"], "system=mix_hist_20: expected one of mfvpr, mix_hist_10, mix_hist_50"),
         (["features.interpolation=torch_bilinear"], "SIFT takes whole numbers"),
         (["features=d2net", "features.preprocessing=vgg"], "expected one of caffe, torch"),
     ],
