@@ -12,13 +12,14 @@ from experiments.settings import SettingsError
 from mfvpr.data.files import write_text
 from mfvpr.data.sequences import own_rows
 from mfvpr.evaluations import Stopwatch
-from mfvpr.fingerprints import fingerprint
+from mfvpr.fingerprints import fingerprint, recipe_of
+from mfvpr.learned_weight import ABSOLUTE, RELATIVE
 from mfvpr.learning.comparison import Checkpoints, compare
 from mfvpr.learning.data_sets import Part, joined
 from mfvpr.learning.losses import LOSSES
-from mfvpr.learning.match_weight import ABSOLUTE, RELATIVE
 from mfvpr.learning.teaching import Options
 from mfvpr.report import comparisons, runs
+from mfvpr.scoring import Scorer
 
 _INPUTS = {"relative": RELATIVE, "absolute": ABSOLUTE}
 
@@ -43,7 +44,7 @@ def learn(settings: dict[str, Any]) -> None:
             _check_apart(sets[:taught], sets[taught:])
             whole = joined(*([one.part for one in some] for some in (sets[:taught], sets[taught:])))
         with watch("learning"):
-            options = {"checkpoints": _checkpoints(settings, whole, sets), "track": console.track}
+            options = {"checkpoints": _checkpoints(settings, varied.scorer, whole, sets), "track": console.track}
             data = varied, whole.judge, whole.match_set, whole.candidates
             comparison = compare(*data, how, **options)
         heading = _heading(settings, whole, sets)
@@ -112,14 +113,14 @@ def _options(settings: dict[str, Any]) -> Options:
     )  # fmt: skip
 
 
-def _checkpoints(settings: dict[str, Any], whole: Part, sets: list[Prepared]) -> Checkpoints | None:
+def _checkpoints(settings: dict[str, Any], scorer: Scorer, whole: Part, sets: list[Prepared]) -> Checkpoints | None:
     """Where the trainings are kept, and what identifies them."""
     root = settings["checkpoints"] or settings["store"]
     if root is None:
         return None
-    names = ("scorer", "loss", "every", "patience", "batch", "learning_rate", "hidden", "inputs", "seed")
+    names = ("loss", "every", "patience", "batch", "learning_rate", "hidden", "inputs", "seed")
     recipe = {
-        "matches": [one.recipe for one in sets],
+        "matches": [one.recipe for one in sets], "scorer": recipe_of(scorer),
         "tolerances": settings["recall"], **{name: settings[name] for name in names},
         "filter_score": settings["fusion"]["filter_score"], "positives": whole.judge.fingerprint,
         "reported": dict(whole.judge.reported_sets),

@@ -72,6 +72,14 @@ def or_list(rule: Rule) -> Rule:
     return Rule(lambda value: rule.holds(value) or listed.holds(value), f"{rule.expected}, or a list of them")
 
 
+def or_file(rule: Rule, suffix: str) -> Rule:
+    """What a rule allows, or the path of a file that ends so."""
+    return Rule(
+        lambda value: rule.holds(value) or (isinstance(value, str) and value.endswith(suffix)),
+        f"{rule.expected}, or a file that ends in {suffix}",
+    )
+
+
 def axis(rule: Rule) -> Rule:
     """Values of a grid."""
     listed = list_of(rule)

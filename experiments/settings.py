@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from experiments.rules import Rule, axis, between, either, is_count, list_of, number, one_of, or_list
+from experiments.rules import Rule, axis, between, either, is_count, list_of, number, one_of, or_file, or_list
 
 CONF = Path(__file__).parent.parent / "conf"
 
@@ -195,10 +195,11 @@ def scorer_rules(file: Path) -> dict[str, dict[str, Rule]]:
     return found
 
 
-def _within(*, length: int = 0, optional: bool = False, **limits: list[Any]) -> Rule:
+def _within(*, length: int = 0, optional: bool = False, file: str = "", **limits: list[Any]) -> Rule:
     """The rule of `mfvpr.declaration.Parameter.limits`."""
     [(kind, values)] = limits.items()
     rule = {"choices": one_of, "whole": between, "number": number}[kind](*values)
+    rule = or_file(rule, file) if file else rule
     rule = list_of(rule, max(length, 0)) if length else rule
     return either(rule, None) if optional else rule
 

@@ -35,6 +35,7 @@ class Parameter:
         optional: None may be written as well.
         none: the field's value where None is written.
         named: the field's values by the words of `choices`.
+        file: how the name of a file ends that may be written in place of a word; "" = none may.
         swept: worth an axis of a sweep.
         learned: a gradient may change it.
         start: where learning starts if its own value is None; of the unit `SCORE` in units of the scores' spread.
@@ -50,6 +51,7 @@ class Parameter:
     optional: bool = False
     none: float | None = None
     named: Mapping[str, Any] | None = None
+    file: str = ""
     swept: bool = True
     learned: bool = False
     start: float = 1.0
@@ -57,13 +59,15 @@ class Parameter:
     @property
     def words(self) -> str:
         """The choices that are words, in a row."""
-        return ", ".join(one for one in self.choices if isinstance(one, str))
+        words = [one for one in self.choices if isinstance(one, str)]
+        return ", ".join([*words, f"FILE{self.file}"] if self.file else words)
 
     @property
     def limits(self) -> dict[str, Any]:
-        """What checks a plain value, itself plain: `choices`, `whole` or `number`; `length` and `optional` if given."""
+        """What checks a plain value, itself plain: `choices`, `whole` or `number`; what else is given."""
         kind = "choices" if self.choices else "whole" if self.whole else "number"
-        limits = {kind: list(self.choices or self.bounds), "length": self.length, "optional": self.optional}
+        limits = {kind: list(self.choices or self.bounds)}
+        limits |= {"length": self.length, "optional": self.optional, "file": self.file}
         return {name: limit for name, limit in limits.items() if limit}
 
     def value(self, plain: Any) -> Any:
@@ -116,9 +120,9 @@ def flag(default: bool, note: str = "") -> Any:
     return _field(default, Parameter(default, note=note, choices=(True, False)), static=True)
 
 
-def named(values: Mapping[str, Any], default: str, note: str = "") -> Any:
-    """One of the values of a table, written as its name."""
-    return _field(values[default], Parameter(default, note=note, choices=tuple(values), named=values))
+def named(values: Mapping[str, Any], default: str, note: str = "", *, file: str = "") -> Any:
+    """One of the values of a table, written as its name; of files that end so, too, if the table reads them."""
+    return _field(values[default], Parameter(default, note=note, choices=tuple(values), named=values, file=file))
 
 
 def declared(method: Any) -> dict[str, Parameter]:

@@ -14,9 +14,10 @@ from experiments.settings import CONF
 from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, value
 from mfvpr.declaration import check_choices, choice, declared, flag, made, named, number, numbers, whole
 from mfvpr.learning.parameters import can_learn, starts
+from mfvpr.named_weights import NAMED_WEIGHTS, SUFFIX
 from mfvpr.scoring import ALONE, SCORERS, match_shifts
 from mfvpr.types import Array, Matches
-from mfvpr.weighting import WEIGHTS, UnitWeight, Weight, match_weights
+from mfvpr.weighting import UnitWeight, Weight, match_weights
 from tests.programs import ROOT, results, shared, small, typed
 
 
@@ -28,7 +29,7 @@ class Nearness:
     most: float | Array | None = number(None, "px", "None = all", bounds=(1, 500))
     rounds: int = whole(2, "iterations", bounds=(1, 9))
     norm: str = choice("sum", "largest", note="of x and y")
-    weight: Weight = named(WEIGHTS, "unit")
+    weight: Weight = named(NAMED_WEIGHTS, "unit", file=SUFFIX)
     size: tuple[float, float] | None = numbers(None, 2, "[x, y] px", "None = any")
     strict: bool = flag(False)
     inner: tuple = ()  # no setting
@@ -50,10 +51,10 @@ radius: 30.0  # px
 most: null  # px; null = all
 rounds: 2  # iterations
 norm: sum  # of x and y; sum, largest
-weight: unit  # WEIGHTS
+weight: unit  # WORDS
 size: null  # [x, y] px; null = any
 strict: false
-""".replace("WEIGHTS", ", ".join(WEIGHTS))
+""".replace("WORDS", ", ".join([*NAMED_WEIGHTS, "FILE.json"]))
 
 
 @pytest.fixture
@@ -103,7 +104,7 @@ def test_conf_and_help_follow_from_the_class(near, monkeypatch, capsys):
     assert f"\n  scorer=near             {others}\n" in stdout
     assert "\n  radius: null  # near: px\n" in stdout
     assert "\n  norm: null  # near: sum, largest\n" in stdout
-    assert f"\n  weight: null  # sum, anchor, histogram, near: {', '.join(WEIGHTS)}\n" in stdout
+    assert f"\n  weight: null  # sum, anchor, histogram, near: {', '.join(NAMED_WEIGHTS)}, FILE.json\n" in stdout
     assert "\n  size: null\n" not in stdout[stdout.index("\ngrid:") :]
     assert "\n  near:\n    # A scorer" in typed(monkeypatch, capsys, "evaluate", "--help", "scorer=all")[1]
 
@@ -116,7 +117,7 @@ def test_conf_and_help_follow_from_the_class(near, monkeypatch, capsys):
         ("evaluate", ["scorer=all", "scorer.near.most=501"], "near.most=501: expected a number from 1 to 500, or null"),
         ("evaluate", ["scorer=near", "scorer.rounds=10"], "scorer.rounds=10: expected a whole number from 1 to 9"),
         ("evaluate", ["scorer=near", "scorer.norm=both"], "scorer.norm=both: expected one of sum, largest"),
-        ("evaluate", ["scorer=near", "scorer.weight=heavy"], f"expected one of {', '.join(WEIGHTS)}"),
+        ("evaluate", ["scorer=near", "scorer.weight=heavy"], ", or a file that ends in .json"),
         ("evaluate", ["scorer=near", "scorer.size=[1]"], "size=[1]: expected a list of 2, each a number above 0"),
         ("evaluate", ["scorer=near", "scorer.strict=1"], "scorer.strict=1: expected one of true, false"),
         ("evaluate", ["scorer=near", "scorer.radios=1"], "unknown setting; the nearest is scorer.radius"),
@@ -144,7 +145,7 @@ def test_all_scores_contain_it(near):
         )
     assert [*found] == [name for name in SCORERS if name not in ALONE]
     assert found["near"] == Nearness(size=(1.0, 2.0), norm="largest")
-    assert found["near"].weight is WEIGHTS["unit"]
+    assert found["near"].weight is NAMED_WEIGHTS["unit"]
 
 
 def test_its_parameters_are_swept(near, tmp_path_factory, tmp_path, monkeypatch, capsys):

@@ -12,7 +12,7 @@ from experiments import evaluation, learning, search
 from mfvpr.learning import checkpoints, teaching
 from mfvpr.learning.splits import TrainingSplit
 from mfvpr.learning.training import Fit, Record
-from mfvpr.learning.weight_files import read_weight
+from mfvpr.weight_files import read_weight
 from tests.programs import QUERIES, composed, results, shared, small, snapshot, typed
 
 SUM = ("scorer=sum",)

@@ -8,9 +8,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from mfvpr.learned_weight import LearnedWeight
 from mfvpr.learning import losses
 from mfvpr.learning.losses import Loss
-from mfvpr.learning.match_weight import LearnedWeight
 from mfvpr.learning.parameters import from_logarithms, starts, to_logarithms
 from mfvpr.learning.splits import Batch
 from mfvpr.numerics import masked_mean

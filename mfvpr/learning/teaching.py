@@ -7,8 +7,8 @@ import jax
 import numpy as np
 import optax
 
+from mfvpr.learned_weight import RELATIVE, LearnedWeight
 from mfvpr.learning.losses import Loss, cross_entropy
-from mfvpr.learning.match_weight import RELATIVE, LearnedWeight
 from mfvpr.learning.models import Model, Parameters
 from mfvpr.learning.splits import Batch, TrainingSplit
 from mfvpr.learning.training import Fit, fit

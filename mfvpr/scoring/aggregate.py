@@ -4,10 +4,11 @@ import jax
 import jax.numpy as jnp
 
 from mfvpr.declaration import check_choices, choice, flag, named, number
+from mfvpr.named_weights import NAMED_WEIGHTS, SUFFIX
 from mfvpr.numerics import masked, masked_mean, masked_median, positive, safe_sqrt, where_finite
 from mfvpr.scoring.shifts import image_sizes, match_shifts
 from mfvpr.types import Array, Matches, value
-from mfvpr.weighting import WEIGHTS, Weight, match_confidence, match_weights
+from mfvpr.weighting import Weight, match_confidence, match_weights
 
 
 @value
@@ -23,7 +24,7 @@ class AggregatedScore:
             the score is smooth in the points but for the median's. None is the paper's; not above 0 scores NaN.
     """
 
-    weight: Weight = named(WEIGHTS, "dmf")
+    weight: Weight = named(NAMED_WEIGHTS, "dmf", file=SUFFIX)
     mean: str = choice("unweighted", "weighted", "median")
     clamp: bool = flag(False)
     temperature: float | Array | None = number(None, "px", "above 0 is smooth; None = the paper's", learned=True)

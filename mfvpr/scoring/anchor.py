@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 
 from mfvpr.declaration import check_choices, choice, flag, named, number, whole
+from mfvpr.named_weights import NAMED_WEIGHTS, SUFFIX
 from mfvpr.numerics import at_least_single, masked, positive, safe_sqrt, where_finite
 from mfvpr.scoring.shifts import image_sizes
 from mfvpr.types import Array, Matches, value
-from mfvpr.weighting import WEIGHTS, Weight, match_confidence, match_weights
+from mfvpr.weighting import Weight, match_confidence, match_weights
 
 MAX_BINS = 215  # per side: pairs of cells are then still numbers of 32 bits
 _LEAST_SHARE = 1e-12  # of the winner's votes, below which a target has none: keeps the logarithm's gradient finite
@@ -50,7 +51,7 @@ class AnchorPoints:
     num_bins: int = whole(15, "cells per side", bounds=(1, 32))  # the soft form's memory
     window: float | Array = number(10.0, "cells")
     tolerance: float | Array = number(3.0, "cells", learned=True)
-    weight: Weight = named(WEIGHTS, "fs")
+    weight: Weight = named(NAMED_WEIGHTS, "fs", file=SUFFIX)
     window_mode: str = choice("half_floor", "asymmetric", "odd_down", "radius")
     first: str = choice("query", "candidate")
     include_self: bool = flag(True)

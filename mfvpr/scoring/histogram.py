@@ -15,13 +15,14 @@ import numpy as np
 
 from mfvpr.declaration import SCORE, check_choices, choice, flag, named, number, numbers, several, whole
 from mfvpr.errors import InputError
+from mfvpr.named_weights import NAMED_WEIGHTS, SUFFIX
 from mfvpr.numerics import compiled, is_concrete, positive, round_up
 from mfvpr.scoring.intervals import mass_interval
 from mfvpr.scoring.lattice import Lattice, bins, climb, mapped, of_all_bins, smooth_tallest, tallest, votes
 from mfvpr.scoring.shifts import are_numbers, image_sizes, match_shifts, where_usable, zoomed
 from mfvpr.scoring.tallest import tallest_bins
 from mfvpr.types import Array, Matches, value
-from mfvpr.weighting import WEIGHTS, Weight, match_weights
+from mfvpr.weighting import Weight, match_weights
 
 MAX_BINS = 1024  # per axis, where nobody asks for more: the histograms of 50 pairs then take 200 MB
 
@@ -70,7 +71,7 @@ class HistogramOfShifts:
 
     bin_size: float | Array = number(15.0, "px")
     sigma: float | Array = number(22.5, "px", learned=True)
-    weight: Weight = named(WEIGHTS, "fs")
+    weight: Weight = named(NAMED_WEIGHTS, "fs", file=SUFFIX)
     truncate: float | Array = number(math.inf, "sigmas", "vote only within so many; None = for all bins")
     shift_range: tuple[float, float] | None = numbers(
         None, 2, "[x, y] px", "None = all possible shifts", bounds=(0.0, 1e12)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, InputError, MatchCount, score_candidates
+from mfvpr.learned_weight import ABSOLUTE
 from mfvpr.learning import comparison
 from mfvpr.learning.comparison import Options, start
 from mfvpr.learning.losses import LOSSES, cross_entropy, mean_loss
-from mfvpr.learning.match_weight import ABSOLUTE
 from mfvpr.learning.models import Model
 from mfvpr.sweeping import Axes
 from mfvpr.sweeping.search import untracked_stages

@@ -9,7 +9,7 @@ import optax
 import pytest
 
 from mfvpr import AggregatedScore, HistogramOfShifts, RatioWeight
-from mfvpr.learning.match_weight import RELATIVE, LearnedWeight
+from mfvpr.learned_weight import RELATIVE, LearnedWeight
 from mfvpr.learning.models import Model
 from mfvpr.learning.splits import Batch
 from mfvpr.learning.teaching import TEACHER_SIGMA, Options, of_matches

@@ -9,8 +9,8 @@ import optax
 import pytest
 
 from mfvpr import HistogramOfShifts, InputError, score_candidates
+from mfvpr.learned_weight import ABSOLUTE, LearnedWeight
 from mfvpr.learning.losses import cross_entropy, mean_loss
-from mfvpr.learning.match_weight import ABSOLUTE, LearnedWeight
 from mfvpr.learning.parameters import from_logarithms, to_logarithms
 from mfvpr.learning.training import TrainingError, fit
 from tests.builders import make_matches

@@ -11,8 +11,9 @@ import numpy as np
 
 from mfvpr.data.files import write_text
 from mfvpr.errors import InputError
-from mfvpr.learning.match_weight import INPUTS, LearnedWeight
+from mfvpr.learned_weight import INPUTS, LearnedWeight
 
+SUFFIX = ".json"
 _FORMAT = "mfvpr match weight 1"
 
 

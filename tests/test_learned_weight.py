@@ -11,7 +11,7 @@ import pytest
 from jax.test_util import check_grads
 
 from mfvpr import AggregatedScore, HistogramOfShifts, InputError, Matches, UnitWeight, score_candidates
-from mfvpr.learning.match_weight import ABSOLUTE, INPUTS, RELATIVE, LearnedWeight
+from mfvpr.learned_weight import ABSOLUTE, INPUTS, RELATIVE, LearnedWeight
 from mfvpr.weighting import match_weights
 from tests.builders import make_matches, per_match, random_matches
 
