@@ -104,7 +104,7 @@ def heading(outcome: Outcome) -> str:
         f"{dataset.name}: {queries} queries{several}{_skipped(bad_queries)}, "
         f"{len(dataset.database)} database images{_skipped(bad_database)}, "
         f"{_num_candidates(outcome)} candidates ({settings['retrieval']['name']}), "
-        f"{settings['features']['name']} features{check}; {truth.in_words(settings, dataset)}"
+        f"{settings['features']['name']} features{check}; {truth.in_words(truth.described(settings, dataset))}"
     )
 
 

@@ -133,7 +133,7 @@ def _checkpoints(settings: dict[str, Any], scorer: Scorer, whole: Part, sets: li
 def _heading(settings: dict[str, Any], whole: Part, sets: list[Prepared]) -> str:
     judge = whole.judge
     what = f"{settings['scorer']['method']} score, {settings['features']['name']} features"
-    right = truth.in_words(settings, sets[0].images.dataset)
+    right = truth.in_words(*(one.described for one in sets[len(sets) - (len(judge.reported_sets) or 1) :]))
     if report := judge.reported_sets:
         learned = ", ".join(one.part.name for one in sets[: len(sets) - len(report)])
         return f"{learned}: {what}; what was learned here is reported on {', '.join(report)}; {right}"

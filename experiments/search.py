@@ -67,11 +67,12 @@ def _kept(settings: dict[str, Any], tools: prepare.Tools, images: prepare.Images
 
 def _heading(settings: dict[str, Any], images: prepare.Images, outcome: Outcome) -> str:
     dataset, features = images.dataset, settings["features"]
+    right = truth.in_words(truth.described(settings, dataset))
     size = " at {} x {} px".format(*features["image_size"]) if features["image_size"] else ""  # files may have others
     return (
         f"{dataset.name}: {len(dataset.queries)} queries, {outcome.judge.views[0].shape[1]} candidates of "
         f"{len(dataset.database)} database images, {len(outcome.settings)} settings of the "
-        f"{settings['scorer']['method']} score, {features['name']} features{size}; {truth.in_words(settings, dataset)}"
+        f"{settings['scorer']['method']} score, {features['name']} features{size}; {right}"
     )
 
 

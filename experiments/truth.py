@@ -35,16 +35,18 @@ def described(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, Any]:
     return kind if truth is None else kind | {"unit": truth.unit, "thresholds": thresholds(settings, truth)}
 
 
-def in_words(settings: Mapping[str, Any], dataset: Dataset) -> str:
-    """The same for a heading."""
-    if dataset.sequences[0].truth is None:
+def in_words(*described: Mapping[str, Any]) -> str:
+    """The same for a heading, of data sets whose thresholds are one."""
+    first = described[0]
+    if "unit" not in first:
         return "no ground truth: rankings only"
-    description = described(settings, dataset)
-    files = ", ".join(dict.fromkeys(description["files"]))
-    source = ("labels in " if description["kind"] == "label" else "") + files or _WORDS.get(
-        description["kind"], description["kind"]
-    )
-    if description["unit"] == "exact":
+    source = ", ".join(dict.fromkeys(map(_source, described)))
+    if first["unit"] == "exact":
         return f"recall in %, ground truth: {source}"
-    within = ", ".join(f"{threshold:g}" for threshold in description["thresholds"])
-    return f"recall in %, within {within} {description['unit']} of the ground truth: {source}"
+    within = ", ".join(f"{threshold:g}" for threshold in first["thresholds"])
+    return f"recall in %, within {within} {first['unit']} of the ground truth: {source}"
+
+
+def _source(described: Mapping[str, Any]) -> str:
+    kind, files = described["kind"], ", ".join(dict.fromkeys(described["files"]))
+    return ("labels in " if kind == "label" else "") + (files or _WORDS.get(kind, kind))
