@@ -16,7 +16,7 @@ from mfvpr.declaration import made
 from mfvpr.learned_weight import RELATIVE, LearnedWeight
 from mfvpr.named_weights import NAMED_WEIGHTS
 from mfvpr.weight_files import read_weight, write_weight
-from mfvpr.weighting import WEIGHTS, match_weights
+from mfvpr.weighting import WEIGHTS
 from tests.builders import random_matches
 from tests.programs import results, shared, small, typed
 
@@ -49,7 +49,7 @@ def test_what_ships_says_how_it_was_made_and_weighs(name):
     weight = NAMED_WEIGHTS[name]
     assert weight is NAMED_WEIGHTS[name]
     assert weight.names == RELATIVE
-    weights = np.asarray(match_weights(weight, MATCHES))[np.asarray(MATCHES.mask)]
+    weights = np.asarray(weight(MATCHES))[np.asarray(MATCHES.mask)]
     assert (weights > 0).all()
     assert weights.std() > 0.01
     path = Path(mfvpr.__file__).parent / "learned" / f"{name}.json"

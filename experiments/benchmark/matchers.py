@@ -34,6 +34,7 @@ from mfvpr.features.aliked import AlikedFeatures
 from mfvpr.features.vlad import VladFitting
 from mfvpr.filters import Retrieval
 from mfvpr.matchers import Matcher
+from mfvpr.named_weights import NAMED_WEIGHTS
 from mfvpr.numerics import available_cpus
 from mfvpr.report.runs import versions
 from mfvpr.report.tables import Table
@@ -61,6 +62,7 @@ SCORERS: dict[str, dict[str, Scorer]] = {  # by matcher
         "homography": Homography(),
         "histogram, FS": HistogramOfShifts(),
         "histogram, 1 - ratio": HistogramOfShifts(weight=RatioWeight()),
+        "histogram, learned": HistogramOfShifts(weight=NAMED_WEIGHTS["learned_aliked"]),  # on drawn streets
     },
     "LightGlue": {
         "count": Unweighted(MatchCount()),
