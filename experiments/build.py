@@ -17,13 +17,16 @@ from mfvpr.features import Aggregated, Extractor
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
 from mfvpr.filters import Filter, Retrieval
+from mfvpr.fingerprints import fingerprint, recipe_of
 from mfvpr.frame_correlation import FrameCorrelation
 from mfvpr.imported import DescriptorFiles, FeatureFiles, File, ShortlistFiles
 from mfvpr.lightglue import LightGlueMatching
 from mfvpr.matchers import Matcher, Matching
+from mfvpr.named_weights import NAMED_WEIGHTS
 from mfvpr.rankings import Fusion
 from mfvpr.retrieval import ExactSearch, WhitenedSearch
 from mfvpr.scoring import SCORERS, Scorer
+from mfvpr.weighting import WEIGHTS
 
 
 def expanded(path: str) -> Path:
@@ -189,6 +192,16 @@ def _network(group: str, name: str, weights: str | None) -> Any:
 def by_scorer(settings: Mapping[str, Any]) -> Mapping[str, Any]:
     """The settings of the chosen scorer, or of all of a group, by name."""
     return {settings["method"]: settings} if "method" in settings else settings
+
+
+def described(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """The settings of scorers by name, with the content of a learned match weight, as a file may change."""
+    return {
+        name: {**values, "weight_content": fingerprint(recipe_of(NAMED_WEIGHTS[values["weight"]]))}
+        if values.get("weight", "fs") not in WEIGHTS
+        else {**values}
+        for name, values in by_scorer(settings).items()
+    }
 
 
 def scorers(settings: Mapping[str, Any]) -> dict[str, Scorer]:

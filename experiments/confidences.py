@@ -28,20 +28,56 @@ def read(settings: Mapping[str, Any]) -> Given | None:
     return None if path is None else Given(path, *read_confidences(build.expanded(path)))
 
 
-def check(given: Given | None, headline: str, settings: Mapping[str, Any], images: Images) -> None:
-    """Refuse a file that does not know the system that decides; say that one of these very images flatters, and what
-    the system had otherwise where it was fitted."""
+def check(given: Given | None, headline: str, settings: Mapping[str, Any], images: Images) -> Given | None:
+    """What of a file says something of this run; a file that does not know the system that decides is refused.
+
+    A line says that one of these very images flatters, what was otherwise where it was fitted, and which other systems
+    are left out because of that.
+    """
     if given is None:
-        return
+        return None
     if headline not in given.systems:
         raise SettingsError(f"confidence={given.path}: expected one of the system that decides, {headline}, got "
                             f"{', '.join(given.systems)}; make it with the same scorer, final and fusion")  # fmt: skip
     if given.made.get("data_fingerprint") == images.fingerprints:
         tell(f"warning: confidence={given.path} was fitted on these very images, so that it flatters")
-    before, now = (_of_system(one, headline) for one in (given.made.get("settings"), settings))
-    if other := [name for name in _NAMES if before.get(name) != now[name]]:
-        tell(f"warning: confidence={given.path} was fitted with other settings of {', '.join(other)}: p may mean "
-             "nothing here")  # fmt: skip
+    other = {name: _otherwise(given, name, settings, images) for name in given.systems}
+    if other[headline]:
+        tell(f"warning: confidence={given.path} was fitted with other settings of {', '.join(other[headline])}: p may "
+             "mean nothing here")  # fmt: skip
+    known = {name: one for name, one in given.systems.items() if {*other[name]} <= {*other[headline]}}
+    if left := [name for name in given.systems if name not in known]:
+        tell(f"confidence={given.path}: nothing is said of {', '.join(left)}, which had other settings there")
+    return given._replace(systems=known)
+
+
+def _otherwise(given: Given, system: str, settings: Mapping[str, Any], images: Images) -> list[str]:
+    """The settings that what was fitted depends on, and that were others."""
+    current = {**settings, "scorer": build.described(settings["scorer"])}
+    before, now = (_of_system(one, system) for one in (given.made.get("settings"), current))
+    names = [name for name in _NAMES if name != "candidates" and before.get(name) != now[name]]
+    counted = given.made.get("candidates") == candidates(settings, images)
+    within = right_within(settings, images)
+    return [
+        *names,
+        *([] if counted else ["candidates (as many as there were)"]),
+        *([] if within in (None, given.made.get("right_within")) else ["recall (what counts as right)"]),
+    ]
+
+
+def candidates(settings: Mapping[str, Any], images: Images) -> int:
+    """How many a query has at most."""
+    number = len(images.dataset.database)
+    return number if settings["candidates"] == "all" else min(settings["candidates"], number)
+
+
+def right_within(settings: Mapping[str, Any], images: Images) -> list[Any] | None:
+    """What counts as right, and its unit; None without ground truth."""
+    right = images.dataset.sequences[0].truth
+    if right is None:
+        return None
+    thresholds = truth.thresholds(settings, right)
+    return [thresholds[len(thresholds) // 2], right.unit]
 
 
 def _of_system(settings: Any, system: str) -> dict[str, Any]:
@@ -58,9 +94,10 @@ def made(settings: Mapping[str, Any], images: Images, judged: Judged) -> dict[st
         "dataset": images.dataset.name,
         "data_fingerprint": images.fingerprints,
         "queries": sum(len(sequence.images) for sequence in judged.sequences),
-        "right_within": judged.threshold if judged.thresholds else None,
+        "right_within": right_within(settings, images),
+        "candidates": candidates(settings, images),
         "ground_truth": truth.described(settings, images.dataset),
-        "settings": {name: settings[name] for name in _NAMES},
+        "settings": {name: settings[name] for name in _NAMES} | {"scorer": build.described(settings["scorer"])},
         "command": settings.get("command"),
         "versions": runs.versions(),
     }

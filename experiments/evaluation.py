@@ -58,18 +58,22 @@ def evaluated(settings: dict[str, Any]) -> Outcome:
     cohort, alone = settings["cohort"], [main]
     if cohort is not None and fusion.members(main) == [main]:
         alone.append(f"{main} + {COHORT}")
-    confidences.check(confidence, headline, settings, images)
+    fusions = {name: fusion.renamed(main, name) for name in alone}
+    confidence = confidences.check(confidence, headline, settings, images)
     result = evaluations.evaluate(
         images.dataset, tools.extractor, tools.filter, scorers, candidates=settings["candidates"],
-        matching=tools.matching, fused=dict.fromkeys(alone, fusion), cohort=cohort,
+        matching=tools.matching, fused=fusions, cohort=cohort,
         correlated={headline: frames} if frames else {}, ties=settings["ties"], archive=tools.archive, watch=watch,
         **tools.where,
     )  # fmt: skip
-    own, members = {**build.by_scorer(settings["scorer"])}, fusion.members(main)
+    own, members = build.described(settings["scorer"]), fusion.members(main)
     if cohort is not None:
         own |= {f"{name} + {COHORT}": values | {"cohort": cohort} for name, values in own.items()}
     of_members = own[main] if members == [main] else {name: own[name] for name in members}
-    fused = {fusion.system(name): (of_members if name == main else own[name]) | settings["fusion"] for name in alone}
+    fused = {
+        how.system(name): (of_members if name == main else own[name]) | settings["fusion"]
+        for name, how in fusions.items()
+    }
     parameters = {FILTER: {}, **own, **fused}
     if frames:
         parameters[f"{headline} + {FRAMES}"] = parameters[headline] | asdict(frames)
@@ -121,7 +125,7 @@ def write(folder: Path, outcome: Outcome) -> None:
     write_gains(folder, outcome.judged)
     write_confidence(folder, outcome.assured, confidences.made(outcome.settings, outcome.images, outcome.judged))
     if outcome.histogram is not None:
-        write_shifts(folder, outcome.judged, outcome.histogram)
+        write_shifts(folder, outcome.judged, outcome.histogram, outcome.assured.refused_of_headline)
     write_skipped(folder, outcome.judged.result)
 
 

@@ -38,19 +38,21 @@ def learn(settings: dict[str, Any]) -> None:
     with run_folder.claimed(settings) as folder:
         varied, how, watch = learnable(settings), _options(settings), Stopwatch()
         sets = [_prepared(one, watch) for one in _each(settings)]
-        whole = sets[0].part
+        taught, reported, whole = sets, sets[:0], sets[0].part
         if settings["report"]:
-            taught = 1 + len(data_sets.composed("also", settings["also"]) if settings["also"] else [])
-            _check_apart(sets[:taught], sets[taught:])
-            whole = joined(*([one.part for one in some] for some in (sets[:taught], sets[taught:])))
+            others = len(data_sets.composed("report", settings["report"]))
+            taught, reported = sets[:-others], sets[-others:]
+            _check_apart(taught, reported)
+            whole = joined(*([one.part for one in some] for some in (taught, reported)))
         with watch("learning"):
             options = {"checkpoints": _checkpoints(settings, varied.scorer, whole, sets), "track": console.track}
             data = varied, whole.judge, whole.match_set, whole.candidates
             comparison = compare(*data, how, **options)
-        heading = _heading(settings, whole, sets)
+        heading = _heading(settings, whole, taught, reported)
         text = f"{heading}\n\n{comparisons.text(comparison)}"
         left_out = ("dataset", "store", "out", "checkpoints", "multirun", "command")
-        several = {"data_sets": [_about(one) for one in sets]} if settings["report"] else _about(sets[0])
+        several = {"data_sets": [*map(_about, taught)], "reported_sets": [*map(_about, reported)]}
+        several = several if reported else _about(sets[0])
         results = {
             **several, **comparisons.results(comparison),
             "settings": {name: value for name, value in settings.items() if name not in left_out},
@@ -66,7 +68,8 @@ def learn(settings: dict[str, Any]) -> None:
             write_text(new / "summary.txt", f"{text}\n")
 
         figures = comparisons.figures(comparison)
-        run_folder.leave(folder, settings, sets[0].described, text=text, write=write, figures=figures)
+        described = {one.part.name: one.described for one in reported} if reported else sets[0].described
+        run_folder.leave(folder, settings, described, text=text, write=write, figures=figures)
 
 
 def _each(settings: dict[str, Any]) -> Iterator[dict[str, Any]]:
@@ -89,13 +92,16 @@ def _prepared(settings: dict[str, Any], watch: Stopwatch) -> Prepared:
 
 
 def _check_apart(teach: list[Prepared], report: list[Prepared]) -> None:
-    """Refuse to report on images that were learned on."""
-    for one in teach:
-        for other in report:
-            sides = itertools.product(other.images.contents.values(), one.images.contents.values())
-            if same := sum(bool(rows) for pair in sides for rows in own_rows(*pair)):
-                raise SettingsError(f"report={other.part.name}: expected other images than those of {one.part.name}, "
-                                    f"which is learned on; {same} are the same")  # fmt: skip
+    """Refuse to report on images that were learned on, and queries that would count twice."""
+    for one, other in itertools.product(teach, report):
+        sides = itertools.product(other.images.contents.values(), one.images.contents.values())
+        if same := sum(bool(rows) for pair in sides for rows in own_rows(*pair)):
+            raise SettingsError(f"report={other.part.name}: expected other images than those of {one.part.name}, "
+                                f"which is learned on; {same} are the same")  # fmt: skip
+    for one, other in (pair for sets in (teach, report) for pair in itertools.combinations(sets, 2)):
+        if same := sum(map(bool, own_rows(*(each.images.contents["query"] for each in (other, one))))):
+            raise SettingsError(f"{other.part.name}: expected other queries than those of {one.part.name}; {same} are "
+                                "the same, and would count twice")  # fmt: skip
 
 
 def _about(one: Prepared) -> dict[str, Any]:
@@ -130,15 +136,14 @@ def _checkpoints(settings: dict[str, Any], scorer: Scorer, whole: Part, sets: li
     return Checkpoints(build.expanded(root) / own, recipe)
 
 
-def _heading(settings: dict[str, Any], whole: Part, sets: list[Prepared]) -> str:
-    judge = whole.judge
+def _heading(settings: dict[str, Any], whole: Part, taught: list[Prepared], reported: list[Prepared]) -> str:
     what = f"{settings['scorer']['method']} score, {settings['features']['name']} features"
-    right = truth.in_words(*(one.described for one in sets[len(sets) - (len(judge.reported_sets) or 1) :]))
-    if report := judge.reported_sets:
-        learned = ", ".join(one.part.name for one in sets[: len(sets) - len(report)])
-        return f"{learned}: {what}; what was learned here is reported on {', '.join(report)}; {right}"
-    reported = sum(len(half.report) for half in judge.halves)
+    right = truth.in_words(*(one.described for one in reported or taught))
+    if reported:
+        learned, told = (", ".join(one.part.name for one in sets) for sets in (taught, reported))
+        return f"{learned}: {what}; what was learned here is reported on {told}; {right}"
+    queries = sum(len(half.report) for half in whole.judge.halves)
     return (
-        f"{whole.name}: {what}; each of {reported} queries is reported on by what was learned on the other half of the "
+        f"{whole.name}: {what}; each of {queries} queries is reported on by what was learned on the other half of the "
         f"path; {right}"
     )

@@ -19,6 +19,7 @@ from mfvpr.features import Extractor, Source
 from mfvpr.filters import Filter
 from mfvpr.match_sets import MatchSet
 from mfvpr.matchers import Matcher
+from mfvpr.named_weights import how_made
 from mfvpr.types import Shortlist
 
 __all__ = ["Images", "Tools", "begun", "matched", "recipe"]
@@ -86,6 +87,7 @@ def _images(settings: dict[str, Any], archive: Archive) -> Images:
         sequences.append(sequence)
     images = Images(replace(dataset, sequences=tuple(sequences)), sides)
     _warn_of_images(settings, images, own)
+    _warn_of_weights(settings, images)
     return images
 
 
@@ -144,6 +146,20 @@ def _warn_of_images(settings: dict[str, Any], images: Images, own: list[OwnRows]
     deepest, available = max(settings["recall"]["ks"]), available if candidates == "all" else min(candidates, available)
     if deepest > available:
         tell(f"note: R@{deepest} is R@{available}, of the filter too: no more candidates are looked at")
+
+
+def _warn_of_weights(settings: dict[str, Any], images: Images) -> None:
+    """What a learned match weight was learned on, where that may give wrong numbers."""
+    chosen = {one.get("weight", "fs") for one in build.by_scorer(settings["scorer"]).values()}
+    for name in sorted(chosen | {*((settings.get("grid") or {}).get("weight") or ())}):
+        made = how_made(name)
+        seen = {folder for one in made.get("data_sets", [made]) for folder in one.get("data_fingerprint", {}).values()}
+        if seen & {*images.fingerprints.values()}:
+            tell(f"warning: weight={name} was learned on images of {images.dataset.name}, so that it flatters here")
+        before, now = (one.get("features", {}) for one in (made.get("settings", {}), settings))
+        if made and (other := [key for key in ("name", "weights") if before.get(key) != now.get(key)]):
+            words = ", ".join(f"{before.get(key)} instead of {now.get(key)}" for key in other)
+            tell(f"warning: weight={name} was learned with other features ({words}); it may mean nothing here")
 
 
 def _warn_of_sequence(settings: dict[str, Any], sequence: QuerySequence, own: OwnRows) -> None:

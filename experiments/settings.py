@@ -151,13 +151,17 @@ def check(settings: Mapping[str, Any]) -> None:
             raise SettingsError(f"{path}={_shown(value)}: expected {rule.expected}")
     _check_vocabulary(settings.get("retrieval", {}))
     features = settings.get("features", {})
-    if features.get("name") == "ssm" and features["image_size"] is None:
-        raise SettingsError("features.image_size=null: expected width and height for features=ssm, such as [336,336]")
+    if features.get("name") in ("sift", "ssm") and features["image_size"] is None:
+        raise SettingsError(f"features.image_size=null: expected width and height for features={features['name']}, "
+                            "such as [336,336]")  # fmt: skip
     if method == "grid":
         _check_cells(settings)
     if settings.get("also") and not settings["report"]:
         raise SettingsError(f"also={settings['also']}: expected report=DATASET,... as well, to learn on several data "
                             "sets and report on others")  # fmt: skip
+    for group in ("features", "retrieval") if settings.get("report") else ():
+        if (name := settings[group]["name"]) in ("import", "pairs"):
+            raise SettingsError(f"{group}={name}: expected none with report=, since the files are of one data set")
     if settings.get("report") and settings["split"] != "both":
         raise SettingsError(f"split={settings['split']}: expected none with report=, since the data sets are the split")
     fusion = settings.get("fusion", {})

@@ -143,7 +143,7 @@ def wrong_with(folder: ImageFolder, features: FeatureSet, bad: Mapping[int, str]
 def nan_scores(
     matched: Sequence[Matched], ranked: Sequence[Mapping[str, Ranked]], scorers: Iterable[str]
 ) -> Iterator[str]:
-    """Scorers of one's own may divide by 0.
+    """What says of scores that are no numbers: scorers of one's own may divide by 0.
 
     Args:
         matched: by sequence.
@@ -151,14 +151,17 @@ def nan_scores(
         scorers: the systems that are no sums of others, whose 0 may say that all are equal.
 
     Raises:
-        InputError: a scorer gives nothing but NaN, and 0 where nothing matches: its ranking would be another's.
+        InputError: a scorer gives no other number than 0, where nothing matches: its ranking would be another's.
     """
     for name in scorers:
         values = np.concatenate([systems[name].scores[systems[name].rows >= 0] for systems in ranked])
-        if np.isnan(values).any() and not values[~np.isnan(values)].any():
-            raise InputError(f"{name}: every score of a pair that has matches is NaN; check what the scorer expects of "
-                             "features and sizes")  # fmt: skip
+        if not np.isfinite(values).all() and not values[np.isfinite(values)].any():
+            raise InputError(f"{name}: every score of a pair that has matches is NaN or infinite; check what the "
+                             "scorer expects of features and sizes")  # fmt: skip
     for sequence, systems in zip(matched, ranked, strict=True):
         for name, system in systems.items():
-            if number := int(np.isnan(system.scores[system.rows >= 0]).sum()):
+            values = system.scores[system.rows >= 0]
+            if number := int(np.isnan(values).sum()):
                 yield f"{sequence.sequence.name}: {number} scores of {name} are NaN, and rank last"
+            if number := int(np.isinf(values).sum()):
+                yield f"{sequence.sequence.name}: {number} scores of {name} are infinite"

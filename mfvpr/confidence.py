@@ -21,7 +21,9 @@ Input = Literal["margin", "height", "filter", "score"]
 INPUTS: tuple[Input, ...] = ("margin", "height")  # by default
 APART = 5  # rows of the database, by default
 _LEAST_SPREAD = 1e-3  # of the first score: less is rounding
-_FORMAT = "mfvpr confidence 1"
+_PRIOR = 2  # candidates of other places whose scores spread as those of all candidates, beside those that there are
+_LEAST_WEIGHT = 1e-9  # of an input: less is where the search for it ended, and would order equal answers by rounding
+_FORMAT = "mfvpr confidence 2"
 
 
 def confidence_inputs(
@@ -30,7 +32,8 @@ def confidence_inputs(
     """What p(right) of the first answers is computed from, `[Q, F]`; NaN where there is no answer.
 
     margin: log(1 + how far the first score is above that of the best candidate of another place), in units of the
-        standard deviation of the scores of all candidates of other places; 0 where there are none.
+        standard deviation of the scores of all candidates of other places, of few of them drawn towards that of all
+        candidates; infinite where there are none, which says nothing.
     height: the same, above their mean.
     filter: minus the log of the best rank, from 1, that the filter gives to a candidate of the answer's place.
     score: inverse hyperbolic sine of the first score itself: not free of scale.
@@ -46,17 +49,24 @@ def confidence_inputs(
     there = (ranked.rows >= 0) & np.isfinite(ranked.scores)
     scores, first = np.where(there, ranked.scores, 0.0).astype(np.float64), ranked.rows[:, :1]
     others = there & (np.abs(ranked.rows - first) > apart)
-    count = np.maximum(others.sum(axis=1), 1)
-    mean = np.sum(scores, axis=1, where=others) / count
-    spread = np.sqrt(np.sum((scores - mean[:, None]) ** 2, axis=1, where=others) / count)
+    (count, mean, variance), (_, _, prior) = _moments(scores, others), _moments(scores, there)
+    spread = np.sqrt((count * variance + _PRIOR * prior) / (count + _PRIOR))
     spread = np.maximum(np.maximum(spread, _LEAST_SPREAD * np.abs(scores[:, 0])), np.finfo(np.float64).tiny)
     second = np.max(scores, axis=1, where=others, initial=-np.inf)
     near = (filtered.rows >= 0) & (np.abs(filtered.rows - first) <= apart)
     above = {"margin": scores[:, 0] - second, "height": scores[:, 0] - mean}
-    found = {name: np.where(others.any(axis=1), np.log1p(np.maximum(value, 0) / spread), 0.0)
+    found = {name: np.where(others.any(axis=1), np.log1p(np.maximum(value, 0) / spread), np.inf)
              for name, value in above.items()}  # fmt: skip
     found |= {"filter": -np.log1p(np.argmax(near, axis=1)), "score": np.arcsinh(scores[:, 0])}
     return np.where(there[:, :1], np.stack([found[name] for name in inputs], axis=1), np.nan)
+
+
+def _moments(scores: np.ndarray, where: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`[Q]` how many scores `[Q, C]` there are, their mean and variance, 0 of none."""
+    count = where.sum(axis=1)
+    mean = np.sum(scores, axis=1, where=where) / np.maximum(count, 1)
+    squares = np.sum((scores - mean[:, None]) ** 2, axis=1, where=where)
+    return count, mean, squares / np.maximum(count, 1)
 
 
 @dataclass(frozen=True)
@@ -84,8 +94,8 @@ class Confidence:
         return self.probability(confidence_inputs(ranked, filtered, inputs=self.inputs, apart=self.apart))
 
     def probability(self, inputs: np.ndarray) -> np.ndarray:
-        """`[Q]` of inputs `[Q, F]`."""
-        centered = (inputs - np.array(self.center)) / np.array(self.scale)
+        """`[Q]` of inputs `[Q, F]`; infinite ones say nothing, as if they were where the model was fitted."""
+        centered = (np.where(np.isinf(inputs), self.center, inputs) - self.center) / np.array(self.scale)
         return special.expit(centered @ np.array(self.weights) + self.bias)
 
 
@@ -98,7 +108,8 @@ def fit_confidence(
     half a right and half a wrong answer more are thought to be at the center.
 
     Args:
-        values: `[Q, F]` of `confidence_inputs`; rows of NaN, which have no answer, are left out.
+        values: `[Q, F]` of `confidence_inputs`; rows that are not finite, without an answer or without candidates of
+            other places, are left out.
         right: `[Q]` bool, of the first answers; of queries without a place in the database False.
         inputs: what the values are.
         apart: what they were computed with.
@@ -107,10 +118,10 @@ def fit_confidence(
     Raises:
         InputError: no answers.
     """
-    there = ~np.isnan(values).any(axis=1)
+    there = np.isfinite(values).all(axis=1)
     values, right = values[there], np.asarray(right, bool)[there]
     if not len(values):
-        raise InputError("confidence: expected answers to fit it on, got none")
+        raise InputError("confidence: expected answers to fit it on, with candidates of other places, got none")
     center, scale = values.mean(axis=0), values.std(axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     columns = np.column_stack([np.ones(len(values)), (values - center) / scale])
@@ -126,7 +137,7 @@ def fit_confidence(
     bounds = [(None, None), *[(0.0, None)] * values.shape[1]]
     options = {"ftol": 1e-13, "gtol": 1e-8, "maxiter": 1000}
     found = optimize.minimize(loss, np.zeros(len(bounds)), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-    bias, *weights = found.x.tolist()
+    bias, *weights = np.where(np.abs(found.x) > _LEAST_WEIGHT, found.x, 0.0).tolist()
     return Confidence(tuple(inputs), apart, tuple(center.tolist()), tuple(scale.tolist()), tuple(weights), bias)
 
 
@@ -148,7 +159,7 @@ def read_confidences(path: Path) -> tuple[dict[str, Confidence], dict[str, Any]]
         if found["format"] != _FORMAT:
             raise ValueError(f"format {found['format']!r}")
         return {name: _confidence(**one) for name, one in found["systems"].items()}, dict(found["made"])
-    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
         reason = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
         raise InputError(f"{path}: expected the confidence.json that an evaluation wrote ({reason}); evaluate images "
                          "with ground truth to make one") from error  # fmt: skip

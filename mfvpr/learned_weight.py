@@ -61,6 +61,9 @@ class LearnedWeight:
         Raises:
             InputError: the matches have no ratio, or there is no such input.
         """
+        if not names or isinstance(names, str) or len({*names}) < len(names):
+            raise InputError(f"LearnedWeight: expected different names of inputs, got {names}")
+        names = (*names,)
         if unknown := [name for name in names if name not in INPUTS]:
             raise InputError(f"LearnedWeight: unknown input {unknown[0]}; expected some of {', '.join(INPUTS)}")
         raw = np.asarray(jax.jit(_raw_inputs, static_argnums=1)(matches, names), np.float64)

@@ -11,13 +11,14 @@ from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mfvpr import pair_matching
 from mfvpr.errors import InputError
 from mfvpr.match_sets import MatchSet, Scales
 from mfvpr.matchers import NEIGHBORS, Matcher
-from mfvpr.numerics import Device, compiled, device_of
+from mfvpr.numerics import Device, at_least_single, compiled, device_of
 from mfvpr.progress import Track, untracked
 from mfvpr.reranking import BIN_STEP
 from mfvpr.scoring import HistogramOfShifts, ShiftHistogram
@@ -134,6 +135,8 @@ class Explanation:
         peak: `[2]` the refined peak between bin centers, px.
         weights: `[K]` of the matches.
         agrees: `[K]` whether a match's shift lies within two standard deviations of the peak along both axes.
+        scale: of the scorer's, at which all of this is.
+        direction: of the shifts, the scorer's.
     """
 
     histogram: ShiftHistogram
@@ -142,25 +145,29 @@ class Explanation:
     peak: Array
     weights: Array
     agrees: Array
+    scale: Array
+    direction: str
 
 
 def explain(scorer: HistogramOfShifts, matches: Matches) -> Explanation:
     """The parts of one pair's score, for figures and for steering; one program for all pairs."""
     fitted = fit(scorer, matches.image_size0, matches.image_size1, multiple=BIN_STEP)
-    return Explanation(*jax.tree.map(np.asarray, _explain(fitted, matches)))
+    return Explanation(*jax.tree.map(np.asarray, _explain(fitted, matches)), direction=scorer.direction)
 
 
 @compiled
 def _explain(scorer: HistogramOfShifts, matches: Matches) -> tuple[Any, ...]:
     shift, peak = scorer.dominant_shift(matches), scorer.dominant_shift(matches, refine=True)
     weights = match_weights(scorer.weight, matches)
-    return scorer.histogram(matches), scorer(matches), shift, peak, weights, scorer.agrees(matches, peak)
+    agrees, scale = scorer.agrees(matches, peak), scorer.dominant_scale(matches)
+    return scorer.histogram(matches), scorer(matches), shift, peak, weights, agrees, scale
 
 
 def dominant_shifts(
     scorer: HistogramOfShifts, match_set: MatchSet, queries: np.ndarray, places: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Refined dominant shifts `[n, 2]` of pairs and their 95 % intervals `[n, 2, 2]` (low, high), px; one program.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How far candidates show what is at the center of their queries from there, px: refined dominant shifts `[n, 2]`
+    (candidate minus query), their 95 % intervals `[n, 2, 2]` (low, high), and the scales `[n]`; one program.
 
     Args:
         scorer: whose histogram is taken.
@@ -169,28 +176,30 @@ def dominant_shifts(
         places: `[n]` of the candidates in their shortlists.
 
     Returns:
-        NaN where nothing matches.
+        NaN where nothing votes.
     """
     fitted = fit(scorer, *match_set.image_sizes, multiple=BIN_STEP)
-    shifts, intervals = [np.zeros((0, 2))], [np.zeros((0, 2, 2))]
+    parts = [(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))]
     for start in range(0, len(queries), SHIFTS_AT_ONCE):
         some = slice(start, start + SHIFTS_AT_ONCE)
         pairs = match_set.pairs(queries[some], places[some], match_set.capacity, total=SHIFTS_AT_ONCE)
         found = jax.tree.map(np.asarray, _dominant_shifts(fitted, pairs))
-        for parts, values in zip((shifts, intervals), found, strict=True):
-            parts.append(values[: len(queries[some])])
-    nothing = match_set.counts[queries, places] == 0
-    return (
-        np.where(nothing[:, None], np.nan, np.concatenate(shifts)),
-        np.where(nothing[:, None, None], np.nan, np.concatenate(intervals)),
-    )
+        parts.append(tuple(values[: len(queries[some])] for values in found))
+    shifts, intervals, scales = (np.concatenate(same) for same in zip(*parts, strict=True))
+    return shifts, intervals, scales
 
 
 @compiled
-def _dominant_shifts(scorer: HistogramOfShifts, matches: Matches) -> tuple[Array, Array]:
+def _dominant_shifts(scorer: HistogramOfShifts, matches: Matches) -> tuple[Array, Array, Array]:
     """Of matches `[P, K, ...]`."""
 
-    def of_pair(one: Matches) -> tuple[Array, Array]:
-        return scorer.dominant_shift(one, refine=True), scorer.shift_interval(one)
+    def of_pair(one: Matches) -> tuple[Array, Array, Array]:
+        scale, votes = scorer.dominant_scale(one), scorer(one) > 0
+        found = jnp.concatenate([scorer.dominant_shift(one, refine=True)[None], scorer.shift_interval(one)])
+        if scorer.direction == "query_minus_candidate":
+            found = -found[jnp.array([0, 2, 1])]
+        apart = (at_least_single(one.image_size1) - at_least_single(one.image_size0))[None] / 2  # of the centers
+        found = jnp.where(votes, apart + jnp.sqrt(scale) * (found - apart), jnp.nan)
+        return found[0], found[1:], jnp.where(votes, scale, jnp.nan)
 
     return jax.vmap(of_pair)(matches)

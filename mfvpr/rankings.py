@@ -1,7 +1,7 @@
 """Rankings of a sequence by every system: the filter alone, each scorer, and what is made of several scores."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -40,6 +40,10 @@ class Fusion:
     def members(self, main: str) -> list[str]:
         """Names of the scorers that take part, the main one first."""
         return [main, *(name for name in self.weights if name not in (main, FILTER))]
+
+    def renamed(self, main: str, name: str) -> "Fusion":
+        """The same of a main scorer of another name, such as one with a cohort."""
+        return replace(self, weights={name if key == main else key: weight for key, weight in self.weights.items()})
 
     def system(self, main: str) -> str:
         """The name of what is ranked, such as `histogram + filter`."""

@@ -143,6 +143,8 @@ def _standardized(scores: Array, mask: Array) -> Array:
     # Relative to one of them, equal scores have no spread that rounding would make.
     some = jax.lax.stop_gradient(jnp.max(masked(scores, finite, -jnp.inf)))
     values = masked(scores - jnp.where(jnp.isfinite(some), some, 0.0), finite)
+    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(values)))  # whose square may be no number
+    values = values / jnp.where((largest > 0) & jnp.isfinite(largest), largest, 1.0)
     mean, spread = masked_mean(values, finite), masked_std(values, finite)
     return jnp.where(finite, (values - mean) / jnp.where(spread > 0, spread, 1.0), scores)
 

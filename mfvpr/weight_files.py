@@ -39,19 +39,24 @@ def read_weight(path: Path) -> tuple[LearnedWeight, dict[str, Any]]:
         if content.pop("format") != _FORMAT:
             raise ValueError("another format")
         return _weight(content.pop("inputs"), content), dict(content["made"])
-    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         reason = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
         raise InputError(f"{path}: expected a match weight that experiments.learn wrote ({reason})") from error
 
 
 def _weight(names: list[str], content: Mapping[str, Any]) -> LearnedWeight:
-    arrays = {f.name: np.array(content[f.name], float) for f in fields(LearnedWeight) if f.name != "names"}
+    plain = {f.name: np.array(content[f.name]) for f in fields(LearnedWeight) if f.name != "names"}
+    if words := [name for name, values in plain.items() if values.dtype.kind not in "fi"]:
+        raise ValueError(f"{words[0]}: expected numbers")
+    with np.errstate(over="ignore"):
+        arrays = {name: values.astype(np.float32) for name, values in plain.items()}
     inputs, hidden = len(names), arrays["output"].size
     shapes = {"center": (inputs,), "scale": (inputs,), "hidden": (inputs, hidden), "hidden_bias": (hidden,),
               "output": (hidden,), "output_bias": ()}  # fmt: skip
     for name, shape in shapes.items():
         if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
             raise ValueError(f"{name} of shape {list(arrays[name].shape)}, expected finite numbers {list(shape)}")
-    if not {*names} <= {*INPUTS} or not names or arrays["scale"].min() <= 0:
+    known = isinstance(names, list) and {*names} <= {*INPUTS} and len({*names}) == len(names) > 0
+    if not known or arrays["scale"].min() < np.finfo(np.float32).tiny:
         raise ValueError(f"inputs {names}, scale {arrays['scale'].tolist()}")
     return LearnedWeight(**{name: jnp.asarray(values, dtype=float) for name, values in arrays.items()}, names=(*names,))

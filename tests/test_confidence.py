@@ -44,13 +44,15 @@ def test_inputs_are_those_of_loops_over_candidates(rankings, apart):
             assert np.isnan(found[query]).all()
             continue
         others = [score for row, score in zip(rows, scores, strict=True) if row >= 0 and abs(row - rows[0]) > apart]
-        spread = max(statistics.pstdev(others), 1e-3 * scores[0]) if others else 1
-        margin = math.log(1 + (scores[0] - max(others)) / spread) if others else 0
-        height = math.log(1 + (scores[0] - statistics.fmean(others)) / spread) if others else 0
+        every = [score for row, score in zip(rows, scores, strict=True) if row >= 0]
+        squares = sum((score - statistics.fmean(others)) ** 2 for score in others) if others else 0
+        spread = math.sqrt((squares + 2 * statistics.pvariance(every)) / (len(others) + 2))
+        margin = math.log(1 + (scores[0] - max(others)) / spread) if others else math.inf
+        height = math.log(1 + (scores[0] - statistics.fmean(others)) / spread) if others else math.inf
         place = [row >= 0 and abs(row - rows[0]) <= apart for row in filtered.rows[query].tolist()]
         expected = [margin, height, -math.log(1 + place.index(True)), math.asinh(scores[0])]
         np.testing.assert_allclose(found[query], expected, rtol=1e-9)
-    assert (found[4, :2] == 0).all() == (apart == 5)
+    assert np.isinf(found[4, :2]).all() == (apart == 5)
 
 
 def test_margins_and_heights_have_no_unit(rankings):
@@ -71,8 +73,25 @@ def test_scores_that_are_all_equal_are_sure_of_nothing():
     rows = np.arange(20)[None]
     same = Ranked(rows, np.full((1, 20), 7.0))
     assert confidence_inputs(same, same).tolist() == [[0.0, 0.0]]
-    alone = Ranked(rows, np.where(rows == 0, 7.0, 3.0))  # above scores without a spread: a thousandth of its own
-    np.testing.assert_allclose(confidence_inputs(alone, alone), np.log1p(4 / 7e-3))
+    alone = Ranked(rows, np.where(rows == 0, 7.0, 3.0))  # above 14 of other places without a spread of their own
+    spread = math.sqrt(2 * 16 * 0.05 * 0.95 / 16)
+    np.testing.assert_allclose(confidence_inputs(alone, alone), np.log1p(4 / spread))
+
+
+@pytest.mark.parametrize("others", [1, 2])
+def test_few_candidates_of_other_places_make_no_answer_certain(others):
+    """Fitted on many candidates; a little above one other image, whose score has no spread, is not far above it."""
+    rng = np.random.default_rng(0)
+    scores = -np.sort(-rng.normal(2.0, 0.2, (200, 50)), axis=1)
+    right = rng.random(200) < 0.5
+    scores[:, 0] = np.where(right, 3.0, scores[:, 0])
+    rows = np.concatenate([np.zeros((200, 1)), 10 * np.arange(1, 50) + np.zeros((200, 1))], axis=1).astype(int)
+    many = Ranked(rows, scores)
+    model = fit_confidence(confidence_inputs(many, many), right)
+    few = Ranked(np.array([[0, 100, 200][: 1 + others]]), np.array([[2.2, 2.0, 1.8][: 1 + others]]))
+    assert 0.02 < model(few, few)[0] < 0.7
+    place = Ranked(np.arange(4)[None], np.array([[2.2, 2.1, 2.0, 1.9]]))  # no other place: what is known of all answers
+    assert model(place, place)[0] == pytest.approx(special.expit(model.bias))
 
 
 def drawn(weights, bias, queries=4000, seed=1):
@@ -137,7 +156,7 @@ def test_what_is_written_is_read(rankings, tmp_path):
 
 def broken(**changes):
     one = {"inputs": ["margin"], "apart": 5, "center": [0.0], "scale": [1.0], "weights": [1.0], "bias": 0.0}
-    return {"format": "mfvpr confidence 1", "made": {}, "systems": {"histogram": one | changes}}
+    return {"format": "mfvpr confidence 2", "made": {}, "systems": {"histogram": one | changes}}
 
 
 @pytest.mark.parametrize(

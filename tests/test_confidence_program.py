@@ -80,8 +80,12 @@ def test_below_the_threshold_the_answer_is_no_place(evaluate):
     first, *_ = evaluate("first")
     systems, made = read_confidences(first / "confidence.json")
     assert tuple(systems) == SYSTEMS
-    assert (made["queries"], made["right_within"], made["ground_truth"]["thresholds"]) == (QUERIES, 1, [0, 1])
-    given = (f"confidence={first}/confidence.json", "threshold=0.8")
+    assert (made["queries"], made["right_within"], made["ground_truth"]["thresholds"]) == (
+        QUERIES,
+        [1, "frames"],
+        [0, 1],
+    )
+    given = (f"confidence={first}/confidence.json", "threshold=0.4")
     out, code, stdout, stderr = evaluate("second", *given)
     assert code == 0, stderr
     assert "was fitted on these very images, so that it flatters" in stderr
@@ -90,7 +94,7 @@ def test_below_the_threshold_the_answer_is_no_place(evaluate):
     assert header.endswith("right  wrong  refused  of these right")
     answers = rows(out / "answers.csv")
     probability, score = (np.array([float(line[name]) for line in answers]) for name in ("p", "score"))
-    refused = probability < 0.8
+    refused = probability < 0.4
     assert 0 < refused.sum() < QUERIES
     assert score[~refused].mean() > score[refused].mean()
     assert [line["answer"] == "no place" for line in answers] == refused.tolist()
@@ -177,3 +181,18 @@ def test_confidence_of_other_settings_is_said(evaluate):
     _, code, _, stderr = evaluate("third", *given, "scorer=paper")
     assert code == 0, stderr
     assert "other settings" not in stderr  # the histogram is the same beside others
+
+
+def test_confidence_of_what_counted_otherwise_is_said(evaluate):
+    first, *_ = evaluate("first", "figures=0", "scorer=paper")
+    given = (f"confidence={first}/confidence.json", "figures=0", "scorer=paper")
+    for changed, words in (("recall.tolerances=[0]", "recall (what counts as right)"),
+                           ("candidates=5", "candidates (as many as there were)")):  # fmt: skip
+        _, code, _, stderr = evaluate(changed, *given, changed)
+        assert code == 0, stderr
+        assert f"confidence.json was fitted with other settings of {words}: p may mean nothing here" in stderr
+    out, code, _, stderr = evaluate("sum", *given, "scorer.sum.weight=fs")
+    assert code == 0, stderr
+    assert "nothing is said of sum, which had other settings there" in stderr
+    assert "other settings of" not in stderr
+    assert "sum" not in {line["system"] for line in rows(out / "confidence.csv")}

@@ -53,8 +53,10 @@ def test_the_reported_set_is_reported_as_it_is_alone(root, streets, learned, tmp
             recall = rows[name]["by_set"]["street2"][str(row["tolerance"])]
             assert recall == pytest.approx(row["recall_at"]["1"], abs=1e-6)
             assert rows[name]["recall_at_1"][str(row["tolerance"])] == pytest.approx(recall)
-    assert [one["dataset"] for one in found["data_sets"]] == ["folder", "street1", "street2"]
-    assert len({json.dumps(one["data_fingerprint"]) for one in found["data_sets"]}) == 3
+    assert [one["dataset"] for one in found["data_sets"]] == ["folder", "street1"]
+    assert [one["dataset"] for one in found["reported_sets"]] == ["street2"]
+    sets = [*found["data_sets"], *found["reported_sets"]]
+    assert len({json.dumps(one["data_fingerprint"]) for one in sets}) == 3
     assert found["queries"]["reported"] == [list(range(2 * QUERIES, 3 * QUERIES))]
     assert found["queries"]["chosen_on"] == [list(range(2 * QUERIES))]
 
@@ -95,6 +97,7 @@ def test_several_sets_as_they_are_typed(streets):
         ),
         (["report=corridor"], "report=corridor: corridor has no default of root; write corridor:root=VALUE"),
         (["report=streets:sed=1"], "report=streets:sed=1: streets has no setting sed; it has cache, name, seed"),
+        (["report=streets", "retrieval.name=pairs"], "retrieval=pairs: expected none with report="),
         (["report=streets:seed=-1"], "dataset.seed=-1: expected a whole number not below 0"),
     ],
 )
@@ -114,3 +117,31 @@ def test_the_images_that_were_learned_on_are_not_reported_on(root, streets, tmp_
     last = stderr.splitlines()[-1]
     assert last == (f"error: report=street0: expected other images than those of folder, which is learned on; "
                     f"{2 * QUERIES} are the same")  # fmt: skip
+
+
+def test_the_same_queries_do_not_count_twice(root, streets, tmp_path, monkeypatch, capsys):
+    twice = f"report={streets[1]},{streets[1].replace('name=street1', 'name=again')}"
+    code, stdout, stderr = typed(monkeypatch, capsys, "learn", *small(root), *SHORT, twice, f"out={tmp_path}/out")
+    assert (code, stdout) == (2, "")
+    assert stderr.splitlines()[-1] == (
+        f"error: again: expected other queries than those of street1; {QUERIES} are the same, and would count twice"
+    )
+
+
+def test_a_learned_weight_knows_what_it_was_learned_on(root, streets, learned, tmp_path, monkeypatch, capsys):
+    weight = learned[0] / "out" / "weights" / "other_sets_match_labels.json"
+    on_these = "was learned on images of folder, so that it flatters here"
+    own = (*small(root), f"scorer.weight={weight}", "figures=0")
+    for number, (more, told) in enumerate([
+        (["scorer=sum"], [on_these]), (["scorer=histogram"], [on_these]),
+        (["scorer=histogram", "scorer.weight=learned_aliked"], ["other features (aliked instead of sift, aliked-n16 "]),
+        (["scorer=histogram", "scorer.weight=ratio"], []),
+    ]):  # fmt: skip
+        _, _, stderr = typed(monkeypatch, capsys, "evaluate", *own, *more, f"out={tmp_path}/{number}")
+        assert [line for line in stderr.splitlines() if "was learned" in line and any(t in line for t in told)] == [
+            line for line in stderr.splitlines() if "was learned" in line
+        ]
+        assert stderr.count("was learned") == len(told)
+    [reported] = data_sets.composed("report", streets[2])
+    learning.prepare.begun(composed(*own, "scorer=sum") | {"dataset": reported}, evaluation.Stopwatch())
+    assert "was learned" not in capsys.readouterr().err

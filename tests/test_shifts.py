@@ -1,6 +1,7 @@
 """shifts.csv of a run: which pairs it is of, and that it is what the library says of them."""
 
 import csv
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -9,7 +10,10 @@ import pytest
 from experiments import evaluation, prepare
 from mfvpr import HistogramOfShifts
 from mfvpr.evaluations import Stopwatch
+from mfvpr.match_sets import MatchSet
+from mfvpr.pipeline import dominant_shifts
 from mfvpr.report.shifts import HEADER
+from tests.builders import make_matches, of_query
 from tests.programs import composed, shared, small
 
 STEERING = ("scorer=histogram", "scorer.bin_size=5", "scorer.sigma=10", "scorer.weight=ratio", "figures=0")
@@ -48,7 +52,47 @@ def test_every_first_answer_has_the_shift_that_the_library_says(root, tmp_path, 
         numbers = [float(line[name]) for name in HEADER[2:]]
         fitted = scorer.with_capacity(pair.image_size0, pair.image_size1)
         np.testing.assert_allclose(numbers[:2], fitted.dominant_shift(pair, refine=True), atol=0.02)
-        np.testing.assert_allclose(np.reshape(numbers[2:], (2, 2)).T, fitted.shift_interval(pair), atol=0.02)
+        np.testing.assert_allclose(np.reshape(numbers[2:6], (2, 2)).T, fitted.shift_interval(pair), atol=0.02)
+        assert numbers[6] == 1
+
+
+@pytest.mark.parametrize("direction", ["candidate_minus_query", "query_minus_candidate"])
+@pytest.mark.parametrize("zoom", [0.5, 1.0, 2.0])
+def test_a_zoomed_candidate_shows_the_middle_of_the_query_where_it_does(zoom, direction):
+    """p1 = c1 + zoom (p0 - c0) + (17, -9), of images of two sizes; and of a pair of which nothing votes nothing."""
+    rng = np.random.default_rng(0)
+    size0, size1 = np.array([320, 240]), np.array([400, 300])
+    points0 = size0 / 2 + rng.uniform(-70, 70, (40, 2))
+    points1 = size1 / 2 + zoom * (points0 - size0 / 2) + [17, -9]
+    pair = make_matches(points0, points1, sizes=(size0, size1))
+    silent = replace(pair, scores0=np.zeros(40, np.float32), scores1=np.zeros(40, np.float32))
+    matches, counts = of_query([pair, silent])
+    match_set = MatchSet([matches], np.array([counts]), 40)
+    scorer = HistogramOfShifts(bin_size=4.0, sigma=5.0, scales=(0.5, 1.0, 2.0), direction=direction)
+    shifts, intervals, scales = dominant_shifts(scorer, match_set, np.array([0, 0]), np.array([0, 1]))
+    expected = size1 / 2 - size0 / 2 + [17, -9]
+    np.testing.assert_allclose(shifts[0], expected, atol=0.01)
+    assert (intervals[0, 0] < expected).all()
+    assert (expected < intervals[0, 1]).all()
+    assert scales[0] == zoom
+    assert np.isnan([*shifts[1], *intervals[1].ravel(), scales[1]]).all()
+
+
+def test_the_refined_shift_stays_in_the_range_of_shifts():
+    points = np.random.default_rng(0).uniform(100, 200, (30, 2))
+    matches = make_matches(points, points + [23.0, 3.0])
+    scorer = HistogramOfShifts(bin_size=5.0, sigma=10.0, shift_range=(20.0, 10.0))
+    np.testing.assert_allclose(scorer.dominant_shift(matches, refine=True), [20, 3], atol=0.01)
+
+
+def test_refused_answers_have_no_shift(root, tmp_path):
+    evaluation.evaluate(composed(*small(root), *STEERING, f"out={tmp_path}/first"))
+    given = (f"confidence={tmp_path}/first/confidence.json", "threshold=0.5", f"out={tmp_path}/out")
+    evaluation.evaluate(composed(*small(root), *STEERING, *given))
+    answers = {line["query"]: line["answer"] for line in lines_of(tmp_path / "out" / "answers.csv")}
+    kept = {query: answer for query, answer in answers.items() if answer != "no place"}
+    assert 0 < len(kept) < len(answers)
+    assert {line["query"]: line["answer"] for line in lines_of(tmp_path / "out" / "shifts.csv")} == kept
 
 
 def test_only_a_histogram_has_one(root, tmp_path):

@@ -118,8 +118,9 @@ def mcnemar(first: np.ndarray, second: np.ndarray) -> McNemar:
 
 
 def block_sign_flips(
-    first: np.ndarray, second: np.ndarray, *, block: int | None = None, sequences: Sequence[int] | None = None
-) -> SignFlips:
+    first: np.ndarray, second: np.ndarray, *, block: int | None = None, sequences: Sequence[int] | None = None,
+    places: np.ndarray | None = None,
+) -> SignFlips:  # fmt: skip
     """Exact test of two systems' hits along a path: a fair coin for every block of neighbors, which differ together.
 
     The statistic is the difference of the two recalls. All flips of the blocks' signs are counted, by convolution. With
@@ -138,6 +139,9 @@ def block_sign_flips(
             no difference makes significant.
         sequences: how many of the queries each sequence has, one behind the other, where there are several: no block
             goes from one into the next.
+        places: `[Q]` whole numbers in the order of the path, where several queries, such as those of several drives
+            along it, show the same places: then blocks are of places, whose queries differ together. Drives taken for
+            independent have p below 5 % in up to 58 % of the draws of equally good systems.
 
     Raises:
         InputError: hits of other shapes, sequences of other queries, or blocks without any.
@@ -150,6 +154,9 @@ def block_sign_flips(
     if block is not None and block < 1:
         raise InputError(f"block={block}: expected a number of queries from 1")
     paths = np.split(first.astype(int) - second.astype(int), np.cumsum(sequences)[:-1])
+    if places is not None:
+        _, rows = np.unique(places, return_inverse=True)
+        paths = [np.bincount(rows, weights=np.concatenate(paths)).astype(int)]
     block = _block_length(paths) if block is None else block
     ahead = [path[start : start + block].sum() for path in paths for start in range(0, len(path), block)]
     ahead = np.abs(ahead)[np.flatnonzero(ahead)]
@@ -176,7 +183,7 @@ def _design_effect(paths: Sequence[np.ndarray], events: float) -> float:
     """Of all values of some paths, of which so many tell something."""
     total = sum(map(len, paths))
     unknown = total ** (1 / 3)
-    if events == 0:
+    if events == 0 or np.ptp(np.concatenate(paths)) == 0:
         return unknown
     correlations = _autocorrelations(paths)
     found = max(1.0, _flat_top(correlations), _markov(correlations))

@@ -83,7 +83,8 @@ def of_matches(split: TrainingSplit, scorer: Any, options: Options) -> Model:
         options: how to learn.
     """
     sizes = split.match_set.image_sizes
-    sigma = TEACHER_SIGMA * float(np.max(sizes[0]))
+    seen, _ = split.match_set.take(split.half.tune).image_sizes  # or reported images would change what is taught
+    sigma = TEACHER_SIGMA * float(np.max(seen))
     teacher = HistogramOfShifts(bin_size=sigma / 2, sigma=sigma, weight=RatioWeight())
     scorer = parameters.fit(scorer, *sizes)
     return Model.of_matches(scorer, _first_weight(split, options), parameters.fit(teacher, *sizes))

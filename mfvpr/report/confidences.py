@@ -59,7 +59,7 @@ class Assured:
         systems = self.judged.result.systems if self.judged.thresholds else ()
         inputs = {name: self._inputs(name) for name in systems}
         return {name: fit_confidence(values, self.right(name)) for name, values in inputs.items()
-                if not np.isnan(values).all()}  # fmt: skip
+                if np.isfinite(values).all(axis=1).any()}  # fmt: skip
 
     def right(self, system: str) -> np.ndarray:
         """`[Q]` bool, whether the first answer is right, with ground truth."""
@@ -122,7 +122,7 @@ class Assured:
             start += len(sequence.images)
         inputs, right, found = self._inputs(system), self.right(system), np.full(start, np.nan)
         for seen, told in zip(map(np.concatenate, tune), map(np.concatenate, report), strict=True):
-            if not np.isnan(inputs[seen]).all():
+            if np.isfinite(inputs[seen]).all(axis=1).any():
                 found[told] = fit_confidence(inputs[seen], right[seen]).probability(inputs[told])
         return found
 

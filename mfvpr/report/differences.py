@@ -30,16 +30,27 @@ def differences(judged: Judged) -> list[Difference]:
     places = range(len(judged.sequences))
     hits = {name: np.concatenate([_right(judged, name, place)[:, 0] for place in places])
             for name in judged.result.systems}  # fmt: skip
-    sequences = [len(sequence.images) for sequence in judged.sequences]
+    shown = _places(judged) if len(judged.sequences) > 1 else None
     return [
         Difference(first, second, mcnemar(hits[first], hits[second]),
-                   block_sign_flips(hits[first], hits[second], sequences=sequences))
+                   block_sign_flips(hits[first], hits[second], places=shown))
         for first, second in itertools.combinations(hits, 2)
     ]  # fmt: skip
 
 
+def _places(judged: Judged) -> np.ndarray:
+    """`[Q]` the first right row of the one database of every query of all sequences; -1 where none is right."""
+    return np.concatenate([
+        np.array([min(right.of(query), default=-1) for query in range(len(right))], int)
+        for right in judged.right if right is not None
+    ])  # fmt: skip
+
+
 def differences_table(judged: Judged) -> Table:
-    """System x system: how many queries only that of the row gets right, and p by blocks of the path."""
+    """System x system: how many queries only that of the row gets right, and p by blocks of the path.
+
+    Of several sequences of one database, blocks are of its places.
+    """
     cells = {}
     for first, second, counts, flips in differences(judged):
         cells[first, second] = f"{counts.only_first} (p {flips.p_value:.2g})"

@@ -106,7 +106,8 @@ def _draw_histogram(axes: Axes, explanation: Explanation, top: float) -> AxesIma
     half = width / 2
     extent = (centers_x[0] - half, centers_x[-1] + half, centers_y[-1] + half, centers_y[0] - half)
     image = axes.imshow(scores, extent=extent, cmap="magma", interpolation="nearest", vmin=0, vmax=top)
-    axes.set_xlabel("shift x, px (candidate minus query; square: tallest bin, cross: refined peak)", fontsize=8)
+    direction = explanation.direction.replace("_", " ")
+    axes.set_xlabel(f"shift x, px ({direction}; square: tallest bin, cross: refined peak)", fontsize=8)
     axes.set_ylabel("shift y, px")
     if explanation.score <= 0:
         axes.set_title("histogram of shifts: no votes", fontsize=9)
@@ -115,5 +116,6 @@ def _draw_histogram(axes: Axes, explanation: Explanation, top: float) -> AxesIma
     axes.add_patch(Rectangle((corner[0], corner[1]), width, width, fill=False, edgecolor="cyan", linewidth=1.4))
     axes.plot(*explanation.peak, marker="+", color="cyan", markersize=8)
     words = "histogram of shifts: score {:.4g}, peak at ({:.1f}, {:.1f}) px"
+    words += f" of images zoomed by {explanation.scale:.3g}" if explanation.scale != 1 else ""
     axes.set_title(words.format(explanation.score, *explanation.peak), fontsize=9)
     return image

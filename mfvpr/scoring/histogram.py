@@ -138,8 +138,8 @@ class HistogramOfShifts:
 
         The center of the tallest bin, the first in row-major order on a tie. With `refine` the peak between bin
         centers: the maximum of the same sum of Gaussians over all shifts, reached from that bin by mean shift
-        (Comaniciu & Meer, PAMI 2002). With several scales z, the dominant one among them, a point p of the query
-        lies at c1 + z (p - c0) + sqrt(z) (shift - c1 + c0) in the candidate, of centers c0 and c1.
+        (Comaniciu & Meer, PAMI 2002), within `shift_range`. With several scales z, the dominant one among them, a point
+        p of the query lies at c1 + z (p - c0) + sqrt(z) (shift - c1 + c0) in the candidate, of centers c0 and c1.
         """
         return _dominant_shift(self._for(matches), matches, refine=refine)
 
@@ -281,6 +281,9 @@ def _dominant_shift(scorer: HistogramOfShifts, matches: Matches, *, refine: bool
     shifts, weights = scorer._planes(matches)[scale].T, match_weights(scorer.weight, matches)
     if refine:
         shift = climb(shift, shifts, weights, scorer._deviation(shifts.dtype))
+        if scorer.shift_range is not None:
+            reach = jnp.asarray(scorer.shift_range, shift.dtype)
+            shift = jnp.clip(shift, -reach, reach)
     shift = jnp.where(jnp.max(scores) > 0, shift, 0.0)
     return where_usable(shift, matches, shifts, weights[None], usable)
 
