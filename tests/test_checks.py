@@ -188,9 +188,16 @@ def test_scores_that_are_nan_are_told(dataset):
     assert any("of n + filter are NaN, and rank last" in line for line in lines)
 
 
-@pytest.mark.parametrize("scorer", [lambda matches: jnp.nan * jnp.sum(matches.distance), mfvpr.GridAnchors()])
+@pytest.mark.parametrize(
+    "scorer",
+    [
+        lambda matches: jnp.nan * jnp.sum(matches.distance),
+        lambda matches: jnp.inf * jnp.sum(matches.distance),
+        mfvpr.GridAnchors(),
+    ],
+)
 def test_a_scorer_of_nothing_but_nan_is_refused(dataset, scorer):
-    with pytest.raises(InputError, match="n: every score of a pair that has matches is NaN; check what"):
+    with pytest.raises(InputError, match="n: every score of a pair that has matches is NaN or infinite; check"):
         evaluated(dataset, scorers={"n": scorer})
 
 

@@ -3,6 +3,7 @@
 import csv
 import json
 
+import numpy as np
 import pytest
 
 from experiments import axes, build, evaluation, settings
@@ -77,3 +78,22 @@ def test_our_system_fuses_two_scores_and_the_filter():
     found = composed("system=mfvpr", *alone, config="sweep")
     settings.check(found)
     assert axes.searchable(axes.as_final(found)).grid() == [{"sigma": 10}]
+
+
+def test_the_weight_of_the_main_scorer_is_that_of_its_cohort_as_well(root, tmp_path):
+    more = ("scorer=paper", "fusion.c=zscore", "fusion.weights={filter: 0.5, histogram: 2}", "cohort=1", "figures=0")
+    evaluation.evaluate(composed(*small(root), *more, f"out={tmp_path}/out"))
+    found = {row["system"]: row for row in json.loads((tmp_path / "out" / "results.json").read_text())}
+    name = "histogram + cohort + filter"
+    assert [*found][-2:] == ["histogram + filter", name]
+    assert found[name]["parameters"]["cohort"] == 1
+    with (tmp_path / "out" / "predictions" / "histogram_cohort_filter.csv").open(newline="") as file:
+        fused = {(line["query"], line["database"]): float(line["score"]) for line in csv.DictReader(file)}
+    parts = {part: {line[:2]: line[2] for line in ranked(tmp_path / "out", part)}
+             for part in ("filter", "histogram_cohort")}  # fmt: skip
+    queries = {query for query, _ in fused}
+    for query in queries:
+        pairs = [pair for pair in fused if pair[0] == query]
+        scores = [np.array([parts[part][pair] for pair in pairs]) for part in parts]
+        filtered, own = ((one - one.mean()) / (one.std() or 1) for one in scores)
+        np.testing.assert_allclose([fused[pair] for pair in pairs], 0.5 * filtered + 2 * own, atol=1e-2)

@@ -99,6 +99,21 @@ def test_programs_take_it(file, weight, tmp_path, tmp_path_factory, monkeypatch,
     assert rankings[0] == rankings[1] != rankings[2]
 
 
+def test_a_changed_file_is_another_setting_of_a_confidence(
+    file, weight, tmp_path, tmp_path_factory, monkeypatch, capsys
+):
+    run = (*small(shared(tmp_path_factory)), "figures=0", "scorer=histogram", f"scorer.weight={file}")
+    found = []
+    for number, value in enumerate((weight, weight, replace(weight, output=np.float32([3, 0, 1])))):
+        write_weight(file, value, {})
+        os.utime(file, ns=(number, number))
+        given = [f"confidence={tmp_path}/0/confidence.json"] if number else []
+        code, _, stderr = typed(monkeypatch, capsys, "evaluate", *run, *given, f"out={tmp_path}/{number}")
+        assert code == 0, stderr
+        found.append("was fitted with other settings of scorer: p may mean nothing here" in stderr)
+    assert found == [False, False, True]
+
+
 @pytest.mark.parametrize(
     ("value", "words"),
     [

@@ -133,14 +133,22 @@ def test_queries_and_settings_are_fused_one_by_one():
 
 
 def test_fused_scales_have_a_gradient_where_scores_are_equal_or_missing():
-    mask = np.array([True, True, True, False])
-    equal, own = np.full(4, 2.0), np.array([1.0, np.nan, 4.0, np.nan])
+    mask = np.array([True, True, True, True, False])
+    equal, own = np.full(5, 2.0), np.array([1.0, np.nan, 4.0, 2.0, np.nan])
 
     def total(scores):
         fused = fuse_scales(scores, mask)
-        return jnp.sum(jnp.where(jnp.isfinite(fused), fused, 0.0) ** 2)
+        return jnp.sum(jnp.where(jnp.isfinite(fused), fused, 0.0) ** 3)  # the sum of squares is their number
 
     for scores in (np.stack([equal, equal], 1), np.stack([equal, own], 1)):
         slope = jax.grad(total)(jnp.asarray(scores, jnp.float32))
         assert np.isfinite(slope).all()
-    assert slope[[0, 2], 1].any()
+    assert np.abs(slope[[0, 2, 3], 1]).min() > 0.05
+
+
+@pytest.mark.parametrize("unit", [1e-30, 1e-20, 1.0, 3e19, 1e30])
+def test_z_scores_have_no_unit(unit):
+    scores = np.array([1.0, 4.0, 2.0, 0.5]) * unit
+    expected = (scores - scores.mean()) / scores.std()
+    fused = fuse_scales(jnp.asarray(scores[:, None], jnp.float32), np.ones(4, bool))
+    np.testing.assert_allclose(fused, expected, rtol=1e-5)

@@ -44,7 +44,9 @@ def test_what_is_not_finite_is_not_written(tmp_path, weight):
     [
         {"format": "mfvpr match weight 0"}, {"inputs": ["ratio"]}, {"inputs": ["ratio", "x", "x0", "x1", "y0"]},
         {"scale": [1, 1, 0, 1, 1]}, {"hidden": [[0] * 3] * 4}, {"output": [1, "a", 2]}, {"output_bias": [1]},
-        {"center": None},
+        {"center": None}, {"scale": [1, 1, 1e-300, 1, 1]}, {"output_bias": 1e300}, {"output_bias": True},
+        {"output_bias": 10**400}, {"inputs": ["ratio", "ratio", "score0_rank", "score1_rank", "distance_rank"]},
+        {"inputs": dict.fromkeys(RELATIVE)},
     ],
 )  # fmt: skip
 def test_another_file_is_refused(tmp_path, weight, change):
@@ -57,6 +59,7 @@ def test_another_file_is_refused(tmp_path, weight, change):
 
 def test_no_file_and_no_json_are_refused(tmp_path):
     (tmp_path / "text.json").write_text("[]")
-    for name, reason in (("none.json", "No such file"), ("text.json", "")):
+    (tmp_path / "deep.json").write_text("[" * 100_000)
+    for name, reason in (("none.json", "No such file"), ("text.json", ""), ("deep.json", "Recursion")):
         with pytest.raises(InputError, match=f"{name}: expected a match weight that experiments.learn wrote .{reason}"):
             read_weight(tmp_path / name)

@@ -221,3 +221,39 @@ def test_blocks_of_other_queries_are_refused(options):
         block_sign_flips(np.ones(5), np.ones(5), **options)
     with pytest.raises(InputError, match=r"got \[5\], \[4\]"):
         block_sign_flips(np.ones(5), np.ones(4))
+
+
+@pytest.mark.parametrize("block", [2, 5])
+def test_queries_of_one_place_differ_together(block):
+    """Against all flips of blocks of the sums by place, in whatever order queries are given."""
+    rng = np.random.default_rng(0)
+    for first, second in latent_paths(0.7, 0.6, 40, count=8, systems=2).swapaxes(0, 1):
+        places = rng.integers(-1, 25, 40)
+        sums = [int((first.astype(int) - second)[places == place].sum()) for place in np.unique(places)]
+        expected = flips_oracle(sums, [len(sums)], block)
+        assert block_sign_flips(first, second, block=block, places=places) == (
+            block, expected[0], pytest.approx(expected[1], rel=1e-12),
+        )  # fmt: skip
+
+
+def test_drives_of_the_same_places_are_no_independent_ones():
+    """Two systems equally good, four drives that share half of what makes a place hard."""
+    drives, count = 4, 300
+    low = {"places": 0, "drives": 0}
+    common = np.random.default_rng(1).standard_normal((2, count, 101 + 200))
+    own = np.random.default_rng(2).standard_normal((2, count, drives, 101 + 200))
+    latent = (common[:, :, None] + own) / math.sqrt(2)
+    for step in range(1, latent.shape[-1]):  # an autoregression, whose start is forgotten
+        latent[..., step] = 0.5 * latent[..., step - 1] + math.sqrt(0.75) * latent[..., step]
+    hits = latent[..., -101:].reshape(2, count, -1) < 0.52
+    for first, second in hits.swapaxes(0, 1):
+        tests = {"places": {"places": np.tile(np.arange(101), drives)}, "drives": {"sequences": [101] * drives}}
+        for name, how in tests.items():
+            low[name] += block_sign_flips(first, second, **how).p_value <= 0.05
+    assert low["places"] / count <= 0.08
+    assert low["drives"] / count > 0.12
+
+
+def test_where_one_system_is_always_ahead_nothing_is_divided_by_0():
+    assert block_sign_flips(np.ones(40, bool), np.zeros(40, bool), block=4) == (4, 10, pytest.approx(2 / 2**10))
+    assert block_sign_flips(np.ones(40, bool), np.zeros(40, bool)).block == 12
