@@ -140,6 +140,8 @@ def _warn_of_images(settings: dict[str, Any], images: Images, own: list[OwnRows]
         look = "dark" if used < bits else "cut off"
         tell(f"warning: the largest value of all 16-bit images is {largest}, so that they come out {look}; "
               f"dataset.bits={used} would use their range")  # fmt: skip
+    if settings["features"]["name"] == "import" and settings["matching"]["name"] == "lightglue":
+        tell("warning: matching=lightglue knows ALIKED's features alone; what features=import gives must be these")
     candidates, available = settings["candidates"], len(dataset.database)
     if candidates != "all" and candidates > available:
         tell(f"note: candidates={candidates}, but the database has {available} images; all of them are re-ranked")

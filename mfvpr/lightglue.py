@@ -31,7 +31,8 @@ class LightGlueMatching:
         network: the recipe of the network that they are of.
         filter_threshold: a match is kept where its assignment is above it.
         depth_confidence: layers of a pair are left out once more than this share of its keypoints is sure, which
-            changes matches a little (published: 0.95); None = never. Pairs of a chunk wait for the slowest.
+            leaves out matches, a third on photographs (published: 0.95); None = never. Pairs of a chunk wait for the
+            slowest.
         chunk_size: pairs at a time, see `mfvpr.Matcher`; it changes memory, time and the last bits alone.
     """
 

@@ -28,14 +28,14 @@ def write_weight(path: Path, weight: LearnedWeight, made: Mapping[str, Any]) -> 
     write_text(path, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
-def read_weight(path: Path) -> tuple[LearnedWeight, dict[str, Any]]:
+def read_weight(path: str | Path) -> tuple[LearnedWeight, dict[str, Any]]:
     """That of `write_weight`, to the last bit, and how it was made.
 
     Raises:
         InputError: no such file, or another one.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
         if content.pop("format") != _FORMAT:
             raise ValueError("another format")
         return _weight(content.pop("inputs"), content), dict(content["made"])

@@ -21,7 +21,9 @@ from mfvpr.sweeping import Axes, Setting, sweep
 from mfvpr.sweeping.search import Stages, untracked_stages
 from mfvpr.sweeping.settings import FUSION
 from mfvpr.types import Shortlist
-from mfvpr.weighting import RatioWeight
+from mfvpr.weighting import DescriptorDistanceWeight, FeatureScoreWeight, RatioWeight, UnitWeight
+
+_OF_THE_PAPER = (FeatureScoreWeight, DescriptorDistanceWeight, UnitWeight)
 
 
 class Checkpoints(NamedTuple):
@@ -123,7 +125,7 @@ class _Compared:
     def rows(self) -> Iterator[Row]:
         """Each is reported as soon as it is chosen or learned."""
         own: Any = self.axes.scorer
-        yield from self.by_hand("paper", own)
+        yield from self.by_hand("paper" if isinstance(own.weight, _OF_THE_PAPER) else "as set", own)
         yield from self.by_hand("1 - ratio", replace(own, weight=RatioWeight()))
         spread = self.split.spread(own)
         for fused in (False, True):

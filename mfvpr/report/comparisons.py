@@ -41,9 +41,12 @@ def table(comparison: Comparison) -> Table:
             [name, *(f"{100 * one.mean():.1f}" for one in recall), f"[{100 * low:.1f}, {100 * high:.1f}]", *compared]
         )
     words = threshold_words(judge.unit, judge.thresholds[judge.main])
-    header = [judge.label(1, threshold) for threshold in judge.thresholds]
+    header, name_of_first = [judge.label(1, threshold) for threshold in judge.thresholds], lines[0][0]
     header += [f"{name}{words}" for name in sets]
-    return Table(["score", *header, f"95 % at{words}" if words else "95 %", "against paper", "p", "p by blocks"], lines)
+    return Table(
+        ["score", *header, f"95 % at{words}" if words else "95 %", f"against {name_of_first}", "p", "p by blocks"],
+        lines,
+    )
 
 
 def _by_set(judge: Judge, hits: np.ndarray) -> dict[str, np.ndarray]:

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from mfvpr.confidence import Confidence, confidence_inputs, fit_confidence, write_confidences
-from mfvpr.evaluation import halves
+from mfvpr.evaluation import Half, Positives, halves
+from mfvpr.evaluation.choosing import separated
 from mfvpr.evaluation.precision import (
     PrecisionRecall,
     Reliability,
@@ -111,20 +112,27 @@ class Assured:
         ])  # fmt: skip
 
     def _crossed(self, system: str) -> np.ndarray:
-        """p of each half of the paths by the other, without what shows places of both."""
-        widest, start = self.judged.thresholds[-1], 0
-        tune, report = ([], []), ([], [])
-        for sequence in self.judged.sequences:
-            if sequence.truth is not None:
-                for number, half in enumerate(halves(sequence.truth.shows_place(widest))):
-                    tune[number].append(start + half.tune)
-                    report[number].append(start + half.report)
-            start += len(sequence.images)
-        inputs, right, found = self._inputs(system), self.right(system), np.full(start, np.nan)
-        for seen, told in zip(map(np.concatenate, tune), map(np.concatenate, report), strict=True):
-            if np.isfinite(inputs[seen]).all(axis=1).any():
-                found[told] = fit_confidence(inputs[seen], right[seen]).probability(inputs[told])
+        """p of each half of the path by the other, without what shows places of both."""
+        inputs, right = self._inputs(system), self.right(system)
+        found = np.full(len(right), np.nan)
+        for half in self._halves():
+            if np.isfinite(inputs[half.tune]).all(axis=1).any():
+                found[half.report] = fit_confidence(inputs[half.tune], right[half.tune]).probability(
+                    inputs[half.report]
+                )
         return found
+
+    def _halves(self) -> tuple[Half, Half]:
+        """Of the path; of several sequences, which pass the same places in whatever order, of the database's."""
+        widest, truths = self.judged.thresholds[-1], [sequence.truth for sequence in self.judged.sequences]
+        shown = [truth.shows_place(widest) for truth in truths if truth is not None]
+        if len(shown) == 1:
+            return halves(shown[0])
+        together = Positives.from_rows((one.of(row) for one in shown for row in range(len(one))), shown[0].num_database)
+        first = np.array([min(together.of(row), default=-1) for row in range(len(together))])
+        behind = first > np.median(first)
+        parts = np.flatnonzero(~behind), np.flatnonzero(behind)
+        return separated(together, *parts), separated(together, *parts[::-1])
 
 
 def confidence_table(assured: Assured) -> Table:
