@@ -41,6 +41,8 @@ def check(given: Given | None, headline: str, settings: Mapping[str, Any], image
                             f"{', '.join(given.systems)}; make it with the same scorer, final and fusion")  # fmt: skip
     if given.made.get("data_fingerprint") == images.fingerprints:
         tell(f"warning: confidence={given.path} was fitted on these very images, so that it flatters")
+    if not any(given.systems[headline].weights):
+        tell(f"warning: confidence={given.path} cannot tell right answers from wrong ones: p is the same for all")
     other = {name: _otherwise(given, name, settings, images) for name in given.systems}
     if other[headline]:
         tell(f"warning: confidence={given.path} was fitted with other settings of {', '.join(other[headline])}: p may "
