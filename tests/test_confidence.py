@@ -4,6 +4,8 @@ import json
 import math
 import statistics
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +13,8 @@ from scipy import special
 
 from mfvpr.confidence import confidence_inputs, fit_confidence, read_confidences, write_confidences
 from mfvpr.errors import InputError
+from mfvpr.evaluation import Positives
+from mfvpr.report.confidences import Assured
 from mfvpr.results import Ranked
 
 NAMES = ("margin", "height", "filter", "score")
@@ -175,3 +179,18 @@ def test_other_files_are_refused_in_one_line(content, tmp_path):
     assert "\n" not in str(told.value)
     with pytest.raises(InputError, match="No such file"):
         read_confidences(tmp_path / "none.json")
+
+
+def test_halves_of_drives_there_and_back_share_no_place():
+    """Of 20 places, two drives of all of them, the second backward; a query shows the places beside it as well."""
+    rows = [range(max(0, place - 1), min(20, place + 2)) for place in (*range(20), *reversed(range(20)))]
+    shown = [Positives.from_rows([list(one) for one in some], 20) for some in (rows[:20], rows[20:])]
+    sequences = [SimpleNamespace(truth=SimpleNamespace(shows_place=lambda _, one=one: one)) for one in shown]
+    judged: Any = SimpleNamespace(thresholds=[1], sequences=sequences)
+    reported = []
+    for half in Assured(judged)._halves():
+        places = [{place for row in part for place in rows[row]} for part in (half.tune, half.report)]
+        assert not places[0] & places[1]
+        assert min(map(len, places)) >= 9
+        reported.extend(half.report)
+    assert sorted(reported) == list(range(40))

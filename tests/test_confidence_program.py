@@ -196,3 +196,13 @@ def test_confidence_of_what_counted_otherwise_is_said(evaluate):
     assert "nothing is said of sum, which had other settings there" in stderr
     assert "other settings of" not in stderr
     assert "sum" not in {line["system"] for line in rows(out / "confidence.csv")}
+
+
+def test_a_confidence_that_is_the_same_for_all_is_told(evaluate, tmp_path):
+    first, *_ = evaluate("first", "figures=0")
+    found = json.loads((first / "confidence.json").read_text())
+    found["systems"]["histogram"]["weights"] = [0.0, 0.0]
+    (tmp_path / "flat.json").write_text(json.dumps(found))
+    _, code, _, stderr = evaluate("out", f"confidence={tmp_path}/flat.json", "figures=0")
+    assert code == 0, stderr
+    assert "flat.json cannot tell right answers from wrong ones: p is the same for all" in stderr

@@ -291,3 +291,15 @@ def test_too_few_queries_are_refused(root, tmp_path, monkeypatch, capsys):
     assert (code, stdout) == (2, "")
     assert "split=first_half: expected queries to learn on and to validate with, got" in stderr.splitlines()[-1]
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_not_the_papers_is_not_called_so(learn, untrained, tmp_path):
+    found = learn(tmp_path / "out", *SUM, "scorer.weight=ratio", "split=first_half", "steps=1")
+    assert [row["score"] for row in found["rows"]][:4] == [
+        "as set",
+        "as set + filter",
+        "1 - ratio",
+        "1 - ratio + filter",
+    ]
+    assert found["rows"][0]["recall_at_1"] == found["rows"][2]["recall_at_1"]
+    assert "against as set" in (tmp_path / "out" / "table.md").read_text()
