@@ -144,7 +144,7 @@ class _Compared:
         name, model = "match labels", of_matches(self.split, own, self.options)
         fitted = self.learned(name, model)
         for row in self.by_hand(name, model.scorer_of(fitted.parameters)):
-            yield replace(row, fitted=fitted)
+            yield replace(row, fitted=fitted if row.name == name else None)  # fused by hand it is the same
 
     def by_hand(self, name: str, scorer: Scorer) -> Iterator[Row]:
         """Alone, and fused with the filter's weight that is set by hand."""
