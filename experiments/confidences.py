@@ -5,9 +5,10 @@ from typing import Any, NamedTuple
 
 from experiments import build, truth
 from experiments.console import tell
-from experiments.prepare import Images
+from experiments.prepare import Images, num_candidates
 from experiments.settings import SettingsError
 from mfvpr.confidence import Confidence, read_confidences
+from mfvpr.evaluation import middle
 from mfvpr.report import runs
 from mfvpr.report.evaluations import Judged
 
@@ -58,7 +59,7 @@ def _otherwise(given: Given, system: str, settings: Mapping[str, Any], images: I
     current = {**settings, "scorer": build.described(settings["scorer"])}
     before, now = (_of_system(one, system) for one in (given.made.get("settings"), current))
     names = [name for name in _NAMES if name != "candidates" and before.get(name) != now[name]]
-    counted = given.made.get("candidates") == candidates(settings, images)
+    counted = given.made.get("candidates") == num_candidates(settings, images)
     within = right_within(settings, images)
     return [
         *names,
@@ -67,19 +68,12 @@ def _otherwise(given: Given, system: str, settings: Mapping[str, Any], images: I
     ]
 
 
-def candidates(settings: Mapping[str, Any], images: Images) -> int:
-    """How many a query has at most."""
-    number = len(images.dataset.database)
-    return number if settings["candidates"] == "all" else min(settings["candidates"], number)
-
-
 def right_within(settings: Mapping[str, Any], images: Images) -> list[Any] | None:
     """What counts as right, and its unit; None without ground truth."""
     right = images.dataset.sequences[0].truth
     if right is None:
         return None
-    thresholds = truth.thresholds(settings, right)
-    return [thresholds[len(thresholds) // 2], right.unit]
+    return [middle(truth.thresholds(settings, right)), right.unit]
 
 
 def _of_system(settings: Any, system: str) -> dict[str, Any]:
@@ -97,7 +91,7 @@ def made(settings: Mapping[str, Any], images: Images, judged: Judged) -> dict[st
         "data_fingerprint": images.fingerprints,
         "queries": sum(len(sequence.images) for sequence in judged.sequences),
         "right_within": right_within(settings, images),
-        "candidates": candidates(settings, images),
+        "candidates": num_candidates(settings, images),
         "ground_truth": truth.described(settings, images.dataset),
         "settings": {name: settings[name] for name in _NAMES} | {"scorer": build.described(settings["scorer"])},
         "command": settings.get("command"),

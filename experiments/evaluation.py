@@ -149,7 +149,8 @@ def result_rows(outcome: Outcome) -> list[dict[str, Any]]:
     rows = []
     for name, parameters in outcome.parameters.items():
         scorers = [part for part in name.split(" + ") if part not in (COHORT, FILTER, FRAMES)]
-        system = {"system": name, "scorer": " + ".join(scorers) or "none", "parameters": parameters}
+        decides = name == judged.headline
+        system = {"system": name, "scorer": " + ".join(scorers) or "none", "decides": decides, "parameters": parameters}
         rows += [system | judgment | common for judgment in _judgments(judged, name)]
     return rows
 

@@ -108,6 +108,12 @@ def recipe(tools: Tools, images: Images, num_candidates: int) -> dict[str, Any]:
     )  # fmt: skip
 
 
+def num_candidates(settings: Mapping[str, Any], images: Images) -> int:
+    """How many a query has at most."""
+    number = len(images.dataset.database)
+    return number if settings["candidates"] == "all" else min(settings["candidates"], number)
+
+
 def dataset_of(settings: dict[str, Any]) -> Dataset:
     """The data set, with progress where it is drawn."""
     bars: list[tqdm] = []
@@ -142,10 +148,10 @@ def _warn_of_images(settings: dict[str, Any], images: Images, own: list[OwnRows]
               f"dataset.bits={used} would use their range")  # fmt: skip
     if settings["features"]["name"] == "import" and settings["matching"]["name"] == "lightglue":
         tell("warning: matching=lightglue knows ALIKED's features alone; what features=import gives must be these")
-    candidates, available = settings["candidates"], len(dataset.database)
+    candidates, available = settings["candidates"], num_candidates(settings, images)
     if candidates != "all" and candidates > available:
         tell(f"note: candidates={candidates}, but the database has {available} images; all of them are re-ranked")
-    deepest, available = max(settings["recall"]["ks"]), available if candidates == "all" else min(candidates, available)
+    deepest = max(settings["recall"]["ks"])
     if deepest > available:
         tell(f"note: R@{deepest} is R@{available}, of the filter too: no more candidates are looked at")
 

@@ -166,7 +166,8 @@ def check(settings: Mapping[str, Any]) -> None:
         raise SettingsError(f"split={settings['split']}: expected none with report=, since the data sets are the split")
     fusion = settings.get("fusion", {})
     if fusion.get("weights") and fusion["c"] != "zscore":
-        raise SettingsError(f"fusion.weights={fusion['weights']}: expected fusion.c=zscore as well")
+        raise SettingsError(f"fusion.weights={fusion['weights']}: expected fusion.c=zscore as well, or "
+                            "fusion.weights=null")  # fmt: skip
     if settings.get("threshold") is not None and settings["confidence"] is None:
         raise SettingsError(f"threshold={settings['threshold']}: expected confidence=FILE as well, the confidence.json "
                             "of a run on other images with ground truth")  # fmt: skip

@@ -53,6 +53,13 @@ def compilations() -> Compilations:
     return _compilations
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_programs() -> Iterator[None]:
+    """A compiled program takes several of the 65,530 memory maps that Linux gives a process; XLA dies without."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture(scope="session", autouse=True)
 def cache(tmp_path_factory) -> Iterator[None]:
     """Nothing of the user's cache is read or written."""

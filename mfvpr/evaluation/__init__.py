@@ -7,8 +7,8 @@ from mfvpr.evaluation.choosing import Half, best_setting, halves, neighbors, sep
 from mfvpr.evaluation.judging import Judge, Split, judge
 from mfvpr.evaluation.positives import Positives, frame_positives, radius_positives, rows_within
 from mfvpr.evaluation.recall import hits, recall_at_k
-from mfvpr.evaluation.truth import Truth, Unit, threshold_words
+from mfvpr.evaluation.truth import Truth, Unit, middle, threshold_words
 
 __all__ = ["Half", "Judge", "Positives", "Split", "Truth", "Unit", "best_setting", "frame_positives", "halves", "hits",
-           "judge", "neighbors", "radius_positives", "recall_at_k", "rows_within", "separated",
+           "judge", "middle", "neighbors", "radius_positives", "recall_at_k", "rows_within", "separated",
            "threshold_words"]  # fmt: skip

@@ -1,7 +1,7 @@
 """What evaluation asks of a ground truth: positives at a threshold."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Literal
 
 import numpy as np
@@ -40,6 +40,11 @@ class Truth(ABC):
     def thresholds(self, *, tolerances: Iterable[int], radius: float) -> list[float]:
         """Those of the unit, ascending: tolerances in frames, or the radius in meters; 0 alone where truth is exact."""
         return {"frames": sorted(set(tolerances)), "m": [radius], "exact": [0]}[self.unit]
+
+
+def middle(thresholds: Sequence[float]) -> float:
+    """The threshold that predictions, failures, figures and confidence go by, of at least one."""
+    return thresholds[len(thresholds) // 2]
 
 
 def threshold_words(unit: Unit, threshold: float) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from mfvpr.data.datasets import MEANS, ImageFolder, QuerySequence
 from mfvpr.data.files import write_text
 from mfvpr.data.images import resize
-from mfvpr.evaluation import Positives, threshold_words
+from mfvpr.evaluation import Positives, middle, threshold_words
 from mfvpr.features import Extractor, Source
 from mfvpr.pipeline import explain
 from mfvpr.report.figures import Answer, histogram_figure
@@ -41,7 +41,7 @@ class Judged:
     @property
     def threshold(self) -> float:
         """The one in the middle, which predictions, failures and figures go by."""
-        return self.thresholds[len(self.thresholds) // 2]
+        return middle(self.thresholds)
 
     @property
     def sequences(self) -> Sequence[QuerySequence]:

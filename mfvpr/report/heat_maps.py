@@ -11,6 +11,7 @@ from matplotlib.patches import Rectangle
 from mfvpr.data.files import replacing
 
 _MARK = "#e8482c"
+_FLAT = 9  # letters of a column's value that fit beside the next one's
 
 
 def heat_map_figure(
@@ -49,6 +50,8 @@ def heat_map_figure(
     ):
         set_ticks(range(len(values)), values)
         set_label(name)
+    if any(len(value) > _FLAT for value in columns[1]):
+        axes.tick_params("x", rotation=30)
     axes.add_patch(Rectangle((best[1] - 0.5, best[0] - 0.5), 1, 1, linewidth=2.5, fill=False, edgecolor=_MARK))
     if own is not None:
         axes.plot(own[1], own[0], marker="o", markersize=30, markerfacecolor="none", markeredgecolor=_MARK)

@@ -54,7 +54,8 @@ def write_failures(path: Path, rankings: Rankings) -> None:
     """CSV with a line per query whose first answer is wrong: `query,answer,rank,right_answer,score,margin`.
 
     `rank`, `right_answer` and `score` are of the first right candidate, empty where there is none; `margin` is how
-    much higher the first answer scores. Nothing is written where it is unknown what is right.
+    much higher the first answer scores; whether it was refused does not matter. Nothing is written where it is unknown
+    what is right.
     """
     if rankings.right is None:
         return

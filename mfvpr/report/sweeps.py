@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Iterator, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -145,10 +146,16 @@ def _heat_maps(outcome: Outcome) -> Iterator[Figure]:
         draw = partial(
             heat_map_figure,
             recall=plane[None] if single else plane,
-            rows=("", [""]) if single else (first, values[first]),
-            columns=(second, values[second]),
+            rows=("", [""]) if single else (first, _short(values[first])),
+            columns=(second, _short(values[second])),
             best=(0 if single else best[first], best[second]),
             own=None if row is None or column is None else (row, column),
             title="; ".join([f"{label} in %", *fixed]),
         )
         yield f"{second}.png" if single else f"{first}_{second}.png", draw
+
+
+def _short(values: list[str]) -> list[str]:
+    """Files by their names alone, where these differ."""
+    names = [Path(value).stem if value.endswith(".json") else value for value in values]
+    return names if len({*names}) == len(names) else values
