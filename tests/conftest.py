@@ -1,6 +1,7 @@
 """Strict arithmetic for every test: no silent rank promotion, warnings are errors (pyproject.toml)."""
 
 import os
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from mfvpr.weights.networks import blueprint, network_of
 from mfvpr.weights.registry import entry_of
 from tests import checkpoints
 
+# A shell ignores Ctrl-C for what it runs in the background; the tests of Ctrl-C need it there too.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 # Compiled programs are shared by this process, those it starts, and the next run.

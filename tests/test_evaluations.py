@@ -115,25 +115,32 @@ def test_sequences_are_evaluated_by_themselves_with_their_means(dataset, split, 
     gains = [(tmp_path / "sequences" / name / "gains.csv").read_text().splitlines() for name in ("first", "second")]
     assert list(map(len, gains)) == [4, 8]
     hits = {name: np.concatenate([judged.is_right(name, place)[:, 0] for place in (0, 1)]) for name in found.systems}
+    earliest = np.maximum(np.arange(10) - 1, 0)  # that is right within 1 of a query
     for first, second, counts, flips in differences(judged):
         assert counts.only_first == (hits[first] > hits[second]).sum()
-        assert flips == block_sign_flips(hits[first], hits[second], sequences=[3, 7])
-    assured, start, parts = Assured(judged), 0, []
-    for sequence in several.sequences:
-        parts.append([[start + half.tune, start + half.report] for half in halves(sequence.truth.positives(1))])
-        start += len(sequence.images)
-    inputs = np.concatenate(
-        [confidence_inputs(*pair) for pair in zip(found.systems["count"], found.systems["filter"], strict=True)]
-    )
-    for one, other in zip(*parts, strict=True):
-        tune, report = (np.concatenate(both) for both in zip(one, other, strict=True))
-        expected = fit_confidence(inputs[tune], hits["count"][tune]).probability(inputs[report])
-        np.testing.assert_allclose(assured.probabilities["count"][report], expected)
-    assert [len(part) for part in assured.by_sequence(assured.scores("count"))] == [3, 7]
+        assert flips == block_sign_flips(hits[first], hits[second], places=earliest)
     with pytest.raises(InputError, match="expected one query sequence, got 2; choose one of first, second"):
         several.queries  # noqa: B018
     with pytest.raises(InputError, match="sequences of different names, got first twice"):
         sequences_dataset(small_street / "database", [split[0], split[0]], ground_truth="order")
+
+
+def test_answers_of_sequences_are_as_sure_as_those_of_one_path(dataset, split, small_street):
+    """The sequences are the two ends of a path: what p is fitted on is the other half of its places, not of each."""
+    several = sequences_dataset(
+        small_street / "database", split, ground_truth="index", index_file="truth.csv", widen_index=True
+    )
+    found = mfvpr.evaluate(several, SIFT, VLAD, SCORERS, candidates=10)
+    assured = Assured(Judged(found, [0, 1], [1], "count"))
+    answers, filtered = found.systems["count"], found.systems["filter"]
+    inputs = np.concatenate([confidence_inputs(*pair) for pair in zip(answers, filtered, strict=True)])
+    right, halved = assured.right("count"), halves(dataset.truth.positives(1))
+    for half in halved:
+        fitted = fit_confidence(inputs[half.tune], right[half.tune])
+        expected = fitted.probability(inputs[half.report])
+        assert np.isfinite(expected).all()
+        np.testing.assert_allclose(assured.probabilities["count"][half.report], expected)
+    assert [len(part) for part in assured.by_sequence(assured.scores("count"))] == [3, 7]
 
 
 def test_the_database_is_described_once_for_all_sequences(split, small_street, tmp_path):
