@@ -37,10 +37,14 @@ def check(given: Given | None, headline: str, settings: Mapping[str, Any], image
     """
     if given is None:
         return None
+    if not given.systems:
+        raise SettingsError(f"confidence={given.path}: expected p of systems, got none: the run that left it could fit "
+                            "none, as where there is but one candidate")  # fmt: skip
     if headline not in given.systems:
         raise SettingsError(f"confidence={given.path}: expected one of the system that decides, {headline}, got "
                             f"{', '.join(given.systems)}; make it with the same scorer, final and fusion")  # fmt: skip
-    if given.made.get("data_fingerprint") == images.fingerprints:
+    before, now = map(_of_queries, (given.made.get("data_fingerprint"), images.fingerprints))
+    if before & now:
         tell(f"warning: confidence={given.path} was fitted on these very images, so that it flatters")
     if not any(given.systems[headline].weights):
         tell(f"warning: confidence={given.path} cannot tell right answers from wrong ones: p is the same for all")
@@ -76,12 +80,22 @@ def right_within(settings: Mapping[str, Any], images: Images) -> list[Any] | Non
     return [middle(truth.thresholds(settings, right)), right.unit]
 
 
+def _of_queries(fingerprints: Any) -> set[str]:
+    """Of the folders with queries, whatever their names; many may share a database."""
+    sides = fingerprints.items() if isinstance(fingerprints, Mapping) else ()
+    return {folder for side, folder in sides if side != "database" and isinstance(folder, str)}
+
+
 def _of_system(settings: Any, system: str) -> dict[str, Any]:
-    """The settings that its scores depend on, of several scorers those that take part."""
-    if not isinstance(settings, Mapping) or not isinstance(settings.get("scorer"), Mapping):
+    """The settings that its scores depend on, of several scorers those that take part; files by what they hold."""
+    scorers = settings.get("scorer") if isinstance(settings, Mapping) else None
+    if not isinstance(scorers, Mapping) or not isinstance(scorers.get("method", ""), str):
         return {}
-    scorers, members = build.by_scorer(settings["scorer"]), system.split(" + ")
-    return {**settings, "scorer": {name: own for name, own in scorers.items() if name in members}}
+    members = system.split(" + ")
+    parts = {name: own for name, own in build.by_scorer(scorers).items() if name in members}
+    files = {name for name, own in parts.items() if isinstance(own, Mapping) and "weight_content" in own}
+    return {**settings, "scorer": {name: {**own, "weight": None} if name in files else own
+                                   for name, own in parts.items()}}  # fmt: skip
 
 
 def made(settings: Mapping[str, Any], images: Images, judged: Judged) -> dict[str, Any]:

@@ -102,6 +102,10 @@ def _check_apart(teach: list[Prepared], report: list[Prepared]) -> None:
         if same := sum(map(bool, own_rows(*(each.images.contents["query"] for each in (other, one))))):
             raise SettingsError(f"{other.part.name}: expected other queries than those of {one.part.name}; {same} are "
                                 "the same, and would count twice")  # fmt: skip
+    for one, other in itertools.combinations(report, 2):
+        if any(own_rows(*(each.images.contents["database"] for each in (other, one)))):
+            console.tell(f"warning: {one.part.name} and {other.part.name} are of one map, but their queries are taken "
+                         "for independent, so that intervals are too narrow and p too low")  # fmt: skip
 
 
 def _about(one: Prepared) -> dict[str, Any]:

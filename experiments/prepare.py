@@ -25,6 +25,9 @@ from mfvpr.types import Shortlist
 __all__ = ["Images", "Tools", "begun", "matched", "recipe"]
 
 
+_LEARNED_WITH = {"features": ("name", "weights"), "matching": ("name", "cross_check")}  # what a match weight depends on
+
+
 @dataclass(frozen=True)
 class Images:
     """A data set with what its files hold."""
@@ -161,13 +164,21 @@ def _warn_of_weights(settings: dict[str, Any], images: Images) -> None:
     chosen = {one.get("weight", "fs") for one in build.by_scorer(settings["scorer"]).values()}
     for name in sorted(chosen | {*((settings.get("grid") or {}).get("weight") or ())}):
         made = how_made(name)
-        seen = {folder for one in made.get("data_sets", [made]) for folder in one.get("data_fingerprint", {}).values()}
+        sets = made["data_sets"] if isinstance(made.get("data_sets"), list) else [made]
+        seen = {str(folder) for one in sets for folder in _part(one, "data_fingerprint").values()}
         if seen & {*images.fingerprints.values()}:
             tell(f"warning: weight={name} was learned on images of {images.dataset.name}, so that it flatters here")
-        before, now = (one.get("features", {}) for one in (made.get("settings", {}), settings))
-        if made and (other := [key for key in ("name", "weights") if before.get(key) != now.get(key)]):
-            words = ", ".join(f"{before.get(key)} instead of {now.get(key)}" for key in other)
-            tell(f"warning: weight={name} was learned with other features ({words}); it may mean nothing here")
+        for group, keys in _LEARNED_WITH.items() if made else ():
+            before, now = _part(_part(made, "settings"), group), settings[group]
+            if other := [key for key in keys if before.get(key) != now.get(key)]:
+                words = ", ".join(f"{before.get(key, 'unknown')} instead of {now.get(key)}" for key in other)
+                tell(f"warning: weight={name} was learned with other {group} ({words}); it may mean nothing here")
+
+
+def _part(content: Any, name: str) -> Mapping[str, Any]:
+    """Of what a file says; empty where that is anything else."""
+    found = content.get(name) if isinstance(content, Mapping) else None
+    return found if isinstance(found, Mapping) else {}
 
 
 def _warn_of_sequence(settings: dict[str, Any], sequence: QuerySequence, own: OwnRows) -> None:

@@ -159,7 +159,7 @@ def read_confidences(path: Path) -> tuple[dict[str, Confidence], dict[str, Any]]
         if found["format"] != _FORMAT:
             raise ValueError(f"format {found['format']!r}")
         return {name: _confidence(**one) for name, one in found["systems"].items()}, dict(found["made"])
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         reason = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
         raise InputError(f"{path}: expected the confidence.json that an evaluation wrote ({reason}); evaluate images "
                          "with ground truth to make one") from error  # fmt: skip
@@ -170,6 +170,8 @@ def _confidence(*, inputs: list[Input], apart: int, bias: float, **vectors: list
     numbers = [bias, *center, *scale, *weights]
     same = len(inputs) == len(center) == len(scale) == len(weights)
     known = set(inputs) <= {"margin", "height", "filter", "score"}
-    if vectors or not (same and known and np.isfinite(numbers).all() and min(scale, default=0) > 0 and apart >= 0):
+    once = len({*inputs}) == len(inputs) and type(apart) is int and apart >= 0
+    fitted = np.isfinite(numbers).all() and min(scale, default=0) > 0 and min(weights) >= 0
+    if vectors or not (same and known and once and fitted):
         raise ValueError("values that make no model")
-    return Confidence(tuple(inputs), int(apart), center, scale, weights, float(bias))
+    return Confidence(tuple(inputs), apart, center, scale, weights, float(bias))

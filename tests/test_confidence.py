@@ -167,7 +167,9 @@ def broken(**changes):
     "content",
     ["", "[]", '{"format": 3}', *(json.dumps(broken(**changes)) for changes in (
         {"inputs": ["else"]}, {"center": [0, 1]}, {"scale": [0]}, {"bias": float("nan")}, {"weights": ["a"]},
-        {"more": [1]}, {"apart": -1}, {"bias": None}))],
+        {"more": [1]}, {"apart": -1}, {"bias": None}, {"apart": 2.5}, {"apart": True}, {"weights": [-1.0]},
+        {name: one * 2 for name, one in broken()["systems"]["histogram"].items() if isinstance(one, list)})),
+     '{"format": "mfvpr confidence 2", "made": ' + "[" * 100_000 + "]" * 100_000 + "}"],
 )  # fmt: skip
 def test_other_files_are_refused_in_one_line(content, tmp_path):
     path = tmp_path / "confidence.json"
@@ -185,7 +187,8 @@ def test_halves_of_drives_there_and_back_share_no_place():
     """Of 20 places, two drives of all of them, the second backward; a query shows the places beside it as well."""
     rows = [range(max(0, place - 1), min(20, place + 2)) for place in (*range(20), *reversed(range(20)))]
     shown = [Positives.from_rows([list(one) for one in some], 20) for some in (rows[:20], rows[20:])]
-    sequences = [SimpleNamespace(truth=SimpleNamespace(shows_place=lambda _, one=one: one)) for one in shown]
+    sequences = [SimpleNamespace(truth=SimpleNamespace(shows_place=lambda _, one=one: one, unit="frames"))
+                 for one in shown]  # fmt: skip
     judged: Any = SimpleNamespace(thresholds=[1], sequences=sequences)
     reported = []
     for half in Assured(judged)._halves():

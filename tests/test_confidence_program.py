@@ -2,18 +2,21 @@
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+import mfvpr
 from mfvpr.confidence import read_confidences
 from mfvpr.evaluation.precision import precision_recall, reliability
 from tests.programs import QUERIES, shared, small, typed
 
 SYSTEMS = ("filter", "histogram", "histogram + filter")
 LINES = ("scorer=histogram", "figures=1")
+LEARNED = Path(mfvpr.__file__).parent / "learned" / "learned_aliked.json"
 
 
 @pytest.fixture(scope="module")
@@ -196,6 +199,57 @@ def test_confidence_of_what_counted_otherwise_is_said(evaluate):
     assert "nothing is said of sum, which had other settings there" in stderr
     assert "other settings of" not in stderr
     assert "sum" not in {line["system"] for line in rows(out / "confidence.csv")}
+
+
+def test_what_it_was_fitted_on_is_known_under_any_name(evaluate, root, tmp_path):
+    """The queries tell, whatever the folder is called; the database alone may be the same."""
+    first, *_ = evaluate("first", "figures=0")
+    found = json.loads((first / "confidence.json").read_text())
+    for name, side, told in (("renamed", "query fwd", True), ("map", "database", False)):
+        seen = found["made"]["data_fingerprint"]
+        [queries] = [folder for key, folder in seen.items() if key != "database"]
+        sides = {"database": "other", side: queries} if told else {"database": seen["database"], "query": "other"}
+        changed = found | {"made": found["made"] | {"data_fingerprint": sides}}
+        (tmp_path / f"{name}.json").write_text(json.dumps(changed))
+        _, code, _, stderr = evaluate(name, f"confidence={tmp_path}/{name}.json", "figures=0")
+        assert code == 0, stderr
+        assert ("was fitted on these very images" in stderr) == told
+
+
+def test_a_single_candidate_leaves_nothing_to_say(evaluate):
+    first, code, _, stderr = evaluate("first", "figures=0", "candidates=1")
+    assert code == 0, stderr
+    line = rows(first / "confidence.csv")[0]
+    assert line["AP by score"]
+    assert {line[name] for name in line if " by p" in name or "ECE" in name or name == "by chance"} == {""}
+    _, code, _, stderr = evaluate("second", "figures=0", "candidates=1", f"confidence={first}/confidence.json")
+    assert code == 2
+    assert "expected p of systems, got none: the run that left it could fit none" in stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize("made", [
+    {"settings": {"scorer": {"method": ["a"]}}, "data_fingerprint": ["x"]},
+    {"settings": "x", "data_fingerprint": {"q": 5}}, {"settings": {"scorer": {"histogram": 5}}},
+])  # fmt: skip
+def test_what_another_program_says_of_how_it_was_made_stops_nothing(evaluate, tmp_path, made):
+    first, *_ = evaluate("first", "figures=0")
+    found = json.loads((first / "confidence.json").read_text())
+    (tmp_path / "other.json").write_text(json.dumps(found | {"made": made}))
+    _, code, _, stderr = evaluate("out", f"confidence={tmp_path}/other.json", "figures=0")
+    assert code == 0, stderr
+    assert "was fitted with other settings of features" in stderr
+
+
+def test_a_weight_is_known_by_what_it_holds(evaluate, tmp_path):
+    for name in ("one", "other"):
+        shutil.copy(LEARNED, tmp_path / f"{name}.json")
+    first, *_ = evaluate("first", "figures=0", f"scorer.weight={tmp_path}/one.json")
+    given = f"confidence={first}/confidence.json"
+    _, code, _, stderr = evaluate("second", "figures=0", given, f"scorer.weight={tmp_path}/other.json")
+    assert code == 0, stderr
+    assert "other settings" not in stderr
+    _, code, _, stderr = evaluate("third", "figures=0", given, "scorer.weight=ratio")
+    assert "fitted with other settings of scorer" in stderr
 
 
 def test_a_confidence_that_is_the_same_for_all_is_told(evaluate, tmp_path):

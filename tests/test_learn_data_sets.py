@@ -2,6 +2,7 @@
 
 import csv
 import json
+from types import SimpleNamespace
 
 import pytest
 
@@ -126,6 +127,24 @@ def test_the_same_queries_do_not_count_twice(root, streets, tmp_path, monkeypatc
     assert stderr.splitlines()[-1] == (
         f"error: again: expected other queries than those of street1; {QUERIES} are the same, and would count twice"
     )
+
+
+def test_sets_of_one_map_are_not_independent(root, streets, tmp_path, capsys):
+    """Other queries of the same database: no set of blocks knows that they show the same places."""
+    several = []
+    for name, of_queries in (("there", 1), ("back", 2)):
+        database, queries = (data_sets.composed("report", streets[number])[0] for number in (1, of_queries))
+        dataset = database | {"name": name, "queries": queries["queries"], "ground_truth": "order"}
+        settings = composed(*small(root), f"out={tmp_path}/out") | {"dataset": dataset | {"index_file": None}}
+        _, images = learning.prepare.begun(settings, evaluation.Stopwatch())
+        several.append(learning.Prepared(SimpleNamespace(name=name), images, {}, {}))
+    learning._check_apart([], several)
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        "warning: there and back are of one map, but their queries are taken for independent, so that intervals are "
+        "too narrow and p too low"
+    )
+    learning._check_apart([], several[:1])
+    assert "of one map" not in capsys.readouterr().err
 
 
 def test_a_learned_weight_knows_what_it_was_learned_on(root, streets, learned, tmp_path, monkeypatch, capsys):

@@ -129,3 +129,18 @@ def test_what_is_none_is_one_line(tmp_path, tmp_path_factory, monkeypatch, capsy
     code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *small(shared(tmp_path_factory)), *arguments)
     assert (code, stdout, stderr.count("\n")) == (2, "", 1)
     assert words in stderr
+
+
+@pytest.mark.parametrize("how", [
+    {"data_sets": ["a", "b"]}, {"data_sets": 5}, {"data_fingerprint": ["x"]}, {"data_fingerprint": {"database": ["x"]}},
+    {"settings": None}, {"settings": {"features": "sift"}}, {"data_sets": [{"data_fingerprint": {"query": None}}]},
+])  # fmt: skip
+def test_how_a_weight_of_another_program_was_made_stops_nothing(
+    weight, tmp_path, tmp_path_factory, monkeypatch, capsys, how
+):
+    write_weight(tmp_path / "theirs.json", weight, how)
+    options = ("scorer=histogram", f"scorer.weight={tmp_path}/theirs.json", "figures=0", f"out={tmp_path}/out")
+    code, _, stderr = typed(monkeypatch, capsys, "evaluate", *small(shared(tmp_path_factory)), *options)
+    assert code == 0, stderr
+    assert "theirs.json was learned with other features (unknown instead of sift" in stderr
+    assert "theirs.json was learned with other matching (unknown instead of neighbors" in stderr

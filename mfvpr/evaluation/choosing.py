@@ -5,7 +5,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mfvpr.evaluation.positives import Positives
+from mfvpr.evaluation.paths import places_along_path
+from mfvpr.evaluation.positives import Positives, stacked
+from mfvpr.evaluation.truth import Unit
 
 
 class Half(NamedTuple):
@@ -34,6 +36,29 @@ def halves(positives: Positives) -> tuple[Half, Half]:
     """
     first, second = np.split(np.arange(len(positives)), [len(positives) // 2])
     return separated(positives, first, second), separated(positives, second, first)
+
+
+def halves_of_map(parts: Sequence[Positives], unit: Unit) -> tuple[Half, Half]:
+    """The same for several sequences of one database, which pass its places in whatever order: halves of its places.
+
+    Of the queries without a place, the first of each sequence are in the first half.
+
+    Args:
+        parts: of each sequence, as in `halves`.
+        unit: of what shows a place.
+    """
+    together = stacked(parts)
+    places = places_along_path(together, unit)
+    there = places >= 0
+    middle = np.median(places[there]) if there.any() else 0
+    behind = places > middle
+    if not behind.any():  # more than half of them wait at the end
+        behind = there & (places >= middle)
+    for own in np.split(np.arange(len(together)), np.cumsum(list(map(len, parts)))[:-1]):
+        nowhere = own[~there[own]]
+        behind[nowhere[len(nowhere) // 2 :]] = True
+    first, second = np.flatnonzero(~behind), np.flatnonzero(behind)
+    return separated(together, first, second), separated(together, second, first)
 
 
 def separated(positives: Positives, tune: np.ndarray, report: np.ndarray) -> Half:

@@ -2,12 +2,14 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
 from mfvpr.errors import InputError
 from mfvpr.evaluation.choosing import Half, halves
+from mfvpr.evaluation.paths import places_along_path
 from mfvpr.evaluation.positives import Positives
 from mfvpr.evaluation.recall import hits
 from mfvpr.evaluation.truth import Truth, Unit, threshold_words
@@ -84,7 +86,7 @@ class Judge:
     def reported(self, rows: np.ndarray, chosen: Sequence[int]) -> np.ndarray:
         """`[thresholds, R]` hits of the queries that are reported on, each by the setting chosen without it."""
         if not self.halves:
-            return np.stack([hits(rows[0][chosen[0]], right) for right in self.positives])
+            return np.stack([hits(rows[0][chosen[0]], right) for right in self.positives])[:, self.order]
         parts = [
             [hits(rows[0][setting][half.report], right.take(half.report)) for right in self.positives]
             for setting, half in zip(chosen, self.halves, strict=True)
@@ -96,8 +98,22 @@ class Judge:
 
         Neighbors fail together, so intervals depend on who is whose neighbor.
         """
-        path = np.argsort(np.concatenate([half.report for half in self.halves]))
-        return np.concatenate(parts, axis=1)[:, path]
+        place = np.argsort(self.order)[np.concatenate([half.report for half in self.halves])]
+        return np.concatenate(parts, axis=1)[:, np.argsort(place)]
+
+    @cached_property
+    def order(self) -> np.ndarray:
+        """`[Q]` queries in the order of their path, and of data sets one after the other.
+
+        That is theirs, but names with positions in meters may be sorted by anything.
+        """
+        if self.unit != "m":
+            return np.arange(len(self.places))
+        places = places_along_path(self.places, self.unit)
+        sizes = [*self.reported_sets.values()]
+        before = len(self.places) - sum(sizes)  # those that are learned on
+        part = np.repeat(np.arange(len(sizes) + 1), [before, *sizes])
+        return np.lexsort((places, part))
 
 
 def judge(truth: Truth, thresholds: Iterable[float], split: Split | None = None) -> Judge:

@@ -167,6 +167,12 @@ def side_by_side(parts: Sequence[Positives]) -> Positives:
     return Positives(rows.astype(np.int32), _offsets(np.concatenate([part.counts for part in parts])), int(starts[-1]))
 
 
+def stacked(parts: Sequence[Positives]) -> Positives:
+    """Of all queries, one behind the other, of the same database."""
+    rows = np.concatenate([part.rows for part in parts])
+    return Positives(rows, _offsets(np.concatenate([part.counts for part in parts])), parts[0].num_database)
+
+
 def rows_within(query_xy: np.ndarray, database_xy: np.ndarray, radius: float) -> Iterator[np.ndarray]:
     """For each query `[n]` int32, the database rows at most `radius` meters away; as `radius_positives`."""
     query_xy, database_xy = np.asarray(query_xy, np.float64), np.asarray(database_xy, np.float64)

@@ -72,7 +72,8 @@ def precision_recall(
         raise InputError("right: expected no right answers to queries that have none; take both of the same truth")
     order = np.argsort(-confidence, kind="stable")[: np.sum(~np.isnan(confidence))]
     thresholds, hits = confidence[order], np.cumsum(right[order])
-    last = np.flatnonzero(np.diff(thresholds, append=np.nan) != 0)  # equal confidences are answered together
+    ends = np.append(thresholds[1:] != thresholds[:-1], [True] * min(len(thresholds), 1))
+    last = np.flatnonzero(ends)  # equal confidences, infinite ones as well, are answered together
     hits = hits[last]
     return PrecisionRecall(thresholds[last], hits / (last + 1), hits / max(has_answer.sum(), 1))
 

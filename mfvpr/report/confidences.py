@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from mfvpr.confidence import Confidence, confidence_inputs, fit_confidence, write_confidences
-from mfvpr.evaluation import Half, Positives, halves
-from mfvpr.evaluation.choosing import separated
+from mfvpr.evaluation import Half, halves
+from mfvpr.evaluation.choosing import halves_of_map
 from mfvpr.evaluation.precision import (
     PrecisionRecall,
     Reliability,
@@ -124,15 +124,9 @@ class Assured:
 
     def _halves(self) -> tuple[Half, Half]:
         """Of the path; of several sequences, which pass the same places in whatever order, of the database's."""
-        widest, truths = self.judged.thresholds[-1], [sequence.truth for sequence in self.judged.sequences]
-        shown = [truth.shows_place(widest) for truth in truths if truth is not None]
-        if len(shown) == 1:
-            return halves(shown[0])
-        together = Positives.from_rows((one.of(row) for one in shown for row in range(len(one))), shown[0].num_database)
-        first = np.array([min(together.of(row), default=-1) for row in range(len(together))])
-        behind = first > np.median(first)
-        parts = np.flatnonzero(~behind), np.flatnonzero(behind)
-        return separated(together, *parts), separated(together, *parts[::-1])
+        truths = [sequence.truth for sequence in self.judged.sequences if sequence.truth is not None]
+        shown = [truth.shows_place(self.judged.thresholds[-1]) for truth in truths]
+        return halves(shown[0]) if len(shown) == 1 else halves_of_map(shown, truths[0].unit)
 
 
 def confidence_table(assured: Assured) -> Table:
@@ -155,7 +149,8 @@ def _line(assured: Assured, system: str, counted: bool) -> list[str]:
     ]
     probabilities = assured.probabilities[system]
     percent += [assured.reliability(system).calibration_error, chance_calibration_error(probabilities)]
-    cells = [system, *(f"{100 * value:.1f}" for value in percent)]
+    known = 3 if np.isnan(probabilities).all() else len(percent)  # nothing is said of a p that there is not
+    cells = [system, *(f"{100 * value:.1f}" if place < known else "" for place, value in enumerate(percent))]
     if counted:
         right, refused = assured.right(system), assured.refused(system)
         counts = (right & ~refused, ~right & ~refused, refused, refused & right)

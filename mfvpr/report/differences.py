@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from mfvpr.data.files import write_text
+from mfvpr.evaluation.paths import places_along_path
+from mfvpr.evaluation.positives import stacked
 from mfvpr.evaluation.statistics import McNemar, SignFlips, block_sign_flips, mcnemar
 from mfvpr.report.evaluations import Judged
 from mfvpr.report.rankings import number, write_csv
@@ -30,7 +32,7 @@ def differences(judged: Judged) -> list[Difference]:
     places = range(len(judged.sequences))
     hits = {name: np.concatenate([_right(judged, name, place)[:, 0] for place in places])
             for name in judged.result.systems}  # fmt: skip
-    shown = _places(judged) if len(judged.sequences) > 1 else None
+    shown = _places(judged)
     return [
         Difference(first, second, mcnemar(hits[first], hits[second]),
                    block_sign_flips(hits[first], hits[second], places=shown))
@@ -38,12 +40,12 @@ def differences(judged: Judged) -> list[Difference]:
     ]  # fmt: skip
 
 
-def _places(judged: Judged) -> np.ndarray:
-    """`[Q]` the first right row of the one database of every query of all sequences; -1 where none is right."""
-    return np.concatenate([
-        np.array([min(right.of(query), default=-1) for query in range(len(right))], int)
-        for right in judged.right if right is not None
-    ])  # fmt: skip
+def _places(judged: Judged) -> np.ndarray | None:
+    """`[Q]` of the one map that all queries are of; None where these are one sequence, in the order of its path."""
+    truth, right = judged.sequences[0].truth, [one for one in judged.right if one is not None]
+    if truth is None or (len(judged.sequences) == 1 and truth.unit != "m"):
+        return None
+    return places_along_path(stacked(right), truth.unit)
 
 
 def differences_table(judged: Judged) -> Table:

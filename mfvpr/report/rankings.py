@@ -72,7 +72,9 @@ def _first_right(rankings: Rankings, right: np.ndarray, query: int) -> list[str 
         return [""] * 4
     rank, scores = int(np.argmax(right)), rankings.scores[query]
     name = rankings.database[int(rankings.rows[query, rank])]
-    return [rank + 1, name, number(scores[rank]), number(scores[0] - scores[rank])]
+    with np.errstate(invalid="ignore"):  # of two infinite scores
+        margin = scores[0] - scores[rank]
+    return [rank + 1, name, number(scores[rank]), number(margin)]
 
 
 def number(value: Any) -> str:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mfvpr.errors import InputError
@@ -50,11 +51,18 @@ def score_pairs(scorer: Any, matches: Matches) -> np.ndarray:
     Raises:
         InputError: it gives anything but a number for each pair.
     """
-    scores = np.asarray(scorer.score_pairs(matches), np.float32)
+    scores, name = np.asarray(scorer.score_pairs(matches)), f"{type(scorer).__name__}.score_pairs"
     if scores.shape != (len(matches.mask),):
-        raise InputError(f"{type(scorer).__name__}.score_pairs: expected a number for each of {len(matches.mask)} "
-                         f"pairs, got an array {list(scores.shape)}")  # fmt: skip
-    return scores
+        raise InputError(f"{name}: expected a number for each of {len(matches.mask)} pairs, got an array "
+                         f"{list(scores.shape)}")  # fmt: skip
+    require_real(name, scores)
+    return scores.astype(np.float32)
+
+
+def require_real(name: str, scores: Array | np.ndarray) -> None:
+    """Raise an InputError unless scores can be ranked."""
+    if scores.dtype.kind not in "fiub" and scores.dtype != jnp.bfloat16:
+        raise InputError(f"{name}: expected real numbers as scores, got {scores.dtype}")
 
 
 SCORERS: dict[str, type] = {
@@ -98,5 +106,6 @@ __all__ = [
     "image_sizes",
     "match_shifts",
     "on_host",
+    "require_real",
     "score_pairs",
 ]

@@ -6,6 +6,7 @@ import pytest
 from mfvpr import frame_positives
 from mfvpr.data.ground_truth import AllowedTruth, FrameTruth, LabelTruth
 from mfvpr.evaluation import Positives, best_setting, halves, hits, neighbors
+from mfvpr.evaluation.choosing import halves_of_map
 
 
 @pytest.mark.parametrize("tolerance", [0, 1, 3])
@@ -22,6 +23,32 @@ def test_halves_never_share_a_place(tolerance):
     assert sorted(reported) == list(range(20))
     first, second = halves(positives)
     assert len(first.tune) == len(second.tune) == 10 - 2 * tolerance
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6])
+def test_queries_without_a_place_are_in_both_halves_of_a_map(share):
+    """One drive there, one back, and one elsewhere: neither half has all that is nowhere, or all that is somewhere."""
+    rng, drive = np.random.default_rng(0), np.arange(100)
+    there = np.where(rng.random(100) < share, -1, drive)
+    parts = [Positives.from_matrix(frame_positives(places, drive, tolerance=2))
+             for places in (there, there[::-1], np.full(50, -1))]  # fmt: skip
+    nowhere = np.concatenate([there, there[::-1], np.full(50, -1)]) < 0
+    found = halves_of_map(parts, "frames")
+    assert sorted(np.concatenate([half.report for half in found])) == list(range(250))
+    for half in found:
+        for side in (half.tune, half.report):
+            assert abs(nowhere[side].sum() - nowhere.sum() / 2) <= 2
+            assert abs((~nowhere[side]).sum() - (~nowhere).sum() / 2) <= 0.1 * (~nowhere).sum() + 8
+
+
+def test_halves_of_a_map_where_most_queries_wait_at_its_end():
+    places = np.r_[np.arange(0, 60, 3), np.full(40, 59)]
+    parts = [Positives.from_matrix(frame_positives(places, np.arange(60), tolerance=1))] * 2
+    first, second = halves_of_map(parts, "frames")
+    assert len(first.report) == 2 * 40
+    assert len(second.report) == 2 * 20
+    nothing = halves_of_map([Positives.from_rows([[]] * 4, 3)] * 2, "m")
+    assert [len(half.report) for half in nothing] == [4, 4]
 
 
 def test_queries_without_a_place_may_be_tuned_on():

@@ -96,3 +96,17 @@ def test_fingerprints_tell_what_is_right_apart():
     made = [judge(TRUTH, TOLERANCES), judge(TRUTH, (0, 1, 2)), judge(shifted, TOLERANCES), judge(TRUTH, (1, 3))]
     assert len({one.fingerprint for one in made}) == 4
     assert judge(TRUTH, TOLERANCES, "both").fingerprint == made[0].fingerprint
+
+
+@pytest.mark.parametrize("split", [None, "both"])
+def test_positions_are_reported_along_their_path_however_names_sort_them(split):
+    """A street to the north whose names are sorted by easting, which is but noise."""
+    rng = np.random.default_rng(0)
+    north = rng.permutation(40).astype(float)
+    positions = np.stack([rng.normal(0, 0.1, 40), 10 * north], axis=1)
+    found = judge(RadiusTruth(positions, positions), [12.0], split)
+    rows = np.where(north < 25, np.arange(40), -1).astype(np.int32)[None, None, :, None].repeat(3, axis=0)
+    hits = found.reported(rows, [0, 0] if split else [0])[0]
+    changes = np.flatnonzero(np.diff(hits.astype(int)))
+    assert hits.sum() == 25
+    assert len(changes) == 1  # neighbors of the street are neighbors

@@ -83,3 +83,14 @@ def test_calibration_error_by_chance_is_that_of_probabilities_that_are_true():
     assert chance_calibration_error(np.full(100, 0.5)) == pytest.approx(math.sqrt(2 / (math.pi * 100)) / 2, rel=0.1)
     assert chance_calibration_error(np.array([0.0, 1.0, np.nan])) == 0
     assert np.isnan(reliability(np.full(3, np.nan), np.zeros(3)).calibration_error)
+
+
+@pytest.mark.parametrize("value", [5.0, np.inf, -np.inf])
+@pytest.mark.parametrize("right", [[True, False], [False, True]])
+def test_equal_confidences_are_answered_together_however_large(value, right):
+    curve = precision_recall(np.array([value, value]), np.array(right))
+    assert (curve.precision.tolist(), curve.recall.tolist(), curve.average_precision) == ([0.5], [0.5], 0.25)
+
+
+def test_without_any_answer_there_is_no_curve():
+    assert len(precision_recall(np.full(2, np.nan), np.zeros(2, bool)).thresholds) == 0

@@ -54,6 +54,14 @@ def test_a_number_for_each_pair_is_expected(monkeypatch, way, wrong):
 
 
 @pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("wrong", [lambda masks: masks.sum(axis=1) * 1j, lambda masks: ["x"] * len(masks)])
+def test_real_numbers_are_expected(monkeypatch, way, wrong):
+    monkeypatch.setitem(globals(), "answer", wrong)
+    with pytest.raises(InputError, match=r"Host\.score_pairs: expected real numbers as scores, got (complex|<U)"):
+        WAYS[way](Host())
+
+
+@pytest.mark.parametrize("way", WAYS)
 def test_a_class_that_is_no_value_is_refused(way):
     class Plain(OpenCvHomography):
         pass

@@ -1,0 +1,64 @@
+"""Places in the order of the map: the same whatever the names of files are sorted by."""
+
+import numpy as np
+import pytest
+
+from mfvpr.evaluation import Positives
+from mfvpr.evaluation.paths import places_along_path
+from mfvpr.evaluation.statistics import block_sign_flips
+
+PLACES = 60
+DRIVES = [*range(PLACES), *reversed(range(0, PLACES, 2))]  # there and back
+
+
+def shown(seed, tolerance=2):
+    """Images within the tolerance of each query's place, whose rows are in any order."""
+    row = np.random.default_rng(seed).permutation(PLACES)
+    return Positives.from_rows(
+        [row[max(place - tolerance, 0) : place + tolerance + 1] for place in DRIVES], PLACES
+    )  # fmt: skip
+
+
+def rising(places):
+    """In the direction of the first drive."""
+    return places if places[0] < places[PLACES - 1] else places.max() - places
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_neighbors_follow_whatever_the_rows_of_the_map_are(seed):
+    found = rising(places_along_path(shown(seed), "m"))
+    assert np.abs(found - DRIVES).max() <= 2  # at the ends images are shown by few queries
+    assert (np.diff(found[2 : PLACES - 2]) == 1).all()
+    np.testing.assert_array_equal(found[PLACES:][::-1], found[:PLACES:2])
+
+
+def test_frames_are_in_order_and_exact_images_in_that_of_the_first_queries():
+    frames = Positives.from_rows([[place] for place in DRIVES], PLACES)
+    np.testing.assert_array_equal(places_along_path(frames, "frames"), DRIVES)
+    np.testing.assert_array_equal(places_along_path(shown(3, tolerance=0), "exact"), DRIVES)
+
+
+@pytest.mark.parametrize("unit", ["frames", "m", "exact"])
+def test_places_that_the_map_does_not_show_are_none(unit):
+    found = places_along_path(Positives.from_rows([[], [3], [3], [], [1], [0], []], 5), unit)
+    assert (found == -1).tolist() == [True, False, False, True, False, False, True]
+    assert found[1] == found[2]
+    assert len({*found[[1, 4, 5]].tolist()}) == 3
+    for queries in (0, 2):
+        assert places_along_path(Positives.from_rows([[]] * queries, 4), unit).tolist() == [-1] * queries
+
+
+def test_p_by_blocks_is_rarely_low_without_a_difference_however_the_names_are_sorted():
+    """Two systems that are equally good, each with its own weak stretches of the street, which drives share."""
+    rng, draws, low = np.random.default_rng(0), 200, {"sorted by chance": 0, "along the path": 0}
+    names = rng.permutation(len(DRIVES))  # queries in the order of files
+    places = places_along_path(shown(0).take(names), "m")
+    for _ in range(draws):
+        hits = []
+        for _ in range(2):
+            latent = np.convolve(rng.normal(size=PLACES + 14), np.ones(15), "valid") / np.sqrt(15)
+            hits.append((latent[DRIVES] > -0.5)[names])
+        low["sorted by chance"] += block_sign_flips(*hits).p_value <= 0.05
+        low["along the path"] += block_sign_flips(*hits, places=places).p_value <= 0.05
+    assert low["along the path"] <= 0.1 * draws
+    assert low["sorted by chance"] >= 0.3 * draws
