@@ -91,12 +91,22 @@ def filter(settings: dict[str, Any], local: Extractor | FeatureFiles, data: Data
         return DescriptorFiles(_files("retrieval", options, data), options["lengths"], search)
     if settings["name"] == "vlad":
         return Retrieval(Aggregated(local, VladFitting(**options)), search)
+    if settings["name"] in ("netvlad", "gem"):
+        return Retrieval(_described(settings["name"], options), search)
     from mfvpr.features.mixvpr import IMAGE_SIZE, MixVprDescriptor
 
     size = options.pop("image_size")
     if tuple(size) != IMAGE_SIZE:
         raise SettingsError(f"retrieval.image_size={size}: MixVPR takes {list(IMAGE_SIZE)} only, as its weights do")
     return Retrieval(MixVprDescriptor(_network("retrieval", "mixvpr", options.pop("weights")), **options), search)
+
+
+def _described(name: str, options: dict[str, Any]) -> Extractor:
+    from mfvpr.features.global_descriptor import GlobalDescriptor
+
+    networks = ("netvlad", "patchnetvlad") if name == "netvlad" else (name,)
+    model, size = _network("retrieval", networks, options.pop("weights")), tuple(options.pop("image_size"))
+    return GlobalDescriptor(model, size, **_only(options, GlobalDescriptor, f"retrieval={name}"))
 
 
 def matching(settings: dict[str, Any]) -> Matcher:
@@ -178,14 +188,15 @@ def frames(settings: dict[str, Any]) -> FrameCorrelation | None:
     return FrameCorrelation(previous) if previous else None
 
 
-def _network(group: str, name: str, weights: str | None) -> Any:
-    """The network with its weights, converted before."""
+def _network(group: str, names: str | tuple[str, ...], weights: str | None) -> Any:
+    """The network, one of these, with its weights, converted before."""
     from mfvpr.weights.files import load_model
     from mfvpr.weights.registry import REGISTRY
 
-    known = [entry.name for entry in REGISTRY.values() if entry.network == name]
+    names = (names,) if isinstance(names, str) else names
+    known = [entry.name for entry in REGISTRY.values() if entry.network in names]
     if weights not in known:
-        raise SettingsError(f"{group}.weights={weights}: expected weights of {name}: one of {', '.join(known)}")
+        raise SettingsError(f"{group}.weights={weights}: expected weights of {names[0]}: one of {', '.join(known)}")
     return load_model(weights)
 
 

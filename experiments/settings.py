@@ -46,7 +46,7 @@ RULES: dict[str, Rule] = {
         lambda value: isinstance(value, str) and bool(re.fullmatch(r"[\w-][\w.-]*", value)), "letters, digits, - and _"
     ),
     "features.name": one_of("sift", "d2net", "aliked", "ssm", "import"),
-    "retrieval.name": one_of("vlad", "mixvpr", "ssm", "import", "pairs"),
+    "retrieval.name": one_of("vlad", "mixvpr", "netvlad", "gem", "ssm", "import", "pairs"),
     "features.image_size": either(list_of(_SIDE, 2), None),
     # data
     "seed": _INDEX,
@@ -81,6 +81,7 @@ RULES: dict[str, Rule] = {
     "max_samples": _COUNT,
     "whiten": either(between(1, 4096), None),
     "dimension": between(1, 4096),
+    "components": either(between(1, 4096), None),
     "max_images": either(_COUNT, None),
     "max_windows": either(_COUNT, None),
     "zero_row": _FLAG,

@@ -48,13 +48,12 @@ def list_weights() -> None:
     """Print a table of the registry."""
     from mfvpr.report.tables import Table
     from mfvpr.weights.files import is_installed
-    from mfvpr.weights.networks import NETWORKS
     from mfvpr.weights.registry import REGISTRY
 
     header = ["name", "network", "official file", "license of code", "of weights", "installed", "MB"]
     rows = []
     for entry in REGISTRY.values():
-        installed = ("yes" if is_installed(entry) else "no") if entry.name in NETWORKS else "no network yet"
+        installed = "yes" if is_installed(entry) else "no"
         size = f"{entry.size / 1e6:.1f}" if entry.size else "-"
         licenses = (entry.code_license, entry.weights_license)
         rows.append([entry.name, entry.network, entry.file, *licenses, installed, size])
@@ -97,7 +96,6 @@ def download(name: str) -> None:
     """Fetch an official checkpoint into the weights folder; it gets its name once its hash is right."""
     from mfvpr.errors import InputError
     from mfvpr.weights.files import file_sha256, weights_folder
-    from mfvpr.weights.networks import NETWORKS
     from mfvpr.weights.registry import entry_of
 
     entry = entry_of(name)
@@ -112,8 +110,7 @@ def download(name: str) -> None:
     else:
         _fetch(entry, target)
         print(f"{target}: downloaded, with the published hash")
-    if name in NETWORKS:
-        print(f"to install it: {WEIGHTS} convert {shlex.quote(str(target))}")
+    print(f"to install it: {WEIGHTS} convert {shlex.quote(str(target))}")
 
 
 def _fetch(entry: "Entry", target: Path) -> None:
@@ -181,21 +178,18 @@ def _verified(entry: "Entry") -> str:
     """
     from mfvpr.errors import InputError
     from mfvpr.weights.files import check_published, load_model, read_manifest, weights_folder
-    from mfvpr.weights.networks import NETWORKS
 
     good = []
     original = weights_folder() / entry.file
     if _original_present(entry):
         check_published(original, entry)
         good.append(f"{entry.file} has the published hash")
-    if entry.name in NETWORKS and (not good or _runtime_present(entry)):
+    if not good or _runtime_present(entry):
         load_model(entry.name)
         parameters = read_manifest(entry.name).parameters
         if parameters != entry.parameters:
             raise InputError(f"expected {entry.parameters:,} parameters, got {parameters:,}")
         good.append(f"{parameters:,} parameters as converted")
-    if not good:
-        raise InputError(f"{original}: not there; fetch it: {how_to_install(entry)}")
     return "good, " + ", ".join(good)
 
 

@@ -178,10 +178,12 @@ def _random(name: str, shape: tuple[int, ...], seed: int) -> np.ndarray:
 
 
 def at_hand() -> Iterator[tuple[str, dict[str, np.ndarray]]]:
-    """(name, tensors): random ones of D2-Net, MixVPR and SSM-VPR, and the real ones of ALIKED and LightGlue."""
+    """(name, tensors): random ones, and the real ones of ALIKED and LightGlue."""
     yield "d2_tf", random_checkpoint(d2net_shapes())
     yield "mixvpr_4096", random_checkpoint(mixvpr_shapes())
     yield "vgg16_places365", random_checkpoint(places365_shapes(full=False))
+    yield "patchnetvlad_mapillary_128", netvlad_checkpoint(16, 128)
+    yield "cosplace_vgg16_512", gem_checkpoint("vgg16", 512)
     for path in sorted([*ALIKED.glob("*.pth"), *LIGHTGLUE.parent.glob(LIGHTGLUE.name)]):
         yield path.stem, read_checkpoint(path)
 
@@ -213,13 +215,111 @@ def places365_shapes(weights: str = "weights", *, full: bool = True) -> dict[str
     return {f"{layer}.{name}": kind(shape) for layer, shape in shapes.items() for name, kind in kinds.items()}
 
 
+_VGG16 = {0: (3, 64), 2: (64, 64), 5: (64, 128), 7: (128, 128), 10: (128, 256), 12: (256, 256), 14: (256, 256),
+          17: (256, 512), 19: (512, 512), 21: (512, 512), 24: (512, 512), 26: (512, 512), 28: (512, 512)}  # fmt: skip
+
+
+def _vgg16(prefix: str) -> dict[str, tuple[int, ...]]:
+    shapes = {}
+    for index, (inputs, outputs) in _VGG16.items():
+        shapes |= {f"{prefix}.{index}.weight": (outputs, inputs, 3, 3), f"{prefix}.{index}.bias": (outputs,)}
+    return shapes
+
+
+def netvlad_shapes(clusters: int = 16, outputs: int | None = 4096) -> dict[str, tuple[int, ...]]:
+    """The tensors of Patch-NetVLAD's checkpoints; without `outputs` those of pytorch-NetVlad's."""
+    shapes = _vgg16("encoder") | {"pool.conv.weight": (clusters, 512, 1, 1), "pool.centroids": (clusters, 512)}
+    projection = {"WPCA.0.weight": (outputs, 512 * clusters, 1, 1), "WPCA.0.bias": (outputs,)}
+    return shapes | (projection if outputs else {})
+
+
+def netvlad_checkpoint(clusters: int = 16, outputs: int | None = 4096, seed: int = 0) -> dict[str, np.ndarray]:
+    """Random weights that assign as decidedly as published ones."""
+    found = random_checkpoint(netvlad_shapes(clusters, outputs), seed)
+    return found | {"pool.conv.weight": 40 * found["pool.conv.weight"]}
+
+
+def gem_checkpoint(backbone: str = "resnet50", outputs: int = 2048, seed: int = 0) -> dict[str, np.ndarray]:
+    """Random weights with a power as of published ones."""
+    return random_checkpoint(gem_shapes(backbone, outputs), seed) | {"aggregation.1.p": np.float32([2.875])}
+
+
+def gem_shapes(backbone: str = "resnet50", outputs: int = 2048) -> dict[str, tuple[int, ...]]:
+    """The tensors of CosPlace's checkpoints."""
+    channels = {"vgg16": 512, "resnet50": 2048}[backbone]
+    shapes = _vgg16("backbone") if backbone == "vgg16" else {
+        "backbone.0.weight": (64, 3, 7, 7), **_norm("backbone.1", 64),
+        **_bottlenecks({f"backbone.{layer + 3}": (blocks, 64 * 2 ** (layer - 1))
+                        for layer, blocks in enumerate((3, 4, 6, 3), start=1)}),
+    }  # fmt: skip
+    return shapes | {"aggregation.1.p": (1,), "aggregation.3.weight": (outputs, channels),
+                     "aggregation.3.bias": (outputs,)}  # fmt: skip
+
+
+def matlab_shapes(clusters: int = 64, outputs: int = 4096) -> dict[str, tuple[int, ...]]:
+    """The arrays of the original's files, as they are read."""
+    weights = {}
+    for position, (inputs, channels) in _VGG16.items():
+        weights |= {f"{position}.weights.0": (3, 3, inputs, channels), f"{position}.weights.1": (1, channels)}
+    weights |= {"30.weights.0": (512, clusters), "30.weights.1": (512, clusters)}
+    weights |= {"33.weights.0": (1, 1, 512 * clusters, outputs), "33.weights.1": (1, outputs)}
+    shapes = {f"net.layers.{name}": shape for name, shape in weights.items()}
+    return shapes | {"net.meta.normalization.averageImage": (6, 5, 3), "net.meta.normalization.imageSize": (1, 3)}
+
+
+def matlab_netvlad(clusters: int = 64, outputs: int = 4096, seed: int = 0) -> dict[str, Any]:
+    """What the original's files hold, as SciPy writes it: `net.layers{i}.weights{j}` and the average image."""
+    tensors = netvlad_checkpoint(clusters, outputs, seed)
+    weights = {position: [tensors[f"encoder.{position}.weight"].transpose(2, 3, 1, 0),
+                          tensors[f"encoder.{position}.bias"][None]] for position in _VGG16}  # fmt: skip
+    weights[30] = [tensors["pool.conv.weight"][:, :, 0, 0].T, -tensors["pool.centroids"].T]
+    weights[33] = [tensors["WPCA.0.weight"][:, :, 0, 0].T[None, None], tensors["WPCA.0.bias"][None]]
+    layers = np.empty((1, 35), object)
+    for position in range(35):
+        layer: dict[str, Any] = {"name": f"layer{position}", "type": "conv" if position in weights else "relu"}
+        if position in weights:
+            layer["weights"] = _cell(weights[position])
+        layers[0, position] = layer
+    average = np.broadcast_to(np.float32([123.68, 116.779, 103.939]), (6, 5, 3)).copy()
+    meta = {"normalization": {"averageImage": average, "imageSize": np.float64([[5, 6, 3]])}, "classes": "none"}
+    return {"net": {"layers": layers, "meta": meta}}
+
+
+def _cell(parts: list[Any]) -> np.ndarray:
+    cell = np.empty((1, len(parts)), object)
+    for place, part in enumerate(parts):
+        cell[0, place] = part
+    return cell
+
+
+def write_matlab(path: Path, content: dict[str, Any], *, packed: bool = True) -> Path:
+    """A .mat file of version 5."""
+    from scipy.io import savemat
+
+    savemat(path, content, do_compression=packed)
+    return path
+
+
 def mixvpr_shapes(out_channels: int = 1024, out_rows: int = 4) -> dict[str, tuple[int, ...]]:
     """The tensors of MixVPR's checkpoints: ResNet-50 to its third layer, the mixer, two projections."""
     shapes = {"backbone.model.conv1.weight": (64, 3, 7, 7), **_norm("backbone.model.bn1", 64)}
-    inputs = 64
-    for layer, (blocks, width) in enumerate(((3, 64), (4, 128), (6, 256)), start=1):
+    shapes |= _bottlenecks({f"backbone.model.layer{layer}": (blocks, 64 * 2 ** (layer - 1))
+                            for layer, blocks in enumerate((3, 4, 6), start=1)})  # fmt: skip
+    for mixer in range(4):
+        prefix = f"aggregator.mix.{mixer}.mix"
+        shapes |= {f"{prefix}.0.weight": (400,), f"{prefix}.0.bias": (400,)}
+        for layer in (1, 3):
+            shapes |= {f"{prefix}.{layer}.weight": (400, 400), f"{prefix}.{layer}.bias": (400,)}
+    shapes |= {"aggregator.channel_proj.weight": (out_channels, 1024), "aggregator.channel_proj.bias": (out_channels,)}
+    return shapes | {"aggregator.row_proj.weight": (out_rows, 400), "aggregator.row_proj.bias": (out_rows,)}
+
+
+def _bottlenecks(layers: Mapping[str, tuple[int, int]]) -> dict[str, tuple[int, ...]]:
+    """Of ResNet-50's layers: blocks and width of each."""
+    shapes, inputs = {}, 64
+    for layer, (blocks, width) in layers.items():
         for block in range(blocks):
-            prefix = f"backbone.model.layer{layer}.{block}"
+            prefix = f"{layer}.{block}"
             sizes = ((width, inputs, 1, 1), (width, width, 3, 3), (4 * width, width, 1, 1))
             for index, size in enumerate(sizes, start=1):
                 shapes[f"{prefix}.conv{index}.weight"] = size
@@ -228,13 +328,7 @@ def mixvpr_shapes(out_channels: int = 1024, out_rows: int = 4) -> dict[str, tupl
                 shapes[f"{prefix}.downsample.0.weight"] = (4 * width, inputs, 1, 1)
                 shapes |= _norm(f"{prefix}.downsample.1", 4 * width)
             inputs = 4 * width
-    for mixer in range(4):
-        prefix = f"aggregator.mix.{mixer}.mix"
-        shapes |= {f"{prefix}.0.weight": (400,), f"{prefix}.0.bias": (400,)}
-        for layer in (1, 3):
-            shapes |= {f"{prefix}.{layer}.weight": (400, 400), f"{prefix}.{layer}.bias": (400,)}
-    shapes |= {"aggregator.channel_proj.weight": (out_channels, 1024), "aggregator.channel_proj.bias": (out_channels,)}
-    return shapes | {"aggregator.row_proj.weight": (out_rows, 400), "aggregator.row_proj.bias": (out_rows,)}
+    return shapes
 
 
 def lightglue_shapes(

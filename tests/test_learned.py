@@ -2,8 +2,13 @@
 
 import json
 
+import numpy as np
 import pytest
 
+from mfvpr.data.datasets import image_folder
+from mfvpr.data.images import resize
+from mfvpr.features.global_descriptor import GlobalDescriptor
+from mfvpr.weights.files import load_model
 from tests import checkpoints
 from tests.programs import ROOT, typed
 
@@ -165,3 +170,44 @@ def test_features_that_lightglue_was_not_trained_for_are_refused(refused, small_
 def test_sizes_that_networks_cannot_take_are_refused_with_those_they_can(refused, weights):
     error = refused(weights, "features=d2net", "features.multiscale=true", "features.image_size=[16,100]")
     assert "expected images of 24 x 24 px or more, got 16 x 100" in error
+
+
+@pytest.mark.parametrize(("name", "options"), [
+    ("netvlad", ("retrieval.weights=patchnetvlad_mapillary_128", "retrieval.components=32")),
+    ("gem", ("retrieval.weights=cosplace_vgg16_512",)),
+])  # fmt: skip
+def test_global_descriptors_of_networks_are_filters(
+    evaluate, weights, small_street, tmp_path, monkeypatch, name, options
+):
+    monkeypatch.setenv("MFVPR_CACHE", str(tmp_path / "cache"))
+    folders = f"dataset.database={small_street}/database", f"dataset.queries={small_street}/queries"
+    told = evaluate("dataset=folder", *folders, "dataset.ground_truth=order", f"retrieval={name}", *options,
+                    "retrieval.image_size=[96,64]", "candidates=3", "figures=0", f"out={tmp_path}/out")  # fmt: skip
+    assert "note: R@10 is R@3" in told
+    stores = {path.name.rpartition("-")[0] for path in (tmp_path / "cache" / "features").glob("*-*")}
+    assert "GlobalDescriptor" in stores
+    model, components = load_model(options[0].partition("=")[2], weights), 32 if name == "netvlad" else None
+    extractor, vectors = GlobalDescriptor(model, (96, 64), components=components), []
+    for side in ("queries", "database"):
+        images = image_folder(small_street / side)
+        resized = [resize(images.read(row), (96, 64), "pil_bilinear") for row in range(len(images))]
+        vectors.append(np.array([one.vector for one in extractor(np.array(resized))]))
+    nearest = np.argsort(-(vectors[0] @ vectors[1].T), axis=1)[:, :3]
+    lines = (tmp_path / "out" / "predictions" / "filter.csv").read_text().splitlines()[1:]
+    assert [line.split(",")[2] for line in lines] == [f"{row:04d}.png" for row in nearest.reshape(-1)]
+
+
+@pytest.mark.parametrize(("options", "words"), [
+    (("retrieval=netvlad", "retrieval.weights=mixvpr_512"), "=mixvpr_512: expected weights of netvlad: one of"),
+    (("retrieval=gem", "retrieval.components=5"), "retrieval.components"),
+    (("retrieval=netvlad", "retrieval.components=200"), "components=200: expected from 1 to 128"),
+])  # fmt: skip
+def test_mistakes_with_them_are_one_line(weights, monkeypatch, capsys, small_street, tmp_path, options, words):
+    monkeypatch.setenv("MFVPR_WEIGHTS", str(weights))
+    folders = f"dataset.database={small_street}/database", f"dataset.queries={small_street}/queries"
+    own = ("retrieval.weights=patchnetvlad_mapillary_128",) if "weights" not in " ".join(options) else ()
+    own = ("retrieval.weights=cosplace_vgg16_512",) if "retrieval=gem" in options else own
+    code, _, stderr = typed(monkeypatch, capsys, "evaluate", "dataset=folder", *folders, "dataset.ground_truth=order",
+                            options[0], *own, *options[1:], f"out={tmp_path}/out")  # fmt: skip
+    assert code == 2
+    assert words in stderr.splitlines()[-1]

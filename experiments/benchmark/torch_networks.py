@@ -25,7 +25,7 @@ def published(arrays: Mapping[str, np.ndarray], table: Table, device: str, layou
     @cache
     def weight(key: str) -> Tensor:
         rule, match = next((rule, match) for rule in table.rules if (match := re.fullmatch(rule.source, key)))
-        array, axes = arrays[match.expand(rule.target)], rule.layout.value
+        array, axes = arrays[match.expand(rule.target)], rule.layout.value.axes
         tensor = torch.from_numpy(np.array(array if axes is None else array.transpose(np.argsort(axes)))).to(device)
         return tensor.contiguous(memory_format=layout) if tensor.ndim == 4 else tensor
 

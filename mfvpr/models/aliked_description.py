@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from flax import nnx
 from jax import Array
 
+from mfvpr.models.lengths import EPSILON, of_unit_length
 from mfvpr.models.sampling import Neighbors, around, between, neighbors
 
-_EPSILON = 1e-12  # of normalizations, where a vector is zero
 _CHUNK = 256  # keypoints described at a time
 
 
@@ -72,7 +72,7 @@ def field(levels: Sequence[Array], rows: slice, columns: slice) -> Field:
         down, right = neighbors(level.shape[0], height, rows), neighbors(level.shape[1], width, columns)
         parts.append(Level(between(level, down, -3), right))
     squares = [jnp.sum(part * part, axis=-1) for part in _enlarged(parts)]
-    return Field(tuple(parts), 1 / jnp.maximum(jnp.sqrt(sum(squares[1:], start=squares[0])), _EPSILON))
+    return Field(tuple(parts), 1 / jnp.maximum(jnp.sqrt(sum(squares[1:], start=squares[0])), EPSILON))
 
 
 def _enlarged(levels: Sequence[Level]) -> list[Array]:
@@ -121,7 +121,7 @@ class DescriptorHead(nnx.Module):
 
         start = jnp.zeros((len(keypoints), self.agg_weights.shape[-1]), keypoints.dtype)
         descriptors, _ = jax.lax.scan(add, start, (self._moves(features, keypoints), self.agg_weights[...]))
-        return descriptors / jnp.maximum(jnp.linalg.norm(descriptors, axis=-1, keepdims=True), _EPSILON)
+        return of_unit_length(descriptors)
 
     def _moves(self, features: Field, keypoints: Array) -> Array:
         """`[positions, N, 2]` (x, y) px, a quarter of the longer side at most.

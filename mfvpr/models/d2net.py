@@ -16,6 +16,7 @@ from flax import nnx
 from jax import Array, lax
 
 from mfvpr.models.imagenet import Preprocessing, preprocess
+from mfvpr.models.lengths import of_unit_length
 from mfvpr.models.sampling import between, neighbors
 from mfvpr.models.vgg import Vgg16
 
@@ -24,7 +25,6 @@ SCALES = (0.5, 1.0, 2.0)  # of the multi-scale detection, in this order
 # Cells of 4 x 4 px that lie within what a position of the map sees (92 x 92 px), from its own cell on.
 _FIELD = (-10, 11)
 _EDGE_THRESHOLD = 5  # largest ratio of the principal curvatures
-_EPSILON = 1e-12  # of the normalization, where a descriptor is zero
 
 
 class D2Net(nnx.Module):
@@ -223,7 +223,7 @@ def _interpolated(dense: Array, position: Array) -> Array:
         + (after[:, 0] * before[:, 1])[:, None] * dense[bottom, left]
         + (after[:, 0] * after[:, 1])[:, None] * dense[bottom, right]
     )
-    return vectors / jnp.maximum(jnp.linalg.norm(vectors, axis=-1, keepdims=True), _EPSILON)
+    return of_unit_length(vectors)
 
 
 def _stretched(values: Array, size: int, *, axis: int) -> Array:

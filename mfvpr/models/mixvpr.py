@@ -9,12 +9,12 @@ from flax import nnx
 from jax import Array
 
 from mfvpr.models.imagenet import DEVIATION, MEAN
+from mfvpr.models.lengths import of_unit_length
 from mfvpr.models.resnet import ResNet50
 
 IMAGE_SIZE = (320, 320)  # px, width and height, to which the mixers' weights belong
 _CHANNELS, _POSITIONS = 1024, 20 * 20  # of the backbone's maps
 _NORM_EPSILON = 1e-5  # the published weights'; Flax's default of 1e-6 changes descriptors where maps are faint
-_LENGTH_EPSILON = 1e-12
 
 
 class FeatureMixer(nnx.Module):
@@ -66,8 +66,7 @@ class MixVPR(nnx.Module):
         for mixer in self.mix:
             maps = mixer(maps)
         descriptors = self._projected(maps).reshape(len(maps), self.dimension)
-        length = jnp.linalg.norm(descriptors, axis=1, keepdims=True)
-        return descriptors / jnp.maximum(length, _LENGTH_EPSILON)
+        return of_unit_length(descriptors)
 
     def _projected(self, maps: Array) -> Array:
         """Channel projection, then row projection: `[B, 1024, positions]` -> `[B, channels, rows]`.

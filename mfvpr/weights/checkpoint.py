@@ -6,20 +6,22 @@ from pathlib import Path
 import numpy as np
 
 from mfvpr.errors import InputError
-from mfvpr.weights.numpy_files import MAGIC, read_layers
+from mfvpr.weights import matlab_files, numpy_files
+from mfvpr.weights.matlab_files import read_matlab
+from mfvpr.weights.numpy_files import read_layers
 from mfvpr.weights.torch_files import read_legacy, read_zip
 
 _DAMAGE = (ArithmeticError, LookupError, TypeError, ValueError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile)
 _DAMAGE += (Warning,)  # raised where warnings are errors
 # By the first bytes; the last is that of every binary pickle.
-_READERS = {b"PK": read_zip, MAGIC: read_layers, b"\x80": read_legacy}
+_READERS = {b"PK": read_zip, numpy_files.MAGIC: read_layers, matlab_files.MAGIC: read_matlab, b"\x80": read_legacy}
 
 
 def read_checkpoint(path: Path | str) -> dict[str, np.ndarray]:
     """Arrays by key, read-only, in the file's own types.
 
     Of torch's files the tensors, those below `model` or `state_dict` if nested; of NumPy's dictionaries of layers
-    `layer.name`.
+    `layer.name`; of MATLAB's structures and cells `variable.field.0`.
 
     Raises:
         InputError: the file is no checkpoint, is damaged, or holds anything but float32, float64 and integer arrays.
@@ -52,7 +54,7 @@ def _start(path: Path) -> bytes:
         raise InputError(f"{path}: expected a checkpoint, got an empty file; {again}")
     if not start.startswith(tuple(_READERS)):
         kind = "a text file, perhaps a web page" if start.isascii() and b"\0" not in start else "another kind of file"
-        raise InputError(f"{path}: expected a checkpoint of torch or NumPy, got {kind}; {again}")
+        raise InputError(f"{path}: expected a checkpoint of torch, NumPy or MATLAB, got {kind}; {again}")
     if start.startswith(b"PK") and not zipfile.is_zipfile(path):
         raise InputError(f"{path}: this checkpoint is truncated; {again}")
     return start

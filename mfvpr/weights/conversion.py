@@ -5,7 +5,7 @@ once, every type and shape is checked. What is wrong is counted by kind, with an
 """
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import NamedTuple
@@ -16,13 +16,23 @@ from mfvpr.errors import InputError
 from mfvpr.weights.pickles import excerpt
 
 
-class Layout(Enum):
-    """How axes are reordered from torch's convention to JAX's."""
+class _Change(NamedTuple):
+    axes: tuple[int, ...] | None = None  # of the source, in our order
+    squeezed: bool = False  # whether axes of length 1 mean nothing, there and here
+    sign: int = 1
+    first_pixel: bool = False  # of an image that is alike everywhere
 
-    COPY = None
-    CONV = (2, 3, 1, 0)  # OIHW -> HWIO
-    LINEAR = (1, 0)  # (out, in) -> (in, out)
-    VECTOR = (0,)  # (1, O, 1, 1) and the like -> (O,)
+
+class Layout(Enum):
+    """How arrays are changed from their file's convention to ours."""
+
+    COPY = _Change()
+    CONV = _Change((2, 3, 1, 0))  # OIHW -> HWIO
+    LINEAR = _Change((1, 0))  # (out, in) -> (in, out)
+    POINTWISE = _Change((1, 0), squeezed=True)  # (out, in, 1, 1) -> (in, out), or (1, 1, in, out)
+    SQUEEZED = _Change(squeezed=True)  # (1, O, 1, 1) and the like -> (O,)
+    OPPOSITE = _Change((1, 0), squeezed=True, sign=-1)  # (in, out) of the other sign -> (out, in)
+    PIXEL = _Change(first_pixel=True)  # (H, W, C) -> (C,)
 
 
 class Rule(NamedTuple):
@@ -86,15 +96,15 @@ def convert(
             wrong("twice", f"{key} and {origin[target]}")
             continue
         origin[target] = key
-        if layout is Layout.VECTOR:
-            value = np.atleast_1d(value.squeeze())
+        if layout.value.first_pixel and value.ndim:
+            value = value[(0,) * (value.ndim - 1)]
         expected = _source_shape(shapes[target], layout)
-        if value.shape != expected:
+        if _compared(value.shape, layout) != expected:
             wrong("of another shape", f"{key}: expected {expected}, got {value.shape}")
         elif value.dtype not in (np.float32, np.float64):
             wrong("of another type", f"{key}: expected float32 or float64, got {value.dtype}")
         else:
-            found[target] = _laid_out(value, layout)
+            found[target] = _laid_out(value.reshape(expected), layout).reshape(shapes[target])
     for target in shapes:
         if target not in origin:
             wrong("missing", target)
@@ -104,10 +114,10 @@ def convert(
     return found
 
 
-def share_known(keys: Iterable[str], table: Table) -> float:
-    """How many of the keys the table names, from 0 to 1."""
-    known = [is_ignored(key, table) or bool(_targets(key, table)) for key in keys]
-    return sum(known) / max(len(known), 1)
+def share_known(keys: Sequence[str], table: Table) -> float:
+    """How many of the keys the table names, from 0 to 1; 0 where all of these are ignored."""
+    used, ignored = ([test(key, table) for key in keys] for test in (_targets, is_ignored))
+    return sum(map(any, zip(used, ignored, strict=True))) / len(used) if any(used) else 0.0
 
 
 def is_ignored(key: str, table: Table) -> bool:
@@ -122,10 +132,17 @@ def _targets(key: str, table: Table) -> list[tuple[str, Layout]]:
 
 def _laid_out(array: np.ndarray, layout: Layout) -> np.ndarray:
     """The array in our layout, contiguous float32."""
-    axes = layout.value
-    return np.array(array if axes is None else array.transpose(axes), np.float32, order="C")
+    axes, sign = layout.value.axes, layout.value.sign
+    ordered = np.array(array if axes is None else array.transpose(axes), np.float32, order="C")
+    return ordered if sign == 1 else np.negative(ordered)
+
+
+def _compared(shape: tuple[int, ...], layout: Layout) -> tuple[int, ...]:
+    """The shape, without axes of length 1 where they mean nothing."""
+    return tuple(side for side in shape if side != 1) if layout.value.squeezed else shape
 
 
 def _source_shape(shape: tuple[int, ...], layout: Layout) -> tuple[int, ...]:
     """The checkpoint's shape of what is `shape` here."""
-    return shape if layout.value is None else tuple(shape[layout.value.index(axis)] for axis in range(len(shape)))
+    shape, axes = _compared(shape, layout), layout.value.axes
+    return shape if axes is None else tuple(shape[axes.index(axis)] for axis in range(len(shape)))

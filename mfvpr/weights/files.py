@@ -57,7 +57,7 @@ def install(checkpoint: Path, name: str, folder: Path | None = None) -> Path:
     """Convert an official checkpoint to the runtime file of this name; the checkpoint stays as it is.
 
     Raises:
-        InputError: unknown name, no network for it, not the published file, no checkpoint, or keys that do not fit.
+        InputError: unknown name, not the published file, no checkpoint, or keys that do not fit.
     """
     from mfvpr.weights.networks import blueprint, network_of, resemblance
 
@@ -169,13 +169,12 @@ def load_model(name: str, folder: Path | None = None) -> "nnx.Module":
     """The network of this name with its weights, ready for inference.
 
     Raises:
-        InputError: unknown name, or no network for it.
+        InputError: unknown name.
         WeightsError: as `load`; or the file's arrays are not this network's.
     """
-    from mfvpr.weights.networks import blueprint, network_of
+    from mfvpr.weights.networks import blueprint
 
     entry = entry_of(name)
-    network_of(entry)
     arrays = load(name, folder)
     try:
         return blueprint(entry).filled(arrays)

@@ -9,14 +9,25 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from mfvpr.errors import InputError
 from mfvpr.weights.conversion import Rule, Table, convert, share_known
 from mfvpr.weights.pickles import excerpt
 from mfvpr.weights.registry import REGISTRY, Entry
-from mfvpr.weights.tables import ALIKED, D2NET, LIGHTGLUE, MIXVPR, SSM
+from mfvpr.weights.tables import (
+    ALIKED,
+    D2NET,
+    GEM_RESNET50,
+    GEM_VGG16,
+    LIGHTGLUE,
+    MIXVPR,
+    NETVLAD,
+    NETVLAD_MATLAB,
+    SSM,
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from flax import nnx
+
+    from mfvpr.models.gem import Backbone
 
 _OURS = Table((Rule("(.*)", r"\1"),))  # runtime files have our own paths
 
@@ -58,12 +69,24 @@ def _lightglue() -> Callable[..., "nnx.Module"]:
     return LightGlue
 
 
+def _netvlad(clusters: int, outputs: int | None, original: bool = False) -> Callable[..., "nnx.Module"]:
+    from mfvpr.models.netvlad import VggNetVlad
+
+    return partial(VggNetVlad, clusters, outputs, original=original)
+
+
+def _gem(backbone: "Backbone", outputs: int) -> Callable[..., "nnx.Module"]:
+    from mfvpr.models.gem import Gem
+
+    return partial(Gem, backbone, outputs)
+
+
 _ALIKED = ("aliked-t16", "aliked-n16", "aliked-n16rot", "aliked-n32")
 
 _MOST = 0.5  # of the keys tell whose they are
 _LONGEST_PREFIX = 4  # parts between dots
 
-# By the registry's names. Entries that are not here have no network in this version.
+# By the registry's names.
 NETWORKS: dict[str, Network] = {
     **{name: Network(_d2net, D2NET) for name in ("d2_tf", "d2_ots", "d2_tf_no_phototourism")},
     "mixvpr_4096": Network(partial(_mixvpr, 1024, 4), MIXVPR),
@@ -72,6 +95,19 @@ NETWORKS: dict[str, Network] = {
     "vgg16_places365": Network(_ssm, SSM),
     **{name: Network(partial(_aliked, name), ALIKED) for name in _ALIKED},
     "aliked_lightglue": Network(_lightglue, LIGHTGLUE),
+    "netvlad_pitts30k": Network(partial(_netvlad, 64, 4096, original=True), NETVLAD_MATLAB),
+    "netvlad_tokyotm": Network(partial(_netvlad, 64, 4096, original=True), NETVLAD_MATLAB),
+    "netvlad_pytorch": Network(partial(_netvlad, 64, None), NETVLAD),
+    **{
+        f"patchnetvlad_{training}_{outputs}": Network(partial(_netvlad, clusters, outputs), NETVLAD)
+        for training, clusters in (("mapillary", 16), ("pitts", 64), ("landmarks", 64))
+        for outputs in ((4096,) if training == "landmarks" else (128, 512, 4096))
+    },
+    "cosplace_vgg16_512": Network(partial(_gem, "vgg16", 512), GEM_VGG16),
+    **{
+        f"cosplace_resnet50_{outputs}": Network(partial(_gem, "resnet50", outputs), GEM_RESNET50)
+        for outputs in (512, 2048)
+    },
 }
 
 
@@ -102,15 +138,7 @@ class Blueprint:
 
 
 def network_of(entry: Entry) -> Network:
-    """How the entry's network is built and converted.
-
-    Raises:
-        InputError: it is not part of this version.
-    """
-    if entry.name not in NETWORKS:
-        raise InputError(
-            f"{entry.name}: the network {entry.network} is not part of this version; its files are listed and verified"
-        )
+    """How the entry's network is built and converted."""
     return NETWORKS[entry.name]
 
 
@@ -129,11 +157,7 @@ def resemblance(keys: Sequence[str], expected: Network) -> str | None:
 
 
 def blueprint(entry: Entry) -> Blueprint:
-    """The shapes of the entry's network.
-
-    Raises:
-        InputError: it is not part of this version.
-    """
+    """The shapes of the entry's network."""
     return planned(network_of(entry).builder())  # imported before tracing, or the module's constants would be traced
 
 

@@ -123,6 +123,53 @@ def _patchnetvlad(training: str, outputs: int, size: int | None, sha256: str) ->
     )
 
 
+def _netvlad(training: str, file: str) -> Entry:
+    return Entry(
+        name=f"netvlad_{training}",
+        network="netvlad",
+        file=file,
+        source=f"https://cvg-data.inf.ethz.ch/hloc/netvlad/{file}",
+        size=None,
+        sha256=None,
+        code_license="MIT",
+        weights_license="MIT",
+        cite="Arandjelovic et al., NetVLAD: CNN Architecture for Weakly Supervised Place Recognition, CVPR 2016",
+        parameters=14_714_688 + 2 * 512 * 64 + (512 * 64 + 1) * 4096,
+    )
+
+
+def _netvlad_pytorch() -> Entry:
+    return Entry(
+        name="netvlad_pytorch",
+        network="netvlad",
+        file="checkpoint.pth.tar",
+        source="vgg16_netvlad_checkpoint.zip at https://drive.google.com/open?id=17luTjZFCX639guSVy00OUtzfTQo4AMF2",
+        size=None,
+        sha256=None,
+        code_license="none stated",
+        weights_license="none stated",
+        cite="Arandjelovic et al., NetVLAD: CNN Architecture for Weakly Supervised Place Recognition, CVPR 2016",
+        parameters=14_714_688 + 2 * 512 * 64,
+    )
+
+
+def _cosplace(backbone: str, outputs: int) -> Entry:
+    file = f"{backbone}_{outputs}_cosplace.pth"
+    convolutions, channels = {"VGG16": (14_714_688, 512), "ResNet50": (23_508_032, 2048)}[backbone]
+    return Entry(
+        name=f"cosplace_{backbone.lower()}_{outputs}",
+        network="gem",
+        file=file,
+        source=f"https://github.com/gmberton/CosPlace/releases/download/v1.0/{file}",
+        size=None,
+        sha256=None,
+        code_license="MIT",
+        weights_license="MIT",
+        cite="Berton, Masone, Caputo, Rethinking Visual Geo-localization for Large-Scale Applications, CVPR 2022",
+        parameters=convolutions + 1 + (channels + 1) * outputs,
+    )
+
+
 # fmt: off
 _ENTRIES = (
     _d2net("d2_tf"),
@@ -137,6 +184,12 @@ _ENTRIES = (
     _aliked("n32", 979_500, 3_946_667, "055283fd1624d3ab46a05c3b617b1a79a3f28d1f551737eef2d653e8c8232890"),
     _lightglue(),
     _ssm(),
+    _netvlad("pitts30k", "Pitts30K_struct.mat"),
+    _netvlad("tokyotm", "TokyoTM_struct.mat"),
+    _netvlad_pytorch(),
+    _cosplace("VGG16", 512),
+    _cosplace("ResNet50", 512),
+    _cosplace("ResNet50", 2048),
     _patchnetvlad("mapillary", 128, 67_319_611, "5b6de8a5537061bbe7a477b62bb687b042d92d472e5231e2072026ecc59ec4b1"),
     _patchnetvlad("mapillary", 512, 92_488_008, "acbe2597c1c23c95482883c05969006a74bf7e68c4151dbb4ab5d67b69e8e346"),
     _patchnetvlad("mapillary", 4096, 327_398_210, "4b22ad1619bb7f085a5229d35f0f865740f2cdad2bced2ddbc7b28791c5b1542"),

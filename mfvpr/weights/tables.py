@@ -1,5 +1,7 @@
 """Keys of the published checkpoints -> paths of our networks."""
 
+from collections.abc import Mapping
+
 from mfvpr.weights.conversion import Layout, Rule, Table
 
 _COUNTERS = r".*\.num_batches_tracked"
@@ -28,8 +30,8 @@ _VGG = {
 }  # fmt: skip
 
 
-def _vgg(source: str) -> tuple[Rule, ...]:
-    layers = (_convolution(rf"{source}\.{position}", f"vgg.{name}") for position, name in _VGG.items())
+def _vgg(source: str, target: str = "vgg") -> tuple[Rule, ...]:
+    layers = (_convolution(rf"{source}\.{position}", f"{target}.{name}") for position, name in _VGG.items())
     return tuple(rule for rules in layers for rule in rules)
 
 
@@ -39,7 +41,7 @@ D2NET = Table(_vgg(r"dense_feature_extraction\.model"))
 SSM = Table(
     (
         Rule(r"(conv\d_\d)\.weights?", r"vgg.\1.kernel", Layout.CONV),
-        Rule(r"(conv\d_\d)\.bias", r"vgg.\1.bias", Layout.VECTOR),
+        Rule(r"(conv\d_\d)\.bias", r"vgg.\1.bias", Layout.SQUEEZED),
         *_vgg("features"),
     ),
     ignored=(  # layers behind the last map
@@ -49,16 +51,28 @@ SSM = Table(
     expected={r"fc8\w*\.weights?|classifier\.6\.weight": (365, 4096)},  # ImageNet's networks have 1000 classes
 )
 
-_BLOCK = r"backbone\.model\.(layer\d\.\d)"
+
+def _resnet(conv1: str, bn1: str, layers: Mapping[str, str]) -> tuple[Rule, ...]:
+    """Of a backbone; what the file calls its layers, and what we do."""
+    rules = [Rule(rf"{conv1}\.weight", "backbone.conv1.kernel", Layout.CONV), *_batch_norm(bn1, "backbone.bn1")]
+    for source, layer in layers.items():
+        block, ours = rf"{source}\.(\d)", rf"backbone.{layer}.\1"
+        rules += [
+            Rule(rf"{block}\.(conv\d)\.weight", rf"{ours}.\2.kernel", Layout.CONV),
+            *_batch_norm(rf"{block}\.(bn\d)", rf"{ours}.\2"),
+            Rule(rf"{block}\.downsample\.0\.weight", f"{ours}.shortcut.kernel", Layout.CONV),
+            *_batch_norm(rf"{block}\.downsample\.1", f"{ours}.shortcut_bn"),
+        ]
+    return tuple(rules)
+
 
 MIXVPR = Table(
     (
-        Rule(r"backbone\.model\.conv1\.weight", "backbone.conv1.kernel", Layout.CONV),
-        *_batch_norm(r"backbone\.model\.bn1", "backbone.bn1"),
-        Rule(rf"{_BLOCK}\.(conv\d)\.weight", r"backbone.\1.\2.kernel", Layout.CONV),
-        *_batch_norm(rf"{_BLOCK}\.(bn\d)", r"backbone.\1.\2"),
-        Rule(rf"{_BLOCK}\.downsample\.0\.weight", r"backbone.\1.shortcut.kernel", Layout.CONV),
-        *_batch_norm(rf"{_BLOCK}\.downsample\.1", r"backbone.\1.shortcut_bn"),
+        *_resnet(
+            r"backbone\.model\.conv1",
+            r"backbone\.model\.bn1",
+            {rf"backbone\.model\.layer{number}": f"layer{number}" for number in (1, 2, 3)},
+        ),
         Rule(r"aggregator\.mix\.(\d)\.mix\.0\.weight", r"mix.\1.norm.scale"),
         Rule(r"aggregator\.mix\.(\d)\.mix\.0\.bias", r"mix.\1.norm.bias"),
         *_linear(r"aggregator\.mix\.(\d)\.mix\.1", r"mix.\1.linear1"),
@@ -120,4 +134,47 @@ LIGHTGLUE = Table(
         *_linear(r"token_confidence\.(\d)\.token\.0", r"confidences.\1"),
     ),
     ignored=("confidence_thresholds",),  # follow from the number of layers
+)
+
+# Patch-NetVLAD's, and pytorch-NetVlad's without the projection, where several devices trained it below `module`.
+NETVLAD = Table(
+    (
+        *_vgg(r"encoder(?:\.module)?"),
+        Rule(r"pool(?:\.module)?\.conv\.weight", "pool.assignment.kernel", Layout.POINTWISE),
+        Rule(r"pool(?:\.module)?\.centroids", "pool.centers"),
+        Rule(r"WPCA\.0\.weight", "projection.kernel", Layout.POINTWISE),
+        Rule(r"WPCA\.0\.bias", "projection.bias"),
+    )
+)
+
+# The original's layers, MATLAB's axes: height, width, inputs, outputs. The centers are stored with the other sign.
+NETVLAD_MATLAB = Table(
+    (
+        *(
+            Rule(rf"net\.layers\.{position}\.weights\.{place}", f"vgg.{name}.{part}", Layout.SQUEEZED)
+            for position, name in _VGG.items()
+            for place, part in enumerate(("kernel", "bias"))
+        ),
+        Rule(r"net\.layers\.30\.weights\.0", "pool.assignment.kernel", Layout.SQUEEZED),
+        Rule(r"net\.layers\.30\.weights\.1", "pool.centers", Layout.OPPOSITE),
+        Rule(r"net\.layers\.33\.weights\.0", "projection.kernel", Layout.SQUEEZED),
+        Rule(r"net\.layers\.33\.weights\.1", "projection.bias", Layout.SQUEEZED),
+        Rule(r"net\.meta\.normalization\.averageImage", "average", Layout.PIXEL),
+    ),
+    ignored=(r"net\.(?!layers\.\d+\.weights|meta\.normalization\.averageImage).*",),  # how it was trained
+)
+
+_GEM = (
+    Rule(r"aggregation\.1\.p", "pool.power"),
+    *_linear(r"aggregation\.3", "projection"),
+)
+GEM_VGG16 = Table((*_vgg("backbone", "backbone"), *_GEM))
+GEM_RESNET50 = Table(
+    (
+        *_resnet(
+            r"backbone\.0", r"backbone\.1", {rf"backbone\.{place}": f"layer{place - 3}" for place in (4, 5, 6, 7)}
+        ),
+        *_GEM,
+    ),
+    ignored=(_COUNTERS,),
 )

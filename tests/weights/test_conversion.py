@@ -8,19 +8,31 @@ import pytest
 from mfvpr.errors import InputError
 from mfvpr.weights.checkpoint import read_checkpoint
 from mfvpr.weights.conversion import Layout, Rule, Table, convert
-from mfvpr.weights.networks import NETWORKS, blueprint, network_of, resemblance
+from mfvpr.weights.networks import NETWORKS, blueprint, resemblance
 from mfvpr.weights.registry import REGISTRY, entry_of
 from tests.checkpoints import (
     ALIKED,
     LIGHTGLUE,
     d2net_shapes,
+    gem_shapes,
     lightglue_shapes,
+    matlab_shapes,
     mixvpr_shapes,
+    netvlad_shapes,
     places365_shapes,
     random_checkpoint,
 )
 from tests.weights.conftest import PARAMETERS, SHAPES, SOURCE_SHAPES, TABLE, tiny_entry
 
+_NETVLAD = (
+    (16, 4096, "mapillary_4096"),
+    (16, 512, "mapillary_512"),
+    (16, 128, "mapillary_128"),
+    (64, 4096, "pitts_4096"),
+    (64, 512, "pitts_512"),
+    (64, 128, "pitts_128"),
+    (64, 4096, "landmarks_4096"),
+)
 PUBLIC = {
     "d2_tf": d2net_shapes(),
     "mixvpr_4096": mixvpr_shapes(1024, 4),
@@ -28,6 +40,12 @@ PUBLIC = {
     "mixvpr_128": mixvpr_shapes(64, 2),
     "vgg16_places365": places365_shapes(),
     "aliked_lightglue": lightglue_shapes(),
+    **{f"patchnetvlad_{name}": netvlad_shapes(clusters, outputs) for clusters, outputs, name in _NETVLAD},
+    "netvlad_pytorch": netvlad_shapes(64, None),
+    "cosplace_vgg16_512": gem_shapes("vgg16", 512),
+    "cosplace_resnet50_512": gem_shapes("resnet50", 512),
+    "cosplace_resnet50_2048": gem_shapes(),
+    **{f"netvlad_{training}": matlab_shapes() for training in ("pitts30k", "tokyotm")},
 }
 
 
@@ -226,12 +244,10 @@ def test_real_weights_are_the_registrys_and_convert(name):
 def test_registry():
     assert all(name == entry.name for name, entry in REGISTRY.items())
     assert len({entry.file for entry in REGISTRY.values()}) == len(REGISTRY)
-    assert NETWORKS.keys() == {entry.name for entry in REGISTRY.values() if entry.network != "patchnetvlad"}
+    assert NETWORKS.keys() == REGISTRY.keys()
     hashes = [entry.sha256 for entry in REGISTRY.values() if entry.sha256]
     assert len(set(hashes)) == len(hashes) == 12
     assert all(len(digest) == 64 and int(digest, 16) for digest in hashes)
-    with pytest.raises(InputError, match="network patchnetvlad is not part of this version"):
-        network_of(entry_of("patchnetvlad_pitts_128"))
     with pytest.raises(InputError, match=r"aliked-n17: .*the nearest is aliked-n16"):
         entry_of("aliked-n17")
 

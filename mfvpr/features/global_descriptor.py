@@ -1,0 +1,94 @@
+"""Global descriptors of networks that take images of any size: NetVLAD, and generalized means."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Protocol
+
+import jax
+import numpy as np
+
+from mfvpr.data.images import Interpolation
+from mfvpr.errors import InputError
+from mfvpr.features import Description, Scale
+from mfvpr.features.network import compiled, in_batches
+from mfvpr.models.lengths import of_unit_length
+
+_SMALLEST = 16  # px, which VGG16 makes one position of
+
+
+class DescriptorNetwork(Protocol):
+    """What gives descriptors `[B, D]` of unit length of images that it has preprocessed, `[B, H, W, 3]`."""
+
+    @property
+    def dimension(self) -> int:
+        """D."""
+        ...
+
+    @property
+    def has_components(self) -> bool:
+        """Whether a descriptor's numbers are principal components, the largest first."""
+        ...
+
+    def preprocess(self, images: jax.Array) -> jax.Array: ...
+
+    def __call__(self, images: jax.Array) -> jax.Array: ...
+
+
+@dataclass(frozen=True)
+class GlobalDescriptor:
+    """What the public codes extract.
+
+    Attributes:
+        model: the network with its weights.
+        image_size: (width, height) px; 640 x 480 is Patch-NetVLAD's.
+        interpolation: see `mfvpr.data.images.resize`.
+        components: how many of the first principal components are kept, scaled to unit length again; None = all.
+        batch_size: images per call.
+
+    Raises:
+        InputError: images of this size are too small, or the network has no so many principal components.
+    """
+
+    model: DescriptorNetwork
+    image_size: tuple[int, int] = (640, 480)
+    interpolation: Interpolation = "pil_bilinear"
+    components: int | None = None
+    batch_size: int = field(default=8, metadata={"recipe": False})
+
+    def __post_init__(self) -> None:
+        if min(self.image_size) < _SMALLEST:
+            raise InputError(f"image_size={list(self.image_size)}: expected {_SMALLEST} x {_SMALLEST} px or more")
+        if self.components is not None and not self.model.has_components:
+            raise InputError(f"components={self.components}: expected None, since these weights have no whitening")
+        if self.components is not None and not 1 <= self.components <= self.model.dimension:
+            raise InputError(f"components={self.components}: expected from 1 to {self.model.dimension}")
+
+    @property
+    def scales(self) -> tuple[Scale, ...]:
+        """(): there are no local features."""
+        return ()
+
+    @property
+    def vector_size(self) -> int:
+        """Numbers of a descriptor."""
+        return self.components or self.model.dimension
+
+    def __call__(self, images: np.ndarray) -> list[Description]:
+        """`[D]` float32 descriptors of unit length, of images `[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32.
+
+        Raises:
+            InputError: the images do not have the size asked for.
+        """
+        (width, height), (rows, columns) = self.image_size, images.shape[1:3]
+        if (columns, rows) != (width, height):
+            raise InputError(f"expected images of {width} x {height} px, got {columns} x {rows}")
+        return [Description(np.asarray(vector)) for vector in in_batches(self._program, images, self.batch_size)]
+
+    @cached_property
+    def _program(self) -> Callable[..., Any]:
+        def describe(model: Any, images: jax.Array) -> jax.Array:
+            descriptors = model(model.preprocess(images))
+            return descriptors if self.components is None else of_unit_length(descriptors[:, : self.components])
+
+        return compiled(self.model, describe)  # pyright: ignore[reportArgumentType]  (a module, whatever else it is)

@@ -1,0 +1,170 @@
+"""Makes netvlad.npz: global descriptors and patches of public codes with random weights, in float64.
+
+`python -m tests.golden.make_netvlad PATCHNETVLAD HLOC COSPLACE TORCHVISION` with clones of
+https://github.com/QVPR/Patch-NetVLAD, https://github.com/cvg/Hierarchical-Localization and
+https://github.com/gmberton/CosPlace, and a folder that holds torchvision's package, of which Python's files are enough.
+The tests read the file without any of these.
+"""
+
+import importlib
+import sys
+import tempfile
+import types
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tests.checkpoints import gem_checkpoint, matlab_netvlad, netvlad_checkpoint, write_matlab
+
+GOLDEN = Path(__file__).parent / "netvlad.npz"
+SAMPLES = 1000
+PATCHES = {4096: (2, 5, 8), 512: (5,), 128: (5,)}  # sizes in the three published configurations, by their outputs
+# Of Patch-NetVLAD's networks: clusters, outputs, image size, seed.
+CASES = (
+    (16, 4096, (640, 480), 0), (16, 512, (640, 480), 1), (16, 128, (480, 480), 2), (16, 512, (480, 480), 3),
+    (16, 512, (171, 203), 4), (64, 128, (171, 203), 5), (64, None, (171, 203), 6),
+)  # fmt: skip
+MATLAB = (64, 128, (171, 203), 7)  # outputs of the original are 4096; fewer are as good a test
+GEM = (("vgg16", 512, (171, 203), 8), ("resnet50", 512, (171, 203), 9), ("resnet50", 2048, (128, 96), 10))
+
+
+def image(size: tuple[int, int]) -> np.ndarray:
+    """`[1, H, W, 3]` uint8: stripes, circles and steps, by integer arithmetic alone."""
+    row, column, channel = np.indices((*size[::-1], 3))
+    circles = (row - 90) ** 2 + (column - 120) ** 2
+    values = circles // (150 + 60 * channel) + 40 * ((row // 32 + column // 24) % 3) + row * column // (90 + channel)
+    return (values % 256).astype(np.uint8)[None]
+
+
+def samples(values: np.ndarray) -> np.ndarray:
+    """Values at `SAMPLES` places, or all."""
+    flat = values.reshape(-1)
+    return flat if flat.size <= SAMPLES else flat[np.random.default_rng(0).choice(flat.size, SAMPLES, replace=False)]
+
+
+def name(*case: Any) -> str:
+    """Of a case in the file."""
+    return "/".join(map(str, case))
+
+
+def main(patch_netvlad: str, hloc: str, cosplace: str, torchvision: str) -> None:
+    import torch
+
+    _torchvision(torchvision)
+    sys.modules["sklearn"], sys.modules["sklearn.neighbors"] = (types.ModuleType(one) for one in ("sklearn", "nothing"))
+    sys.modules["sklearn.neighbors"].NearestNeighbors = None  # pyright: ignore  (for training)
+    with torch.inference_mode():
+        golden = dict(_patches(patch_netvlad))
+        golden[name("matlab", *MATLAB)] = _matlab(hloc)
+        golden |= {name("gem", *case): _gem(cosplace, *case) for case in GEM}
+    np.savez_compressed(GOLDEN, **{key: array.astype(np.float32) for key, array in golden.items()})
+
+
+def _torchvision(folder: str) -> None:
+    """Its networks, without its operators, which belong to one version of torch."""
+    for package in ("torchvision", "torchvision.models"):
+        module = types.ModuleType(package)
+        module.__path__ = [f"{folder}/{package.replace('.', '/')}"]
+        module.__version__ = "0.28"
+        sys.modules[package] = module
+    models = sys.modules["torchvision"].models = sys.modules["torchvision.models"]  # pyright: ignore
+    for part, makers in (("vgg", ("vgg16",)), ("resnet", ("resnet50",))):
+        for maker in makers:
+            setattr(models, maker, _untrained(getattr(importlib.import_module(f"torchvision.models.{part}"), maker)))
+    models.VGG16, models.ResNet50 = models.vgg16, models.resnet50
+
+
+def _untrained(maker: Callable) -> Callable:
+    return lambda **_: maker()
+
+
+def _tensors(checkpoint: dict[str, np.ndarray]) -> dict:
+    import torch
+
+    return {key: torch.from_numpy(np.asarray(array)) for key, array in checkpoint.items()}
+
+
+def _normalized(size: tuple[int, int]) -> Any:
+    """As ToTensor and Normalize do, in float64."""
+    import torch
+
+    from mfvpr.models.imagenet import DEVIATION, MEAN
+
+    pixels = torch.from_numpy(image(size)).permute(0, 3, 1, 2).double() / 255
+    mean, deviation = (torch.tensor(values, dtype=torch.float64)[None, :, None, None] for values in (MEAN, DEVIATION))
+    return (pixels - mean) / deviation
+
+
+def _patches(clone: str) -> Iterator[tuple[str, np.ndarray]]:
+    """As Patch-NetVLAD's feature_extract.py, its global descriptor and all patches; without a projection NetVLAD's."""
+    from configparser import ConfigParser
+
+    import torch
+
+    sys.path.insert(0, clone)
+    from patchnetvlad.models.models_generic import get_backend, get_model, get_pca_encoding
+
+    for clusters, outputs, size, seed in CASES:
+        config = ConfigParser()
+        config["global_params"] = {
+            "pooling": "patchnetvlad" if outputs else "netvlad", "num_clusters": str(clusters), "vladv2": "False",
+            "num_pcs": str(outputs), "patch_sizes": ",".join(map(str, PATCHES.get(outputs or 0, (1,)))),
+            "strides": ",".join("1" for _ in PATCHES.get(outputs or 0, (1,))),
+        }  # fmt: skip
+        channels, encoder = get_backend()
+        model = get_model(encoder, channels, config["global_params"], append_pca_layer=outputs is not None)
+        model.load_state_dict(_tensors(netvlad_checkpoint(clusters, outputs, seed)))
+        model.double().eval()
+        torch.set_default_dtype(torch.float64)
+        found = model.pool(model.encoder(_normalized(size)))  # pyright: ignore
+        torch.set_default_dtype(torch.float32)
+        case = name("patch", clusters, outputs, size, seed)
+        if outputs is None:
+            yield f"{case}/global", samples(found.numpy())
+            continue
+        local, whole = found
+        yield f"{case}/global", get_pca_encoding(model, whole).numpy()[0]
+        for patch, descriptors in zip(PATCHES[outputs], local, strict=True):
+            _, inputs, count = descriptors.shape
+            rows = descriptors.permute(2, 0, 1).reshape(-1, inputs)
+            projected = get_pca_encoding(model, rows).reshape(count, outputs).numpy()
+            yield f"{case}/{patch}", samples(projected)
+            yield f"{case}/{patch}/means", projected.mean(axis=0)
+
+
+def _matlab(clone: str) -> np.ndarray:
+    """As hloc's extractor, of a file as the original's."""
+    import torch
+
+    sys.path.insert(0, clone)
+    for package in ("hloc", "hloc.extractors", "hloc.utils"):  # without what it imports besides
+        module = types.ModuleType(package)
+        module.__path__ = [f"{clone}/{package.replace('.', '/')}"]
+        sys.modules[package] = module
+    extractor = importlib.import_module("hloc.extractors.netvlad")
+    clusters, outputs, size, seed = MATLAB
+    with tempfile.TemporaryDirectory() as folder, torch.inference_mode(False):
+        torch.hub.set_dir(folder)
+        path = Path(folder) / "netvlad" / "VGG16-NetVLAD-Pitts30K.mat"
+        path.parent.mkdir()
+        write_matlab(path, matlab_netvlad(clusters, outputs, seed))
+        model = extractor.NetVLAD({"model_name": "VGG16-NetVLAD-Pitts30K", "whiten": True}).double().eval()
+    pixels = torch.from_numpy(image(size)).permute(0, 3, 1, 2).double() / 255
+    return model({"image": pixels})["global_descriptor"].numpy()[0]
+
+
+def _gem(clone: str, backbone: str, outputs: int, size: tuple[int, int], seed: int) -> np.ndarray:
+    """As CosPlace's network."""
+    sys.path.insert(0, clone)
+    from cosplace_model.cosplace_network import GeoLocalizationNet
+
+    public = {"vgg16": "VGG16", "resnet50": "ResNet50"}[backbone]
+    model = GeoLocalizationNet(public, outputs)
+    model.load_state_dict(_tensors(gem_checkpoint(backbone, outputs, seed)))
+    return model.double().eval()(_normalized(size)).numpy()[0]
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
