@@ -8,7 +8,7 @@ from mfvpr import sweeping
 from mfvpr.declaration import declared
 from mfvpr.errors import InputError
 from mfvpr.learning.parameters import can_learn
-from mfvpr.match_sets import MatchSet, block_bytes
+from mfvpr.match_sets import MatchSet, Scales, block_bytes, scales
 from mfvpr.numerics import free_host_bytes
 from mfvpr.scoring import SCORERS
 from mfvpr.sweeping import Axes
@@ -94,9 +94,9 @@ def _plain_c(settings: dict[str, Any]) -> Any:
     return c
 
 
-def require_memory(settings: dict[str, Any], varied: Axes, views: int, matches: MatchSet) -> None:
+def require_memory(settings: dict[str, Any], varied: Axes, views: int, matches: MatchSet | Scales) -> None:
     """Refuse results, or a chunk, that would not fit, before they are begun."""
-    queries = len(matches)
+    queries = len(scales(matches)[0])
     num_settings = varied.size + (dict(varied.own) not in varied.grid())
     _require(
         f"grid: rankings of {queries:,} queries by {num_settings:,} settings",

@@ -70,13 +70,17 @@ def extractor(settings: dict[str, Any], data: Dataset | None) -> Extractor | Fea
     # Here, since Flax takes half a second.
     from mfvpr.features.aliked import AlikedFeatures
     from mfvpr.features.d2net import D2NetFeatures
+    from mfvpr.features.patch_netvlad import PatchNetVladFeatures
     from mfvpr.features.ssm import STAGE2_FITTING, SsmCells
 
-    made = {"aliked": AlikedFeatures, "d2net": D2NetFeatures, "ssm": SsmCells}[name]
+    made = {"aliked": AlikedFeatures, "d2net": D2NetFeatures, "ssm": SsmCells, "patch_netvlad": PatchNetVladFeatures}
     weights = options.pop("weights", None)
     if name == "ssm":
         options["whitening"] = _fitting(options, STAGE2_FITTING)
-    return made(_network("features", name, weights), **_only(options, made, f"features={name}"))
+    for several in {"patch_sizes", "scale_weights"} & options.keys():
+        options[several] = options[several] and tuple(options[several])
+    network = _network("features", name.replace("_", ""), weights)
+    return made[name](network, **_only(options, made[name], f"features={name}"))
 
 
 def filter(settings: dict[str, Any], local: Extractor | FeatureFiles, data: Dataset | None) -> Filter:
@@ -87,6 +91,8 @@ def filter(settings: dict[str, Any], local: Extractor | FeatureFiles, data: Data
         return _voting({name: value for name, value in settings.items() if name != "name"})
     options = {name: value for name, value in settings.items() if name not in ("name", "whiten")}
     search = ExactSearch() if settings["whiten"] is None else WhitenedSearch(settings["whiten"])
+    if settings["name"] == "same":
+        return Retrieval(_with_vectors(local), search)
     if settings["name"] == "import":
         return DescriptorFiles(_files("retrieval", options, data), options["lengths"], search)
     if settings["name"] == "vlad":
@@ -99,6 +105,13 @@ def filter(settings: dict[str, Any], local: Extractor | FeatureFiles, data: Data
     if tuple(size) != IMAGE_SIZE:
         raise SettingsError(f"retrieval.image_size={size}: MixVPR takes {list(IMAGE_SIZE)} only, as its weights do")
     return Retrieval(MixVprDescriptor(_network("retrieval", "mixvpr", options.pop("weights")), **options), search)
+
+
+def _with_vectors(local: Extractor | FeatureFiles) -> Extractor:
+    if isinstance(local, FeatureFiles) or not local.vector_size:
+        raise SettingsError("retrieval=same: expected features with a global descriptor, such as patch_netvlad's; "
+                            "choose another filter")  # fmt: skip
+    return local
 
 
 def _described(name: str, options: dict[str, Any]) -> Extractor:

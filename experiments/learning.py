@@ -18,6 +18,7 @@ from mfvpr.learning.comparison import Checkpoints, compare
 from mfvpr.learning.data_sets import Part, joined
 from mfvpr.learning.losses import LOSSES
 from mfvpr.learning.teaching import Options
+from mfvpr.match_sets import Scales
 from mfvpr.report import comparisons, runs
 from mfvpr.scoring import Scorer
 
@@ -87,6 +88,9 @@ def _prepared(settings: dict[str, Any], watch: Stopwatch) -> Prepared:
     judge = truth.judge(settings, images.dataset)
     matches, candidates = prepare.matched(settings, tools, images, watch)
     recipe = prepare.recipe(tools, images, candidates.mask.shape[1])
+    if isinstance(matches, Scales):
+        raise SettingsError(f"features.patch_sizes={settings['features']['patch_sizes']}: expected one size, since "
+                            "learning knows one scale")  # fmt: skip
     part = Part(data_sets.label(settings["dataset"]), judge, matches, candidates)
     return Prepared(part, images, recipe, truth.described(settings, images.dataset))
 

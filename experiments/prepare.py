@@ -17,7 +17,7 @@ from mfvpr.evaluation import threshold_words
 from mfvpr.evaluations import Stopwatch, match_sequence, matches_recipe
 from mfvpr.features import Extractor, Source
 from mfvpr.filters import Filter
-from mfvpr.match_sets import MatchSet
+from mfvpr.match_sets import MatchSet, Scales
 from mfvpr.matchers import Matcher
 from mfvpr.named_weights import how_made
 from mfvpr.types import Shortlist
@@ -94,21 +94,25 @@ def _images(settings: dict[str, Any], archive: Archive) -> Images:
     return images
 
 
-def matched(settings: dict[str, Any], tools: Tools, images: Images, watch: Stopwatch) -> tuple[MatchSet, Shortlist]:
+def matched(
+    settings: dict[str, Any], tools: Tools, images: Images, watch: Stopwatch
+) -> tuple[MatchSet | Scales, Shortlist]:
     """Matches and shortlist of the only sequence, from their store where they are all there."""
     result = match_sequence(
         images.dataset, images.dataset.only, tools.extractor, tools.filter, settings["candidates"],
         matching=tools.matching, archive=tools.archive, watch=watch, **tools.where,
     )  # fmt: skip
-    return result.matches[0], result.candidates
+    return result.by_scale, result.candidates
 
 
 def recipe(tools: Tools, images: Images, num_candidates: int) -> dict[str, Any]:
-    """Of the shortlist and the matches of the only sequence."""
-    return matches_recipe(
+    """Of the shortlist and the matches of the only sequence, and of how several scales are fused."""
+    recipe = matches_recipe(
         images.dataset, images.dataset.only, tools.extractor, tools.filter, num_candidates, tools.matching,
         tools.archive,
     )  # fmt: skip
+    scales = tools.extractor.scales
+    return recipe | ({"scale_weights": [scale.weight for scale in scales]} if len(scales) > 1 else {})
 
 
 def num_candidates(settings: Mapping[str, Any], images: Images) -> int:

@@ -45,8 +45,8 @@ RULES: dict[str, Rule] = {
     "dataset.name": Rule(
         lambda value: isinstance(value, str) and bool(re.fullmatch(r"[\w-][\w.-]*", value)), "letters, digits, - and _"
     ),
-    "features.name": one_of("sift", "d2net", "aliked", "ssm", "import"),
-    "retrieval.name": one_of("vlad", "mixvpr", "netvlad", "gem", "ssm", "import", "pairs"),
+    "features.name": one_of("sift", "d2net", "aliked", "ssm", "patch_netvlad", "import"),
+    "retrieval.name": one_of("vlad", "mixvpr", "netvlad", "gem", "ssm", "same", "import", "pairs"),
     "features.image_size": either(list_of(_SIDE, 2), None),
     # data
     "seed": _INDEX,
@@ -85,6 +85,8 @@ RULES: dict[str, Rule] = {
     "max_images": either(_COUNT, None),
     "max_windows": either(_COUNT, None),
     "zero_row": _FLAG,
+    "patch_sizes": list_of(between(1, 64)),
+    "scale_weights": either(list_of(_POSITIVE), None),
     "stride": between(1, 8),
     "candidates": either(_COUNT, "all"),
     "memory": either(_POSITIVE, None),

@@ -12,7 +12,7 @@ import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -158,8 +158,9 @@ def match_sequence(
         if archive.root is not None:
             recipe = matches_recipe(dataset, sequence, extractor, filter, num_candidates, matching, archive)
             stores = [held.enter_context(one) for one in _match_stores(sequence, extractor, recipe, archive)]
+        weights = tuple(scale.weight for scale in extractor.scales)
         if kept := _kept(sequence, stores, archive, watch, where.get("memory")):
-            return _looked_at(kept, archive)
+            return _looked_at(replace(kept, weights=weights), archive)
         with watch("filter"):
             filtered = filter.shortlist(sequence, database, num_candidates, archive)
             sizes = len(sequence.images), len(database), num_candidates
@@ -173,7 +174,8 @@ def match_sequence(
                 pipeline.match(*scale, filtered.candidates, matching, store=store, **options)
                 for scale, store in zip(sides, stores or [None] * len(sides), strict=True)
             )
-    return _looked_at(Matched(sequence, filtered.candidates, matches, bad["queries"], bad["database"]), archive)
+    matched = Matched(sequence, filtered.candidates, matches, bad["queries"], bad["database"], weights)
+    return _looked_at(matched, archive)
 
 
 def match_cohort(
@@ -253,7 +255,8 @@ def _kept(
         return None  # another shortlist for some scales, which will be told
     for line in warnings:
         archive.warn(line)
-    return Matched(sequence, read[0][1], tuple(match_set for match_set, _ in read), *bad)
+    queries, database = bad
+    return Matched(sequence, read[0][1], tuple(match_set for match_set, _ in read), queries, database)
 
 
 def _remark(stores: Sequence[MatchStore], archive: Archive, remarks: Mapping[str, Any]) -> None:

@@ -18,18 +18,19 @@ COHORT = "cohort"  # in the names of those that other places of the map take par
 
 @dataclass(frozen=True)
 class Matched:
-    """A sequence's candidates, and their matches by scale."""
+    """A sequence's candidates, and their matches by scale; `weights` of the scales, None = 1 each."""
 
     sequence: QuerySequence
     candidates: Shortlist
     matches: tuple[MatchSet, ...]
     bad_queries: Mapping[int, str]
     bad_database: Mapping[int, str]
+    weights: tuple[float, ...] | None = None
 
     @property
     def by_scale(self) -> MatchSet | Scales:
         """What is scored: several scales are fused, each standardized over a query's candidates."""
-        return self.matches[0] if len(self.matches) == 1 else Scales(self.matches)
+        return self.matches[0] if len(self.matches) == 1 else Scales(self.matches, self.weights)
 
 
 @dataclass(frozen=True)

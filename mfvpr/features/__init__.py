@@ -18,10 +18,16 @@ from mfvpr.types import Features
 
 
 class Scale(NamedTuple):
-    """Local features of one scale: D of the `descriptors`, and `typical_count` of an image, for forecasts of space."""
+    """Local features of one scale.
+
+    dimension: D of the descriptors.
+    typical_count: of an image's features, for forecasts of space.
+    weight: of its score, where those of several scales are fused.
+    """
 
     dimension: int
     typical_count: int
+    weight: float = 1.0
 
 
 class Description(NamedTuple):

@@ -9,7 +9,7 @@ import numpy as np
 from mfvpr.declaration import declared
 from mfvpr.errors import InputError
 from mfvpr.evaluation import Judge
-from mfvpr.match_sets import MatchSet
+from mfvpr.match_sets import MatchSet, Scales
 from mfvpr.progress import Track, untracked
 from mfvpr.sweeping.axes import Axes
 from mfvpr.sweeping.outcome import Outcome
@@ -31,7 +31,7 @@ def untracked_stages(stage: str) -> Track:
 
 
 def search_grid(
-    axes: Axes, judge: Judge, match_set: MatchSet, candidates: Shortlist, *,
+    axes: Axes, judge: Judge, match_set: MatchSet | Scales, candidates: Shortlist, *,
     ks: Sequence[int] = KS, track: Stages = untracked_stages, **options: Any,
 ) -> Outcome:  # fmt: skip
     """Every setting of the grid, and the scorer's own values last where the grid does not have them.
@@ -56,7 +56,7 @@ def search_grid(
 
 
 def search_optuna(
-    axes: Axes, judge: Judge, match_set: MatchSet, candidates: Shortlist, *,
+    axes: Axes, judge: Judge, match_set: MatchSet | Scales, candidates: Shortlist, *,
     trials: int, seed: int = 0, ks: Sequence[int] = KS, track: Stages = untracked_stages, **options: Any,
 ) -> Outcome:  # fmt: skip
     """The scorer's own values, and the settings that Optuna's sampler (TPE) proposes, which depend on the seed alone.
@@ -110,7 +110,7 @@ def require_optuna() -> None:
 
 
 def _ranker(
-    axes: Axes, judge: Judge, match_set: MatchSet, candidates: Shortlist, **options: Any
+    axes: Axes, judge: Judge, match_set: MatchSet | Scales, candidates: Shortlist, **options: Any
 ) -> Callable[[Sequence[Mapping[str, Any]], Track], np.ndarray]:
     """Plain settings -> rows `[V, S, Q, depth]` of their rankings."""
     return lambda settings, track: sweep(

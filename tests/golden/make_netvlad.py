@@ -27,6 +27,7 @@ CASES = (
     (16, 512, (171, 203), 4), (64, 128, (171, 203), 5), (64, None, (171, 203), 6),
 )  # fmt: skip
 MATLAB = (64, 128, (171, 203), 7)  # outputs of the original are 4096; fewer are as good a test
+POSITIONS = (((640, 480), 2), ((640, 480), 5), ((640, 480), 8), ((171, 203), 3))  # image and patch sizes
 GEM = (("vgg16", 512, (171, 203), 8), ("resnet50", 512, (171, 203), 9), ("resnet50", 2048, (128, 96), 10))
 
 
@@ -56,7 +57,7 @@ def main(patch_netvlad: str, hloc: str, cosplace: str, torchvision: str) -> None
     sys.modules["sklearn"], sys.modules["sklearn.neighbors"] = (types.ModuleType(one) for one in ("sklearn", "nothing"))
     sys.modules["sklearn.neighbors"].NearestNeighbors = None  # pyright: ignore  (for training)
     with torch.inference_mode():
-        golden = dict(_patches(patch_netvlad))
+        golden = dict(_patches(patch_netvlad)) | dict(_positions())
         golden[name("matlab", *MATLAB)] = _matlab(hloc)
         golden |= {name("gem", *case): _gem(cosplace, *case) for case in GEM}
     np.savez_compressed(GOLDEN, **{key: array.astype(np.float32) for key, array in golden.items()})
@@ -132,6 +133,16 @@ def _patches(clone: str) -> Iterator[tuple[str, np.ndarray]]:
             projected = get_pca_encoding(model, rows).reshape(count, outputs).numpy()
             yield f"{case}/{patch}", samples(projected)
             yield f"{case}/{patch}/means", projected.mean(axis=0)
+
+
+def _positions() -> Iterator[tuple[str, np.ndarray]]:
+    """Keypoints `[n, 2]` (x, y) of all patches."""
+    from patchnetvlad.models.local_matcher import calc_keypoint_centers_from_patches
+
+    for (width, height), patch in POSITIONS:
+        config = {"imageresizeW": width, "imageresizeH": height}
+        keypoints, _ = calc_keypoint_centers_from_patches(config, patch, patch, 1, 1)
+        yield name("positions", (width, height), patch), keypoints.T
 
 
 def _matlab(clone: str) -> np.ndarray:

@@ -1,0 +1,104 @@
+"""Patch-NetVLAD's features (Hausler et al., CVPR 2021): NetVLAD of all squares of a map, of several sizes."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import jax
+import numpy as np
+
+from mfvpr.data.images import Interpolation
+from mfvpr.errors import InputError
+from mfvpr.features import Description, Scale
+from mfvpr.features.network import compiled, in_batches
+from mfvpr.models.netvlad import STRIDE, VggNetVlad
+from mfvpr.types import Features
+
+_MIDDLE = (STRIDE - 1) // 2  # px from a position's first pixel, as published: a half is dropped
+
+
+@dataclass(frozen=True)
+class PatchNetVladFeatures:
+    """The global descriptor and the patches of one pass, as the public code extracts them.
+
+    Patches are in rows from the top, each from the left; their scores are 1.
+
+    Attributes:
+        model: the network with its weights.
+        image_size: (width, height) px.
+        interpolation: see `mfvpr.data.images.resize`.
+        patch_sizes: sides of the squares, in positions of the map; each size is a scale.
+        scale_weights: how much the score of each scale counts, see `mfvpr.fuse_scales`; None = all alike.
+        batch_size: images per call.
+
+    Raises:
+        InputError: no patch sizes, one that images of this size have no room for, or weights of other scales.
+    """
+
+    model: VggNetVlad
+    image_size: tuple[int, int] = (640, 480)
+    interpolation: Interpolation = "pil_bilinear"
+    patch_sizes: tuple[int, ...] = (5,)
+    scale_weights: tuple[float, ...] | None = field(default=None, metadata={"recipe": False})
+    batch_size: int = field(default=8, metadata={"recipe": False})
+
+    def __post_init__(self) -> None:
+        columns, rows = self._map_size
+        if not self.patch_sizes or not 1 <= min(self.patch_sizes) <= max(self.patch_sizes) <= min(columns, rows):
+            raise InputError(f"patch_sizes={list(self.patch_sizes)}: expected sizes from 1 to {min(columns, rows)}, as "
+                             f"a map of {columns} x {rows} positions has room for")  # fmt: skip
+        if self.scale_weights is not None and len(self.scale_weights) != len(self.patch_sizes):
+            raise InputError(f"scale_weights={list(self.scale_weights)}: expected one for each of "
+                             f"patch_sizes={list(self.patch_sizes)}, or None")  # fmt: skip
+
+    @property
+    def vector_size(self) -> int:
+        """Numbers of the global descriptor."""
+        return self.model.dimension
+
+    @property
+    def scales(self) -> tuple[Scale, ...]:
+        """One for each size of patches."""
+        columns, rows = self._map_size
+        weights = self.scale_weights or (1.0,) * len(self.patch_sizes)
+        return tuple(
+            Scale(self.model.dimension, (columns - size + 1) * (rows - size + 1), weight)
+            for size, weight in zip(self.patch_sizes, weights, strict=True)
+        )
+
+    @property
+    def _map_size(self) -> tuple[int, int]:
+        width, height = self.image_size
+        return width // STRIDE, height // STRIDE
+
+    def __call__(self, images: np.ndarray) -> list[Description]:
+        """Descriptors of images `[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32.
+
+        Raises:
+            InputError: the images do not have the size asked for.
+        """
+        (width, height), (rows, columns) = self.image_size, images.shape[1:3]
+        if (columns, rows) != (width, height):
+            raise InputError(f"Patch-NetVLAD: expected images of {width} x {height} px, got {columns} x {rows}")
+        found = in_batches(self._program, images, self.batch_size)
+        return [Description(vector, tuple(map(self._features, self.patch_sizes, patches))) for vector, patches in found]
+
+    @cached_property
+    def _program(self) -> Callable[..., Any]:
+        def describe(model: VggNetVlad, images: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+            return model.with_patches(model.preprocess(images), self.patch_sizes)
+
+        return compiled(self.model, describe)
+
+    def _features(self, size: int, descriptors: np.ndarray) -> Features:
+        columns, rows = (side - size + 1 for side in self._map_size)
+        row, column = np.indices((rows, columns)).reshape(2, -1)
+        middle = STRIDE * np.stack([column, row], axis=1) + STRIDE * (size - 1) // 2 + _MIDDLE
+        return Features(
+            keypoints=middle.astype(np.float32),
+            descriptors=descriptors,
+            scores=np.ones(len(middle), np.float32),
+            mask=np.ones(len(middle), bool),
+            image_size=np.array(self.image_size, np.float32),
+        )

@@ -1,0 +1,163 @@
+"""Patch-NetVLAD as a system: patches of several sizes, scored by themselves and fused; one pass with its own filter."""
+
+import json
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+import mfvpr
+from experiments import prepare
+from mfvpr.archive import Archive
+from mfvpr.data.datasets import folder_dataset
+from mfvpr.errors import InputError
+from mfvpr.features.patch_netvlad import PatchNetVladFeatures
+from mfvpr.filters import Retrieval
+from mfvpr.models.netvlad import VggNetVlad
+from mfvpr.weights.conversion import convert
+from mfvpr.weights.networks import planned
+from mfvpr.weights.tables import NETVLAD
+from tests.checkpoints import netvlad_checkpoint
+from tests.golden.make_netvlad import GOLDEN, POSITIONS, image, name
+from tests.programs import results, typed
+
+SIZE = (160, 128)
+SCORERS = {"count": mfvpr.MatchCount(), "histogram": mfvpr.HistogramOfShifts()}
+
+
+@pytest.fixture(scope="module")
+def model():
+    plan = planned(partial(VggNetVlad, 4, 16))
+    return plan.filled(convert(netvlad_checkpoint(4, 16), NETVLAD, plan.shapes))
+
+
+@pytest.fixture(scope="module")
+def dataset(small_street):
+    return folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
+
+
+@pytest.mark.parametrize("position", POSITIONS, ids=map(str, POSITIONS))
+def test_patches_are_where_the_public_code_has_them(model, position):
+    size, patch = position
+    extractor = PatchNetVladFeatures(model, size, patch_sizes=(patch,))
+    [scale], [description] = extractor.scales, extractor(image(size))
+    expected = np.load(GOLDEN)[name("positions", *position)]
+    np.testing.assert_array_equal(description.features.keypoints, expected)
+    assert description.features.descriptors.shape == (len(expected), 16)
+    assert scale == (16, len(expected), 1.0)
+
+
+def test_one_pass_gives_what_the_network_gives(model):
+    extractor = PatchNetVladFeatures(model, SIZE, patch_sizes=(1, 3))
+    [found] = extractor(image(SIZE))
+    whole, patches = model.with_patches(model.preprocess(image(SIZE)), (1, 3))
+    np.testing.assert_allclose(found.vector, whole[0], atol=1e-6)
+    for local, expected in zip(found.local, patches, strict=True):
+        np.testing.assert_allclose(local.descriptors, expected[0], atol=1e-6)
+        np.testing.assert_allclose(np.linalg.norm(local.descriptors, axis=1), 1, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("options", "words"), [
+    ({"patch_sizes": ()}, r"patch_sizes=\[\]: expected sizes from 1 to 8, as a map of 10 x 8 positions has room for"),
+    ({"patch_sizes": (9,)}, "expected sizes from 1 to 8"), ({"patch_sizes": (0, 2)}, "expected sizes from 1 to 8"),
+    ({"scale_weights": (1.0, 2.0)}, r"scale_weights=\[1.0, 2.0\]: expected one for each of patch_sizes=\[5\], or None"),
+])  # fmt: skip
+def test_what_cannot_be_is_refused(model, options, words):
+    with pytest.raises(InputError, match=words):
+        PatchNetVladFeatures(model, SIZE, **options)
+    with pytest.raises(InputError, match="expected images of 160 x 128 px, got 128 x 160"):
+        PatchNetVladFeatures(model, SIZE)(np.zeros((1, 160, 128, 3), np.uint8))
+
+
+def test_scales_are_standardized_weighted_and_summed(model, dataset, tmp_path):
+    """As the public code does: z-scores over a query's candidates by scale, by float64 loops; also out of its store."""
+    sizes, weights = (2, 3, 5), (0.45, 0.15, 0.4)
+    extractor = PatchNetVladFeatures(model, SIZE, patch_sizes=sizes, scale_weights=weights)
+    lines = []
+    archive = partial(Archive, tmp_path, tell=lines.append)
+    options = {"candidates": 6, "archive": archive()}
+    found = mfvpr.evaluate(dataset, extractor, Retrieval(extractor), SCORERS, **options)
+    assert sum("images to do" in line for line in lines) == 2  # one pass a side: descriptors and patches
+    single = []
+    for size in sizes:  # out of stores as well, which round descriptors
+        one, kept = replace(extractor, patch_sizes=(size,), scale_weights=None), Archive(tmp_path / str(size))
+        single.append(mfvpr.evaluate(dataset, one, Retrieval(one), SCORERS, candidates=6, archive=kept))
+    for scorer in SCORERS:
+        expected = 0.0
+        for weight, alone in zip(weights, single, strict=True):
+            [ranked] = alone.systems[scorer]
+            scores = np.take_along_axis(ranked.scores, np.argsort(ranked.rows, axis=1), axis=1).astype(np.float64)
+            expected += weight * (scores - scores.mean(axis=1, keepdims=True)) / scores.std(axis=1, keepdims=True)
+        [ranked] = found.systems[scorer]
+        actual = np.take_along_axis(ranked.scores, np.argsort(ranked.rows, axis=1), axis=1)
+        np.testing.assert_allclose(actual, expected, atol=1e-4)
+    again = mfvpr.evaluate(dataset, extractor, Retrieval(extractor), SCORERS, candidates=6, archive=archive())
+    other = replace(extractor, scale_weights=(1.0, 2.0, 3.0))
+    changed = mfvpr.evaluate(dataset, other, Retrieval(other), SCORERS, candidates=6, archive=archive())
+    assert sum("images to do" in line for line in lines) == 2  # weights are no part of what is kept
+    for scorer in SCORERS:
+        np.testing.assert_array_equal(again.systems[scorer][0].scores, found.systems[scorer][0].scores)
+        assert np.abs(changed.systems[scorer][0].scores - found.systems[scorer][0].scores).max() > 0.1
+
+
+@pytest.fixture
+def program(weights, small_street, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("MFVPR_WEIGHTS", str(weights))
+    folders = f"dataset.database={small_street}/database", f"dataset.queries={small_street}/queries"
+    small = ("features.weights=patchnetvlad_mapillary_128", "features.image_size=[160,128]", "candidates=5")
+
+    def run(kind, *more):
+        out = tmp_path / str(len([*tmp_path.iterdir()]))
+        own = ("dataset=folder", *folders, "dataset.ground_truth=order", *more, *small, f"out={out}")
+        code, stdout, stderr = typed(monkeypatch, capsys, kind, *own)
+        return out, code, stdout, stderr
+
+    return run
+
+
+@pytest.mark.parametrize(("system", "scorer"), [
+    ("patch_netvlad_performance", "homography"), ("patch_netvlad_speed", "rapid"), ("patch_netvlad_storage", "rapid"),
+])  # fmt: skip
+def test_its_configurations_run_by_name(program, system, scorer):
+    out, code, _, stderr = program("evaluate", f"system={system}", "figures=2")
+    assert code == 0, stderr
+    rows = json.loads((out / "results.json").read_text())
+    assert [row["system"] for row in rows if row["decides"]] == [scorer] * 3
+    assert rows[0]["features"]["patch_sizes"] == ([2, 5, 8] if "performance" in system else [5])
+    assert rows[0]["filter"]["name"] == "same"
+
+
+def test_a_sweep_fuses_the_scales_as_an_evaluation_does(program):
+    options = ("features=patch_netvlad", "features.patch_sizes=[2,4]", "retrieval=same", "scorer=count")
+    many = (*options, "scorer=histogram", "features.scale_weights=[1,3]")
+    out, code, _, stderr = program("sweep", *many, "grid.bin_size=[8,16]")
+    assert code == 0, stderr
+    swept = results(out)["settings"]
+    for setting in swept[:2]:
+        alone, code, _, stderr = program("evaluate", *many, f"scorer.bin_size={setting['parameters']['bin_size']}",
+                                         "figures=0")  # fmt: skip
+        assert code == 0, stderr
+        rows = json.loads((alone / "results.json").read_text())
+        expected = [row["recall_at"]["1"] for row in rows if row["system"] == "histogram"]
+        assert [row["1"] for row in setting["recall_at"].values()] == pytest.approx(expected, abs=1e-6)
+
+
+def test_what_it_cannot_be_used_for_is_one_line(program, monkeypatch):
+    scales = ("features=patch_netvlad", "features.patch_sizes=[2,4]")
+    _, code, _, stderr = program("learn", *scales, "retrieval=same", "scorer=sum", "steps=1", "recall.tolerances=[0]")
+    assert code == 2
+    words = "features.patch_sizes=[2, 4]: expected one size, since learning knows one scale"
+    assert words in stderr.splitlines()[-1]
+    monkeypatch.setattr(prepare, "dataset_of", None)  # told before
+    _, code, _, stderr = program("evaluate", *scales, "retrieval=same", "features.scale_weights=[1]")
+    assert code == 2
+    assert "scale_weights=[1.0]: expected one for each of patch_sizes=[2, 4]" in stderr.replace("[1]", "[1.0]")
+
+
+def test_other_features_have_no_global_descriptor(small_street, tmp_path, monkeypatch, capsys):
+    folders = f"dataset.database={small_street}/database", f"dataset.queries={small_street}/queries"
+    code, _, stderr = typed(monkeypatch, capsys, "evaluate", "dataset=folder", *folders, "dataset.ground_truth=order",
+                            "retrieval=same", f"out={tmp_path}/out")  # fmt: skip
+    assert code == 2
+    assert "retrieval=same: expected features with a global descriptor, such as patch_netvlad's" in stderr
