@@ -153,7 +153,7 @@ def test_systems_of_several_scores_are_ranked_beside_the_others(matched):
 
 def test_scores_of_several_scales_are_fused_again_with_the_filter(matched):
     """They are standardized sums themselves."""
-    twice = replace(matched, matches=matched.matches * 2)
+    twice = replace(matched, matches=matched.matches * 2, weights=(1.0, 1.0))
     systems = rank_sequence(twice, SCORERS, {"histogram": Fusion("zscore")}, {}, "filter")
     once = rank_sequence(matched, SCORERS, {"histogram": Fusion("zscore")}, {}, "filter")
     name = "histogram + filter"

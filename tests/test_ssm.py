@@ -144,7 +144,7 @@ def test_cells_are_whitened_windows_at_their_places(model, cells, dataset):
     images = np.random.default_rng(0).integers(0, 256, (2, 40, 48, 3), np.uint8)
     maps = [one.vector.reshape(5, 6, 512).astype(np.float64) for one in SsmMaps(model, 2, SMALL)(images)]
     found = Windows((5, 6, 512), 3)
-    assert cells.scales == learned.scales == ((6, 12),)
+    assert cells.scales == learned.scales == ((6, 12, 1.0),)
     for features, one in zip(local(learned(images)), maps, strict=True):
         expected = learned.whitening(found.take(one, np.arange(12)))
         np.testing.assert_allclose(features.descriptors, expected, atol=1e-4 * np.abs(expected).max())

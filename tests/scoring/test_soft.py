@@ -85,7 +85,8 @@ def test_histogram_agrees_with_the_loop(matches, scorer, temperature):
         (start, size0), (end, size1) = (end, size1), (start, size0)
     expected = soft_oracles.histogram_score(end - start, weights, size0, size1, temperature=temperature, **options)
     got = score(replace(scorer, temperature=temperature), matches)
-    np.testing.assert_allclose(got, expected, rtol=2e-5, atol=2e-6 * (1 + temperature))
+    # Of up to 900 bins: the temperature times a logarithm near 7, in single precision.
+    np.testing.assert_allclose(got, expected, rtol=2e-5, atol=4e-6 * (1 + temperature))
 
 
 @draws(ANCHORS, [0.02, 0.3, 1.0, 3.0])
