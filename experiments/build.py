@@ -77,10 +77,8 @@ def extractor(settings: dict[str, Any], data: Dataset | None) -> Extractor | Fea
     weights = options.pop("weights", None)
     if name == "ssm":
         options["whitening"] = _fitting(options, STAGE2_FITTING)
-    for several in {"patch_sizes", "scale_weights"} & options.keys():
-        options[several] = options[several] and tuple(options[several])
-    network = _network("features", name.replace("_", ""), weights)
-    return made[name](network, **_only(options, made[name], f"features={name}"))
+    options = {option: tuple(value) if isinstance(value, list) else value for option, value in options.items()}
+    return made[name](_network("features", name, weights), **_only(options, made[name], f"features={name}"))
 
 
 def filter(settings: dict[str, Any], local: Extractor | FeatureFiles, data: Dataset | None) -> Filter:
@@ -117,7 +115,7 @@ def _with_vectors(local: Extractor | FeatureFiles) -> Extractor:
 def _described(name: str, options: dict[str, Any]) -> Extractor:
     from mfvpr.features.global_descriptor import GlobalDescriptor
 
-    networks = ("netvlad", "patchnetvlad") if name == "netvlad" else (name,)
+    networks = ("netvlad", "patch_netvlad") if name == "netvlad" else (name,)
     model, size = _network("retrieval", networks, options.pop("weights")), tuple(options.pop("image_size"))
     return GlobalDescriptor(model, size, **_only(options, GlobalDescriptor, f"retrieval={name}"))
 

@@ -17,7 +17,7 @@ import numpy as np
 from mfvpr.matching import filter_matches
 from mfvpr.numerics import available_cpus, compiled, held, holds_function, is_concrete, knows_own_context, platform
 from mfvpr.reranking import BIN_STEP, check_candidates, matched_sizes
-from mfvpr.scoring import HistogramOfShifts, check_host, on_host, score_pairs
+from mfvpr.scoring import HistogramOfShifts, check_host, on_host, require_real, score_pairs
 from mfvpr.scoring.parameters import fit, numbers, whole_numbers, with_parameters
 from mfvpr.types import Array, Matches
 from mfvpr.weighting import ChosenWeight, Weight, match_weights
@@ -117,7 +117,9 @@ def score_settings(
         weightings: `[W]` values of what only says how much a match counts, which is cheap to vary: `max_distance`
             (matches further apart do not count) and `weight` (an option of the scorer's `ChosenWeight`); none: W = 1.
     """
-    return (_on_host if on_host(scorer) else _in_jax)(scorer, matches, settings, weightings)
+    scores = (_on_host if on_host(scorer) else _in_jax)(scorer, matches, settings, weightings)
+    require_real("scorer", scores)
+    return scores
 
 
 def _on_host(

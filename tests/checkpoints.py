@@ -188,15 +188,20 @@ def at_hand() -> Iterator[tuple[str, dict[str, np.ndarray]]]:
         yield path.stem, read_checkpoint(path)
 
 
+_VGG16 = {0: (3, 64), 2: (64, 64), 5: (64, 128), 7: (128, 128), 10: (128, 256), 12: (256, 256), 14: (256, 256),
+          17: (256, 512), 19: (512, 512), 21: (512, 512), 24: (512, 512), 26: (512, 512), 28: (512, 512)}  # fmt: skip
+
+
+def _vgg16(prefix: str, last: int = 28) -> dict[str, tuple[int, ...]]:
+    shapes = {}
+    for index, (inputs, outputs) in ((index, widths) for index, widths in _VGG16.items() if index <= last):
+        shapes |= {f"{prefix}.{index}.weight": (outputs, inputs, 3, 3), f"{prefix}.{index}.bias": (outputs,)}
+    return shapes
+
+
 def d2net_shapes() -> dict[str, tuple[int, ...]]:
     """The tensors of d2_tf.pth, which holds them below the key `model`."""
-    widths = {0: (3, 64), 2: (64, 64), 5: (64, 128), 7: (128, 128), 10: (128, 256), 12: (256, 256), 14: (256, 256),
-              17: (256, 512), 19: (512, 512), 21: (512, 512)}  # fmt: skip
-    shapes = {}
-    for index, (inputs, outputs) in widths.items():
-        shapes[f"dense_feature_extraction.model.{index}.weight"] = (outputs, inputs, 3, 3)
-        shapes[f"dense_feature_extraction.model.{index}.bias"] = (outputs,)
-    return shapes
+    return _vgg16("dense_feature_extraction.model", last=21)
 
 
 def places365_shapes(weights: str = "weights", *, full: bool = True) -> dict[str, tuple[int, ...]]:
@@ -213,17 +218,6 @@ def places365_shapes(weights: str = "weights", *, full: bool = True) -> dict[str
         del shapes["conv5_3"]
     kinds = {weights: lambda shape: shape, "bias": lambda shape: shape[:1]}
     return {f"{layer}.{name}": kind(shape) for layer, shape in shapes.items() for name, kind in kinds.items()}
-
-
-_VGG16 = {0: (3, 64), 2: (64, 64), 5: (64, 128), 7: (128, 128), 10: (128, 256), 12: (256, 256), 14: (256, 256),
-          17: (256, 512), 19: (512, 512), 21: (512, 512), 24: (512, 512), 26: (512, 512), 28: (512, 512)}  # fmt: skip
-
-
-def _vgg16(prefix: str) -> dict[str, tuple[int, ...]]:
-    shapes = {}
-    for index, (inputs, outputs) in _VGG16.items():
-        shapes |= {f"{prefix}.{index}.weight": (outputs, inputs, 3, 3), f"{prefix}.{index}.bias": (outputs,)}
-    return shapes
 
 
 def netvlad_shapes(clusters: int = 16, outputs: int | None = 4096) -> dict[str, tuple[int, ...]]:

@@ -102,7 +102,7 @@ def evaluated(dataset, extractor=SIFT, chosen=None, scorers=HISTOGRAM, **options
         ({"scorers": {"h": 5}}, "scorers: expected h to map Matches to a score, got 5"),
         ({"scorers": {"h": mfvpr.HistogramOfShifts(sigma=-1.0)}}, "sigma=-1.0: expected numbers from"),
         ({"scorers": {"v": lambda matches: matches.points0[:, 0]}}, "v: expected a number for each pair"),
-        ({"scorers": {"v": lambda matches: matches.points0[0, 0].astype(complex)}}, "v: expected real numbers"),
+        ({"scorers": {"v": lambda matches: matches.points0[0, 0].astype(complex)}}, "scorer: expected real number"),
         ({"matching": Matching(cross_check="x")}, "cross_check='x': expected one of"),
         ({"fused": {"histogram": Fusion(1.0, "euclidean")}}, "filter_score='euclidean': expected one of"),
         ({"fused": {"histogram": Fusion(1.0, "negative_euclidean")}, "chosen": Fixed((0, 1, 2), 3.0)},

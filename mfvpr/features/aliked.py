@@ -13,7 +13,7 @@ from jax import Array
 from mfvpr.data.images import Interpolation
 from mfvpr.errors import InputError
 from mfvpr.features import Description, Scale
-from mfvpr.features.network import compiled, in_batches
+from mfvpr.features.network import compiled, in_batches, require_size
 from mfvpr.models.aliked import Aliked
 from mfvpr.models.aliked_detection import RADIUS, Detections
 from mfvpr.types import Features
@@ -70,9 +70,7 @@ class AlikedFeatures:
         Raises:
             InputError: the images do not have the size asked for.
         """
-        if images.shape[1:3] != self.image_size[::-1]:
-            (width, height), (rows, columns) = self.image_size, images.shape[1:3]
-            raise InputError(f"ALIKED: expected images of {width} x {height} px, got {columns} x {rows}")
+        require_size("ALIKED", images, self.image_size)
         usual = min(self._limit, math.ceil(math.prod(self.image_size) / _PIXELS_PER_SLOT))
         found = in_batches(self._program(usual), images, self.batch_size)
         crowded = [row for row, (detections, _) in enumerate(found) if detections.count > usual]

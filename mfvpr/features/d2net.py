@@ -10,7 +10,7 @@ import numpy as np
 from mfvpr.data.images import Interpolation
 from mfvpr.errors import InputError
 from mfvpr.features import Description, Scale
-from mfvpr.features.network import compiled, in_batches
+from mfvpr.features.network import compiled, in_batches, require_size
 from mfvpr.models.d2net import SCALES, STRIDE, D2Net, Detections, extract, map_size
 from mfvpr.models.imagenet import Preprocessing
 from mfvpr.types import Features
@@ -75,9 +75,7 @@ class D2NetFeatures:
         Raises:
             InputError: the images do not have the size asked for.
         """
-        (width, height), (rows, columns) = self.image_size, images.shape[1:3]
-        if (columns, rows) != (width, height):
-            raise InputError(f"D2-Net: expected images of {width} x {height} px, got {columns} x {rows}")
+        require_size("D2-Net", images, self.image_size)
         found = in_batches(self._usual_program, images, self.batch_size)
         crowded = [row for row, levels in enumerate(found) if any(level.count > len(level.mask) for level in levels)]
         for row, levels in zip(crowded, in_batches(self._roomy_program, images[crowded], self.batch_size), strict=True):

@@ -11,7 +11,7 @@ import numpy as np
 from mfvpr.data.images import Interpolation
 from mfvpr.errors import InputError
 from mfvpr.features import Description, Scale
-from mfvpr.features.network import compiled, in_batches
+from mfvpr.features.network import compiled, in_batches, require_size
 from mfvpr.models.lengths import of_unit_length
 
 _SMALLEST = 16  # px, which VGG16 makes one position of
@@ -80,9 +80,7 @@ class GlobalDescriptor:
         Raises:
             InputError: the images do not have the size asked for.
         """
-        (width, height), (rows, columns) = self.image_size, images.shape[1:3]
-        if (columns, rows) != (width, height):
-            raise InputError(f"expected images of {width} x {height} px, got {columns} x {rows}")
+        require_size(type(self.model).__name__, images, self.image_size)
         return [Description(np.asarray(vector)) for vector in in_batches(self._program, images, self.batch_size)]
 
     @cached_property

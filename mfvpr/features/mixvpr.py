@@ -9,9 +9,8 @@ import jax
 import numpy as np
 
 from mfvpr.data.images import Interpolation
-from mfvpr.errors import InputError
 from mfvpr.features import Description, Scale
-from mfvpr.features.network import compiled, in_batches
+from mfvpr.features.network import compiled, in_batches, require_size
 from mfvpr.models.mixvpr import IMAGE_SIZE, MixVPR, preprocess
 
 
@@ -51,9 +50,7 @@ class MixVprDescriptor:
         Raises:
             InputError: the images have another size.
         """
-        if images.shape[1:3] != IMAGE_SIZE[::-1]:
-            height, width = images.shape[1:3]
-            raise InputError(f"MixVPR: expected images of {IMAGE_SIZE[0]} x {IMAGE_SIZE[1]} px, got {width} x {height}")
+        require_size("MixVPR", images, IMAGE_SIZE)
         return [Description(np.asarray(vector)) for vector in in_batches(self._program, images, self.batch_size)]
 
     @cached_property

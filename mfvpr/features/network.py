@@ -1,4 +1,4 @@
-"""How a network is put to work: weights are arguments of one compiled program, batches have a fixed size."""
+"""How a network is put to work: weights are arguments of one compiled program; images and batches have one size."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,7 +8,9 @@ import numpy as np
 from flax import nnx
 
 from mfvpr import ragged
+from mfvpr.errors import InputError
 from mfvpr.numerics import device_bytes
+from mfvpr.types import Features
 
 
 def compiled(model: nnx.Module, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -17,6 +19,24 @@ def compiled(model: nnx.Module, function: Callable[..., Any]) -> Callable[..., A
     program = jax.jit(lambda state, *inputs: function(nnx.merge(graph, state), *inputs))
     state = jax.device_put(state)
     return lambda *inputs: program(state, *inputs)
+
+
+def require_size(name: str, images: np.ndarray, size: tuple[int, int]) -> None:
+    """Raise an InputError unless images `[B, H, W, 3]` have this (width, height)."""
+    rows, columns = images.shape[1:3]
+    if (columns, rows) != tuple(size):
+        raise InputError(f"{name}: expected images of {size[0]} x {size[1]} px, got {columns} x {rows}")
+
+
+def at_places(keypoints: np.ndarray, descriptors: np.ndarray, image_size: tuple[int, int]) -> Features:
+    """Features of every image's same places `[N, 2]` (x, y) px: scores are 1."""
+    return Features(
+        keypoints=keypoints.astype(np.float32),
+        descriptors=descriptors,
+        scores=np.ones(len(keypoints), np.float32),
+        mask=np.ones(len(keypoints), bool),
+        image_size=np.array(image_size, np.float32),
+    )
 
 
 def in_batches(program: Callable[[Any], Any], images: np.ndarray, batch_size: int) -> list[Any]:

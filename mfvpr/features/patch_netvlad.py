@@ -11,7 +11,7 @@ import numpy as np
 from mfvpr.data.images import Interpolation
 from mfvpr.errors import InputError
 from mfvpr.features import Description, Scale
-from mfvpr.features.network import compiled, in_batches
+from mfvpr.features.network import at_places, compiled, in_batches, require_size
 from mfvpr.models.netvlad import STRIDE, VggNetVlad
 from mfvpr.types import Features
 
@@ -78,9 +78,7 @@ class PatchNetVladFeatures:
         Raises:
             InputError: the images do not have the size asked for.
         """
-        (width, height), (rows, columns) = self.image_size, images.shape[1:3]
-        if (columns, rows) != (width, height):
-            raise InputError(f"Patch-NetVLAD: expected images of {width} x {height} px, got {columns} x {rows}")
+        require_size("Patch-NetVLAD", images, self.image_size)
         found = in_batches(self._program, images, self.batch_size)
         return [Description(vector, tuple(map(self._features, self.patch_sizes, patches))) for vector, patches in found]
 
@@ -95,10 +93,4 @@ class PatchNetVladFeatures:
         columns, rows = (side - size + 1 for side in self._map_size)
         row, column = np.indices((rows, columns)).reshape(2, -1)
         middle = STRIDE * np.stack([column, row], axis=1) + STRIDE * (size - 1) // 2 + _MIDDLE
-        return Features(
-            keypoints=middle.astype(np.float32),
-            descriptors=descriptors,
-            scores=np.ones(len(middle), np.float32),
-            mask=np.ones(len(middle), bool),
-            image_size=np.array(self.image_size, np.float32),
-        )
+        return at_places(middle, descriptors, self.image_size)

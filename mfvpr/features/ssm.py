@@ -11,7 +11,7 @@ import numpy as np
 from mfvpr.data.images import Interpolation
 from mfvpr.errors import InputError
 from mfvpr.features import Description, Scale
-from mfvpr.features.network import compiled, in_batches
+from mfvpr.features.network import at_places, compiled, in_batches
 from mfvpr.features.windows import WindowFitting, Windows, kernels, known, normalized, whitened
 from mfvpr.models.imagenet import Preprocessing
 from mfvpr.models.ssm import STAGE1_STRIDE, STAGE2_STRIDE, SsmVgg
@@ -199,13 +199,7 @@ class SsmCells:
 
     def _features(self, descriptors: np.ndarray) -> Features:
         middle = STAGE2_STRIDE * (self.windows.corners[:, ::-1] + self.windows.size // 2) + _MIDDLE
-        return Features(
-            keypoints=middle.astype(np.float32),
-            descriptors=descriptors,
-            scores=np.ones(len(middle), np.float32),
-            mask=np.ones(len(middle), bool),
-            image_size=np.array(self.image_size, np.float32),
-        )
+        return at_places(middle, descriptors, self.image_size)
 
 
 def _program(model: SsmVgg, maps: SsmMaps, windows: Windows, whitening: Whitening) -> Callable[..., Any]:

@@ -15,7 +15,7 @@ from mfvpr.numerics import Device, available_cpus, compiled, held, knows_own_con
 from mfvpr.parameter_grids import score_settings
 from mfvpr.progress import Track, untracked
 from mfvpr.reranking import BIN_STEP, fuse_scales
-from mfvpr.scoring import Scorer, check_host, on_host, require_real, score_pairs
+from mfvpr.scoring import Scorer, check_host, on_host, score_pairs
 from mfvpr.scoring.parameters import fit
 from mfvpr.threads import ordered_map
 from mfvpr.types import Array, Matches, Shortlist
@@ -124,7 +124,6 @@ def _in_jax(matches: Matches, scorers: dict[str, Scorer]) -> dict[str, Array]:
     for name, values in scores.items():
         if values.shape != matches.mask.shape[:1]:
             raise InputError(f"{name}: expected a number for each pair, got an array {list(values.shape[1:])}")
-        require_real(name, values)
     return scores
 
 

@@ -110,7 +110,7 @@ def _patchnetvlad(training: str, outputs: int, size: int | None, sha256: str) ->
     vgg, vlad, projection = 14_714_688, 2 * 512 * clusters, (512 * clusters + 1) * outputs
     return Entry(
         name=f"patchnetvlad_{training}_{outputs}",
-        network="patchnetvlad",
+        network="patch_netvlad",
         file=f"{training}_WPCA{outputs}.pth.tar",
         source=f"https://huggingface.co/TobiasRobotics/Patch-NetVLAD/resolve/main/{training}_WPCA{outputs}.pth.tar",
         size=size,
@@ -123,33 +123,22 @@ def _patchnetvlad(training: str, outputs: int, size: int | None, sha256: str) ->
     )
 
 
-def _netvlad(training: str, file: str) -> Entry:
+_HLOC = "https://cvg-data.inf.ethz.ch/hloc/netvlad"
+_NANNE = "vgg16_netvlad_checkpoint.zip at https://drive.google.com/open?id=17luTjZFCX639guSVy00OUtzfTQo4AMF2"
+
+
+def _netvlad(name: str, file: str, source: str, license: str, outputs: int | None) -> Entry:
     return Entry(
-        name=f"netvlad_{training}",
+        name=f"netvlad_{name}",
         network="netvlad",
         file=file,
-        source=f"https://cvg-data.inf.ethz.ch/hloc/netvlad/{file}",
+        source=source,
         size=None,
         sha256=None,
-        code_license="MIT",
-        weights_license="MIT",
+        code_license=license,
+        weights_license=license,
         cite="Arandjelovic et al., NetVLAD: CNN Architecture for Weakly Supervised Place Recognition, CVPR 2016",
-        parameters=14_714_688 + 2 * 512 * 64 + (512 * 64 + 1) * 4096,
-    )
-
-
-def _netvlad_pytorch() -> Entry:
-    return Entry(
-        name="netvlad_pytorch",
-        network="netvlad",
-        file="checkpoint.pth.tar",
-        source="vgg16_netvlad_checkpoint.zip at https://drive.google.com/open?id=17luTjZFCX639guSVy00OUtzfTQo4AMF2",
-        size=None,
-        sha256=None,
-        code_license="none stated",
-        weights_license="none stated",
-        cite="Arandjelovic et al., NetVLAD: CNN Architecture for Weakly Supervised Place Recognition, CVPR 2016",
-        parameters=14_714_688 + 2 * 512 * 64,
+        parameters=14_714_688 + 2 * 512 * 64 + (512 * 64 + 1) * (outputs or 0),
     )
 
 
@@ -184,9 +173,9 @@ _ENTRIES = (
     _aliked("n32", 979_500, 3_946_667, "055283fd1624d3ab46a05c3b617b1a79a3f28d1f551737eef2d653e8c8232890"),
     _lightglue(),
     _ssm(),
-    _netvlad("pitts30k", "Pitts30K_struct.mat"),
-    _netvlad("tokyotm", "TokyoTM_struct.mat"),
-    _netvlad_pytorch(),
+    _netvlad("pitts30k", "Pitts30K_struct.mat", f"{_HLOC}/Pitts30K_struct.mat", "MIT", 4096),
+    _netvlad("tokyotm", "TokyoTM_struct.mat", f"{_HLOC}/TokyoTM_struct.mat", "MIT", 4096),
+    _netvlad("pytorch", "checkpoint.pth.tar", _NANNE, "none stated", None),
     _cosplace("VGG16", 512),
     _cosplace("ResNet50", 512),
     _cosplace("ResNet50", 2048),

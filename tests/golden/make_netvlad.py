@@ -71,10 +71,8 @@ def _torchvision(folder: str) -> None:
         module.__version__ = "0.28"
         sys.modules[package] = module
     models = sys.modules["torchvision"].models = sys.modules["torchvision.models"]  # pyright: ignore
-    for part, makers in (("vgg", ("vgg16",)), ("resnet", ("resnet50",))):
-        for maker in makers:
-            setattr(models, maker, _untrained(getattr(importlib.import_module(f"torchvision.models.{part}"), maker)))
-    models.VGG16, models.ResNet50 = models.vgg16, models.resnet50
+    for part, maker in (("vgg", "vgg16"), ("resnet", "resnet50")):
+        setattr(models, maker, _untrained(getattr(importlib.import_module(f"torchvision.models.{part}"), maker)))
 
 
 def _untrained(maker: Callable) -> Callable:
