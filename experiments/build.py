@@ -64,16 +64,23 @@ def extractor(settings: dict[str, Any], data: Dataset | None) -> Extractor | Fea
     if name == "import":
         return FeatureFiles(_files("features", options, data), options["lengths"], options["image_size"])
     if name == "sift":
-        if options["interpolation"] == "torch_bilinear":
-            raise SettingsError("features.interpolation=torch_bilinear: gives fractions, but SIFT takes whole numbers")
+        if (kind := options["interpolation"]).startswith("torch"):
+            raise SettingsError(f"features.interpolation={kind}: gives fractions, but SIFT takes whole numbers")
         return Sift(**_only(options, Sift, "features=sift"))
     # Here, since Flax takes half a second.
     from mfvpr.features.aliked import AlikedFeatures
     from mfvpr.features.d2net import D2NetFeatures
     from mfvpr.features.patch_netvlad import PatchNetVladFeatures
+    from mfvpr.features.selavpr import SelaVprFeatures
     from mfvpr.features.ssm import STAGE2_FITTING, SsmCells
 
-    made = {"aliked": AlikedFeatures, "d2net": D2NetFeatures, "ssm": SsmCells, "patch_netvlad": PatchNetVladFeatures}
+    made = {
+        "aliked": AlikedFeatures,
+        "d2net": D2NetFeatures,
+        "ssm": SsmCells,
+        "patch_netvlad": PatchNetVladFeatures,
+        "selavpr": SelaVprFeatures,
+    }
     weights = options.pop("weights", None)
     if name == "ssm":
         options["whitening"] = _fitting(options, STAGE2_FITTING)
@@ -95,7 +102,7 @@ def filter(settings: dict[str, Any], local: Extractor | FeatureFiles, data: Data
         return DescriptorFiles(_files("retrieval", options, data), options["lengths"], search)
     if settings["name"] == "vlad":
         return Retrieval(Aggregated(local, VladFitting(**options)), search)
-    if settings["name"] in ("netvlad", "gem"):
+    if settings["name"] in ("netvlad", "gem", "dinov2"):
         return Retrieval(_described(settings["name"], options), search)
     from mfvpr.features.mixvpr import IMAGE_SIZE, MixVprDescriptor
 
@@ -107,7 +114,7 @@ def filter(settings: dict[str, Any], local: Extractor | FeatureFiles, data: Data
 
 def _with_vectors(local: Extractor | FeatureFiles) -> Extractor:
     if isinstance(local, FeatureFiles) or not local.vector_size:
-        raise SettingsError("retrieval=same: expected features with a global descriptor, such as patch_netvlad's; "
+        raise SettingsError("retrieval=same: expected features with a global descriptor, patch_netvlad or selavpr; "
                             "choose another filter")  # fmt: skip
     return local
 
@@ -117,6 +124,10 @@ def _described(name: str, options: dict[str, Any]) -> Extractor:
 
     networks = ("netvlad", "patch_netvlad") if name == "netvlad" else (name,)
     model, size = _network("retrieval", networks, options.pop("weights")), tuple(options.pop("image_size"))
+    if name == "dinov2":
+        from mfvpr.models.vit import TokenDescriptor
+
+        model = TokenDescriptor(model, options.pop("pooling"), options.pop("power"))
     return GlobalDescriptor(model, size, **_only(options, GlobalDescriptor, f"retrieval={name}"))
 
 

@@ -45,8 +45,8 @@ RULES: dict[str, Rule] = {
     "dataset.name": Rule(
         lambda value: isinstance(value, str) and bool(re.fullmatch(r"[\w-][\w.-]*", value)), "letters, digits, - and _"
     ),
-    "features.name": one_of("sift", "d2net", "aliked", "ssm", "patch_netvlad", "import"),
-    "retrieval.name": one_of("vlad", "mixvpr", "netvlad", "gem", "ssm", "same", "import", "pairs"),
+    "features.name": one_of("sift", "d2net", "aliked", "ssm", "patch_netvlad", "selavpr", "import"),
+    "retrieval.name": one_of("vlad", "mixvpr", "netvlad", "gem", "dinov2", "ssm", "same", "import", "pairs"),
     "features.image_size": either(list_of(_SIDE, 2), None),
     # data
     "seed": _INDEX,
@@ -67,7 +67,9 @@ RULES: dict[str, Rule] = {
     "bits": either(between(8, 16), None),
     # features and filter
     "image_size": list_of(_SIDE, 2),
-    "interpolation": one_of("pil_bilinear", "pil_bicubic", "cv2_linear", "cv2_area", "cv2_cubic", "torch_bilinear"),
+    "interpolation": one_of(
+        "pil_bilinear", "pil_bicubic", "cv2_linear", "cv2_area", "cv2_cubic", "torch_bilinear", "torch_no_antialias"
+    ),
     "weights": _TEXT,
     "preprocessing": one_of("caffe", "torch"),
     "multiscale": _FLAG,
@@ -87,6 +89,7 @@ RULES: dict[str, Rule] = {
     "zero_row": _FLAG,
     "patch_sizes": list_of(between(1, 64)),
     "scale_weights": either(list_of(_POSITIVE), None),
+    "pooling": one_of("cls", "gem"),
     "stride": between(1, 8),
     "candidates": either(_COUNT, "all"),
     "memory": either(_POSITIVE, None),

@@ -250,6 +250,50 @@ def gem_shapes(backbone: str = "resnet50", outputs: int = 2048) -> dict[str, tup
                      "aggregation.3.bias": (outputs,)}  # fmt: skip
 
 
+def dinov2_shapes(
+    width: int, depth: int, registers: int = 0, prefix: str = "", *, adapted: bool = False
+) -> dict[str, tuple[int, ...]]:
+    """The tensors of DINOv2's checkpoints; `adapted` those of SelaVPR's backbone."""
+    shapes = {"cls_token": (1, 1, width), "pos_embed": (1, 1370, width), "mask_token": (1, width),
+              "patch_embed.proj.weight": (width, 3, 14, 14), "patch_embed.proj.bias": (width,),
+              "norm.weight": (width,), "norm.bias": (width,)}  # fmt: skip
+    if registers:
+        shapes["register_tokens"] = (1, registers, width)
+    linear = {"attn.qkv": (3, 1), "attn.proj": (1, 1), "mlp.fc1": (4, 1), "mlp.fc2": (1, 4)}
+    if adapted:
+        adapters = (f"adapter{one}.D_fc{place}" for one in (1, 2) for place in (1, 2))
+        linear |= {name: (0.5, 1) if name.endswith("1") else (1, 0.5) for name in adapters}
+    for block in (f"blocks.{place}" for place in range(depth)):
+        for name, (outputs, inputs) in linear.items():
+            shapes[f"{block}.{name}.weight"] = (int(outputs * width), int(inputs * width))
+            shapes[f"{block}.{name}.bias"] = (int(outputs * width),)
+        for one in (1, 2):
+            shapes[f"{block}.ls{one}.gamma"] = (width,)
+            shapes |= {f"{block}.norm{one}.{part}": (width,) for part in ("weight", "bias")}
+    return {f"{prefix}{name}": shape for name, shape in shapes.items()}
+
+
+def selavpr_shapes(
+    width: int = 1024, depth: int = 24, registers: int = 0, prefix: str = "module."
+) -> dict[str, tuple[int, ...]]:
+    """The tensors of SelaVPR's checkpoints, which hold them below `model_state_dict`."""
+    head = {"aggregation.1.p": (1,), "LocalAdapt.upconv1.weight": (width, 256, 3, 3), "LocalAdapt.upconv1.bias": (256,),
+            "LocalAdapt.upconv2.weight": (256, 128, 3, 3), "LocalAdapt.upconv2.bias": (128,)}  # fmt: skip
+    backbone = dinov2_shapes(width, depth, registers, f"{prefix}backbone.", adapted=True)
+    return backbone | {f"{prefix}{name}": shape for name, shape in head.items()}
+
+
+def transformer_checkpoint(shapes: Mapping[str, tuple[int, ...]], seed: int = 0) -> dict[str, np.ndarray]:
+    """Random weights of these tensors, in which positions and registers count as much as the patches do."""
+    found = random_checkpoint(shapes, seed)
+    for name, tensor in found.items():
+        if name.endswith(("pos_embed", "register_tokens")):
+            found[name] = tensor / tensor.std() / 2
+        if name.endswith("aggregation.1.p"):
+            found[name] = np.float32([2.875])
+    return found
+
+
 def matlab_shapes(clusters: int = 64, outputs: int = 4096) -> dict[str, tuple[int, ...]]:
     """The arrays of the original's files, as they are read."""
     weights = {}

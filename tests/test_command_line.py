@@ -138,7 +138,7 @@ def test_version(monkeypatch, capsys, program):
         ("evaluate", ["+new=1"], "+new=1: settings can be set, not added"),
         ("evaluate", ["word"], "word: expected name=value"),
         ("evaluate", ["scorer=[count,sum]"], "expected one of all"),
-        ("evaluate", ["features=null"], "features=null: expected one of aliked, d2net, import, patch_netvlad, sift"),
+        ("evaluate", ["features=null"], "expected one of aliked, d2net, import, patch_netvlad, selavpr, sift, ssm"),
         ("evaluate", ["scorer.count.method=histogram"], "scorer.count.method=histogram: expected count"),
         ("evaluate", ["scorer=histogram", "scorer.bin_size=[1,2"], "scorer.bin_size=[1,2: expected a number above 0"),
         ("evaluate", ["scorer.histogram=3"], "scorer.histogram=3: this is a group of settings"),

@@ -165,4 +165,4 @@ def test_other_features_have_no_global_descriptor(small_street, tmp_path, monkey
     code, _, stderr = typed(monkeypatch, capsys, "evaluate", "dataset=folder", *folders, "dataset.ground_truth=order",
                             "retrieval=same", f"out={tmp_path}/out")  # fmt: skip
     assert code == 2
-    assert "retrieval=same: expected features with a global descriptor, such as patch_netvlad's" in stderr
+    assert "retrieval=same: expected features with a global descriptor, patch_netvlad or selavpr" in stderr

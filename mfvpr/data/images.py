@@ -21,7 +21,9 @@ from mfvpr.errors import InputError
 MAX_PIXELS = 64_000_000
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
 
-Interpolation = Literal["pil_bilinear", "pil_bicubic", "cv2_linear", "cv2_area", "cv2_cubic", "torch_bilinear"]
+Interpolation = Literal[
+    "pil_bilinear", "pil_bicubic", "cv2_linear", "cv2_area", "cv2_cubic", "torch_bilinear", "torch_no_antialias"
+]
 _PIL = {"pil_bilinear": Image.Resampling.BILINEAR, "pil_bicubic": Image.Resampling.BICUBIC}
 _CV2 = {"cv2_linear": cv2.INTER_LINEAR, "cv2_area": cv2.INTER_AREA, "cv2_cubic": cv2.INTER_CUBIC}
 
@@ -121,11 +123,14 @@ def resize(image: np.ndarray, size: tuple[int, int], interpolation: Interpolatio
     | `pil_bilinear`, `pil_bicubic` | Pillow, antialiased; torch's of uint8, but for a level in 1 % of values | uint8 |
     | `cv2_linear`, `cv2_area`, `cv2_cubic` | OpenCV; only `cv2_area` is antialiased | uint8 |
     | `torch_bilinear` | torch's antialiasing of floats, not rounded | float32, 0 .. 255 |
+    | `torch_no_antialias` | torch's bilinear of floats as it was up to 2022, not rounded | float32, 0 .. 255 |
 
     Networks take both types; SIFT refuses floats.
     """
     if interpolation == "torch_bilinear":
         return _resized_in_float(image, size)
+    if interpolation == "torch_no_antialias":
+        return np.asarray(cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_LINEAR))
     if interpolation in _PIL:
         return np.asarray(Image.fromarray(image).resize(size, _PIL[interpolation]))
     return np.asarray(cv2.resize(image, size, interpolation=_CV2[interpolation]))

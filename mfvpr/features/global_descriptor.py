@@ -1,4 +1,4 @@
-"""Global descriptors of networks that take images of any size: NetVLAD, and generalized means."""
+"""Global descriptors of networks that take images of many sizes: NetVLAD, generalized means, transformers."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -14,8 +14,6 @@ from mfvpr.features import Description, Scale
 from mfvpr.features.network import compiled, in_batches, require_size
 from mfvpr.models.lengths import of_unit_length
 
-_SMALLEST = 16  # px, which VGG16 makes one position of
-
 
 class DescriptorNetwork(Protocol):
     """What gives descriptors `[B, D]` of unit length of images that it has preprocessed, `[B, H, W, 3]`."""
@@ -28,6 +26,10 @@ class DescriptorNetwork(Protocol):
     @property
     def has_components(self) -> bool:
         """Whether a descriptor's numbers are principal components, the largest first."""
+        ...
+
+    def require(self, size: tuple[int, int]) -> None:
+        """Raise an InputError unless images of this (width, height) px will do."""
         ...
 
     def preprocess(self, images: jax.Array) -> jax.Array: ...
@@ -47,7 +49,7 @@ class GlobalDescriptor:
         batch_size: images per call.
 
     Raises:
-        InputError: images of this size are too small, or the network has no so many principal components.
+        InputError: images of this size are not the network's, or it has no so many principal components.
     """
 
     model: DescriptorNetwork
@@ -57,8 +59,7 @@ class GlobalDescriptor:
     batch_size: int = field(default=8, metadata={"recipe": False})
 
     def __post_init__(self) -> None:
-        if min(self.image_size) < _SMALLEST:
-            raise InputError(f"image_size={list(self.image_size)}: expected {_SMALLEST} x {_SMALLEST} px or more")
+        self.model.require(self.image_size)
         if self.components is not None and not self.model.has_components:
             raise InputError(f"components={self.components}: expected None, since these weights have no whitening")
         if self.components is not None and not 1 <= self.components <= self.model.dimension:

@@ -12,7 +12,8 @@ from mfvpr.data.images import Interpolation
 from mfvpr.errors import InputError
 from mfvpr.features import Description, Scale
 from mfvpr.features.network import at_places, compiled, in_batches, require_size
-from mfvpr.models.netvlad import STRIDE, VggNetVlad
+from mfvpr.models.netvlad import VggNetVlad
+from mfvpr.models.vgg import STRIDE
 from mfvpr.types import Features
 
 _MIDDLE = (STRIDE - 1) // 2  # px from a position's first pixel, as published: a half is dropped

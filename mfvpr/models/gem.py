@@ -9,7 +9,7 @@ from jax import Array
 from mfvpr.models.imagenet import preprocess
 from mfvpr.models.lengths import of_unit_length
 from mfvpr.models.resnet import ResNet50
-from mfvpr.models.vgg import Vgg16
+from mfvpr.models.vgg import Vgg16, require_position
 
 Backbone = Literal["vgg16", "resnet50"]
 
@@ -47,6 +47,8 @@ class Gem(nnx.Module):
         self.projection = nnx.Linear(_CHANNELS[backbone], outputs, precision=precision, rngs=rngs)
         self.dimension = outputs
         self.has_components = False
+
+    require = staticmethod(require_position)
 
     @staticmethod
     def preprocess(images: Array) -> Array:

@@ -13,10 +13,9 @@ from jax import Array
 from mfvpr.models.imagenet import preprocess
 from mfvpr.models.lengths import of_unit_length
 from mfvpr.models.resnet import PointwiseConv
-from mfvpr.models.vgg import Vgg16
+from mfvpr.models.vgg import Vgg16, require_position
 
 CHANNELS = 512  # of VGG16's conv5_3
-STRIDE = 16  # px between positions of its map
 Order = Literal["clusters", "channels"]  # whose numbers stand together in a descriptor
 
 
@@ -94,6 +93,8 @@ class VggNetVlad(nnx.Module):
         self.original = original
         if original:
             self.average = Statistic(jnp.zeros(3, jnp.float32))
+
+    require = staticmethod(require_position)
 
     def preprocess(self, images: Array) -> Array:
         """`[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32 -> what the network takes, float32."""

@@ -7,8 +7,10 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
+from mfvpr.errors import InputError
 from mfvpr.models.convolution import Conv3x3
 
+STRIDE = 16  # px between positions of the last block's map
 Pool = Literal["max", "max_ceil", "average"]
 
 _WIDTHS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
@@ -70,6 +72,12 @@ class Vgg16(nnx.Module):
             if len(found) == len(layers):
                 break
         return tuple(found[name] for name in layers)
+
+
+def require_position(size: tuple[int, int]) -> None:
+    """Raise an InputError unless the last block has a position of images of this (width, height) px."""
+    if min(size) < STRIDE:
+        raise InputError(f"image_size={list(size)}: expected {STRIDE} x {STRIDE} px or more")
 
 
 def _block(name: str) -> int:

@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 
+from mfvpr.declaration import check_choices, choice
 from mfvpr.types import Array, Matches, value
 from mfvpr.weighting import match_confidence
 
@@ -11,8 +12,18 @@ class MatchCount:
     """Number of matches, each counted with its confidence.
 
     Soft matches make it soft: its temperature is that of `mfvpr.soft_match`.
+
+    Attributes:
+        single: what a pair with exactly one match scores: `count` it, or `zero`, as SelaVPR's code does by accident.
     """
+
+    single: str = choice("count", "zero", note="a pair with one match")
+
+    def __post_init__(self) -> None:
+        check_choices(self)
 
     def __call__(self, matches: Matches) -> Array:
         """Score of one pair, `[]` float32."""
-        return jnp.sum(match_confidence(matches))
+        confidence = match_confidence(matches)
+        score = jnp.sum(confidence)
+        return score if self.single == "count" else jnp.where(jnp.sum(confidence > 0) == 1, 0.0, score)

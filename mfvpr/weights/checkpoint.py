@@ -20,8 +20,8 @@ _READERS = {b"PK": read_zip, numpy_files.MAGIC: read_layers, matlab_files.MAGIC:
 def read_checkpoint(path: Path | str) -> dict[str, np.ndarray]:
     """Arrays by key, read-only, in the file's own types.
 
-    Of torch's files the tensors, those below `model` or `state_dict` if nested; of NumPy's dictionaries of layers
-    `layer.name`; of MATLAB's structures and cells `variable.field.0`.
+    Of torch's files the tensors, those below `model`, `state_dict` or `model_state_dict` if nested; of NumPy's
+    dictionaries of layers `layer.name`; of MATLAB's structures and cells `variable.field.0`.
 
     Raises:
         InputError: the file is no checkpoint, is damaged, or holds anything but float32, float64 and integer arrays.

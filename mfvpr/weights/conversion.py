@@ -28,6 +28,7 @@ class Layout(Enum):
 
     COPY = _Change()
     CONV = _Change((2, 3, 1, 0))  # OIHW -> HWIO
+    UPSAMPLING = _Change((2, 3, 0, 1))  # a transposed convolution's IOHW -> HWIO
     LINEAR = _Change((1, 0))  # (out, in) -> (in, out)
     POINTWISE = _Change((1, 0), squeezed=True)  # (out, in, 1, 1) -> (in, out), or (1, 1, in, out)
     SQUEEZED = _Change(squeezed=True)  # (1, O, 1, 1) and the like -> (O,)

@@ -15,12 +15,14 @@ from mfvpr.weights.registry import REGISTRY, Entry
 from mfvpr.weights.tables import (
     ALIKED,
     D2NET,
+    DINOV2,
     GEM_RESNET50,
     GEM_VGG16,
     LIGHTGLUE,
     MIXVPR,
     NETVLAD,
     NETVLAD_MATLAB,
+    SELAVPR,
     SSM,
 )  # fmt: skip
 
@@ -81,6 +83,18 @@ def _gem(backbone: "Backbone", outputs: int) -> Callable[..., "nnx.Module"]:
     return partial(Gem, backbone, outputs)
 
 
+def _dinov2(width: int, depth: int, heads: int) -> Callable[..., "nnx.Module"]:
+    from mfvpr.models.vit import VisionTransformer
+
+    return partial(VisionTransformer, width, depth, heads)
+
+
+def _selavpr(registers: int) -> Callable[..., "nnx.Module"]:
+    from mfvpr.models.selavpr import SelaVpr
+
+    return partial(SelaVpr, registers=registers)
+
+
 _ALIKED = ("aliked-t16", "aliked-n16", "aliked-n16rot", "aliked-n32")
 
 _MOST = 0.5  # of the keys tell whose they are
@@ -108,6 +122,12 @@ NETWORKS: dict[str, Network] = {
         f"cosplace_resnet50_{outputs}": Network(partial(_gem, "resnet50", outputs), GEM_RESNET50)
         for outputs in (512, 2048)
     },
+    "dinov2_vits14": Network(partial(_dinov2, 384, 12, 6), DINOV2),
+    "dinov2_vitb14": Network(partial(_dinov2, 768, 12, 12), DINOV2),
+    "dinov2_vitl14": Network(partial(_dinov2, 1024, 24, 16), DINOV2),
+    "selavpr_pitts30k": Network(partial(_selavpr, 0), SELAVPR),
+    "selavpr_msls": Network(partial(_selavpr, 0), SELAVPR),
+    "selavpr_msls_registers": Network(partial(_selavpr, 4), SELAVPR),
 }
 
 

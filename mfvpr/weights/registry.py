@@ -159,6 +159,37 @@ def _cosplace(backbone: str, outputs: int) -> Entry:
     )
 
 
+def _dinov2(name: str, parameters: int) -> Entry:
+    file = f"dinov2_{name}_pretrain.pth"
+    return Entry(
+        name=f"dinov2_{name}",
+        network="dinov2",
+        file=file,
+        source=f"https://dl.fbaipublicfiles.com/dinov2/dinov2_{name}/{file}",
+        size=None,
+        sha256=None,
+        code_license="Apache-2.0",
+        weights_license="Apache-2.0",
+        cite="Oquab et al., DINOv2: Learning Robust Visual Features without Supervision, TMLR 2024",
+        parameters=parameters,
+    )
+
+
+def _selavpr(training: str, file: str, drive_id: str, registers: int = 0) -> Entry:
+    return Entry(
+        name=f"selavpr_{training}",
+        network="selavpr",
+        file=file,
+        source=f"https://drive.google.com/file/d/{drive_id}/view",
+        size=None,
+        sha256=None,
+        code_license="MIT, Apache-2.0",
+        weights_license="none stated",
+        cite="Lu et al., Towards Seamless Adaptation of Pre-trained Models for Visual Place Recognition, ICLR 2024",
+        parameters=357_427_585 + 1024 * registers,  # without the training's mask token
+    )
+
+
 # fmt: off
 _ENTRIES = (
     _d2net("d2_tf"),
@@ -186,6 +217,12 @@ _ENTRIES = (
     _patchnetvlad("pitts", 512, None, "309611d927c759e897e1eb27977994236b5618d9d3cd7202035cea1b56c08c1c"),
     _patchnetvlad("pitts", 4096, 1_132_901_186, "2c3cf17de91974156cb6aee40a6f7a229825095273d7de87c0792084ae1bf4aa"),
     _patchnetvlad("landmarks", 4096, None, "659a837b11883ed8a8ea5e1d1a46eb2871ea26514fbfc2ad7d9d4e1334380a34"),
+    _dinov2("vits14", 22_056_192),
+    _dinov2("vitb14", 86_579_712),
+    _dinov2("vitl14", 304_367_616),
+    _selavpr("pitts30k", "SelaVPR_pitts30k.pth", "1LKTZZRHfMH3dY3UPagCt2TIlMN5LguGO"),
+    _selavpr("msls", "SelaVPR_msls.pth", "1vy05l0JTEgr6n8iSoz_P_yjWfEzFPAkV"),
+    _selavpr("msls_registers", "SelaVPR_reg4_msls.pth", "16Qkr6MGe3k0kYtFfw3YLQXZFn4c9YvJk", registers=4),
 )
 # fmt: on
 

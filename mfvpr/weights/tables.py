@@ -178,3 +178,43 @@ GEM_RESNET50 = Table(
     ),
     ignored=(_COUNTERS,),
 )
+
+
+def _transformer(source: str, target: str) -> tuple[Rule, ...]:
+    block, ours = rf"{source}blocks\.(\d+)", rf"{target}blocks.\1"
+    return (
+        Rule(rf"{source}cls_token", f"{target}first", Layout.SQUEEZED),
+        Rule(rf"{source}pos_embed", f"{target}positions", Layout.SQUEEZED),
+        Rule(rf"{source}register_tokens", f"{target}registers", Layout.SQUEEZED),
+        *_convolution(rf"{source}patch_embed\.proj", f"{target}patches"),
+        *_linear(rf"{block}\.attn\.qkv", f"{ours}.attention.qkv"),
+        *_linear(rf"{block}\.attn\.proj", f"{ours}.attention.output"),
+        *_linear(rf"{block}\.mlp\.fc1", f"{ours}.perceptron.hidden"),
+        *_linear(rf"{block}\.mlp\.fc2", f"{ours}.perceptron.output"),
+        Rule(rf"{block}\.ls(\d)\.gamma", rf"{ours}.scale\2"),
+        Rule(rf"{block}\.norm(\d)\.weight", rf"{ours}.norm\2.scale"),
+        Rule(rf"{block}\.norm(\d)\.bias", rf"{ours}.norm\2.bias"),
+        Rule(rf"{source}norm\.weight", f"{target}norm.scale"),
+        Rule(rf"{source}norm\.bias", f"{target}norm.bias"),
+    )
+
+
+_MASK = "mask_token"  # of the training
+
+DINOV2 = Table(_transformer("", ""), ignored=(_MASK,))
+
+# Its training on several devices puts `module` before all keys.
+_SELA, _BLOCK = r"(?:module\.)?", r"backbone\.blocks\.(\d+)"
+SELAVPR = Table(
+    (
+        *_transformer(rf"{_SELA}backbone\.", "backbone."),
+        *_linear(rf"{_SELA}{_BLOCK}\.adapter1\.D_fc1", r"backbone.blocks.\1.serial.down"),
+        *_linear(rf"{_SELA}{_BLOCK}\.adapter1\.D_fc2", r"backbone.blocks.\1.serial.up"),
+        *_linear(rf"{_SELA}{_BLOCK}\.adapter2\.D_fc1", r"backbone.blocks.\1.parallel.down"),
+        *_linear(rf"{_SELA}{_BLOCK}\.adapter2\.D_fc2", r"backbone.blocks.\1.parallel.up"),
+        Rule(rf"{_SELA}aggregation\.1\.p", "pool.power"),
+        Rule(rf"{_SELA}LocalAdapt\.upconv(\d)\.weight", r"upsampling\1.kernel", Layout.UPSAMPLING),
+        Rule(rf"{_SELA}LocalAdapt\.upconv(\d)\.bias", r"upsampling\1.bias"),
+    ),
+    ignored=(rf"{_SELA}backbone\.{_MASK}",),
+)

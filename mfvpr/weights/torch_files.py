@@ -19,7 +19,7 @@ from mfvpr.weights.pickles import MEND, Name, excerpt, file_size, natural, of_ty
 
 Order = Literal["little", "big"]
 
-_WRAPPERS = ("model", "state_dict")
+_WRAPPERS = ("model", "state_dict", "model_state_dict")
 _ORDERS: dict[bytes, Order] = {b"little": "little", b"big": "big"}
 _DTYPES = {
     "FloatStorage": np.dtype("f4"),

@@ -93,7 +93,9 @@ def test_resize_is_the_librarys_own(photo, size):
     assert resize(photo, size, "cv2_linear").shape == (size[1], size[0], 3)
 
 
-@pytest.mark.parametrize(("interpolation", "tolerance"), [("pil_bicubic", 1), ("torch_bilinear", 1e-3)])
+@pytest.mark.parametrize(("interpolation", "tolerance"), [
+    ("pil_bicubic", 1), ("torch_bilinear", 1e-3), ("torch_no_antialias", 1e-3),
+])  # fmt: skip
 def test_resize_is_torchs(interpolation, tolerance):
     golden = np.load(make_resize.GOLDEN)[interpolation]
     resized = resize(make_resize.image(), make_resize.SIZE, interpolation)
@@ -107,7 +109,8 @@ def test_resize_without_rounding_keeps_order_and_range(photo):
     exact, rounded = resize(photo, (20, 10), "torch_bilinear"), resize(photo, (20, 10), "pil_bilinear")
     assert exact.shape == rounded.shape
     assert np.abs(exact - rounded).max() <= 1  # Pillow rounds between the axes as well
-    np.testing.assert_array_equal(resize(photo, (60, 40), "torch_bilinear"), photo)
+    for kind in ("torch_bilinear", "torch_no_antialias"):
+        np.testing.assert_array_equal(resize(photo, (60, 40), kind), photo)
 
 
 def test_ordered_map_keeps_order_and_never_runs_far_ahead():

@@ -85,7 +85,7 @@ def _tensors(checkpoint: dict[str, np.ndarray]) -> dict:
     return {key: torch.from_numpy(np.asarray(array)) for key, array in checkpoint.items()}
 
 
-def _normalized(size: tuple[int, int]) -> Any:
+def normalized(size: tuple[int, int]) -> Any:
     """As ToTensor and Normalize do, in float64."""
     import torch
 
@@ -117,7 +117,7 @@ def _patches(clone: str) -> Iterator[tuple[str, np.ndarray]]:
         model.load_state_dict(_tensors(netvlad_checkpoint(clusters, outputs, seed)))
         model.double().eval()
         torch.set_default_dtype(torch.float64)
-        found = model.pool(model.encoder(_normalized(size)))  # pyright: ignore
+        found = model.pool(model.encoder(normalized(size)))  # pyright: ignore
         torch.set_default_dtype(torch.float32)
         case = name("patch", clusters, outputs, size, seed)
         if outputs is None:
@@ -172,7 +172,7 @@ def _gem(clone: str, backbone: str, outputs: int, size: tuple[int, int], seed: i
     public = {"vgg16": "VGG16", "resnet50": "ResNet50"}[backbone]
     model = GeoLocalizationNet(public, outputs)
     model.load_state_dict(_tensors(gem_checkpoint(backbone, outputs, seed)))
-    return model.double().eval()(_normalized(size)).numpy()[0]
+    return model.double().eval()(normalized(size)).numpy()[0]
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Makes resize.npz: what torch's antialiased resampling gives. `python -m tests.golden.make_resize`"""
+"""Makes resize.npz: what torch's resampling gives. `python -m tests.golden.make_resize`"""
 
 from pathlib import Path
 
@@ -21,7 +21,8 @@ def main() -> None:
     batch = torch.from_numpy(image()).permute(2, 0, 1)[None]
     bicubic = interpolate(batch, SIZE[::-1], mode="bicubic", antialias=True)
     bilinear = interpolate(batch.float(), SIZE[::-1], mode="bilinear", antialias=True)
-    golden = {"pil_bicubic": bicubic, "torch_bilinear": bilinear}
+    plain = interpolate(batch.float(), SIZE[::-1], mode="bilinear", antialias=False)
+    golden = {"pil_bicubic": bicubic, "torch_bilinear": bilinear, "torch_no_antialias": plain}
     np.savez_compressed(GOLDEN, **{name: result[0].permute(1, 2, 0).numpy() for name, result in golden.items()})
 
 

@@ -14,6 +14,7 @@ from tests.checkpoints import (
     ALIKED,
     LIGHTGLUE,
     d2net_shapes,
+    dinov2_shapes,
     gem_shapes,
     lightglue_shapes,
     matlab_shapes,
@@ -21,6 +22,7 @@ from tests.checkpoints import (
     netvlad_shapes,
     places365_shapes,
     random_checkpoint,
+    selavpr_shapes,
 )
 from tests.weights.conftest import PARAMETERS, SHAPES, SOURCE_SHAPES, TABLE, tiny_entry
 
@@ -46,6 +48,12 @@ PUBLIC = {
     "cosplace_resnet50_512": gem_shapes("resnet50", 512),
     "cosplace_resnet50_2048": gem_shapes(),
     **{f"netvlad_{training}": matlab_shapes() for training in ("pitts30k", "tokyotm")},
+    "dinov2_vits14": dinov2_shapes(384, 12),
+    "dinov2_vitb14": dinov2_shapes(768, 12),
+    "dinov2_vitl14": dinov2_shapes(1024, 24),
+    "selavpr_pitts30k": selavpr_shapes(),
+    "selavpr_msls": selavpr_shapes(),
+    "selavpr_msls_registers": selavpr_shapes(registers=4),
 }
 
 

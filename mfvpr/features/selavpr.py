@@ -1,0 +1,82 @@
+"""SelaVPR's features (Lu et al., ICLR 2024): its global descriptor, and a dense map of local ones."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import jax
+import numpy as np
+
+from mfvpr.data.images import Interpolation
+from mfvpr.features import Description, Scale
+from mfvpr.features.network import at_places, compiled, in_batches, require_size
+from mfvpr.models.selavpr import LOCAL, SelaVpr
+from mfvpr.models.vit import PATCH, require_patches
+from mfvpr.types import Features
+
+_STEP = PATCH / 4  # px between positions of the local map, which was upsampled twice
+_MIDDLE = (PATCH - 1) / 2  # px from a patch's first pixel to its middle
+
+
+@dataclass(frozen=True)
+class SelaVprFeatures:
+    """The global descriptor and the local map of one pass, as the public code extracts them.
+
+    Local features are in rows from the top, each from the left; their scores are 1. A position of the map is taken for
+    where it lies between the middles of the patches; the public code, whose score knows no positions, has none.
+
+    Attributes:
+        model: the network with its weights.
+        image_size: (width, height) px, multiples of 14; 224 x 224 is published.
+        interpolation: see `mfvpr.data.images.resize`; as published, colors between pixels, without antialiasing.
+        batch_size: images per call.
+
+    Raises:
+        InputError: an image has no whole number of patches.
+    """
+
+    model: SelaVpr
+    image_size: tuple[int, int] = (224, 224)
+    interpolation: Interpolation = "torch_no_antialias"
+    batch_size: int = field(default=8, metadata={"recipe": False})
+
+    def __post_init__(self) -> None:
+        require_patches(self.image_size)
+
+    @property
+    def vector_size(self) -> int:
+        """Numbers of the global descriptor."""
+        return self.model.dimension
+
+    @property
+    def scales(self) -> tuple[Scale, ...]:
+        """One, of every position of the map."""
+        columns, rows = self._map_size
+        return (Scale(LOCAL, columns * rows),)
+
+    @property
+    def _map_size(self) -> tuple[int, int]:
+        width, height = (4 * (side // PATCH) - 3 for side in self.image_size)
+        return width, height
+
+    def __call__(self, images: np.ndarray) -> list[Description]:
+        """Descriptors of images `[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32.
+
+        Raises:
+            InputError: the images do not have the size asked for.
+        """
+        require_size("SelaVPR", images, self.image_size)
+        found = in_batches(self._program, images, self.batch_size)
+        return [Description(vector, (self._features(local),)) for vector, local in found]
+
+    @cached_property
+    def _program(self) -> Callable[..., Any]:
+        def describe(model: SelaVpr, images: jax.Array) -> tuple[jax.Array, jax.Array]:
+            return model(model.preprocess(images))
+
+        return compiled(self.model, describe)
+
+    def _features(self, local: np.ndarray) -> Features:
+        row, column = np.indices(local.shape[:2]).reshape(2, -1)
+        return at_places(_MIDDLE + _STEP * np.stack([column, row], axis=1), local.reshape(-1, LOCAL), self.image_size)
