@@ -15,7 +15,7 @@ import numpy as np
 
 from mfvpr import ragged
 from mfvpr.errors import InputError, require_word
-from mfvpr.neighbors import nearest, nearest_two
+from mfvpr.neighbors import even_size, nearest, nearest_two
 from mfvpr.numerics import at_least_single, compiled, device_bytes, masked, safe_sqrt
 from mfvpr.types import Array, Features, Matches, per_keypoint, per_match
 
@@ -48,11 +48,14 @@ def match(
     require_word("cross_check", cross_check, CrossCheck)
     if cross_check == "candidate":
         return _exchanged(match(features1, features0, cross_check="none", with_ratio=with_ratio))
-    features0, features1 = ready(features0), ready(at_least_one(features1))
+    slots = features0.mask.shape[-1]
+    features0, features1 = ready(_even(features0)), ready(_even(at_least_one(features1)))
     similarity = _similarity(features0, features1)
     nearest1, valid = _neighbors(similarity, cross_check)
     ratio = _ratio(features0, features1, similarity) if with_ratio else None
-    return paired(features0, features1, nearest1, valid, ratio=ratio)
+    matches = paired(features0, features1, nearest1, valid, ratio=ratio)
+    own = {name: values[:slots] for name, values in per_match(matches).items()}
+    return replace(matches, mask=matches.mask[:slots], **own)
 
 
 def match_candidates(
@@ -180,6 +183,21 @@ def keypoint_count(features: Features) -> Array:
 def at_least_one(features: Features) -> Features:
     """An image without a single slot gets one of padding."""
     return replace(features, **ragged.at_least_one(per_keypoint(features)))
+
+
+def _even(features: Features) -> Features:
+    """With as many slots more as come out even in the blocks that similarities are searched by.
+
+    A few rows of padding are cheap; filling up the matrix itself takes several times as long as all of the matching.
+    """
+    size = features.mask.shape[-1]
+    missing = even_size(size) - size
+    if not missing:
+        return features
+    padded = jax.tree.map(
+        lambda values: jnp.pad(values, [(0, missing)] + [(0, 0)] * (np.ndim(values) - 1)), per_keypoint(features)
+    )
+    return replace(features, **padded)
 
 
 def _similarity(features0: Features, features1: Features) -> Array:

@@ -53,11 +53,21 @@ def first(hit: Array, axis: int) -> Array:
     return jnp.where(found == size, 0, found)
 
 
+def even_size(size: int) -> int:
+    """The smallest size, not below this one, that comes out even in blocks."""
+    return size + -size % _length(size)
+
+
+def _length(size: int) -> int:
+    """Of the blocks."""
+    return next((length for length in range(BLOCK, BLOCK // 4, -1) if size % length == 0), BLOCK)
+
+
 def _blocks(similarity: Array, axis: int) -> Array:
     """The axis in two: blocks, and places in a block; filled up with -inf where they do not come out even."""
     size = similarity.shape[axis]
-    length = next((length for length in range(BLOCK, BLOCK // 4, -1) if size % length == 0), BLOCK)
-    missing = -size % length if size else length
+    length = _length(size)
+    missing = even_size(size) - size if size else length
     if missing:
         widths = [(0, missing if place == axis else 0) for place in range(2)]
         similarity = jnp.pad(similarity, widths, constant_values=-jnp.inf)

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -17,10 +18,12 @@ from mfvpr.features import Aggregated, Description
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
 from mfvpr.filters import Retrieval
+from mfvpr.models.selavpr import SelaVpr
 from mfvpr.scoring import MatchCount
 from mfvpr.types import Shortlist
-from mfvpr.weights.networks import blueprint, network_of
+from mfvpr.weights.networks import NETWORKS, Network, blueprint, network_of
 from mfvpr.weights.registry import entry_of
+from mfvpr.weights.tables import SELAVPR
 from tests import checkpoints
 
 ROOT = Path(__file__).parent.parent
@@ -36,7 +39,10 @@ def contest(tmp_path_factory):
     torch.set_num_threads(1)  # several wait for each other when other processes take their cores
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MFVPR_WEIGHTS", str(tmp_path_factory.mktemp("weights")))
-        small = {"BATCHES": (2,), "D2NET_SIZE": 96, "ALIKED_SIZE": 96, "ALIKED": ("aliked-n16",)}
+        small = {"BATCHES": (2,), "D2NET_SIZE": 96, "ALIKED_SIZE": 96, "ALIKED": ("aliked-n16",), "BLOCKS": 2,
+                 "PLACES_SIZE": (160, 128), "SELAVPR_SIZE": (42, 28)}  # fmt: skip
+        narrow = Network(lambda: partial(SelaVpr, 128, 2, 2), SELAVPR)
+        patch.setitem(NETWORKS, networks.SELAVPR, narrow)
         for name, value in small.items():
             patch.setattr(networks, name, value)
         lineup = networks.lineup()
@@ -91,6 +97,30 @@ def test_descriptors_are_the_same(contest):
     ours, others = peers(contest[0]["MixVPR descriptor, batch 2"])
     for theirs in others:
         np.testing.assert_allclose(ours, theirs, atol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("step", ["NetVLAD descriptor", "generalized mean of ResNet-50"])
+def test_global_descriptors_are_the_same(contest, step):
+    ours, others = peers(contest[0][f"{step}, batch 2"])
+    for theirs in others:
+        np.testing.assert_allclose(ours, theirs, atol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("step", [
+    "Patch-NetVLAD features, sizes 5, 512 dimensions", "Patch-NetVLAD features, sizes 2, 5, 8, 4096 dimensions",
+    "SelaVPR features",
+])  # fmt: skip
+def test_local_descriptors_are_the_same(contest, step):
+    results = dict(contest[0][f"{step}, batch 2"])
+    ours = results.pop("mfvpr")
+    assert len(results) == 3
+    for theirs in results.values():
+        for one, (whole, *local) in zip(ours, theirs, strict=True):
+            np.testing.assert_allclose(one.vector, whole, atol=1e-5)
+            for features, expected in zip(one.local, local, strict=True):
+                np.testing.assert_allclose(features.descriptors.ravel(), expected.ravel(), atol=2e-5)
 
 
 @pytest.mark.slow

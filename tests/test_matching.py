@@ -155,6 +155,21 @@ def test_images_without_a_single_slot(mode, counts):
 
 
 @pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("counts", [(37, 41), (32, 127), (67, 30)])
+def test_numbers_that_do_not_come_out_even_in_blocks(mode, counts):
+    """Slots are added, and are gone from the result."""
+    rng = np.random.default_rng(13)
+    pair = [make_features(rng, count, capacity=count) for count in counts]
+    matches = match_once(*pair, cross_check=mode, with_ratio=True)
+    expected = oracles.nearest(*(features.descriptors for features in pair), mode)
+    slots = counts[mode == "candidate"]
+    assert matches.mask.shape == (slots,)
+    assert {len(values) for values in per_match(matches).values()} == {slots}
+    assert [(i, j) for i, j, _ in expected] == list(zip(found(matches)[0], matches.index1[matches.mask], strict=True))
+    assert (int(matches.count0), int(matches.count1)) == counts
+
+
+@pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_broken_descriptor_costs_its_own_matches_only(mode, value):
     rng = np.random.default_rng(7)

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from functools import partial
 
+import jax
 import numpy as np
 import pytest
 
@@ -15,14 +16,25 @@ from mfvpr.errors import InputError
 from mfvpr.features.patch_netvlad import PatchNetVladFeatures
 from mfvpr.filters import Retrieval
 from mfvpr.models.netvlad import VggNetVlad
+from mfvpr.reranking import fuse_scales
+from mfvpr.stores import features, vectors
 from mfvpr.weights.conversion import convert
 from mfvpr.weights.networks import planned
 from mfvpr.weights.tables import NETVLAD
 from tests.checkpoints import netvlad_checkpoint
+from tests.golden import make_patch_scores as patch_scores
 from tests.golden.make_netvlad import GOLDEN, POSITIONS, image, name
 from tests.programs import results, typed
 
 SIZE = (160, 128)
+
+
+def _vacant(outputs):
+    """A network that is never run."""
+    plan = planned(partial(VggNetVlad, 2, outputs))
+    return plan.filled({path: np.zeros(shape, np.float32) for path, shape in plan.shapes.items()})
+
+
 SCORERS = {"count": mfvpr.MatchCount(), "histogram": mfvpr.HistogramOfShifts()}
 
 
@@ -99,6 +111,50 @@ def test_scales_are_standardized_weighted_and_summed(model, dataset, tmp_path):
     for scorer in SCORERS:
         np.testing.assert_array_equal(again.systems[scorer][0].scores, found.systems[scorer][0].scores)
         assert np.abs(changed.systems[scorer][0].scores - found.systems[scorer][0].scores).max() > 0.1
+
+
+@pytest.mark.parametrize(("images", "size", "patch_sizes", "outputs", "printed"), [
+    (220, (480, 480), (2, 5, 8), 4096, 7040), (1415, (640, 480), (2, 5, 8), 4096, 62520),
+    (220, (480, 480), (5,), 512, 292), (1415, (640, 480), (5,), 512, 2596),
+])  # fmt: skip
+def test_databases_are_of_the_published_size(images, size, patch_sizes, outputs, printed):
+    """In MiB, in float32; stores, of float16, take half of it."""
+    extractor = PatchNetVladFeatures(_vacant(outputs), size, patch_sizes=patch_sizes)
+    numbers = extractor.vector_size + sum(scale.dimension * scale.typical_count for scale in extractor.scales)
+    assert images * 4 * numbers / 2**20 == pytest.approx(printed, rel=0.01)
+    stored = vectors.forecast_bytes(images, extractor.vector_size)
+    stored += sum(features.forecast_bytes(images, scale.typical_count, scale.dimension) for scale in extractor.scales)
+    assert stored / 2**20 == pytest.approx(printed / 2, rel=0.03)
+
+
+@pytest.mark.parametrize(("matcher", "scorer", "unit"), [
+    ("RANSAC", lambda patch: mfvpr.Homography(24.0, few="zero", per_feature=True), 1),
+    ("spatialApproximator", lambda patch: mfvpr.RapidSpatialScore(
+        size=tuple(16.0 * (side - patch) for side in reversed(patch_scores.MAP)), per_feature=True), 256),
+])  # fmt: skip
+def test_scores_and_rankings_are_the_public_codes(model, matcher, scorer, unit):
+    """Of every size, for pairs and over candidates; the public scores are the smaller, the better, and in patches.
+
+    Where few patches show a place, RANSAC finds one more or less by luck; here most do.
+    """
+    golden, height, width = np.load(patch_scores.GOLDEN), *(16 * side for side in patch_scores.MAP)
+    scores = []
+    for patch in patch_scores.PATCHES:
+        [places] = PatchNetVladFeatures(model, (width, height), patch_sizes=(patch,))(image((width, height)))
+        query, candidates = patch_scores.descriptors(patch)
+        everywhere = jax.tree.map(partial(np.repeat, repeats=len(candidates), axis=0),
+                                  jax.tree.map(lambda field: field[None], places.features))  # fmt: skip
+        sides = (replace(side, descriptors=own) for side, own in ((places.features, query), (everywhere, candidates)))
+        matches = mfvpr.match_candidates(*sides)
+        scores.append(np.asarray(mfvpr.score_candidates(scorer(patch), matches)) / unit)
+    found, real = np.stack(scores, axis=1), np.ones(len(scores[0]), bool)
+    np.testing.assert_allclose(found, -golden[f"{matcher}/scales"], rtol=1e-4)
+    weights = np.array(patch_scores.WEIGHTS)
+    pairs = fuse_scales(found, real, weights, normalize="none")
+    np.testing.assert_allclose(pairs, -golden[f"{matcher}/pairs"], rtol=1e-4)
+    fused = fuse_scales(found, real, weights)
+    np.testing.assert_allclose(fused, -golden[f"{matcher}/fused"], atol=1e-4)
+    np.testing.assert_array_equal(mfvpr.rerank(fused).order, np.argsort(golden[f"{matcher}/fused"]))
 
 
 @pytest.fixture

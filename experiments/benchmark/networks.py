@@ -18,8 +18,11 @@ from mfvpr.data.streets import draw_streets
 from mfvpr.features import Description
 from mfvpr.features.aliked import AlikedFeatures
 from mfvpr.features.d2net import D2NetFeatures
+from mfvpr.features.global_descriptor import GlobalDescriptor
 from mfvpr.features.mixvpr import MixVprDescriptor
 from mfvpr.features.network import compiled
+from mfvpr.features.patch_netvlad import PatchNetVladFeatures
+from mfvpr.features.selavpr import SelaVprFeatures
 from mfvpr.models.d2net import extract
 from mfvpr.models.imagenet import preprocess
 from mfvpr.weights.files import is_installed, load
@@ -30,6 +33,9 @@ BATCHES = (1, 8)
 D2NET_SIZE, MIXVPR_SIZE, ALIKED_SIZE = 336, 320, 320  # px
 D2NET, MIXVPR, ALIKED = "d2_tf", "mixvpr_4096", ("aliked-n16", "aliked-n32")
 MAP, ON_DEVICE, FEATURES = "D2-Net dense map", "D2-Net features, left on the device", "D2-Net features"
+PLACES_SIZE, SELAVPR_SIZE = (640, 480), (224, 224)  # px: Patch-NetVLAD's, which NetVLAD and CosPlace share here
+PATCHES = {"patchnetvlad_mapillary_512": (5,), "patchnetvlad_mapillary_4096": (2, 5, 8)}  # speed, performance
+GEM, SELAVPR, BLOCKS = "cosplace_resnet50_2048", "selavpr_msls", 24
 THRESHOLD = 0.1  # of the detection score: the paper's
 PAPER = "paper, RTX 2080 Ti: features 0.03 s (D2-Net at 320), matching and score of 50 candidates 0.07 s"
 
@@ -42,11 +48,14 @@ def run(rounds: int | None, out: Path) -> None:
 def lineup() -> Lineup:
     """mfvpr's networks and torch's, where it is installed."""
     images = make_images(D2NET_SIZE)
-    entries = [*of_d2net(images), *of_mixvpr(_resized(images, MIXVPR_SIZE))]
+    entries = [*of_d2net(images), *of_mixvpr(_resized(images, (MIXVPR_SIZE, MIXVPR_SIZE)))]
     for name in ALIKED:
-        entries += of_aliked(name, _resized(images, ALIKED_SIZE))
-    sizes = f"D2-Net at {D2NET_SIZE} px, MixVPR at {MIXVPR_SIZE} px, ALIKED at {ALIKED_SIZE} px"
-    published = [name for name in (D2NET, MIXVPR, *ALIKED) if is_installed(entry_of(name))]
+        entries += of_aliked(name, _resized(images, (ALIKED_SIZE, ALIKED_SIZE)))
+    entries += of_places(images)
+    width, height = PLACES_SIZE
+    sizes = (f"D2-Net at {D2NET_SIZE} px, MixVPR at {MIXVPR_SIZE} px, ALIKED at {ALIKED_SIZE} px, SelaVPR at "
+             f"{SELAVPR_SIZE[0]} px, others at {width} x {height} px")  # fmt: skip
+    published = [name for name in (D2NET, MIXVPR, *ALIKED, *PATCHES, GEM, SELAVPR) if is_installed(entry_of(name))]
     weights = f"published weights of {', '.join(published)}, others random" if published else "random weights"
     return Lineup(
         title=f"images of the drawn street, {sizes}, {weights}",
@@ -65,7 +74,9 @@ def _remarks(seconds: Seconds, results: Results) -> Iterator[str]:
         yield f"D2-Net, batch {count}: detection adds {100 * share:.1f} % to the dense map"
     counts: dict[str, list[str]] = {}
     for (step, name), result in results.items():
-        local: list[Any] = [one.features if isinstance(one, Description) and one.local else one for one in result]
+        local: list[Any] = [
+            one.features if isinstance(one, Description) and one.vector is None else one for one in result
+        ]
         if hasattr(local[0], "keypoints"):
             mean = np.mean([len(features.keypoints) for features in local])
             counts.setdefault(step, []).append(f"{name} {mean:.1f}")
@@ -81,8 +92,8 @@ def make_images(size: int) -> np.ndarray:
         return np.stack([read_image(path) for path in sorted(folder.rglob("*.png"))[: max(BATCHES)]])
 
 
-def _resized(images: np.ndarray, size: int) -> np.ndarray:
-    return np.stack([resize(image, (size, size)) for image in images])
+def _resized(images: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    return np.stack([resize(image, size) for image in images])
 
 
 def make_network(name: str) -> tuple[Any, dict[str, np.ndarray]]:
@@ -148,6 +159,34 @@ def of_aliked(name: str, images: np.ndarray) -> list[Entry]:
         note = " (deformable convolution in Python)"
         entries += of_torch({step: partial(aliked, threshold=THRESHOLD)}, name, arrays, images, note)
     return entries
+
+
+def of_places(images: np.ndarray) -> list[Entry]:
+    """NetVLAD, its patches, a generalized mean, and SelaVPR, from host to host."""
+    large, small = _resized(images, PLACES_SIZE), _resized(images, SELAVPR_SIZE)
+    speed, performance = PATCHES
+    lineup = [
+        ("NetVLAD descriptor", speed, large, "netvlad", {}, GlobalDescriptor),
+        *((f"Patch-NetVLAD features, {_sizes(name)}", name, large, "patch_netvlad", {"sizes": PATCHES[name]},
+           partial(PatchNetVladFeatures, patch_sizes=PATCHES[name])) for name in (speed, performance)),
+        ("generalized mean of ResNet-50", GEM, large, "gem", {}, GlobalDescriptor),
+        ("SelaVPR features", SELAVPR, small, "selavpr", {"blocks": BLOCKS}, SelaVprFeatures),
+    ]  # fmt: skip
+    entries = []
+    for step, name, batch, peer, options, extractor in lineup:
+        model, arrays = make_network(name)
+        made = partial(extractor, model, image_size=batch.shape[2:0:-1])
+        entries += of_mfvpr({step: lambda count, made=made: made(batch_size=count)}, batch)
+        if find_spec("torch"):
+            from experiments.benchmark import torch_places
+
+            network = partial(getattr(torch_places, peer), **options)
+            entries += of_torch({step: network}, name, arrays, batch)
+    return entries
+
+
+def _sizes(name: str) -> str:
+    return f"sizes {', '.join(map(str, PATCHES[name]))}, {name.rpartition('_')[2]} dimensions"
 
 
 def of_mfvpr(steps: Mapping[str, Callable[[int], Callable]], images: np.ndarray) -> list[Entry]:

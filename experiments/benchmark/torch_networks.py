@@ -26,6 +26,7 @@ def published(arrays: Mapping[str, np.ndarray], table: Table, device: str, layou
     def weight(key: str) -> Tensor:
         rule, match = next((rule, match) for rule in table.rules if (match := re.fullmatch(rule.source, key)))
         array, axes = arrays[match.expand(rule.target)], rule.layout.value.axes
+        array = array.squeeze() if rule.layout.value.squeezed else array
         tensor = torch.from_numpy(np.array(array if axes is None else array.transpose(np.argsort(axes)))).to(device)
         return tensor.contiguous(memory_format=layout) if tensor.ndim == 4 else tensor
 
@@ -135,7 +136,8 @@ def _described(dense: Tensor, detected: Tensor, steps: Tensor) -> LocalFeatures:
 
 def mixvpr(w: Weights, images: Tensor) -> np.ndarray:
     """Descriptors `[B, D]` of unit length, on the host: four mixers over the positions, two projections."""
-    x = resnet(w, images).flatten(2)  # [B, 1024, positions]
+    layers = tuple(f"backbone.model.layer{place}" for place in (1, 2, 3))
+    x = resnet(w, images, "backbone.model.conv1", "backbone.model.bn1", layers).flatten(2)  # [B, 1024, positions]
     for place in range(4):
         name = f"aggregator.mix.{place}.mix"
         normal = F.layer_norm(x, x.shape[2:], w(f"{name}.0.weight"), w(f"{name}.0.bias"))
@@ -144,16 +146,23 @@ def mixvpr(w: Weights, images: Tensor) -> np.ndarray:
     return F.normalize(_linear(w, "aggregator.row_proj", x).flatten(1)).cpu().numpy()
 
 
-def resnet(w: Weights, images: Tensor) -> Tensor:
-    """Maps `[B, 1024, h, w]` of MixVPR's backbone: ResNet-50 to its third layer."""
+def normalized(images: Tensor) -> Tensor:
+    """As networks trained on ImageNet take them."""
     mean, deviation = (torch.tensor(values, device=images.device)[:, None, None] for values in (MEAN, DEVIATION))
-    name = "backbone.model"
-    x = conv(w, f"{name}.conv1", (images / 255 - mean) / deviation, stride=2, padding=3)
-    x = F.max_pool2d(F.relu(batch_norm(w, f"{name}.bn1", x), inplace=True), 3, stride=2, padding=1)
-    for layer, blocks in ((1, 3), (2, 4), (3, 6)):
+    return (images / 255 - mean) / deviation
+
+
+_BLOCKS = (3, 4, 6, 3)  # of ResNet-50's layers
+
+
+def resnet(w: Weights, images: Tensor, first: str, norm: str, layers: tuple[str, ...]) -> Tensor:
+    """Maps `[B, C, h, w]` of ResNet-50 to the last of the layers, which are given by their names."""
+    x = conv(w, first, normalized(images), stride=2, padding=3)
+    x = F.max_pool2d(F.relu(batch_norm(w, norm, x), inplace=True), 3, stride=2, padding=1)
+    for place, (layer, blocks) in enumerate(zip(layers, _BLOCKS, strict=False)):
         for block in range(blocks):
-            stride = 2 if layer > 1 and block == 0 else 1
-            x = _bottleneck(w, f"{name}.layer{layer}.{block}", x, stride, shortcut=block == 0)
+            stride = 2 if place and block == 0 else 1
+            x = _bottleneck(w, f"{layer}.{block}", x, stride, shortcut=block == 0)
     return x
 
 

@@ -62,8 +62,9 @@ class Attention(nnx.Module):
         batch, tokens, width = x.shape
         queries, keys, values = jnp.moveaxis(self.qkv(x).reshape(batch, tokens, 3, self.heads, -1), (2, 3), (0, 2))
         queries = queries * (width // self.heads) ** -0.5
-        weights = nnx.softmax(jnp.matmul(queries, keys.swapaxes(2, 3), precision=self.precision), axis=-1)
-        seen = jnp.matmul(weights, values, precision=self.precision)
+        logits = jnp.matmul(queries, keys.swapaxes(2, 3), precision=self.precision)
+        weights = jnp.exp(logits - jnp.max(logits, axis=-1, keepdims=True))
+        seen = jnp.matmul(weights, values, precision=self.precision) / jnp.sum(weights, axis=-1, keepdims=True)
         return self.output(jnp.moveaxis(seen, 1, 2).reshape(x.shape))
 
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from mfvpr.declaration import check_choices, choice, flag, number, whole
 from mfvpr.numerics import at_least_single, masked, where_finite, without_gradient
 from mfvpr.scoring import planes, quads
+from mfvpr.scoring.shifts import query_features
 from mfvpr.types import Array, Matches, value
 from mfvpr.weighting import match_confidence
 
@@ -52,6 +53,7 @@ class Homography:
         refit: fit the best model to its inliers by least squares, and count again, as OpenCV 5 does. OpenCV 4, of the
             paper's time, refines the homography after it has counted.
         few: score of less than 4 matches, `count` (re-ranking-for-VPR) or `zero` (Patch-NetVLAD); 4 score 4.
+        per_feature: divide by the number of the query's keypoints, matched or not, as Patch-NetVLAD does.
         seed: of the samples.
     """
 
@@ -61,6 +63,7 @@ class Homography:
     measure: str = choice("inliers", "msac")
     refit: bool = flag(False, "count again after least squares")
     few: str = choice("count", "zero", note="less than 4 matches")
+    per_feature: bool = flag(False)
     seed: int = whole(0, "", "of the samples", bounds=(0, 2**31 - 1), swept=False)
 
     def __post_init__(self) -> None:
@@ -104,6 +107,7 @@ class Homography:
         score = jnp.sum(masked(search.worth(model, inside), inliers) * counts)
         few = jnp.sum(counts) if self.few == "count" else jnp.zeros_like(score)
         score = jnp.where(number == 4, jnp.sum(counts), jnp.where(number < 4, few, score))
+        score = score / query_features(matches) if self.per_feature else score
         finite = where_finite(score, masked(points, real), counts)
         usable = (threshold >= 0) & (max_iterations >= 1) & (sureness > 0)
         return Estimate(frame.outside(model), inliers, jnp.where(usable, finite, jnp.nan), samples)

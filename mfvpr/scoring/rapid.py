@@ -3,9 +3,8 @@
 import jax.numpy as jnp
 
 from mfvpr.declaration import check_choices, choice, flag, numbers
-from mfvpr.errors import InputError
 from mfvpr.numerics import at_least_single, masked, masked_mean, where_finite
-from mfvpr.scoring.shifts import image_sizes, match_shifts
+from mfvpr.scoring.shifts import image_sizes, match_shifts, query_features
 from mfvpr.types import Array, Matches, value
 from mfvpr.weighting import match_confidence
 
@@ -45,10 +44,7 @@ class RapidSpatialScore:
         closeness = self._reach(matches, shifts, confidence > 0)[None] - residuals
         score = jnp.sum(confidence * jnp.sum(masked(closeness, matches.mask) ** 2, axis=-1))
         if self.per_feature:
-            if matches.count0 is None:
-                raise InputError("per_feature=True: expected matches that know how many keypoints the query has "
-                                 "(count0), got None")  # fmt: skip
-            score = score / jnp.maximum(jnp.asarray(matches.count0, score.dtype), 1.0)
+            score = score / query_features(matches)
         return where_finite(score, confidence, shifts)
 
     def _reach(self, matches: Matches, shifts: Array, real: Array) -> Array:

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 
+from mfvpr.errors import InputError
 from mfvpr.numerics import at_least_single, masked
 from mfvpr.types import Array, Matches
 
@@ -39,6 +40,18 @@ def image_sizes(matches: Matches) -> tuple[Array, Array]:
     size0, size1 = at_least_single(matches.image_size0), at_least_single(matches.image_size1)
     usable = lambda size: some | ((size > 0) & jnp.isfinite(size))  # noqa: E731
     return masked(size0, usable(size0), 1.0), masked(size1, usable(size1), 1.0)
+
+
+def query_features(matches: Matches) -> Array:
+    """`[]` float32, how many keypoints the query of one pair has, 1 at least: what scores per feature are divided by.
+
+    Raises:
+        InputError: the matches do not know.
+    """
+    if matches.count0 is None:
+        raise InputError("per_feature=True: expected matches that know how many keypoints the query has (count0), got "
+                         "None")  # fmt: skip
+    return jnp.maximum(jnp.asarray(matches.count0, jnp.float32), 1.0)
 
 
 def where_usable(found: Array, matches: Matches, shifts: Array, weights: Array, usable: Array) -> Array:

@@ -15,6 +15,7 @@ from mfvpr.features.selavpr import SelaVprFeatures
 from mfvpr.fingerprints import fingerprint, recipe_of
 from mfvpr.models.selavpr import AdaptedBlock, SelaVpr, Upsampling
 from mfvpr.models.vit import Block, TokenDescriptor, VisionTransformer
+from mfvpr.stores import features, vectors
 from mfvpr.weights.tables import DINOV2, SELAVPR
 from tests.checkpoints import dinov2_shapes, selavpr_shapes, transformer_checkpoint
 from tests.golden.make_netvlad import image, name, samples
@@ -120,16 +121,27 @@ def test_features_lie_between_the_middles_of_patches():
     size = (42, 28)
     extractor = SelaVprFeatures(network(width=64), size)
     [description] = extractor(image(size))
-    [features] = description.local
+    [local] = description.local
     assert extractor.scales == ((128, 9 * 5, 1.0),)
     assert (extractor.vector_size, description.vector.shape) == (64, (64,))
-    np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1, rtol=1e-5)
-    keypoints = features.keypoints.reshape(5, 9, 2)
+    np.testing.assert_allclose(np.linalg.norm(local.descriptors, axis=1), 1, rtol=1e-5)
+    keypoints = local.keypoints.reshape(5, 9, 2)
     np.testing.assert_array_equal(keypoints[0, :, 0], 6.5 + 3.5 * np.arange(9))  # every fourth a patch's middle
     np.testing.assert_array_equal(keypoints[:, 0, 1], 6.5 + 3.5 * np.arange(5))
     assert (keypoints.max(axis=(0, 1)) == np.array(size) - 7.5).all()
     floats = extractor(image(size).astype(np.float32))[0]
     np.testing.assert_allclose(floats.vector, description.vector, atol=1e-6)
+
+
+@pytest.mark.parametrize(("images", "printed"), [(220, 401), (1415, 2577)])
+def test_databases_are_of_the_published_size(images, printed):
+    """In MiB, in float32; stores, of float16, take little more than half of it."""
+    [scale] = SelaVprFeatures(network(width=64)).scales
+    numbers = 1024 + scale.dimension * scale.typical_count
+    assert images * 4 * numbers / 2**20 == pytest.approx(printed, rel=0.01)
+    stored = vectors.forecast_bytes(images, 1024)
+    stored += features.forecast_bytes(images, scale.typical_count, scale.dimension)
+    assert stored / 2**20 == pytest.approx(0.54 * printed, rel=0.02)
 
 
 @pytest.mark.parametrize("size", [(224, 225), (7, 14), (0, 14)])

@@ -1,0 +1,72 @@
+"""Makes patch_scores.npz: how Patch-NetVLAD's code scores pairs by patches of three sizes, and ranks candidates.
+
+`python -m tests.golden.make_patch_scores CLONE` with a clone of https://github.com/QVPR/Patch-NetVLAD. The tests read
+the file without it.
+"""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from unittest.mock import MagicMock
+
+import numpy as np
+
+GOLDEN = Path(__file__).parent / "patch_scores.npz"
+MAP = (10, 14)  # rows and columns of a feature map, 16 px each
+PATCHES, WEIGHTS = (2, 5, 8), (0.45, 0.15, 0.4)
+DIMENSION = 32
+# Of candidates, so alike that RANSAC needs no luck: how far they are moved (columns, rows), and how many of the patches
+# show the place; None = one color.
+CANDIDATES = (((0, 0), 0.9), ((1, 0), 0.8), ((-1, 0), 0.9), ((0, -1), 0.7), ((3, 0), 0.9), ((0, 0), None))
+MATCHERS = ("RANSAC", "spatialApproximator")
+
+
+def descriptors(patch: int) -> tuple[np.ndarray, np.ndarray]:
+    """`[n, D]` of the query's patches and `[C, n, D]` of the candidates', float32 of unit length, by rows."""
+    rng, edge = np.random.default_rng(patch), 4
+    rows, columns = (side - patch + 1 for side in MAP)
+    world = rng.normal(size=(rows + 2 * edge, columns + 2 * edge, DIMENSION))
+    candidates = []
+    for (right, down), share in CANDIDATES:
+        seen = world[edge + down : edge + down + rows, edge + right : edge + right + columns]
+        other, noise = rng.normal(size=(2, *seen.shape))
+        shows = rng.random((rows, columns, 1)) < (share or 0)
+        candidates.append(np.where(shows, seen + 0.2 * noise, other if share else world[:1, :1]))
+    query = world[edge : edge + rows, edge : edge + columns]
+    every = np.stack([query, *candidates]).reshape(1 + len(candidates), rows * columns, DIMENSION)
+    every = (every / np.linalg.norm(every, axis=-1, keepdims=True)).astype(np.float32)
+    return every[0], every[1:]
+
+
+def main(clone: str) -> None:
+    sys.path.insert(0, clone)
+    np.savez_compressed(GOLDEN, **dict(_scores()))
+
+
+def _scores() -> Iterator[tuple[str, np.ndarray]]:
+    """By matcher the scores `[C, S]` of all scales, their sums `[C]` for pairs, and over the candidates `[C]`."""
+    import torch
+
+    for unused in ("patchnetvlad.tools.datasets", "patchnetvlad.models.models_generic"):
+        sys.modules.setdefault(unused, MagicMock())
+    from match_two import apply_patch_weights  # pyright: ignore
+    from patchnetvlad.models.local_matcher import calc_keypoint_centers_from_patches, normalise_func
+    from patchnetvlad.tools.patch_matcher import PatchMatcher
+
+    config = {"imageresizeH": 16 * MAP[0], "imageresizeW": 16 * MAP[1]}
+    keypoints, indices = zip(*(calc_keypoint_centers_from_patches(config, p, p, 1, 1) for p in PATCHES), strict=True)
+    features = [descriptors(patch) for patch in PATCHES]
+    query = [torch.from_numpy(one) for one, _ in features]
+    for name in MATCHERS:
+        matcher = PatchMatcher(name, PATCHES, [1] * len(PATCHES), keypoints, indices)
+        scores = np.array([
+            matcher.match(query, [torch.from_numpy(others[candidate].T) for _, others in features])[0]
+            for candidate in range(len(CANDIDATES))
+        ])  # fmt: skip
+        yield f"{name}/scales", scores
+        yield f"{name}/pairs", np.array([apply_patch_weights(one, len(PATCHES), WEIGHTS) for one in scores])
+        yield f"{name}/fused", normalise_func(scores, len(PATCHES), WEIGHTS)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
