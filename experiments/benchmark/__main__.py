@@ -15,6 +15,7 @@ from experiments.launch import version
 BENCHMARKS = {
     "scores": "matching and scoring of one query with 50 candidates (15 rounds)",
     "cells": "SSM-VPR's matching and score of 50 candidates (9 rounds)",
+    "maps": "SelaVPR's and Patch-NetVLAD's re-ranking beside their products (7 rounds)",
     "homographies": "RANSAC of 50 pairs beside OpenCV's (7 rounds)",
     "agreement": "RANSAC on matches of real images beside OpenCV's: recall and inliers (4 seeds; half an hour)",
     "real": "all scores on the same matches of real images: recall with intervals, time per query (1 round)",
