@@ -84,13 +84,14 @@ def _each(settings: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def _prepared(settings: dict[str, Any], watch: Stopwatch) -> Prepared:
+    if len(sizes := settings["features"].get("patch_sizes", [])) > 1:
+        raise SettingsError(f"features.patch_sizes={sizes}: expected one size, since learning knows one scale")
     tools, images = prepare.begun(settings, watch)
     judge = truth.judge(settings, images.dataset)
     matches, candidates = prepare.matched(settings, tools, images, watch)
-    recipe = prepare.recipe(tools, images, candidates.mask.shape[1])
     if isinstance(matches, Scales):
-        raise SettingsError(f"features.patch_sizes={settings['features']['patch_sizes']}: expected one size, since "
-                            "learning knows one scale")  # fmt: skip
+        raise ValueError("expected features of one scale, since learning knows one")
+    recipe = prepare.recipe(tools, images, candidates.mask.shape[1])
     part = Part(data_sets.label(settings["dataset"]), judge, matches, candidates)
     return Prepared(part, images, recipe, truth.described(settings, images.dataset))
 

@@ -157,13 +157,15 @@ def check(settings: Mapping[str, Any]) -> None:
             raise SettingsError(f"{path}={_shown(value)}: expected {rule.expected}")
     _check_vocabulary(settings.get("retrieval", {}))
     features = settings.get("features", {})
-    if features.get("name") in ("sift", "ssm") and features["image_size"] is None:
+    if features.get("name") in ("sift", "ssm", "patch_netvlad", "selavpr") and features["image_size"] is None:
         raise SettingsError(f"features.image_size=null: expected width and height for features={features['name']}, "
                             "such as [336,336]")  # fmt: skip
     if method == "grid":
         _check_cells(settings)
-    if features.get("name") == "patch_netvlad" and settings["scorer"].get("size") is not None:
-        _check_patches(features, settings["scorer"]["size"])
+    if features.get("name") == "patch_netvlad":
+        for path, one in [("scorer", scorer), *((f"scorer.{name}", one) for name, one in scorer.items())]:
+            if isinstance(one, Mapping) and one.get("size") is not None:
+                _check_patches(features, f"{path}.size", one["size"])
     if settings.get("also") and not settings["report"]:
         raise SettingsError(f"also={settings['also']}: expected report=DATASET,... as well, to learn on several data "
                             "sets and report on others")  # fmt: skip
@@ -239,13 +241,13 @@ def _check_cells(settings: Mapping[str, Any]) -> None:
                                 f"{features['image_size']}, which are {sides[0]} x {sides[1]}")  # fmt: skip
 
 
-def _check_patches(features: Mapping[str, Any], reach: list[float]) -> None:
+def _check_patches(features: Mapping[str, Any], path: str, reach: list[float]) -> None:
     """That the rapid score's reach is that of the patches, which the configurations write for their own image size."""
     expected = [[16 * (pixels // 16 - patch) for pixels in features["image_size"]] for patch in features["patch_sizes"]]
     if expected != [list(reach)]:
         of_patches = f"{expected[0]}, the largest place of these patches, or" if len(expected) == 1 else "null, since"
         why = "null" if len(expected) == 1 else "each size of patches has its own"
-        raise SettingsError(f"scorer.size={reach}: expected {of_patches} {why}")
+        raise SettingsError(f"{path}={reach}: expected {of_patches} {why}")
 
 
 def _shown(value: Any) -> str:

@@ -83,6 +83,8 @@ def match_candidates(
         shapes = f"{np.shape(query.mask)} and {np.shape(candidates.mask)}"
         raise ValueError(f"expected one query [N0] and candidates [C, N1], got masks of shapes {shapes}; see match")
     chunk_size = pairs_at_once(chunk_size, query, candidates)
+    if 0 in (np.shape(query.mask)[0], np.shape(candidates.mask)[1]):  # of which `lax.map` cannot make chunks
+        chunk_size = 1
     return _match_candidates(query, candidates, cross_check=cross_check, with_ratio=with_ratio, chunk_size=chunk_size)
 
 

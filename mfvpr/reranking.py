@@ -133,7 +133,9 @@ def fuse_scales(
         by_scale = jnp.moveaxis(scores, -1, -2)
         standardized = jnp.vectorize(_standardized, signature="(c),(c)->(c)")
         scores = jnp.moveaxis(standardized(by_scale, mask[..., None, :]), -2, -1)
-    fused = jnp.matmul(masked(scores, mask), weights.astype(scores.dtype), precision=jax.lax.Precision.HIGHEST)
+    counts = jnp.expand_dims(weights != 0, tuple(range(scores.ndim - 1)))
+    scores = jnp.where(mask[..., None] & counts, scores, 0.0)  # infinity times 0 would be no number
+    fused = jnp.matmul(scores, weights.astype(scores.dtype), precision=jax.lax.Precision.HIGHEST)
     return masked(fused, mask, jnp.nan)
 
 
@@ -141,9 +143,9 @@ def _standardized(scores: Array, mask: Array) -> Array:
     """Scores `[C]` with mean 0 and standard deviation 1 over the finite ones of the candidates."""
     finite = mask & jnp.isfinite(scores)
     # Relative to one of them, equal scores have no spread that rounding would make.
-    some = jax.lax.stop_gradient(jnp.max(masked(scores, finite, -jnp.inf)))
+    some = jax.lax.stop_gradient(jnp.max(masked(scores, finite, -jnp.inf), initial=-jnp.inf))
     values = masked(scores - jnp.where(jnp.isfinite(some), some, 0.0), finite)
-    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(values)))  # whose square may be no number
+    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(values), initial=0.0))  # whose square may be no number
     values = values / jnp.where((largest > 0) & jnp.isfinite(largest), largest, 1.0)
     mean, spread = masked_mean(values, finite), masked_std(values, finite)
     return jnp.where(finite, (values - mean) / jnp.where(spread > 0, spread, 1.0), scores)

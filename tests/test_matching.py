@@ -154,6 +154,39 @@ def test_images_without_a_single_slot(mode, counts):
     assert compact_once(match_once(features0, features1), 4).mask.shape == (4,)
 
 
+@pytest.mark.parametrize("counts", [(0, 3), (3, 0), (0, 0)])
+@pytest.mark.parametrize("mode", ["mutual", "candidate"])
+def test_chunks_of_images_without_a_single_slot(mode, counts):
+    rng = np.random.default_rng(15)
+    query = make_features(rng, counts[0])
+    candidates = jax.tree.map(lambda *fields: np.stack(fields), *[make_features(rng, counts[1]) for _ in range(5)])
+    matches = match_candidates(query, candidates, cross_check=mode, chunk_size=2)
+    assert matches.mask.shape == (5, counts[mode == "candidate"])
+    assert not matches.mask.any()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_padding_is_not_nearer_than_what_looks_the_opposite(mode):
+    """Padding's similarity is taken for 0 at first, which wins over those below."""
+    rng = np.random.default_rng(14)
+    pair = [make_features(rng, count, capacity=32) for count in (5, 9)]
+    for features, sign in zip(pair, (1, -1), strict=True):
+        descriptors = sign * np.abs(rng.normal(size=features.descriptors.shape)).astype(np.float32)
+        features.descriptors[features.mask] = unit(descriptors)[features.mask]
+    real = [features.descriptors[features.mask] for features in pair]
+    assert (real[0] @ real[1].T).max() < 0
+    matches = match_once(*pair, cross_check=mode, with_ratio=True)
+    expected = oracles.nearest(*real, mode)
+    assert [(i, j) for i, j, _ in expected] == list(zip(found(matches)[0], matches.index1[matches.mask], strict=True))
+    alone = [
+        jax.tree.map(lambda field, f=f: field[f.mask] if np.ndim(field) and len(field) == 32 else field, f)
+        for f in pair
+    ]
+    ratio = match_once(*alone, cross_check=mode, with_ratio=True).ratio
+    slots = np.flatnonzero(pair[mode == "candidate"].mask)
+    np.testing.assert_allclose(np.asarray(matches.ratio)[slots], ratio, atol=1e-6)
+
+
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("counts", [(37, 41), (32, 127), (67, 30)])
 def test_numbers_that_do_not_come_out_even_in_blocks(mode, counts):

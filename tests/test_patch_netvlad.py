@@ -163,9 +163,9 @@ def program(weights, small_street, tmp_path, monkeypatch, capsys):
     folders = f"dataset.database={small_street}/database", f"dataset.queries={small_street}/queries"
     small = ("features.weights=patchnetvlad_mapillary_128", "features.image_size=[160,128]", "candidates=5")
 
-    def run(kind, *more):
+    def run(kind, *more, last=()):
         out = tmp_path / str(len([*tmp_path.iterdir()]))
-        own = ("dataset=folder", *folders, "dataset.ground_truth=order", *more, *small, f"out={out}")
+        own = ("dataset=folder", *folders, "dataset.ground_truth=order", *more, *small, f"out={out}", *last)
         code, stdout, stderr = typed(monkeypatch, capsys, kind, *own)
         return out, code, stdout, stderr
 
@@ -202,6 +202,16 @@ def test_a_sweep_fuses_the_scales_as_an_evaluation_does(program):
         rows = json.loads((alone / "results.json").read_text())
         expected = [row["recall_at"]["1"] for row in rows if row["system"] == "histogram"]
         assert [row["1"] for row in setting["recall_at"].values()] == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize(("options", "words"), [
+    (("scorer=all", "scorer.rapid.size=[560,400]"), "scorer.rapid.size=[560, 400]: expected [80, 48], the largest"),
+    (("features.image_size=null",), "features.image_size=null: expected width and height for features=patch_netvlad"),
+])  # fmt: skip
+def test_settings_of_other_sizes_are_refused(program, options, words):
+    _, code, _, stderr = program("evaluate", "features=patch_netvlad", "retrieval=same", last=options)
+    assert code == 2
+    assert words in stderr
 
 
 def test_what_it_cannot_be_used_for_is_one_line(program, monkeypatch):

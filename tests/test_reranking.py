@@ -108,6 +108,15 @@ def test_a_candidate_that_is_not_there_or_no_number_matters_to_itself_alone():
     assert np.isnan(fused[[1, 3]]).all()
 
 
+def test_a_scale_without_weight_takes_no_part_and_no_candidates_have_no_score():
+    scores = np.array([[np.inf, 1], [1, 2], [3, np.nan]], np.float32)
+    fused = np.asarray(
+        fuse_scales(scores, np.array([True, True, False]), np.array([0, 1], np.float32), normalize="none")
+    )
+    np.testing.assert_array_equal(fused, [1, 2, np.nan])
+    assert fuse_scales(np.zeros((0, 2), np.float32), np.zeros(0, bool)).shape == (0,)
+
+
 def test_scales_of_equal_scores_say_nothing():
     """Whatever rounding makes of the mean of equal scores."""
     rng = np.random.default_rng(0)

@@ -25,8 +25,10 @@ class GeneralizedMean(nnx.Module):
 
     def __call__(self, maps: Array) -> Array:
         """`[B, h, w, C]` -> `[B, C]`."""
-        power = self.power[...][0]
-        return jnp.mean(jnp.maximum(maps, _SMALLEST) ** power, axis=(1, 2)) ** (1 / power)
+        power, values = self.power[...][0], jnp.maximum(maps, _SMALLEST)
+        largest = jnp.max(values, axis=(1, 2), keepdims=True)  # relative to it, no power of small values is lost
+        means = jnp.mean((values / largest) ** power, axis=(1, 2))
+        return largest[:, 0, 0] * means ** (1 / power)
 
 
 class Gem(nnx.Module):

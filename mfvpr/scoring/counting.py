@@ -26,4 +26,4 @@ class MatchCount:
         """Score of one pair, `[]` float32."""
         confidence = match_confidence(matches)
         score = jnp.sum(confidence)
-        return score if self.single == "count" else jnp.where(jnp.sum(confidence > 0) == 1, 0.0, score)
+        return score if self.single == "count" else jnp.where(jnp.sum(confidence != 0) == 1, 0.0 * score, score)

@@ -106,10 +106,14 @@ def test_where_a_map_is_zero_there_is_no_nan():
     assert not np.asarray(layer.patches(zero, 2)).any()
 
 
-@pytest.mark.parametrize("power", [1.0, 2.5, 30.0])
-def test_the_generalized_mean_is_its_definition(power):
-    maps = np.random.default_rng(0).normal(size=(2, 3, 4, 5)).astype(np.float32)
-    expected = np.mean(np.maximum(maps.astype(np.float64), 1e-6) ** power, axis=(1, 2)) ** (1 / power)
+@pytest.mark.parametrize("power", [1.0, 2.5, 30.0, 1000.0])
+@pytest.mark.parametrize("unit", [1.0, 0.03])
+def test_the_generalized_mean_is_its_definition(power, unit):
+    """Also where powers of small values, as those of long vectors of unit length, would be 0 in float32."""
+    maps = unit * np.random.default_rng(0).normal(size=(2, 3, 4, 5)).astype(np.float32)
+    positive = np.maximum(maps.astype(np.float64), 1e-6)
+    largest = positive.max(axis=(1, 2), keepdims=True)
+    expected = largest[:, 0, 0] * np.mean((positive / largest) ** power, axis=(1, 2)) ** (1 / power)
     np.testing.assert_allclose(GeneralizedMean(power)(jax.numpy.asarray(maps)), expected, rtol=1e-5)
     constant = np.full((1, 2, 2, 3), 0.7, np.float32)
     np.testing.assert_allclose(GeneralizedMean(power)(jax.numpy.asarray(constant)), 0.7, rtol=1e-5)

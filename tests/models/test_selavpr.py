@@ -1,5 +1,6 @@
 """DINOv2 and SelaVPR against the public code's numbers (tests/golden), and their layers by definition."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -17,6 +18,7 @@ from mfvpr.models.selavpr import AdaptedBlock, SelaVpr, Upsampling
 from mfvpr.models.vit import Block, TokenDescriptor, VisionTransformer
 from mfvpr.stores import features, vectors
 from mfvpr.weights.tables import DINOV2, SELAVPR
+from tests.builders import make_matches
 from tests.checkpoints import dinov2_shapes, selavpr_shapes, transformer_checkpoint
 from tests.golden.make_netvlad import image, name, samples
 from tests.golden.make_selavpr import BACKBONES, GOLDEN, MATCHES, NETWORKS, SIZE, WIDTH, maps
@@ -74,6 +76,16 @@ def test_scores_are_the_public_codes(golden, case):
     np.testing.assert_array_equal(np.where(counted == 1, 0, counted), published)
     assert (counted >= 1).all()  # the nearest pair of all is mutual
     assert (case[0] == 1) == (counted == 1).all()
+
+
+@pytest.mark.parametrize(("confidence", "published"), [
+    ([0.5, 0.0], 0.0), ([0.5, 0.25], 0.75), ([0.0, 0.0], 0.0), ([np.nan, 0.25], np.nan), ([np.nan, 0.0], np.nan),
+])  # fmt: skip
+def test_a_single_match_is_one_with_confidence(confidence, published):
+    matches = make_matches(np.zeros((2, 2)), np.ones((2, 2)), capacity=4)
+    matches = replace(matches, confidence=np.array([*confidence, np.nan, np.nan], np.float32))
+    np.testing.assert_array_equal(mfvpr.MatchCount("zero")(matches), np.float32(published))
+    np.testing.assert_array_equal(mfvpr.MatchCount()(matches), np.float32(sum(confidence)))
 
 
 def as_features(values):
