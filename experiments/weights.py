@@ -1,6 +1,7 @@
 """Published weights: list them, download, convert, verify. `python -m experiments.weights --help`."""
 
 import shlex
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +13,8 @@ if TYPE_CHECKING:
 
 # Functions import what they need: --help and wrong usage need not wait for JAX.
 _CHUNK = 1 << 18
+
+_LARGE = 200  # MiB, which take some seconds to convert
 
 
 def main() -> None:
@@ -65,6 +68,8 @@ def convert(file: Path, name: str | None) -> None:
     from mfvpr.weights.files import install, read_manifest
 
     entry = _recognized(file, name)
+    if file.is_file() and (megabytes := file.stat().st_size >> 20) > _LARGE:
+        print(f"{file}: {megabytes:,} MiB to convert, some {max(1, megabytes // 50)} s", file=sys.stderr)
     path = install(file, entry.name)
     manifest = read_manifest(entry.name)
     rounded = f", {manifest.rounded} of its tensors rounded from float64 to float32" if manifest.rounded else ""

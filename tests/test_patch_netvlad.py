@@ -73,11 +73,16 @@ def test_one_pass_gives_what_the_network_gives(model):
 @pytest.mark.parametrize(("options", "words"), [
     ({"patch_sizes": ()}, r"patch_sizes=\[\]: expected sizes from 1 to 8, as a map of 10 x 8 positions has room for"),
     ({"patch_sizes": (9,)}, "expected sizes from 1 to 8"), ({"patch_sizes": (0, 2)}, "expected sizes from 1 to 8"),
+    ({"patch_sizes": (2, 2)}, r"patch_sizes=\[2, 2\]: expected each size once"),
     ({"scale_weights": (1.0, 2.0)}, r"scale_weights=\[1.0, 2.0\]: expected one for each of patch_sizes=\[5\], or None"),
 ])  # fmt: skip
 def test_what_cannot_be_is_refused(model, options, words):
     with pytest.raises(InputError, match=words):
         PatchNetVladFeatures(model, SIZE, **options)
+    with pytest.raises(InputError, match="Patch-NetVLAD: expected a VggNetVlad as model, got Vgg16; `"):
+        PatchNetVladFeatures(model.vgg, SIZE)
+    with pytest.raises(ValueError, match="expected features of one scale, got 2; see `local`"):
+        _ = PatchNetVladFeatures(model, SIZE, patch_sizes=(2, 3))(image(SIZE))[0].features
     with pytest.raises(InputError, match="expected images of 160 x 128 px, got 128 x 160"):
         PatchNetVladFeatures(model, SIZE)(np.zeros((1, 160, 128, 3), np.uint8))
 
@@ -206,6 +211,7 @@ def test_a_sweep_fuses_the_scales_as_an_evaluation_does(program):
 
 @pytest.mark.parametrize(("options", "words"), [
     (("scorer=all", "scorer.rapid.size=[560,400]"), "scorer.rapid.size=[560, 400]: expected [80, 48], the largest"),
+    (("scorer=rapid", "scorer.size=[560,400]", "features.patch_sizes=[9]"), "[9]: expected sizes from 1 to 8"),
     (("features.image_size=null",), "features.image_size=null: expected width and height for features=patch_netvlad"),
 ])  # fmt: skip
 def test_settings_of_other_sizes_are_refused(program, options, words):

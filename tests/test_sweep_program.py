@@ -242,7 +242,7 @@ SIGMA = "grid.sigma=[10]"
         (["scorer=anchor", "grid.num_bins=[33]"], "each a whole number from 1 to 32"),
         (["grid.sigma=[10,10]"], "grid.sigma=[10, 10]: expected different values"),
         (["scorer=all", SIGMA], "scorer: a sweep takes one scorer at a time"),
-        (["scorer=count", SIGMA], "grid.sigma: scorer=count has no such parameter; it has max_distance, c"),
+        (["scorer=count", SIGMA], "grid.sigma: scorer=count has no such parameter; it has single, max_distance, c"),
         ([SIGMA, "dataset.ground_truth=none", "dataset.index_file=null"], "choosing settings needs a ground truth"),
         ([SIGMA, "search=random"], "search=random: expected one of grid, optuna"),
         ([SIGMA, "split=half"], "split=half: expected one of null, first_half, second_half, both"),

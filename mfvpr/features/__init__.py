@@ -42,9 +42,14 @@ class Description(NamedTuple):
 
     @property
     def features(self) -> Features:
-        """Of the only scale."""
-        [features] = self.local
-        return features
+        """Of the only scale.
+
+        Raises:
+            ValueError: there are several, or none.
+        """
+        if len(self.local) != 1:
+            raise ValueError(f"expected features of one scale, got {len(self.local)}; see `local`")
+        return self.local[0]
 
 
 class Extractor(Protocol):

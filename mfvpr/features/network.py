@@ -21,6 +21,13 @@ def compiled(model: nnx.Module, function: Callable[..., Any]) -> Callable[..., A
     return lambda *inputs: program(state, *inputs)
 
 
+def require_network(name: str, model: Any, expected: type[nnx.Module]) -> None:
+    """Raise an InputError unless the model is such a network."""
+    if not isinstance(model, expected):
+        raise InputError(f"{name}: expected a {expected.__name__} as model, got {type(model).__name__}; "
+                         "`mfvpr.weights.files.load_model` gives a network by its name")  # fmt: skip
+
+
 def require_size(name: str, images: np.ndarray, size: tuple[int, int]) -> None:
     """Raise an InputError unless images `[B, H, W, 3]` have this (width, height)."""
     rows, columns = images.shape[1:3]

@@ -11,7 +11,7 @@ import numpy as np
 from mfvpr.data.images import Interpolation
 from mfvpr.errors import InputError
 from mfvpr.features import Description, Scale
-from mfvpr.features.network import at_places, compiled, in_batches, require_size
+from mfvpr.features.network import at_places, compiled, in_batches, require_network, require_size
 from mfvpr.models.netvlad import VggNetVlad
 from mfvpr.models.vgg import STRIDE
 from mfvpr.types import Features
@@ -34,7 +34,8 @@ class PatchNetVladFeatures:
         batch_size: images per call.
 
     Raises:
-        InputError: no patch sizes, one that images of this size have no room for, or weights of other scales.
+        InputError: another network; no patch sizes, one twice, or one that images of this size have no room for;
+            weights of other scales.
     """
 
     model: VggNetVlad
@@ -45,10 +46,13 @@ class PatchNetVladFeatures:
     batch_size: int = field(default=8, metadata={"recipe": False})
 
     def __post_init__(self) -> None:
+        require_network("Patch-NetVLAD", self.model, VggNetVlad)
         columns, rows = self._map_size
         if not self.patch_sizes or not 1 <= min(self.patch_sizes) <= max(self.patch_sizes) <= min(columns, rows):
             raise InputError(f"patch_sizes={list(self.patch_sizes)}: expected sizes from 1 to {min(columns, rows)}, as "
                              f"a map of {columns} x {rows} positions has room for")  # fmt: skip
+        if len(set(self.patch_sizes)) < len(self.patch_sizes):
+            raise InputError(f"patch_sizes={list(self.patch_sizes)}: expected each size once")
         if self.scale_weights is not None and len(self.scale_weights) != len(self.patch_sizes):
             raise InputError(f"scale_weights={list(self.scale_weights)}: expected one for each of "
                              f"patch_sizes={list(self.patch_sizes)}, or None")  # fmt: skip

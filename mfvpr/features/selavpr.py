@@ -10,7 +10,7 @@ import numpy as np
 
 from mfvpr.data.images import Interpolation
 from mfvpr.features import Description, Scale
-from mfvpr.features.network import at_places, compiled, in_batches, require_size
+from mfvpr.features.network import at_places, compiled, in_batches, require_network, require_size
 from mfvpr.models.selavpr import LOCAL, SelaVpr
 from mfvpr.models.vit import PATCH, require_patches
 from mfvpr.types import Features
@@ -33,7 +33,7 @@ class SelaVprFeatures:
         batch_size: images per call.
 
     Raises:
-        InputError: an image has no whole number of patches.
+        InputError: another network, or an image has no whole number of patches.
     """
 
     model: SelaVpr
@@ -42,6 +42,7 @@ class SelaVprFeatures:
     batch_size: int = field(default=8, metadata={"recipe": False})
 
     def __post_init__(self) -> None:
+        require_network("SelaVPR", self.model, SelaVpr)
         require_patches(self.image_size)
 
     @property

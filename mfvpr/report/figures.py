@@ -84,7 +84,8 @@ def _draw_pair(axes: Axes, query: np.ndarray, answer: Answer, max_lines: int) ->
 def _draw_matches(axes: Axes, offset: int, matches: Matches, explanation: Explanation, max_lines: int) -> str:
     """What was drawn, in words."""
     count = int(matches.mask.sum())
-    heaviest = np.argsort(-np.where(matches.mask, explanation.weights, -np.inf), kind="stable")[: min(max_lines, count)]
+    weights = np.where(matches.mask, explanation.weights, -np.inf)
+    heaviest = np.lexsort((matches.distance, -weights))[: min(max_lines, count)]  # of equal weights the nearest
     start, end = matches.points0[heaviest], matches.points1[heaviest] + [offset, 0]
     colors = np.where(explanation.agrees[heaviest], _AGREES, _DIFFERS)
     lines = np.stack([start, end], axis=1)

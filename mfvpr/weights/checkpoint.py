@@ -27,7 +27,7 @@ def read_checkpoint(path: Path | str) -> dict[str, np.ndarray]:
         InputError: the file is no checkpoint, is damaged, or holds anything but float32, float64 and integer arrays.
     """
     path = Path(path)
-    start = _start(path)
+    start = require_checkpoint(path)
     (read,) = (read for magic, read in _READERS.items() if start.startswith(magic))
     try:
         with path.open("rb") as file:
@@ -40,8 +40,12 @@ def read_checkpoint(path: Path | str) -> dict[str, np.ndarray]:
         raise InputError(f"{path}: this checkpoint is damaged; download it again") from error
 
 
-def _start(path: Path) -> bytes:
-    """The first bytes, which are those of a checkpoint, or the file is refused."""
+def require_checkpoint(path: Path) -> bytes:
+    """The first bytes, which are those of a checkpoint.
+
+    Raises:
+        InputError: they are not.
+    """
     again = "download it again"
     if path.exists() and not path.is_file():  # a pipe would be waited for
         raise InputError(f"{path}: expected a checkpoint file, got {'a folder' if path.is_dir() else 'no plain file'}")

@@ -12,7 +12,7 @@ import numpy as np
 
 from mfvpr.data.files import replacing, write_text
 from mfvpr.errors import InputError
-from mfvpr.weights.checkpoint import read_checkpoint
+from mfvpr.weights.checkpoint import read_checkpoint, require_checkpoint
 from mfvpr.weights.conversion import convert, is_ignored
 from mfvpr.weights.registry import REGISTRY, Entry, entry_of
 
@@ -63,6 +63,7 @@ def install(checkpoint: Path, name: str, folder: Path | None = None) -> Path:
 
     entry = entry_of(name)
     network = network_of(entry)
+    require_checkpoint(checkpoint)  # a web page is told before its hash is
     check_published(checkpoint, entry)
     tensors = read_checkpoint(checkpoint)
     plan = blueprint(entry)
