@@ -11,6 +11,7 @@ from experiments.settings import SettingsError
 from mfvpr.archive import Archive
 from mfvpr.data.datasets import Dataset, folder_dataset, sequences_dataset
 from mfvpr.data.ground_truth import CHOICES
+from mfvpr.data.published import published_dataset
 from mfvpr.data.streets import streets_folder
 from mfvpr.declaration import made
 from mfvpr.features import Aggregated, Extractor
@@ -42,6 +43,10 @@ def dataset(settings: dict[str, Any], progress: Callable[[int, int], None]) -> D
             root / "database", root / "queries", name="streets", ground_truth="index",
             index_file=root / "ground_truth.csv", widen_index=True,
         )  # fmt: skip
+    if "ground_truth" not in settings:
+        return published_dataset(
+            settings["name"], expanded(settings["root"]), seasons=settings.get("seasons") and tuple(settings["seasons"])
+        )
     if settings["ground_truth"] is None:
         raise SettingsError(f"dataset.ground_truth: nothing is assumed of your own images; set it to one of {CHOICES}")
     options: dict[str, Any] = {n: value for n, value in settings.items() if n not in ("root", "exclude_neighbors")}

@@ -12,6 +12,7 @@ from experiments.console import bar, tell
 from mfvpr.archive import Archive
 from mfvpr.data.contents import Contents
 from mfvpr.data.datasets import Dataset, QuerySequence
+from mfvpr.data.published import differences
 from mfvpr.data.sequences import OwnRows, own_rows, without_neighbors
 from mfvpr.evaluation import threshold_words
 from mfvpr.evaluations import Stopwatch, match_sequence, matches_recipe
@@ -140,6 +141,8 @@ def dataset_of(settings: dict[str, Any]) -> Dataset:
 def _warn_of_images(settings: dict[str, Any], images: Images, own: list[OwnRows]) -> None:
     """What is in the data set that may give wrong numbers, and what was done about it."""
     dataset = images.dataset
+    for difference in differences(dataset):
+        tell(f"warning: {dataset.name}: {difference}; its numbers are not comparable")
     for sequence, rows in zip(dataset.sequences, own, strict=True):
         _warn_of_sequence(settings, sequence, rows)
     for side, did in images.reading.items():
@@ -158,9 +161,10 @@ def _warn_of_images(settings: dict[str, Any], images: Images, own: list[OwnRows]
     candidates, available = settings["candidates"], num_candidates(settings, images)
     if candidates != "all" and candidates > available:
         tell(f"note: candidates={candidates}, but the database has {available} images; all of them are re-ranked")
-    deepest = max(settings["recall"]["ks"])
-    if deepest > available:
-        tell(f"note: R@{deepest} is R@{available}, of the filter too: no more candidates are looked at")
+    deeper = [f"R@{k}" for k in settings["recall"]["ks"] if k > available]
+    if deeper:
+        verb = "is" if len(deeper) == 1 else "are"
+        tell(f"note: {' and '.join(deeper)} {verb} R@{available}, of the filter too: no more candidates are looked at")
 
 
 def _warn_of_weights(settings: dict[str, Any], images: Images) -> None:

@@ -63,6 +63,7 @@ RULES: dict[str, Rule] = {
     "database_labels": either(_PATH, None),
     "query_labels": either(_PATH, None),
     "exclude_neighbors": either(_INDEX, None),
+    "seasons": list_of(one_of("fall", "spring", "summer", "winter"), 2),
     "orient": _FLAG,
     "bits": either(between(8, 16), None),
     # features and filter

@@ -9,7 +9,8 @@ from mfvpr.data.datasets import Dataset
 from mfvpr.evaluation import Judge, Truth
 
 _FILES = ("index_file", "query_labels", "database_labels")
-_WORDS = {"order": "file order", "utm": "positions in the names", "drawn": "drawn with the images"}
+_WORDS = {"order": "file order", "utm": "positions in the names", "drawn": "drawn with the images",
+          "published": "as published"}  # fmt: skip
 
 
 def thresholds(settings: Mapping[str, Any], truth: Truth | None) -> list[float]:
@@ -30,7 +31,8 @@ def judge(settings: Mapping[str, Any], dataset: Dataset) -> Judge:
 def described(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, Any]:
     """Kind, files, unit and thresholds of the ground truth, as results keep them."""
     chosen, truth = settings["dataset"], dataset.sequences[0].truth
-    kind = {"kind": chosen.get("ground_truth", "drawn"), "files": [chosen[name] for name in _FILES if chosen.get(name)]}
+    known = "drawn" if "cache" in chosen else "published"
+    kind = {"kind": chosen.get("ground_truth", known), "files": [chosen[name] for name in _FILES if chosen.get(name)]}
     kind["exclude_neighbors"] = chosen.get("exclude_neighbors")
     return kind if truth is None else kind | {"unit": truth.unit, "thresholds": thresholds(settings, truth)}
 

@@ -72,9 +72,10 @@ ALLOWED = {
         "progress",
     },
     "evaluation": {"errors", "fingerprints", "types", "evaluation"},
-    "data": {"errors", "evaluation", "numerics", "threads", "types", "data"},
+    "foreign": {"errors", "foreign"},
+    "data": {"errors", "evaluation", "foreign", "numerics", "threads", "types", "data"},
     "models": {"errors", "numerics", "types", "models"},
-    "weights": {"errors", "data", "models", "weights"},
+    "weights": {"errors", "data", "foreign", "models", "weights"},
     "features": {
         "errors",
         "types",

@@ -51,7 +51,12 @@ def in_batches(program: Callable[[Any], Any], images: np.ndarray, batch_size: in
 
     A device without memory of its own takes them one by one, which keeps activations in the processor's caches (a batch
     of 8 is no faster there); elsewhere the last batch is filled up, so that there is one program.
+
+    Raises:
+        InputError: floating-point images of 0 to 1, to which every network here is blind.
     """
+    if images.dtype.kind == "f" and images.size and 0 < (largest := images.max()) <= 1:
+        raise InputError(f"images: expected values from 0 to 255, the largest is {largest:.3g}; multiply by 255")
     size = 1 if device_bytes(()) is None else batch_size
     found = []
     for start in range(0, len(images), size):

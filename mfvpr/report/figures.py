@@ -108,7 +108,7 @@ def _draw_histogram(axes: Axes, explanation: Explanation, top: float) -> AxesIma
     extent = (centers_x[0] - half, centers_x[-1] + half, centers_y[-1] + half, centers_y[0] - half)
     image = axes.imshow(scores, extent=extent, cmap="magma", interpolation="nearest", vmin=0, vmax=top)
     direction = explanation.direction.replace("_", " ")
-    axes.set_xlabel(f"shift x, px ({direction}; square: tallest bin, cross: refined peak)", fontsize=8)
+    axes.set_xlabel(f"shift x, px ({direction})\nsquare: tallest bin, cross: refined peak", fontsize=8)
     axes.set_ylabel("shift y, px")
     if explanation.score <= 0:
         axes.set_title("histogram of shifts: no votes", fontsize=9)

@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 
 from mfvpr.errors import InputError
-from mfvpr.weights import matlab_files, numpy_files
-from mfvpr.weights.matlab_files import read_matlab
+from mfvpr.foreign import matlab_files, numpy_objects
+from mfvpr.foreign.matlab_files import read_matlab
 from mfvpr.weights.numpy_files import read_layers
 from mfvpr.weights.torch_files import read_legacy, read_zip
 
 _DAMAGE = (ArithmeticError, LookupError, TypeError, ValueError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile)
 _DAMAGE += (Warning,)  # raised where warnings are errors
 # By the first bytes; the last is that of every binary pickle.
-_READERS = {b"PK": read_zip, numpy_files.MAGIC: read_layers, matlab_files.MAGIC: read_matlab, b"\x80": read_legacy}
+_READERS = {b"PK": read_zip, numpy_objects.MAGIC: read_layers, matlab_files.MAGIC: read_matlab, b"\x80": read_legacy}
 
 
 def read_checkpoint(path: Path | str) -> dict[str, np.ndarray]:

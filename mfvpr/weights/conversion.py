@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mfvpr.errors import InputError
-from mfvpr.weights.pickles import excerpt
+from mfvpr.foreign.pickles import excerpt
 
 
 class _Change(NamedTuple):

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from mfvpr.foreign.pickles import excerpt
 from mfvpr.weights.conversion import Rule, Table, convert, share_known
-from mfvpr.weights.pickles import excerpt
 from mfvpr.weights.registry import REGISTRY, Entry
 from mfvpr.weights.tables import (
     ALIKED,

@@ -15,7 +15,7 @@ from typing import Any, BinaryIO, Literal
 import numpy as np
 
 from mfvpr.errors import InputError
-from mfvpr.weights.pickles import MEND, Name, excerpt, file_size, natural, of_type, read_pickle, refused
+from mfvpr.foreign.pickles import MEND, Name, excerpt, file_size, natural, of_type, read_pickle, refused
 
 Order = Literal["little", "big"]
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mfvpr.errors import InputError
-from mfvpr.weights import pickles
+from mfvpr.foreign import pickles
 from mfvpr.weights.checkpoint import read_checkpoint
 from tests.checkpoints import ALIKED, Call, Global, View, Writer, random_checkpoint, write_legacy, write_zip
 from tests.weights.conftest import SOURCE_SHAPES

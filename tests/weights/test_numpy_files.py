@@ -316,7 +316,7 @@ def test_other_content(path, content, words):
             "{'descr': '<f4', 'fortran_order': False, 'shape': (3,), }",
             "expected a dictionary of layers, got an array, {",
         ),
-        (HEADER.replace("()", "(1,)"), "got an array"),
+        (HEADER.replace("()", "(1,)"), "got another object"),
         (HEADER.replace("|O", "|V4"), "got an array"),
         ("__import__('os').mkdir('made')", "got an array, __import__"),
         ("9" * 117, "got an array"),

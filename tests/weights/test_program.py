@@ -15,7 +15,7 @@ import pytest
 
 from experiments.errors import one_line
 from experiments.weights import main
-from mfvpr.weights.files import load_model, save
+from mfvpr.weights.files import file_sha256, load_model, save
 from mfvpr.weights.registry import REGISTRY
 from tests.checkpoints import (
     ALIKED,
@@ -129,7 +129,10 @@ def test_convert_list_verify(program, folder, tiny_checkpoint):
     assert stdout == f"{folder}/tiny.safetensors: tiny, {PARAMETERS} parameters\n"
     assert program("list")[1].splitlines()[-1].split()[-2:] == ["yes", "-"]
     for arguments in ([], ["tiny"]):
-        assert program("verify", *arguments) == (0, f"tiny: good, {PARAMETERS} parameters as converted\n", "")
+        code, stdout, stderr = program("verify", *arguments)
+        assert (code, stderr) == (0, "")
+        source = f"from a tiny.pth of sha256 {file_sha256(tiny_checkpoint)[:12]}..., which nobody published"
+        assert stdout == f"tiny: good, {PARAMETERS} parameters as converted, {source}\n"
 
 
 def test_convert_says_what_was_rounded(program, tmp_path):
@@ -359,7 +362,7 @@ def test_places365_from_numpys_file_to_network(program, refused, folder, tmp_pat
     assert stdout == f"{folder}/vgg16_places365.safetensors: vgg16_places365, 12,354,880 parameters\n"
     model = load_model("vgg16_places365")
     assert (model.vgg.conv5_2.kernel[...] == arrays["conv5_2.weights"].transpose(2, 3, 1, 0)).all()
-    assert program("verify") == (0, "vgg16_places365: good, 12,354,880 parameters as converted\n", "")
+    assert program("verify")[1].startswith("vgg16_places365: good, 12,354,880 parameters as converted, from a vgg16")
     write_numpy(path, {"conv1_1": {"weights": Path("/")}})
     refused("vgg16_places365.npy: it asks for pathlib.PosixPath, where arrays of numbers are expected", "convert", path)
     write_numpy(path, layered(random_checkpoint(SOURCE_SHAPES)))

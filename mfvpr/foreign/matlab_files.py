@@ -1,7 +1,7 @@
-"""Reads MATLAB's files of version 5 (to 7.2) as arrays of numbers by their path through structures and cells.
+"""Reads MATLAB's files of version 5 (to 7.2) as arrays by their path through structures and cells.
 
 SciPy's reader writes beyond its memory where a file is damaged on purpose. Here every length is checked against what
-holds it, and what is no structure, cell or array of numbers is left out.
+holds it, and what is no structure, cell, text or array of numbers is left out.
 """
 
 import math
@@ -13,14 +13,15 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 
 from mfvpr.errors import InputError
-from mfvpr.weights.pickles import file_size
+from mfvpr.foreign.pickles import file_size
 
 MAGIC = b"MATLAB"
 
 _HEADER = 128  # bytes
 _PACKED, _MATRIX, _NAMES, _SIZES, _FLAGS = 15, 14, 1, 5, 6  # types of elements
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}  # of numbers
-_CELL, _STRUCTURE = 1, 2  # classes of matrices; of numbers:
+_CODES = {2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16"}  # of text, by the type of its elements
+_CELL, _STRUCTURE, _TEXT = 1, 2, 4  # classes of matrices; of numbers:
 _NUMBERS = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
 _COMPLEX = 0x0800
 _DEEPEST = 12  # matrices within each other
@@ -33,8 +34,12 @@ class _Element(NamedTuple):
     content: memoryview
 
 
-def read_matlab(file: BinaryIO) -> dict[str, np.ndarray]:
+def read_matlab(file: BinaryIO, *, text: bool = False) -> dict[str, np.ndarray]:
     """Arrays by `variable.field.0.field`, where 0, 1, ... are places in a cell, or in an array of structures.
+
+    Args:
+        file: at its start.
+        text: whether lines of text are given as well, as arrays of one string.
 
     Raises:
         InputError: it is of another version, too deep, or larger than such files are when it is unpacked.
@@ -49,7 +54,8 @@ def read_matlab(file: BinaryIO) -> dict[str, np.ndarray]:
         for path, array in _arrays("", variable.content, order, 1):
             if path in found:
                 raise ValueError
-            found[path] = array
+            if text or array.dtype.kind != "U":
+                found[path] = array
     return found
 
 
@@ -119,6 +125,14 @@ def _arrays(path: str, content: memoryview, order: str, depth: int) -> Iterator[
         stored = next(parts)
         values = np.frombuffer(stored.content, order + _STORED[stored.kind])
         yield path, values.astype(_NUMBERS[kind]).reshape(shape, order="F")
+    elif kind == _TEXT and number and shape[0] == 1:
+        yield path, np.array(_text(next(parts), order))
+
+
+def _text(stored: _Element, order: str) -> str:
+    code = _CODES[stored.kind]
+    endian = {"<": "-le", ">": "-be"}[order] if code == "utf-16" else ""
+    return bytes(stored.content).decode(code + endian)
 
 
 def _parts(paths: list[str], parts: Iterator[_Element], order: str, depth: int) -> Iterator[tuple[str, np.ndarray]]:

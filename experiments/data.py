@@ -1,0 +1,121 @@
+"""Data sets by name: list them, and check what a folder holds. `python -m experiments.data --help`."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from experiments.errors import Parser, one_line, refuse, unwind_on_sigterm
+
+if TYPE_CHECKING:
+    from mfvpr.data.contents import Contents
+    from mfvpr.data.datasets import Dataset, QuerySequence
+
+# Functions import what they need: --help and wrong usage need not wait for JAX.
+DATA = "python -m experiments.data"
+_TOLERANCE, _RADIUS = 5, 25.0  # frames, meters: the widest that the paper takes
+
+
+def main() -> None:
+    """Run the command line's command."""
+    unwind_on_sigterm()
+    with one_line():
+        arguments = vars(_parser().parse_args())
+        arguments.pop("run")(**arguments)
+
+
+def _parser() -> Parser:
+    from experiments.launch import version
+
+    parser = Parser(prog=DATA, description="Nothing is downloaded: each data set has its place and its license.")
+    parser.add_argument("--version", action="version", version=version(), help="print it and exit")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    command = commands.add_parser("list", help="the published data sets, their sizes, and what their folders hold")
+    command.add_argument("names", metavar="NAME", nargs="*", help="by default a table of all")
+    command.set_defaults(run=list_data)
+    command = commands.add_parser("check", help="what a folder holds beside what is published; draws pairs of images")
+    command.add_argument("name", metavar="NAME", help="as in dataset=NAME")
+    command.add_argument("settings", metavar="root=DIR", nargs="*", help="settings of the data set, without `dataset.`")
+    command.add_argument("--sheet", metavar="FILE", type=Path, help="where to draw them, by default NAME.png")
+    command.set_defaults(run=check)
+    return parser
+
+
+def list_data(names: list[str]) -> None:
+    """Print a table, or what is known of some."""
+    from mfvpr.data.published import PUBLISHED
+    from mfvpr.errors import InputError
+    from mfvpr.report.tables import Table
+
+    for name in names:
+        if name not in PUBLISHED:
+            raise InputError(f"{name}: expected one of {', '.join(PUBLISHED)}")
+    if names:
+        for entry in map(PUBLISHED.__getitem__, names):
+            layout = "\n".join(f"  {line}" for line in entry.layout.splitlines())
+            print(f"{entry.name}: {entry.title}\n{layout}\nfrom {entry.source}")
+        return
+    rows = [
+        [entry.name, entry.title, f"{entry.database:,}", f"{sum(entry.queries.values()):,}"]
+        for entry in PUBLISHED.values()
+    ]
+    print(Table(["name", "what it is", "database", "queries"], rows, text_columns=2).text(), end="")
+
+
+def check(name: str, settings: list[str], sheet: Path | None) -> None:
+    """Print counts beside the published ones and what is odd about the ground truth; draw pairs."""
+    from experiments import data_sets
+    from experiments.prepare import dataset_of
+    from mfvpr.archive import Archive
+    from mfvpr.data.published import differences
+    from mfvpr.report.contact_sheets import contact_sheet
+    from mfvpr.report.tables import Table
+
+    [chosen] = data_sets.composed("check", ":".join([name, *settings]))
+    dataset = dataset_of(chosen)
+    archive = Archive(None)
+    contents = [archive.contents(dataset.database), *(archive.contents(one.images) for one in dataset.sequences)]
+    print(Table(["images of", "there", "published", "unreadable"], list(_counts(dataset, contents)), 1).text())
+    for sequence, queries in zip(dataset.sequences, contents[1:], strict=True):
+        for line in _truth(sequence, queries, contents[0]):
+            print(f"{sequence.name}: {line}")
+    target = sheet or Path(f"{name}.png")
+    contact_sheet(target, dataset)
+    print(f"pairs of images: {target}")
+    if different := list(differences(dataset)):
+        refuse(f"{dataset.name}: {'; '.join(different)}")
+
+
+def _counts(dataset: "Dataset", contents: "list[Contents]") -> Iterator[list[str]]:
+    from mfvpr.data.published import PUBLISHED
+
+    entry = PUBLISHED.get(dataset.name)
+    sides = ["database", *(sequence.name for sequence in dataset.sequences)]
+    for side, files in zip(sides, contents, strict=True):
+        published = "-"
+        if entry is not None:
+            published = f"{entry.database if side == 'database' else entry.queries[side]:,}"
+        bad = sum(not file.sha256 for file in files.files)
+        yield [side, f"{len(files.files):,}", published, f"{bad:,}"]
+
+
+def _truth(sequence: "QuerySequence", queries: "Contents", database: "Contents") -> Iterator[str]:
+    """What the ground truth of a sequence says, and how many of its queries are database images."""
+    import numpy as np
+
+    from mfvpr.data.sequences import own_rows
+    from mfvpr.evaluation import threshold_words
+
+    if sequence.truth is None:
+        yield "no ground truth"
+    else:
+        [threshold] = sequence.truth.thresholds(tolerances=[_TOLERANCE], radius=_RADIUS)
+        counts = sequence.truth.positives(threshold).counts
+        within = threshold_words(sequence.truth.unit, threshold).strip()
+        yield (f"right images of a query{f' ({within})' if within else ''}: {counts.min()} to {counts.max()}, median "
+               f"{np.median(counts):g}; {(counts == 0).sum():,} queries have none")  # fmt: skip
+    if own := sum(map(bool, own_rows(queries, database))):
+        yield f"{own:,} queries are images of the database"
+
+
+if __name__ == "__main__":
+    main()
