@@ -12,7 +12,8 @@ from mfvpr.archive import Archive
 from mfvpr.data.datasets import Dataset, folder_dataset, sequences_dataset
 from mfvpr.data.ground_truth import CHOICES
 from mfvpr.data.published import published_dataset
-from mfvpr.data.streets import streets_folder
+from mfvpr.data.streets import seasons_folder, streets_folder
+from mfvpr.data.streets.seasons import CONDITIONS, TRUTH
 from mfvpr.declaration import made
 from mfvpr.features import Aggregated, Extractor
 from mfvpr.features.sift import Sift
@@ -37,6 +38,12 @@ def expanded(path: str) -> Path:
 
 def dataset(settings: dict[str, Any], progress: Callable[[int, int], None]) -> Dataset:
     """The data set; `streets` is drawn first where the cache does not have it."""
+    if settings["name"] == "streets_seasons":
+        root = seasons_folder(expanded(settings["cache"]), seed=settings["seed"], progress=progress)
+        return sequences_dataset(
+            root / "database", [root / name for name in CONDITIONS], name="streets_seasons", ground_truth="index",
+            index_file=TRUTH, widen_index=True,
+        )  # fmt: skip
     if "cache" in settings:
         root = streets_folder(expanded(settings["cache"]), seed=settings["seed"], progress=progress)
         return folder_dataset(

@@ -6,5 +6,6 @@ RGB, 0..255.
 """
 
 from mfvpr.data.streets.drawing import draw_streets, streets_folder
+from mfvpr.data.streets.seasons import draw_seasons, seasons_folder
 
-__all__ = ["draw_streets", "streets_folder"]
+__all__ = ["draw_seasons", "draw_streets", "seasons_folder", "streets_folder"]

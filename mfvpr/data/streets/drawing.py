@@ -2,9 +2,10 @@
 
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -22,6 +23,7 @@ from mfvpr.data.streets.weather import WEATHERS, Weather
 
 VERSION = 1  # of the drawings: raise it when they change, so that old caches are not taken for new ones
 SIGHT = 100.0  # panels farther away are not drawn, meters
+Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -41,18 +43,24 @@ def streets_folder(
     seed: int = 0,
     num_frames: int = 100,
     image_size: tuple[int, int] = (448, 336),
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Path:
-    """The folder of the drawn street inside `cache`, drawn now if it is not there yet; see `draw_streets`.
+    """The folder of the drawn street inside `cache`, drawn now if it is not there yet; see `draw_streets`."""
+    name = f"streets-v{VERSION}-seed{seed}-{num_frames}x{image_size[0]}x{image_size[1]}"
+    draw = partial(draw_streets, seed=seed, num_frames=num_frames, image_size=image_size, progress=progress)
+    return kept(cache / name, draw)
+
+
+def kept(folder: Path, draw: Callable[[Path], None]) -> Path:
+    """A folder that `draw(folder)` makes, unless it is there.
 
     It is drawn under another name and renamed when complete, so a killed run leaves nothing that looks complete.
     """
-    folder = cache / f"streets-v{VERSION}-seed{seed}-{num_frames}x{image_size[0]}x{image_size[1]}"
     if not folder.exists():
-        cache.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=cache, prefix=".drawing-") as temporary:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".drawing-") as temporary:
             drawing = Path(temporary) / folder.name
-            draw_streets(drawing, seed=seed, num_frames=num_frames, image_size=image_size, progress=progress)
+            draw(drawing)
             try:
                 os.replace(drawing, folder)
             except OSError:
@@ -67,7 +75,7 @@ def draw_streets(
     seed: int = 0,
     num_frames: int = 100,
     image_size: tuple[int, int] = (448, 336),
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> None:
     """Draw the street into `folder`.
 
@@ -95,6 +103,11 @@ def draw_streets(
     database, queries = plan_drives(seed, num_frames, image_size)
     write_ground_truth(folder / "ground_truth.csv", scene.facades, queries, database)
     shots = plan_shots(folder, scene, seed, database, queries)
+    draw_shots(scene, shots, progress)
+
+
+def draw_shots(scene: Scene, shots: Sequence[Shot], progress: Progress | None) -> None:
+    """Draw the images on threads."""
     pool = ThreadPoolExecutor()
     try:
         drawn = [pool.submit(draw_shot, scene, shot) for shot in shots]

@@ -23,6 +23,8 @@ def expose(image: Image, weather: Weather, rng: Rng) -> Image:
         seen = cv2.GaussianBlur(seen, (0, 0), defocus)
     if exposure.flakes:
         seen = fall_snow(seen, int(rng.uniform(0.5, 1.5) * exposure.flakes), rng)
+    if exposure.streaks:
+        seen = fall_rain(seen, int(rng.uniform(0.5, 1.5) * exposure.streaks), rng)
     seen += exposure.noise * rng.standard_normal(seen.shape, np.float32)
     return np.clip(seen, 0, 255).astype(np.uint8)
 
@@ -44,3 +46,14 @@ def fall_snow(image: Floats, count: int, rng: Rng) -> Floats:
         cv2.circle(flakes, center, round(radius * 16), int(rng.integers(70, 180)), -1, cv2.LINE_AA, 4)
     share = cv2.GaussianBlur(flakes, (0, 0), 0.8).astype(np.float32)[..., None] / 255
     return image + share * (245 - image)
+
+
+def fall_rain(image: Floats, count: int, rng: Rng) -> Floats:
+    """The image with `count` streaks of several lengths in front, all blown to the same side."""
+    height, width = image.shape[:2]
+    streaks, slant = np.zeros((height, width), np.uint8), rng.uniform(-0.3, 0.3)
+    for x, y, length in rng.uniform((0, 0, width / 60), (width, height, width / 14), (count, 3)):
+        start, end = (round(x * 16), round(y * 16)), (round((x + slant * length) * 16), round((y + length) * 16))
+        cv2.line(streaks, start, end, int(rng.integers(40, 120)), 1, cv2.LINE_AA, 4)
+    share = cv2.GaussianBlur(streaks, (0, 0), 0.6).astype(np.float32)[..., None] / 255
+    return image + share * (image.mean() + 60 - image)

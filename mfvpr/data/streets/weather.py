@@ -19,6 +19,7 @@ class Exposure:
     defocus_spread: float = 0.0  # how much more it is at random, at most
     drops: float = 0.0  # how much more it is by drops on the lens, px per unit of severity
     flakes: float = 0.0  # mean number of snow flakes per image
+    streaks: float = 0.0  # mean number of rain streaks per image
 
 
 @dataclass(frozen=True)
@@ -52,5 +53,30 @@ WEATHERS = {
         ambient=(0.56, 0.60, 0.70), lamp=(0.3, 0.22, 0.1), sun=0.0, glow=0.8, snow=0.95,
         zenith=(128, 138, 164), horizon=(184, 188, 204), haze=75.0,
         exposure=Exposure(noise=1.5, defocus=0.3, drops=0.08, flakes=130),
+    ),
+    "dawn": Weather(
+        ambient=(0.68, 0.56, 0.52), lamp=(0.3, 0.21, 0.1), sun=0.4, glow=0.45, snow=0.0,
+        zenith=(98, 112, 152), horizon=(236, 184, 152), haze=85.0,
+        exposure=Exposure(noise=2.0, defocus=0.4),
+    ),
+    "dusk": Weather(
+        ambient=(0.44, 0.41, 0.50), lamp=(0.5, 0.37, 0.18), sun=0.15, glow=0.85, snow=0.0,
+        zenith=(44, 52, 96), horizon=(190, 122, 98), haze=120.0,
+        exposure=Exposure(noise=3.0, motion=0.2, bloom=0.6, defocus=0.5),
+    ),
+    "night-rain": Weather(
+        ambient=(0.23, 0.26, 0.38), lamp=(0.78, 0.58, 0.32), sun=0.0, glow=1.0, snow=0.0,
+        zenith=(10, 12, 24), horizon=(42, 44, 58), haze=65.0,
+        exposure=Exposure(noise=5.0, motion=0.4, bloom=1.4, defocus=0.7, defocus_spread=0.4, drops=0.1, streaks=110),
+    ),
+    "winter": Weather(
+        ambient=(0.74, 0.76, 0.82), lamp=(0, 0, 0), sun=0.1, glow=0.2, snow=0.3,
+        zenith=(168, 176, 188), horizon=(206, 210, 216), haze=110.0,
+        exposure=Exposure(noise=1.5, defocus=0.3),
+    ),
+    "rain": Weather(
+        ambient=(0.54, 0.56, 0.60), lamp=(0.2, 0.15, 0.08), sun=0.0, glow=0.5, snow=0.0,
+        zenith=(112, 118, 128), horizon=(160, 164, 170), haze=70.0,
+        exposure=Exposure(noise=2.0, defocus=0.4, drops=0.08, streaks=160),
     ),
 }  # fmt: skip
