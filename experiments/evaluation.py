@@ -41,7 +41,7 @@ def evaluate(settings: dict[str, Any]) -> None:
     with run_folder.claimed(settings) as folder:
         outcome = evaluated(settings)
         run_folder.leave(
-            folder, settings, truth.described(settings, outcome.images.dataset), text=text(outcome),
+            folder, settings, ground_truth(outcome), text=text(outcome),
             write=lambda new: write(new, outcome), figures=outcome.figures,
         )  # fmt: skip
 
@@ -84,6 +84,11 @@ def evaluated(settings: dict[str, Any]) -> Outcome:
     drawn = [*figures(judged, tools.extractor, shown, histogram), *(confidence_figures(assured) if shown else [])]
     deciding = histogram if main == "histogram" else None
     return Outcome(settings, images, tools, judged, assured, parameters, deciding, drawn)
+
+
+def ground_truth(outcome: Outcome) -> dict[str, Any]:
+    """What the recall refers to."""
+    return truth.described(outcome.settings, outcome.images.dataset)
 
 
 def text(outcome: Outcome) -> str:

@@ -28,7 +28,8 @@ def help_text(config: str, arguments: Sequence[str]) -> str:
 
 def _parts(config: str, chosen: dict[str, str | None]) -> Iterator[str]:
     yield from (line.removeprefix("#").removeprefix(" ") for line in _header(CONF / f"{config}.yaml"))
-    yield "\nGroups, each with the choice whose settings follow, and other choices:\n"
+    if chosen:
+        yield "\nGroups, each with the choice whose settings follow, and other choices:\n"
     for group, choice in chosen.items():
         others = ", ".join(other for other in choices(group) if other != choice)
         yield f"  {group}={choice or 'null'}".ljust(26) + others

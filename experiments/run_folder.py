@@ -47,6 +47,18 @@ def leave(
         figures: one that cannot be drawn costs a warning.
     """
     try:
+        keep(folder, settings, ground_truth, write)
+    finally:
+        print(f"\n{text}", flush=True)
+    draw(folder, figures)
+    print(f"results: {folder}")
+
+
+def keep(
+    folder: Path, settings: Mapping[str, Any], ground_truth: Mapping[str, Any], write: Callable[[Path], None]
+) -> None:
+    """The files of a run, with what made them; arguments as of `leave`."""
+    try:
         with runs.writing(folder) as new:
             write(new)
             runs.write_json(new / "run.json", _about(settings, ground_truth))
@@ -55,14 +67,15 @@ def leave(
             f"{folder}: the results cannot be written ({error.strerror}); they are printed above, and features and "
             "matches are kept where there is a store: make room, or name another folder with out=DIR"
         ) from error
-    finally:
-        print(f"\n{text}", flush=True)
-    for name, draw in console.track("figures")(figures, len(figures)):
+
+
+def draw(folder: Path, figures: Sequence[Figure]) -> None:
+    """The figures of a run; one that cannot be drawn costs a warning."""
+    for name, drawn in console.track("figures")(figures, len(figures)):
         try:
-            draw(folder / "figures" / name)
+            drawn(folder / "figures" / name)
         except Exception as error:
             console.tell(f"warning: {folder}/figures/{name}: not drawn ({error})")
-    print(f"results: {folder}")
 
 
 def _about(settings: Mapping[str, Any], ground_truth: Mapping[str, Any]) -> dict[str, Any]:

@@ -114,6 +114,10 @@ RULES: dict[str, Rule] = {
     "cohort": either(_INDEX, None),
     ".confidence": either(_PATH, None),
     ".threshold": either(number(0, 1), None),
+    # the paper's evaluation
+    ".data": either(_PATH, None),
+    ".datasets": either(list_of(_TEXT), None),
+    ".systems": either(list_of(_TEXT), None),
     # report
     "tolerances": list_of(_INDEX),
     "radius": _POSITIVE,

@@ -142,8 +142,8 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, re.sub("[\ud800-\udfff]", lambda found: f"\\u{ord(found[0]):04x}", text) + "\n")
 
 
-def write_table(folder: Path, table: Table, heading: str) -> None:
+def write_table(folder: Path, table: Table, heading: str, *, name: str = "table") -> None:
     """The same table as Markdown, CSV and LaTeX."""
-    write_text(folder / "table.md", f"{heading}\n\n{table.markdown()}")
-    write_text(folder / "table.csv", table.csv())
-    write_text(folder / "table.tex", f"% {heading}\n{table.latex()}")
+    write_text(folder / f"{name}.md", f"{heading}\n\n{table.markdown()}")
+    write_text(folder / f"{name}.csv", table.csv())
+    write_text(folder / f"{name}.tex", f"% {heading}\n{table.latex()}")

@@ -1,0 +1,153 @@
+"""The paper's figures, of what was evaluated here."""
+
+import csv
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from experiments.paper.lineup import Row
+from experiments.paper.printed import average, printed
+from experiments.paper.tables import OVERALL, TOLERANCES, Found
+from mfvpr.data.datasets import Dataset, ImageFolder
+from mfvpr.data.files import printable, replacing
+from mfvpr.data.images import resize
+from mfvpr.report import runs
+
+_MIDDLE = 1  # of the tolerances: the paper's figure
+_OURS, _THEIRS = "#2f6fb0", "#c9a227"
+_STEPS = {"filter": "#7a9e9f", "features": "#c98b2d", "matching": "#2f6fb0", "scores": "#7b4b94"}
+_SIDE = 300  # px of an image's longer side among the failures
+
+
+def figures(
+    found: Found, failures: Mapping[str, Path], growth: Mapping[str, Mapping[int, float]]
+) -> Iterator[runs.Figure]:
+    """Those for which there are numbers.
+
+    Args:
+        found: what was evaluated.
+        failures: a csv of failures by data set.
+        growth: see `timing.growth`.
+    """
+    if bars := _averages(found):
+        yield "averages.png", partial(draw_averages, bars=bars)
+    if found.seconds:
+        yield "speed.png", partial(draw_speed, rows=found.rows, seconds=found.seconds)
+    if growth:
+        yield "growth.png", partial(draw_growth, growth=growth)
+    if failures:
+        yield "failures.png", partial(draw_failures, datasets=found.datasets, files=failures)
+
+
+def _averages(found: Found) -> list[tuple[str, float | None, float | None]]:
+    """(title, mean over the data sets here, the printed mean) within 2 frames, of rows that have one."""
+    tolerance = TOLERANCES[_MIDDLE]
+    bars = []
+    for row in found.rows:
+        own = [
+            one.recall[OVERALL][tolerance][1]
+            for name in found.datasets
+            if (one := found.evaluated.get((row.name, name))) and tolerance in one.recall[OVERALL]
+        ]
+        theirs = average(printed()["recall"].get(row.name, {}))
+        if own or theirs is not None:
+            bars.append((row.title, float(np.mean(own)) if own else None, None if theirs is None else theirs[_MIDDLE]))
+    return bars
+
+
+def draw_averages(path: Path, bars: Sequence[tuple[str, float | None, float | None]]) -> None:
+    """Mean recall within 2 frames, beside the paper's mean over its own six data sets."""
+    figure, axes = _canvas(9, 1.2 + 0.3 * len(bars))
+    places = np.arange(len(bars))
+    sides = [("over the data sets here", 1, _OURS), ("printed, over the paper's six", 2, _THEIRS)]
+    for shift, (label, at, color) in zip((-0.2, 0.2), sides, strict=True):
+        axes.barh(places + shift, [float(bar[at] or 0) for bar in bars], 0.38, label=label, color=color)
+        for place, bar in zip(places, bars, strict=True):
+            if (value := bar[at]) is not None:
+                axes.text(float(value) + 0.5, place + shift, f"{value:.1f}", va="center", fontsize=7)
+    axes.set_yticks(places, [bar[0] for bar in bars], fontsize=8)
+    axes.invert_yaxis()
+    axes.set_xlim(0, 108)
+    axes.set_xlabel("mean Recall@1 within 2 frames, %")
+    axes.legend(loc="lower right", fontsize=8)
+    _save(figure, path)
+
+
+def draw_speed(path: Path, rows: Sequence[Row], seconds: Mapping[str, Mapping[str, float]]) -> None:
+    """Seconds of a query, step by step."""
+    shown = [row for row in rows if row.name in seconds]
+    figure, axes = _canvas(9, 1.2 + 0.3 * len(shown))
+    left = np.zeros(len(shown))
+    for step, color in _STEPS.items():
+        width = np.array([seconds[row.name][step] for row in shown])
+        axes.barh(np.arange(len(shown)), width, 0.7, left=left, label=step, color=color)
+        left += width
+    for place, total in enumerate(left):
+        axes.text(total, place, f" {total:.3f}", va="center", fontsize=7)
+    axes.set_yticks(np.arange(len(shown)), [row.title for row in shown], fontsize=8)
+    axes.invert_yaxis()
+    axes.set_xlim(0, 1.12 * left.max())
+    axes.set_xlabel("seconds of a query")
+    axes.legend(loc="lower right", fontsize=8)
+    _save(figure, path)
+
+
+def draw_growth(path: Path, growth: Mapping[str, Mapping[int, float]]) -> None:
+    """Seconds of a query as the database grows: the search grows, the rest stays."""
+    figure, axes = _canvas(7, 4.2)
+    for title, by_size in growth.items():
+        axes.loglog([*by_size], [*by_size.values()], marker="o", markersize=3, label=title)
+    axes.set_xlabel("images of the database")
+    axes.set_ylabel("seconds of a query")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    _save(figure, path)
+
+
+def draw_failures(path: Path, datasets: Mapping[str, Dataset], files: Mapping[str, Path], each: int = 2) -> None:
+    """Query, answer and truth, where the answer scores higher than a right image among the candidates."""
+    cases = [(name, *case) for name, file in files.items() for case in _failures(file, each)]
+    figure = Figure(figsize=(9.5, 0.4 + 2.4 * max(len(cases), 1)), layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, (name, sequence, *images) in zip(
+        figure.subplots(max(len(cases), 1), 3, squeeze=False), cases, strict=False
+    ):
+        dataset = datasets[name]
+        queries = next((one.images for one in dataset.sequences if one.name == sequence), dataset.sequences[0].images)
+        folders = (queries, dataset.database, dataset.database)
+        for one, folder, image, word in zip(axes, folders, images, ("query", "answer", "truth"), strict=True):
+            one.set_axis_off()
+            one.imshow(_small(folder, image))
+            where = f"{name} {sequence}".strip() if word == "query" else ""
+            one.set_title(printable(f"{where} {word}: {image}".strip()), fontsize=7, parse_math=False)
+    _save(figure, path)
+
+
+def _failures(file: Path, number: int) -> Iterator[tuple[str, str, str, str]]:
+    """(sequence, query, answer, right answer) of the clearest failures that the filter did not cause."""
+    with file.open(newline="", encoding="utf-8", errors="surrogateescape") as lines:
+        rows = [row for row in csv.DictReader(lines) if row["right_answer"]]
+    rows.sort(key=lambda row: -float(row["margin"]))
+    yield from ((row.get("sequence", ""), row["query"], row["answer"], row["right_answer"]) for row in rows[:number])
+
+
+def _small(folder: ImageFolder, name: str) -> np.ndarray:
+    image = folder.read(folder.names.index(name))
+    scale = _SIDE / max(image.shape[:2])
+    return resize(image, (round(image.shape[1] * scale), round(image.shape[0] * scale)))
+
+
+def _canvas(width: float, height: float) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots()
+
+
+def _save(figure: Figure, path: Path) -> None:
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)

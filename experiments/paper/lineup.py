@@ -1,0 +1,154 @@
+"""What is evaluated: the rows of the tables, the evaluations that give them, and the data sets that are here."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from experiments.build import expanded
+from experiments.settings import SettingsError
+from mfvpr.data.published import PUBLISHED
+from mfvpr.results import FILTER
+from mfvpr.weights.files import is_installed
+from mfvpr.weights.registry import REGISTRY, Entry
+
+DRAWN = "streets_seasons"
+REAL = {  # those without a layout of their own, by the folders that they hold
+    "grief_season": ("database", "queries"),
+    "corridor": ("ref", "query"),
+}
+COMBINED = f"histogram + {FILTER}"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of the tables.
+
+    Attributes:
+        name: of the row, in the printed numbers as well.
+        title: for people.
+        run: the evaluation that gives it.
+        ranking: which of the evaluation's; None = the one that decides.
+    """
+
+    name: str
+    title: str
+    run: str
+    ranking: str | None = None
+
+
+@dataclass(frozen=True)
+class Place:
+    """A data set that is here, and its folder; None = it is drawn."""
+
+    name: str
+    root: Path | None
+
+
+_SSM = {"hist": "hist", "anchor": "anchor", "sum": "sum", "ran_8": "RAN 8 px", "ran_24": "RAN 24 px"}
+_MIX = {"hist_10": "hist 10", "hist_50": "hist 50", "hist_comb_10": "hist-comb 10", "hist_comb_50": "hist-comb 50"}
+_PAPER = (
+    Row("patch_netvlad_performance", "Patch-NV perf.", "patch_netvlad_performance"),
+    Row("patch_netvlad_speed", "Patch-NV speed", "patch_netvlad_speed"),
+    Row("mixvpr", "MixVPR", "mix_hist_50", FILTER),
+    Row("selavpr_pitts_stage_1", "SelaVPR pits. stage 1", "selavpr_pitts", FILTER),
+    Row("selavpr_pitts", "SelaVPR pits.", "selavpr_pitts"),
+    Row("selavpr_msls_stage_1", "SelaVPR msls stage 1", "selavpr_msls", FILTER),
+    Row("selavpr_msls", "SelaVPR msls", "selavpr_msls"),
+    Row("ssm_vpr", "SSM-VPR", "ssm_vpr"),
+    *(Row(f"ssm_{name}", f"SSM-{title}", f"ssm_{name}") for name, title in _SSM.items()),
+    *(Row(f"mix_{name}", f"Mix-{title}", f"mix_{name}") for name, title in _MIX.items()),
+    Row("mix_hist_aliked_50", "Mix-hist 50, ALIKED", "mix_hist_aliked_50"),
+)
+_SCORES = {"count": "count", "rapid": "rapid", "sum": "sum", "anchor": "anchor", "histogram": "hist 50",
+           "homography_8": "RAN 8 px", "homography_24": "RAN 24 px", COMBINED: "hist-comb 50"}  # fmt: skip
+_NAMES = {"histogram": "hist_50", "homography_8": "ran_8", "homography_24": "ran_24", COMBINED: "hist_comb_50"}
+
+
+def _stand_ins(features: str, title: str) -> Iterator[Row]:
+    """The methods with features whose weights are here, after VLAD of the same features."""
+    yield Row(f"{features}_vlad", f"VLAD of {title}", f"{features}_50", FILTER)
+    for ranking, words in _SCORES.items():
+        yield Row(f"{features}_{_NAMES.get(ranking, ranking)}", f"{title}-{words}", f"{features}_50", ranking)
+    yield Row(f"{features}_hist_10", f"{title}-hist 10", f"{features}_10", "histogram")
+    yield Row(f"{features}_hist_comb_10", f"{title}-hist-comb 10", f"{features}_10", COMBINED)
+    yield Row(f"{features}_mfvpr", f"{title}, system=mfvpr", f"{features}_mfvpr")
+
+
+ROWS = (*_PAPER, *_stand_ins("sift", "SIFT"), *_stand_ins("aliked", "ALIKED"))
+
+_SIFT, _ALIKED = (
+    ("features=sift", "retrieval=vlad"),
+    ("features=aliked", "features.weights=aliked-n32", "retrieval=vlad"),
+)
+_ALL, _FEW = ("scorer=compared", "candidates=50"), ("scorer=histogram", "candidates=10")
+_RUNS = {
+    "sift_50": (*_SIFT, *_ALL),
+    "sift_10": (*_SIFT, *_FEW),
+    "sift_mfvpr": ("system=mfvpr", "features=sift"),
+    "aliked_50": (*_ALIKED, *_ALL),
+    "aliked_10": (*_ALIKED, *_FEW),
+    "aliked_mfvpr": ("system=mfvpr",),
+}
+
+
+def overrides(run: str, dataset: str) -> tuple[str, ...]:
+    """Settings of `experiments.evaluate` that make an evaluation, without its data set."""
+    chosen = _RUNS.get(run, (f"system={run}",))
+    if run.startswith("selavpr"):
+        return (*chosen, "candidates=50")
+    if run.startswith("patch_netvlad") and dataset == "robotcar_seasons":
+        return (*chosen, "features.image_size=[480,480]", *_reach(run))
+    return chosen
+
+
+def _reach(run: str) -> tuple[str, ...]:
+    """Where patches are scored by their grid, that of square images."""
+    return ("scorer.size=[26,26]",) if run == "patch_netvlad_speed" else ()
+
+
+def chosen_rows(names: Sequence[str] | None) -> tuple[Row, ...]:
+    """Rows by name, in the order of the tables; all for None."""
+    known = [row.name for row in ROWS]
+    for name in names or ():
+        if name not in known:
+            raise SettingsError(f"systems=[{name}]: expected some of {', '.join(known)}")
+    return tuple(row for row in ROWS if names is None or row.name in names)
+
+
+def places(data: str | None, names: Sequence[str] | None) -> tuple[list[Place], list[str]]:
+    """The data sets that are here, and a line for each that is not."""
+    known = [DRAWN, *REAL, *PUBLISHED]
+    for name in names or ():
+        if name not in known:
+            raise SettingsError(f"datasets=[{name}]: expected some of {', '.join(known)}")
+    root = None if data is None else expanded(data)
+    if root is not None and not root.is_dir():
+        raise SettingsError(f"data={data}: expected a folder with a folder per data set, got nothing; check the path")
+    found, missing = [], []
+    for name in known if names is None else [one for one in known if one in names]:
+        if name == DRAWN:
+            found.append(Place(name, None))
+        elif folder := _folder(root, name):
+            found.append(Place(name, folder))
+        else:
+            missing.append(f"{name}: {_needed(name, data)}")
+    return found, missing
+
+
+def _folder(root: Path | None, name: str) -> Path | None:
+    names = PUBLISHED[name].folders if name in PUBLISHED else (name,)
+    return next((root / one for one in names if (root / one).is_dir()), None) if root else None
+
+
+def _needed(name: str, data: str | None) -> str:
+    where = f"{data or 'data=DIR'}/{name}"
+    if name in REAL:
+        return f"needs {where} with {' and '.join(REAL[name])}"
+    return f"needs {where}, from {PUBLISHED[name].source}"
+
+
+def missing_weights(settings: Mapping[str, Any]) -> list[Entry]:
+    """Of the networks that settings name, those whose weights are not installed."""
+    named = [settings[group].get("weights") for group in ("features", "retrieval", "matching")]
+    return [REGISTRY[name] for name in dict.fromkeys(named) if name in REGISTRY and not is_installed(REGISTRY[name])]

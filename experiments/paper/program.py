@@ -1,0 +1,163 @@
+"""Every system on every data set that is here; then tables and figures of them all."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from experiments import build
+from experiments.console import tell
+from experiments.errors import how_to_install
+from experiments.paper import figures, lineup, runs, timing
+from experiments.paper.lineup import Place, Row
+from experiments.paper.tables import Evaluated, Found, evaluated, tables
+from experiments.prepare import dataset_of
+from experiments.settings import SettingsError
+from mfvpr.data.datasets import Dataset
+from mfvpr.errors import InputError
+from mfvpr.report import runs as run_folders
+
+_BEST = ("mix_hist_50", "aliked_hist_50", "sift_hist_50")  # whose failures are shown: the first that is here
+
+
+def paper(settings: dict[str, Any]) -> None:
+    """Evaluate what is not evaluated yet, then write tables and figures, and print the recalls."""
+    rows = lineup.chosen_rows(settings["systems"])
+    found, missing = lineup.places(settings["data"], settings["datasets"])
+    rows, lacking = _with_weights(rows, found, settings)
+    for line in (*missing, *lacking):
+        tell(f"left out: {line}")
+    if not found or not rows:
+        raise SettingsError("nothing to evaluate: the lines above say what is missing")
+    datasets, failed = _evaluate_all(rows, found, settings)
+    here = [place for place in found if place.name in datasets]
+    if not here:
+        raise SettingsError(f"nothing was evaluated: {failed[0]}")
+    out = Path(settings["out"]).expanduser()
+    results = _collected(rows, here, settings)
+    times = _timed(rows, here, datasets, settings, out)
+    everything = Found(rows, datasets, results, *_by_row(rows, times))
+    _write(out, everything, here, settings)
+    if failed:
+        raise SettingsError(f"{len(failed)} of the evaluations could not be made: {failed[0]}")
+
+
+def _with_weights(
+    rows: Sequence[Row], found: Sequence[Place], settings: Mapping[str, Any]
+) -> tuple[list[Row], list[str]]:
+    """Rows whose networks are installed, and a line for each evaluation whose are not."""
+    lines: dict[str, str] = {}
+    for run in dict.fromkeys(row.run for row in rows) if found else ():
+        if entries := lineup.missing_weights(runs.settings_of(run, found[0], settings)):
+            needs = "; ".join(f"{entry.name} ({entry.file}): {how_to_install(entry)}" for entry in entries)
+            lines[run] = f"{run}: needs {needs}"
+    return [row for row in rows if row.run not in lines], list(lines.values())
+
+
+def _evaluate_all(
+    rows: Sequence[Row], found: Sequence[Place], settings: Mapping[str, Any]
+) -> tuple[dict[str, Dataset], list[str]]:
+    """The data sets that could be read, and a line for each evaluation that could not be made."""
+    names = list(dict.fromkeys(row.run for row in rows))
+    datasets: dict[str, Dataset] = {}
+    failed: list[str] = []
+    for number, place in enumerate(found):
+        try:
+            chosen = runs.settings_of(names[0], place, settings)
+            datasets[place.name] = dataset = dataset_of(chosen["dataset"])
+            archive = build.archive(chosen)
+            sides = {one.name: one.images for one in dataset.sequences} | {"the database": dataset.database}
+            images = {side: archive.contents(folder).fingerprint for side, folder in sides.items()}
+        except InputError as error:
+            datasets.pop(place.name, None)
+            failed.append(f"{place.name}: {error}")
+            tell(f"left out: {failed[-1]}")
+            continue
+        for turn, run in enumerate(names):
+            chosen = runs.settings_of(run, place, settings)
+            folder, expected = runs.folder_of(run, place, settings), runs.made_of(chosen, images)
+            if runs.is_done(folder, expected):
+                continue
+            tell(f"{number * len(names) + turn + 1} of {len(found) * len(names)}: {run} on {place.name}")
+            try:
+                runs.evaluate(chosen, expected)
+            except InputError as error:
+                failed.append(f"{run} on {place.name}: {error}")
+                tell(f"left out: {failed[-1]}")
+    return datasets, failed
+
+
+def _collected(
+    rows: Sequence[Row], here: Sequence[Place], settings: Mapping[str, Any]
+) -> dict[tuple[str, str], Evaluated]:
+    collected = {}
+    for place in here:
+        for run in dict.fromkeys(row.run for row in rows):
+            folder = runs.folder_of(run, place, settings)
+            found = runs.results(folder) if (folder / "results.json").is_file() else []
+            for row in rows:
+                if row.run == run and (one := evaluated(row, found)):
+                    collected[row.name, place.name] = one
+    return collected
+
+
+def _timed(
+    rows: Sequence[Row], here: Sequence[Place], datasets: Mapping[str, Dataset], settings: Mapping[str, Any], out: Path
+) -> dict[str, dict[str, float]]:
+    """Seconds and bytes by evaluation, on RobotCar's snow where that is here; measured once."""
+    place = next((one for one in here if one.name == "robotcar_seasons"), here[0])
+    times = {}
+    for run in dict.fromkeys(row.run for row in rows):
+        path = out / "seconds" / f"{run}.json"
+        if not path.is_file():
+            tell(f"timing: {run} on {place.name}")
+            try:
+                measured = timing.measured(runs.settings_of(run, place, settings), datasets[place.name])
+            except InputError as error:
+                tell(f"left out: seconds of {run}: {error}")
+                continue
+            path.parent.mkdir(parents=True, exist_ok=True)
+            run_folders.write_json(path, measured | {"data_set": place.name} | timing.device())
+        times[run] = json.loads(path.read_text(encoding="utf-8"))
+    return times
+
+
+def _by_row(
+    rows: Sequence[Row], times: Mapping[str, Mapping[str, float]]
+) -> tuple[dict[str, Mapping[str, float]], dict[str, float]]:
+    """Of the rows whose ranking was timed: an evaluation's first score, or its histogram."""
+    timed = {row.name: times[row.run] for row in rows if row.run in times and row.ranking in (None, "histogram")}
+    sized = {row.name: times[row.run]["bytes"] for row in rows if row.name in timed}
+    return timed, sized
+
+
+def _write(out: Path, found: Found, here: Sequence[Place], settings: Mapping[str, Any]) -> None:
+    for name, heading, table in tables(found):
+        run_folders.write_table(out / "tables", table, heading, name=name)
+        if name in ("recall", "averages"):
+            print(f"\n{heading}\n\n{table.text()}", end="")
+    failures = {place.name: path for place in here if (path := _failures(found.rows, place, settings))}
+    for name, draw in figures.figures(found, failures, _growth(found, out)):
+        draw(out / "figures" / name)
+    print(f"\ntables and figures: {out}")
+
+
+def _failures(rows: Sequence[Row], place: Place, settings: Mapping[str, Any]) -> Path | None:
+    """The failures of the histogram of shifts, of the first of some systems that is here."""
+    runs_here = [row.run for name in _BEST for row in rows if row.name == name]
+    paths = (runs.folder_of(run, place, settings) / "failures" / "histogram.csv" for run in runs_here)
+    return next((path for path in paths if path.is_file()), None)
+
+
+def _growth(found: Found, out: Path) -> dict[str, dict[int, float]]:
+    """Of the same systems, measured once."""
+    path = out / "seconds" / "growth.json"
+    if not path.is_file():
+        numbers = {
+            row.title: (int(times["descriptor"]), sum(times[step] for step in timing.STEPS))
+            for row in found.rows
+            if row.name in _BEST and (times := found.seconds.get(row.name)) and times["descriptor"]
+        }
+        run_folders.write_json(path, timing.growth(numbers))
+    read = json.loads(path.read_text(encoding="utf-8"))
+    return {title: {int(size): seconds for size, seconds in by_size.items()} for title, by_size in read.items()}

@@ -1,0 +1,101 @@
+"""The evaluations, each in a run folder of its own; what is finished is not done again."""
+
+import json
+from collections.abc import Mapping
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import hydra
+import jax
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import OmegaConf
+
+from experiments import evaluation, run_folder
+from experiments.console import tell
+from experiments.paper.lineup import Place, overrides
+from experiments.quoting import as_typed
+from experiments.settings import CONF, SettingsError, check
+from mfvpr.fingerprints import fingerprint
+from mfvpr.report import runs
+from mfvpr.weights import files
+from mfvpr.weights.registry import REGISTRY
+
+FIGURES = 2  # queries that each run draws
+_MADE_OF = "made_of.json"
+_SHARED = ("store", "memory", "devices")  # settings of both programs
+_FREE = {"out", "store", "memory", "devices", "command"}  # of which no number depends
+
+
+def settings_of(run: str, place: Place, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The checked settings of an evaluation."""
+    chosen = [f"dataset={place.name}", *overrides(run, place.name), f"figures={FIGURES}"]
+    if place.root is not None:
+        chosen.append(as_typed(f"dataset.root={place.root}"))
+    running = GlobalHydra.instance().is_initialized()
+    with nullcontext() if running else hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        composed: Any = OmegaConf.to_container(hydra.compose("config", chosen), resolve=True)
+    composed |= {name: settings[name] for name in _SHARED}
+    composed["out"] = str(folder_of(run, place, settings))
+    check(composed)
+    return composed | {"command": f"python -m experiments.evaluate {' '.join(chosen)}"}
+
+
+def folder_of(run: str, place: Place, settings: Mapping[str, Any]) -> Path:
+    """Its run folder."""
+    return Path(settings["out"]).expanduser() / "runs" / place.name / run
+
+
+def made_of(settings: Mapping[str, Any], images: Mapping[str, str]) -> dict[str, str]:
+    """What an evaluation follows from, each as a hash: settings, images, weights, and the code's version."""
+    free = {name: value for name, value in settings.items() if name not in _FREE}
+    free["dataset"] = {name: value for name, value in settings["dataset"].items() if name not in ("root", "cache")}
+    free["dataset"] |= {name: None for name in ("database", "queries") if name in free["dataset"]}  # folders
+    names = [settings[group].get("weights") for group in ("features", "retrieval", "matching")]
+    weights = {name: files.fingerprint(name) for name in names if name in REGISTRY}
+    return {
+        "settings": fingerprint(free), "images": fingerprint(dict(images)), "weights": fingerprint(weights),
+        "version": runs.versions()["mfvpr"],
+    }  # fmt: skip
+
+
+def is_done(folder: Path, expected: Mapping[str, str]) -> bool:
+    """Whether a run is finished there.
+
+    Raises:
+        SettingsError: one of other settings, images, weights or of another version is.
+    """
+    if not (folder / "results.json").is_file():
+        return False
+    try:
+        found = json.loads((folder / _MADE_OF).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        found = {}
+    other = [name for name, value in expected.items() if not isinstance(found, dict) or found.get(name) != value]
+    if other:
+        raise SettingsError(f"{folder}: a finished run of other {' and '.join(other)} is there; remove it, or name "
+                            "another folder with out=DIR")  # fmt: skip
+    return True
+
+
+def evaluate(settings: Mapping[str, Any], made_of: Mapping[str, str]) -> None:
+    """One evaluation into its run folder; its table goes to no terminal."""
+    with run_folder.claimed(settings) as folder:
+        outcome = evaluation.evaluated(dict(settings))
+
+        def write(new: Path) -> None:
+            evaluation.write(new, outcome)
+            runs.write_json(new / _MADE_OF, dict(made_of))
+
+        run_folder.keep(folder, settings, evaluation.ground_truth(outcome), write)
+        run_folder.draw(folder, outcome.figures)
+    jax.clear_caches()  # compiled programs of one data set are of no use to another, and each takes maps of memory
+
+
+def results(folder: Path) -> list[dict[str, Any]]:
+    """Rows of a finished run."""
+    try:
+        return json.loads((folder / "results.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        tell(f"warning: {folder}/results.json cannot be read; remove the folder, and run this again")
+        return []

@@ -1,0 +1,230 @@
+"""The paper's tables, of what was evaluated here, each number beside the printed one."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from experiments.paper.lineup import Row
+from experiments.paper.printed import average, printed, printed_recall
+from mfvpr.data.datasets import MEANS, Dataset
+from mfvpr.report.tables import Table
+
+OVERALL = ""  # in place of a sequence: the only one, or the plain mean of several
+TOLERANCES = (1, 2, 5)  # of the printed recalls
+_NONE = "-"
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """What a row's ranking achieves on a data set.
+
+    Attributes:
+        recall: in %, by sequence (`OVERALL` for all), threshold and depth.
+        about: settings of the evaluation, as its results keep them.
+    """
+
+    recall: Mapping[str, Mapping[float, Mapping[int, float]]]
+    about: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Found:
+    """All that was evaluated.
+
+    Attributes:
+        rows: of the tables.
+        datasets: that are here, by name.
+        evaluated: by row and data set.
+        seconds: by row: of a query, by step; see `timing`.
+        sizes: by row: bytes of an image's features in float32, as the paper counts them.
+    """
+
+    rows: Sequence[Row]
+    datasets: Mapping[str, Dataset]
+    evaluated: Mapping[tuple[str, str], Evaluated]
+    seconds: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    sizes: Mapping[str, float] = field(default_factory=dict)
+
+    def known(self, rows: Iterable[Row], datasets: Iterable[str]) -> list[Row]:
+        """Those that were evaluated on one of the data sets, or are printed for it."""
+        names = [*datasets]
+        return [
+            row for row in rows
+            if any((row.name, name) in self.evaluated or printed_recall(row.name, name) for name in names)
+        ]  # fmt: skip
+
+
+def evaluated(row: Row, results: Sequence[Mapping[str, Any]]) -> Evaluated | None:
+    """A row's part of an evaluation's results; None where it has none."""
+    own = [one for one in results if (one["decides"] if row.ranking is None else one["system"] == row.ranking)]
+    recall: dict[str, dict[float, dict[int, float]]] = {}
+    for one in own:
+        sequence, threshold = one.get("sequence", OVERALL), one.get("tolerance", one.get("radius", 0))
+        depths = {int(k): 100 * value for k, value in one["recall_at"].items()}
+        recall.setdefault(OVERALL if sequence == MEANS[0] else sequence, {})[threshold] = depths
+    recall.pop(MEANS[1], None)
+    return Evaluated(recall, own[0]) if own and OVERALL in recall else None
+
+
+def beside(ours: float | None, theirs: float | None, form: str = ".1f") -> str:
+    """Both numbers and their difference, as far as there are."""
+    if ours is None:
+        return _NONE if theirs is None else f"({theirs:{form}})"
+    if theirs is None:
+        return f"{ours:{form}}"
+    return f"{ours:{form}} ({theirs:{form}}, {round(ours, 1) - theirs:+{form}})"
+
+
+def tables(found: Found) -> Iterator[tuple[str, str, Table]]:
+    """(name, heading, table) of each that is not empty."""
+    note = "printed numbers and differences in brackets"
+    candidates = (
+        ("data_sets", f"Data sets (Table I); {note}", data_sets(found)),
+        ("settings", "Settings (Table II); the printed ones are in printed.yaml", settings(found)),
+        ("recall", f"Recall@1 in %, by data set and threshold (Tables III and VII); {note}", recalls(found)),
+        *(
+            (f"sequences_{name}", f"Recall@1 in % by sequence of {name} (Table IV); {note}", sequences(found, name))
+            for name, dataset in found.datasets.items()
+            if len(dataset.sequences) > 1
+        ),
+        ("averages", f"Average Recall@1 in % (figure 8); {note}", averages(found)),
+        ("depths", f"Recall@1, @5 and @10 in %, by data set (Table VIII); {note}", depths(found)),
+        ("sizes", f"Size of the database in MiB, of float32 (Table V); {note}", sizes(found)),
+        ("seconds", f"Seconds of a query by step (Table VI: an RTX 2080 Ti; here the device of report.json); {note}",
+         seconds(found)),
+    )  # fmt: skip
+    yield from (one for one in candidates if one[2].rows)
+
+
+def data_sets(found: Found) -> Table:
+    """Images of reference and queries."""
+    rows = []
+    for name, dataset in found.datasets.items():
+        ours = [len(dataset.database), sum(len(sequence.images) for sequence in dataset.sequences)]
+        theirs = printed()["data_sets"].get(name, [None, None])
+        rows.append([name, *(beside(*both, form=",.0f") for both in zip(ours, theirs, strict=True))])
+    return Table(["data set", "reference", "queries"], rows)
+
+
+def settings(found: Found) -> Table:
+    """Filter and features with the sizes of their images, and candidates."""
+    lines: dict[str, list[str]] = {}
+    for (row, _), one in found.evaluated.items():
+        about = one.about
+        sides = [about[group].get("image_size") for group in ("filter", "features")]
+        sizes = [" x ".join(map(str, side)) if side else _NONE for side in sides]
+        lines[row] = [about["filter"]["name"], sizes[0], about["features"]["name"], sizes[1], str(about["candidates"])]
+    rows = [[row.title, *lines[row.name]] for row in found.rows if row.name in lines]
+    return Table(["system", "filter", "its images", "features", "their images", "candidates"], rows, text_columns=5)
+
+
+def recalls(found: Found) -> Table:
+    """All systems by data set and threshold."""
+    columns = [(name, threshold) for name in found.datasets for threshold in _thresholds(found, name)]
+    rows = []
+    for row in found.known(found.rows, found.datasets):
+        cells = [_cell(found, row, name, OVERALL, threshold) for name, threshold in columns]
+        rows.append([row.title, *cells])
+    return Table(["system", *(f"{name} ±{threshold:g}" for name, threshold in columns)], rows if columns else [])
+
+
+def sequences(found: Found, dataset: str) -> Table:
+    """All systems in each sequence of a data set, and their plain mean."""
+    thresholds = _thresholds(found, dataset)
+    parts = [sequence.name for sequence in found.datasets[dataset].sequences]
+    columns = [(part, threshold) for part in (*parts, OVERALL) for threshold in thresholds]
+    rows = [
+        [row.title, *(_cell(found, row, dataset, part, threshold) for part, threshold in columns)]
+        for row in found.known(found.rows, [dataset])
+    ]
+    return Table(
+        ["system", *(f"{part or 'mean'} ±{threshold:g}" for part, threshold in columns)], rows if columns else []
+    )
+
+
+def averages(found: Found) -> Table:
+    """The paper's mean where all six data sets are here; otherwise the plain mean of those that every row has."""
+    rows = []
+    common = [name for name in found.datasets if {*TOLERANCES} <= {*_thresholds(found, name)}]
+    for row in found.rows:
+        own = {name: _at(found.evaluated[row.name, name]) for name in common if (row.name, name) in found.evaluated}
+        theirs = average(printed()["recall"].get(row.name, {}))
+        ours = average(own)
+        plain = np.mean([own[name] for name in common], axis=0) if common and len(own) == len(common) else None
+        if ours is None and plain is None and theirs is None:
+            continue
+        cells = [beside(*both) for both in zip(_or_none(ours), _or_none(theirs), strict=True)]
+        rows.append([row.title, *cells, *(beside(one, None) for one in _or_none(plain))])
+    header = [f"of the six ±{t}" for t in TOLERANCES] + [f"of {len(common)} here ±{t}" for t in TOLERANCES]
+    return Table(["system", *header], rows)
+
+
+def depths(found: Found) -> Table:
+    """Recall at several depths, within the threshold in the middle; Pittsburgh's beside the printed."""
+    ks = (1, 5, 10)
+    rows = []
+    for row in found.rows:
+        for name in found.datasets:
+            if one := found.evaluated.get((row.name, name)):
+                recall = one.recall[OVERALL]
+                threshold = sorted(recall)[len(recall) // 2]
+                theirs = printed()["pitts30k"].get(row.name) if name.startswith("pitts30k") else None
+                cells = [beside(recall[threshold].get(k), theirs and theirs[at]) for at, k in enumerate(ks)]
+                rows.append([row.title, f"{name} ±{threshold:g}", *cells])
+    return Table(["system", "data set", *(f"R@{k}" for k in ks)], rows, text_columns=2)
+
+
+def sizes(found: Found) -> Table:
+    """Bytes of an image times images of the database."""
+    rows = []
+    for row in found.rows:
+        theirs = printed()["sizes"].get(row.name, {})
+        cells = [
+            beside(found.sizes[row.name] * len(dataset.database) / 2**20 if row.name in found.sizes else None,
+                   theirs.get(name))
+            for name, dataset in found.datasets.items()
+        ]  # fmt: skip
+        if any(cell != _NONE for cell in cells):
+            rows.append([row.title, *cells])
+    return Table(["system", *found.datasets], rows)
+
+
+def seconds(found: Found) -> Table:
+    """By step, and in all."""
+    rows = []
+    for row in found.rows:
+        theirs = printed()["seconds"].get(row.name, [None] * 4)
+        if ours := found.seconds.get(row.name):
+            steps = [ours["filter"], ours["features"], ours["matching"] + ours["scores"]]
+            own = [*steps, sum(steps)]
+            cells = [_second(*both) for both in zip(own, theirs, strict=True)]
+            rows.append([row.title, *cells])
+    return Table(["system", "filter", "features", "matching and score", "in all"], rows)
+
+
+def _second(ours: float, theirs: float | None) -> str:
+    return f"{ours:.3f}" if theirs is None else f"{ours:.3f} ({theirs:.2f})"
+
+
+def _thresholds(found: Found, dataset: str) -> list[float]:
+    """Of the data set's evaluations."""
+    known = (one.recall[OVERALL] for (_, name), one in found.evaluated.items() if name == dataset)
+    return sorted(next(known, {}))
+
+
+def _cell(found: Found, row: Row, dataset: str, sequence: str, threshold: float) -> str:
+    one = found.evaluated.get((row.name, dataset))
+    ours = None if one is None else one.recall.get(sequence, {}).get(threshold, {}).get(1)
+    theirs = printed_recall(row.name, dataset, sequence or None)
+    at = TOLERANCES.index(int(threshold)) if threshold in TOLERANCES else None
+    return beside(ours, theirs[at] if theirs and at is not None else None)
+
+
+def _at(one: Evaluated) -> list[float]:
+    return [one.recall[OVERALL][tolerance][1] for tolerance in TOLERANCES]
+
+
+def _or_none(values: Any) -> Sequence[float | None]:
+    return [None] * len(TOLERANCES) if values is None else list(values)
