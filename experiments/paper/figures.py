@@ -65,7 +65,9 @@ def draw_averages(path: Path, bars: Sequence[tuple[str, float | None, float | No
     figure, axes = _canvas(9, 1.2 + 0.3 * len(bars))
     places = np.arange(len(bars))
     sides = [("over the data sets here", 1, _OURS), ("printed, over the paper's six", 2, _THEIRS)]
-    for shift, (label, at, color) in zip((-0.2, 0.2), sides, strict=True):
+    sides = [side for side in sides if any(bar[side[1]] is not None for bar in bars)]
+    for turn, (label, at, color) in enumerate(sides):
+        shift = 0.4 * (turn - (len(sides) - 1) / 2)
         axes.barh(places + shift, [float(bar[at] or 0) for bar in bars], 0.38, label=label, color=color)
         for place, bar in zip(places, bars, strict=True):
             if (value := bar[at]) is not None:
@@ -74,7 +76,7 @@ def draw_averages(path: Path, bars: Sequence[tuple[str, float | None, float | No
     axes.invert_yaxis()
     axes.set_xlim(0, 108)
     axes.set_xlabel("mean Recall@1 within 2 frames, %")
-    axes.legend(loc="lower right", fontsize=8)
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False, fontsize=8)
     _save(figure, path)
 
 
@@ -93,7 +95,7 @@ def draw_speed(path: Path, rows: Sequence[Row], seconds: Mapping[str, Mapping[st
     axes.invert_yaxis()
     axes.set_xlim(0, 1.12 * left.max())
     axes.set_xlabel("seconds of a query")
-    axes.legend(loc="lower right", fontsize=8)
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=len(_STEPS), frameon=False, fontsize=8)
     _save(figure, path)
 
 
