@@ -103,8 +103,8 @@ def overrides(run: str, dataset: str) -> tuple[str, ...]:
 
 
 def _reach(run: str) -> tuple[str, ...]:
-    """Where patches are scored by their grid, that of square images."""
-    return ("scorer.size=[26,26]",) if run == "patch_netvlad_speed" else ()
+    """The largest place of patches in square images, by which the rapid score goes."""
+    return ("scorer.size=[400,400]",) if run == "patch_netvlad_speed" else ()
 
 
 def chosen_rows(names: Sequence[str] | None) -> tuple[Row, ...]:

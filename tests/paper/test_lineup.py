@@ -1,0 +1,176 @@
+"""What is evaluated: rows, settings and data sets."""
+
+import numpy as np
+import pytest
+
+from experiments.paper import lineup
+from experiments.paper.lineup import DRAWN, ROWS, Place, chosen_rows, missing_weights, overrides, places
+from experiments.paper.printed import printed
+from experiments.paper.runs import made_of, settings_of
+from experiments.paper.tables import OVERALL, Evaluated, Found, beside, evaluated, tables
+from experiments.settings import SettingsError
+from mfvpr.data.datasets import Dataset, ImageFolder, QuerySequence
+
+SETTINGS = {"out": "out", "store": None, "memory": None, "devices": 1}
+RUNS = list(dict.fromkeys(row.run for row in ROWS))
+
+
+def made(run, place=DRAWN, root=None):
+    return settings_of(run, Place(place, root), SETTINGS)
+
+
+def test_every_printed_row_is_evaluated():
+    known = {row.name for row in ROWS}
+    for table in ("recall", "sequences", "sizes", "seconds", "pitts30k"):
+        assert {*printed()[table]} <= known, table
+    assert len(known) == len(ROWS) == len({row.title for row in ROWS})
+
+
+@pytest.mark.parametrize("run", RUNS)
+def test_every_evaluation_has_settings_of_the_paper(run):
+    settings = made(run)
+    candidates = {"patch_netvlad": 100, "sift_10": 10, "aliked_10": 10, "mix_hist_10": 10, "mix_hist_comb_10": 10}
+    expected = next((number for name, number in candidates.items() if run.startswith(name)), 50)
+    assert settings["candidates"] == expected
+    sizes = {"mix": [320, 320], "ssm": [336, 336], "selavpr": [224, 224], "patch_netvlad": [640, 480]}
+    for name, size in sizes.items():
+        if run.startswith(name):
+            assert settings["features"]["image_size"] == size
+    assert settings["final"] == ("combined" if "comb" in run or "mfvpr" in run else "score")
+
+
+@pytest.mark.parametrize("run", ["patch_netvlad_performance", "patch_netvlad_speed"])
+def test_patch_netvlads_images_are_square_on_robotcar(run, tmp_path):
+    settings = made(run, "robotcar_seasons", tmp_path)
+    assert settings["features"]["image_size"] == [480, 480]
+    assert settings["dataset"]["root"] == str(tmp_path)
+
+
+def test_thresholds_are_those_of_the_data_set(tmp_path):
+    assert made("sift_50")["recall"]["tolerances"] == [1, 2, 5]
+    assert made("sift_50", "nordland_27592", tmp_path)["recall"]["tolerances"] == [10]
+
+
+def test_data_sets_are_found_by_their_names(tmp_path):
+    (tmp_path / "Gardens_point_RAS2020").mkdir()
+    (tmp_path / "corridor").mkdir()
+    found, missing = places(str(tmp_path), None)
+    assert [place.name for place in found] == [DRAWN, "corridor", "gardens_point"]
+    assert found[2].root == tmp_path / "Gardens_point_RAS2020"
+    assert len(missing) == 12
+    assert f"grief_season: needs {tmp_path}/grief_season with database and queries" in missing
+    assert any(line.startswith("msls_val: needs ") and "https://" in line for line in missing)
+    found, missing = places(None, ["corridor", DRAWN])
+    assert ([place.name for place in found], len(missing)) == ([DRAWN], 1)
+    for arguments, words in (((None, ["x"]), "datasets"), ((str(tmp_path / "no"), None), "expected a folder")):
+        with pytest.raises(SettingsError, match=words):
+            places(*arguments)
+
+
+def test_rows_are_chosen_by_name():
+    assert chosen_rows(None) == ROWS
+    assert [row.name for row in chosen_rows(["sift_hist_50", "mixvpr"])] == ["mixvpr", "sift_hist_50"]
+    with pytest.raises(SettingsError, match=r"systems=\[best\]: expected some of patch_netvlad_performance"):
+        chosen_rows(["best"])
+
+
+def test_weights_that_are_missing_are_named(monkeypatch):
+    monkeypatch.setattr(lineup, "is_installed", lambda entry: False)
+    assert [entry.name for entry in missing_weights(made("mix_hist_50"))] == ["d2_tf", "mixvpr_4096"]
+    assert [entry.name for entry in missing_weights(made("ssm_vpr"))] == ["vgg16_places365"]
+    assert missing_weights(made("sift_50")) == []
+
+
+def test_a_run_is_known_by_what_decides_its_numbers(tmp_path, monkeypatch):
+    images = {"database": "a", "queries": "b"}
+    first = made_of(made("sift_50", "corridor", tmp_path / "a"), images)
+    assert first == made_of(made("sift_50", "corridor", tmp_path / "b") | {"out": "elsewhere"}, images)
+    assert first["settings"] != made_of(made("sift_10", "corridor", tmp_path), images)["settings"]
+    assert first["images"] != made_of(made("sift_50", "corridor", tmp_path), images | {"queries": "c"})["images"]
+
+
+def test_overrides_of_all_rows_are_few():
+    assert overrides("mix_hist_50", DRAWN) == ("system=mix_hist_50",)
+    assert "candidates=50" in overrides("selavpr_msls", DRAWN)
+
+
+# Tables
+
+
+def result(system, recall, *, decides=False, **more):
+    return {"system": system, "recall_at": {"1": recall, "5": 0.9, "10": 1.0}, "decides": decides, "tolerance": 1,
+            "filter": {"name": "vlad"}, "features": {"name": "sift", "image_size": [336, 320]}, "candidates": 50,
+            "parameters": {}} | more  # fmt: skip
+
+
+def dataset(name, *parts, database=10):
+    folder = ImageFolder(None, tuple(map(str, range(database))))
+    return Dataset(name, folder, tuple(QuerySequence(part, folder, None) for part in parts))
+
+
+def test_numbers_stand_beside_the_printed():
+    assert beside(84.16, 84.0) == "84.2 (84.0, +0.2)"
+    assert beside(None, 84.0) == "(84.0)"
+    assert beside(84.16, None) == "84.2"
+    assert beside(None, None) == "-"
+    assert beside(83.94, 84.0) == "83.9 (84.0, -0.1)"
+
+
+def test_a_rows_ranking_is_taken_from_its_evaluation():
+    rows = {row.name: row for row in ROWS}
+    results = [result("filter", 0.1), result("histogram", 0.2, decides=True), result("histogram + filter", 0.3)]
+    recall = {name: evaluated(rows[name], results).recall[OVERALL][1][1]
+              for name in ("mixvpr", "mix_hist_50", "sift_hist_50", "sift_hist_comb_50")}  # fmt: skip
+    assert recall == pytest.approx({"mixvpr": 10, "mix_hist_50": 20, "sift_hist_50": 20, "sift_hist_comb_50": 30})
+    assert evaluated(rows["sift_anchor"], results) is None
+
+
+def test_of_several_sequences_the_plain_mean_counts():
+    row = next(row for row in ROWS if row.name == "mix_hist_50")
+    results = [result("histogram", value, decides=True, sequence=name)
+               for name, value in (("dawn", 0.1), ("dusk", 0.4), ("mean", 0.25), ("pooled", 0.3))]  # fmt: skip
+    one = evaluated(row, results)
+    assert {name: at[1][1] for name, at in one.recall.items()} == {"dawn": 10, "dusk": 40, OVERALL: 25}
+
+
+def test_tables_hold_both_numbers():
+    row = next(row for row in ROWS if row.name == "mix_hist_50")
+    recall = {at: {1: value, 5: 95.0, 10: 99.0} for at, value in ((1, 81.0), (2, 92.5), (5, 96.0))}
+    one = Evaluated({OVERALL: recall}, result("histogram", 0.8))
+    gardens = dataset("gardens_point", "all", database=200)
+    found = Found([row], {"gardens_point": gardens},
+                  {("mix_hist_50", "gardens_point"): one}, sizes={"mix_hist_50": 2.0**20},
+                  seconds={"mix_hist_50": dict(filter=0.1, features=0.2, matching=0.3, scores=0.1)})  # fmt: skip
+    made = {name: table for name, _, table in tables(found)}
+    assert made["recall"].rows == [["Mix-hist 50", "81.0 (80.0, +1.0)", "92.5 (92.0, +0.5)", "96.0 (96.0, +0.0)"]]
+    assert made["data_sets"].rows == [["gardens_point", "200 (200, +0)", "200 (200, +0)"]]
+    assert made["sizes"].rows == [["Mix-hist 50", "200.0"]]
+    assert made["seconds"].rows == [["Mix-hist 50", "0.100 (0.01)", "0.200 (0.03)", "0.400 (0.07)", "0.700 (0.10)"]]
+    assert made["averages"].rows[0][1:4] == ["(87.5)", "(92.9)", "(95.0)"]
+    assert made["depths"].rows == [["Mix-hist 50", "gardens_point ±2", "92.5", "95.0", "99.0"]]
+    assert made["settings"].rows == [["Mix-hist 50", "vlad", "-", "sift", "336 x 320", "50"]]
+
+
+def test_sequences_have_a_table_of_their_own():
+    row = next(row for row in ROWS if row.name == "mix_hist_50")
+    recall = {part: {at: {1: 90.0} for at in (1, 2, 5)} for part in ("night", "snow", OVERALL)}
+    found = Found([row], {"robotcar_seasons": dataset("robotcar_seasons", "night", "snow")},
+                  {("mix_hist_50", "robotcar_seasons"): Evaluated(recall, result("histogram", 0.9))})  # fmt: skip
+    made = {name: table for name, _, table in tables(found)}
+    [line] = made["sequences_robotcar_seasons"].rows
+    assert line[1:4] == ["90.0 (82.0, +8.0)", "90.0 (89.6, +0.4)", "90.0 (93.4, -3.4)"]
+    assert line[7:] == ["90.0 (92.8, -2.8)", "90.0 (96.9, -6.9)", "90.0 (98.5, -8.5)"]
+
+
+def test_averages_over_all_six_are_the_papers():
+    row = next(row for row in ROWS if row.name == "mix_hist_50")
+    names = printed()["recall"]["mix_hist_50"]
+    recalls = {name: {at: {1: value} for at, value in zip((1, 2, 5), values, strict=True)}
+               for name, values in names.items()}  # fmt: skip
+    results = {("mix_hist_50", name): Evaluated({OVERALL: recall}, result("histogram", 0.5))
+               for name, recall in recalls.items()}  # fmt: skip
+    found = Found([row], {name: dataset(name, name) for name in names}, results)
+    [line] = {name: table for name, _, table in tables(found)}["averages"].rows
+    assert [cell.split(" ")[0] for cell in line[1:4]] == ["87.5", "92.9", "95.0"]
+    assert all(cell.endswith("+0.0)") or cell.endswith("-0.0)") for cell in line[1:4])
+    assert np.isfinite([float(cell) for cell in line[4:]]).all()

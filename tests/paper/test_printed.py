@@ -1,0 +1,66 @@
+"""The paper's numbers, and what follows from them."""
+
+import numpy as np
+import pytest
+
+from experiments.paper.printed import BERLIN, OTHERS, average, printed, printed_recall
+
+# Recomputed from the printed tables by hand: within 1, 2 and 5 frames.
+AVERAGES = {
+    "patch_netvlad_performance": (76.79, 84.56, 89.62), "patch_netvlad_speed": (65.97, 73.47, 80.52),
+    "mixvpr": (78.11, 85.57, 90.66), "selavpr_pitts": (84.83, 91.71, 96.18), "selavpr_msls": (85.01, 92.35, 96.65),
+    "ssm_vpr": (85.14, 89.27, 90.80), "ssm_ran_8": (82.11, 89.61, 92.47), "ssm_ran_24": (82.75, 90.98, 93.85),
+    "ssm_hist": (85.08, 91.17, 92.97), "ssm_anchor": (82.62, 88.58, 90.99), "ssm_sum": (76.78, 83.82, 87.50),
+    "mix_hist_10": (87.62, 93.06, 95.25), "mix_hist_50": (87.48, 92.88, 94.95),
+    "mix_hist_comb_10": (87.88, 93.27, 95.42), "mix_hist_comb_50": (89.13, 94.19, 96.17),
+}  # fmt: skip
+QUERIES = {"dawn": 218, "dusk": 179, "night": 183, "night-rain": 218, "overcast-winter": 195, "rain": 192, "snow": 226}
+
+
+def test_averages_come_out_exactly():
+    recall = printed()["recall"]
+    assert {*AVERAGES} == {*recall} - {"mix_hist_aliked_50"}
+    for row, expected in AVERAGES.items():
+        assert np.abs(average(recall[row]) - expected).max() < 0.0051, row
+
+
+def test_robotcar_is_the_plain_mean_of_its_sequences():
+    for row, by_sequence in printed()["sequences"].items():
+        assert {*by_sequence} == {*QUERIES}
+        mean = np.mean([*by_sequence.values()], axis=0)
+        assert np.abs(mean - printed()["recall"][row]["robotcar_seasons"]).max() <= 0.05 + 0.05, row
+    pooled = [
+        np.abs(np.average([*by_sequence.values()], axis=0, weights=[*QUERIES.values()]) - recall).max()
+        for row, by_sequence in printed()["sequences"].items()
+        for recall in [printed()["recall"][row]["robotcar_seasons"]]
+    ]
+    assert max(pooled) > 0.2  # it is not the recall over all queries
+
+
+@pytest.mark.parametrize("sequence", QUERIES)
+def test_recalls_of_a_sequence_are_shares_of_its_queries(sequence):
+    number = QUERIES[sequence]
+    for row, by_sequence in printed()["sequences"].items():
+        for value in by_sequence[sequence]:
+            assert min(abs(100 * right / number - value) for right in range(number + 1)) <= 0.0501, (row, value)
+
+
+def test_recalls_of_small_data_sets_are_shares_of_their_queries():
+    for name in (*BERLIN, "gardens_point", "nordland_1415"):
+        number = printed()["data_sets"][name][1]
+        for row, by_name in printed()["recall"].items():
+            for value in by_name[name]:
+                assert min(abs(100 * right / number - value) for right in range(number + 1)) <= 0.0501, (row, name)
+
+
+def test_steps_add_up():
+    for row, (*steps, total) in printed()["seconds"].items():
+        assert abs(sum(steps) - total) <= 0.0151, row  # each is rounded to hundredths
+
+
+def test_recalls_are_found_by_name():
+    assert printed_recall("mix_hist_50", "gardens_point") == [80.0, 92.0, 96.0]
+    assert printed_recall("mix_hist_50", "robotcar_seasons", "night") == [82.0, 89.6, 93.4]
+    assert printed_recall("mix_hist_50", "streets_seasons", "night") is None
+    assert printed_recall("sift_hist_50", "gardens_point") is None
+    assert average({name: [1.0, 2, 3] for name in (*BERLIN, *OTHERS[1:])}) is None

@@ -1,0 +1,148 @@
+"""The paper's evaluation as a program: of what is there, once, however often it is killed."""
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.programs import ROOT, typed
+from tests.programs import run as run_program
+
+SYSTEMS = "systems=[sift_hist_10,sift_hist_comb_10,mix_hist_10]"
+QUERIES = 8
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """A folder with one data set: frames of the drawn street under the names of another."""
+    from mfvpr.data.streets import draw_streets
+
+    folder = tmp_path_factory.mktemp("data") / "grief_season"
+    draw_streets(folder, num_frames=QUERIES, image_size=(160, 120))
+    (folder / "ground_truth.csv").unlink()
+    return folder.parent
+
+
+def arguments(data, out):
+    return f"data={data}", "datasets=[grief_season,gardens_point]", SYSTEMS, f"out={out}", f"store={out.parent}/store"
+
+
+@pytest.fixture(scope="module")
+def finished(data, tmp_path_factory):
+    out = tmp_path_factory.mktemp("paper") / "out"
+    done = run_program(*arguments(data, out), program="paper")
+    assert done.returncode == 0, done.stderr
+    return out, done
+
+
+def files(out):
+    """What does not depend on the time: every file but seconds and their figures, and results without them."""
+    found = {}
+    for path in sorted(path for path in out.rglob("*") if path.is_file()):
+        if path.parent.name == "seconds" or path.stem in ("speed", "growth", "run", "seconds", "report"):
+            continue
+        content = path.read_bytes()
+        if path.name == "results.json":
+            content = [{name: value for name, value in row.items() if name != "seconds"} for row in json.loads(content)]
+        found[str(path.relative_to(out))] = content
+    return found
+
+
+def test_it_says_what_is_left_out_and_prints_what_it_found(finished, data):
+    out, done = finished
+    assert f"left out: gardens_point: needs {data}/gardens_point, from http" in done.stderr
+    assert "left out: mix_hist_10: needs d2_tf (d2_tf.pth): python -m experiments.weights convert" in done.stderr
+    assert "SIFT-hist 10" in done.stdout
+    assert "Mix-hist 10" not in done.stdout
+    assert done.stdout.endswith(f"tables and figures: {out}\n")
+    assert sorted(path.stem for path in (out / "tables").glob("*.md")) == [
+        "averages", "data_sets", "depths", "recall", "seconds", "settings", "sizes",
+    ]  # fmt: skip
+    assert {path.name for path in (out / "figures").iterdir()} >= {"averages.png", "speed.png"}
+
+
+def test_what_is_finished_is_not_done_again(finished, data, monkeypatch, capsys):
+    out, _ = finished
+    before, folder = files(out), out / "runs/grief_season/sift_10"
+    made = (folder / "results.json").stat().st_mtime_ns
+    code, stdout, stderr = typed(monkeypatch, capsys, "paper", *arguments(data, out))
+    assert code == 0
+    assert "SIFT-hist 10" in stdout
+    assert "sift_10 on grief_season" not in stderr
+    assert (folder / "results.json").stat().st_mtime_ns == made
+    assert files(out) == before
+
+
+def test_other_images_in_the_same_folder_are_no_finished_run(finished, data, tmp_path, monkeypatch, capsys):
+    out, _ = finished
+    other = tmp_path / "data"
+    shutil.copytree(data, other)
+    image = other / "grief_season/queries/0003.png"
+    image.write_bytes((other / "grief_season/queries/0004.png").read_bytes())
+    code, _, stderr = typed(monkeypatch, capsys, "paper", *arguments(other, out))
+    assert code == 2
+    assert "sift_10: a finished run of other images is there; remove it, or name another folder" in stderr
+    made = out / "runs/grief_season/sift_10/made_of.json"
+    kept = made.read_text()
+    for content in (json.dumps(json.loads(kept) | {"weights": "x"}), "[]", "{"):
+        made.write_text(content)
+        code, _, stderr = typed(monkeypatch, capsys, "paper", *arguments(data, out))
+        assert code == 2
+        assert "a finished run of other" in stderr
+    made.write_text(kept)
+
+
+@pytest.mark.parametrize(("changed", "words"), [
+    (["systems=[best]"], "systems=[best]: expected some of"),
+    (["datasets=[x]"], "datasets=[x]: expected some of streets_seasons"),
+    (["data=/no/such"], "data=/no/such: expected a folder with a folder per data set"),
+    (["systems=[mix_hist_10]"], "nothing to evaluate: the lines above say what is missing"),
+    (["datasets=[gardens_point]"], "nothing to evaluate"),
+    (["systems=sift_hist_10"], "systems=sift_hist_10: expected"),
+    (["sytems=[x]"], "sytems: unknown setting; the nearest is systems"),
+])  # fmt: skip
+def test_mistakes_are_one_line(data, tmp_path, monkeypatch, capsys, changed, words):
+    names = {one.partition("=")[0] for one in changed}
+    kept = [one for one in arguments(data, tmp_path / "out") if one.partition("=")[0] not in names]
+    code, _, stderr = typed(monkeypatch, capsys, "paper", *kept, *changed)
+    assert code == 2
+    [line] = [line for line in stderr.splitlines() if line.startswith("error: ")]
+    assert words in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_data_set_of_another_layout_is_left_out(data, tmp_path, monkeypatch, capsys):
+    both = tmp_path / "data"
+    shutil.copytree(data, both)
+    (both / "gardens_point").mkdir()
+    code, stdout, stderr = typed(monkeypatch, capsys, "paper", *arguments(both, tmp_path / "out"))
+    assert code == 2
+    assert "left out: gardens_point: " in stderr
+    assert "1 of the evaluations could not be made: gardens_point" in stderr
+    assert "SIFT-hist 10" in stdout
+
+
+@pytest.mark.slow
+def test_killed_five_times_it_ends_with_the_same_bytes(finished, data, tmp_path):
+    whole, _ = finished
+    out, chance = tmp_path / "paper" / "out", random.Random(0)
+    command = [sys.executable, "-m", "experiments.paper", *arguments(data, out)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    for _ in range(5):
+        with (tmp_path / "log").open("w") as log:
+            running = subprocess.Popen(
+                command, cwd=ROOT, stdout=log, stderr=log, env=environment, start_new_session=True
+            )
+        time.sleep(chance.uniform(2, 12))
+        os.killpg(running.pid, signal.SIGKILL)
+        running.wait()
+    assert run_program(*arguments(data, out), program="paper").returncode == 0
+    assert files(out) == files(whole)
+    assert not [path for path in Path(out).rglob("*") if path.name.startswith(".")]
