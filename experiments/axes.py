@@ -46,8 +46,7 @@ def axes(settings: dict[str, Any]) -> Axes:
         raise SettingsError("grid: expected at least one axis, such as 'grid.sigma=[10,22.5]', or an experiment=; see "
                             "--help")  # fmt: skip
     own = settings["scorer"] | {"max_distance": settings["matching"].get("max_distance")}
-    if "c" in values:
-        own["c"] = 0.0 if settings.get("final") == "score" else _plain_c(settings)  # 0: the score alone decides
+    own |= {"c": _plain_c(settings)} if "c" in values else {}
     return Axes(scorer, values, {name: own.get(name) for name in values})
 
 

@@ -94,7 +94,7 @@ def test_several_sets_as_they_are_typed(streets):
         (["report=streets", "split=first_half"], "split=first_half: expected none with report="),
         (
             ["report=street"],
-            "report=street: expected data sets such as streets:seed=1,corridor:root=DIR, of corridor, ",
+            "report=street: expected data sets such as streets:seed=1,corridor:root=DIR, of berlin_a100, ",
         ),
         (["report=corridor"], "report=corridor: corridor has no default of root; write corridor:root=VALUE"),
         (["report=streets:sed=1"], "report=streets:sed=1: streets has no setting sed; it has cache, name, seed"),

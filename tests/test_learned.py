@@ -183,7 +183,7 @@ def test_global_descriptors_of_networks_are_filters(
     folders = f"dataset.database={small_street}/database", f"dataset.queries={small_street}/queries"
     told = evaluate("dataset=folder", *folders, "dataset.ground_truth=order", f"retrieval={name}", *options,
                     "retrieval.image_size=[96,64]", "candidates=3", "figures=0", f"out={tmp_path}/out")  # fmt: skip
-    assert "note: R@10 is R@3" in told
+    assert "note: R@5 and R@10 are R@3, of the filter too" in told
     stores = {path.name.rpartition("-")[0] for path in (tmp_path / "cache" / "features").glob("*-*")}
     assert "GlobalDescriptor" in stores
     model, components = load_model(options[0].partition("=")[2], weights), 32 if name == "netvlad" else None
