@@ -37,13 +37,14 @@ class Outcome:
 
 
 def evaluate(settings: dict[str, Any]) -> None:
-    """Every stage, the table, a run folder."""
+    """Every stage, the table, a run folder with its page."""
     with run_folder.claimed(settings) as folder:
         outcome = evaluated(settings)
         run_folder.leave(
             folder, settings, truth.described(settings, outcome.images.dataset), text=text(outcome),
             write=lambda new: write(new, outcome), figures=outcome.figures,
         )  # fmt: skip
+        run_folder.report(folder)
 
 
 def evaluated(settings: dict[str, Any]) -> Outcome:
