@@ -21,13 +21,7 @@ from mfvpr.report.tables import Table
 from mfvpr.results import Matched, Ranked, Recall, Result
 from mfvpr.scoring import HistogramOfShifts
 
-ABOUT: tuple[str, ...] = (
-    "system",
-    "sequence",
-    "outcome",
-    "query",
-    "answer",
-)  # what the file of a query's figure says of it
+ABOUT: tuple[str, ...] = ("system", "sequence", "outcome", "query", "answer")  # what the file of a figure tells
 SEQUENCES = "sequences"  # the folder of a run in which each of several has its own
 
 

@@ -22,7 +22,8 @@ from mfvpr.report.tables import Table
 _LEFT_BY = "expected the run folder of an evaluation"
 _KINDS_OF_A_ROW = {"system": str, "decides": bool, "parameters": dict, "recall_at": dict}
 _KINDS = {"dataset": str, "ground_truth": dict, "data_fingerprint": dict, "filter": dict, "features": dict,
-          "versions": dict, "seconds": dict, "queries": int, "database": int, "candidates": int}  # fmt: skip
+          "versions": dict, "seconds": dict, "queries": int, "database": int, "candidates": int,
+          "bytes_per_image": int | None}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class Answer:
         query: name of its image.
         answer: name of the database image; empty = none.
         score: of it.
-        outcome: "right", "wrong", or "unknown" without ground truth.
+        outcome: "right", "wrong", or "best" without ground truth.
         rank: of the first right candidate; empty = unknown, or none.
     """
 
@@ -150,7 +151,7 @@ class Run:
         first = {line["query"]: line for line in _lines(path) if line["rank"] == "1"}
         if sequence not in self.gains:
             for query, line in first.items():
-                yield Answer(system, sequence, query, line["database"], line["score"], "unknown", "")
+                yield Answer(system, sequence, query, line["database"], line["score"], "best", "")
             return
         gains = self.gains[sequence]
         for query, rank in zip(gains.queries, gains.ranks[system].tolist(), strict=True):
@@ -200,7 +201,9 @@ def _telling_which(folder: Path) -> Iterator[None]:
     except (ValueError, LookupError, TypeError, AttributeError, StopIteration, csv.Error) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{folder}: {_LEFT_BY}, got other files ({type(error).__name__}: {error})") from None
+        raise InputError(
+            f"{folder}: {_LEFT_BY} of this version, got other files ({type(error).__name__}: {error})"
+        ) from None
 
 
 def _sequences(results: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -124,7 +124,8 @@ def costs_section(run: Run) -> Section:
     rows = [[stage, f"{value:.3f}", f"{value / max(common['queries'], 1):.4f}"] for stage, value in seconds.items()]
     sizes = [["queries", f"{common['queries']}"], ["database images", f"{common['database']}"],
              ["candidates of a query", f"{common['candidates']}"]]  # fmt: skip
-    sizes += [[what, f"{size}"] for what, size in common.get("bytes_per_image", {}).items()]
+    if common["bytes_per_image"] is not None:
+        sizes.append(["bytes on disk of an image's features, about", f"{common['bytes_per_image']}"])
     chart = amounts("seconds", "Seconds by stage", seconds, axis="seconds")
     sheets = [Sheet("Seconds", Table(["stage", "seconds", "per query"], rows)),
               Sheet("Sizes", Table(["what", "number"], sizes))]  # fmt: skip
