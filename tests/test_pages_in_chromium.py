@@ -125,6 +125,17 @@ def test_answers_are_filtered_by_click_and_by_key(opened):
     assert page.locator(".picture:visible").count() == 1
 
 
+def test_pictures_are_full_size_when_asked_for(opened):
+    page = opened.page("one", 390)
+    picture = page.locator(".picture").first
+    before = picture.locator("img").bounding_box()["width"]
+    picture.get_by_role("button").press("Enter")
+    assert before < 390 < picture.locator("img").bounding_box()["width"] == 1000
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    picture.get_by_role("button").click()
+    assert picture.locator("img").bounding_box()["width"] == before
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_the_theme_follows_the_system_until_it_is_chosen(opened, scheme):
     page, other = opened.page("one", scheme=scheme), {"light": "Dark", "dark": "Light"}[scheme]

@@ -333,14 +333,19 @@ def test_a_figure_that_cannot_be_drawn_costs_a_warning(root, evaluated, tmp_path
     limited(30_000)
     code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *small(root), *LINES, f"out={tmp_path}/out")
     assert code == 0, stderr
-    assert stdout.endswith(f"results: {tmp_path}/out\n")
+    assert stdout.endswith(f"results: {tmp_path}/out\nreport: {tmp_path}/out/report.html\n")
     warnings = [line for line in stderr.splitlines() if line.startswith(f"warning: {tmp_path}/out/figures/wrong_")]
     assert len(warnings) == 2
     assert all("not drawn ([Errno 27] File too large" in line for line in warnings)
-    last = stderr.splitlines()[-1]
-    assert last.startswith(f"warning: {tmp_path}/out: no page was made of it ([Errno 27] File too large")
     assert (tmp_path / "out" / "predictions.csv").read_bytes() == (evaluated / "predictions.csv").read_bytes()
     assert not [path for path in (tmp_path / "out").rglob(".*")]
+
+
+def test_a_page_that_cannot_be_made_costs_a_warning(tmp_path, capsys):
+    run_folder.report(tmp_path)
+    stdout, stderr = capsys.readouterr()
+    assert stdout == ""
+    assert stderr.startswith(f"warning: {tmp_path}: no page was made of it (")
 
 
 def test_ctrl_c_while_figures_are_drawn_keeps_the_tables(root, evaluated, tmp_path, monkeypatch, capsys):

@@ -43,6 +43,11 @@ function filter() {
 for (const select of filters) select.addEventListener("change", filter);
 if (filters.length) filter();
 
+// On a narrow screen a picture is small until it is asked for.
+for (const button of document.querySelectorAll(".picture button")) {
+  button.addEventListener("click", () => button.setAttribute("aria-pressed", button.getAttribute("aria-pressed") === "false"));
+}
+
 // Charts have the colors of the page, which may change.
 const charts = JSON.parse(document.getElementById("charts").textContent);
 const dark = window.matchMedia("(prefers-color-scheme: dark)");
