@@ -11,6 +11,7 @@ from mfvpr import evaluations
 from mfvpr.data.datasets import Dataset
 from mfvpr.evaluation import Unit
 from mfvpr.evaluations import Stopwatch
+from mfvpr.features import Source
 from mfvpr.report import runs
 from mfvpr.report.confidences import Assured, confidence_figures, confidence_table, write_confidence
 from mfvpr.report.differences import write_gains
@@ -18,6 +19,7 @@ from mfvpr.report.evaluations import Figure, Judged, figures, recall_table, writ
 from mfvpr.report.shifts import write_shifts
 from mfvpr.results import COHORT, FILTER, FRAMES
 from mfvpr.scoring import HistogramOfShifts
+from mfvpr.sinks import open_sinks
 
 _THRESHOLDS: dict[Unit, str] = {"frames": "tolerance", "m": "radius"}  # their names in results
 
@@ -37,13 +39,14 @@ class Outcome:
 
 
 def evaluate(settings: dict[str, Any]) -> None:
-    """Every stage, the table, a run folder."""
+    """Every stage, the table, a run folder with its page."""
     with run_folder.claimed(settings) as folder:
         outcome = evaluated(settings)
         run_folder.leave(
             folder, settings, ground_truth(outcome), text=text(outcome),
             write=lambda new: write(new, outcome), figures=outcome.figures,
         )  # fmt: skip
+        run_folder.report(folder)
 
 
 def evaluated(settings: dict[str, Any]) -> Outcome:
@@ -148,6 +151,7 @@ def result_rows(outcome: Outcome) -> list[dict[str, Any]]:
         "data_fingerprint": outcome.images.fingerprints,
         "ground_truth": truth.described(settings, dataset),
         "reading": outcome.images.reading,
+        "bytes_per_image": _bytes_per_image(outcome),
         "seconds": judged.result.seconds,
         "versions": runs.versions(),
     }
@@ -158,6 +162,14 @@ def result_rows(outcome: Outcome) -> list[dict[str, Any]]:
         system = {"system": name, "scorer": " + ".join(scorers) or "none", "decides": decides, "parameters": parameters}
         rows += [system | judgment | common for judgment in _judgments(judged, name)]
     return rows
+
+
+def _bytes_per_image(outcome: Outcome) -> int | None:
+    """The forecast of what an image's features take on disk; None where they are imported, and not kept."""
+    extractor = outcome.tools.extractor
+    if isinstance(extractor, Source):
+        return None
+    return sum(sink.forecast(1) for sink in open_sinks(None, extractor, {}, num_images=1, waiting=None))
 
 
 def _judgments(judged: Judged, system: str) -> list[dict[str, Any]]:

@@ -9,6 +9,7 @@ from experiments import build, console
 from experiments.settings import SettingsError
 from mfvpr.errors import InputError
 from mfvpr.report import runs
+from mfvpr.report.pages import one_run
 from mfvpr.report.runs import Figure
 
 _OF_THE_START = ("multirun", "command")  # what `command_line` adds to the settings
@@ -76,6 +77,16 @@ def draw(folder: Path, figures: Sequence[Figure]) -> None:
             drawn(folder / "figures" / name)
         except Exception as error:
             console.tell(f"warning: {folder}/figures/{name}: not drawn ({error})")
+
+
+def report(folder: Path) -> None:
+    """The page of an evaluation that was left in a folder; one that cannot be made costs a warning, as figures do."""
+    try:
+        page = one_run.write_report(folder)
+    except Exception as error:
+        console.tell(f"warning: {folder}: no page was made of it ({error})")
+    else:
+        print(f"report: {page}")
 
 
 def _about(settings: Mapping[str, Any], ground_truth: Mapping[str, Any]) -> dict[str, Any]:

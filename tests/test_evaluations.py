@@ -114,6 +114,8 @@ def test_sequences_are_evaluated_by_themselves_with_their_means(dataset, split, 
     write_gains(tmp_path, judged)
     gains = [(tmp_path / "sequences" / name / "gains.csv").read_text().splitlines() for name in ("first", "second")]
     assert list(map(len, gains)) == [4, 8]
+    places = [line.split(",")[1] for lines in gains for line in lines[1:]]
+    assert places == list(map(str, range(10)))  # the two ends of one path, so that tests know what is next to what
     hits = {name: np.concatenate([judged.is_right(name, place)[:, 0] for place in (0, 1)]) for name in found.systems}
     for first, second, counts, flips in differences(judged):
         assert counts.only_first == (hits[first] > hits[second]).sum()

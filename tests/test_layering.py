@@ -130,8 +130,11 @@ ALLOWED = {
 }
 HOMES = {
     "cv2": {"data", "features", "scoring"},
-    "PIL": {"data"},
+    "PIL": {"data", "report"},
     "matplotlib": {"report"},
+    "plotly": {"report"},
+    "jinja2": {"report"},
+    "markupsafe": {"report"},
     "hydra": set(),
     "omegaconf": set(),
     "torch": set(),

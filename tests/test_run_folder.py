@@ -125,7 +125,8 @@ def test_without_ground_truth_nothing_is_right_or_failed(root, tmp_path):
     evaluation.evaluate(composed(*small(root), *LINES, *none))
     assert {line["right"] for line in rows(tmp_path / "out" / "predictions.csv")} == {""}
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert names == {"results.json", "run.json", "predictions.csv", "predictions", "shifts.csv", "figures"}
+    files = {"results.json", "run.json", "predictions.csv", "predictions", "shifts.csv", "figures", "report.html"}
+    assert names == files
     assert {path.name.split("_")[0] for path in (tmp_path / "out" / "figures").iterdir()} == {"best"}
     assert json.loads((tmp_path / "out" / "run.json").read_text())["ground_truth"]["kind"] == "none"
 
@@ -150,7 +151,7 @@ def test_a_run_says_how_it_was_made(root, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *small(root), "scorer=count", "figures=0", "out=a b")
     assert code == 0, stderr
-    assert stdout.endswith("results: a b\n")
+    assert stdout.endswith("results: a b\nreport: a b/report.html\n")
     found = json.loads((tmp_path / "a b" / "run.json").read_text())
     assert found["command"].startswith("python -m experiments.evaluate dataset=folder dataset.database=")
     assert found["command"].endswith(" scorer=count figures=0 'out=a b'")
@@ -332,12 +333,19 @@ def test_a_figure_that_cannot_be_drawn_costs_a_warning(root, evaluated, tmp_path
     limited(30_000)
     code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *small(root), *LINES, f"out={tmp_path}/out")
     assert code == 0, stderr
-    assert stdout.endswith(f"results: {tmp_path}/out\n")
+    assert stdout.endswith(f"results: {tmp_path}/out\nreport: {tmp_path}/out/report.html\n")
     warnings = [line for line in stderr.splitlines() if line.startswith(f"warning: {tmp_path}/out/figures/wrong_")]
     assert len(warnings) == 2
     assert all("not drawn ([Errno 27] File too large" in line for line in warnings)
     assert (tmp_path / "out" / "predictions.csv").read_bytes() == (evaluated / "predictions.csv").read_bytes()
     assert not [path for path in (tmp_path / "out").rglob(".*")]
+
+
+def test_a_page_that_cannot_be_made_costs_a_warning(tmp_path, capsys):
+    run_folder.report(tmp_path)
+    stdout, stderr = capsys.readouterr()
+    assert stdout == ""
+    assert stderr.startswith(f"warning: {tmp_path}: no page was made of it (")
 
 
 def test_ctrl_c_while_figures_are_drawn_keeps_the_tables(root, evaluated, tmp_path, monkeypatch, capsys):
@@ -348,7 +356,7 @@ def test_ctrl_c_while_figures_are_drawn_keeps_the_tables(root, evaluated, tmp_pa
     assert code == 130
     assert "\nhistogram + filter " in stdout
     assert stderr.endswith("\ninterrupted; nothing half-written was left, and what was finished is kept\n")
-    names = {path.name for path in evaluated.iterdir()} - {"figures"}
+    names = {path.name for path in evaluated.iterdir()} - {"figures", "report.html"}
     assert {path.name for path in (tmp_path / "out").iterdir()} == names
 
 
@@ -365,7 +373,7 @@ def test_names_that_are_no_utf8_cost_nothing(root, tmp_path, monkeypatch, capsys
                  "dataset.ground_truth=order", "dataset.index_file=null", "scorer=histogram"]  # fmt: skip
     code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *small(root), *arguments)
     assert code == 0, stderr
-    assert stdout.endswith("out\\udcff\n")
+    assert stdout.endswith("out\\udcff/report.html\n")
     assert "warning" not in stderr
     assert len(list((out / "figures").glob("*_0*.png"))) == 2
     assert b"\xfe0000.png,1,\xfe000" in (out / "predictions.csv").read_bytes()

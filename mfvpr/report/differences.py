@@ -1,7 +1,7 @@
 """Where systems differ: for every query whether each is right, and for every two of them whether that is luck."""
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -65,13 +65,18 @@ def differences_table(judged: Judged) -> Table:
 def write_gains(folder: Path, judged: Judged) -> None:
     """`gains.csv` of every sequence, where its predictions are, and of all `differences.csv` and `differences.md`.
 
-    Nothing is written without ground truth.
+    Nothing is written without ground truth. `place` in `gains.csv` is where along the map each query is, empty where
+    they are in the order of their path: intervals and tests across runs need to know whose neighbor it is.
     """
     if not judged.thresholds:
         return
     columns = [column for name in judged.result.systems for column in (name, f"{name} rank")]
-    for place in range(len(judged.sequences)):
-        write_csv(judged.folder(folder, place) / "gains.csv", ["query", *columns], _gains(judged, place))
+    shown = _places(judged)
+    sizes = [len(sequence.images) for sequence in judged.sequences]
+    along = [""] * sum(sizes) if shown is None else shown.tolist()
+    for place, start in enumerate(np.cumsum([0, *sizes[:-1]])):
+        lines = _gains(judged, place, along[start : start + sizes[place]])
+        write_csv(judged.folder(folder, place) / "gains.csv", ["query", "place", *columns], lines)
     write_csv(
         folder / "differences.csv",
         ["system", "other", "only_system", "only_other", "mcnemar_p", "block", "blocks", "blocks_p"],
@@ -82,11 +87,11 @@ def write_gains(folder: Path, judged: Judged) -> None:
     write_text(folder / "differences.md", differences_table(judged).markdown())
 
 
-def _gains(judged: Judged, place: int) -> Iterator[list[str | int]]:
+def _gains(judged: Judged, place: int, along: Sequence[str | int]) -> Iterator[list[str | int]]:
     """By query: for every system whether its first answer is right, and the rank of the first right one."""
     right = [_right(judged, system, place) for system in judged.result.systems]
     for query, name in enumerate(judged.sequences[place].images.names):
-        line: list[str | int] = [name]
+        line: list[str | int] = [name, along[query]]
         for answers in (one[query] for one in right):
             line += [int(answers[0]), int(np.argmax(answers)) + 1 if answers.any() else ""]
         yield line

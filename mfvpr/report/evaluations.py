@@ -15,11 +15,14 @@ from mfvpr.evaluation import Positives, middle, threshold_words
 from mfvpr.features import Extractor, Source
 from mfvpr.pipeline import explain
 from mfvpr.report.figures import Answer, histogram_figure
-from mfvpr.report.rankings import Rankings, write_failures, write_predictions
+from mfvpr.report.rankings import Rankings, file_of, write_failures, write_predictions
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table
 from mfvpr.results import Matched, Ranked, Recall, Result
 from mfvpr.scoring import HistogramOfShifts
+
+ABOUT: tuple[str, ...] = ("system", "sequence", "outcome", "query", "answer")  # what the file of a figure tells
+SEQUENCES = "sequences"  # the folder of a run in which each of several has its own
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,7 @@ class Judged:
 
     def folder(self, run: Path, place: int) -> Path:
         """Where a sequence's files are: `sequences/<name>/` of several, as a name may be that of any other file."""
-        return run / "sequences" / self.sequences[place].name if len(self.sequences) > 1 else run
+        return run / SEQUENCES / self.sequences[place].name if len(self.sequences) > 1 else run
 
 
 def recall_table(judged: Judged) -> Table:
@@ -106,7 +109,7 @@ def write_rankings(folder: Path, judged: Judged, refused: Sequence[np.ndarray] |
             rankings = Rankings(
                 sequence.images.names, database, answers.rows, answers.scores, judged.is_right(name, place)
             )
-            file = f"{name.replace(' + ', '_')}.csv"
+            file = file_of(name)
             write_predictions(own / "predictions" / file, rankings)
             write_failures(own / "failures" / file, rankings)
             if name == judged.headline:
@@ -197,10 +200,11 @@ class _Page:
         names, truth = self.sequence.images.names, self.sequence.truth
         answers = [self._answer(query, 0, verdict), *(self._right_answer(query) if verdict == "wrong" else [])]
         within = "" if truth is None else threshold_words(truth.unit, self.judged.threshold)
-        verdict += " at" * bool(within) + within
         answer = self.database.names[self.ranked.rows[query, 0]]
+        about = dict(zip(ABOUT, (self.judged.headline, self.sequence.name, verdict, names[query], answer), strict=True))
+        verdict += " at" * bool(within) + within
         title = f"{self.judged.headline}, {verdict}: {names[query]} -> {answer}"
-        histogram_figure(path, self._image(self.sequence.images, query), answers, title=title)
+        histogram_figure(path, self._image(self.sequence.images, query), answers, title=title, about=about)
 
     def _answer(self, query: int, rank: int, verdict: str) -> Answer:
         """The candidate at a rank from 0."""

@@ -1,7 +1,7 @@
 """The paper's histogram figure: images with their matches beside the histogram of shifts, its peak marked."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,15 +39,22 @@ class Answer:
 
 
 def histogram_figure(
-    path: Path, query_image: np.ndarray, answers: Sequence[Answer], *, title: str, max_lines: int = 30
+    path: Path,
+    query_image: np.ndarray,
+    answers: Sequence[Answer],
+    *,
+    title: str,
+    about: Mapping[str, str] | None = None,
+    max_lines: int = 30,
 ) -> None:
     """Write the figure of one query.
 
     Args:
-        path: image file to write.
+        path: PNG file to write.
         query_image: `[H, W, 3]` uint8, at the size that the points refer to.
         answers: one below the other, their histograms in the same colors.
         title: above everything.
+        about: what it shows, for programs: text by keyword, in the file itself.
         max_lines: matches drawn, the heaviest (the paper shows 30); blue where they agree with the peak.
     """
     figure = Figure(figsize=(12, 0.2 + 4.4 * len(answers)), layout="constrained")
@@ -64,7 +71,8 @@ def histogram_figure(
             figure.colorbar(_draw_histogram(heat, answer.explanation, top), ax=heat, label="bin score", shrink=0.85)
     with replacing(path) as temporary, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # names in scripts that the font lacks
-        figure.savefig(temporary, dpi=110, bbox_inches="tight", pad_inches=0.15)
+        metadata = {keyword: printable(text) for keyword, text in (about or {}).items()}
+        figure.savefig(temporary, dpi=110, bbox_inches="tight", pad_inches=0.15, metadata=metadata)
 
 
 def _draw_pair(axes: Axes, query: np.ndarray, answer: Answer, max_lines: int) -> None:

@@ -1,0 +1,167 @@
+"""Charts of runs, drawn by plotly: lines and bars of numbers that stand in the page's tables or the run's files."""
+
+import html
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+from mfvpr.data.files import printable
+
+if TYPE_CHECKING:
+    from plotly.graph_objects import Figure
+
+# plotly is imported where it is needed, since everything else can do without.
+_COLORS = ("#0b84c6", "#e1701a", "#1a9e6f", "#c9559d", "#9a7bd0", "#b58900", "#d1495b", "#5f9ea0")  # on dark and light
+_HEIGHT = 380  # px
+_FIRST = "#8a8f98"  # of what all others are compared with
+_DASHES = ("solid", "dash", "dot", "dashdot")  # told apart without colors, too
+
+Scale = Literal["linear", "log", "percent"]
+_SCALES: dict[Scale, dict[str, Any]] = {
+    "linear": {"type": "linear"},
+    "log": {"type": "log", "tickvals": [step * 10**power for power in range(6) for step in (1, 2, 5)]},
+    "percent": {"type": "linear", "range": [-1, 101]},
+}
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A chart of a page.
+
+    Attributes:
+        name: of its element, a word.
+        title: above it.
+        words: what it shows, for those who do not see it.
+        figure: as JSON values, plotly's `data` and `layout`.
+    """
+
+    name: str
+    title: str
+    words: str
+    figure: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A bar's height in %, and its interval where that is known."""
+
+    percent: float
+    interval: tuple[float, float] | None = None
+
+
+def lines(
+    name: str,
+    title: str,
+    curves: Mapping[str, Sequence[tuple[float, float]]],
+    *,
+    axes: tuple[str, str],
+    scale: Scale = "linear",
+    marked: bool = False,
+) -> Chart:
+    """A curve of points (x, y in %) for each name; the first is what the others are compared with.
+
+    Args:
+        name: of the chart's element.
+        title: of the chart.
+        curves: by name.
+        axes: words of x and y.
+        scale: of x.
+        marked: points are drawn, since there is nothing between them.
+    """
+    from plotly import graph_objects
+
+    figure = graph_objects.Figure()
+    for place, (label, points) in enumerate(curves.items()):
+        figure.add_scatter(
+            x=[x for x, _ in points], y=[y for _, y in points], name=_plain(label),
+            mode="lines+markers" if marked else "lines", line=_line(place), hovertemplate="%{x:.4g}: %{y:.1f} %",
+        )  # fmt: skip
+    _lay_out(figure, axes, legend=len(curves) > 1)
+    figure.update_xaxes(_SCALES[scale])
+    figure.update_yaxes(range=[-2, 102])
+    ends = (f"{label}: {points[0][1]:.1f} to {points[-1][1]:.1f} %" for label, points in curves.items() if points)
+    return Chart(name, title, f"{axes[1]} against {axes[0]}. {'; '.join(ends)}.", _values(figure))
+
+
+def bars(name: str, title: str, groups: Mapping[str, Mapping[str, Bar]], *, axis: str) -> Chart:
+    """Bars from the left: by the name of a color, and by that of a place, with whiskers where intervals are known.
+
+    Of one color alone, each place has its own.
+    """
+    from plotly import graph_objects
+
+    figure, alone = graph_objects.Figure(), len(groups) == 1
+    for place, (label, members) in enumerate(groups.items()):
+        colors = [_line(one)["color"] for one in range(len(members))] if alone else _line(place)["color"]
+        figure.add_bar(
+            x=[bar.percent for bar in members.values()], y=[*map(_plain, members)], name=_plain(label),
+            orientation="h", marker_color=colors, error_x=_whiskers([*members.values()]),
+            hovertemplate="%{y}: %{x:.1f} %",
+        )  # fmt: skip
+    _lay_out(figure, (axis, ""), legend=not alone)
+    figure.update_layout(height=max(_HEIGHT, 100 + 16 * sum(map(len, groups.values()))))
+    figure.update_xaxes(range=[0, 102])
+    figure.update_yaxes(type="category", autorange="reversed")
+    parts = (f"{label}, {group}: {bar.percent:.1f} %" for label, some in groups.items() for group, bar in some.items())
+    return Chart(name, title, f"{axis}. {'; '.join(parts)}.", _values(figure))
+
+
+def amounts(name: str, title: str, values: Mapping[str, float], *, axis: str) -> Chart:
+    """Bars from the left, one for each name."""
+    from plotly import graph_objects
+
+    figure = graph_objects.Figure()
+    figure.add_bar(
+        x=[*values.values()], y=[*map(_plain, values)], orientation="h", marker_color=_COLORS[0],
+        hovertemplate="%{y}: %{x:.4g}", texttemplate="%{x:.3g}", textposition="auto",
+    )  # fmt: skip
+    _lay_out(figure, (axis, ""), legend=False)
+    figure.update_yaxes(type="category", autorange="reversed")
+    parts = "; ".join(f"{label}: {value:.3g}" for label, value in values.items())
+    return Chart(name, title, f"{axis}. {parts}.", _values(figure))
+
+
+def _plain(text: str) -> str:
+    """For plotly, whose labels understand some HTML."""
+    return html.escape(printable(text), quote=False)
+
+
+def _line(place: int) -> dict[str, Any]:
+    if place == 0:
+        return {"color": _FIRST, "dash": "solid", "width": 2}
+    return {
+        "color": _COLORS[(place - 1) % len(_COLORS)],
+        "dash": _DASHES[(place - 1) // len(_COLORS) % len(_DASHES)],
+        "width": 2,
+    }
+
+
+def _whiskers(members: Sequence[Bar]) -> dict[str, Any]:
+    ends = [bar.interval or (bar.percent, bar.percent) for bar in members]
+    return {
+        "type": "data",
+        "symmetric": False,
+        "visible": any(bar.interval for bar in members),
+        "array": [high - bar.percent for (_, high), bar in zip(ends, members, strict=True)],
+        "arrayminus": [bar.percent - low for (low, _), bar in zip(ends, members, strict=True)],
+        "thickness": 1.2,
+        "width": 3,
+    }
+
+
+def _lay_out(figure: "Figure", axes: tuple[str, str], *, legend: bool) -> None:
+    """What all charts have in common; their colors follow the page's."""
+    figure.update_layout(
+        template="none", paper_bgcolor="rgba(0,0,0,0)", plot_bgcolor="rgba(0,0,0,0)", dragmode=False, height=_HEIGHT,
+        margin={"l": 56, "r": 12, "t": 12, "b": 48}, font={"family": "system-ui, sans-serif", "size": 13},
+        showlegend=legend, legend={"orientation": "h", "yanchor": "bottom", "y": 1.02, "x": 0},
+        hoverlabel={"namelength": -1}, barmode="group",
+    )  # fmt: skip
+    options = {"fixedrange": True, "automargin": True, "zeroline": False, "title_font_size": 13}
+    figure.update_xaxes(title_text=axes[0], **options)
+    figure.update_yaxes(title_text=axes[1], **options)
+
+
+def _values(figure: "Figure") -> dict[str, Any]:
+    found = figure.to_plotly_json()
+    return {"data": found["data"], "layout": found["layout"]}

@@ -1,0 +1,49 @@
+"""The page of one run."""
+
+from pathlib import Path
+
+from mfvpr.report.pages import sections
+from mfvpr.report.pages.files import Run, read_run
+from mfvpr.report.pages.rendering import write_page
+from mfvpr.results import FILTER
+
+PAGE = "report.html"  # in a run folder
+
+
+def write_report(folder: Path, path: Path | None = None) -> Path:
+    """The page of a run folder, by default in it.
+
+    Returns:
+        where it is.
+
+    Raises:
+        InputError: it is no run folder of an evaluation.
+    """
+    run, path = read_run(folder), path or folder / PAGE
+    judged = [sections.recall_section(run), sections.differences_section(run)] if run.gains else []
+    parts = [*judged, sections.confidence_section(run), sections.answers_section(run), sections.costs_section(run),
+             sections.settings_section(run)]  # fmt: skip
+    write_page(path, title=str(run.common["dataset"]), words=in_words(run), facts=_facts(run),
+               sections=[part for part in parts if part is not None])  # fmt: skip
+    return path
+
+
+def in_words(run: Run) -> str:
+    """One line that says what was evaluated."""
+    common = run.common
+    several = f" in {len(run.sequences)} sequences" if len(run.sequences) > 1 else ""
+    right = f"right is what is within{run.within}" if run.gains and run.within else ""
+    right = right or ("right or not, as told" if run.gains else "no ground truth: rankings only")
+    return (
+        f"{common['queries']} queries{several}, {common['database']} database images, {common['candidates']} candidates"
+        f" ({common['filter']['name']}), {common['features']['name']} features; {right}"
+    )
+
+
+def _facts(run: Run) -> dict[str, str]:
+    facts = {"decides": run.headline}
+    for name in dict.fromkeys((run.headline, FILTER)) if run.gains else ():
+        hits, interval = run.all_gains.hits(name), sections.interval(run.all_gains, name)
+        found = f"{100 * hits.mean():.1f} %", sections.percent(interval)
+        facts[f"{name}, R@1{run.within}"] = " ".join(words.replace(" ", "\N{NO-BREAK SPACE}") for words in found)
+    return facts | {"seconds in all": f"{sum(run.common['seconds'].values()):.1f}"}

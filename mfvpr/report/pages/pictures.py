@@ -1,0 +1,69 @@
+"""The figures of a run, small enough to stand in a page."""
+
+import base64
+from collections.abc import Iterator
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+
+from PIL import Image
+
+from mfvpr.errors import InputError
+from mfvpr.report.evaluations import ABOUT
+
+MOST_PICTURES = 60
+_WIDTH, _QUALITY = 1000, 75  # px, of JPEG: some 60 kB each
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A query's figure.
+
+    Attributes:
+        system: that answered.
+        sequence: of the query.
+        outcome: "right", "wrong", or "best" without ground truth.
+        query: name of its image.
+        answer: name of the database image.
+        source: the picture as a `data:` URI.
+        size: width and height, px.
+    """
+
+    system: str
+    sequence: str
+    outcome: str
+    query: str
+    answer: str
+    source: str
+    size: tuple[int, int]
+
+
+def pictures(run: Path) -> list[Picture]:
+    """Those of a run folder's figures that show a query, by the names of their files; evenly chosen of too many.
+
+    Raises:
+        InputError: a figure cannot be read.
+    """
+    paths = sorted((run / "figures").rglob("*_[0-9]*.png"))
+    step = max(1, -(-len(paths) // MOST_PICTURES))
+    return [picture for path in paths[::step] for picture in _pictures(path)]
+
+
+def _pictures(path: Path) -> Iterator[Picture]:
+    """The picture of a figure; nothing where its file does not say what it shows."""
+    try:
+        with Image.open(path) as image:
+            image.load()
+            about = image.info
+            if {*ABOUT} <= {*about}:
+                small = image.convert("RGB")
+                small.thumbnail((_WIDTH, small.height))
+                yield Picture(**{name: str(about[name]) for name in ABOUT}, source=_uri(small), size=small.size)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(f"{path}: expected a figure of the run ({error}); remove it, or run again") from None
+
+
+def _uri(image: Image.Image) -> str:
+    file = BytesIO()
+    image.save(file, "JPEG", quality=_QUALITY, optimize=True)
+    return f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode()}"

@@ -1,0 +1,87 @@
+"use strict";
+
+// Tables are sorted by the buttons in their headers: numbers as numbers, names naturally, empty cells last.
+const collator = new Intl.Collator("en", { numeric: true });
+
+function sort(button) {
+  const header = button.closest("th");
+  const body = button.closest("table").tBodies[0];
+  const direction = header.getAttribute("aria-sort") === "ascending" ? "descending" : "ascending";
+  for (const other of header.parentNode.children) other.removeAttribute("aria-sort");
+  header.setAttribute("aria-sort", direction);
+  const rows = [...body.rows].map((row) => ({ row, text: row.cells[header.cellIndex].textContent.trim() }));
+  const numbers = rows.every(({ text }) => text === "" || !Number.isNaN(Number(text)));
+  const sign = direction === "ascending" ? 1 : -1;
+  rows.sort((first, second) => {
+    if (first.text === "" || second.text === "") return (first.text === "") - (second.text === "");
+    const order =  collator.compare(first.text, second.text);
+    return sign * order;
+  });
+  body.append(...rows.map(({ row }) => row));
+}
+
+for (const button of document.querySelectorAll("table.sortable th button")) {
+  button.addEventListener("click", () => sort(button));
+}
+
+// Pictures and answers are shown that every filter lets through.
+const filters = [...document.querySelectorAll("[data-filter]")];
+const kinds = { pictures: document.querySelectorAll(".picture"), answers: document.querySelectorAll("tr[data-outcome]") };
+
+function filter() {
+  const counts = Object.entries(kinds).map(([kind, items]) => {
+    let shown = 0;
+    for (const item of items) {
+      item.hidden = filters.some(({ value, dataset }) => value !== "-1" && item.dataset[dataset.filter] !== value);
+      shown += !item.hidden;
+    }
+    return `${shown} of ${items.length} ${kind}`;
+  });
+  document.getElementById("shown").textContent = counts.join(", ");
+}
+
+for (const select of filters) select.addEventListener("change", filter);
+if (filters.length) filter();
+
+// On a narrow screen a picture is small until it is asked for.
+for (const button of document.querySelectorAll(".picture button")) {
+  button.addEventListener("click", () => button.setAttribute("aria-pressed", button.getAttribute("aria-pressed") === "false"));
+}
+
+// Charts have the colors of the page, which may change.
+const charts = JSON.parse(document.getElementById("charts").textContent);
+const dark = window.matchMedia("(prefers-color-scheme: dark)");
+const theme = document.getElementById("theme");
+
+function colors() {
+  const style = getComputedStyle(document.documentElement);
+  const [text, line, card] = ["--text", "--line", "--card"].map((name) => style.getPropertyValue(name).trim());
+  const found = { "font.color": text, "hoverlabel.bgcolor": card, "hoverlabel.font.color": text };
+  for (const axis of ["xaxis", "yaxis"]) {
+    found[`${axis}.gridcolor`] = line;
+    found[`${axis}.linecolor`] = line;
+  }
+  return [{ "error_x.color": text }, found];
+}
+
+function isDark() {
+  return (document.documentElement.dataset.theme || (dark.matches ? "dark" : "light")) === "dark";
+}
+
+function paint() {
+  theme.textContent = isDark() ? "Light" : "Dark";
+  for (const name of Object.keys(charts)) Plotly.update(`chart-${name}`, ...colors());
+}
+
+theme.hidden = false;
+theme.addEventListener("click", () => {
+  document.documentElement.dataset.theme = isDark() ? "light" : "dark";
+  paint();
+});
+dark.addEventListener("change", paint);
+const options = { responsive: true, displayModeBar: false };
+const drawn = Object.entries(charts).map(([name, { data, layout }]) => Plotly.newPlot(`chart-${name}`, data, layout, options));
+Promise.all(drawn).then(() => {
+  paint();
+  document.documentElement.dataset.ready = "";
+});

@@ -1,0 +1,257 @@
+"""Pages of run folders: what stands in them, that names cannot do anything, and what is refused."""
+
+import base64
+import hashlib
+import json
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from experiments import report
+from mfvpr.errors import InputError
+from mfvpr.evaluation.statistics import block_sign_flips, mcnemar, recall_interval
+from mfvpr.report.pages import sections, several_runs
+from mfvpr.report.pages.files import read_run
+from mfvpr.report.pages.one_run import write_report
+from mfvpr.report.pages.several_runs import write_comparison
+from tests.run_folders import HEADLINE, HOSTILE, RANKS, SYSTEMS, TOLERANCES, change_json, write_run
+
+TWO = ("</style><b onclick=alert(3)>", "{{7*7}}")
+
+
+class Parsed(HTMLParser):
+    """A page as a browser's parser sees it: elements, texts by element, and rows of cells."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.elements, self.open, self.text, self.rows, self.scripts = [], [], [], [], []
+        self.feed(path.read_text("utf-8"))
+
+    def handle_starttag(self, tag, attributes):
+        self.elements.append((tag, dict(attributes)))
+        self.open = [*self.open, tag]
+        if tag == "tr":
+            self.rows.append([])
+        elif tag in ("td", "th"):
+            self.rows[-1].append("")
+        elif tag == "script":
+            self.scripts.append("")
+
+    def handle_endtag(self, tag):
+        self.open = self.open[: len(self.open) - 1 - self.open[::-1].index(tag)]
+
+    def handle_data(self, data):
+        if self.open[-1:] == ["script"]:
+            self.scripts[-1] += data
+        elif self.open[-1:] != ["style"]:
+            self.text.append(data)
+            if {"td", "th"} & {*self.open}:
+                self.rows[-1][-1] += data
+
+    def of(self, tag):
+        return [attributes for name, attributes in self.elements if name == tag]
+
+    @property
+    def charts(self):
+        return json.loads(self.scripts[0], parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
+
+
+def shown(text):
+    """How a name stands in a page: a parser takes every end of a line for the same."""
+    return text.encode("utf-8", "backslashreplace").decode().replace("\r", "\n")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return write_run(tmp_path_factory.mktemp("runs") / "one")
+
+
+@pytest.fixture(scope="module")
+def page(run):
+    return Parsed(write_report(run))
+
+
+@pytest.fixture(scope="module")
+def several(tmp_path_factory):
+    return Parsed(write_report(write_run(tmp_path_factory.mktemp("runs") / "several", sequences=TWO)))
+
+
+def test_names_are_nothing_but_text(page, several):
+    for parsed in (page, several):
+        text = "".join(parsed.text).replace("\r", "\n")
+        for name in (*HOSTILE, SYSTEMS[2], TWO[0]):
+            assert shown(name) in text
+        assert len(parsed.scripts) == 3
+        attributes = {name for _, found in parsed.elements for name in found}
+        assert not {name for name in attributes if name.startswith("on")}
+        assert not {tag for tag, _ in parsed.elements} & {"b", "svg", "iframe", "object"}
+        assert len(parsed.of("img")) == len(parsed.of("figcaption"))
+        assert not re.search(r"[<>&]", parsed.scripts[0])
+    labels = [trace["name"] for trace in several.charts["depths"]["data"]]
+    assert labels == ["filter", "histogram", "&lt;script&gt;alert(2)&lt;/script&gt;"]  # plotly reads some HTML
+
+
+def test_nothing_comes_from_elsewhere(page):
+    for tag, attributes in page.elements:
+        assert not {"srcset", "action", "style", "data", "formaction"} & {*attributes}
+        assert attributes.get("src", "data:").startswith("data:")
+        assert attributes.get("href", "#").startswith("#")
+        assert tag not in ("link", "base", "iframe", "object", "embed")
+    [policy] = [one["content"] for one in page.of("meta") if "content" in one and "default-src" in one["content"]]
+    assert policy.startswith("default-src 'none'; script-src 'sha256-")
+    assert "img-src data:" in policy
+    for script in page.scripts[1:]:
+        assert f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'" in policy
+
+
+def test_the_same_folder_is_the_same_page(run, tmp_path):
+    first = write_report(run, tmp_path / "a" / "first.html").read_bytes()
+    assert write_report(run, tmp_path / "second.html").read_bytes() == first
+    assert write_report(write_run(tmp_path / "again"), tmp_path / "third.html").read_bytes() == first
+
+
+def test_recall_and_its_intervals_are_those_of_the_files(page):
+    table = page.rows[: len(SYSTEMS) + 1]
+    assert table[0] == ["system", "R@1 ±2", "95 % at ±2"]
+    for row, name in zip(table[1:], SYSTEMS, strict=True):
+        hits = np.array(RANKS[name]) == 1
+        low, high = recall_interval(hits)
+        assert row == [name, f"{100 * hits.mean():.1f}", f"[{100 * low:.1f}, {100 * high:.1f}]"]
+    for trace, ranks in zip(page.charts["depths"]["data"], RANKS.values(), strict=True):
+        assert (trace["x"], trace["y"]) == ([1, 2, 3], [10 * sum(0 < rank <= k for rank in ranks) for k in (1, 2, 3)])
+    [bars] = page.charts["intervals"]["data"]
+    assert bars["x"] == [30.0, 80.0, 60.0]
+    for trace in page.charts["tolerances"]["data"]:
+        assert trace["x"] == TOLERANCES
+        assert trace["y"] == pytest.approx([trace["y"][2] / 3, 2 * trace["y"][2] / 3, trace["y"][2]])
+    [curve] = page.charts["precision-score"]["data"]
+    assert curve["name"] == f"{HEADLINE}: AP {100 * (0.25 + 0.25 + 0.25 * 0.75):.1f}"
+    assert (curve["x"], curve["y"]) == ([25.0, 50.0, 75.0], [100.0, 100.0, 75.0])
+
+
+def test_sequences_have_bars_and_rows_of_their_own(several):
+    for trace, name in zip(several.charts["intervals"]["data"], SYSTEMS, strict=True):
+        assert len(trace["y"]) == 3
+        assert trace["x"] == [10.0 * RANKS[name].count(1)] * 3
+    rows = several.rows[1 : 1 + 4 * len(SYSTEMS)]
+    assert [row[1] for row in rows] == [*TWO, "mean", "pooled"] * len(SYSTEMS)
+    hits = np.repeat(np.array(RANKS["filter"]) == 1, 2)  # two drives, in the order of the one map
+    low, high = recall_interval(hits)
+    assert [row[-1] for row in rows[2:4]] == ["", f"[{100 * low:.1f}, {100 * high:.1f}]"]
+
+
+def test_answers_are_pictures_and_rows(page, several, run):
+    images = page.of("img")
+    assert [one["alt"].split()[0] for one in images] == ["right", "wrong"]
+    assert shown(HOSTILE[6]) in images[1]["alt"]
+    for image in images:
+        assert (image["width"], image["height"]) == ("1000", "231")
+        assert base64.b64decode(image["src"].removeprefix("data:image/jpeg;base64,"))[:3] == b"\xff\xd8\xff"
+    rows = [row for row in page.rows if len(row) == 6 and row[0] in SYSTEMS]
+    assert [row[0] for row in rows] == [HEADLINE] * 10 + ["filter"] * 10 + [SYSTEMS[2]] * 10
+    expected = [HEADLINE, shown(HOSTILE[3]), shown(HOSTILE[-4]), "13", "wrong", "2"]
+    assert [cell.replace("\r", "\n") for cell in rows[3]] == expected
+    assert [choice["id"] for choice in page.of("select")] == ["filter-system", "filter-outcome"]
+    assert [choice["id"] for choice in several.of("select")] == ["filter-system", "filter-sequence", "filter-outcome"]
+    assert len([row for row in several.rows if len(row) == 7 and row[0] in SYSTEMS]) == 60
+
+
+def test_too_many_answers_are_left_to_the_files(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(sections, "MOST_ANSWERS", 7)
+    text = write_report(run, tmp_path / "page.html").read_text("utf-8")
+    assert "The first 7; 23 more are in the run" in text
+
+
+def test_without_ground_truth_there_are_answers_alone(tmp_path):
+    page = Parsed(write_report(write_run(tmp_path / "run", truth=False)))
+    assert [*page.charts] == ["seconds"]
+    assert {row[4] for row in page.rows if len(row) == 6 and row[0] in SYSTEMS} == {"best"}
+    assert "no ground truth: rankings only" in "".join(page.text)
+
+
+def test_runs_are_compared_query_by_query(tmp_path):
+    other = RANKS | {HEADLINE: [2, 0, 1, 1, 1, 1, 1, 0, 0, 0]}
+    runs = [write_run(tmp_path / "a"), write_run(tmp_path / "b", ranks=other)]
+    write_comparison(runs, tmp_path / "page.html")
+    page = Parsed(tmp_path / "page.html")
+    hits = [np.array(one[HEADLINE]) == 1 for one in (RANKS, other)]
+    test, flips = mcnemar(*hits), block_sign_flips(*hits)
+    [row] = [row for row in page.rows if row and row[0] == f"a: {HEADLINE}"]
+    assert row == [f"a: {HEADLINE}", f"b: {HEADLINE}", "5", "2", f"{test.p_value:.2g}", str(flips.block),
+                   str(flips.blocks), f"{flips.p_value:.2g}"]  # fmt: skip
+    assert [bar["x"] for bar in page.charts["intervals"]["data"]] == [[80.0, 50.0]]
+    assert "Not comparable" not in "".join(page.text)
+    assert len(page.scripts) == 3
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"data_fingerprint": {"database": "1"}}, "other images"),
+        ({"truth": False}, "a run has no ground truth"),
+        ({"sequences": TWO}, "other queries"),
+        ({"ground_truth": {"kind": "order", "files": [], "exclude_neighbors": None, "unit": "m",
+                           "thresholds": [25]}}, "another ground truth (unit, thresholds)"),
+    ],
+)  # fmt: skip
+def test_runs_of_other_queries_are_not(tmp_path, changes, reason):
+    runs = [write_run(tmp_path / "a"), write_run(tmp_path / "b", **changes)]
+    assert several_runs.why_not(*map(read_run, runs)) == reason
+    write_comparison(runs, tmp_path / "page.html")
+    page = Parsed(tmp_path / "page.html")
+    assert ["a", "b", reason] in page.rows
+    assert not [row for row in page.rows if row[0] == f"a: {HEADLINE}"]
+
+
+def program(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr(sys, "argv", ["report", *map(str, arguments)])
+    monkeypatch.setattr(report, "unwind_on_sigterm", lambda: None)
+    code = 0
+    try:
+        report.main()
+    except SystemExit as end:
+        code = end.code
+    return code, *capsys.readouterr()
+
+
+def test_the_program_says_where_the_page_is(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert program(monkeypatch, capsys, run) == (0, f"report: {run}/report.html\n", "")
+    again = write_run(tmp_path / "again")
+    assert program(monkeypatch, capsys, run, again) == (0, "report: comparison.html\n", "")
+    assert program(monkeypatch, capsys, run, "--out", "a.html") == (0, "report: a.html\n", "")
+    assert {path.name for path in tmp_path.iterdir()} == {"again", "comparison.html", "a.html"}
+
+
+def test_what_is_no_run_is_refused_in_one_line(run, tmp_path, monkeypatch, capsys):
+    places = {name: write_run(tmp_path / name) for name in ("sweep", "broken", "kind", "lacking", "old", "figure")}
+    change_json(places["sweep"] / "results.json", lambda rows: {"settings": []})
+    (places["broken"] / "run.json").write_text("{")
+    change_json(places["kind"] / "results.json", lambda rows: [{**row, "seconds": "3"} for row in rows])
+    (places["lacking"] / "gains.csv").unlink()
+    (places["old"] / "gains.csv").write_text("query,filter,filter rank\na,1,1\n")
+    (places["figure"] / "figures" / "right_0009.png").write_bytes(b"no image")
+    for place, words in (
+        (tmp_path / "none", "none with a results.json"), (places["sweep"], "no rows"), (places["broken"], "JSONDecode"),
+        (places["kind"], "seconds is str"), (places["lacking"], "gains.csv"), (places["old"], "'place'"),
+        (places["figure"], "expected a figure of the run"),
+    ):  # fmt: skip
+        code, stdout, stderr = program(monkeypatch, capsys, place)
+        assert (code, stdout, stderr.count("\n")) == (2, "", 1)
+        assert stderr.startswith(f"error: {place}")
+        assert words in stderr
+    code, _, stderr = program(monkeypatch, capsys, run, run)
+    assert (code, stderr) == (2, "error: expected different run folders, got one twice\n")
+    with pytest.raises(InputError, match="expected different"):
+        write_comparison([run, run.parent / "." / "one"], tmp_path / "page.html")
+
+
+def test_help_and_the_library_wait_for_no_charts():
+    code = ("import sys, mfvpr; from experiments import evaluation; "
+            "assert not {'plotly', 'jinja2', 'playwright'} & {*sys.modules}")  # fmt: skip
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -1,0 +1,174 @@
+"""Pages as people meet them, in a headless Chromium: drawn, sorted, filtered, on a wide screen and on a phone."""
+
+import shutil
+from importlib.util import find_spec
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mfvpr.report.pages.one_run import write_report
+from mfvpr.report.pages.several_runs import write_comparison
+from tests.run_folders import HEADLINE, RANKS, SYSTEMS, write_run
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+WHY_NOT = "" if CHROMIUM else "no chromium, chromium-browser or google-chrome on the PATH"
+WHY_NOT = WHY_NOT or ("" if find_spec("playwright") else "playwright is not installed: pip install 'mfvpr[test]'")
+
+pytestmark = pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT)
+SEQUENCES = ("day", "night " * 12)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory):
+    """Of a run with one sequence, of one with two, of one without ground truth, and of these compared."""
+    root = tmp_path_factory.mktemp("runs")
+    runs = [
+        write_run(root / "one"),
+        write_run(root / "two", sequences=SEQUENCES),
+        write_run(root / "none", truth=False),
+    ]
+    write_comparison([*runs, write_run(root / "other")], root / "all.html")
+    return {"all": root / "all.html"} | {run.name: write_report(run) for run in runs}
+
+
+@pytest.fixture
+def opened(browser, pages):
+    """Opens a page, and fails where it says anything, asks anything, or wants anything from elsewhere."""
+    said, contexts = [], []
+
+    def open_page(name, width=1280, scheme="light"):
+        contexts.append(browser.new_context(viewport={"width": width, "height": 800}, color_scheme=scheme))
+        page = contexts[-1].new_page()
+        page.on("console", lambda message: said.append(message.text))
+        page.on("pageerror", lambda error: said.append(str(error)))
+        page.on("dialog", lambda dialog: said.append(dialog.message))
+        page.on("request", lambda request: request.url.startswith(("file:", "data:")) or said.append(request.url))
+        page.goto(pages[name].as_uri())
+        page.wait_for_selector("html[data-ready]", state="attached")
+        return page
+
+    yield SimpleNamespace(page=open_page, said=said)
+    for context in contexts:
+        context.close()
+    assert said == []
+
+
+def cells(page, column, table="First answers"):
+    """Texts of the visible cells of a table's column."""
+    rows = page.locator(f"[aria-label='{table}'] tbody tr:visible td:nth-child({column})")
+    return rows.all_text_contents()
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+@pytest.mark.parametrize("name", ["one", "two", "none", "all"])
+def test_pages_fit_and_their_charts_are_drawn(opened, tmp_path, name, width):
+    page = opened.page(name, width, "dark" if width == 390 else "light")
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    charts = page.locator(".chart")
+    assert charts.count() == {"one": 6, "two": 6, "none": 1, "all": 2}[name]
+    for chart in charts.all():
+        assert chart.get_attribute("aria-label")
+        assert chart.locator("svg.main-svg").first.bounding_box()["width"] > 250
+    for image in page.locator(".picture img").all():
+        assert image.evaluate("image => image.decode().then(() => image.naturalWidth)") == 1000
+        assert len(image.get_attribute("alt")) > 40
+    page.screenshot(path=tmp_path / "page.png", full_page=True)
+    pixels = np.asarray(Image.open(tmp_path / "page.png").convert("L"))
+    assert pixels.shape[1] == width
+    assert (np.median(pixels) > 128) == (width == 1280)
+    assert pixels.std() > 10
+
+
+def test_tables_are_sorted_by_click_and_by_key(opened):
+    page = opened.page("one")
+    scores, header = cells(page, 4), page.locator("[aria-label='First answers'] th").nth(3)
+    assert [float(score) for score in scores] == [*range(10, 20)]
+    page.get_by_role("button", name="score", exact=True).click()
+    assert (header.get_attribute("aria-sort"), cells(page, 4)) == ("ascending", scores)
+    page.get_by_role("button", name="score", exact=True).press("Enter")
+    assert (header.get_attribute("aria-sort"), cells(page, 4)) == ("descending", scores[::-1])
+    page.get_by_role("button", name="first right rank").press("Space")
+    assert header.get_attribute("aria-sort") is None
+    assert cells(page, 6) == ["1"] * 8 + ["2", ""]  # numbers, and what is empty behind them
+    page.get_by_role("button", name="first right rank").click()
+    assert cells(page, 6) == ["2"] + ["1"] * 8 + [""]
+
+
+def test_answers_are_filtered_by_click_and_by_key(opened):
+    page = opened.page("two")
+    told = page.locator("#shown")
+    assert told.text_content() == "4 of 4 pictures, 20 of 60 answers"
+    page.get_by_role("combobox", name="Outcome").select_option("wrong")
+    assert told.text_content() == "2 of 4 pictures, 4 of 60 answers"
+    assert {*cells(page, 6)} == {"wrong"}
+    page.get_by_role("combobox", name="Sequence").select_option("day")
+    assert told.text_content() == "1 of 4 pictures, 2 of 60 answers"
+    page.get_by_role("combobox", name="System").focus()
+    page.keyboard.press("Home")
+    assert told.text_content() == f"1 of 4 pictures, {sum(10 - one.count(1) for one in RANKS.values())} of 60 answers"
+    page.get_by_role("combobox", name="System").select_option(SYSTEMS[0])
+    assert page.locator(".picture:visible").count() == 0
+    assert {*cells(page, 1)} == {SYSTEMS[0]}
+    page.get_by_role("combobox", name="System").select_option(HEADLINE)
+    assert page.locator(".picture:visible").count() == 1
+
+
+def test_pictures_are_full_size_when_asked_for(opened):
+    page = opened.page("one", 390)
+    picture = page.locator(".picture").first
+    before = picture.locator("img").bounding_box()["width"]
+    picture.get_by_role("button").press("Enter")
+    assert before < 390 < picture.locator("img").bounding_box()["width"] == 1000
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    picture.get_by_role("button").click()
+    assert picture.locator("img").bounding_box()["width"] == before
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_theme_follows_the_system_until_it_is_chosen(opened, scheme):
+    page, other = opened.page("one", scheme=scheme), {"light": "Dark", "dark": "Light"}[scheme]
+    look = "[document.body, document.querySelector('.xtick text')].map(one => getComputedStyle(one)).map(one => [one."
+    look += "backgroundColor, one.fill])"
+    [before, _], [_, text] = page.evaluate(look)
+    page.get_by_role("button", name=other, exact=True).click()
+    [after, _], [_, new_text] = page.evaluate(look)
+    assert before != after
+    assert text != new_text
+    page.emulate_media(color_scheme=other.lower())
+    assert page.evaluate(look)[0][0] == after
+
+
+def test_the_keyboard_reaches_everything(opened):
+    page = opened.page("two", 390)
+    page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.textContent") == "Skip to the results"
+    page.keyboard.press("Enter")
+    assert page.evaluate("document.activeElement.id") == "content"
+    reached = set()
+    for _ in range(80):
+        page.keyboard.press("Tab")
+        found = page.evaluate("[document.activeElement.tagName, getComputedStyle(document.activeElement).outlineStyle]")
+        reached.add(tuple(found))
+    assert {tag for tag, _ in reached} >= {"SUMMARY", "DIV", "BUTTON", "SELECT"}
+    assert "none" not in {style for tag, style in reached if tag != "BODY"}
+
+
+def test_scripts_in_what_is_added_do_not_run(opened):
+    page = opened.page("one")
+    page.evaluate("document.body.insertAdjacentHTML('beforeend', '<img src=data:, onerror=\"window.ran = 1\">')")
+    page.evaluate("fetch('https://example.invalid').catch(() => { window.refused = 1 })")
+    assert page.evaluate("[window.ran, window.refused]") == [None, 1]
+    assert all("Content Security Policy" in line for line in opened.said)
+    opened.said.clear()
