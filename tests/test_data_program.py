@@ -1,0 +1,69 @@
+"""Data sets as a program: listed, and checked beside what is published."""
+
+import signal
+
+import pytest
+from PIL import Image
+
+from experiments import data
+from mfvpr.data.published import PUBLISHED
+from tests.data.test_published import put
+
+
+@pytest.fixture
+def program(monkeypatch, capsys):
+    handler = signal.getsignal(signal.SIGTERM)
+
+    def call(*arguments):
+        monkeypatch.setattr("sys.argv", ["data", *map(str, arguments)])
+        code = 0
+        try:
+            data.main()
+        except SystemExit as left:
+            code = left.code
+        return code, *capsys.readouterr()
+
+    yield call
+    signal.signal(signal.SIGTERM, handler)
+
+
+def test_all_are_listed_with_their_numbers(program):
+    code, stdout, _ = program("list")
+    assert code == 0
+    assert [line.split()[0] for line in stdout.splitlines()[2:]] == [*PUBLISHED]
+    assert "1,411" in next(line for line in stdout.splitlines() if line.startswith("robotcar"))
+
+
+def test_a_layout_is_told(program):
+    code, stdout, _ = program("list", "gardens_point", "msls_val")
+    assert code == 0
+    assert "GroundTruth.csv" in stdout
+    assert "train_val/cph/database/images" in stdout
+    assert program("list", "x")[0] == 2
+
+
+def test_what_is_there_stands_beside_what_is_published(program, tmp_path):
+    put(tmp_path, *(f"Reference/image{i:04d}.png" for i in range(4)), *(f"Live/image{i:04d}.png" for i in range(2)))
+    (tmp_path / "GroundTruth.csv").write_text("Reference,Live\n0,0\n3,1\n")
+    code, stdout, stderr = program("check", "berlin_a100", f"root={tmp_path}", "--sheet", tmp_path / "sheet.png")
+    assert code == 2
+    assert ["database", "4", "85", "0"] in [line.split() for line in stdout.splitlines()]
+    assert "berlin_a100: right images of a query (±5): 4 to 4, median 4; 0 queries have none" in stdout
+    assert "2 queries are images of the database" in stdout
+    assert "4 database images where 85 are published; 2 queries in berlin_a100 where 81 are published" in stderr
+    with Image.open(tmp_path / "sheet.png") as sheet:
+        assert sheet.size[0] > 500
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["check", "gardens_point"], "has no default of root"),
+    (["check", "gardens_point", "root=/no/such"], "expected the folder of gardens_point, got nothing"),
+    (["check", "garden"], "expected data sets such as"),
+    (["check"], "the following arguments are required: NAME"),
+    ([], "the following arguments are required: COMMAND"),
+])  # fmt: skip
+def test_mistakes_are_one_line(program, arguments, words):
+    code, _, stderr = program(*arguments)
+    assert code == 2
+    assert words in stderr
+    assert stderr.count("\n") == 1
