@@ -103,7 +103,8 @@ def _write_tables(folder, ranks, sequences):
               for name, one in ranks.items() for part in names or [None]]  # fmt: skip
     header = ["system", *(["sequence"] if names else []), "R@1 ±2"]
     (folder / "table.csv").write_text(Table(header, recall).csv(), encoding="utf-8")
-    write_csv(folder / "differences.csv", ["system", "other", *"abcdef"], [[*SYSTEMS[:2], 0, 5, 0.06, 2, 3, 0.25]])
+    pairs = [[*SYSTEMS[:2], 0, 5, 0.06, 2, 3, 0.25], [*SYSTEMS[1:], 2, 0, "1e-09", 2, 3, 0.25]]
+    write_csv(folder / "differences.csv", ["system", "other", *"abcdef"], pairs)
     write_csv(folder / "confidence.csv", ["system", "AP by score"], [[HEADLINE, "90.0"]])
     write_csv(folder / "rerank_share.csv", ["re-ranked", *SYSTEMS[1:]], [["0.00", 30.0, 30.0], ["1.00", 80.0, 70.0]])
     points = [[HEADLINE, "score", 3, 1, 0.25], [HEADLINE, "score", 2, 1, 0.5], [HEADLINE, "score", 1, 0.75, 0.75]]

@@ -104,6 +104,8 @@ def test_tables_are_sorted_by_click_and_by_key(opened):
     assert cells(page, 6) == ["1"] * 8 + ["2", ""]  # numbers, and what is empty behind them
     page.get_by_role("button", name="first right rank").click()
     assert cells(page, 6) == ["2"] + ["1"] * 8 + [""]
+    page.get_by_role("button", name="McNemar p").click()
+    assert cells(page, 5, "Every two systems") == ["1e-09", "0.06"]
 
 
 def test_answers_are_filtered_by_click_and_by_key(opened):

@@ -14,7 +14,7 @@ function sort(button) {
   const sign = direction === "ascending" ? 1 : -1;
   rows.sort((first, second) => {
     if (first.text === "" || second.text === "") return (first.text === "") - (second.text === "");
-    const order =  collator.compare(first.text, second.text);
+    const order = numbers ? Number(first.text) - Number(second.text) : collator.compare(first.text, second.text);
     return sign * order;
   });
   body.append(...rows.map(({ row }) => row));
