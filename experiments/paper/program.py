@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments import build
+from experiments import build, truth
 from experiments.console import tell
 from experiments.errors import how_to_install
 from experiments.paper import figures, lineup, runs, timing
@@ -68,6 +68,7 @@ def _evaluate_all(
             archive = build.archive(chosen)
             sides = {one.name: one.images for one in dataset.sequences} | {"the database": dataset.database}
             images = {side: archive.contents(folder).fingerprint for side, folder in sides.items()}
+            truths = runs.truths(dataset, truth.thresholds(chosen, dataset.sequences[0].truth))
         except InputError as error:
             datasets.pop(place.name, None)
             failed.append(f"{place.name}: {error}")
@@ -75,7 +76,7 @@ def _evaluate_all(
             continue
         for turn, run in enumerate(names):
             chosen = runs.settings_of(run, place, settings)
-            folder, expected = runs.folder_of(run, place, settings), runs.made_of(chosen, images)
+            folder, expected = runs.folder_of(run, place, settings), runs.made_of(chosen, images, truths)
             if runs.is_done(folder, expected):
                 continue
             tell(f"{number * len(names) + turn + 1} of {len(found) * len(names)}: {run} on {place.name}")
@@ -124,10 +125,10 @@ def _timed(
 
 def _by_row(
     rows: Sequence[Row], times: Mapping[str, Mapping[str, float]]
-) -> tuple[dict[str, Mapping[str, float]], dict[str, float]]:
-    """Of the rows whose ranking was timed: an evaluation's first score, or its histogram."""
+) -> tuple[dict[str, Mapping[str, float]], dict[tuple[str, str], float]]:
+    """Of the rows whose ranking was timed: an evaluation's first score, or its histogram; sizes by data set as well."""
     timed = {row.name: times[row.run] for row in rows if row.run in times and row.ranking in (None, "histogram")}
-    sized = {row.name: times[row.run]["bytes"] for row in rows if row.name in timed}
+    sized = {(name, str(one["data_set"])): one["bytes"] for name, one in timed.items()}
     return timed, sized
 
 

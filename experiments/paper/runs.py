@@ -1,7 +1,7 @@
 """The evaluations, each in a run folder of its own; what is finished is not done again."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,8 @@ from experiments.console import tell
 from experiments.paper.lineup import Place, overrides
 from experiments.quoting import as_typed
 from experiments.settings import CONF, SettingsError, check
-from mfvpr.fingerprints import fingerprint
+from mfvpr.data.datasets import Dataset
+from mfvpr.fingerprints import fingerprint, recipe_of
 from mfvpr.report import runs
 from mfvpr.weights import files
 from mfvpr.weights.registry import REGISTRY
@@ -46,15 +47,25 @@ def folder_of(run: str, place: Place, settings: Mapping[str, Any]) -> Path:
     return Path(settings["out"]).expanduser() / "runs" / place.name / run
 
 
-def made_of(settings: Mapping[str, Any], images: Mapping[str, str]) -> dict[str, str]:
-    """What an evaluation follows from, each as a hash: settings, images, weights, and the code's version."""
+def truths(dataset: Dataset, thresholds: Sequence[float]) -> list[Any]:
+    """What is right by sequence and threshold, whatever file says it."""
+    found = []
+    for sequence in dataset.sequences:
+        known = [] if sequence.truth is None else [sequence.truth.positives(threshold) for threshold in thresholds]
+        found.append([sequence.name, *({"rows": one.rows, "offsets": one.offsets} for one in known)])
+    return found
+
+
+def made_of(settings: Mapping[str, Any], images: Mapping[str, str], truths: Any = ()) -> dict[str, str]:
+    """What an evaluation follows from, each as a hash: settings, images, truths, weights, and the code's version."""
     free = {name: value for name, value in settings.items() if name not in _FREE}
     free["dataset"] = {name: value for name, value in settings["dataset"].items() if name not in ("root", "cache")}
     free["dataset"] |= {name: None for name in ("database", "queries") if name in free["dataset"]}  # folders
     names = [settings[group].get("weights") for group in ("features", "retrieval", "matching")]
     weights = {name: files.fingerprint(name) for name in names if name in REGISTRY}
     return {
-        "settings": fingerprint(free), "images": fingerprint(dict(images)), "weights": fingerprint(weights),
+        "settings": fingerprint(free), "images": fingerprint(dict(images)),
+        "ground truth": fingerprint(recipe_of(truths)), "weights": fingerprint(weights),
         "version": runs.versions()["mfvpr"],
     }  # fmt: skip
 
@@ -86,9 +97,9 @@ def evaluate(settings: Mapping[str, Any], made_of: Mapping[str, str]) -> None:
         def write(new: Path) -> None:
             evaluation.write(new, outcome)
             runs.write_json(new / _MADE_OF, dict(made_of))
+            run_folder.draw(new, outcome.figures)  # before results.json is there, as nothing is done again behind it
 
         run_folder.keep(folder, settings, evaluation.ground_truth(outcome), write)
-        run_folder.draw(folder, outcome.figures)
     jax.clear_caches()  # compiled programs of one data set are of no use to another, and each takes maps of memory
 
 

@@ -38,14 +38,14 @@ class Found:
         datasets: that are here, by name.
         evaluated: by row and data set.
         seconds: by row: of a query, by step; see `timing`.
-        sizes: by row: bytes of an image's features in float32, as the paper counts them.
+        sizes: by row and data set: bytes of an image's features in float32, as the paper counts them.
     """
 
     rows: Sequence[Row]
     datasets: Mapping[str, Dataset]
     evaluated: Mapping[tuple[str, str], Evaluated]
     seconds: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    sizes: Mapping[str, float] = field(default_factory=dict)
+    sizes: Mapping[tuple[str, str], float] = field(default_factory=dict)
 
     def known(self, rows: Iterable[Row], datasets: Iterable[str]) -> list[Row]:
         """Those that were evaluated on one of the data sets, or are printed for it."""
@@ -92,8 +92,8 @@ def tables(found: Found) -> Iterator[tuple[str, str, Table]]:
         ("averages", f"Average Recall@1 in % (figure 8); {note}", averages(found)),
         ("depths", f"Recall@1, @5 and @10 in %, by data set (Table VIII); {note}", depths(found)),
         ("sizes", f"Size of the database in MiB, of float32 (Table V); {note}", sizes(found)),
-        ("seconds", f"Seconds of a query by step (Table VI: an RTX 2080 Ti; here the device of report.json); {note}",
-         seconds(found)),
+        ("seconds", "Seconds of a query by step (Table VI: an RTX 2080 Ti; here the device that seconds/*.json names); "
+         f"{note}", seconds(found)),
     )  # fmt: skip
     yield from (one for one in candidates if one[2].rows)
 
@@ -181,11 +181,10 @@ def sizes(found: Found) -> Table:
     rows = []
     for row in found.rows:
         theirs = printed()["sizes"].get(row.name, {})
-        cells = [
-            beside(found.sizes[row.name] * len(dataset.database) / 2**20 if row.name in found.sizes else None,
-                   theirs.get(name))
-            for name, dataset in found.datasets.items()
-        ]  # fmt: skip
+        cells = []
+        for name, dataset in found.datasets.items():
+            size = found.sizes.get((row.name, name))
+            cells.append(beside(None if size is None else size * len(dataset.database) / 2**20, theirs.get(name)))
         if any(cell != _NONE for cell in cells):
             rows.append([row.title, *cells])
     return Table(["system", *found.datasets], rows)

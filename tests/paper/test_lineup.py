@@ -6,10 +6,11 @@ import pytest
 from experiments.paper import lineup
 from experiments.paper.lineup import DRAWN, ROWS, Place, chosen_rows, missing_weights, overrides, places
 from experiments.paper.printed import printed
-from experiments.paper.runs import made_of, settings_of
+from experiments.paper.runs import made_of, settings_of, truths
 from experiments.paper.tables import OVERALL, Evaluated, Found, beside, evaluated, tables
 from experiments.settings import SettingsError
 from mfvpr.data.datasets import Dataset, ImageFolder, QuerySequence
+from mfvpr.data.ground_truth import FrameTruth
 
 SETTINGS = {"out": "out", "store": None, "memory": None, "devices": 1}
 RUNS = list(dict.fromkeys(row.run for row in ROWS))
@@ -139,7 +140,7 @@ def test_tables_hold_both_numbers():
     one = Evaluated({OVERALL: recall}, result("histogram", 0.8))
     gardens = dataset("gardens_point", "all", database=200)
     found = Found([row], {"gardens_point": gardens},
-                  {("mix_hist_50", "gardens_point"): one}, sizes={"mix_hist_50": 2.0**20},
+                  {("mix_hist_50", "gardens_point"): one}, sizes={("mix_hist_50", "gardens_point"): 2.0**20},
                   seconds={"mix_hist_50": dict(filter=0.1, features=0.2, matching=0.3, scores=0.1)})  # fmt: skip
     made = {name: table for name, _, table in tables(found)}
     assert made["recall"].rows == [["Mix-hist 50", "81.0 (80.0, +1.0)", "92.5 (92.0, +0.5)", "96.0 (96.0, +0.0)"]]
@@ -174,3 +175,13 @@ def test_averages_over_all_six_are_the_papers():
     assert [cell.split(" ")[0] for cell in line[1:4]] == ["87.5", "92.9", "95.0"]
     assert all(cell.endswith("+0.0)") or cell.endswith("-0.0)") for cell in line[1:4])
     assert np.isfinite([float(cell) for cell in line[4:]]).all()
+
+
+def test_another_ground_truth_of_the_same_images_is_another_run(tmp_path):
+    folder, settings = ImageFolder(None, ("0", "1", "2")), made("sift_50", "corridor", tmp_path)
+    known = []
+    for rows in (((0,), (1,), (2,)), ((0,), (2,), (1,))):
+        parts = (QuerySequence("one", folder, FrameTruth(rows, 3)),)
+        known.append(made_of(settings, {}, truths(Dataset("corridor", folder, parts), [1])))
+    assert known[0] != known[1]
+    assert {name for name in known[0] if known[0][name] != known[1][name]} == {"ground truth"}

@@ -1,6 +1,6 @@
 """Images that a list names, and lists of NumPy's files, in which nothing is executed."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -106,14 +106,3 @@ def _array(path: Path) -> np.ndarray:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
     except (ValueError, EOFError):
         raise InputError(f"{path}: expected an array of NumPy; get it again") from None
-
-
-def rows_of(numbers: Sequence[int], num_database: int, origin: Path) -> tuple[tuple[int, ...], ...]:
-    """One database row per query.
-
-    Raises:
-        InputError: there is no such row.
-    """
-    if beyond := [row for row in numbers if not 0 <= row < num_database]:
-        raise InputError(f"{origin}: expected rows from 0 to {num_database - 1}, got {beyond[0]}")
-    return tuple((row,) for row in numbers)
