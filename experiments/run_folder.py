@@ -16,13 +16,13 @@ _OF_THE_START = ("multirun", "command")  # what `command_line` adds to the setti
 
 
 @contextmanager
-def claimed(settings: Mapping[str, Any]) -> Iterator[Path]:
-    """The run folder that the settings name, for this run alone."""
+def claimed(settings: Mapping[str, Any], *, own: bool = False) -> Iterator[Path]:
+    """The run folder that the settings name, for this run alone; `own` as of `runs.claimed`."""
     out, name = settings["out"], settings["dataset"]["name"]
     folder = build.expanded(out) if out else runs.new_run_folder(Path("runs"), name)
     with ExitStack() as claim:
         try:
-            folder = claim.enter_context(runs.claimed(folder, numbered=not out))
+            folder = claim.enter_context(runs.claimed(folder, numbered=not out, own=own))
         except InputError as error:
             raise SettingsError(f"{error} with out=DIR") from error
         yield folder
@@ -80,13 +80,18 @@ def draw(folder: Path, figures: Sequence[Figure]) -> None:
 
 
 def report(folder: Path) -> None:
-    """The page of an evaluation that was left in a folder; one that cannot be made costs a warning, as figures do."""
+    """Make the page of an evaluation that was left in a folder, and say where it is."""
+    if page := report_page(folder):
+        print(f"report: {page}")
+
+
+def report_page(folder: Path) -> Path | None:
+    """The page of an evaluation, now made; one that cannot be made costs a warning, as figures do."""
     try:
-        page = one_run.write_report(folder)
+        return one_run.write_report(folder)
     except Exception as error:
         console.tell(f"warning: {folder}: no page was made of it ({error})")
-    else:
-        print(f"report: {page}")
+        return None
 
 
 def _about(settings: Mapping[str, Any], ground_truth: Mapping[str, Any]) -> dict[str, Any]:

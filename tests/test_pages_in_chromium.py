@@ -77,7 +77,7 @@ def test_pages_fit_and_their_charts_are_drawn(opened, tmp_path, name, width):
     page = opened.page(name, width, "dark" if width == 390 else "light")
     assert page.evaluate("document.documentElement.scrollWidth") <= width
     charts = page.locator(".chart")
-    assert charts.count() == {"one": 6, "two": 6, "none": 1, "all": 2}[name]
+    assert charts.count() == {"one": 6, "two": 6, "none": 1, "all": 4}[name]
     for chart in charts.all():
         assert chart.get_attribute("aria-label")
         assert chart.locator("svg.main-svg").first.bounding_box()["width"] > 250

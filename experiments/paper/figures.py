@@ -1,6 +1,7 @@
 """The paper's figures, of what was evaluated here."""
 
 import csv
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -13,10 +14,11 @@ from matplotlib.figure import Figure
 from experiments.paper.lineup import Row
 from experiments.paper.printed import average, printed
 from experiments.paper.tables import OVERALL, TOLERANCES, Found
-from mfvpr.data.datasets import Dataset, ImageFolder
+from mfvpr.data.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.data.files import printable, replacing
 from mfvpr.data.images import resize
 from mfvpr.report import runs
+from mfvpr.report.evaluations import sequence_folder
 
 _MIDDLE = 1  # of the tolerances: the paper's figure
 _OURS, _THEIRS = "#2f6fb0", "#c9a227"
@@ -24,27 +26,28 @@ _STEPS = {"filter": "#7a9e9f", "features": "#c98b2d", "matching": "#2f6fb0", "sc
 _SIDE = 300  # px of an image's longer side among the failures
 
 
-def figures(
-    found: Found, failures: Mapping[str, Path], growth: Mapping[str, Mapping[int, float]]
-) -> Iterator[runs.Figure]:
+def figures(found: Found, best: Mapping[str, Path], growth: Mapping[str, Mapping[int, float]]) -> Iterator[runs.Figure]:
     """Those for which there are numbers.
 
     Args:
         found: what was evaluated.
-        failures: a csv of failures by data set.
+        best: the run folder by data set whose histograms and failures are shown.
         growth: see `timing.growth`.
     """
-    if bars := _averages(found):
+    histograms = (path for folder in best.values() for path in sorted((folder / "figures").rglob("right_*.png")))
+    if histogram := next(histograms, None):
+        yield "histogram.png", partial(_copy, source=histogram)
+    if bars := mean_bars(found):
         yield "averages.png", partial(draw_averages, bars=bars)
     if found.seconds:
         yield "speed.png", partial(draw_speed, rows=found.rows, seconds=found.seconds)
     if growth:
         yield "growth.png", partial(draw_growth, growth=growth)
-    if failures:
-        yield "failures.png", partial(draw_failures, datasets=found.datasets, files=failures)
+    if best:
+        yield "failures.png", partial(draw_failures, datasets=found.datasets, best=best)
 
 
-def _averages(found: Found) -> list[tuple[str, float | None, float | None]]:
+def mean_bars(found: Found) -> list[tuple[str, float | None, float | None]]:
     """(title, mean over the data sets here, the printed mean) within 2 frames, of rows that have one."""
     tolerance = TOLERANCES[_MIDDLE]
     bars = []
@@ -105,37 +108,55 @@ def draw_growth(path: Path, growth: Mapping[str, Mapping[int, float]]) -> None:
     for title, by_size in growth.items():
         axes.loglog([*by_size], [*by_size.values()], marker="o", markersize=3, label=title)
     axes.set_xlabel("images of the database")
+    for set_formatter in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
+        set_formatter("{x:g}")
     axes.set_ylabel("seconds of a query")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     _save(figure, path)
 
 
-def draw_failures(path: Path, datasets: Mapping[str, Dataset], files: Mapping[str, Path], each: int = 2) -> None:
+def draw_failures(path: Path, datasets: Mapping[str, Dataset], best: Mapping[str, Path], each: int = 2) -> None:
     """Query, answer and truth, where the answer scores higher than a right image among the candidates."""
-    cases = [(name, *case) for name, file in files.items() for case in _failures(file, each)]
+    cases = [(name, *case) for name, folder in best.items() for case in _failures(folder, datasets[name], each)]
     figure = Figure(figsize=(9.5, 0.4 + 2.4 * max(len(cases), 1)), layout="constrained")
     FigureCanvasAgg(figure)
     for axes, (name, sequence, *images) in zip(
         figure.subplots(max(len(cases), 1), 3, squeeze=False), cases, strict=False
     ):
         dataset = datasets[name]
-        queries = next((one.images for one in dataset.sequences if one.name == sequence), dataset.sequences[0].images)
-        folders = (queries, dataset.database, dataset.database)
+        folders = (sequence.images, dataset.database, dataset.database)
         for one, folder, image, word in zip(axes, folders, images, ("query", "answer", "truth"), strict=True):
             one.set_axis_off()
             one.imshow(_small(folder, image))
-            where = f"{name} {sequence}".strip() if word == "query" else ""
+            where = " ".join(dict.fromkeys((name, sequence.name))) if word == "query" else ""
             one.set_title(printable(f"{where} {word}: {image}".strip()), fontsize=7, parse_math=False)
     _save(figure, path)
 
 
-def _failures(file: Path, number: int) -> Iterator[tuple[str, str, str, str]]:
+def _failures(run: Path, dataset: Dataset, number: int) -> Iterator[tuple[QuerySequence, str, str, str]]:
     """(sequence, query, answer, right answer) of the clearest failures that the filter did not cause."""
-    with file.open(newline="", encoding="utf-8", errors="surrogateescape") as lines:
-        rows = [row for row in csv.DictReader(lines) if row["right_answer"]]
-    rows.sort(key=lambda row: -float(row["margin"]))
-    yield from ((row.get("sequence", ""), row["query"], row["answer"], row["right_answer"]) for row in rows[:number])
+    names, rows = [sequence.name for sequence in dataset.sequences], []
+    for place, sequence in enumerate(dataset.sequences):
+        file = sequence_folder(run, names, place) / "failures" / "histogram.csv"
+        with file.open(newline="", encoding="utf-8", errors="surrogateescape") as lines:
+            rows += [(sequence, row) for row in csv.DictReader(lines)
+                     if row["right_answer"] and _is_far(sequence, dataset.database, row)]  # fmt: skip
+    rows.sort(key=lambda row: -float(row[1]["margin"]))
+    yield from ((sequence, row["query"], row["answer"], row["right_answer"]) for sequence, row in rows[:number])
+
+
+def _is_far(sequence: QuerySequence, database: ImageFolder, row: Mapping[str, str]) -> bool:
+    """Whether an answer is wrong within the widest of the paper's tolerances, too; of positions it is."""
+    if sequence.truth is None or sequence.truth.unit != "frames":
+        return True
+    right = sequence.truth.positives(TOLERANCES[-1]).of(sequence.images.names.index(row["query"]))
+    return database.names.index(row["answer"]) not in right
+
+
+def _copy(path: Path, source: Path) -> None:
+    with replacing(path) as temporary:
+        shutil.copyfile(source, temporary)
 
 
 def _small(folder: ImageFolder, name: str) -> np.ndarray:

@@ -1,12 +1,14 @@
 """What is evaluated: the rows of the tables, the evaluations that give them, and the data sets that are here."""
 
-from collections.abc import Iterator, Mapping, Sequence
+import os
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from experiments.build import expanded
-from experiments.settings import SettingsError
+from experiments.quoting import as_typed
+from experiments.settings import RULES, SettingsError
 from mfvpr.data.published import PUBLISHED
 from mfvpr.results import FILTER
 from mfvpr.weights.files import is_installed
@@ -17,6 +19,8 @@ REAL = {  # those without a layout of their own, by the folders that they hold
     "grief_season": ("database", "queries"),
     "corridor": ("ref", "query"),
 }
+_SIDES = ("database", "queries")
+_POSITIONS = "@"  # what names of images begin with that tell where they were taken: @easting@northing@...
 COMBINED = f"histogram + {FILTER}"
 
 
@@ -36,13 +40,25 @@ class Row:
     run: str
     ranking: str | None = None
 
+    @property
+    def leads(self) -> bool:
+        """Whether it is the first score of its evaluation, which is timed and compared with others."""
+        return self.ranking in (None, "histogram")
+
 
 @dataclass(frozen=True)
 class Place:
-    """A data set that is here, and its folder; None = it is drawn."""
+    """A data set that is here.
+
+    Attributes:
+        name: of it.
+        settings: of `experiments.evaluate`, that choose it.
+        root: its folder; None = it is drawn.
+    """
 
     name: str
-    root: Path | None
+    settings: tuple[str, ...]
+    root: Path | None = None
 
 
 _SSM = {"hist": "hist", "anchor": "anchor", "sum": "sum", "ran_8": "RAN 8 px", "ran_24": "RAN 24 px"}
@@ -118,27 +134,50 @@ def chosen_rows(names: Sequence[str] | None) -> tuple[Row, ...]:
 
 def places(data: str | None, names: Sequence[str] | None) -> tuple[list[Place], list[str]]:
     """The data sets that are here, and a line for each that is not."""
-    known = [DRAWN, *REAL, *PUBLISHED]
-    for name in names or ():
-        if name not in known:
-            raise SettingsError(f"datasets=[{name}]: expected some of {', '.join(known)}")
     root = None if data is None else expanded(data)
     if root is not None and not root.is_dir():
         raise SettingsError(f"data={data}: expected a folder with a folder per data set, got nothing; check the path")
+    positioned = {place.name: place for place in _positioned(root)} if root else {}
+    known = list(dict.fromkeys((DRAWN, *REAL, *PUBLISHED, *positioned)))
+    for name in names or ():
+        if name not in known:
+            raise SettingsError(f"datasets=[{name}]: expected some of {', '.join(known)}")
     found, missing = [], []
     for name in known if names is None else [one for one in known if one in names]:
         if name == DRAWN:
-            found.append(Place(name, None))
-        elif folder := _folder(root, name):
-            found.append(Place(name, folder))
+            found.append(Place(name, (f"dataset={name}",)))
+        elif name in positioned and not RULES["dataset.name"].holds(name):
+            missing.append(f"{name}: needs a folder's name of {RULES['dataset.name'].expected}; rename it")
+        elif name in positioned:
+            found.append(positioned[name])
+        elif folder := _folder(root, name, positioned):
+            found.append(Place(name, (f"dataset={name}", as_typed(f"dataset.root={folder}")), folder))
         else:
             missing.append(f"{name}: {_needed(name, data)}")
     return found, missing
 
 
-def _folder(root: Path | None, name: str) -> Path | None:
+def _positioned(root: Path) -> Iterator[Place]:
+    """Folders whose names of images tell positions, as those of VPR-datasets-downloader do."""
+    for folder in sorted(path for path in root.iterdir() if path.is_dir()):
+        for inside in (folder, folder / "images" / "test"):
+            sides = {side: inside / side for side in _SIDES}
+            if all(side.is_dir() and _first(side).startswith(_POSITIONS) for side in sides.values()):
+                chosen = {"name": folder.name, **sides, "ground_truth": "utm"}
+                settings = (as_typed(f"dataset.{name}={value}") for name, value in chosen.items())
+                yield Place(folder.name, ("dataset=folder", *settings), folder)
+                break
+
+
+def _first(folder: Path) -> str:
+    """The name of some file; empty where there is none."""
+    with os.scandir(folder) as entries:
+        return next((entry.name for entry in entries if entry.is_file()), "")
+
+
+def _folder(root: Path | None, name: str, taken: Collection[str]) -> Path | None:
     names = PUBLISHED[name].folders if name in PUBLISHED else (name,)
-    return next((root / one for one in names if (root / one).is_dir()), None) if root else None
+    return next((root / one for one in names if one not in taken and (root / one).is_dir()), None) if root else None
 
 
 def _needed(name: str, data: str | None) -> str:

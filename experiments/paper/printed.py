@@ -38,3 +38,9 @@ def printed_recall(row: str, dataset: str, sequence: str | None = None) -> Seque
     if sequence is None:
         return printed()["recall"].get(row, {}).get(dataset)
     return printed()["sequences"].get(row, {}).get(sequence) if dataset == "robotcar_seasons" else None
+
+
+def printed_settings(row: str) -> Mapping[str, Any]:
+    """Sizes of images and candidates of a system, by column; empty = not printed."""
+    families = (family for family in printed()["settings"] if row.startswith(family))
+    return printed()["settings"].get(max(families, key=len, default=""), {})

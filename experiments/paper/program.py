@@ -8,7 +8,7 @@ from typing import Any
 from experiments import build, truth
 from experiments.console import tell
 from experiments.errors import how_to_install
-from experiments.paper import figures, lineup, runs, timing
+from experiments.paper import figures, lineup, pages, runs, timing
 from experiments.paper.lineup import Place, Row
 from experiments.paper.tables import Evaluated, Found, evaluated, tables
 from experiments.prepare import dataset_of
@@ -16,6 +16,8 @@ from experiments.settings import SettingsError
 from mfvpr.data.datasets import Dataset
 from mfvpr.errors import InputError
 from mfvpr.report import runs as run_folders
+from mfvpr.report.pages.one_run import PAGE
+from mfvpr.results import FILTER
 
 _BEST = ("mix_hist_50", "aliked_hist_50", "sift_hist_50")  # whose failures are shown: the first that is here
 
@@ -29,15 +31,21 @@ def paper(settings: dict[str, Any]) -> None:
         tell(f"left out: {line}")
     if not found or not rows:
         raise SettingsError("nothing to evaluate: the lines above say what is missing")
+    out = Path(settings["out"]).expanduser()
+    with runs.held(out):
+        _make(rows, found, settings, out)
+
+
+def _make(rows: Sequence[Row], found: Sequence[Place], settings: Mapping[str, Any], out: Path) -> None:
     datasets, failed = _evaluate_all(rows, found, settings)
     here = [place for place in found if place.name in datasets]
     if not here:
         raise SettingsError(f"nothing was evaluated: {failed[0]}")
-    out = Path(settings["out"]).expanduser()
     results = _collected(rows, here, settings)
     times = _timed(rows, here, datasets, settings, out)
-    everything = Found(rows, datasets, results, *_by_row(rows, times))
-    _write(out, everything, here, settings)
+    seconds = {row.name: times[row.run] for row in rows if row.run in times and row.leads}
+    finished = _finished(rows, here, settings)
+    _write(out, Found(rows, datasets, results, seconds, _sizes(rows, finished)), finished)
     if failed:
         raise SettingsError(f"{len(failed)} of the evaluations could not be made: {failed[0]}")
 
@@ -78,10 +86,12 @@ def _evaluate_all(
             chosen = runs.settings_of(run, place, settings)
             folder, expected = runs.folder_of(run, place, settings), runs.made_of(chosen, images, truths)
             if runs.is_done(folder, expected):
+                runs.page(folder)
                 continue
             tell(f"{number * len(names) + turn + 1} of {len(found) * len(names)}: {run} on {place.name}")
             try:
                 runs.evaluate(chosen, expected)
+                runs.page(folder)
             except InputError as error:
                 failed.append(f"{run} on {place.name}: {error}")
                 tell(f"left out: {failed[-1]}")
@@ -95,7 +105,7 @@ def _collected(
     for place in here:
         for run in dict.fromkeys(row.run for row in rows):
             folder = runs.folder_of(run, place, settings)
-            found = runs.results(folder) if (folder / "results.json").is_file() else []
+            found = runs.results(folder) if runs.is_finished(folder) else []
             for row in rows:
                 if row.run == run and (one := evaluated(row, found)):
                     collected[row.name, place.name] = one
@@ -105,7 +115,7 @@ def _collected(
 def _timed(
     rows: Sequence[Row], here: Sequence[Place], datasets: Mapping[str, Dataset], settings: Mapping[str, Any], out: Path
 ) -> dict[str, dict[str, float]]:
-    """Seconds and bytes by evaluation, on RobotCar's snow where that is here; measured once."""
+    """Seconds by evaluation, on RobotCar's snow where that is here; measured once."""
     place = next((one for one in here if one.name == "robotcar_seasons"), here[0])
     times = {}
     for run in dict.fromkeys(row.run for row in rows):
@@ -123,42 +133,57 @@ def _timed(
     return times
 
 
-def _by_row(
-    rows: Sequence[Row], times: Mapping[str, Mapping[str, float]]
-) -> tuple[dict[str, Mapping[str, float]], dict[tuple[str, str], float]]:
-    """Of the rows whose ranking was timed: an evaluation's first score, or its histogram; sizes by data set as well."""
-    timed = {row.name: times[row.run] for row in rows if row.run in times and row.ranking in (None, "histogram")}
-    sized = {(name, str(one["data_set"])): one["bytes"] for name, one in timed.items()}
-    return timed, sized
+def _sizes(rows: Sequence[Row], finished: Mapping[tuple[str, str], Path]) -> dict[tuple[str, str], float]:
+    """Bytes of an image by row and data set: of a filter alone without local features."""
+    found = {key: runs.sizes(folder) for key, folder in finished.items()}
+    return {
+        (row.name, place): one["descriptor"] + (0 if row.ranking == FILTER else one["local"])
+        for row in rows
+        for (place, run), one in found.items()
+        if run == row.run and (row.leads or row.ranking == FILTER)
+    }
 
 
-def _write(out: Path, found: Found, here: Sequence[Place], settings: Mapping[str, Any]) -> None:
-    for name, heading, table in tables(found):
+def _finished(rows: Sequence[Row], here: Sequence[Place], settings: Mapping[str, Any]) -> dict[tuple[str, str], Path]:
+    """Run folders by data set and evaluation."""
+    names = dict.fromkeys(row.run for row in rows)
+    folders = {(place.name, run): runs.folder_of(run, place, settings) for place in here for run in names}
+    return {key: folder for key, folder in folders.items() if runs.is_finished(folder)}
+
+
+def _write(out: Path, found: Found, finished: Mapping[tuple[str, str], Path]) -> None:
+    made = {name: (heading, table) for name, heading, table in tables(found)}
+    for name, (heading, table) in made.items():
         run_folders.write_table(out / "tables", table, heading, name=name)
         if name in ("recall", "averages"):
             print(f"\n{heading}\n\n{table.text()}", end="")
-    failures = {place.name: path for place in here if (path := _failures(found.rows, place, settings))}
-    for name, draw in figures.figures(found, failures, _growth(found, out)):
+    best = [row for name in _BEST for row in found.rows if row.name == name]
+    growth = _growth(best, found, finished, out)
+    shown = {}
+    for name in found.datasets:
+        folders = (finished[name, row.run] for row in best if (name, row.run) in finished)
+        if folder := next(folders, None):
+            shown[name] = folder
+    for name, draw in figures.figures(found, shown, growth):
         draw(out / "figures" / name)
-    print(f"\ntables and figures: {out}")
+    pages.write(out, found, made, growth, finished)
+    print(f"\ntables and figures: {out}\nreport: {out / PAGE}")
 
 
-def _failures(rows: Sequence[Row], place: Place, settings: Mapping[str, Any]) -> Path | None:
-    """The failures of the histogram of shifts, of the first of some systems that is here."""
-    runs_here = [row.run for name in _BEST for row in rows if row.name == name]
-    paths = (runs.folder_of(run, place, settings) / "failures" / "histogram.csv" for run in runs_here)
-    return next((path for path in paths if path.is_file()), None)
-
-
-def _growth(found: Found, out: Path) -> dict[str, dict[int, float]]:
-    """Of the same systems, measured once."""
+def _growth(
+    rows: Sequence[Row], found: Found, finished: Mapping[tuple[str, str], Path], out: Path
+) -> dict[str, dict[int, float]]:
+    """Of some systems; measured once."""
     path = out / "seconds" / "growth.json"
-    if not path.is_file():
-        numbers = {
-            row.title: (int(times["descriptor"]), sum(times[step] for step in timing.STEPS))
-            for row in found.rows
-            if row.name in _BEST and (times := found.seconds.get(row.name)) and times["descriptor"]
-        }
-        run_folders.write_json(path, timing.growth(numbers))
-    read = json.loads(path.read_text(encoding="utf-8"))
-    return {title: {int(size): seconds for size, seconds in by_size.items()} for title, by_size in read.items()}
+    known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    lengths = {run: runs.sizes(folder)["descriptor"] for (_, run), folder in finished.items()}
+    rest = {
+        row.title: (int(lengths[row.run]), sum(found.seconds[row.name][step] for step in timing.STEPS))
+        for row in rows
+        if row.title not in known and row.name in found.seconds and row.run in lengths
+    }
+    if rest:
+        known |= {title: {str(size): value for size, value in by.items()} for title, by in timing.growth(rest).items()}
+        run_folders.write_json(path, known)
+    shown = {row.title: known[row.title] for row in rows if row.title in known}
+    return {title: {int(size): seconds for size, seconds in by_size.items()} for title, by_size in shown.items()}

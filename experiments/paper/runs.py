@@ -1,8 +1,10 @@
 """The evaluations, each in a run folder of its own; what is finished is not done again."""
 
+import fcntl
 import json
-from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -14,25 +16,49 @@ from omegaconf import OmegaConf
 from experiments import evaluation, run_folder
 from experiments.console import tell
 from experiments.paper.lineup import Place, overrides
-from experiments.quoting import as_typed
+from experiments.paper.sizes import bytes_of_an_image
 from experiments.settings import CONF, SettingsError, check
 from mfvpr.data.datasets import Dataset
+from mfvpr.data.files import remove_leftovers
 from mfvpr.fingerprints import fingerprint, recipe_of
 from mfvpr.report import runs
+from mfvpr.report.pages.one_run import PAGE
 from mfvpr.weights import files
 from mfvpr.weights.registry import REGISTRY
 
 FIGURES = 2  # queries that each run draws
-_MADE_OF = "made_of.json"
+_MADE_OF, _SIZES = "made_of.json", "sizes.json"
 _SHARED = ("store", "memory", "devices")  # settings of both programs
 _FREE = {"out", "store", "memory", "devices", "command"}  # of which no number depends
 
 
+@contextmanager
+def held(out: Path) -> Iterator[None]:
+    """Keep others from evaluating into a folder, and remove what was being written there by one that was killed.
+
+    Raises:
+        SettingsError: another process does, or the folder cannot be made.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        handle = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise SettingsError(f"out={out}: cannot be made ({error.strerror}); name another folder") from error
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise SettingsError(f"out={out}: another process evaluates into it; wait until it ends, or name another "
+                                "folder") from None  # fmt: skip
+        remove_leftovers(out)
+        yield
+    finally:
+        os.close(handle)
+
+
 def settings_of(run: str, place: Place, settings: Mapping[str, Any]) -> dict[str, Any]:
     """The checked settings of an evaluation."""
-    chosen = [f"dataset={place.name}", *overrides(run, place.name), f"figures={FIGURES}"]
-    if place.root is not None:
-        chosen.append(as_typed(f"dataset.root={place.root}"))
+    chosen = [*place.settings, *overrides(run, place.name), f"figures={FIGURES}"]
     running = GlobalHydra.instance().is_initialized()
     with nullcontext() if running else hydra.initialize_config_dir(str(CONF), version_base="1.3"):
         composed: Any = OmegaConf.to_container(hydra.compose("config", chosen), resolve=True)
@@ -70,13 +96,18 @@ def made_of(settings: Mapping[str, Any], images: Mapping[str, str], truths: Any 
     }  # fmt: skip
 
 
+def is_finished(folder: Path) -> bool:
+    """Whether a run is finished there, whatever it is of."""
+    return (folder / "results.json").is_file()
+
+
 def is_done(folder: Path, expected: Mapping[str, str]) -> bool:
     """Whether a run is finished there.
 
     Raises:
         SettingsError: one of other settings, images, weights or of another version is.
     """
-    if not (folder / "results.json").is_file():
+    if not is_finished(folder):
         return False
     try:
         found = json.loads((folder / _MADE_OF).read_text(encoding="utf-8"))
@@ -91,16 +122,28 @@ def is_done(folder: Path, expected: Mapping[str, str]) -> bool:
 
 def evaluate(settings: Mapping[str, Any], made_of: Mapping[str, str]) -> None:
     """One evaluation into its run folder; its table goes to no terminal."""
-    with run_folder.claimed(settings) as folder:
+    with run_folder.claimed(settings, own=True) as folder:
         outcome = evaluation.evaluated(dict(settings))
 
         def write(new: Path) -> None:
             evaluation.write(new, outcome)
             runs.write_json(new / _MADE_OF, dict(made_of))
+            runs.write_json(new / _SIZES, bytes_of_an_image(outcome.tools, outcome.images.dataset.database))
             run_folder.draw(new, outcome.figures)  # before results.json is there, as nothing is done again behind it
 
         run_folder.keep(folder, settings, evaluation.ground_truth(outcome), write)
     jax.clear_caches()  # compiled programs of one data set are of no use to another, and each takes maps of memory
+
+
+def sizes(folder: Path) -> dict[str, float]:
+    """Of a finished run, see `bytes_of_an_image`."""
+    return json.loads((folder / _SIZES).read_text(encoding="utf-8"))
+
+
+def page(folder: Path) -> None:
+    """The page of a finished run, unless it is there."""
+    if not (folder / PAGE).is_file():
+        run_folder.report_page(folder)
 
 
 def results(folder: Path) -> list[dict[str, Any]]:

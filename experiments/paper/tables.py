@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from experiments.paper.lineup import Row
-from experiments.paper.printed import average, printed, printed_recall
+from experiments.paper.printed import average, printed, printed_recall, printed_settings
 from mfvpr.data.datasets import MEANS, Dataset
 from mfvpr.report.tables import Table
 
@@ -82,7 +82,7 @@ def tables(found: Found) -> Iterator[tuple[str, str, Table]]:
     note = "printed numbers and differences in brackets"
     candidates = (
         ("data_sets", f"Data sets (Table I); {note}", data_sets(found)),
-        ("settings", "Settings (Table II); the printed ones are in printed.yaml", settings(found)),
+        ("settings", "Settings (Table II); printed ones in brackets", settings(found)),
         ("recall", f"Recall@1 in %, by data set and threshold (Tables III and VII); {note}", recalls(found)),
         *(
             (f"sequences_{name}", f"Recall@1 in % by sequence of {name} (Table IV); {note}", sequences(found, name))
@@ -109,13 +109,16 @@ def data_sets(found: Found) -> Table:
 
 
 def settings(found: Found) -> Table:
-    """Filter and features with the sizes of their images, and candidates."""
+    """Filter and features with the sizes of their images in px, and candidates."""
     lines: dict[str, list[str]] = {}
-    for (row, _), one in found.evaluated.items():
-        about = one.about
+    for (name, _), one in found.evaluated.items():
+        about, theirs = one.about, printed_settings(name)
         sides = [about[group].get("image_size") for group in ("filter", "features")]
         sizes = [" x ".join(map(str, side)) if side else _NONE for side in sides]
-        lines[row] = [about["filter"]["name"], sizes[0], about["features"]["name"], sizes[1], str(about["candidates"])]
+        ours = [sizes[0], sizes[1], str(about["candidates"])]
+        beside_them = [theirs.get(column) for column in ("filter", "re_ranking", "candidates")]
+        cells = [cell if value is None else f"{cell} ({value})" for cell, value in zip(ours, beside_them, strict=True)]
+        lines[name] = [about["filter"]["name"], cells[0], about["features"]["name"], *cells[1:]]
     rows = [[row.title, *lines[row.name]] for row in found.rows if row.name in lines]
     return Table(["system", "filter", "its images", "features", "their images", "candidates"], rows, text_columns=5)
 

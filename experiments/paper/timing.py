@@ -1,4 +1,4 @@
-"""Seconds of a query by step, and bytes of an image, as the paper gives them, of each evaluation."""
+"""Seconds of a query by step, as the paper gives them, and as the database grows."""
 
 import os
 import tempfile
@@ -16,19 +16,18 @@ from mfvpr import evaluations
 from mfvpr.archive import Archive
 from mfvpr.data.datasets import Dataset, ImageFolder
 from mfvpr.evaluations import Stopwatch
-from mfvpr.filters import Retrieval
 from mfvpr.report import runs
 from mfvpr.retrieval import ExactSearch
 
 QUERIES, DATABASE = 10, 60  # images
 STEPS = ("filter", "features", "matching", "scores")
-_FLOAT, _KEYPOINT = 4, 12  # bytes of a number, and of a keypoint with its score
+_FLOAT = 4  # bytes of a number
 _MOST = 1 << 30  # bytes of made descriptors
 _ROUNDS = 5
 
 
 def measured(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, float]:
-    """Seconds of a query by step, and bytes of an image.
+    """Seconds of a query by step.
 
     A part of the database is enough, as the time does not depend on its size but for the search among descriptors (see
     `growth`). What is taken from it, and all that is learned of it, is there before: the queries are asked twice, under
@@ -53,9 +52,7 @@ def measured(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, float]:
                 Dataset(dataset.name, database, (part,)), extractor, filter, {main: scorers[main]},
                 candidates=candidates, matching=matching, archive=archive, watch=watch,
             )  # fmt: skip
-        local, length = _bytes(archive, database, extractor), _descriptor(archive, database, filter)
-    seconds = {step: watch.seconds.get(step, 0.0) / number for step in STEPS}
-    return seconds | {"bytes": local + _FLOAT * length, "descriptor": length}
+    return {step: watch.seconds.get(step, 0.0) / number for step in STEPS}
 
 
 def device() -> dict[str, Any]:
@@ -76,31 +73,18 @@ def _part(folder: ImageFolder, rows: range) -> ImageFolder:
     return replace(folder, names=tuple(folder.names[row] for row in rows))
 
 
-def _bytes(archive: Archive, database: ImageFolder, extractor: Any) -> float:
-    """Of an image's local features in float32, on average."""
-    sources = archive.local(database, extractor)
-    return sum(float((_FLOAT * one.dimension + _KEYPOINT) * one.counts.mean()) for one in sources)
-
-
-def _descriptor(archive: Archive, database: ImageFolder, filter: Any) -> int:
-    """Numbers of a global descriptor; 0 of a filter that has none, such as SSM-VPR's votes."""
-    if not isinstance(filter, Retrieval):
-        return 0
-    return archive.vectors(database, filter.describer, database).values.shape[1]
-
-
 def growth(numbers: Mapping[str, tuple[int, float]], largest: int = 100_000) -> dict[str, dict[int, float]]:
     """Seconds of a query by the size of the database: the search among made descriptors, and what does not grow.
 
     Args:
-        numbers: by title: numbers of a descriptor, and seconds of everything but the search.
+        numbers: by title: bytes of a descriptor, and seconds of everything but the search.
         largest: database; less where descriptors would take more than `_MOST` bytes.
     """
     found: dict[str, dict[int, float]] = {}
     rng = np.random.default_rng(0)
-    for title, (length, rest) in numbers.items():
-        sizes = [size for size in (100, 1000, 10_000, largest) if size * length * _FLOAT <= _MOST]
-        for size in sizes:
+    for title, (descriptor, rest) in numbers.items():
+        length = descriptor // _FLOAT
+        for size in (size for size in (100, 1000, 10_000, largest) if size * descriptor <= _MOST):
             database = rng.standard_normal((size, length), np.float32)
             query = rng.standard_normal((1, length), np.float32)
             search = ExactSearch().fit(database)

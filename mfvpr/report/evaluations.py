@@ -22,7 +22,7 @@ from mfvpr.results import Matched, Ranked, Recall, Result
 from mfvpr.scoring import HistogramOfShifts
 
 ABOUT: tuple[str, ...] = ("system", "sequence", "outcome", "query", "answer")  # what the file of a figure tells
-SEQUENCES = "sequences"  # the folder of a run in which each of several has its own
+_SEQUENCES = "sequences"  # the folder of a run in which each of several has its own
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,13 @@ class Judged:
         return None if right is None else right.contains(self.result.systems[system][place].rows)
 
     def folder(self, run: Path, place: int) -> Path:
-        """Where a sequence's files are: `sequences/<name>/` of several, as a name may be that of any other file."""
-        return run / SEQUENCES / self.sequences[place].name if len(self.sequences) > 1 else run
+        """Where the files of the sequence at a place are."""
+        return sequence_folder(run, [sequence.name for sequence in self.sequences], place)
+
+
+def sequence_folder(run: Path, sequences: Sequence[str], place: int) -> Path:
+    """Where a run's files of one of its sequences are: of several, as a name may be that of any other file, apart."""
+    return run / _SEQUENCES / sequences[place] if len(sequences) > 1 else run
 
 
 def recall_table(judged: Judged) -> Table:

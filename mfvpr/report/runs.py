@@ -33,7 +33,7 @@ def new_run_folder(root: Path, name: str) -> Path:
 
 
 @contextmanager
-def claimed(folder: Path, *, numbered: bool = False) -> Iterator[Path]:
+def claimed(folder: Path, *, numbered: bool = False, own: bool = False) -> Iterator[Path]:
     """A new or empty folder for this process alone, until the block ends or the process does, however that ends.
 
     It is removed again, with the folders that were made for it, where nothing was left in it.
@@ -41,6 +41,7 @@ def claimed(folder: Path, *, numbered: bool = False) -> Iterator[Path]:
     Args:
         folder: of the run.
         numbered: where there is such a folder, `folder-2`, `folder-3`, ... is taken instead.
+        own: nobody but runs puts anything into it; what one left that was killed is removed.
 
     Raises:
         InputError: the folder cannot be made or written to, is not empty, or another run has it.
@@ -51,7 +52,7 @@ def claimed(folder: Path, *, numbered: bool = False) -> Iterator[Path]:
     with _telling_why(folder):
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        _take(handle, folder)  # until then it may be another's, and must stay
+        _take(handle, folder, own)  # until then it may be another's, and must stay
         try:
             yield folder
         finally:
@@ -75,7 +76,7 @@ def _made(folder: Path, numbered: bool) -> Path:
             wanted = folder.with_name(f"{folder.name}-{number}")
 
 
-def _take(handle: int, folder: Path) -> None:
+def _take(handle: int, folder: Path, own: bool) -> None:
     """Lock an open folder, and check that a run can be written into it."""
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -85,11 +86,22 @@ def _take(handle: int, folder: Path) -> None:
         pass  # a file system without locks of folders, such as NFS
     with _telling_why(folder):
         found = {path.name for path in folder.iterdir()}
-        if found - {_UNFINISHED}:
+        if own and _LAST not in found:
+            _empty(folder)
+        elif found - {_UNFINISHED}:
             raise InputError(f"{folder}: expected a new or empty run folder; remove it, or name another")
         shutil.rmtree(folder / _UNFINISHED, ignore_errors=True)  # of a run that was killed
         with tempfile.TemporaryFile(dir=folder):
             pass
+
+
+def _empty(folder: Path) -> None:
+    """Without what a run had moved there when it was killed."""
+    for path in folder.iterdir():
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
 
 
 @contextmanager

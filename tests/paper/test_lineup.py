@@ -17,7 +17,8 @@ RUNS = list(dict.fromkeys(row.run for row in ROWS))
 
 
 def made(run, place=DRAWN, root=None):
-    return settings_of(run, Place(place, root), SETTINGS)
+    chosen = (f"dataset={place}", *([] if root is None else [f"dataset.root={root}"]))
+    return settings_of(run, Place(place, chosen, root), SETTINGS)
 
 
 def test_every_printed_row_is_evaluated():
@@ -66,6 +67,21 @@ def test_data_sets_are_found_by_their_names(tmp_path):
     for arguments, words in (((None, ["x"]), "datasets"), ((str(tmp_path / "no"), None), "expected a folder")):
         with pytest.raises(SettingsError, match=words):
             places(*arguments)
+
+
+def test_folders_whose_names_tell_positions_are_data_sets(tmp_path):
+    for folder in ("pitts30k/images/test", "other", "no positions"):
+        for side in ("database", "queries"):
+            inside = tmp_path / folder / side
+            inside.mkdir(parents=True)
+            (inside / ("1.jpg" if folder == "no positions" else "@1@2@.jpg")).touch()
+    found, missing = places(str(tmp_path), None)
+    assert [place.name for place in found] == [DRAWN, "other", "pitts30k"]
+    assert f"dataset.database={tmp_path}/pitts30k/images/test/database" in " ".join(found[2].settings).replace("'", "")
+    assert any(line.startswith("pitts30k_test: needs") for line in missing)
+    assert [place.name for place in places(str(tmp_path), ["other"])[0]] == ["other"]
+    with pytest.raises(SettingsError, match="no positions"):
+        places(str(tmp_path), ["no positions"])
 
 
 def test_rows_are_chosen_by_name():
@@ -149,7 +165,9 @@ def test_tables_hold_both_numbers():
     assert made["seconds"].rows == [["Mix-hist 50", "0.100 (0.01)", "0.200 (0.03)", "0.400 (0.07)", "0.700 (0.10)"]]
     assert made["averages"].rows[0][1:4] == ["(87.5)", "(92.9)", "(95.0)"]
     assert made["depths"].rows == [["Mix-hist 50", "gardens_point ±2", "92.5", "95.0", "99.0"]]
-    assert made["settings"].rows == [["Mix-hist 50", "vlad", "-", "sift", "336 x 320", "50"]]
+    assert made["settings"].rows == [
+        ["Mix-hist 50", "vlad", "- (320 x 320)", "sift", "336 x 320 (320 x 320)", "50 (10 or 50)"]
+    ]
 
 
 def test_sequences_have_a_table_of_their_own():

@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from experiments.paper.runs import held
 from tests.programs import ROOT, typed
 from tests.programs import run as run_program
 
@@ -61,11 +63,75 @@ def test_it_says_what_is_left_out_and_prints_what_it_found(finished, data):
     assert "left out: mix_hist_10: needs d2_tf (d2_tf.pth): python -m experiments.weights convert" in done.stderr
     assert "SIFT-hist 10" in done.stdout
     assert "Mix-hist 10" not in done.stdout
-    assert done.stdout.endswith(f"tables and figures: {out}\n")
+    assert done.stdout.endswith(f"tables and figures: {out}\nreport: {out}/report.html\n")
     assert sorted(path.stem for path in (out / "tables").glob("*.md")) == [
         "averages", "data_sets", "depths", "recall", "seconds", "settings", "sizes",
     ]  # fmt: skip
     assert {path.name for path in (out / "figures").iterdir()} >= {"averages.png", "speed.png"}
+
+
+def test_every_run_has_a_page_and_one_leads_to_them(finished):
+    out, _ = finished
+    page = (out / "report.html").read_text()
+    addresses = re.findall(r'<li><a href="([^"#]+)">', page)
+    assert addresses == ["runs/grief_season/sift_10/report.html"]
+    assert all((out / address).is_file() for address in addresses)
+    assert "SIFT-hist 10" in page
+    assert "sift_10: histogram" in page  # a picture
+
+
+def test_runs_of_a_data_set_stand_side_by_side(finished, data, tmp_path, monkeypatch, capsys):
+    out, whole = tmp_path / "paper" / "out", finished[0]
+    shutil.copytree(whole, out)
+    (out / "runs/grief_season/sift_10/report.html").unlink()
+    chosen = [one for one in arguments(data, out) if not one.startswith("systems=")]
+    code, _, _ = typed(monkeypatch, capsys, "paper", *chosen, "systems=[sift_hist_10,sift_hist_50]")
+    assert code == 0
+    assert "sift_50" in (out / "comparisons/grief_season.html").read_text()
+    assert '<a href="comparisons/grief_season.html">' in (out / "report.html").read_text()
+    assert (out / "runs/grief_season/sift_10/report.html").is_file()
+    assert {path.name for path in (out / "figures").iterdir()} >= {"failures.png", "growth.png", "histogram.png"}
+
+
+def test_what_a_run_left_that_was_killed_while_its_files_moved_is_no_obstacle(finished, data, tmp_path):
+    whole, out = finished[0], tmp_path / "paper" / "out"
+    shutil.copytree(whole, out)
+    folder = out / "runs/grief_season/sift_10"
+    kept = files(folder)
+    (folder / ".unfinished").mkdir()
+    (folder / "results.json").rename(folder / ".unfinished/results.json")
+    (folder / "of another.csv").touch()
+    done = run_program(*arguments(data, out), program="paper")
+    assert done.returncode == 0, done.stderr
+    assert files(folder) == kept
+
+
+def test_two_do_not_evaluate_into_one_folder(finished, data, monkeypatch, capsys):
+    out, _ = finished
+    (out / "tables" / ".recall-0123456z.csv").touch()  # of one that was killed
+    (out / "tables" / ".mine").touch()
+    with held(out):
+        assert {path.name for path in (out / "tables").glob(".*")} == {".mine"}
+        code, _, stderr = typed(monkeypatch, capsys, "paper", *arguments(data, out))
+    (out / "tables" / ".mine").unlink()
+    assert code == 2
+    assert "another process evaluates into it" in stderr
+
+
+def test_data_sets_whose_names_tell_positions_are_found(data, tmp_path, monkeypatch, capsys):
+    for side, east in (("database", 0), ("queries", 3)):
+        folder = tmp_path / "data" / "my-town" / "images" / "test" / side
+        folder.mkdir(parents=True)
+        for row, image in enumerate(sorted((data / "grief_season" / side).iterdir())):
+            shutil.copy(image, folder / f"@{500000 + 100 * row + east}@4600000@{row}@.png")
+    shutil.copytree(tmp_path / "data/my-town", tmp_path / "data/my town")
+    arguments = [f"data={tmp_path}/data", f"out={tmp_path}/out", f"store={tmp_path}/store", "systems=[sift_hist_10]"]
+    code, stdout, stderr = typed(monkeypatch, capsys, "paper", *arguments, "datasets=[my-town,my town]")
+    assert code == 0
+    assert "left out: my town: needs a folder's name of letters, digits, - and _; rename it" in stderr
+    assert "my-town ±25" in stdout
+    assert (tmp_path / "out/runs/my-town/sift_10/results.json").is_file()
+    assert '<a href="runs/my-town/sift_10/report.html">' in (tmp_path / "out/report.html").read_text()
 
 
 def test_what_is_finished_is_not_done_again(finished, data, monkeypatch, capsys):

@@ -20,6 +20,7 @@ from mfvpr.data.streets.painting import paint
 from mfvpr.data.streets.scene import Scene, build_scene
 from mfvpr.data.streets.sky import sky_prop
 from mfvpr.data.streets.weather import WEATHERS, Weather
+from mfvpr.numerics import available_cpus
 
 VERSION = 1  # of the drawings: raise it when they change, so that old caches are not taken for new ones
 SIGHT = 100.0  # panels farther away are not drawn, meters
@@ -108,7 +109,7 @@ def draw_streets(
 
 def draw_shots(scene: Scene, shots: Sequence[Shot], progress: Progress | None) -> None:
     """Draw the images on threads."""
-    pool = ThreadPoolExecutor()
+    pool = ThreadPoolExecutor(available_cpus())  # more would only wait for each other
     try:
         drawn = [pool.submit(draw_shot, scene, shot) for shot in shots]
         for done, future in enumerate(as_completed(drawn), start=1):

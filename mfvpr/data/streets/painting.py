@@ -69,8 +69,12 @@ def clip_outline(homography: Floats) -> Floats | None:
 
 def shows_back(outline: Floats) -> bool:
     """Whether the corners `[n, 2]` run the wrong way around, or enclose less than half a px."""
-    x, y = outline.T
-    return bool(x @ np.roll(y, -1) - y @ np.roll(x, -1) <= 1)  # twice the area
+    (x0, y0), *others = outline.tolist()
+    corners = [*others, (x0, y0)]
+    area = 0.0
+    for x1, y1 in corners:
+        area, x0, y0 = area + x0 * y1 - y0 * x1, x1, y1
+    return area <= 1  # twice the area
 
 
 def haze_table(weather: Weather, depth: float) -> Image:

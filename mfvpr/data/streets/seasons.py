@@ -57,13 +57,14 @@ def draw_seasons(
     drives = {"database": database}
     for number, condition in enumerate(CONDITIONS):
         drives[condition] = plan_return(seed, number, num_frames, image_size)
-    shots = []
-    for number, (name, cameras) in enumerate(drives.items()):
+    for name in drives:
         (folder / name).mkdir()
-        cars = scene.cars[1::2] if name == "database" else scene.cars[::2]
-        for row, camera in enumerate(cameras):
+    shots = []
+    for row in range(num_frames):  # all weathers in turn: threads then need not make the same textures at a time
+        for number, (name, cameras) in enumerate(drives.items()):
+            cars = scene.cars[1::2] if name == "database" else scene.cars[::2]
             weather = WEATHERS["day" if name == "database" else name]
-            shots.append(Shot(folder / name / f"{row:04d}.png", camera, weather, cars, (seed, 10, number, row)))
+            shots.append(Shot(folder / name / f"{row:04d}.png", cameras[row], weather, cars, (seed, 10, number, row)))
     for condition in CONDITIONS:
         write_ground_truth(folder / condition / TRUTH, scene.facades, drives[condition], database)
     draw_shots(scene, shots, progress)

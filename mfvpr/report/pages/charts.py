@@ -57,8 +57,9 @@ def lines(
     axes: tuple[str, str],
     scale: Scale = "linear",
     marked: bool = False,
+    unit: str = "%",
 ) -> Chart:
-    """A curve of points (x, y in %) for each name; the first is what the others are compared with.
+    """A curve of points (x, y) for each name; the first is what the others are compared with.
 
     Args:
         name: of the chart's element.
@@ -67,19 +68,22 @@ def lines(
         axes: words of x and y.
         scale: of x.
         marked: points are drawn, since there is nothing between them.
+        unit: of y; what is not in % has an axis in powers of ten.
     """
     from plotly import graph_objects
 
-    figure = graph_objects.Figure()
+    figure, form = graph_objects.Figure(), ".1f" if unit == "%" else ".3g"
     for place, (label, points) in enumerate(curves.items()):
         figure.add_scatter(
             x=[x for x, _ in points], y=[y for _, y in points], name=_plain(label),
-            mode="lines+markers" if marked else "lines", line=_line(place), hovertemplate="%{x:.4g}: %{y:.1f} %",
+            mode="lines+markers" if marked else "lines", line=_line(place),
+            hovertemplate=f"%{{x:.4g}}: %{{y:{form}}} {unit}",
         )  # fmt: skip
     _lay_out(figure, axes, legend=len(curves) > 1)
     figure.update_xaxes(_SCALES[scale])
-    figure.update_yaxes(range=[-2, 102])
-    ends = (f"{label}: {points[0][1]:.1f} to {points[-1][1]:.1f} %" for label, points in curves.items() if points)
+    figure.update_yaxes({"range": [-2, 102]} if unit == "%" else {"type": "log"})
+    ends = (f"{label}: {points[0][1]:{form}} to {points[-1][1]:{form}} {unit}" for label, points in curves.items()
+            if points)  # fmt: skip
     return Chart(name, title, f"{axes[1]} against {axes[0]}. {'; '.join(ends)}.", _values(figure))
 
 

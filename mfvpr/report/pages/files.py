@@ -15,7 +15,7 @@ import numpy as np
 from mfvpr.data.datasets import MEANS
 from mfvpr.errors import InputError
 from mfvpr.evaluation import Unit, middle, threshold_words
-from mfvpr.report.evaluations import SEQUENCES
+from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.rankings import file_of
 from mfvpr.report.tables import Table
 
@@ -147,7 +147,8 @@ class Run:
                     yield from self._answers(system, sequence)
 
     def _answers(self, system: str, sequence: str) -> Iterator[Answer]:
-        path = _folder(self.folder, self.sequences, sequence) / "predictions" / file_of(system)
+        own = sequence_folder(self.folder, self.sequences, self.sequences.index(sequence))
+        path = own / "predictions" / file_of(system)
         first = {line["query"]: line for line in _lines(path) if line["rank"] == "1"}
         if sequence not in self.gains:
             for query, line in first.items():
@@ -173,7 +174,7 @@ def read_run(folder: Path) -> Run:
         results, about = (json.loads((folder / name).read_text("utf-8")) for name in ("results.json", "run.json"))
         _check(results, about)
         sequences = _sequences(results)
-        paths = {name: _folder(folder, sequences, name) / "gains.csv" for name in sequences}
+        paths = {name: sequence_folder(folder, sequences, place) / "gains.csv" for place, name in enumerate(sequences)}
         run = Run(folder, results, about, {name: _gains(path) for name, path in paths.items() if path.exists()})
         if len(run.gains) != (len(sequences) if run.thresholds else 0):
             raise ValueError("each sequence with ground truth has a gains.csv, and no other")
@@ -212,10 +213,6 @@ def _sequences(results: Sequence[Mapping[str, Any]]) -> list[str]:
     if "sequence" not in first:
         return [first["dataset"]]
     return list(dict.fromkeys(row["sequence"] for row in results))[: -len(MEANS)]
-
-
-def _folder(run: Path, sequences: Sequence[str], sequence: str) -> Path:
-    return run / SEQUENCES / sequence if len(sequences) > 1 else run
 
 
 def _gains(path: Path) -> Gains:

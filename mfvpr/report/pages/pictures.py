@@ -38,14 +38,14 @@ class Picture:
     size: tuple[int, int]
 
 
-def pictures(run: Path) -> list[Picture]:
+def pictures(run: Path, *, most: int = MOST_PICTURES) -> list[Picture]:
     """Those of a run folder's figures that show a query, by the names of their files; evenly chosen of too many.
 
     Raises:
         InputError: a figure cannot be read.
     """
     paths = sorted((run / "figures").rglob("*_[0-9]*.png"))
-    step = max(1, -(-len(paths) // MOST_PICTURES))
+    step = max(1, -(-len(paths) // most))
     return [picture for path in paths[::step] for picture in _pictures(path)]
 
 

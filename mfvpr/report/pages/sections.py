@@ -18,6 +18,7 @@ from mfvpr.report.tables import Table
 from mfvpr.results import FILTER
 
 MOST_ANSWERS = 5000  # rows of a table that a browser still sorts at once
+PRECISION_AXES = "recall of queries with an answer, %", "precision, %"
 _MOST_POINTS = 200  # of a curve
 _DIFFERENCES = ("system", "other", "only system", "only other", "McNemar p", "queries in a block", "blocks",
                 "p by blocks")  # fmt: skip
@@ -50,7 +51,10 @@ class Gallery:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a page, with a word as the name of its element; `words` stand above everything in it."""
+    """A part of a page, with a word as the name of its element; `words` stand above everything in it.
+
+    `links` are words and the addresses of other pages, from where this one is.
+    """
 
     name: str
     title: str
@@ -58,6 +62,7 @@ class Section:
     charts: Sequence[Chart] = ()
     sheets: Sequence[Sheet] = ()
     gallery: Gallery | None = None
+    links: Sequence[tuple[str, str]] = ()
 
 
 def recall_section(run: Run) -> Section:
@@ -65,7 +70,7 @@ def recall_section(run: Run) -> Section:
     charts = [bars("intervals", f"Recall at 1{run.within}, with intervals", _intervals(run), axis="recall at 1, %")]
     if len(run.thresholds) > 1:
         axes = f"tolerance, {run.unit}", "recall at 1, %"
-        charts.append(lines("tolerances", "Recall over tolerance", _by_tolerance(run), axes=axes, marked=True))
+        charts.append(lines("tolerances", "Recall over tolerance", recall_by_tolerance(run), axes=axes, marked=True))
     curves = {name: recall_by_depth(run.all_gains, name, run.common["candidates"]) for name in run.systems}
     axes = "K, the first candidates", "recall at K, %"
     charts.append(lines("depths", f"Recall over K{run.within}", curves, axes=axes, scale="log"))
@@ -101,15 +106,14 @@ def differences_section(run: Run) -> Section | None:
 
 def confidence_section(run: Run) -> Section | None:
     """Precision against recall, and what re-ranking the unsure queries gives; None without ground truth."""
-    points, table, shares = map(run.table, ("precision_recall.csv", "confidence.csv", "rerank_share.csv"))
-    if points is None:
+    if run.table("precision_recall.csv") is None:
         return None
+    table, shares = map(run.table, ("confidence.csv", "rerank_share.csv"))
     charts = []
     for by, words in (("score", "by the score"), ("p", "by p(right)")):
-        curves = _precision(points, by)
-        axes = "recall of queries with an answer, %", "precision, %"
-        if curves:
-            charts.append(lines(f"precision-{by}", f"Precision and recall {words}", curves, axes=axes, scale="percent"))
+        if curves := precision_by_recall(run, {name: name for name in run.systems}, by):
+            title = f"Precision and recall {words}"
+            charts.append(lines(f"precision-{by}", title, curves, axes=PRECISION_AXES, scale="percent"))
     if shares is not None and shares.rows:
         axes, title = ("queries re-ranked, %", "recall at 1, %"), "Re-ranking only what the filter is unsure of"
         charts.append(lines("shares", title, _by_share(shares), axes=axes, scale="percent"))
@@ -197,7 +201,7 @@ def _with_intervals(run: Run, table: Table) -> Table:
     return Table([*table.header, f"95 % at{run.within}" if run.within else "95 %"], rows, 1 + several)
 
 
-def _by_tolerance(run: Run) -> dict[str, list[tuple[float, float]]]:
+def recall_by_tolerance(run: Run) -> dict[str, list[tuple[float, float]]]:
     """(threshold, recall in %) by system, of all queries."""
     rows = [row for row in run.results if row.get("sequence", MEANS[-1]) == MEANS[-1]]
     found: dict[str, list[tuple[float, float]]] = {name: [] for name in run.systems}
@@ -216,15 +220,16 @@ def _by_share(shares: Table) -> dict[str, list[tuple[float, float]]]:
     return curves
 
 
-def _precision(points: Table, by: str) -> dict[str, list[tuple[float, float]]]:
-    """(recall, precision) in % by system, whose label has its average precision."""
-    curves = {}
-    for system in dict.fromkeys(row[0] for row in points.rows):
-        rows = [[float(cell) for cell in row[2:]] for row in points.rows if (row[0], row[1]) == (system, by)]
+def precision_by_recall(run: Run, names: Mapping[str, str], by: str = "score") -> dict[str, list[tuple[float, float]]]:
+    """(recall, precision) in % by the names of some systems, to which their average precision is added."""
+    points, curves = run.table("precision_recall.csv"), {}
+    known = [] if points is None else points.rows
+    for system, name in names.items():
+        rows = [[float(cell) for cell in row[2:]] for row in known if (row[0], row[1]) == (system, by)]
         if rows:
             curve = PrecisionRecall(*np.array(rows).T)
             some = np.unique(np.linspace(0, len(rows) - 1, _MOST_POINTS).round().astype(int))
-            label = f"{system}: AP {100 * curve.average_precision:.1f}"
+            label = f"{name}: AP {100 * curve.average_precision:.1f}"
             shown = zip(curve.recall[some], curve.precision[some], strict=True)
             curves[label] = [(round(100 * x, 3), round(100 * y, 3)) for x, y in shown]
     return curves

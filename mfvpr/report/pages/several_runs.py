@@ -9,11 +9,21 @@ import numpy as np
 
 from mfvpr.errors import InputError
 from mfvpr.evaluation.statistics import block_sign_flips, mcnemar
-from mfvpr.report.pages.charts import Bar, bars, lines
+from mfvpr.report.pages.charts import Bar, Chart, bars, lines
 from mfvpr.report.pages.files import Run, read_run
 from mfvpr.report.pages.one_run import in_words
 from mfvpr.report.pages.rendering import write_page
-from mfvpr.report.pages.sections import Section, Sheet, flat, interval, percent, recall_by_depth
+from mfvpr.report.pages.sections import (
+    PRECISION_AXES,
+    Section,
+    Sheet,
+    flat,
+    interval,
+    percent,
+    precision_by_recall,
+    recall_by_depth,
+    recall_by_tolerance,
+)
 from mfvpr.report.tables import Table
 
 _ONLY = ("run", "other", "only run", "only other", "McNemar p", "queries in a block", "blocks", "p by blocks")
@@ -84,7 +94,14 @@ def _recall(runs: Mapping[str, Run]) -> Section:
     charts = [
         bars("intervals", "Recall at 1, with intervals", {"recall": bar}, axis="recall at 1, %"),
         lines("depths", "Recall over K", curves, axes=("K, the first candidates", "recall at K, %"), scale="log"),
+        *_over_tolerance(runs),
     ]
+    if precision := {
+        name: curve for label, run in runs.items()
+        for name, curve in precision_by_recall(run, {run.headline: label}).items()
+    }:  # fmt: skip
+        title = "Precision and recall by the score"
+        charts.append(lines("precision", title, precision, axes=PRECISION_AXES, scale="percent"))
     systems = list(dict.fromkeys(name for run in runs.values() for name in run.systems))
     rows = [
         [system, *(_with_interval(run, system) if system in run.systems else "" for run in runs.values())]
@@ -96,6 +113,18 @@ def _recall(runs: Mapping[str, Run]) -> Section:
     if any(why_not(*pair) for pair in itertools.combinations(runs.values(), 2)):
         words += " Not all of these runs have the same queries and the same ground truth: see below."
     return Section("recall", "Recall", words, charts, [Sheet("Recall at 1 of every system", Table(header, rows))])
+
+
+def _over_tolerance(runs: Mapping[str, Run]) -> list[Chart]:
+    """Of those that are judged by several thresholds of one unit."""
+    several = {label: run for label, run in runs.items() if len(run.thresholds) > 1}
+    charts = []
+    for unit in dict.fromkeys(run.unit for run in several.values()):
+        curves = {label: recall_by_tolerance(run)[run.headline] for label, run in several.items() if run.unit == unit}
+        axes = f"tolerance, {unit}", "recall at 1, %"
+        name = f"tolerances-{len(charts)}"
+        charts.append(lines(name, "Recall over tolerance", curves, axes=axes, marked=True))
+    return charts
 
 
 def _with_interval(run: Run, system: str) -> str:

@@ -1,6 +1,6 @@
 "use strict";
 
-// Tables are sorted by the buttons in their headers: numbers as numbers, names naturally, empty cells last.
+// Tables are sorted by the buttons in their headers: numbers as numbers, names naturally, empty cells and dashes last.
 const collator = new Intl.Collator("en", { numeric: true });
 
 function sort(button) {
@@ -9,7 +9,7 @@ function sort(button) {
   const direction = header.getAttribute("aria-sort") === "ascending" ? "descending" : "ascending";
   for (const other of header.parentNode.children) other.removeAttribute("aria-sort");
   header.setAttribute("aria-sort", direction);
-  const rows = [...body.rows].map((row) => ({ row, text: row.cells[header.cellIndex].textContent.trim() }));
+  const rows = [...body.rows].map((row) => ({ row, text: row.cells[header.cellIndex].textContent.trim().replace(/^-$/, "") }));
   const numbers = rows.every(({ text }) => text === "" || !Number.isNaN(Number(text)));
   const sign = direction === "ascending" ? 1 : -1;
   rows.sort((first, second) => {
@@ -29,7 +29,7 @@ const filters = [...document.querySelectorAll("[data-filter]")];
 const kinds = { pictures: document.querySelectorAll(".picture"), answers: document.querySelectorAll("tr[data-outcome]") };
 
 function filter() {
-  const counts = Object.entries(kinds).map(([kind, items]) => {
+  const counts = Object.entries(kinds).filter(([, items]) => items.length).map(([kind, items]) => {
     let shown = 0;
     for (const item of items) {
       item.hidden = filters.some(({ value, dataset }) => value !== "-1" && item.dataset[dataset.filter] !== value);
