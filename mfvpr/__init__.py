@@ -1,9 +1,9 @@
 """Model-free re-ranking for visual place recognition.
 
 Images become features; features become a shortlist and matches; matches become scores; scores become a ranking;
-rankings become recall. `evaluate` goes the whole way over a data set; the other names below are the core of that
-sentence, on arrays. `mfvpr.data`, `mfvpr.features`, `mfvpr.filters`, `mfvpr.archive` and `mfvpr.report` put it to work
-on images and files. `value`, `Scorer` and what follows from them is
+rankings become recall. `evaluate` goes the whole way over a data set, a `Map` is asked with one image at a time; the
+other names below are the core of that sentence, on arrays. `mfvpr.data`, `mfvpr.features`, `mfvpr.filters`,
+`mfvpr.archive` and `mfvpr.report` put it to work on images and files. `value`, `Scorer` and what follows from them is
 what a scorer of your own is written with; `mfvpr.testing.check_scorer` says whether it keeps the contract.
 """
 
@@ -47,6 +47,7 @@ from mfvpr.weighting import (
 
 if TYPE_CHECKING:
     from mfvpr.evaluations import evaluate
+    from mfvpr.maps import Map
 
 __version__ = "0.2.0"
 
@@ -62,6 +63,7 @@ __all__ = [
     "InputError",
     "LightGlueMatching",
     "LostScore",
+    "Map",
     "MatchCount",
     "Matcher",
     "Matches",
@@ -105,9 +107,10 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """`evaluate`, once it is asked for: images take longer to import than arrays."""
-    if name != "evaluate":
+    """`evaluate` and `Map`, once they are asked for: images take longer to import than arrays."""
+    if name not in ("evaluate", "Map"):
         raise AttributeError(f"module 'mfvpr' has no attribute {name!r}")
     from mfvpr.evaluations import evaluate
+    from mfvpr.maps import Map
 
-    return evaluate
+    return evaluate if name == "evaluate" else Map

@@ -44,11 +44,20 @@ def described(
         InputError: an image cannot be read (unless `skip_bad`).
     """
     for part, images in _image_batches(folder, rows, extractor, skip_bad, bad, track):
-        batch = dict(zip(part, _checked(list(extractor(images)), extractor, len(part)), strict=True))
-        for row in [row for row, description in batch.items() if not _finite(description)]:
-            del batch[row]
+        found = dict(zip(part, described_images(images, extractor), strict=True))
+        for row in (row for row, description in found.items() if description is None):
             bad[row] = f"{folder.paths[row]}: features are not finite (NaN or infinite); the image ranks last"
-        yield batch
+        yield {row: description for row, description in found.items() if description is not None}
+
+
+def described_images(images: np.ndarray, extractor: Extractor) -> list[Description | None]:
+    """Descriptions of images `[B, H, W, 3]` of the extractor's size; None of one that is not finite.
+
+    Raises:
+        InputError: the extractor gives something else than it says.
+    """
+    found = _checked(list(extractor(images)), extractor, len(images))
+    return [description if _finite(description) else None for description in found]
 
 
 def _checked(descriptions: list[Description], extractor: Extractor, number: int) -> list[Description]:

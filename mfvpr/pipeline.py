@@ -183,15 +183,15 @@ def dominant_shifts(
     for start in range(0, len(queries), SHIFTS_AT_ONCE):
         some = slice(start, start + SHIFTS_AT_ONCE)
         pairs = match_set.pairs(queries[some], places[some], match_set.capacity, total=SHIFTS_AT_ONCE)
-        found = jax.tree.map(np.asarray, _dominant_shifts(fitted, pairs))
+        found = jax.tree.map(np.asarray, pair_shifts(fitted, pairs))
         parts.append(tuple(values[: len(queries[some])] for values in found))
     shifts, intervals, scales = (np.concatenate(same) for same in zip(*parts, strict=True))
     return shifts, intervals, scales
 
 
 @compiled
-def _dominant_shifts(scorer: HistogramOfShifts, matches: Matches) -> tuple[Array, Array, Array]:
-    """Of matches `[P, K, ...]`."""
+def pair_shifts(scorer: HistogramOfShifts, matches: Matches) -> tuple[Array, Array, Array]:
+    """`dominant_shifts` of matches `[P, K, ...]`, by a scorer that is fitted to their images."""
 
     def of_pair(one: Matches) -> tuple[Array, Array, Array]:
         scale, votes = scorer.dominant_scale(one), scorer(one) > 0

@@ -137,7 +137,7 @@ def _capacities(counts: np.ndarray) -> np.ndarray:
     return np.array([half, most] if half <= 0.75 * most else [most])
 
 
-def _few_sizes(number: int) -> int:
+def few_sizes(number: int) -> int:
     """At least as many slots, by a quarter more at most: another number is another program."""
     number = max(WRITTEN, number)
     return round_up(number, 2 ** (number.bit_length() - 3))
@@ -208,7 +208,7 @@ class Slots:
         kept = KEPT * budget / max(1, sum(capacity * size * number for capacity, number in rows.items()))
         self._together = max(WRITTEN, int(STAGED * budget / (capacities[-1] * size)))
         self._recent = {
-            capacity: Recent(_few_sizes(min(number, max(self._together, int(kept * number)))))
+            capacity: Recent(few_sizes(min(number, max(self._together, int(kept * number)))))
             for capacity, number in rows.items()
         }
         self._arrays: dict[int, Features] = {}
@@ -240,21 +240,22 @@ class Slots:
         for capacity, slots, features in staged.new:
             rows = jax.device_put(features, self._device)
             if capacity not in self._arrays:
-                self._arrays[capacity] = _empty(rows, self._recent[capacity].number)
-            self._arrays[capacity] = _write(self._arrays[capacity], slots, rows)
+                self._arrays[capacity] = empty_slots(rows, self._recent[capacity].number)
+            self._arrays[capacity] = write_slots(self._arrays[capacity], slots, rows)
         return self._arrays
 
 
-def _empty(rows: Features, number: int) -> Features:
-    """As many rows, where these are."""
+def empty_slots(rows: Features, number: int) -> Features:
+    """As many rows `[number, N, ...]` of zeros, where rows `[R, N, ...]` are."""
     return jax.tree.map(lambda leaf: jnp.zeros((number, *leaf.shape[1:]), leaf.dtype, device=leaf.device), rows)
 
 
-def _write(arrays: Features, slots: np.ndarray, rows: Features) -> Features:
+def write_slots(arrays: Features, slots: np.ndarray, rows: Features) -> Features:
+    """With rows `[R, N, ...]` in slots `[R]`, beyond the last those that are none; in place."""
     return jax.tree.map(lambda array, row: array.at[slots].set(row, mode="drop"), arrays, rows)
 
 
-_write = compiled(_write, donate_argnums=0)  # in place: the arrays may be as large as the memory allows
+write_slots = compiled(write_slots, donate_argnums=0)  # the arrays may be as large as the memory allows
 
 
 def stacked(images: Sequence[Features], capacity: int, *, total: int | None = None) -> Features:

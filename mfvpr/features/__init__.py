@@ -52,6 +52,7 @@ class Description(NamedTuple):
         return self.local[0]
 
 
+@runtime_checkable
 class Extractor(Protocol):
     """Images `[B, H, W, 3]` uint8 RGB -> a Description of each.
 

@@ -49,6 +49,11 @@ def forecast_bytes(num_images: int, features_per_image: float, dimension: int) -
     return num_images * row_bytes(features_per_image * (2 * dimension + 16) + 8, _NUM_ARRAYS)
 
 
+def as_stored(features: Features) -> Features:
+    """Features `[N, ...]` as they come back from a store: without padding, descriptors to 5e-4."""
+    return _unpack(_pack(features))
+
+
 def _pack(features: Features) -> dict[str, np.ndarray]:
     mask = np.asarray(features.mask)
     keypoints, descriptors, scores = (

@@ -1,0 +1,104 @@
+"""Images -> local features and a global descriptor, as a map keeps them of its own images and takes them of queries."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mfvpr.data.datasets import ImageFolder
+from mfvpr.data.images import read_image, resize
+from mfvpr.errors import InputError
+from mfvpr.extraction import described, described_images
+from mfvpr.features import Aggregation, Description, Extractor
+from mfvpr.fingerprints import recipe_of
+from mfvpr.progress import Track, untracked
+from mfvpr.stores.features import as_stored
+from mfvpr.types import Features
+
+Image = Path | str | np.ndarray
+Described = tuple[Features, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Describing:
+    """What describes images; features are as a store gives them back, those of queries as well.
+
+    Attributes:
+        extractor: of the local features, of one scale.
+        describer: of the global descriptor: the same extractor, another, or an aggregation of the local features.
+    """
+
+    extractor: Extractor
+    describer: Extractor | Aggregation
+
+    @property
+    def recipe(self) -> dict[str, Any]:
+        """All that changes what it gives."""
+        return {"extractor": recipe_of(self.extractor), "describer": recipe_of(self.describer)}
+
+    def image(self, image: Image) -> Described:
+        """Of one image: a file, or `[H, W, 3]` uint8 RGB.
+
+        Raises:
+            InputError: it cannot be read, or something is not finite.
+        """
+        pixels, name = (image, "image") if isinstance(image, np.ndarray) else (read_image(image), str(image))
+        if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint8:
+            raise InputError(f"{name}: expected [H, W, 3] uint8 RGB, got {list(pixels.shape)} {pixels.dtype}")
+        description = _one(self.extractor, pixels, name)
+        features = as_stored(description.features)
+        if self.describer is self.extractor:
+            return features, _flat(description)
+        if isinstance(describer := self.describer, Extractor):
+            return features, _flat(_one(describer, pixels, name))
+        return features, describer([features])[0]
+
+    def folder(
+        self, images: ImageFolder, rows: Sequence[int], track: Track = untracked
+    ) -> Iterator[dict[int, Described]]:
+        """Of some images of a folder, by row, batch by batch.
+
+        Raises:
+            InputError: as `image`.
+        """
+        for local in _batches(images, self.extractor, rows, track):
+            features = {row: as_stored(description.features) for row, description in local.items()}
+            if self.describer is self.extractor:
+                vectors = {row: _flat(description) for row, description in local.items()}
+            elif isinstance(describer := self.describer, Extractor):
+                parts = _batches(images, describer, [*features], untracked)
+                vectors = {row: _flat(description) for part in parts for row, description in part.items()}
+            else:
+                vectors = dict(zip(features, describer([*features.values()]), strict=True))
+            yield {row: (features[row], vectors[row]) for row in features}
+
+
+def local_features(images: ImageFolder, extractor: Extractor, track: Track = untracked) -> Iterator[Features]:
+    """Of all images of a folder."""
+    for batch in _batches(images, extractor, range(len(images)), track):
+        yield from (as_stored(description.features) for description in batch.values())
+
+
+def _one(extractor: Extractor, pixels: np.ndarray, name: str) -> Description:
+    [found] = described_images(resize(pixels, extractor.image_size, extractor.interpolation)[None], extractor)
+    if found is None:
+        raise InputError(f"{name}: features are not finite (NaN or infinite)")
+    return found
+
+
+def _batches(
+    images: ImageFolder, extractor: Extractor, rows: Sequence[int], track: Track
+) -> Iterator[dict[int, Description]]:
+    bad: dict[int, str] = {}
+    for batch in described(images, extractor, rows, bad, track=track):
+        if bad:
+            raise InputError(next(iter(bad.values())))
+        yield batch
+
+
+def _flat(description: Description) -> np.ndarray:
+    if description.vector is None:
+        raise InputError("describer: gives no global descriptor; expected one that does, or VladFitting()")
+    return np.asarray(description.vector, np.float32).reshape(-1)

@@ -1,0 +1,251 @@
+"""A map that is asked: the same answers as an evaluation gives, whole rows only, and nothing that is not there."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+import mfvpr
+from mfvpr.archive import Archive
+from mfvpr.confidence import Confidence
+from mfvpr.data.datasets import folder_dataset
+from mfvpr.errors import InputError
+from mfvpr.features import Aggregated, Description, Scale
+from mfvpr.features.sift import Sift
+from mfvpr.features.vlad import VladFitting
+from mfvpr.filters import Retrieval
+from mfvpr.maps import Map
+from mfvpr.stores import maps as map_store
+from mfvpr.types import Features
+from tests.programs import ROOT
+
+SIFT, VLAD = Sift(max_keypoints=60, image_size=(160, 120)), VladFitting(num_words=8)
+SURE = Confidence(("margin", "height"), 1, (0.0, 0.0), (1.0, 1.0), (1.0, 1.0), 0.0)
+
+
+@pytest.fixture(scope="module")
+def dataset(small_street):
+    return folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
+
+
+@pytest.fixture(scope="module")
+def folder(dataset, tmp_path_factory):
+    """A map of the database, whose places are rows."""
+    folder = tmp_path_factory.mktemp("maps") / "map"
+    Map(folder, SIFT, VLAD).build(dataset.database, list(range(len(dataset.database))))
+    return folder
+
+
+def asked(folder, **options):
+    return Map(folder, SIFT, VLAD, **{"candidates": 5} | options)
+
+
+def test_answers_are_those_of_an_evaluation_with_a_store(dataset, folder, tmp_path):
+    filter, scorers = Retrieval(Aggregated(SIFT, VLAD)), {"histogram": mfvpr.HistogramOfShifts()}
+    result = mfvpr.evaluate(dataset, SIFT, filter, scorers, candidates=5, archive=Archive(tmp_path))
+    [ranked], known = result.systems["histogram"], asked(folder)
+    for query, path in enumerate(dataset.queries.paths):
+        answer = known.localize(path)
+        assert [one.row for one in answer.alternatives] == ranked.rows[query].tolist()
+        scores = [one.score for one in answer.alternatives]
+        np.testing.assert_allclose(scores, ranked.scores[query], rtol=1e-5)
+        assert answer.place == ranked.rows[query, 0]
+        assert answer.score == scores[0]
+
+
+def test_an_image_of_the_map_is_found_where_it_is(dataset, folder):
+    answer = asked(folder).localize(dataset.database.read(3))
+    assert (answer.place, answer.alternatives[0].name) == (3, dataset.database.names[3])
+    np.testing.assert_allclose(answer.shift, 0, atol=0.5)
+    (low_x, low_y), (high_x, high_y) = answer.shift_interval
+    assert low_x <= answer.shift[0] <= high_x
+    assert low_y <= answer.shift[1] <= high_y
+    assert answer.scale == 1
+    assert not answer.is_refused
+    assert len(answer.as_json(2)["alternatives"]) == 2
+
+
+def test_nothing_is_compiled_after_the_first_query(dataset, folder, compilations):
+    known = asked(folder)
+    known.localize(dataset.queries.paths[0])
+    compilations.reset()
+    for path in dataset.queries.paths[1:]:
+        known.localize(path)
+    assert compilations.count == 0
+
+
+def test_unsure_answers_are_no_place(dataset, folder):
+    image = dataset.queries.paths[0]
+    sure = asked(folder, confidence=SURE).localize(image)
+    assert 0.5 < sure.p_right <= 1
+    assert sure.place is not None
+    refused = asked(folder, confidence=replace(SURE, bias=-100.0), threshold=0.5).localize(image)
+    assert refused.place is None
+    assert refused.is_refused
+    assert refused.p_right < 1e-9
+    assert refused.alternatives == sure.alternatives
+    with pytest.raises(InputError, match="expected a confidence as well"):
+        asked(folder, threshold=0.5)
+
+
+def test_images_come_one_by_one_and_others_see_them(dataset, tmp_path):
+    adding, names = asked(tmp_path / "map"), dataset.database.names
+    other = asked(tmp_path / "map")
+    for one in (adding, other):
+        with pytest.raises(InputError, match="expected a map with images, got an empty one"):
+            one.localize(dataset.queries.paths[0])
+    with pytest.raises(InputError, match="no vocabulary yet"):
+        adding.add(dataset.database.paths[0], 0)
+    adding.learn(dataset.database)
+    for row, path in enumerate(dataset.database.paths):
+        adding.add(path, {"row": row}, name=names[row])
+        assert other.localize(path).place == {"row": row}
+        assert len(other) == row + 1
+    assert other.names == adding.names == list(names)
+    with pytest.raises(InputError, match="has an image of this name"):
+        adding.add(dataset.database.paths[0], 0, name=names[0])
+    with pytest.raises(InputError, match="expected one for an image that is no file"):
+        adding.add(dataset.database.read(0), 0)
+
+
+def test_the_newest_rows_can_be_left_out(dataset, folder):
+    known, last = asked(folder), len(dataset.database) - 1
+    answer = known.localize(dataset.database.paths[last], recent=3)
+    assert max(one.row for one in answer.alternatives) == last - 3
+    assert known.localize(dataset.database.paths[last], recent=last + 1).alternatives == ()
+
+
+def test_a_map_goes_on_where_it_was(dataset, tmp_path):
+    first = asked(tmp_path / "map")
+    first.build(replace(dataset.database, names=dataset.database.names[:4]))
+    again = asked(tmp_path / "map")
+    assert again.build(dataset.database) == len(dataset.database) - 4
+    assert again.build(dataset.database) == 0
+    assert again.names == list(dataset.database.names)
+    assert again.localize(dataset.database.paths[6]).place == dataset.database.names[6]
+    with pytest.raises(InputError, match="a place of each of"):
+        again.build(dataset.database, [1])
+
+
+def test_segments_follow_each_other(dataset, tmp_path, monkeypatch):
+    monkeypatch.setattr(map_store, "SEGMENT", 3)
+    known, other = asked(tmp_path / "map"), asked(tmp_path / "map")
+    known.build(dataset.database)
+    other.refresh()
+    assert other.names == known.names == list(dataset.database.names)
+    assert sorted(path.name for path in (tmp_path / "map").iterdir()) == ["0000", "0001", "0002", "0003",
+                                                                          "vocabulary.npz"]  # fmt: skip
+    for row, path in enumerate(dataset.database.paths):
+        assert other.localize(path).alternatives[0].row == row
+
+
+@pytest.mark.parametrize(("extractor", "vocabulary"), [
+    (replace(SIFT, image_size=(120, 120)), VLAD), (replace(SIFT, max_keypoints=50), VLAD),
+    (SIFT, VladFitting(num_words=4)),
+])  # fmt: skip
+def test_other_features_are_refused(folder, extractor, vocabulary):
+    with pytest.raises(InputError, match=r"vocabulary.npz: expected arrays as they were written here"):
+        Map(folder, extractor, vocabulary)
+
+
+def test_another_describer_is_refused(folder):
+    with pytest.raises(InputError, match=r"were made with recipe\.describer"):
+        Map(folder, SIFT, Constant())
+
+
+def test_damaged_rows_are_told(dataset, folder, tmp_path):
+    shutil.copytree(folder, tmp_path / "map")
+    [path] = (tmp_path / "map/0000/entries").glob("2-*.npz")
+    path.write_bytes(path.read_bytes()[:-50])
+    with pytest.raises(InputError, match="damaged on disk"):
+        asked(tmp_path / "map")
+
+
+def test_two_do_not_add_at_the_same_time(dataset, tmp_path):
+    first, second = asked(tmp_path / "map"), asked(tmp_path / "map")
+    first.learn(dataset.database)
+    second.refresh()
+    with first._adding(), pytest.raises(InputError, match="in use by process"):
+        second.add(dataset.database.paths[0], 0)
+    second.add(dataset.database.paths[0], 0)
+    assert first.localize(dataset.database.paths[0]).place == 0
+
+
+@pytest.mark.parametrize("image", [np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3)), np.zeros((4, 4, 4), np.uint8)])
+def test_arrays_are_images(folder, image):
+    with pytest.raises(InputError, match=r"expected \[H, W, 3\] uint8 RGB"):
+        asked(folder).localize(image)
+
+
+def test_a_plain_image_is_nowhere(folder):
+    answer = asked(folder).localize(np.full((120, 160, 3), 90, np.uint8))
+    assert (answer.place, answer.alternatives, answer.shift) == (None, (), None)
+    assert not answer.is_refused
+
+
+@dataclass(frozen=True)
+class Constant:
+    """Both features and a global descriptor, of few pixels."""
+
+    image_size: tuple[int, int] = (16, 12)
+    interpolation: str = "pil_bilinear"
+    batch_size: int = 4
+    vector_size: int = 36
+    scales: tuple[Scale, ...] = (Scale(3, 4),)
+
+    def __call__(self, images):
+        return [self.one(image) for image in images]
+
+    def one(self, image):
+        small = image[::4, ::4].astype(np.float32).reshape(-1)
+        vector = (small - small.mean()) / (np.linalg.norm(small - small.mean()) + 1e-9)
+        descriptors = np.eye(3, dtype=np.float32)
+        points = np.array([[1.0, 2.0], [5.0, 6.0], [9.0, 3.0]], np.float32)
+        features = Features(points, descriptors, np.ones(3, np.float32), np.ones(3, bool), np.array([16.0, 12.0]))
+        return Description(vector, (features,))
+
+
+def test_descriptors_may_be_the_extractors_own_or_anothers(dataset, tmp_path):
+    same = Constant()
+    for extractor, describer in ((same, same), (SIFT, same)):
+        known = Map(tmp_path / type(extractor).__name__, extractor, describer, candidates=3)
+        known.build(dataset.database)
+        known.add(dataset.queries.paths[0], "a query", name="q")
+        for image in (*dataset.database.paths, dataset.queries.paths[0]):
+            assert len(known.localize(image).alternatives) == 3
+
+
+@pytest.mark.slow
+def test_killed_while_adding_it_has_whole_rows(small_street, tmp_path):
+    """Rows appear one by one; whatever is there can be read, and the next goes on behind it."""
+    program = (
+        "import sys; from pathlib import Path; from mfvpr.data.datasets import folder_dataset\n"
+        "from mfvpr.maps import Map; from tests.maps.test_map import SIFT, VLAD\n"
+        "root = Path(sys.argv[1]); data = folder_dataset(root / 'database', root / 'queries', ground_truth='order')\n"
+        "known = Map(sys.argv[2], SIFT, VLAD); known.learn(data.database); print('ready', flush=True)\n"
+        "for turn in range(int(sys.argv[3]), 10**6):\n"
+        "    known.add(data.database.paths[turn % 10], turn, name=str(turn))\n"
+    )
+    seen, known, start = 0, None, 0
+    for turn in range(5):
+        command = [sys.executable, "-c", program, str(small_street), str(tmp_path / "map"), str(start)]
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        running = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, start_new_session=True)
+        running.stdout.readline()
+        time.sleep(0.2 + 0.1 * turn)
+        os.killpg(running.pid, signal.SIGKILL)
+        running.communicate()
+        known = asked(tmp_path / "map") if known is None else known
+        known.refresh()
+        assert known.names == [str(number) for number in range(len(known))]
+        assert len(known) > seen
+        seen = start = len(known)
+        assert asked(tmp_path / "map").names == known.names
+    data = folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
+    assert known.localize(data.database.paths[4]).place % 10 == 4
