@@ -8,6 +8,7 @@ from urllib.parse import quote
 from experiments.paper.figures import mean_bars
 from experiments.paper.tables import OVERALL, Found
 from experiments.paper.timing import STEPS
+from mfvpr.evaluation import threshold_words
 from mfvpr.report.pages.charts import Bar, Chart, amounts, bars, lines
 from mfvpr.report.pages.one_run import PAGE
 from mfvpr.report.pages.pictures import MOST_PICTURES, Picture, pictures
@@ -44,8 +45,7 @@ def write(
             comparisons[name] = out / "comparisons" / f"{name}.html"
             write_comparison(folders, comparisons[name])
     parts = [
-        Section("recall", "Recall", "In %. Printed numbers stand beside ours where there are any: the drawn streets, "
-                "GRIEF and the corridor are not among the paper's data sets, nor is SIFT among its features.",
+        Section("recall", "Recall", "In %. Where the paper prints a number, that and the difference stand beside ours.",
                 [_averages(found), *_by_sequence(found)],
                 _sheets(tables, [name for name in tables if name not in (*_COSTS, *_ABOUT)])),
         Section("pages", "Every evaluation", "Their own pages, and all of a data set side by side, with tests and "
@@ -82,7 +82,8 @@ def _by_sequence(found: Found) -> Iterator[Chart]:
                 threshold = sorted(one.recall[OVERALL])[len(one.recall[OVERALL]) // 2]
                 groups[row.title] = {part.name: Bar(one.recall[part.name][threshold][1]) for part in dataset.sequences}
         if groups:
-            yield bars(f"sequences-{name}", f"{name}, by sequence", groups, axis="recall at 1, %")
+            within = threshold_words(dataset.sequences[0].truth.unit, threshold) if dataset.sequences[0].truth else ""
+            yield bars(f"sequences-{name}", f"{name}, by sequence{within}", groups, axis="recall at 1, %")
 
 
 def _costs(found: Found, growth: Mapping[str, Mapping[int, float]]) -> Iterator[Chart]:

@@ -1,6 +1,7 @@
 """Every system on every data set that is here; then tables and figures of them all."""
 
 import json
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -152,6 +153,8 @@ def _finished(rows: Sequence[Row], here: Sequence[Place], settings: Mapping[str,
 
 
 def _write(out: Path, found: Found, finished: Mapping[tuple[str, str], Path]) -> None:
+    for name in ("tables", "figures", "comparisons"):  # of other rows and data sets, perhaps
+        shutil.rmtree(out / name, ignore_errors=True)
     made = {name: (heading, table) for name, heading, table in tables(found)}
     for name, (heading, table) in made.items():
         run_folders.write_table(out / "tables", table, heading, name=name)

@@ -79,23 +79,25 @@ def beside(ours: float | None, theirs: float | None, form: str = ".1f") -> str:
 
 def tables(found: Found) -> Iterator[tuple[str, str, Table]]:
     """(name, heading, table) of each that is not empty."""
-    note = "printed numbers and differences in brackets"
     candidates = (
-        ("data_sets", f"Data sets (Table I); {note}", data_sets(found)),
-        ("settings", "Settings (Table II); printed ones in brackets", settings(found)),
-        ("recall", f"Recall@1 in %, by data set and threshold (Tables III and VII); {note}", recalls(found)),
+        ("data_sets", "Data sets (Table I)", data_sets(found)),
+        ("settings", "Settings (Table II)", settings(found)),
+        ("recall", "Recall@1 in %, by data set and threshold (Tables III and VII)", recalls(found)),
         *(
-            (f"sequences_{name}", f"Recall@1 in % by sequence of {name} (Table IV); {note}", sequences(found, name))
+            (f"sequences_{name}", f"Recall@1 in % by sequence of {name} (Table IV)", sequences(found, name))
             for name, dataset in found.datasets.items()
             if len(dataset.sequences) > 1
         ),
-        ("averages", f"Average Recall@1 in % (figure 8); {note}", averages(found)),
-        ("depths", f"Recall@1, @5 and @10 in %, by data set (Table VIII); {note}", depths(found)),
-        ("sizes", f"Size of the database in MiB, of float32 (Table V); {note}", sizes(found)),
-        ("seconds", "Seconds of a query by step (Table VI: an RTX 2080 Ti; here the device that seconds/*.json names); "
-         f"{note}", seconds(found)),
+        ("averages", "Average Recall@1 in % (figure 8)", averages(found)),
+        ("depths", "Recall@1, @5 and @10 in %, by data set (Table VIII)", depths(found)),
+        ("sizes", "Size of the database in MiB, of float32 (Table V)", sizes(found)),
+        ("seconds", "Seconds of a query by step, those of features that the filter takes under filter (Table VI: an "
+         "RTX 2080 Ti; here the device that seconds/*.json names)", seconds(found)),
     )  # fmt: skip
-    yield from (one for one in candidates if one[2].rows)
+    for name, heading, table in candidates:
+        if table.rows:
+            has_printed = any("(" in cell for row in table.rows for cell in row[1:])
+            yield name, heading + "; in brackets the printed numbers and the differences" * has_printed, table
 
 
 def data_sets(found: Found) -> Table:
@@ -161,7 +163,13 @@ def averages(found: Found) -> Table:
         cells = [beside(*both) for both in zip(_or_none(ours), _or_none(theirs), strict=True)]
         rows.append([row.title, *cells, *(beside(one, None) for one in _or_none(plain))])
     header = [f"of the six ±{t}" for t in TOLERANCES] + [f"of {len(common)} here ±{t}" for t in TOLERANCES]
-    return Table(["system", *header], rows)
+    return _without_empty_columns(Table(["system", *header], rows))
+
+
+def _without_empty_columns(table: Table) -> Table:
+    kept = [place for place in range(len(table.header)) if any(row[place] != _NONE for row in table.rows)]
+    rows = [[row[place] for place in kept] for row in table.rows]
+    return Table([table.header[place] for place in kept], rows) if rows else table
 
 
 def depths(found: Found) -> Table:

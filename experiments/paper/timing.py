@@ -16,8 +16,8 @@ from mfvpr import evaluations
 from mfvpr.archive import Archive
 from mfvpr.data.datasets import Dataset, ImageFolder
 from mfvpr.evaluations import Stopwatch
+from mfvpr.maps.vectors import Vectors
 from mfvpr.report import runs
-from mfvpr.retrieval import ExactSearch
 
 QUERIES, DATABASE = 10, 60  # images
 STEPS = ("filter", "features", "matching", "scores")
@@ -85,13 +85,13 @@ def growth(numbers: Mapping[str, tuple[int, float]], largest: int = 100_000) -> 
     for title, (descriptor, rest) in numbers.items():
         length = descriptor // _FLOAT
         for size in (size for size in (100, 1000, 10_000, largest) if size * descriptor <= _MOST):
-            database = rng.standard_normal((size, length), np.float32)
-            query = rng.standard_normal((1, length), np.float32)
-            search = ExactSearch().fit(database)
-            times = []
+            known = Vectors()
+            for row in range(size):
+                known.put(row, rng.standard_normal(length, np.float32))
+            query, times = rng.standard_normal(length, np.float32), []
             for _ in range(_ROUNDS + 1):
                 start = time.perf_counter()
-                search.shortlist(query, database, min(50, size))
+                known.nearest(query, 50)
                 times.append(time.perf_counter() - start)
             found.setdefault(title, {})[size] = rest + float(np.median(times[1:]))
     return found

@@ -57,7 +57,7 @@ def histogram_figure(
         about: what it shows, for programs: text by keyword, in the file itself.
         max_lines: matches drawn, the heaviest (the paper shows 30); blue where they agree with the peak.
     """
-    figure = Figure(figsize=(12, 0.2 + 4.4 * len(answers)), layout="constrained")
+    figure = Figure(figsize=(12, 0.2 + 4.8 * len(answers)), layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(printable(title), fontsize=11, parse_math=False)  # a file's name may hold a $
     top = max(1e-9, *(float(answer.explanation.score) for answer in answers if answer.explanation))
@@ -68,7 +68,7 @@ def histogram_figure(
         if answer.explanation is None:
             heat.set_axis_off()
         else:
-            figure.colorbar(_draw_histogram(heat, answer.explanation, top), ax=heat, label="bin score", shrink=0.85)
+            figure.colorbar(_draw_histogram(heat, answer.explanation, top), ax=heat, label="bin score", shrink=0.8)
     with replacing(path) as temporary, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # names in scripts that the font lacks
         metadata = {keyword: printable(text) for keyword, text in (about or {}).items()}

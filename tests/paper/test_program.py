@@ -84,10 +84,12 @@ def test_runs_of_a_data_set_stand_side_by_side(finished, data, tmp_path, monkeyp
     out, whole = tmp_path / "paper" / "out", finished[0]
     shutil.copytree(whole, out)
     (out / "runs/grief_season/sift_10/report.html").unlink()
+    (out / "tables/sequences_other.md").touch()
     chosen = [one for one in arguments(data, out) if not one.startswith("systems=")]
     code, _, _ = typed(monkeypatch, capsys, "paper", *chosen, "systems=[sift_hist_10,sift_hist_50]")
     assert code == 0
     assert "sift_50" in (out / "comparisons/grief_season.html").read_text()
+    assert not (out / "tables/sequences_other.md").exists()
     assert '<a href="comparisons/grief_season.html">' in (out / "report.html").read_text()
     assert (out / "runs/grief_season/sift_10/report.html").is_file()
     assert {path.name for path in (out / "figures").iterdir()} >= {"failures.png", "growth.png", "histogram.png"}

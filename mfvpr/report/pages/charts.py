@@ -90,13 +90,14 @@ def lines(
 def bars(name: str, title: str, groups: Mapping[str, Mapping[str, Bar]], *, axis: str) -> Chart:
     """Bars from the left: by the name of a color, and by that of a place, with whiskers where intervals are known.
 
-    Of one color alone, each place has its own.
+    Of one color alone, each place has its own where there are enough colors.
     """
     from plotly import graph_objects
 
     figure, alone = graph_objects.Figure(), len(groups) == 1
     for place, (label, members) in enumerate(groups.items()):
-        colors = [_line(one)["color"] for one in range(len(members))] if alone else _line(place)["color"]
+        own = alone and len(members) <= 1 + len(_COLORS)
+        colors = [_line(one)["color"] for one in range(len(members))] if own else _line(place + alone)["color"]
         figure.add_bar(
             x=[bar.percent for bar in members.values()], y=[*map(_plain, members)], name=_plain(label),
             orientation="h", marker_color=colors, error_x=_whiskers([*members.values()]),

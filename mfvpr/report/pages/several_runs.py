@@ -39,7 +39,8 @@ def write_comparison(folders: Sequence[Path], path: Path) -> None:
     judged = {label: run for label, run in runs.items() if run.gains}
     parts = [_overview(runs), *([_recall(judged), _pairs(runs)] if judged else []), _settings(runs)]
     words = "The systems that decide, beside each other; each run has a page of its own."
-    write_page(path, title=f"{len(runs)} runs compared", words=words, facts=_facts(judged), sections=parts)
+    names = ", ".join(dict.fromkeys(str(run.common["dataset"]) for run in runs.values()))
+    write_page(path, title=f"{names}: {len(runs)} runs compared", words=words, facts=_facts(judged), sections=parts)
 
 
 def why_not(first: Run, second: Run) -> str | None:
