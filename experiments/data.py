@@ -8,10 +8,15 @@ from experiments.errors import Parser, one_line, refuse, unwind_on_sigterm
 
 if TYPE_CHECKING:
     from mfvpr.data.contents import Contents
-    from mfvpr.data.datasets import Dataset, QuerySequence
+    from mfvpr.data.datasets import Dataset, ImageFolder, QuerySequence
 
 # Functions import what they need: --help and wrong usage need not wait for JAX.
 DATA = "python -m experiments.data"
+_OTHERS = {
+    "grief_season": "a park path in summer, and in snow (Krajnik et al., ECMR 2015): database/ and queries/",
+    "corridor": "an indoor corridor, 111 + 111 frames, as VPR-Bench has it: ref/ and query/",
+    "streets_seasons": "drawn: a street by day, and on seven other days; it needs no folder",
+}
 _TOLERANCE, _RADIUS = 5, 25.0  # frames, meters: the widest that the paper takes
 
 
@@ -47,10 +52,12 @@ def list_data(names: list[str]) -> None:
     from mfvpr.report.tables import Table
 
     for name in names:
-        if name not in PUBLISHED:
-            raise InputError(f"{name}: expected one of {', '.join(PUBLISHED)}")
+        if name not in PUBLISHED and name not in _OTHERS:
+            raise InputError(f"{name}: expected one of {', '.join((*PUBLISHED, *_OTHERS))}")
     if names:
-        for entry in map(PUBLISHED.__getitem__, names):
+        for name in (name for name in names if name in _OTHERS):
+            print(f"{name}: {_OTHERS[name]}")
+        for entry in (PUBLISHED[name] for name in names if name in PUBLISHED):
             layout = "\n".join(f"  {line}" for line in entry.layout.splitlines())
             print(f"{entry.name}: {entry.title}\n{layout}\nfrom {entry.source}")
         return
@@ -59,6 +66,8 @@ def list_data(names: list[str]) -> None:
         for entry in PUBLISHED.values()
     ]
     print(Table(["name", "what it is", "database", "queries"], rows, text_columns=2).text(), end="")
+    for name, what in _OTHERS.items():
+        print(f"{name}: {what}")
 
 
 def check(name: str, settings: list[str], sheet: Path | None) -> None:
@@ -74,28 +83,54 @@ def check(name: str, settings: list[str], sheet: Path | None) -> None:
     dataset = dataset_of(chosen)
     archive = Archive(None)
     contents = [archive.contents(dataset.database), *(archive.contents(one.images) for one in dataset.sequences)]
-    print(Table(["images of", "there", "published", "unreadable"], list(_counts(dataset, contents)), 1).text())
+    counts, unreadable = list(_counts(dataset)), list(_unreadable(dataset))
+    rows = [[*row, f"{len(bad):,}"] for row, bad in zip(counts, unreadable, strict=True)]
+    print(Table(["images of", "there", "published", "unreadable"], rows).text())
+    for line in (line for bad in unreadable for line in bad[:3]):
+        print(f"unreadable: {line}")
     for sequence, queries in zip(dataset.sequences, contents[1:], strict=True):
         for line in _truth(sequence, queries, contents[0]):
             print(f"{sequence.name}: {line}")
-    target = sheet or Path(f"{name}.png")
+    target = sheet or Path(f"{dataset.name}.png")
     contact_sheet(target, dataset)
     print(f"pairs of images: {target}")
-    if different := list(differences(dataset)):
-        refuse(f"{dataset.name}: {'; '.join(different)}")
+    bad = sum(map(len, unreadable))
+    if wrong := [*differences(dataset), *([f"{bad:,} images cannot be read"] if bad else [])]:
+        refuse(f"{dataset.name}: {'; '.join(wrong)}")
 
 
-def _counts(dataset: "Dataset", contents: "list[Contents]") -> Iterator[list[str]]:
+def _counts(dataset: "Dataset") -> Iterator[list[str]]:
+    """Side, images, and how many are published."""
     from mfvpr.data.published import PUBLISHED
 
     entry = PUBLISHED.get(dataset.name)
-    sides = ["database", *(sequence.name for sequence in dataset.sequences)]
-    for side, files in zip(sides, contents, strict=True):
-        published = "-"
-        if entry is not None:
-            published = f"{entry.database if side == 'database' else entry.queries[side]:,}"
-        bad = sum(not file.sha256 for file in files.files)
-        yield [side, f"{len(files.files):,}", published, f"{bad:,}"]
+    published = "-" if entry is None else f"{entry.database:,}"
+    yield ["database", f"{len(dataset.database):,}", published]
+    for sequence in dataset.sequences:
+        number = None if entry is None else entry.queries.get(sequence.name)
+        side = f"queries {sequence.name}" if len(dataset.sequences) > 1 else "queries"
+        yield [side, f"{len(sequence.images):,}", "-" if number is None else f"{number:,}"]
+
+
+def _unreadable(dataset: "Dataset") -> Iterator[list[str]]:
+    """Why images of each side cannot be read, those that cannot."""
+    from experiments import console
+    from mfvpr.errors import InputError
+    from mfvpr.numerics import available_cpus
+    from mfvpr.threads import ordered_map
+
+    for side, folder in [("database", dataset.database), *((one.name, one.images) for one in dataset.sequences)]:
+
+        def why(row: int, folder: "ImageFolder" = folder) -> str | None:
+            try:
+                folder.read(row)
+            except InputError as error:
+                return str(error)
+            return None
+
+        found = console.track(f"reading {side}")(ordered_map(why, range(len(folder)), workers=available_cpus()),
+                                                 len(folder))  # fmt: skip
+        yield [reason for reason in found if reason]
 
 
 def _truth(sequence: "QuerySequence", queries: "Contents", database: "Contents") -> Iterator[str]:

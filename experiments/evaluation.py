@@ -9,6 +9,7 @@ from experiments.prepare import Images, Tools
 from experiments.settings import SettingsError
 from mfvpr import evaluations
 from mfvpr.data.datasets import Dataset
+from mfvpr.data.published import differences
 from mfvpr.evaluation import Unit
 from mfvpr.evaluations import Stopwatch
 from mfvpr.features import Source
@@ -91,7 +92,8 @@ def evaluated(settings: dict[str, Any]) -> Outcome:
 
 def ground_truth(outcome: Outcome) -> dict[str, Any]:
     """What the recall refers to."""
-    return truth.described(outcome.settings, outcome.images.dataset)
+    dataset, thresholds = outcome.images.dataset, outcome.judged.thresholds
+    return truth.described(outcome.settings, dataset) | {"fingerprint": truth.fingerprint(dataset, thresholds)}
 
 
 def text(outcome: Outcome) -> str:
@@ -112,8 +114,9 @@ def heading(outcome: Outcome) -> str:
     check = f"cross_check={matching['cross_check']}" if "cross_check" in matching else matching["name"]
     check = "" if check == "cross_check=mutual" else f", {check}"
     several = f" in {len(dataset.sequences)} sequences" if len(dataset.sequences) > 1 else ""
+    incomplete = " (incomplete)" if any(differences(dataset)) else ""
     return (
-        f"{dataset.name}: {queries} queries{several}{_skipped(bad_queries)}, "
+        f"{dataset.name}{incomplete}: {queries} queries{several}{_skipped(bad_queries)}, "
         f"{len(dataset.database)} database images{_skipped(bad_database)}, "
         f"{_num_candidates(outcome)} candidates ({settings['retrieval']['name']}), "
         f"{settings['features']['name']} features{check}; {truth.in_words(truth.described(settings, dataset))}"
@@ -148,8 +151,9 @@ def result_rows(outcome: Outcome) -> list[dict[str, Any]]:
         "queries": sum(len(sequence.images) for sequence in dataset.sequences),
         "database": len(dataset.database),
         "dataset": dataset.name,
+        "incomplete": list(differences(dataset)),
         "data_fingerprint": outcome.images.fingerprints,
-        "ground_truth": truth.described(settings, dataset),
+        "ground_truth": ground_truth(outcome),
         "reading": outcome.images.reading,
         "bytes_per_image": _bytes_per_image(outcome),
         "seconds": judged.result.seconds,

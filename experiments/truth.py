@@ -1,10 +1,10 @@
 """What a recall refers to: which ground truth, what still counts as right, and how that is written."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from experiments.settings import SettingsError
-from mfvpr import evaluation
+from mfvpr import evaluation, fingerprints
 from mfvpr.data.datasets import Dataset
 from mfvpr.evaluation import Judge, Truth
 
@@ -35,6 +35,19 @@ def described(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, Any]:
     kind = {"kind": chosen.get("ground_truth", known), "files": [chosen[name] for name in _FILES if chosen.get(name)]}
     kind["exclude_neighbors"] = chosen.get("exclude_neighbors")
     return kind if truth is None else kind | {"unit": truth.unit, "thresholds": thresholds(settings, truth)}
+
+
+def fingerprint(dataset: Dataset, thresholds: Sequence[float]) -> str | None:
+    """Of what is right at these thresholds, in every sequence, whatever file says it; None without ground truth."""
+    known = [
+        [sequence.name, *(sequence.truth.positives(threshold) for threshold in thresholds)]
+        for sequence in dataset.sequences
+        if sequence.truth is not None
+    ]
+    if not known:
+        return None
+    rows = [[name, *({"rows": one.rows, "offsets": one.offsets} for one in found)] for name, *found in known]
+    return fingerprints.fingerprint(fingerprints.recipe_of(rows))
 
 
 def in_words(*described: Mapping[str, Any]) -> str:

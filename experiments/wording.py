@@ -53,6 +53,7 @@ def _group(text: str, settings: Mapping[str, Any]) -> str:
     """Whose file a message begins with."""
     from experiments.build import expanded
 
-    queries = settings["retrieval"].get("queries", [])
-    files = [settings["retrieval"].get("database"), *(queries if isinstance(queries, list) else [queries])]
+    retrieval = settings.get("retrieval", {})
+    queries = retrieval.get("queries", [])
+    files = [retrieval.get("database"), *(queries if isinstance(queries, list) else [queries])]
     return "retrieval" if any(file and text.startswith(f"{expanded(file)}:") for file in files) else "features"

@@ -30,8 +30,28 @@ def program(monkeypatch, capsys):
 def test_all_are_listed_with_their_numbers(program):
     code, stdout, _ = program("list")
     assert code == 0
-    assert [line.split()[0] for line in stdout.splitlines()[2:]] == [*PUBLISHED]
+    names = [line.split()[0].removesuffix(":") for line in stdout.splitlines()[2:]]
+    assert names == [*PUBLISHED, "grief_season", "corridor", "streets_seasons"]
     assert "1,411" in next(line for line in stdout.splitlines() if line.startswith("robotcar"))
+
+
+def test_images_that_cannot_be_read_are_counted(program, tmp_path):
+    put(tmp_path, *(f"{side}/{i}.png" for side in ("database", "queries") for i in range(3)))
+    (tmp_path / "queries/1.png").write_bytes((tmp_path / "queries/1.png").read_bytes()[:30])
+    (tmp_path / "queries/2.png").write_text("text")
+    code, stdout, stderr = program("check", "grief_season", f"root={tmp_path}", "--sheet", tmp_path / "sheet.png")
+    assert code == 2
+    assert ["queries", "3", "-", "2"] in [line.split() for line in stdout.splitlines()]
+    assert stdout.count("unreadable: ") == 2
+    assert "2 images cannot be read" in stderr
+
+
+def test_other_sequences_under_a_published_name(program, tmp_path):
+    put(tmp_path, "db/1.png", "q1/1.png", "q2/1.png")
+    typed = [f"database={tmp_path}/db", f"queries=[{tmp_path}/q1,{tmp_path}/q2]", "ground_truth=none"]
+    code, _, stderr = program("check", "sequences", "name=robotcar_seasons", *typed, "--sheet", tmp_path / "sheet.png")
+    assert code == 2
+    assert "queries in q2, which is none of its sequences" in stderr
 
 
 def test_a_layout_is_told(program):

@@ -4,6 +4,7 @@ import base64
 import hashlib
 import json
 import re
+import shutil
 import subprocess
 import sys
 from html.parser import HTMLParser
@@ -18,6 +19,7 @@ from mfvpr.report.pages import sections, several_runs
 from mfvpr.report.pages.files import read_run
 from mfvpr.report.pages.one_run import write_report
 from mfvpr.report.pages.several_runs import write_comparison
+from mfvpr.report.runs import write_json
 from tests.run_folders import HEADLINE, HOSTILE, RANKS, SYSTEMS, TOLERANCES, change_json, write_run
 
 TWO = ("</style><b onclick=alert(3)>", "{{7*7}}")
@@ -116,7 +118,7 @@ def test_the_same_folder_is_the_same_page(run, tmp_path):
 
 def test_recall_and_its_intervals_are_those_of_the_files(page):
     table = page.rows[: len(SYSTEMS) + 1]
-    assert table[0] == ["system", "R@1 ±2", "95 % at ±2"]
+    assert table[0] == ["system", "R@1 ±2", "R@1 ±2, 95 %"]
     for row, name in zip(table[1:], SYSTEMS, strict=True):
         hits = np.array(RANKS[name]) == 1
         low, high = recall_interval(hits)
@@ -188,6 +190,20 @@ def test_runs_are_compared_query_by_query(tmp_path):
     assert len(page.scripts) == 3
 
 
+def test_recall_over_tolerance_is_of_the_first_depth_that_is_told(run, tmp_path):
+    results = json.loads((run / "results.json").read_text("utf-8"))
+    for row in results:
+        row["recall_at"] = {"2": row["recall_at"]["2"]}
+    folder = tmp_path / "run"
+    shutil.copytree(run, folder)
+    write_json(folder / "results.json", results)
+    page = Parsed(write_report(folder))
+    chart = page.charts["tolerances"]
+    assert chart["layout"]["yaxis"]["title"]["text"] == "recall at 2, %"
+    own = [100 * row["recall_at"]["2"] for row in results if row["system"] == SYSTEMS[0]]
+    assert chart["data"][0]["y"] == own
+
+
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
@@ -196,6 +212,8 @@ def test_runs_are_compared_query_by_query(tmp_path):
         ({"sequences": TWO}, "other queries"),
         ({"ground_truth": {"kind": "order", "files": [], "exclude_neighbors": None, "unit": "m",
                            "thresholds": [25]}}, "another ground truth (unit, thresholds)"),
+        ({"ground_truth": {"kind": "order", "files": [], "exclude_neighbors": None, "unit": "frames",
+                           "thresholds": TOLERANCES, "fingerprint": "1"}}, "another ground truth (fingerprint)"),
     ],
 )  # fmt: skip
 def test_runs_of_other_queries_are_not(tmp_path, changes, reason):
@@ -245,7 +263,8 @@ def test_what_is_no_run_is_refused_in_one_line(run, tmp_path, monkeypatch, capsy
         assert stderr.startswith(f"error: {place}")
         assert words in stderr
     code, _, stderr = program(monkeypatch, capsys, run, run)
-    assert (code, stderr) == (2, "error: expected different run folders, got one twice\n")
+    assert code == 2
+    assert stderr.endswith("one: expected different run folders, got this one twice\n")
     with pytest.raises(InputError, match="expected different"):
         write_comparison([run, run.parent / "." / "one"], tmp_path / "page.html")
 

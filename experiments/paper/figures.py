@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 
 from experiments.paper.lineup import Row
 from experiments.paper.printed import average, printed
-from experiments.paper.tables import OVERALL, TOLERANCES, Found
+from experiments.paper.tables import TOLERANCES, Found, listed
 from mfvpr.data.datasets import Dataset, ImageFolder, QuerySequence
-from mfvpr.data.files import printable, replacing
+from mfvpr.data.files import clipped, printable, replacing
 from mfvpr.data.images import resize
 from mfvpr.report import runs
 from mfvpr.report.evaluations import sequence_folder
@@ -24,6 +24,7 @@ _MIDDLE = 1  # of the tolerances: the paper's figure
 _OURS, _THEIRS = "#2f6fb0", "#c9a227"
 _STEPS = {"filter": "#7a9e9f", "features": "#c98b2d", "matching": "#2f6fb0", "scores": "#7b4b94"}
 _SIDE = 300  # px of an image's longer side among the failures
+_LONGEST = 32  # characters of a name
 
 
 def figures(found: Found, best: Mapping[str, Path], growth: Mapping[str, Mapping[int, float]]) -> Iterator[runs.Figure]:
@@ -38,9 +39,9 @@ def figures(found: Found, best: Mapping[str, Path], growth: Mapping[str, Mapping
     if histogram := next(histograms, None):
         yield "histogram.png", partial(_copy, source=histogram)
     if bars := mean_bars(found):
-        yield "averages.png", partial(draw_averages, bars=bars)
+        yield "averages.png", partial(draw_averages, bars=bars, names=listed(found))
     if found.seconds:
-        yield "speed.png", partial(draw_speed, rows=found.rows, seconds=found.seconds)
+        yield "speed.png", partial(draw_speed, rows=found.rows, seconds=found.seconds, about=found.timed_on)
     if growth:
         yield "growth.png", partial(draw_growth, growth=growth)
     if best:
@@ -48,26 +49,20 @@ def figures(found: Found, best: Mapping[str, Path], growth: Mapping[str, Mapping
 
 
 def mean_bars(found: Found) -> list[tuple[str, float | None, float | None]]:
-    """(title, mean over the data sets here, the printed mean) within 2 frames, of rows that have one."""
-    tolerance = TOLERANCES[_MIDDLE]
+    """(title, mean here, see `Found.means`, the printed mean) within 2 frames, of rows that have one."""
     bars = []
     for row in found.rows:
-        own = [
-            one.recall[OVERALL][tolerance][1]
-            for name in found.datasets
-            if (one := found.evaluated.get((row.name, name))) and tolerance in one.recall[OVERALL]
-        ]
-        theirs = average(printed()["recall"].get(row.name, {}))
-        if own or theirs is not None:
-            bars.append((row.title, float(np.mean(own)) if own else None, None if theirs is None else theirs[_MIDDLE]))
+        ours, theirs = found.means[1].get(row.name), average(printed()["recall"].get(row.name, {}))
+        if ours is not None or theirs is not None:
+            bars.append((row.title, *(None if one is None else float(one[_MIDDLE]) for one in (ours, theirs))))
     return bars
 
 
-def draw_averages(path: Path, bars: Sequence[tuple[str, float | None, float | None]]) -> None:
-    """Mean recall within 2 frames, beside the paper's mean over its own six data sets."""
+def draw_averages(path: Path, bars: Sequence[tuple[str, float | None, float | None]], names: str) -> None:
+    """Mean recall within 2 frames over the data sets that are named, beside the paper's over its own six."""
     figure, axes = _canvas(9, 1.2 + 0.3 * len(bars))
     places = np.arange(len(bars))
-    sides = [("over the data sets here", 1, _OURS), ("printed, over the paper's six", 2, _THEIRS)]
+    sides = [(f"over {names}", 1, _OURS), ("printed, over the paper's six", 2, _THEIRS)]
     sides = [side for side in sides if any(bar[side[1]] is not None for bar in bars)]
     for turn, (label, at, color) in enumerate(sides):
         shift = 0.4 * (turn - (len(sides) - 1) / 2)
@@ -83,8 +78,8 @@ def draw_averages(path: Path, bars: Sequence[tuple[str, float | None, float | No
     _save(figure, path)
 
 
-def draw_speed(path: Path, rows: Sequence[Row], seconds: Mapping[str, Mapping[str, float]]) -> None:
-    """Seconds of a query, step by step."""
+def draw_speed(path: Path, rows: Sequence[Row], seconds: Mapping[str, Mapping[str, float]], about: str) -> None:
+    """Seconds of a query, step by step; `about` = of what, on what."""
     shown = [row for row in rows if row.name in seconds]
     figure, axes = _canvas(9, 1.2 + 0.3 * len(shown))
     left = np.zeros(len(shown))
@@ -97,7 +92,7 @@ def draw_speed(path: Path, rows: Sequence[Row], seconds: Mapping[str, Mapping[st
     axes.set_yticks(np.arange(len(shown)), [row.title for row in shown], fontsize=8)
     axes.invert_yaxis()
     axes.set_xlim(0, 1.12 * left.max())
-    axes.set_xlabel("seconds of a query")
+    axes.set_xlabel(f"seconds of a query of {about}")
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=len(_STEPS), frameon=False, fontsize=8)
     _save(figure, path)
 
@@ -107,7 +102,7 @@ def draw_growth(path: Path, growth: Mapping[str, Mapping[int, float]]) -> None:
     figure, axes = _canvas(7, 4.2)
     for title, by_size in growth.items():
         axes.loglog([*by_size], [*by_size.values()], marker="o", markersize=3, label=title)
-    axes.set_xlabel("images of the database")
+    axes.set_xlabel("images of a database, whose descriptors are made up")
     for set_formatter in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
         set_formatter("{x:g}")
     axes.set_ylabel("seconds of a query")
@@ -117,21 +112,29 @@ def draw_growth(path: Path, growth: Mapping[str, Mapping[int, float]]) -> None:
 
 
 def draw_failures(path: Path, datasets: Mapping[str, Dataset], best: Mapping[str, Path], each: int = 2) -> None:
-    """Query, answer and truth, where the answer scores higher than a right image among the candidates."""
+    """Query, answer, and the best ranked of the right images, where the answer scores higher than that."""
     cases = [(name, *case) for name, folder in best.items() for case in _failures(folder, datasets[name], each)]
-    figure = Figure(figsize=(9.5, 0.4 + 2.4 * max(len(cases), 1)), layout="constrained")
+    shown = [
+        [_small(folder, image) for folder, image in zip(_folders(datasets[name], sequence), images, strict=True)]
+        for name, sequence, *images in cases
+    ]
+    heights = [0.35 + 3.1 * max(image.shape[0] / image.shape[1] for image in images) for images in shown] or [1.0]
+    figure = Figure(figsize=(9.5, sum(heights)), layout="constrained")
     FigureCanvasAgg(figure)
-    for axes, (name, sequence, *images) in zip(
-        figure.subplots(max(len(cases), 1), 3, squeeze=False), cases, strict=False
-    ):
-        dataset = datasets[name]
-        folders = (sequence.images, dataset.database, dataset.database)
-        for one, folder, image, word in zip(axes, folders, images, ("query", "answer", "truth"), strict=True):
-            one.set_axis_off()
-            one.imshow(_small(folder, image))
+    rows = figure.subplots(len(heights), 3, squeeze=False, height_ratios=heights)
+    for axes, images, (name, sequence, *names) in zip(rows, shown, cases, strict=False):
+        for one, image, file, word in zip(axes, images, names, ("query", "answer", "right"), strict=True):
+            one.imshow(image)
             where = " ".join(dict.fromkeys((name, sequence.name))) if word == "query" else ""
-            one.set_title(printable(f"{where} {word}: {image}".strip()), fontsize=7, parse_math=False)
+            title = f"{where} {word}: {clipped(file, _LONGEST)}".strip()
+            one.set_title(printable(title), fontsize=7, parse_math=False)
+    for one in rows.ravel():
+        one.set_axis_off()
     _save(figure, path)
+
+
+def _folders(dataset: Dataset, sequence: QuerySequence) -> tuple[ImageFolder, ImageFolder, ImageFolder]:
+    return sequence.images, dataset.database, dataset.database
 
 
 def _failures(run: Path, dataset: Dataset, number: int) -> Iterator[tuple[QuerySequence, str, str, str]]:

@@ -1,5 +1,6 @@
 """What is evaluated: the rows of the tables, the evaluations that give them, and the data sets that are here."""
 
+import difflib
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -128,24 +129,35 @@ def chosen_rows(names: Sequence[str] | None) -> tuple[Row, ...]:
     known = [row.name for row in ROWS]
     for name in names or ():
         if name not in known:
-            raise SettingsError(f"systems=[{name}]: expected some of {', '.join(known)}")
+            raise SettingsError(_unknown("systems", name, known))
     return tuple(row for row in ROWS if names is None or row.name in names)
+
+
+def _unknown(setting: str, name: str, known: Sequence[str]) -> str:
+    nearest = difflib.get_close_matches(name, known, n=1) or [one for one in known if name in one]
+    hint = f"; the nearest is {nearest[0]}" if nearest else ""
+    return f"{setting}=[{name}]: expected some of {', '.join(known)}{hint}"
 
 
 def places(data: str | None, names: Sequence[str] | None) -> tuple[list[Place], list[str]]:
     """The data sets that are here, and a line for each that is not."""
     root = None if data is None else expanded(data)
     if root is not None and not root.is_dir():
-        raise SettingsError(f"data={data}: expected a folder with a folder per data set, got nothing; check the path")
+        got = "a file" if root.exists() else "nothing"
+        raise SettingsError(f"data={data}: expected a folder with a folder per data set, got {got}; check the path")
     positioned = {place.name: place for place in _positioned(root)} if root else {}
     known = list(dict.fromkeys((DRAWN, *REAL, *PUBLISHED, *positioned)))
     for name in names or ():
         if name not in known:
-            raise SettingsError(f"datasets=[{name}]: expected some of {', '.join(known)}")
+            raise SettingsError(_unknown("datasets", name, known))
     found, missing = [], []
     for name in known if names is None else [one for one in known if one in names]:
         if name == DRAWN:
             found.append(Place(name, (f"dataset={name}",)))
+            if root and (root / name).is_dir():
+                missing.append(f"{root / name}: the drawn data set has this name; rename the folder")
+        elif name in positioned and name in (*REAL, *PUBLISHED):
+            missing.append(f"{name}: needs another layout than that of names with positions; rename the folder")
         elif name in positioned and not RULES["dataset.name"].holds(name):
             missing.append(f"{name}: needs a folder's name of {RULES['dataset.name'].expected}; rename it")
         elif name in positioned:
@@ -184,7 +196,7 @@ def _needed(name: str, data: str | None) -> str:
     where = f"{data or 'data=DIR'}/{name}"
     if name in REAL:
         return f"needs {where} with {' and '.join(REAL[name])}"
-    return f"needs {where}, from {PUBLISHED[name].source}"
+    return f"needs {where} ({PUBLISHED[name].source})"
 
 
 def missing_weights(settings: Mapping[str, Any]) -> list[Entry]:

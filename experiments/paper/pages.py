@@ -6,7 +6,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from experiments.paper.figures import mean_bars
-from experiments.paper.tables import OVERALL, Found
+from experiments.paper.tables import OVERALL, Found, listed
 from experiments.paper.timing import STEPS
 from mfvpr.evaluation import threshold_words
 from mfvpr.report.pages.charts import Bar, Chart, amounts, bars, lines
@@ -28,6 +28,7 @@ def write(
     tables: Tables,
     growth: Mapping[str, Mapping[int, float]],
     runs: Mapping[tuple[str, str], Path],
+    left_out: Sequence[str],
 ) -> None:
     """`report.html` of all, and in `comparisons/` a page of each data set's evaluations side by side.
 
@@ -37,6 +38,7 @@ def write(
         tables: of it.
         growth: see `timing.growth`.
         runs: folders of the evaluations, by data set and name.
+        left_out: lines that say what was not evaluated, and what that needs.
     """
     comparisons = {}
     for name in found.datasets:
@@ -53,7 +55,8 @@ def write(
         Section("answers", "Answers", "Of each evaluation: query and first answer with their heaviest matches, and the "
                 "histogram of their shifts; below a wrong answer the right one.", gallery=_gallery(runs)),
         Section("costs", "Seconds and sizes", "", [*_costs(found, growth)], _sheets(tables, _COSTS)),
-        Section("settings", "Data sets and settings", "", sheets=[*_sheets(tables, _ABOUT), _versions()]),
+        Section("settings", "Data sets and settings", "", sheets=[*_sheets(tables, _ABOUT), *_left_out(left_out),
+                                                                  _versions()]),
     ]  # fmt: skip
     words = f"{len(found.datasets)} data sets, {len(runs)} evaluations, after Pivonka and Preucil, IEEE T-IV 2024"
     write_page(out / PAGE, title="The paper's evaluation", words=words, facts={}, sections=parts)
@@ -62,7 +65,7 @@ def write(
 def _averages(found: Found) -> Chart:
     """Ours and the printed ones."""
     all_bars = mean_bars(found)
-    sides = {"over the data sets here": 1, "printed, over the paper's six": 2}
+    sides = {f"over {listed(found)}": 1, "printed, over the paper's six": 2}
     groups = {
         words: {bar[0]: Bar(float(value)) for bar in all_bars if (value := bar[place]) is not None}
         for words, place in sides.items()
@@ -83,18 +86,18 @@ def _by_sequence(found: Found) -> Iterator[Chart]:
                 groups[row.title] = {part.name: Bar(one.recall[part.name][threshold][1]) for part in dataset.sequences}
         if groups:
             within = threshold_words(dataset.sequences[0].truth.unit, threshold) if dataset.sequences[0].truth else ""
-            yield bars(f"sequences-{name}", f"{name}, by sequence{within}", groups, axis="recall at 1, %")
+            yield bars(f"sequences-{name}", f"{found.title(name)}, by sequence{within}", groups, axis="recall at 1, %")
 
 
 def _costs(found: Found, growth: Mapping[str, Mapping[int, float]]) -> Iterator[Chart]:
     if found.seconds:
         titles = {row.name: row.title for row in found.rows}
         totals = {titles[name]: sum(one[step] for step in STEPS) for name, one in found.seconds.items()}
-        yield amounts("seconds", "Seconds of a query", totals, axis="seconds")
+        yield amounts("seconds", f"Seconds of a query of {found.timed_on}", totals, axis="seconds")
     if growth:
         curves = {title: [(float(size), value) for size, value in by.items()] for title, by in growth.items()}
-        axes = "images of the database", "seconds of a query"
-        yield lines("growth", "As the database grows", curves, axes=axes, scale="log", marked=True, unit="s")
+        axes = "images of a database, whose descriptors are made up", "seconds of a query"
+        yield lines("growth", "As a database grows", curves, axes=axes, scale="log", marked=True, unit="s")
 
 
 def _sheets(tables: Tables, names: Sequence[str]) -> list[Sheet]:
@@ -105,15 +108,21 @@ def _versions() -> Sheet:
     return Sheet("Versions", Table(["name", "value"], [*map(list, flat(versions()))], text_columns=2))
 
 
+def _left_out(lines: Sequence[str]) -> list[Sheet]:
+    rows = [[*line.partition(": ")[::2]] for line in lines]
+    return [Sheet("Left out", Table(["what", "why"], rows, text_columns=2))] if rows else []
+
+
 def _links(
     out: Path, runs: Mapping[tuple[str, str], Path], comparisons: Mapping[str, Path]
 ) -> Iterator[tuple[str, str]]:
     """Words, and addresses from a page in the folder of all."""
-    shown = {f"{dataset}: all side by side": path for dataset, path in comparisons.items()}
-    shown |= {f"{dataset}: {run}": folder / PAGE for (dataset, run), folder in runs.items()}
-    for words, path in sorted(shown.items()):
-        if path.is_file():
-            yield words, quote(path.relative_to(out).as_posix())
+    for dataset in dict.fromkeys(name for name, _ in runs):
+        shown = {f"{dataset}: all side by side": comparisons[dataset]} if dataset in comparisons else {}
+        shown |= {f"{dataset}: {run}": folder / PAGE for (name, run), folder in runs.items() if name == dataset}
+        for words, path in shown.items():
+            if path.is_file():
+                yield words, quote(path.relative_to(out).as_posix())
 
 
 def _gallery(runs: Mapping[tuple[str, str], Path]) -> Gallery:

@@ -15,6 +15,7 @@ from experiments.paper.tables import Evaluated, Found, evaluated, tables
 from experiments.prepare import dataset_of
 from experiments.settings import SettingsError
 from mfvpr.data.datasets import Dataset
+from mfvpr.data.published import differences
 from mfvpr.errors import InputError
 from mfvpr.report import runs as run_folders
 from mfvpr.report.pages.one_run import PAGE
@@ -34,19 +35,23 @@ def paper(settings: dict[str, Any]) -> None:
         raise SettingsError("nothing to evaluate: the lines above say what is missing")
     out = Path(settings["out"]).expanduser()
     with runs.held(out):
-        _make(rows, found, settings, out)
+        _make(rows, found, settings, out, [*missing, *lacking])
 
 
-def _make(rows: Sequence[Row], found: Sequence[Place], settings: Mapping[str, Any], out: Path) -> None:
+def _make(
+    rows: Sequence[Row], found: Sequence[Place], settings: Mapping[str, Any], out: Path, left_out: Sequence[str]
+) -> None:
     datasets, failed = _evaluate_all(rows, found, settings)
     here = [place for place in found if place.name in datasets]
     if not here:
         raise SettingsError(f"nothing was evaluated: {failed[0]}")
     results = _collected(rows, here, settings)
-    times = _timed(rows, here, datasets, settings, out)
+    timed_on = next((one for one in here if one.name == "robotcar_seasons"), here[0])
+    times = _timed(rows, timed_on, datasets[timed_on.name], settings, out)
     seconds = {row.name: times[row.run] for row in rows if row.run in times and row.leads}
     finished = _finished(rows, here, settings)
-    _write(out, Found(rows, datasets, results, seconds, _sizes(rows, finished)), finished)
+    about = f"{timed_on.name}, on {timing.device()['cores']} cores of {timing.device()['device']}"
+    _write(out, Found(rows, datasets, results, seconds, _sizes(rows, finished), about), finished, [*left_out, *failed])
     if failed:
         raise SettingsError(f"{len(failed)} of the evaluations could not be made: {failed[0]}")
 
@@ -70,6 +75,7 @@ def _evaluate_all(
     names = list(dict.fromkeys(row.run for row in rows))
     datasets: dict[str, Dataset] = {}
     failed: list[str] = []
+    before = 0
     for number, place in enumerate(found):
         try:
             chosen = runs.settings_of(names[0], place, settings)
@@ -77,17 +83,20 @@ def _evaluate_all(
             archive = build.archive(chosen)
             sides = {one.name: one.images for one in dataset.sequences} | {"the database": dataset.database}
             images = {side: archive.contents(folder).fingerprint for side, folder in sides.items()}
-            truths = runs.truths(dataset, truth.thresholds(chosen, dataset.sequences[0].truth))
+            right = truth.fingerprint(dataset, truth.thresholds(chosen, dataset.sequences[0].truth))
         except InputError as error:
             datasets.pop(place.name, None)
             failed.append(f"{place.name}: {error}")
             tell(f"left out: {failed[-1]}")
             continue
+        for difference in differences(dataset):
+            tell(f"warning: {place.name}: {difference}; its numbers are not comparable")
         for turn, run in enumerate(names):
             chosen = runs.settings_of(run, place, settings)
-            folder, expected = runs.folder_of(run, place, settings), runs.made_of(chosen, images, truths)
+            folder, expected = runs.folder_of(run, place, settings), runs.made_of(chosen, images, right)
             if runs.is_done(folder, expected):
                 runs.page(folder)
+                before += 1
                 continue
             tell(f"{number * len(names) + turn + 1} of {len(found) * len(names)}: {run} on {place.name}")
             try:
@@ -96,6 +105,8 @@ def _evaluate_all(
             except InputError as error:
                 failed.append(f"{run} on {place.name}: {error}")
                 tell(f"left out: {failed[-1]}")
+    if before:
+        tell(f"{before} of {len(found) * len(names)} evaluations were finished before")
     return datasets, failed
 
 
@@ -106,32 +117,46 @@ def _collected(
     for place in here:
         for run in dict.fromkeys(row.run for row in rows):
             folder = runs.folder_of(run, place, settings)
-            found = runs.results(folder) if runs.is_finished(folder) else []
+            if not runs.is_finished(folder):
+                continue
+            found, asked = runs.results(folder), runs.asked(folder)
             for row in rows:
-                if row.run == run and (one := evaluated(row, found)):
+                if row.run == run and (one := evaluated(row, found, asked)):
                     collected[row.name, place.name] = one
     return collected
 
 
 def _timed(
-    rows: Sequence[Row], here: Sequence[Place], datasets: Mapping[str, Dataset], settings: Mapping[str, Any], out: Path
-) -> dict[str, dict[str, float]]:
-    """Seconds by evaluation, on RobotCar's snow where that is here; measured once."""
-    place = next((one for one in here if one.name == "robotcar_seasons"), here[0])
+    rows: Sequence[Row], place: Place, dataset: Dataset, settings: Mapping[str, Any], out: Path
+) -> dict[str, dict[str, Any]]:
+    """Seconds by evaluation that is finished on a data set; measured once of the same settings, data and device."""
     times = {}
     for run in dict.fromkeys(row.run for row in rows):
-        path = out / "seconds" / f"{run}.json"
-        if not path.is_file():
+        folder, path = runs.folder_of(run, place, settings), out / "seconds" / f"{run}.json"
+        if not runs.is_finished(folder):
+            continue
+        about = {"data_set": place.name, "of": runs.origin(folder)} | timing.device()
+        known = _read(path)
+        if any(known.get(name) != value for name, value in about.items()):
             tell(f"timing: {run} on {place.name}")
             try:
-                measured = timing.measured(runs.settings_of(run, place, settings), datasets[place.name])
+                known = timing.measured(runs.settings_of(run, place, settings), dataset) | about
             except InputError as error:
                 tell(f"left out: seconds of {run}: {error}")
                 continue
             path.parent.mkdir(parents=True, exist_ok=True)
-            run_folders.write_json(path, measured | {"data_set": place.name} | timing.device())
-        times[run] = json.loads(path.read_text(encoding="utf-8"))
+            run_folders.write_json(path, known)
+        times[run] = known
     return times
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """A JSON object; an empty one where there is none, or a damaged one."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def _sizes(rows: Sequence[Row], finished: Mapping[tuple[str, str], Path]) -> dict[tuple[str, str], float]:
@@ -152,7 +177,7 @@ def _finished(rows: Sequence[Row], here: Sequence[Place], settings: Mapping[str,
     return {key: folder for key, folder in folders.items() if runs.is_finished(folder)}
 
 
-def _write(out: Path, found: Found, finished: Mapping[tuple[str, str], Path]) -> None:
+def _write(out: Path, found: Found, finished: Mapping[tuple[str, str], Path], left_out: Sequence[str]) -> None:
     for name in ("tables", "figures", "comparisons"):  # of other rows and data sets, perhaps
         shutil.rmtree(out / name, ignore_errors=True)
     made = {name: (heading, table) for name, heading, table in tables(found)}
@@ -169,24 +194,28 @@ def _write(out: Path, found: Found, finished: Mapping[tuple[str, str], Path]) ->
             shown[name] = folder
     for name, draw in figures.figures(found, shown, growth):
         draw(out / "figures" / name)
-    pages.write(out, found, made, growth, finished)
+    pages.write(out, found, made, growth, finished, left_out)
     print(f"\ntables and figures: {out}\nreport: {out / PAGE}")
 
 
 def _growth(
     rows: Sequence[Row], found: Found, finished: Mapping[tuple[str, str], Path], out: Path
 ) -> dict[str, dict[int, float]]:
-    """Of some systems; measured once."""
-    path = out / "seconds" / "growth.json"
-    known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    lengths = {run: runs.sizes(folder)["descriptor"] for (_, run), folder in finished.items()}
-    rest = {
-        row.title: (int(lengths[row.run]), sum(found.seconds[row.name][step] for step in timing.STEPS))
-        for row in rows
-        if row.title not in known and row.name in found.seconds and row.run in lengths
-    }
-    if rest:
-        known |= {title: {str(size): value for size, value in by.items()} for title, by in timing.growth(rest).items()}
-        run_folders.write_json(path, known)
-    shown = {row.title: known[row.title] for row in rows if row.title in known}
-    return {title: {int(size): seconds for size, seconds in by_size.items()} for title, by_size in shown.items()}
+    """Seconds of a query of some systems by the size of the database; the search is measured once."""
+    path, device = out / "seconds" / "growth.json", timing.device()
+    known = _read(path)
+    if known.get("device") != device:
+        known = {"device": device, "search": {}}
+    lengths = {run: int(runs.sizes(folder)["descriptor"]) for (_, run), folder in finished.items()}
+    growth = {}
+    for row in rows:
+        if row.name not in found.seconds or row.run not in lengths:
+            continue
+        length = str(lengths[row.run])
+        if length not in known["search"]:
+            known["search"][length] = {str(size): value for size, value in timing.search(lengths[row.run]).items()}
+            path.parent.mkdir(parents=True, exist_ok=True)
+            run_folders.write_json(path, known)
+        rest = sum(found.seconds[row.name][step] for step in timing.STEPS)
+        growth[row.title] = {int(size): rest + value for size, value in known["search"][length].items()}
+    return growth

@@ -3,7 +3,7 @@
 import fcntl
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,11 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from experiments import evaluation, run_folder
-from experiments.console import tell
 from experiments.paper.lineup import Place, overrides
 from experiments.paper.sizes import bytes_of_an_image
 from experiments.settings import CONF, SettingsError, check
-from mfvpr.data.datasets import Dataset
 from mfvpr.data.files import remove_leftovers
-from mfvpr.fingerprints import fingerprint, recipe_of
+from mfvpr.fingerprints import fingerprint
 from mfvpr.report import runs
 from mfvpr.report.pages.one_run import PAGE
 from mfvpr.weights import files
@@ -73,17 +71,8 @@ def folder_of(run: str, place: Place, settings: Mapping[str, Any]) -> Path:
     return Path(settings["out"]).expanduser() / "runs" / place.name / run
 
 
-def truths(dataset: Dataset, thresholds: Sequence[float]) -> list[Any]:
-    """What is right by sequence and threshold, whatever file says it."""
-    found = []
-    for sequence in dataset.sequences:
-        known = [] if sequence.truth is None else [sequence.truth.positives(threshold) for threshold in thresholds]
-        found.append([sequence.name, *({"rows": one.rows, "offsets": one.offsets} for one in known)])
-    return found
-
-
-def made_of(settings: Mapping[str, Any], images: Mapping[str, str], truths: Any = ()) -> dict[str, str]:
-    """What an evaluation follows from, each as a hash: settings, images, truths, weights, and the code's version."""
+def made_of(settings: Mapping[str, Any], images: Mapping[str, str], truth: str | None) -> dict[str, str]:
+    """What an evaluation follows from, each as a hash: settings, images, truth, weights, and the code's version."""
     free = {name: value for name, value in settings.items() if name not in _FREE}
     free["dataset"] = {name: value for name, value in settings["dataset"].items() if name not in ("root", "cache")}
     free["dataset"] |= {name: None for name in ("database", "queries") if name in free["dataset"]}  # folders
@@ -91,7 +80,7 @@ def made_of(settings: Mapping[str, Any], images: Mapping[str, str], truths: Any 
     weights = {name: files.fingerprint(name) for name in names if name in REGISTRY}
     return {
         "settings": fingerprint(free), "images": fingerprint(dict(images)),
-        "ground truth": fingerprint(recipe_of(truths)), "weights": fingerprint(weights),
+        "ground truth": truth or "none", "weights": fingerprint(weights),
         "version": runs.versions()["mfvpr"],
     }  # fmt: skip
 
@@ -105,10 +94,16 @@ def is_done(folder: Path, expected: Mapping[str, str]) -> bool:
     """Whether a run is finished there.
 
     Raises:
-        SettingsError: one of other settings, images, weights or of another version is.
+        SettingsError: one of other settings, images, weights or of another version is, or a damaged one.
     """
     if not is_finished(folder):
         return False
+    for name in ("results.json", "run.json", _SIZES):
+        try:
+            json.loads((folder / name).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            raise SettingsError(f"{folder}/{name}: is damaged, or missing; remove the folder, and run this again, or "
+                                "name another with out=DIR") from None  # fmt: skip
     try:
         found = json.loads((folder / _MADE_OF).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -148,8 +143,14 @@ def page(folder: Path) -> None:
 
 def results(folder: Path) -> list[dict[str, Any]]:
     """Rows of a finished run."""
-    try:
-        return json.loads((folder / "results.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        tell(f"warning: {folder}/results.json cannot be read; remove the folder, and run this again")
-        return []
+    return json.loads((folder / "results.json").read_text(encoding="utf-8"))
+
+
+def asked(folder: Path) -> int | str:
+    """Candidates that a finished run's settings ask for."""
+    return json.loads((folder / "run.json").read_text(encoding="utf-8"))["settings"]["candidates"]
+
+
+def origin(folder: Path) -> Any:
+    """What a finished run follows from, see `made_of`."""
+    return json.loads((folder / _MADE_OF).read_text(encoding="utf-8"))

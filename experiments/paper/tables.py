@@ -2,15 +2,18 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from experiments.paper.lineup import Row
-from experiments.paper.printed import average, printed, printed_recall, printed_settings
+from experiments.paper.printed import BERLIN, OTHERS, average, printed, printed_recall, printed_settings
 from mfvpr.data.datasets import MEANS, Dataset
+from mfvpr.data.published import differences
 from mfvpr.report.tables import Table
 
+INCOMPLETE = " (incomplete)"
 OVERALL = ""  # in place of a sequence: the only one, or the plain mean of several
 TOLERANCES = (1, 2, 5)  # of the printed recalls
 _NONE = "-"
@@ -23,10 +26,12 @@ class Evaluated:
     Attributes:
         recall: in %, by sequence (`OVERALL` for all), threshold and depth.
         about: settings of the evaluation, as its results keep them.
+        asked: candidates, of which a small database has fewer; None = as many as there were.
     """
 
     recall: Mapping[str, Mapping[float, Mapping[int, float]]]
     about: Mapping[str, Any]
+    asked: int | str | None = None
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,7 @@ class Found:
         evaluated: by row and data set.
         seconds: by row: of a query, by step; see `timing`.
         sizes: by row and data set: bytes of an image's features in float32, as the paper counts them.
+        timed_on: the data set and the device of the seconds, in words.
     """
 
     rows: Sequence[Row]
@@ -46,6 +52,29 @@ class Found:
     evaluated: Mapping[tuple[str, str], Evaluated]
     seconds: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     sizes: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    timed_on: str = ""
+
+    def title(self, name: str) -> str:
+        """A data set's name; one that lacks images is called so."""
+        return name + INCOMPLETE * (next(differences(self.datasets[name]), None) is not None)
+
+    @cached_property
+    def means(self) -> tuple[list[str], dict[str, np.ndarray]]:
+        """Data sets, and by row the mean recall `[tolerances]` over them.
+
+        They are the paper's six, as the paper averages them, where all of these are here; else all that are judged by
+        these tolerances. Rows that lack one have no mean.
+        """
+        names = [name for name in self.datasets if {*TOLERANCES} <= {*thresholds_of(self, name)}]
+        six = [name for name in names if name in (*BERLIN, *OTHERS)]
+        names = six if len(six) == len(BERLIN) + len(OTHERS) else names
+        found = {}
+        for row in self.rows:
+            own = {name: _at(self.evaluated[row.name, name]) for name in names if (row.name, name) in self.evaluated}
+            if names and len(own) == len(names):
+                macro = average(own)
+                found[row.name] = np.mean([*own.values()], axis=0) if macro is None or names != six else macro
+        return names, found
 
     def known(self, rows: Iterable[Row], datasets: Iterable[str]) -> list[Row]:
         """Those that were evaluated on one of the data sets, or are printed for it."""
@@ -56,7 +85,7 @@ class Found:
         ]  # fmt: skip
 
 
-def evaluated(row: Row, results: Sequence[Mapping[str, Any]]) -> Evaluated | None:
+def evaluated(row: Row, results: Sequence[Mapping[str, Any]], asked: int | str | None = None) -> Evaluated | None:
     """A row's part of an evaluation's results; None where it has none."""
     own = [one for one in results if (one["decides"] if row.ranking is None else one["system"] == row.ranking)]
     recall: dict[str, dict[float, dict[int, float]]] = {}
@@ -65,7 +94,7 @@ def evaluated(row: Row, results: Sequence[Mapping[str, Any]]) -> Evaluated | Non
         depths = {int(k): 100 * value for k, value in one["recall_at"].items()}
         recall.setdefault(OVERALL if sequence == MEANS[0] else sequence, {})[threshold] = depths
     recall.pop(MEANS[1], None)
-    return Evaluated(recall, own[0]) if own and OVERALL in recall else None
+    return Evaluated(recall, own[0], asked) if own and OVERALL in recall else None
 
 
 def beside(ours: float | None, theirs: float | None, form: str = ".1f") -> str:
@@ -84,20 +113,25 @@ def tables(found: Found) -> Iterator[tuple[str, str, Table]]:
         ("settings", "Settings (Table II)", settings(found)),
         ("recall", "Recall@1 in %, by data set and threshold (Tables III and VII)", recalls(found)),
         *(
-            (f"sequences_{name}", f"Recall@1 in % by sequence of {name} (Table IV)", sequences(found, name))
+            (f"sequences_{name}", f"Recall@1 in %, sequences of {found.title(name)} (Table IV)", sequences(found, name))
             for name, dataset in found.datasets.items()
             if len(dataset.sequences) > 1
         ),
-        ("averages", "Average Recall@1 in % (figure 8)", averages(found)),
+        ("averages", f"Average Recall@1 in % (figure 8), here over {listed(found)}", averages(found)),
         ("depths", "Recall@1, @5 and @10 in %, by data set (Table VIII)", depths(found)),
         ("sizes", "Size of the database in MiB, of float32 (Table V)", sizes(found)),
-        ("seconds", "Seconds of a query by step, those of features that the filter takes under filter (Table VI: an "
-         "RTX 2080 Ti; here the device that seconds/*.json names)", seconds(found)),
+        ("seconds", "Seconds of a query by step, those of features that the filter takes under filter (Table VI: "
+         f"RobotCar's snow, an RTX 2080 Ti; here {found.timed_on})", seconds(found)),
     )  # fmt: skip
     for name, heading, table in candidates:
         if table.rows:
             has_printed = any("(" in cell for row in table.rows for cell in row[1:])
             yield name, heading + "; in brackets the printed numbers and the differences" * has_printed, table
+
+
+def listed(found: Found) -> str:
+    """The data sets of the means."""
+    return ", ".join(map(found.title, found.means[0])) or "none"
 
 
 def data_sets(found: Found) -> Table:
@@ -106,7 +140,7 @@ def data_sets(found: Found) -> Table:
     for name, dataset in found.datasets.items():
         ours = [len(dataset.database), sum(len(sequence.images) for sequence in dataset.sequences)]
         theirs = printed()["data_sets"].get(name, [None, None])
-        rows.append([name, *(beside(*both, form=",.0f") for both in zip(ours, theirs, strict=True))])
+        rows.append([found.title(name), *(beside(*both, form=",.0f") for both in zip(ours, theirs, strict=True))])
     return Table(["data set", "reference", "queries"], rows)
 
 
@@ -117,7 +151,7 @@ def settings(found: Found) -> Table:
         about, theirs = one.about, printed_settings(name)
         sides = [about[group].get("image_size") for group in ("filter", "features")]
         sizes = [" x ".join(map(str, side)) if side else _NONE for side in sides]
-        ours = [sizes[0], sizes[1], str(about["candidates"])]
+        ours = [sizes[0], sizes[1], str(one.asked or about["candidates"])]
         beside_them = [theirs.get(column) for column in ("filter", "re_ranking", "candidates")]
         cells = [cell if value is None else f"{cell} ({value})" for cell, value in zip(ours, beside_them, strict=True)]
         lines[name] = [about["filter"]["name"], cells[0], about["features"]["name"], *cells[1:]]
@@ -127,17 +161,19 @@ def settings(found: Found) -> Table:
 
 def recalls(found: Found) -> Table:
     """All systems by data set and threshold."""
-    columns = [(name, threshold) for name in found.datasets for threshold in _thresholds(found, name)]
+    columns = [(name, threshold) for name in found.datasets for threshold in thresholds_of(found, name)]
     rows = []
     for row in found.known(found.rows, found.datasets):
         cells = [_cell(found, row, name, OVERALL, threshold) for name, threshold in columns]
         rows.append([row.title, *cells])
-    return Table(["system", *(f"{name} ±{threshold:g}" for name, threshold in columns)], rows if columns else [])
+    return Table(
+        ["system", *(f"{found.title(name)} ±{threshold:g}" for name, threshold in columns)], rows if columns else []
+    )
 
 
 def sequences(found: Found, dataset: str) -> Table:
     """All systems in each sequence of a data set, and their plain mean."""
-    thresholds = _thresholds(found, dataset)
+    thresholds = thresholds_of(found, dataset)
     parts = [sequence.name for sequence in found.datasets[dataset].sequences]
     columns = [(part, threshold) for part in (*parts, OVERALL) for threshold in thresholds]
     rows = [
@@ -150,19 +186,18 @@ def sequences(found: Found, dataset: str) -> Table:
 
 
 def averages(found: Found) -> Table:
-    """The paper's mean where all six data sets are here; otherwise the plain mean of those that every row has."""
+    """Means over the data sets that are here, see `Found.means`, and the printed ones beside those of the same six."""
+    names, means = found.means
+    is_papers = {*names} == {*BERLIN, *OTHERS}
     rows = []
-    common = [name for name in found.datasets if {*TOLERANCES} <= {*_thresholds(found, name)}]
     for row in found.rows:
-        own = {name: _at(found.evaluated[row.name, name]) for name in common if (row.name, name) in found.evaluated}
-        theirs = average(printed()["recall"].get(row.name, {}))
-        ours = average(own)
-        plain = np.mean([own[name] for name in common], axis=0) if common and len(own) == len(common) else None
-        if ours is None and plain is None and theirs is None:
+        theirs, ours = average(printed()["recall"].get(row.name, {})), _or_none(means.get(row.name))
+        if row.name not in means and theirs is None:
             continue
-        cells = [beside(*both) for both in zip(_or_none(ours), _or_none(theirs), strict=True)]
-        rows.append([row.title, *cells, *(beside(one, None) for one in _or_none(plain))])
-    header = [f"of the six ±{t}" for t in TOLERANCES] + [f"of {len(common)} here ±{t}" for t in TOLERANCES]
+        papers = zip(ours if is_papers else _or_none(None), _or_none(theirs), strict=True)
+        own = _or_none(None) if is_papers else ours
+        rows.append([row.title, *(beside(*both) for both in papers), *(beside(one, None) for one in own)])
+    header = [f"of the paper's six ±{t}" for t in TOLERANCES] + [f"of {len(names)} here ±{t}" for t in TOLERANCES]
     return _without_empty_columns(Table(["system", *header], rows))
 
 
@@ -181,9 +216,9 @@ def depths(found: Found) -> Table:
             if one := found.evaluated.get((row.name, name)):
                 recall = one.recall[OVERALL]
                 threshold = sorted(recall)[len(recall) // 2]
-                theirs = printed()["pitts30k"].get(row.name) if name.startswith("pitts30k") else None
+                theirs = printed()["pitts30k"].get(row.name) if name == "pitts30k_val" else None
                 cells = [beside(recall[threshold].get(k), theirs and theirs[at]) for at, k in enumerate(ks)]
-                rows.append([row.title, f"{name} ±{threshold:g}", *cells])
+                rows.append([row.title, f"{found.title(name)} ±{threshold:g}", *cells])
     return Table(["system", "data set", *(f"R@{k}" for k in ks)], rows, text_columns=2)
 
 
@@ -198,7 +233,7 @@ def sizes(found: Found) -> Table:
             cells.append(beside(None if size is None else size * len(dataset.database) / 2**20, theirs.get(name)))
         if any(cell != _NONE for cell in cells):
             rows.append([row.title, *cells])
-    return Table(["system", *found.datasets], rows)
+    return Table(["system", *map(found.title, found.datasets)], rows)
 
 
 def seconds(found: Found) -> Table:
@@ -218,8 +253,8 @@ def _second(ours: float, theirs: float | None) -> str:
     return f"{ours:.3f}" if theirs is None else f"{ours:.3f} ({theirs:.2f})"
 
 
-def _thresholds(found: Found, dataset: str) -> list[float]:
-    """Of the data set's evaluations."""
+def thresholds_of(found: Found, dataset: str) -> list[float]:
+    """Of a data set's evaluations."""
     known = (one.recall[OVERALL] for (_, name), one in found.evaluated.items() if name == dataset)
     return sorted(next(known, {}))
 

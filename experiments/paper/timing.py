@@ -19,7 +19,7 @@ from mfvpr.evaluations import Stopwatch
 from mfvpr.maps.vectors import Vectors
 from mfvpr.report import runs
 
-QUERIES, DATABASE = 10, 60  # images
+QUERIES, DATABASE = 10, 60  # images; as many of the database as there are candidates, at least
 STEPS = ("filter", "features", "matching", "scores")
 _FLOAT = 4  # bytes of a number
 _MOST = 1 << 30  # bytes of made descriptors
@@ -36,7 +36,8 @@ def measured(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, float]:
     sequence = dataset.sequences[-1]  # RobotCar's snow, as the paper
     number = min(QUERIES, len(sequence.images))
     candidates = min(int(settings["candidates"]), len(dataset.database)) if settings["candidates"] != "all" else "all"
-    database = _part(dataset.database, range(min(DATABASE, len(dataset.database))))
+    least = DATABASE if candidates == "all" else max(DATABASE, candidates)
+    database = _part(dataset.database, range(min(least, len(dataset.database))))
     extractor = build.extractor(settings["features"], None)
     filter, matching = build.filter(settings["retrieval"], extractor, None), build.matching(settings["matching"])
     scorers, watch = build.scorers(settings["scorer"]), Stopwatch()
@@ -73,25 +74,22 @@ def _part(folder: ImageFolder, rows: range) -> ImageFolder:
     return replace(folder, names=tuple(folder.names[row] for row in rows))
 
 
-def growth(numbers: Mapping[str, tuple[int, float]], largest: int = 100_000) -> dict[str, dict[int, float]]:
-    """Seconds of a query by the size of the database: the search among made descriptors, and what does not grow.
+def search(descriptor: int, largest: int = 100_000) -> dict[int, float]:
+    """Seconds that the search among made descriptors takes, by the size of the database.
 
     Args:
-        numbers: by title: bytes of a descriptor, and seconds of everything but the search.
+        descriptor: bytes of one.
         largest: database; less where descriptors would take more than `_MOST` bytes.
     """
-    found: dict[str, dict[int, float]] = {}
-    rng = np.random.default_rng(0)
-    for title, (descriptor, rest) in numbers.items():
-        length = descriptor // _FLOAT
-        for size in (size for size in (100, 1000, 10_000, largest) if size * descriptor <= _MOST):
-            known = Vectors()
-            for row in range(size):
-                known.put(row, rng.standard_normal(length, np.float32))
-            query, times = rng.standard_normal(length, np.float32), []
-            for _ in range(_ROUNDS + 1):
-                start = time.perf_counter()
-                known.nearest(query, 50)
-                times.append(time.perf_counter() - start)
-            found.setdefault(title, {})[size] = rest + float(np.median(times[1:]))
+    found, rng, length = {}, np.random.default_rng(0), descriptor // _FLOAT
+    for size in (size for size in (100, 1000, 10_000, largest) if size * descriptor <= _MOST):
+        known = Vectors()
+        for row in range(size):
+            known.put(row, rng.standard_normal(length, np.float32))
+        query, times = rng.standard_normal(length, np.float32), []
+        for _ in range(_ROUNDS + 1):
+            start = time.perf_counter()
+            known.nearest(query, 50)
+            times.append(time.perf_counter() - start)
+        found[size] = float(np.median(times[1:]))
     return found

@@ -41,6 +41,12 @@ def printable(text: str) -> str:
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
+def clipped(text: str, most: int) -> str:
+    """`text` of at most so many characters, the middle left out."""
+    half = (most - 1) // 2
+    return text if len(text) <= most else f"{text[:half]}\N{HORIZONTAL ELLIPSIS}{text[-half:]}"
+
+
 def write_text(path: Path, text: str) -> None:
     """Write `printable` text as UTF-8, atomically."""
     with replacing(path) as temporary:

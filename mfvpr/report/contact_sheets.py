@@ -11,13 +11,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from mfvpr.data.datasets import Dataset, QuerySequence
-from mfvpr.data.files import printable, replacing
+from mfvpr.data.files import clipped, printable, replacing
 from mfvpr.data.images import resize
 from mfvpr.errors import InputError
 
 SIDE = 320  # px of an image's longer side on the sheet
 _COLUMNS = 2  # of pairs
-_LONGEST = 48  # characters of a caption
+_LONGEST = 44  # characters of a caption
+_WIDTH = 3.2  # inches of an image
 
 
 @dataclass(frozen=True)
@@ -39,19 +40,21 @@ def contact_sheet(path: Path, dataset: Dataset, *, pairs: int = 12) -> None:
     """
     each = max(2, -(-pairs // len(dataset.sequences)))
     chosen = [pair for sequence in dataset.sequences for pair in _spread(sequence, each)]
+    images = [_images(dataset, pair) for pair in chosen]
+    shapes = [image.shape for both in images for image, _ in both if image is not None]
+    height = _WIDTH * float(np.median([rows / columns for rows, columns, _ in shapes] or [0.75]))
     rows = -(-len(chosen) // _COLUMNS)
-    figure = Figure(figsize=(13, 0.5 + 2.35 * rows), layout="constrained")
+    figure = Figure(figsize=(2 * _COLUMNS * _WIDTH, 0.5 + (0.3 + height) * rows), layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(f"{dataset.name}: query | the place that the ground truth names", fontsize=11, parse_math=False)
     cells = figure.subplots(rows, 2 * _COLUMNS, squeeze=False).reshape(-1, 2)
     for axes in cells.ravel():
         axes.set_axis_off()
-    for (left, right), pair in zip(cells, chosen, strict=False):
-        _draw(left, *_image(pair.sequence, pair.query))
-        if pair.place is not None:
-            _draw(right, *_image(QuerySequence("", dataset.database, None), pair.place))
-        else:
-            right.text(0.5, 0.5, "no place", ha="center")
+    for pair, both in zip(cells, images, strict=False):
+        for one, drawn in zip(pair, both, strict=False):
+            _draw(one, *drawn)
+        if len(both) < 2:
+            pair[1].text(0.5, 0.5, "no place", ha="center")
     with replacing(path) as temporary, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # names in scripts that the font lacks
         figure.savefig(temporary, dpi=80)
@@ -61,6 +64,12 @@ def _spread(sequence: QuerySequence, number: int) -> Sequence[_Pair]:
     rows = np.unique(np.linspace(0, len(sequence.images) - 1, number).round().astype(int))
     truth = sequence.truth
     return [_Pair(sequence, int(row), None if truth is None else truth.place(int(row))) for row in rows]
+
+
+def _images(dataset: Dataset, pair: _Pair) -> list[tuple[np.ndarray | None, str]]:
+    """Query, and place where it is known."""
+    place = [] if pair.place is None else [_image(QuerySequence("", dataset.database, None), pair.place)]
+    return [_image(pair.sequence, pair.query), *place]
 
 
 def _image(sequence: QuerySequence, row: int) -> tuple[np.ndarray | None, str]:
@@ -77,5 +86,4 @@ def _image(sequence: QuerySequence, row: int) -> tuple[np.ndarray | None, str]:
 def _draw(axes: Axes, image: np.ndarray | None, caption: str) -> None:
     if image is not None:
         axes.imshow(image)
-    shown = caption if len(caption) <= _LONGEST else f"...{caption[-_LONGEST:]}"
-    axes.set_title(printable(shown), fontsize=7, parse_math=False)
+    axes.set_title(printable(clipped(caption, _LONGEST)), fontsize=7, parse_math=False)

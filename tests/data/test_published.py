@@ -139,6 +139,18 @@ def test_nearest_places_of_equal_ones_are_the_first():
     assert distance.tolist() == [1]
 
 
+def test_robotcar_knows_one_pose_of_each_image(tmp_path):
+    centers = {place(condition, 1): (0, 0, 0) for condition in (REFERENCE, *CONDITIONS)}
+    write_poses(tmp_path, centers)
+    poses = tmp_path / "robotcar_v2_train.txt"
+    text = poses.read_text()
+    poses.write_text(f"\ufeff{text}{text}", encoding="utf-8")  # a byte order mark, and every line twice
+    assert published_dataset("robotcar_seasons", tmp_path).database.names == (f"{REFERENCE}/rear/1.jpg",)
+    line = text.splitlines()[0].split()
+    poses.write_text(text + " ".join([*line[:4], "3.0", *line[5:]]) + "\n")
+    refused("robotcar_seasons", tmp_path, f"expected one pose of {REFERENCE}/rear/1.jpg, got another")
+
+
 def test_robotcar_lacks_something(tmp_path):
     refused("robotcar_seasons", tmp_path, "robotcar_v2_train.txt: cannot be read")
     centers = {place(condition, 1): (0, 0, 0) for condition in (REFERENCE, *CONDITIONS)}

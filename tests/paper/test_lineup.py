@@ -1,14 +1,15 @@
 """What is evaluated: rows, settings and data sets."""
 
-import numpy as np
 import pytest
 
 from experiments.paper import lineup
+from experiments.paper.figures import mean_bars
 from experiments.paper.lineup import DRAWN, ROWS, Place, chosen_rows, missing_weights, overrides, places
 from experiments.paper.printed import printed
-from experiments.paper.runs import made_of, settings_of, truths
+from experiments.paper.runs import made_of, settings_of
 from experiments.paper.tables import OVERALL, Evaluated, Found, beside, evaluated, tables
 from experiments.settings import SettingsError
+from experiments.truth import fingerprint
 from mfvpr.data.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.data.ground_truth import FrameTruth
 
@@ -100,10 +101,10 @@ def test_weights_that_are_missing_are_named(monkeypatch):
 
 def test_a_run_is_known_by_what_decides_its_numbers(tmp_path, monkeypatch):
     images = {"database": "a", "queries": "b"}
-    first = made_of(made("sift_50", "corridor", tmp_path / "a"), images)
-    assert first == made_of(made("sift_50", "corridor", tmp_path / "b") | {"out": "elsewhere"}, images)
-    assert first["settings"] != made_of(made("sift_10", "corridor", tmp_path), images)["settings"]
-    assert first["images"] != made_of(made("sift_50", "corridor", tmp_path), images | {"queries": "c"})["images"]
+    first = made_of(made("sift_50", "corridor", tmp_path / "a"), images, None)
+    assert first == made_of(made("sift_50", "corridor", tmp_path / "b") | {"out": "elsewhere"}, images, None)
+    assert first["settings"] != made_of(made("sift_10", "corridor", tmp_path), images, None)["settings"]
+    assert first["images"] != made_of(made("sift_50", "corridor", tmp_path), images | {"queries": "c"}, None)["images"]
 
 
 def test_overrides_of_all_rows_are_few():
@@ -154,7 +155,7 @@ def test_tables_hold_both_numbers():
     row = next(row for row in ROWS if row.name == "mix_hist_50")
     recall = {at: {1: value, 5: 95.0, 10: 99.0} for at, value in ((1, 81.0), (2, 92.5), (5, 96.0))}
     one = Evaluated({OVERALL: recall}, result("histogram", 0.8))
-    gardens = dataset("gardens_point", "all", database=200)
+    gardens = dataset("gardens_point", "gardens_point", database=200)
     found = Found([row], {"gardens_point": gardens},
                   {("mix_hist_50", "gardens_point"): one}, sizes={("mix_hist_50", "gardens_point"): 2.0**20},
                   seconds={"mix_hist_50": dict(filter=0.1, features=0.2, matching=0.3, scores=0.1)})  # fmt: skip
@@ -164,6 +165,7 @@ def test_tables_hold_both_numbers():
     assert made["sizes"].rows == [["Mix-hist 50", "200.0"]]
     assert made["seconds"].rows == [["Mix-hist 50", "0.100 (0.01)", "0.200 (0.03)", "0.400 (0.07)", "0.700 (0.10)"]]
     assert made["averages"].rows[0][1:4] == ["(87.5)", "(92.9)", "(95.0)"]
+    assert made["averages"].header[4:] == [f"of 1 here ±{tolerance}" for tolerance in (1, 2, 5)]
     assert made["depths"].rows == [["Mix-hist 50", "gardens_point ±2", "92.5", "95.0", "99.0"]]
     assert made["settings"].rows == [
         ["Mix-hist 50", "vlad", "- (320 x 320)", "sift", "336 x 320 (320 x 320)", "50 (10 or 50)"]
@@ -192,14 +194,38 @@ def test_averages_over_all_six_are_the_papers():
     [line] = {name: table for name, _, table in tables(found)}["averages"].rows
     assert [cell.split(" ")[0] for cell in line[1:4]] == ["87.5", "92.9", "95.0"]
     assert all(cell.endswith("+0.0)") or cell.endswith("-0.0)") for cell in line[1:4])
-    assert np.isfinite([float(cell) for cell in line[4:]]).all()
+    assert line[4:] == []
+    assert mean_bars(found) == [(row.title, pytest.approx(92.875), pytest.approx(92.875))]
+
+
+def test_rows_that_lack_a_data_set_have_no_mean():
+    some = [row for row in ROWS if row.name in ("sift_hist_50", "sift_anchor")]
+    recall = {at: {1: 50.0} for at in (1, 2, 5)}
+    results = {(row.name, name): Evaluated({OVERALL: recall}, result("histogram", 0.5))
+               for row in some for name in ("corridor", "grief_season")}  # fmt: skip
+    del results["sift_anchor", "corridor"]
+    found = Found(some, {name: dataset(name, name) for name in ("corridor", "grief_season")}, results)
+    assert mean_bars(found) == [("SIFT-hist 50", 50.0, None)]
+    [line] = {name: table for name, _, table in tables(found)}["averages"].rows
+    assert line == ["SIFT-hist 50", "50.0", "50.0", "50.0"]
+
+
+def test_data_sets_that_lack_images_are_called_so():
+    row = next(row for row in ROWS if row.name == "mix_hist_50")
+    one = Evaluated({OVERALL: {at: {1: 90.0} for at in (1, 2, 5)}}, result("histogram", 0.9))
+    found = Found(
+        [row], {"gardens_point": dataset("gardens_point", "gardens_point")}, {(row.name, "gardens_point"): one}
+    )
+    headings = {name: (heading, table.header) for name, heading, table in tables(found)}
+    assert headings["recall"][1][1] == "gardens_point (incomplete) ±1"
+    assert "here over gardens_point (incomplete)" in headings["averages"][0]
 
 
 def test_another_ground_truth_of_the_same_images_is_another_run(tmp_path):
     folder, settings = ImageFolder(None, ("0", "1", "2")), made("sift_50", "corridor", tmp_path)
     known = []
     for rows in (((0,), (1,), (2,)), ((0,), (2,), (1,))):
-        parts = (QuerySequence("one", folder, FrameTruth(rows, 3)),)
-        known.append(made_of(settings, {}, truths(Dataset("corridor", folder, parts), [1])))
-    assert known[0] != known[1]
+        dataset = Dataset("corridor", folder, (QuerySequence("one", folder, FrameTruth(rows, 3)),))
+        known.append(made_of(settings, {}, fingerprint(dataset, [1])))
     assert {name for name in known[0] if known[0][name] != known[1][name]} == {"ground truth"}
+    assert fingerprint(Dataset("corridor", folder, (QuerySequence("one", folder, None),)), []) is None

@@ -59,7 +59,7 @@ def files(out):
 
 def test_it_says_what_is_left_out_and_prints_what_it_found(finished, data):
     out, done = finished
-    assert f"left out: gardens_point: needs {data}/gardens_point, from http" in done.stderr
+    assert f"left out: gardens_point: needs {data}/gardens_point (http" in done.stderr
     assert "left out: mix_hist_10: needs d2_tf (d2_tf.pth): python -m experiments.weights convert" in done.stderr
     assert "SIFT-hist 10" in done.stdout
     assert "Mix-hist 10" not in done.stdout
@@ -106,6 +106,31 @@ def test_what_a_run_left_that_was_killed_while_its_files_moved_is_no_obstacle(fi
     done = run_program(*arguments(data, out), program="paper")
     assert done.returncode == 0, done.stderr
     assert files(folder) == kept
+
+
+def test_seconds_of_something_else_are_measured_again(finished, data, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "paper" / "out"
+    shutil.copytree(finished[0], out)
+    path = out / "seconds/sift_10.json"
+    kept = json.loads(path.read_text())
+    for content in (json.dumps(kept | {"matching": 77.0, "of": kept["of"] | {"images": "others"}}), "{"):
+        path.write_text(content)
+        code, _, stderr = typed(monkeypatch, capsys, "paper", *arguments(data, out))
+        assert code == 0
+        assert "timing: sift_10 on grief_season" in stderr
+        assert json.loads(path.read_text())["matching"] < 70
+    heading = (out / "tables/seconds.md").read_text().splitlines()[0]
+    assert "here grief_season, on " in heading
+
+
+@pytest.mark.parametrize("name", ["results.json", "run.json", "sizes.json"])
+def test_damaged_runs_are_told(finished, data, tmp_path, monkeypatch, capsys, name):
+    out = tmp_path / "paper" / "out"
+    shutil.copytree(finished[0], out)
+    (out / "runs/grief_season/sift_10" / name).write_text("[")
+    code, _, stderr = typed(monkeypatch, capsys, "paper", *arguments(data, out))
+    assert code == 2
+    assert f"sift_10/{name}: is damaged, or missing; remove the folder, and run this again" in stderr
 
 
 def test_two_do_not_evaluate_into_one_folder(finished, data, monkeypatch, capsys):

@@ -117,7 +117,8 @@ def published_dataset(name: str, root: Path, *, seasons: tuple[str, str] | None 
     if not root.is_dir():
         found = "a file" if root.exists() else "nothing"
         raise InputError(f"{root}: expected the folder of {name}, got {found}; it is to be had at {entry.source}")
-    if seasons is not None and (entry.seasons is None or not {*seasons} <= {*nordland.SEASONS}):
+    known = seasons is None or (entry.seasons is not None and {*seasons} <= {*nordland.SEASONS})
+    if seasons is not None and not (known and len({*seasons}) == 2):
         raise InputError(f"seasons={list(seasons)}: expected two of {', '.join(nordland.SEASONS)}")
     read = entry.read if entry.seasons is None else partial(entry.read, seasons=seasons or entry.seasons)
     try:
@@ -134,5 +135,8 @@ def differences(dataset: Dataset) -> Iterator[str]:
     if len(dataset.database) != entry.database:
         yield f"{len(dataset.database):,} database images where {entry.database:,} are published"
     for sequence in dataset.sequences:
-        if (got := len(sequence.images)) != (number := entry.queries.get(sequence.name)):
+        got, number = len(sequence.images), entry.queries.get(sequence.name)
+        if number is None:
+            yield f"queries in {sequence.name}, which is none of its sequences"
+        elif got != number:
             yield f"{got:,} queries in {sequence.name} where {number:,} are published"

@@ -26,6 +26,9 @@ def listed_images(root: Path, names: Iterable[str], origin: Path) -> ImageFolder
     for name in names:
         if name.startswith("/") or ".." in name.split("/"):
             raise InputError(f"{origin}: expected names below {root}, got {name}")
+    if len({*names}) < len(names):
+        twice = next(name for row, name in enumerate(names) if name in names[:row])
+        raise InputError(f"{origin}: expected every image once, got {twice} again; get the file again")
     missing = [name for name in names if not (root / name).is_file()]
     if missing:
         raise InputError(f"{root}: {len(missing):,} of the {len(names):,} images of {origin.name} are missing, the "
@@ -45,7 +48,7 @@ def read_lines(path: Path) -> list[str]:
         InputError: the file cannot be read.
     """
     try:
-        text = path.read_text(encoding="utf-8", errors="surrogateescape")
+        text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
     return [stripped for line in text.splitlines() if (stripped := line.strip())]
@@ -66,6 +69,8 @@ def read_rows(path: Path, num_database: int) -> list[tuple[int, ...]]:
         InputError: the file is another, is damaged, or a row is none of the database.
     """
     rows = _rows(path)
+    if rows and num_database > 2 and all(len(found) == num_database and {*found} <= {0, 1} for found in rows):
+        raise InputError(f"{path}: expected rows of the database, got flags for each of them; get the file again")
     for query, found in enumerate(rows):
         if found and not 0 <= min(found) <= max(found) < num_database:
             raise InputError(f"{path}: query {query}: expected rows from 0 to {num_database - 1}, got "

@@ -62,7 +62,10 @@ def camera_centers(path: Path) -> dict[str, np.ndarray]:
         center = np.array(numbers[3:12:4])
         if len(numbers) != 16 or not np.all(np.abs(center) <= FARTHEST):
             raise InputError(f"{path}: line {number}: expected a name and the 16 numbers of a pose, got {line[:60]!r}")
-        centers[str(Path(name).with_suffix(".jpg").as_posix())] = center
+        image = str(Path(name).with_suffix(".jpg").as_posix())
+        if image in centers and not np.array_equal(centers[image], center):
+            raise InputError(f"{path}: line {number}: expected one pose of {image}, got another; get the file again")
+        centers[image] = center
     return centers
 
 

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
 # plotly is imported where it is needed, since everything else can do without.
 _COLORS = ("#0b84c6", "#e1701a", "#1a9e6f", "#c9559d", "#9a7bd0", "#b58900", "#d1495b", "#5f9ea0")  # on dark and light
+_POWERS = [step * 10.0**power for power in range(-4, 4) for step in (1, 2, 5)]
 _HEIGHT = 380  # px
 _FIRST = "#8a8f98"  # of what all others are compared with
 _DASHES = ("solid", "dash", "dot", "dashdot")  # told apart without colors, too
@@ -81,7 +82,7 @@ def lines(
         )  # fmt: skip
     _lay_out(figure, axes, legend=len(curves) > 1)
     figure.update_xaxes(_SCALES[scale])
-    figure.update_yaxes({"range": [-2, 102]} if unit == "%" else {"type": "log"})
+    figure.update_yaxes({"range": [-2, 102]} if unit == "%" else {"type": "log", "tickvals": _POWERS})
     ends = (f"{label}: {points[0][1]:{form}} to {points[-1][1]:{form}} {unit}" for label, points in curves.items()
             if points)  # fmt: skip
     return Chart(name, title, f"{axes[1]} against {axes[0]}. {'; '.join(ends)}.", _values(figure))

@@ -116,6 +116,11 @@ class Run:
         return self.common["ground_truth"].get("thresholds", [])
 
     @property
+    def first_k(self) -> str:
+        """The smallest depth that recall is told at, with ground truth."""
+        return min(self.common["recall_at"], key=int)
+
+    @property
     def within(self) -> str:
         """What counts as right in `gains` and everything per query, as it stands behind R@K."""
         return threshold_words(self.unit, middle(self.thresholds))

@@ -34,9 +34,10 @@ def in_words(run: Run) -> str:
     several = f" in {len(run.sequences)} sequences" if len(run.sequences) > 1 else ""
     right = f"right is what is within{run.within}" if run.gains and run.within else ""
     right = right or ("right or not, as told" if run.gains else "no ground truth: rankings only")
+    lacks = f"; incomplete: {', '.join(common['incomplete'])}" if common.get("incomplete") else ""
     return (
         f"{common['queries']} queries{several}, {common['database']} database images, {common['candidates']} candidates"
-        f" ({common['filter']['name']}), {common['features']['name']} features; {right}"
+        f" ({common['filter']['name']}), {common['features']['name']} features; {right}{lacks}"
     )
 
 

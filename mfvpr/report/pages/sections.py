@@ -18,6 +18,7 @@ from mfvpr.report.tables import Table
 from mfvpr.results import FILTER
 
 MOST_ANSWERS = 5000  # rows of a table that a browser still sorts at once
+_P_VALUES = ("McNemar p", "p by blocks")
 PRECISION_AXES = "recall of queries with an answer, %", "precision, %"
 _MOST_POINTS = 200  # of a curve
 _DIFFERENCES = ("system", "other", "only system", "only other", "McNemar p", "queries in a block", "blocks",
@@ -69,7 +70,7 @@ def recall_section(run: Run) -> Section:
     """Recall with intervals, over tolerances and over K; with ground truth."""
     charts = [bars("intervals", f"Recall at 1{run.within}, with intervals", _intervals(run), axis="recall at 1, %")]
     if len(run.thresholds) > 1:
-        axes = f"tolerance, {run.unit}", "recall at 1, %"
+        axes = f"tolerance, {run.unit}", f"recall at {run.first_k}, %"
         charts.append(lines("tolerances", "Recall over tolerance", recall_by_tolerance(run), axes=axes, marked=True))
     curves = {name: recall_by_depth(run.all_gains, name, run.common["candidates"]) for name in run.systems}
     axes = "K, the first candidates", "recall at K, %"
@@ -100,7 +101,12 @@ def differences_section(run: Run) -> Section | None:
         return None
     words = "How many queries only one of two systems gets right, and how probable that is if neither is better: by "
     words += "McNemar's exact test, which takes queries for independent, and by blocks of neighbors along the path."
-    sheet = Sheet("Every two systems", Table(_DIFFERENCES, found.rows, 2))
+    probabilities = [place for place, name in enumerate(_DIFFERENCES) if name in _P_VALUES]
+    rows = [
+        [f"{float(cell):.2g}" if place in probabilities else cell for place, cell in enumerate(row)]
+        for row in found.rows
+    ]
+    sheet = Sheet("Every two systems", Table(_DIFFERENCES, rows, 2))
     return Section("differences", "Differences", words, sheets=[sheet])
 
 
@@ -198,16 +204,16 @@ def _with_intervals(run: Run, table: Table) -> Table:
     for row in table.rows:
         gains = parts.get(row[1]) if several else run.all_gains
         rows.append([*row, "" if gains is None else percent(interval(gains, row[0]))])
-    return Table([*table.header, f"95 % at{run.within}" if run.within else "95 %"], rows, 1 + several)
+    return Table([*table.header, f"R@1{run.within}, 95 %"], rows, 1 + several)
 
 
 def recall_by_tolerance(run: Run) -> dict[str, list[tuple[float, float]]]:
-    """(threshold, recall in %) by system, of all queries."""
+    """(threshold, recall at `Run.first_k` in %) by system, of all queries."""
     rows = [row for row in run.results if row.get("sequence", MEANS[-1]) == MEANS[-1]]
     found: dict[str, list[tuple[float, float]]] = {name: [] for name in run.systems}
     for row in rows:
         threshold = next(row[name] for name in ("tolerance", "radius") if name in row)
-        found[row["system"]].append((threshold, 100 * next(iter(row["recall_at"].values()))))
+        found[row["system"]].append((threshold, 100 * row["recall_at"][run.first_k]))
     return found
 
 

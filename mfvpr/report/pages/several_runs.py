@@ -49,7 +49,8 @@ def why_not(first: Run, second: Run) -> str | None:
         return "a run has no ground truth"
     if first.common["data_fingerprint"] != second.common["data_fingerprint"]:
         return "other images"
-    differ = [name for name in ("kind", "files", "unit", "thresholds", "exclude_neighbors")
+    differ = [name for name in ("kind", "files", "unit", "thresholds", "exclude_neighbors",
+                                                  "fingerprint")
               if first.common["ground_truth"].get(name) != second.common["ground_truth"].get(name)]  # fmt: skip
     if differ:
         return f"another ground truth ({', '.join(differ)})"
@@ -66,7 +67,8 @@ def _labels(folders: Sequence[Path]) -> list[str]:
         labels = ["/".join(parts[-length:]) for parts in paths]
         if len({*labels}) == len(labels):
             return labels
-    raise InputError("expected different run folders, got one twice")
+    twice = next(folder for row, folder in enumerate(folders) if folder.absolute() in map(Path.absolute, folders[:row]))
+    raise InputError(f"{twice}: expected different run folders, got this one twice")
 
 
 def _facts(runs: Mapping[str, Run]) -> dict[str, str]:
@@ -117,12 +119,13 @@ def _recall(runs: Mapping[str, Run]) -> Section:
 
 
 def _over_tolerance(runs: Mapping[str, Run]) -> list[Chart]:
-    """Of those that are judged by several thresholds of one unit."""
+    """Of those that are judged by several thresholds of one unit, at one depth."""
     several = {label: run for label, run in runs.items() if len(run.thresholds) > 1}
     charts = []
-    for unit in dict.fromkeys(run.unit for run in several.values()):
-        curves = {label: recall_by_tolerance(run)[run.headline] for label, run in several.items() if run.unit == unit}
-        axes = f"tolerance, {unit}", "recall at 1, %"
+    for kind in dict.fromkeys((run.unit, run.first_k) for run in several.values()):
+        own = {label: run for label, run in several.items() if (run.unit, run.first_k) == kind}
+        curves = {label: recall_by_tolerance(run)[run.headline] for label, run in own.items()}
+        axes = f"tolerance, {kind[0]}", f"recall at {kind[1]}, %"
         name = f"tolerances-{len(charts)}"
         charts.append(lines(name, "Recall over tolerance", curves, axes=axes, marked=True))
     return charts
