@@ -9,7 +9,14 @@ import yaml
 
 from experiments.settings import CONF, SettingsError
 
-PROGRAMS = {"config": "evaluate", "sweep": "sweep", "learn": "learn", "paper": "paper"}  # by their file in conf/
+PROGRAMS = {
+    "config": "evaluate",
+    "sweep": "sweep",
+    "learn": "learn",
+    "paper": "paper",
+    "map": "map build",
+    "localize": "localize",
+}  # by their file in conf/
 
 
 def defaults(file: Path) -> list[Any]:

@@ -118,6 +118,12 @@ RULES: dict[str, Rule] = {
     ".data": either(_PATH, None),
     ".datasets": either(list_of(_TEXT), None),
     ".systems": either(list_of(_TEXT), None),
+    # a map that is asked
+    ".map": _PATH,
+    ".images": or_list(_PATH),
+    "watch": _FLAG,
+    "alternatives": _INDEX,
+    "recent": _INDEX,
     # report
     "tolerances": list_of(_INDEX),
     "radius": _POSITIVE,

@@ -74,15 +74,19 @@ def matches_path(settings):
 
 def typed(monkeypatch, capsys, program, *arguments):
     """Exit code, stdout and stderr of a command line, in this process."""
-    monkeypatch.setattr(sys, "argv", [program, *map(str, arguments)])
+    program, *command = program.split()
+    monkeypatch.setattr(sys, "argv", [program, *command, *map(str, arguments)])
     monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)  # this and the next two are put back
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     monkeypatch.setattr(logging, "shutdown", lambda *_: None)  # Hydra's call would close an earlier test's stderr
     handler, code = signal.getsignal(signal.SIGTERM), 0
     capsys.readouterr()
     try:
-        config = "config" if program == "evaluate" else program
-        launch(getattr(import_module(f"experiments.{program}"), program), config)
+        module, config = import_module(f"experiments.{program}"), "config" if program == "evaluate" else program
+        if hasattr(module, "main"):  # of commands
+            module.main()
+        else:
+            launch(getattr(module, program), config)
     except SystemExit as left:
         code = left.code
     finally:

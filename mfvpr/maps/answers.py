@@ -1,6 +1,7 @@
 """What a map answers."""
 
-from dataclasses import asdict, dataclass
+import math
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -53,8 +54,10 @@ class Answer:
 
     def as_json(self, most: int = 5) -> dict[str, Any]:
         """JSON values, with so many alternatives."""
-        values = asdict(self)
-        return values | {"alternatives": values["alternatives"][:most]}
+        values = asdict(replace(self, alternatives=self.alternatives[:most]))
+        for one in (values, *values["alternatives"]):
+            one["score"] = one["score"] if math.isfinite(one["score"]) else None
+        return values
 
 
 def pair_of(values: np.ndarray) -> tuple[float, float] | None:

@@ -1,0 +1,33 @@
+"""Frames of a video file, one after the other."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from mfvpr.errors import InputError
+
+SUFFIXES = frozenset({".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm"})
+
+
+def frames(path: Path, *, every: int = 1) -> Iterator[tuple[int, np.ndarray]]:
+    """(number from 0, `[H, W, 3]` uint8 RGB) of every so many frames.
+
+    Raises:
+        InputError: no video, or one without frames that can be read.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: expected a video file, got {'a folder' if path.is_dir() else 'nothing'}")
+    video, number = cv2.VideoCapture(str(path)), 0
+    try:
+        while video.grab():
+            if number % every == 0:
+                there, image = video.retrieve()
+                if there:
+                    yield number, cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+            number += 1
+    finally:
+        video.release()
+    if not number:
+        raise InputError(f"{path}: expected a video, got a file without frames that can be read; convert it")
