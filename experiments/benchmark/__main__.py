@@ -28,6 +28,7 @@ BENCHMARKS = {
     "lightglue": "LightGlue of one query with 50 candidates, beside the public code in torch with --peer (3 rounds)",
     "sweeps": "grids of a score's parameters on cached matches (7 rounds)",
     "networks": "D2-Net, MixVPR, ALIKED, NetVLAD, Patch-NetVLAD, a generalized mean, SelaVPR (5 rounds; half an hour)",
+    "localize": "maps of 1,000 and 10,000 images that are asked: time from file to answer (3 rounds)",
     "scale": "databases of 1,000 to 10,000 images on disk: time per query and peak memory (3 rounds)",
 }
 

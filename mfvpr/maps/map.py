@@ -31,6 +31,7 @@ from mfvpr.stores.maps import Entry, MapRows
 from mfvpr.types import Features, Matches
 
 _VOCABULARY = "vocabulary.npz"
+_NO_VOCABULARY = "{}: this map has no vocabulary yet; learn it from some images first (`learn`)"
 
 
 class Map:
@@ -94,6 +95,17 @@ class Map:
     def __len__(self) -> int:
         """Images that are known."""
         return len(self._entries)
+
+    @property
+    def describing(self) -> Describing:
+        """What describes images.
+
+        Raises:
+            InputError: the map has no vocabulary yet.
+        """
+        if self._made is None:
+            raise InputError(_NO_VOCABULARY.format(self.folder))
+        return self._made.describing
 
     @property
     def names(self) -> list[str]:
@@ -169,11 +181,28 @@ class Map:
         name = str(image) if name is None and not isinstance(image, np.ndarray) else name
         if name is None:
             raise InputError("name: expected one for an image that is no file")
+        features, vector = self.describing.image(image)
+        self.add_described([Entry(name, place, vector)], [features])
+
+    def add_described(self, entries: Sequence[Entry], features: Sequence[Features]) -> None:
+        """Add images that are described already, as `describing` does it.
+
+        Args:
+            entries: names, places and descriptors.
+            features: local ones, as a store gives them back.
+
+        Raises:
+            InputError: as `add`.
+        """
+        if len(entries) != len(features):
+            raise InputError(f"expected features of each of {len(entries)} images, got {len(features)}")
         with self._adding() as made:
-            if name in self.names:
-                raise InputError(f"{name}: the map has an image of this name; choose another")
-            features, vector = made.describing.image(image)
-            made.rows.add([(features, Entry(name, place, vector))])
+            known = {*self.names}
+            for name in (entry.name for entry in entries):
+                if name in known:
+                    raise InputError(f"{name}: the map has an image of this name; choose another")
+                known.add(name)
+            made.rows.add([*zip(features, entries, strict=True)])
         self.refresh()
 
     def localize(self, image: Image, *, recent: int = 0) -> Answer:
@@ -228,13 +257,12 @@ class Map:
     @contextmanager
     def _adding(self) -> Iterator["_Made"]:
         """What rows are made with, while nobody else adds any; what others added is known."""
-        if self._made is None:
-            raise InputError(
-                f"{self.folder}: this map has no vocabulary yet; learn it from some images first (`learn`)"
-            )
-        with self._made.rows.adding():
+        made = self._made
+        if made is None:
+            raise InputError(_NO_VOCABULARY.format(self.folder))
+        with made.rows.adding():
             self.refresh()
-            yield self._made
+            yield made
 
     def _use(self, describer: Extractor | Aggregation) -> None:
         describing = Describing(self.extractor, describer)
