@@ -125,7 +125,7 @@ def tables(found: Found) -> Iterator[tuple[str, str, Table]]:
     )  # fmt: skip
     for name, heading, table in candidates:
         if table.rows:
-            has_printed = any("(" in cell for row in table.rows for cell in row[1:])
+            has_printed = any("(" in cell.replace(INCOMPLETE, "") for row in table.rows for cell in row[1:])
             yield name, heading + "; in brackets the printed numbers and the differences" * has_printed, table
 
 

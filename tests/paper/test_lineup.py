@@ -219,6 +219,7 @@ def test_data_sets_that_lack_images_are_called_so():
     headings = {name: (heading, table.header) for name, heading, table in tables(found)}
     assert headings["recall"][1][1] == "gardens_point (incomplete) ±1"
     assert "here over gardens_point (incomplete)" in headings["averages"][0]
+    assert "brackets" not in headings["depths"][0]
 
 
 def test_another_ground_truth_of_the_same_images_is_another_run(tmp_path):
