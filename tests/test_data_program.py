@@ -1,30 +1,18 @@
 """Data sets as a program: listed, and checked beside what is published."""
 
-import signal
+from functools import partial
 
 import pytest
 from PIL import Image
 
-from experiments import data
 from mfvpr.data.published import PUBLISHED
 from tests.data.test_published import put
+from tests.programs import typed
 
 
 @pytest.fixture
 def program(monkeypatch, capsys):
-    handler = signal.getsignal(signal.SIGTERM)
-
-    def call(*arguments):
-        monkeypatch.setattr("sys.argv", ["data", *map(str, arguments)])
-        code = 0
-        try:
-            data.main()
-        except SystemExit as left:
-            code = left.code
-        return code, *capsys.readouterr()
-
-    yield call
-    signal.signal(signal.SIGTERM, handler)
+    return partial(typed, monkeypatch, capsys, "data")
 
 
 def test_all_are_listed_with_their_numbers(program):

@@ -12,7 +12,6 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from experiments import report
 from mfvpr.errors import InputError
 from mfvpr.evaluation.statistics import block_sign_flips, mcnemar, recall_interval
 from mfvpr.report.pages import sections, several_runs
@@ -20,6 +19,7 @@ from mfvpr.report.pages.files import read_run
 from mfvpr.report.pages.one_run import write_report
 from mfvpr.report.pages.several_runs import write_comparison
 from mfvpr.report.runs import write_json
+from tests.programs import typed
 from tests.run_folders import HEADLINE, HOSTILE, RANKS, SYSTEMS, TOLERANCES, change_json, write_run
 
 TWO = ("</style><b onclick=alert(3)>", "{{7*7}}")
@@ -226,14 +226,7 @@ def test_runs_of_other_queries_are_not(tmp_path, changes, reason):
 
 
 def program(monkeypatch, capsys, *arguments):
-    monkeypatch.setattr(sys, "argv", ["report", *map(str, arguments)])
-    monkeypatch.setattr(report, "unwind_on_sigterm", lambda: None)
-    code = 0
-    try:
-        report.main()
-    except SystemExit as end:
-        code = end.code
-    return code, *capsys.readouterr()
+    return typed(monkeypatch, capsys, "report", *arguments)
 
 
 def test_the_program_says_where_the_page_is(run, tmp_path, monkeypatch, capsys):

@@ -33,7 +33,7 @@ def figures(found: Found, best: Mapping[str, Path], growth: Mapping[str, Mapping
     Args:
         found: what was evaluated.
         best: the run folder by data set whose histograms and failures are shown.
-        growth: see `timing.growth`.
+        growth: seconds of a query by title and by the size of the database.
     """
     histograms = (path for folder in best.values() for path in sorted((folder / "figures").rglob("right_*.png")))
     if histogram := next(histograms, None):

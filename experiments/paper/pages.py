@@ -6,9 +6,9 @@ from pathlib import Path
 from urllib.parse import quote
 
 from experiments.paper.figures import mean_bars
-from experiments.paper.tables import OVERALL, Found, listed
+from experiments.paper.tables import Found, listed, thresholds_of
 from experiments.paper.timing import STEPS
-from mfvpr.evaluation import threshold_words
+from mfvpr.evaluation import middle, threshold_words
 from mfvpr.report.pages.charts import Bar, Chart, amounts, bars, lines
 from mfvpr.report.pages.one_run import PAGE
 from mfvpr.report.pages.pictures import MOST_PICTURES, Picture, pictures
@@ -36,7 +36,7 @@ def write(
         out: folder of them.
         found: what was evaluated.
         tables: of it.
-        growth: see `timing.growth`.
+        growth: seconds of a query by title and by the size of the database.
         runs: folders of the evaluations, by data set and name.
         left_out: lines that say what was not evaluated, and what that needs.
     """
@@ -77,12 +77,13 @@ def _averages(found: Found) -> Chart:
 def _by_sequence(found: Found) -> Iterator[Chart]:
     """Of data sets with several sequences, at the middle threshold."""
     for name, dataset in found.datasets.items():
-        if len(dataset.sequences) < 2:
+        thresholds = thresholds_of(found, name)
+        if len(dataset.sequences) < 2 or not thresholds:
             continue
         groups: dict[str, dict[str, Bar]] = {}
+        threshold = middle(thresholds)
         for row in found.rows:
             if row.leads and (one := found.evaluated.get((row.name, name))):
-                threshold = sorted(one.recall[OVERALL])[len(one.recall[OVERALL]) // 2]
                 groups[row.title] = {part.name: Bar(one.recall[part.name][threshold][1]) for part in dataset.sequences}
         if groups:
             within = threshold_words(dataset.sequences[0].truth.unit, threshold) if dataset.sequences[0].truth else ""

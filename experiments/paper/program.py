@@ -45,11 +45,11 @@ def _make(
     here = [place for place in found if place.name in datasets]
     if not here:
         raise SettingsError(f"nothing was evaluated: {failed[0]}")
-    results = _collected(rows, here, settings)
+    finished = _finished(rows, here, settings)
+    results = _collected(rows, finished)
     timed_on = next((one for one in here if one.name == "robotcar_seasons"), here[0])
     times = _timed(rows, timed_on, datasets[timed_on.name], settings, out)
     seconds = {row.name: times[row.run] for row in rows if row.run in times and row.leads}
-    finished = _finished(rows, here, settings)
     about = f"{timed_on.name}, on {timing.device()['cores']} cores of {timing.device()['device']}"
     _write(out, Found(rows, datasets, results, seconds, _sizes(rows, finished), about), finished, [*left_out, *failed])
     if failed:
@@ -110,19 +110,13 @@ def _evaluate_all(
     return datasets, failed
 
 
-def _collected(
-    rows: Sequence[Row], here: Sequence[Place], settings: Mapping[str, Any]
-) -> dict[tuple[str, str], Evaluated]:
+def _collected(rows: Sequence[Row], finished: Mapping[tuple[str, str], Path]) -> dict[tuple[str, str], Evaluated]:
     collected = {}
-    for place in here:
-        for run in dict.fromkeys(row.run for row in rows):
-            folder = runs.folder_of(run, place, settings)
-            if not runs.is_finished(folder):
-                continue
-            found, asked = runs.results(folder), runs.asked(folder)
-            for row in rows:
-                if row.run == run and (one := evaluated(row, found, asked)):
-                    collected[row.name, place.name] = one
+    for (place, run), folder in finished.items():
+        found, asked = runs.results(folder), runs.asked(folder)
+        for row in rows:
+            if row.run == run and (one := evaluated(row, found, asked)):
+                collected[row.name, place] = one
     return collected
 
 

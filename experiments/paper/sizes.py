@@ -5,6 +5,8 @@ Keypoints count where they are found, not where they are the places of a grid. (
 
 from typing import Any
 
+import numpy as np
+
 from experiments.prepare import Tools
 from mfvpr.data.datasets import ImageFolder
 from mfvpr.features.patch_netvlad import PatchNetVladFeatures
@@ -19,11 +21,17 @@ _GRIDS = (WindowExtractor, PatchNetVladFeatures, SelaVprFeatures)
 def bytes_of_an_image(tools: Tools, database: ImageFolder) -> dict[str, float]:
     """On average, of what was already taken from the database: `local` features, and the filter's `descriptor`."""
     archive, filter = tools.archive, tools.filter
-    sources = archive.local(database, fitted(tools.extractor, database, archive))
+    sources = archive.local(database, fitted(tools.extractor, database, archive), [])  # nothing is extracted for this
     keypoint = 0 if isinstance(tools.extractor, _GRIDS) else _KEYPOINT
-    local = sum((_FLOAT * one.dimension + keypoint) * float(one.counts.mean()) for one in sources)
+    local = sum((_FLOAT * one.dimension + keypoint) * _mean(one.source.counts) for one in sources)
     describer: Any = fitted(filter, database, archive)  # all filters of the paper have one
     return {
         "local": local,
         "descriptor": _FLOAT * archive.vectors(database, describer.describer, database).values.shape[1],
     }
+
+
+def _mean(counts: np.ndarray) -> float:
+    """Keypoints of an image, of those that were looked at: filters other than VLAD need candidates alone."""
+    known = counts[counts >= 0]
+    return float(known.mean()) if known.size else 0.0

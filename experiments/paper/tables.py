@@ -11,6 +11,7 @@ from experiments.paper.lineup import Row
 from experiments.paper.printed import BERLIN, OTHERS, average, printed, printed_recall, printed_settings
 from mfvpr.data.datasets import MEANS, Dataset
 from mfvpr.data.published import differences
+from mfvpr.evaluation import middle
 from mfvpr.report.tables import Table
 
 INCOMPLETE = " (incomplete)"
@@ -215,7 +216,7 @@ def depths(found: Found) -> Table:
         for name in found.datasets:
             if one := found.evaluated.get((row.name, name)):
                 recall = one.recall[OVERALL]
-                threshold = sorted(recall)[len(recall) // 2]
+                threshold = middle(sorted(recall))
                 theirs = printed()["pitts30k"].get(row.name) if name == "pitts30k_val" else None
                 cells = [beside(recall[threshold].get(k), theirs and theirs[at]) for at, k in enumerate(ks)]
                 rows.append([row.title, f"{found.title(name)} ±{threshold:g}", *cells])

@@ -1,6 +1,5 @@
 """Seconds of a query by step, as the paper gives them, and as the database grows."""
 
-import os
 import tempfile
 import time
 from collections.abc import Mapping
@@ -17,6 +16,7 @@ from mfvpr.archive import Archive
 from mfvpr.data.datasets import Dataset, ImageFolder
 from mfvpr.evaluations import Stopwatch
 from mfvpr.maps.vectors import Vectors
+from mfvpr.numerics import available_cpus
 from mfvpr.report import runs
 
 QUERIES, DATABASE = 10, 60  # images; as many of the database as there are candidates, at least
@@ -30,7 +30,7 @@ def measured(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, float]:
     """Seconds of a query by step.
 
     A part of the database is enough, as the time does not depend on its size but for the search among descriptors (see
-    `growth`). What is taken from it, and all that is learned of it, is there before: the queries are asked twice, under
+    `search`). What is taken from it, and all that is learned of it, is there before: the queries are asked twice, under
     other names, which are other images to an archive, so that nothing is compiled while they are timed.
     """
     sequence = dataset.sequences[-1]  # RobotCar's snow, as the paper
@@ -58,7 +58,7 @@ def measured(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, float]:
 
 def device() -> dict[str, Any]:
     """What the seconds were measured on."""
-    return {"device": jax.devices()[0].device_kind, "cores": os.cpu_count(), "versions": runs.versions()}
+    return {"device": jax.devices()[0].device_kind, "cores": available_cpus(), "versions": runs.versions()}
 
 
 def _renamed(images: ImageFolder, number: int, folder: Path) -> ImageFolder:

@@ -1,5 +1,7 @@
 """The map itself: what it is made with, what is added to it, and what it is asked."""
 
+import json
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -155,6 +157,8 @@ class Map:
         places = images.names if places is None else places
         if len(places) != len(images):
             raise InputError(f"expected a place of each of {len(images)} images, got {len(places)}")
+        for name, place in zip(images.names, places, strict=True):
+            _check_place(name, place)
         self.learn(images, track=track)
         with self._adding() as made:
             known = {*self.names}
@@ -198,7 +202,8 @@ class Map:
             raise InputError(f"expected features of each of {len(entries)} images, got {len(features)}")
         with self._adding() as made:
             known = {*self.names}
-            for name in (entry.name for entry in entries):
+            for name, place, _ in entries:
+                _check_place(name, place)
                 if name in known:
                     raise InputError(f"{name}: the map has an image of this name; choose another")
                 known.add(name)
@@ -228,7 +233,8 @@ class Map:
         order = np.argsort(-np.where(np.isnan(scores), -np.inf, scores), kind="stable")
         ranked, filtered = Ranked(rows[order][None], scores[order][None]), Ranked(rows[None], similarity[None])
         p = None if self.confidence is None else float(self.confidence(ranked, filtered)[0])
-        refused = p is not None and self.threshold is not None and not p >= self.threshold
+        p = None if p is None or math.isnan(p) else p  # of a score that is not finite nothing is known
+        refused = self.threshold is not None and not (p is not None and p >= self.threshold)
         found = tuple(self._alternative(int(rows[one]), float(scores[one])) for one in order)
         place = None if refused else found[0].place
         return Answer(place, found, found[0].score, p, *self._shift(matches, int(order[0])))
@@ -277,6 +283,16 @@ class Map:
     def _vocabulary_of(self) -> str:
         """What the vocabulary is of: another's is refused."""
         return fingerprint({"extractor": recipe_of(self.extractor), "vocabulary": recipe_of(self._fitting)})
+
+
+def _check_place(name: str, place: Any) -> None:
+    """None would be no place; what JSON cannot say cannot be kept."""
+    try:
+        if place is None:
+            raise ValueError("None")
+        json.dumps(place, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: expected a place that JSON can say, and not null, got {error}") from None
 
 
 class _Made(NamedTuple):

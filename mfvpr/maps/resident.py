@@ -41,8 +41,9 @@ class Resident:
             candidates: of a query: so many must be there at the same time.
             memory: GB that they may take; None = a third of what is free. There are twice the candidates in any case.
         """
-        self._rows, self._typical, self._memory = rows, round_up(typical, STEP), memory
+        self._rows, self._typical = rows, round_up(typical, STEP)
         self._least, self._device = max(_LEAST, 2 * candidates), device_of(())
+        self._budget = memory_budget(memory, [self._device])  # once: slots must not change with what is free later
         self._recent, self.capacity = Recent(0), 0
         self._arrays: Features | None = None
 
@@ -58,11 +59,13 @@ class Resident:
         arrays = self._grown(int(max(counts, default=0)), query, total)
         slots, new = self._recent.take(rows)
         place, read = dict(zip(rows, slots, strict=True)), self._rows.features(new)
+        self._arrays = None  # until all is there: a slot whose row cannot be read holds another row
         while part := [*itertools.islice(read, WRITTEN)]:
             where = np.full(WRITTEN, self._recent.number, np.int32)
             where[: len(part)] = [place[row] for row, _ in part]
             images = stacked([image for _, image in part], self.capacity, total=WRITTEN)
-            arrays = self._arrays = write_slots(arrays, where, jax.device_put(images, self._device))
+            arrays = write_slots(arrays, where, jax.device_put(images, self._device))
+        self._arrays = arrays
         return arrays, np.array(slots, np.int32)
 
     def _grown(self, count: int, query: Features, total: int) -> Features:
@@ -71,8 +74,10 @@ class Resident:
         capacity = self.capacity
         if count > capacity:
             capacity = min(size for size in (self._typical, few_sizes(round_up(count, STEP))) if size >= count)
+        if self._arrays is not None and capacity == self.capacity and total <= self._recent.number:
+            return self._arrays
         one = stacked([query], capacity, total=1)
-        fitting = memory_budget(self._memory, [self._device]) // sum(leaf.nbytes for leaf in jax.tree.leaves(one))
+        fitting = self._budget // sum(leaf.nbytes for leaf in jax.tree.leaves(one))
         number = self._least
         while number < total and 2 * number <= fitting:
             number *= 2

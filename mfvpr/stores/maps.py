@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mfvpr.errors import InputError
 from mfvpr.stores.features import FeatureStore, open_store
 from mfvpr.stores.manifest import Kind
 from mfvpr.stores.rows import RowStore, open_rows
@@ -114,11 +115,18 @@ class MapRows:
         return np.array([self._segments[segment].features.counts[row] for segment, row in places], int)
 
     def features(self, rows: Sequence[int]) -> Iterator[tuple[int, Features]]:
-        """(row, features) of rows that are there, in no order."""
+        """(row, features) of rows that are there, in no order.
+
+        Raises:
+            InputError: they are damaged, or were and are gone.
+        """
         segments: dict[int, list[int]] = {}
         for row in rows:
             segments.setdefault(row // SEGMENT, []).append(row % SEGMENT)
         for number, own in segments.items():
+            if gone := [row for row in own if self._segments[number].features.counts[row] < 0]:
+                raise InputError(f"{self.folder}: the features of row {number * SEGMENT + gone[0]} were damaged, and "
+                                 "are gone; make the map anew")  # fmt: skip
             for row, features in self._segments[number].features.read(own):
                 yield number * SEGMENT + row, features
 
@@ -192,11 +200,10 @@ class MapRows:
         changed = _changed(folder / "entries")
         seen = before.seen if before is not None and before.changed == changed else now
         sizes = {"num_images": SEGMENT}
-        segment = _Segment(
-            open_store(folder / "features", self.recipe, num_images=SEGMENT),
-            open_rows(folder / "entries", MAP, self.recipe, sizes, pack=_pack, unpack=_unpack),
-            changed, seen, now,
-        )  # fmt: skip
+        # Entries first: what is added in between then has features, as these are written before.
+        entries = open_rows(folder / "entries", MAP, self.recipe, sizes, pack=_pack, unpack=_unpack)
+        features = open_store(folder / "features", self.recipe, num_images=SEGMENT)
+        segment = _Segment(features, entries, changed, seen, now)
         if before is None:
             self._segments.append(segment)
             self._known.append(np.zeros(SEGMENT, bool))

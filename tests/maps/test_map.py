@@ -21,6 +21,7 @@ from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
 from mfvpr.filters import Retrieval
 from mfvpr.maps import Map
+from mfvpr.maps.resident import Resident
 from mfvpr.stores import maps as map_store
 from mfvpr.types import Features
 from tests.programs import ROOT
@@ -165,6 +166,75 @@ def test_damaged_rows_are_told(dataset, folder, tmp_path):
     path.write_bytes(path.read_bytes()[:-50])
     with pytest.raises(InputError, match="damaged on disk"):
         asked(tmp_path / "map")
+
+
+class Unsteady:
+    """Rows of one keypoint that says which; those that are bad cannot be read."""
+
+    bad = ()
+
+    def counts(self, rows):
+        return np.ones(len(rows), int)
+
+    def features(self, rows):
+        for row in rows:
+            if row in self.bad:
+                raise InputError(f"row {row}")
+            point = np.full((1, 2), row, np.float32)
+            yield (
+                row,
+                Features(point, np.ones((1, 4), np.float32), point[:, 0], np.ones(1, bool), np.ones(2, np.float32)),
+            )
+
+
+def test_rows_that_cannot_be_read_leave_no_others_in_their_slots():
+    rows = Unsteady()
+    resident, [(_, query)] = Resident(rows, typical=1, candidates=2, memory=None), rows.features([0])
+    resident.hold([0, 1], query, 4)
+    rows.bad = (2,)
+    with pytest.raises(InputError, match="row 2"):
+        resident.hold([3, 2], query, 4)
+    for asked_for in ([3, 1], [0, 3]):
+        arrays, slots = resident.hold(asked_for, query, 4)
+        assert np.asarray(arrays.scores)[slots, 0].tolist() == asked_for
+
+
+def test_features_that_are_gone_are_told(dataset, folder, tmp_path):
+    shutil.copytree(folder, tmp_path / "map")
+    known, images = asked(tmp_path / "map", candidates=2), dataset.database.paths
+    [path] = (tmp_path / "map/0000/features").glob("8-*.npz")
+    path.write_bytes(path.read_bytes()[:-50])
+    for words in ("damaged on disk", "of row 8 were damaged, and are gone; make the map anew"):
+        with pytest.raises(InputError, match=words):
+            known.localize(images[8])
+
+
+def test_a_row_that_is_added_while_its_segment_is_opened_has_features(dataset, folder, tmp_path, monkeypatch):
+    """The entries are listed before the features, which are written before the entries."""
+    opened = []
+    for name in ("open_store", "open_rows"):
+        made = getattr(map_store, name)
+        monkeypatch.setattr(map_store, name, lambda *a, name=name, made=made, **o: opened.append(name) or made(*a, **o))
+    asked(folder)
+    assert opened[:2] == ["open_rows", "open_store"]
+
+
+@pytest.mark.parametrize("place", [None, float("nan"), {1, 2}])
+def test_places_are_what_json_can_say(dataset, tmp_path, place):
+    known = asked(tmp_path / "map")
+    with pytest.raises(InputError, match="expected a place that JSON can say"):
+        known.build(dataset.database, [place] * len(dataset.database))
+    known.build(dataset.database)
+    with pytest.raises(InputError, match="expected a place that JSON can say"):
+        known.add(dataset.queries.paths[0], place)
+    assert len(known) == len(dataset.database)
+
+
+def test_of_a_score_that_is_not_finite_nothing_is_sure(dataset, folder):
+    known = asked(folder, scorer=lambda matches: np.nan * matches.distance.sum(), confidence=SURE, threshold=0.5)
+    answer = known.localize(dataset.queries.paths[0])
+    assert (answer.place, answer.p_right, answer.as_json()["score"]) == (None, None, None)
+    assert answer.is_refused
 
 
 def test_two_do_not_add_at_the_same_time(dataset, tmp_path):

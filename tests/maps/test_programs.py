@@ -136,6 +136,7 @@ def test_mistakes_are_one_line(folder, monkeypatch, capsys, arguments, words):
 @pytest.mark.parametrize(("more", "words"), [
     (["candidates=4"], "was made with other candidates; name another folder"),
     (["features.max_keypoints=50"], "was made with other features"),
+    (["candidates=all"], "candidates=all: a map matches so many"),
     (["retrieval.whiten=4"], "expected vlad, same or a network, without whiten"),
     (["scorer=paper"], "expected one score, as scorer=histogram, got several"),
     (["map=STREET"], "expected a new or empty folder, or a map"),
