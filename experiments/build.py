@@ -28,6 +28,7 @@ from mfvpr.named_weights import NAMED_WEIGHTS
 from mfvpr.rankings import Fusion
 from mfvpr.retrieval import ExactSearch, WhitenedSearch
 from mfvpr.scoring import SCORERS, Scorer
+from mfvpr.shards import Shard
 from mfvpr.weighting import WEIGHTS
 
 
@@ -195,8 +196,9 @@ def _files(group: str, settings: dict[str, Any], data: Dataset | None) -> dict[P
 def archive(settings: dict[str, Any]) -> Archive:
     """Where what is taken from images is kept."""
     root = None if settings["store"] is None else expanded(settings["store"])
+    shard = settings.get("shard") and Shard.parse(settings["shard"])
     return Archive(root, skip_bad=settings["on_bad_image"] == "skip", track=console.track, tell=console.tell,
-                   wait=settings.get("multirun", False))  # fmt: skip
+                   wait=settings.get("multirun", False), shard=shard, patience=settings.get("wait", 0))  # fmt: skip
 
 
 def where(settings: dict[str, Any]) -> dict[str, Any]:

@@ -4,15 +4,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments import build, confidences, prepare, run_folder, truth
+from experiments import build, confidences, prepare, run_folder, sharding, truth
 from experiments.prepare import Images, Tools
 from experiments.settings import SettingsError
 from mfvpr import evaluations
 from mfvpr.data.datasets import Dataset
 from mfvpr.data.published import differences
 from mfvpr.evaluation import Unit
-from mfvpr.evaluations import Stopwatch
 from mfvpr.features import Source
+from mfvpr.progress import Stopwatch
 from mfvpr.report import runs
 from mfvpr.report.confidences import Assured, confidence_figures, confidence_table, write_confidence
 from mfvpr.report.differences import write_gains
@@ -20,6 +20,7 @@ from mfvpr.report.evaluations import Figure, Judged, figures, recall_table, writ
 from mfvpr.report.shifts import write_shifts
 from mfvpr.results import COHORT, FILTER, FRAMES
 from mfvpr.scoring import HistogramOfShifts
+from mfvpr.shards import NotYet
 from mfvpr.sinks import open_sinks
 
 _THRESHOLDS: dict[Unit, str] = {"frames": "tolerance", "m": "radius"}  # their names in results
@@ -40,14 +41,38 @@ class Outcome:
 
 
 def evaluate(settings: dict[str, Any]) -> None:
-    """Every stage, the table, a run folder with its page."""
-    with run_folder.claimed(settings) as folder:
-        outcome = evaluated(settings)
-        run_folder.leave(
-            folder, settings, ground_truth(outcome), text=text(outcome),
-            write=lambda new: write(new, outcome), figures=outcome.figures,
-        )  # fmt: skip
-        run_folder.report(folder)
+    """Every stage, the table, a run folder with its page; of a shard, what it can do by now."""
+    if settings["shard"] is None:
+        with run_folder.claimed(settings) as folder:
+            _leave(folder, evaluated(settings))
+        return
+    with sharding.joined(settings) as says:
+        try:
+            outcome = evaluated(settings)
+        except NotYet as wait:
+            says(sharding.COMPLETE if wait.is_complete else f"waits: {wait}")
+            done, again = (
+                ("its part", "the last shard leaves the results")
+                if wait.is_complete
+                else ("what it can", "start it again when they are there")
+            )
+            print(f"shard {settings['shard']} has done {done}: {wait}; {again}")
+            return
+        with sharding.last(settings) as is_last:
+            if is_last:
+                with run_folder.claimed(settings, own=True, beside=[sharding.SHARDS]) as folder:
+                    _leave(folder, outcome)
+            else:
+                print(f"shard {settings['shard']} is complete; results: {settings['out']}")
+        says(sharding.COMPLETE)
+
+
+def _leave(folder: Path, outcome: Outcome) -> None:
+    run_folder.leave(
+        folder, outcome.settings, ground_truth(outcome), text=text(outcome),
+        write=lambda new: write(new, outcome), figures=outcome.figures,
+    )  # fmt: skip
+    run_folder.report(folder)
 
 
 def evaluated(settings: dict[str, Any]) -> Outcome:
@@ -56,6 +81,7 @@ def evaluated(settings: dict[str, Any]) -> Outcome:
     fusion, main = build.fusion(settings), "histogram" if "histogram" in scorers else next(iter(scorers))
     fusion.check(main, scorers)
     tools, images = prepare.begun(settings, watch)
+    sharding.check_data(settings, images)
     shown = asked_figures(settings["figures"], images.dataset)
     combined, histogram = fusion.system(main), scorers.get("histogram")
     headline, frames = combined if settings["final"] == "combined" else main, build.frames(settings)
@@ -173,7 +199,7 @@ def _bytes_per_image(outcome: Outcome) -> int | None:
     extractor = outcome.tools.extractor
     if isinstance(extractor, Source):
         return None
-    return sum(sink.forecast(1) for sink in open_sinks(None, extractor, {}, num_images=1, waiting=None))
+    return sum(sink.forecast(1) for sink in open_sinks(None, extractor, {}, num_images=1))
 
 
 def _judgments(judged: Judged, system: str) -> list[dict[str, Any]]:

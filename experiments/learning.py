@@ -11,7 +11,6 @@ from experiments.prepare import Images
 from experiments.settings import SettingsError
 from mfvpr.data.files import write_text
 from mfvpr.data.sequences import own_rows
-from mfvpr.evaluations import Stopwatch
 from mfvpr.fingerprints import fingerprint, recipe_of
 from mfvpr.learned_weight import ABSOLUTE, RELATIVE
 from mfvpr.learning.comparison import Checkpoints, compare
@@ -19,6 +18,7 @@ from mfvpr.learning.data_sets import Part, joined
 from mfvpr.learning.losses import LOSSES
 from mfvpr.learning.teaching import Options
 from mfvpr.match_sets import Scales
+from mfvpr.progress import Stopwatch
 from mfvpr.report import comparisons, runs
 from mfvpr.scoring import Scorer
 

@@ -15,12 +15,13 @@ from mfvpr.data.datasets import Dataset, QuerySequence
 from mfvpr.data.published import differences
 from mfvpr.data.sequences import OwnRows, own_rows, without_neighbors
 from mfvpr.evaluation import threshold_words
-from mfvpr.evaluations import Stopwatch, match_sequence, matches_recipe
 from mfvpr.features import Extractor, Source
 from mfvpr.filters import Filter
 from mfvpr.match_sets import MatchSet, Scales
 from mfvpr.matchers import Matcher
 from mfvpr.named_weights import how_made
+from mfvpr.progress import Stopwatch
+from mfvpr.sequence_matching import match_sequence, matches_recipe
 from mfvpr.types import Shortlist
 
 __all__ = ["Images", "Tools", "begun", "matched", "recipe"]

@@ -16,13 +16,13 @@ _OF_THE_START = ("multirun", "command")  # what `command_line` adds to the setti
 
 
 @contextmanager
-def claimed(settings: Mapping[str, Any], *, own: bool = False) -> Iterator[Path]:
-    """The run folder that the settings name, for this run alone; `own` as of `runs.claimed`."""
+def claimed(settings: Mapping[str, Any], **how: Any) -> Iterator[Path]:
+    """The run folder that the settings name, for this run alone; `own` and `beside` as of `runs.claimed`."""
     out, name = settings["out"], settings["dataset"]["name"]
     folder = build.expanded(out) if out else runs.new_run_folder(Path("runs"), name)
     with ExitStack() as claim:
         try:
-            folder = claim.enter_context(runs.claimed(folder, numbered=not out, own=own))
+            folder = claim.enter_context(runs.claimed(folder, numbered=not out, **how))
         except InputError as error:
             raise SettingsError(f"{error} with out=DIR") from error
         yield folder

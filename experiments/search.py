@@ -8,8 +8,8 @@ from experiments import build, console, prepare, run_folder, truth
 from experiments.axes import as_final, require_memory, searchable
 from mfvpr import sweeping
 from mfvpr.data.files import write_text
-from mfvpr.evaluations import Stopwatch
 from mfvpr.fingerprints import fingerprint
+from mfvpr.progress import Stopwatch
 from mfvpr.report import runs, sweeps
 from mfvpr.sweeping import Outcome
 from mfvpr.types import Shortlist

@@ -132,6 +132,14 @@ RULES: dict[str, Rule] = {
     "on_bad_image": one_of("fail", "skip"),
     "figures": _FIGURES,
     "out": either(_PATH, None),
+    "shard": either(
+        Rule(
+            lambda value: isinstance(value, str) and bool(re.fullmatch(r"[0-9]+/[0-9]+", value)),
+            "i/n with i from 0 to n - 1, such as 0/8",
+        ),
+        None,
+    ),
+    "wait": number(0, 1e9),
     # sweeps
     "search": one_of("grid", "optuna"),
     "trials": between(1, 100_000),
@@ -189,6 +197,10 @@ def check(settings: Mapping[str, Any]) -> None:
     if fusion.get("weights") and fusion["c"] != "zscore":
         raise SettingsError(f"fusion.weights={fusion['weights']}: expected fusion.c=zscore as well, or "
                             "fusion.weights=null")  # fmt: skip
+    if settings.get("shard") is not None:
+        for name in ("out", "store"):
+            if settings[name] is None:
+                raise SettingsError(f"shard={settings['shard']}: expected {name}=DIR as well, the same of all shards")
     if settings.get("threshold") is not None and settings["confidence"] is None:
         raise SettingsError(f"threshold={settings['threshold']}: expected confidence=FILE as well, the confidence.json "
                             "of a run on other images with ground truth")  # fmt: skip

@@ -24,7 +24,8 @@ from mfvpr.features import Aggregated, Aggregation, Extractor, Source
 from mfvpr.fingerprints import fingerprint, recipe_of
 from mfvpr.progress import Track, untracked
 from mfvpr.report.runs import versions
-from mfvpr.sinks import Sink, account, open_sinks
+from mfvpr.shards import Shard
+from mfvpr.sinks import Sink, Taken, account, open_sinks
 from mfvpr.sources import FeatureSet, FeatureSource, InMemory
 from mfvpr.stores import matches as match_stores
 from mfvpr.stores.manifest import MATCHES, store_path
@@ -51,15 +52,6 @@ class Vectors:
 
 
 @dataclass
-class _Taken:
-    """What an extractor takes from a folder's images: where that is kept, and why some gave nothing, by row."""
-
-    sinks: list[Sink]
-    bad: dict[int, str] = field(default_factory=dict)
-    announced: bool = False
-
-
-@dataclass
 class Archive:
     """What was taken from images, in stores below a folder, or for the time of this process.
 
@@ -69,6 +61,8 @@ class Archive:
         track: label -> progress of what follows.
         tell: is told, in one line, what is to be done and how much space that takes, and what is wrong with images.
         wait: for other processes that are making the same, instead of refusing.
+        shard: takes from its own images alone, and asks the others' of their stores; it needs a root.
+        patience: seconds that a shard waits for others, before it says `mfvpr.shards.NotYet`.
     """
 
     root: Path | None = None
@@ -76,11 +70,15 @@ class Archive:
     track: Callable[[str], Track] = lambda label: untracked
     tell: Callable[[str], None] = lambda line: None
     wait: bool = False
+    shard: Shard | None = None
+    patience: float = 0.0
     _computed: dict[tuple, tuple[Any, Any]] = field(default_factory=dict, repr=False)
     _warned: set[str] = field(default_factory=set, repr=False)
 
     def __post_init__(self) -> None:
         self.root = None if self.root is None else Path(self.root)
+        if self.shard is not None and self.root is None:
+            raise InputError(f"shard={self.shard}: expected a root as well, the folder of the stores of all shards")
 
     def contents(self, folder: ImageFolder) -> Contents:
         """What the files of a folder hold; remembered below the root from run to run."""
@@ -142,6 +140,7 @@ class Archive:
 
         Raises:
             InputError: an image cannot be read (unless `skip_bad`), or none can; or a store cannot be used.
+            NotYet: other shards have not taken theirs.
         """
         if isinstance(extractor, Source):
             opened = self.once("opened", lambda: self._opened(folder, extractor, label), folder, extractor)
@@ -191,7 +190,7 @@ class Archive:
             raise ValueError("nothing is kept on disk: this archive has no root")
         path = store_path(self.root, "matches", recipe, MATCHES)
         sizes = {"num_queries": num_queries, "num_candidates": num_candidates}
-        with match_stores.open_match_store(path, recipe, **sizes, waiting=self._waiting) as store:
+        with match_stores.open_match_store(path, recipe, **sizes, **self.store_options) as store:
             if missing := num_queries - int(store.done.sum()):
                 needed = match_stores.forecast_bytes(missing, num_candidates, typical)
                 require_space(store.folder, needed)
@@ -202,8 +201,9 @@ class Archive:
             yield store
 
     @property
-    def _waiting(self) -> Callable[[str], None] | None:
-        return self.tell if self.wait else None
+    def store_options(self) -> dict[str, Any]:
+        """Of `stores.rows.open_rows`."""
+        return {"waiting": self.tell if self.wait else None, "shard": self.shard}
 
     def _told_by_content(self, path: PurePath) -> Any:
         path = Path(path)
@@ -219,23 +219,27 @@ class Archive:
         self.tell(f"{label} features: {number} of {len(folder)} images imported, about {typical:.0f} features each")
         return opened
 
-    def _extract(self, folder: ImageFolder, extractor: Extractor, rows: Sequence[int], label: str) -> _Taken:
+    def _extract(self, folder: ImageFolder, extractor: Extractor, rows: Sequence[int], label: str) -> Taken:
         """Run the extractor on those of the rows that lack something."""
-        taken = self.once("taken", lambda: _Taken(self._sinks(folder, extractor)), folder, extractor)
+        taken = self.once("taken", lambda: Taken(self._sinks(folder, extractor)), folder, extractor)
         with ExitStack() as held:
             if any(sink.lacks(rows) for sink in taken.sinks):
                 for sink in taken.sinks:
                     if sink.store is not None:
                         held.enter_context(sink.store)
-            missing = sorted({row for sink in taken.sinks for row in sink.lacks(rows)} - taken.bad.keys())
+            own = rows if self.shard is None else self.shard.rows(folder.names, rows)
+            missing = taken.lacks(own)
             self._announce(extractor, taken, missing, len(rows), len(folder), label)
             batches = described(folder, extractor, missing, taken.bad, skip_bad=self.skip_bad, track=self.track(label))
             for batch in batches:
                 for sink in taken.sinks:
                     sink.keep({row: sink.pick(description) for row, description in batch.items()})
             if missing:
+                taken.leave_bad()
                 for line in account(taken.sinks[bool(extractor.vector_size) :], extractor.scales):
                     self.tell(f"{label}: {line}")
+        if self.shard is not None:
+            self.shard.wait(lambda: taken.look(rows), folder.names, label, patience=self.patience)
         if len(taken.bad) == len(folder):
             raise InputError(f"{folder.root}: none of {len(folder)} images can be used; the first: "
                              f"{taken.bad[min(taken.bad)]}")  # fmt: skip
@@ -243,10 +247,10 @@ class Archive:
 
     def _sinks(self, folder: ImageFolder, extractor: Extractor) -> list[Sink]:
         recipe = self.recipe(folder, extractor) if self.root is not None else {}
-        return open_sinks(self.root, extractor, recipe, num_images=len(folder), waiting=self._waiting)
+        return open_sinks(self.root, extractor, recipe, num_images=len(folder), **self.store_options)
 
     def _announce(
-        self, extractor: Extractor, taken: _Taken, missing: Sequence[int], asked: int, total: int, label: str
+        self, extractor: Extractor, taken: Taken, missing: Sequence[int], asked: int, total: int, label: str
     ) -> None:
         """What is to be done; that nothing is, only once."""
         stores = [sink.store for sink in taken.sinks if sink.store is not None]
@@ -276,8 +280,8 @@ class Archive:
         return Vectors(values, dict(taken.bad))
 
     def _aggregated(self, folder: ImageFolder, describer: Aggregated, database: ImageFolder, label: str) -> Vectors:
-        aggregation = self.once("fitted", lambda: self._fitted(describer, database), database, describer)
         [features] = self.local(folder, describer.extractor, label=label)
+        aggregation = self.once("fitted", lambda: self._fitted(describer, database), database, describer)
         values = np.zeros((len(folder), aggregation.vector_size), np.float32)
         rows = range(len(folder))
         for start in self.track(f"{label} descriptors")(range(0, len(rows), AGGREGATED), -(-len(rows) // AGGREGATED)):

@@ -1,26 +1,19 @@
 """Hubs: database images that score high with whatever query, known by their scores with other places of the map.
 
     matched = match_cohort(dataset, 5, extractor, filter)
-    strengths = scored_hubness(matched, {"histogram": HistogramOfShifts()})
-    better = by_hubness(candidates, scores, strengths["histogram"])
+    among = pipeline.score({"histogram": HistogramOfShifts()}, matched.by_scale, matched.candidates)
+    better = by_hubness(candidates, scores, hubness(matched.candidates, among["histogram"], len(dataset.database)))
 
 All but the last is done when the map is made: no query takes part. Images far apart in the drive count as other places:
 where it passes a place twice, its images score high with each other, and lose as hubs do.
 """
 
-from collections.abc import Mapping, Sequence
-
 import numpy as np
 
-from mfvpr import pipeline
 from mfvpr.data.contents import Contents
 from mfvpr.data.datasets import QuerySequence
 from mfvpr.data.sequences import own_rows, without_neighbors
 from mfvpr.errors import InputError
-from mfvpr.numerics import Device
-from mfvpr.progress import Track, untracked
-from mfvpr.results import Matched
-from mfvpr.scoring import Scorer
 from mfvpr.types import Shortlist
 
 # Usual scores that each image is thought to have beside its own. On drawn streets the scores of an image vary (in
@@ -47,26 +40,6 @@ def cohort_sequence(database: Contents, neighbors: int) -> QuerySequence:
                          "scored with those that are farther away; leave fewer out")  # fmt: skip
     own = tuple(tuple({row, *same}) for row, same in enumerate(own_rows(database, database)))
     return without_neighbors(QuerySequence("cohort", database.folder, None), number, own, int(neighbors))
-
-
-def scored_hubness(
-    matched: Matched,
-    scorers: Mapping[str, Scorer],
-    *,
-    devices: Sequence[Device] | None = None,
-    track: Track = untracked,
-) -> dict[str, np.ndarray]:
-    """`hubness` `[N]` by name of the scorer.
-
-    Args:
-        matched: the database images among each other, of `evaluations.match_cohort`.
-        scorers: by name.
-        devices: see `pipeline.score`.
-        track: see there.
-    """
-    candidates, number = matched.candidates, len(matched.sequence.images)
-    scores = pipeline.score(scorers, matched.by_scale, candidates, devices=devices, track=track)
-    return {name: hubness(candidates, values, number, who=name) for name, values in scores.items()}
 
 
 def hubness(candidates: Shortlist, scores: np.ndarray, num_database: int, *, who: str = "a scorer") -> np.ndarray:

@@ -8,49 +8,33 @@
 Features, shortlist and matches are kept in an archive, where that has a folder.
 """
 
-import json
-import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 
 from mfvpr import pipeline
 from mfvpr.archive import Archive
-from mfvpr.checks import check_matching, check_request, checked_candidates, nan_scores, wrong_with
-from mfvpr.cohort import cohort_sequence, scored_hubness
+from mfvpr.checks import check_request, nan_scores
+from mfvpr.cohort import cohort_sequence, hubness
 from mfvpr.data.datasets import Dataset, QuerySequence
-from mfvpr.data.files import write_text
 from mfvpr.features import Extractor, Source
-from mfvpr.filters import Filter, Filtered
-from mfvpr.fingerprints import recipe_of
-from mfvpr.fitting import fitted
+from mfvpr.filters import Filter
 from mfvpr.frame_correlation import FrameCorrelation
 from mfvpr.matchers import NEIGHBORS, Matcher
 from mfvpr.numerics import Device
+from mfvpr.progress import Stopwatch
 from mfvpr.rankings import Fusion, rank_sequence
 from mfvpr.reranking import Ties
-from mfvpr.results import Matched, Result
+from mfvpr.results import COHORT, Matched, Result
 from mfvpr.scoring import Scorer
-from mfvpr.sources import FeatureSet
-from mfvpr.stores.matches import MatchStore
+from mfvpr.sequence_matching import match_sequence, matches_recipe
+from mfvpr.shards import together
+from mfvpr.stores.manifest import SCORES, store_path
+from mfvpr.stores.scores import open_score_store
 
-_REMARKS = "images.json"  # beside the matches: which images are bad
-
-
-@dataclass
-class Stopwatch:
-    """Seconds by stage."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.seconds[stage] = round(self.seconds.get(stage, 0) + time.perf_counter() - start, 3)
+Scored = tuple[Matched, dict[str, np.ndarray]]  # of a sequence, and its scores [Q, C] by name of the scorer
 
 
 def evaluate(
@@ -96,203 +80,81 @@ def evaluate(
     Raises:
         InputError: arguments, images, stores or features that cannot be used, or what an extractor, a filter or a
             scorer gives; one line says which, and the mend.
+        NotYet: the archive is that of a shard, which has done its part, and others have not: see `mfvpr.shards`.
     """
     fused, correlated = fused or {}, correlated or {}
     check_request(scorers, fused, correlated, ties, memory, cohort=cohort is not None)
     archive, watch = archive or Archive(), watch or Stopwatch()
+    tools = (extractor, filter, candidates)
     how = {"matching": matching, "archive": archive, "memory": memory, "devices": devices}
+    calls = [partial(_scored, dataset, sequence, tools, scorers, watch, **how) for sequence in dataset.sequences]
+    if cohort is not None:
+        others = cohort_sequence(archive.contents(dataset.database), cohort)
+        calls.insert(0, partial(_scored_cohort, dataset, others, tools, scorers, watch, **how))
+    found: list[Scored] = together(*calls)
     strengths: dict[str, np.ndarray] = {}
     if cohort is not None:
-        with watch("cohort"):
-            options = {"devices": devices, "track": archive.track("cohort scores")}
-            strengths = scored_hubness(
-                match_cohort(dataset, cohort, extractor, filter, candidates, **how), scorers, **options
-            )
-    matched = [
-        match_sequence(dataset, sequence, extractor, filter, candidates, watch=watch, **how)
-        for sequence in dataset.sequences
-    ]
-    with watch("scores"):
-        options = {"hubness": strengths, "devices": devices, "track": archive.track("scores")}
-        ranked = [rank_sequence(sequence, scorers, fused, correlated, ties, **options) for sequence in matched]
+        among, scores = found.pop(0)
+        strengths = {
+            name: hubness(among.candidates, values, len(dataset.database), who=name) for name, values in scores.items()
+        }
+    matched = [one for one, _ in found]
+    ranked = [rank_sequence(one, scores, fused, correlated, ties, hubness=strengths) for one, scores in found]
     for line in nan_scores(matched, ranked, scorers):
         archive.warn(line)
     systems = {name: [by_system[name] for by_system in ranked] for name in ranked[0]}
     return Result(dataset, matched, systems, watch.seconds)
 
 
-def match_sequence(
+def _scored(
     dataset: Dataset,
     sequence: QuerySequence,
-    extractor: Extractor | Source,
-    filter: Filter,
-    candidates: int | Literal["all"] = 50,
+    tools: tuple[Extractor | Source, Filter, int | Literal["all"]],
+    scorers: Mapping[str, Scorer],
+    watch: Stopwatch,
     *,
-    matching: Matcher = NEIGHBORS,
-    archive: Archive | None = None,
-    watch: Stopwatch | None = None,
-    **where: Any,
-) -> Matched:
-    """Candidates and matches of one sequence's queries; features of no other database images than candidates are taken.
-
-    Where the archive has a root, matches are kept below it, and where they are all there, nothing else is read.
-
-    Args:
-        dataset: of the sequence.
-        sequence: Q queries.
-        extractor: see `evaluate`.
-        filter: see there.
-        candidates: see there.
-        matching: see there.
-        archive: see there.
-        watch: gets the seconds of the stages.
-        **where: `memory`, `devices` and `track` of `pipeline.match`.
-    """
-    check_matching(candidates, extractor, matching)
-    archive, watch, database = archive or Archive(), watch or Stopwatch(), dataset.database
-    with watch("filter"):
-        extractor, filter = fitted(extractor, database, archive), fitted(filter, database, archive)
-    num_candidates = len(database) if candidates == "all" else min(int(candidates), len(database))
-    with ExitStack() as held:
-        stores = []
-        if archive.root is not None:
-            recipe = matches_recipe(dataset, sequence, extractor, filter, num_candidates, matching, archive)
-            stores = [held.enter_context(one) for one in _match_stores(sequence, extractor, recipe, archive)]
-        weights = tuple(scale.weight for scale in extractor.scales)
-        if kept := _kept(sequence, stores, archive, watch, where.get("memory")):
-            return _looked_at(replace(kept, weights=weights), archive)
-        with watch("filter"):
-            filtered = filter.shortlist(sequence, database, num_candidates, archive)
-            sizes = len(sequence.images), len(database), num_candidates
-            filtered = checked_candidates(filtered, type(filter).__name__, *sizes)
-        with watch("features"):
-            sides, bad = _features(dataset, sequence, extractor, filtered, archive)
-        _remark(stores, archive, bad)
-        options = {"track": archive.track("matching"), **where}
-        with watch("matching"):
-            matches = tuple(
-                pipeline.match(*scale, filtered.candidates, matching, store=store, **options)
-                for scale, store in zip(sides, stores or [None] * len(sides), strict=True)
-            )
-    matched = Matched(sequence, filtered.candidates, matches, bad["queries"], bad["database"], weights)
-    return _looked_at(matched, archive)
-
-
-def match_cohort(
-    dataset: Dataset,
-    neighbors: int,
-    extractor: Extractor | Source,
-    filter: Filter,
-    candidates: int | Literal["all"] = 50,
-    *,
-    archive: Archive | None = None,
+    archive: Archive,
+    label: str = "",
     **how: Any,
-) -> Matched:
-    """Candidates and matches of the database images among each other, once for all sequences: see `mfvpr.cohort`.
+) -> Scored:
+    """All of a sequence; a shard scores its own queries, and asks the others' of their stores."""
 
-    Args:
-        dataset: whose database, in the order of the drive.
-        neighbors: frames on both sides of an image that show its place, and are none of its candidates.
-        extractor: see `evaluate`; and for all others `match_sequence`, which keeps the matches.
-        filter: see there.
-        candidates: see there.
-        archive: see there.
-        **how: see there.
-    """
-    archive = archive or Archive()
-    sequence = cohort_sequence(archive.contents(dataset.database), neighbors)
-    how = {"track": archive.track("cohort matching")} | how
-    return match_sequence(dataset, sequence, extractor, filter, candidates, archive=archive, **how)
+    def match(rows: Sequence[int] | None = None) -> Matched:
+        options: dict[str, Any] = how | ({"track": archive.track(f"{label}matching")} if label else {})
+        return match_sequence(dataset, sequence, *tools, archive=archive, watch=watch, rows=rows, **options)
 
+    def score(matched: Matched) -> dict[str, np.ndarray]:
+        with watch("scores"):
+            track = archive.track(f"{label}scores")
+            return pipeline.score(scorers, matched.by_scale, matched.candidates, devices=how["devices"], track=track)
 
-def _features(
-    dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, filtered: Filtered, archive: Archive
-) -> tuple[list[tuple[FeatureSet, FeatureSet]], dict[str, Any]]:
-    """By scale, those of the queries and of all candidates; and what is wrong with some images of either side."""
-    rows = np.unique(filtered.candidates.indices[filtered.candidates.mask])
-    database = archive.local(dataset.database, extractor, rows.tolist(), label="database")
-    queries = archive.local(sequence.images, extractor, label=f"query {sequence.name}")
-    bad = {
-        "queries": _by_row(filtered.bad_queries, queries[0].bad),
-        "database": _by_row(filtered.bad_database, database[0].bad),
-    }
-    warnings = [
-        *wrong_with(dataset.database, database[0], bad["database"]),
-        *wrong_with(sequence.images, queries[0], bad["queries"]),
-    ]
-    return list(zip(queries, database, strict=True)), bad | {"warnings": warnings}
+    if archive.shard is None or archive.root is None:
+        matched = match()
+        return matched, score(matched)
+    made = matches_recipe(dataset, sequence, *tools, how["matching"], archive)
+    recipe = {"matches": made, "scorers": archive.recipe_of(dict(scorers))}
+    names, path = sequence.images.names, store_path(archive.root, "scores", recipe, SCORES)
+    with open_score_store(path, recipe, num_queries=len(names), **archive.store_options) as store:
+        own = archive.shard.rows(names)
+        missing = [row for row in own if not store.done[row]]
+        if missing or not own:  # then it has images only
+            part = match(own)
+        if missing:  # all are scored, so that what goes on has the bits of one run
+            scores = np.stack([*score(part).values()], axis=1)
+            store.write({row: scores[own.index(row)] for row in missing})
 
+        def lacking() -> Sequence[int]:
+            store.look()
+            return np.flatnonzero(~store.done).tolist()
 
-def _looked_at(matched: Matched, archive: Archive) -> Matched:
-    """The same; queries that the filter finds nothing for are told."""
-    nothing = [row for row in np.flatnonzero(~matched.candidates.mask.any(axis=1)) if row not in matched.bad_queries]
-    if nothing:
-        images = matched.sequence.images
-        archive.warn(f"{images.paths[nothing[0]]}: no candidates ({len(nothing)} such queries of {len(images)}), which "
-                     "counts as a failure")  # fmt: skip
-    return matched
+        archive.shard.wait(lacking, names, f"{sequence.name} scores", patience=archive.patience, is_complete=True)
+        by_query = np.stack([scores for _, scores in store.read()])
+    return match(), dict(zip(scorers, np.moveaxis(by_query, 1, 0), strict=True))
 
 
-def _by_row(*reasons: Mapping[int, str]) -> dict[int, str]:
-    return {int(row): reason for some in reasons for row, reason in some.items()}
-
-
-def _kept(
-    sequence: QuerySequence, stores: Sequence[MatchStore], archive: Archive, watch: Stopwatch, memory: float | None
-) -> Matched | None:
-    """Matches of all scales, of stores that are complete."""
-    if not stores or not all(store.done.all() for store in stores):
-        return None
-    try:
-        remarks = json.loads((stores[0].folder / _REMARKS).read_text())
-        bad = [{int(row): reason for row, reason in remarks[side].items()} for side in ("queries", "database")]
-        warnings = [*remarks["warnings"]]
-    except (OSError, ValueError, LookupError, TypeError, AttributeError):
-        return None  # so images are looked at again, but not matched
-    with watch("matches read"):
-        read = [pipeline.stored_matches(store, memory=memory) for store in stores]
-    if any((other.indices != read[0][1].indices).any() for _, other in read):
-        return None  # another shortlist for some scales, which will be told
-    for line in warnings:
-        archive.warn(line)
-    queries, database = bad
-    return Matched(sequence, read[0][1], tuple(match_set for match_set, _ in read), queries, database)
-
-
-def _remark(stores: Sequence[MatchStore], archive: Archive, remarks: Mapping[str, Any]) -> None:
-    """Tell what is wrong with images, also to those who will read the matches and nothing else."""
-    for store in stores[:1]:
-        write_text(store.folder / _REMARKS, json.dumps(remarks))
-    for line in remarks["warnings"]:
-        archive.warn(line)
-
-
-def matches_recipe(
-    dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, filter: Filter, num_candidates: int,
-    matching: Matcher, archive: Archive,
-) -> dict[str, Any]:  # fmt: skip
-    """All that changes a shortlist and its matches: both sides' images and features, the filter, and the matching."""
-    excluded, database = sequence.excluded, dataset.database
-    extractor, filter = fitted(extractor, database, archive), fitted(filter, database, archive)
-    return {
-        "database": archive.recipe(database, extractor),
-        "query": archive.recipe(sequence.images, extractor),
-        "filter": archive.recipe_of(filter),
-        "candidates": num_candidates,
-        "matching": archive.recipe_of(matching),
-        "skip_bad": archive.skip_bad,
-        "excluded": None if excluded is None else recipe_of([excluded.rows, excluded.offsets]),
-    }
-
-
-def _match_stores(
-    sequence: QuerySequence, extractor: Extractor | Source, recipe: Mapping[str, Any], archive: Archive
-) -> Iterator[AbstractContextManager[MatchStore]]:
-    """A store for the matches of each scale."""
-    several = len(extractor.scales) > 1
-    share = 1 if recipe["matching"].get("cross_check") in ("none", "candidate") else 3
-    for number, scale in enumerate(extractor.scales):
-        yield archive.matches(
-            {**recipe, "scale": number} if several else recipe, len(sequence.images), recipe["candidates"],
-            typical=scale.typical_count // share, label=f"{sequence.name} matches",
-        )  # fmt: skip
+def _scored_cohort(
+    dataset: Dataset, others: QuerySequence, tools: Any, scorers: Any, watch: Stopwatch, **how: Any
+) -> Scored:
+    """Of the database among itself: a stage of its own."""
+    with watch(COHORT):
+        return _scored(dataset, others, tools, scorers, Stopwatch(), label="cohort ", **how)

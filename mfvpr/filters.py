@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -10,6 +11,7 @@ from mfvpr.archive import Archive
 from mfvpr.data.datasets import ImageFolder, QuerySequence
 from mfvpr.features import Aggregated, Extractor
 from mfvpr.retrieval import EXACT, Search
+from mfvpr.shards import together
 from mfvpr.types import Shortlist
 
 
@@ -57,8 +59,10 @@ class Retrieval:
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, archive: Archive
     ) -> Filtered:
         """See `Filter`."""
-        database_vectors = archive.vectors(database, self.describer, database, label="database")
-        query_vectors = archive.vectors(sequence.images, self.describer, database, label=f"query {sequence.name}")
+        database_vectors, query_vectors = together(
+            partial(archive.vectors, database, self.describer, database, label="database"),
+            partial(archive.vectors, sequence.images, self.describer, database, label=f"query {sequence.name}"),
+        )
         nothing = ~query_vectors.values.any(axis=1, keepdims=True)  # of no features, which resembles all alike
         search = archive.once("search", lambda: self.search.fit(database_vectors.values), database, self)
         candidates = search.shortlist(

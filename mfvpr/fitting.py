@@ -7,6 +7,7 @@
 
 import json
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
 
@@ -18,6 +19,7 @@ from mfvpr.data.datasets import ImageFolder
 from mfvpr.extraction import described
 from mfvpr.features.windows import WindowExtractor, WindowFitting, origin
 from mfvpr.fingerprints import fingerprint
+from mfvpr.stores.disk import locked
 from mfvpr.whitening import Whitening
 
 FORMAT = "mfvpr whitening 1"
@@ -66,13 +68,15 @@ def _whitening(extractor: WindowExtractor, how: WindowFitting, database: ImageFo
     recipe = whitening_recipe(extractor, how, database, archive)
     about, name = fingerprint(recipe), type(extractor).__name__
     path = archive.root / f"{name}-whitening-{about}.npz"
-    if not path.exists():
-        learned = _learned(extractor, how, database, archive)
-        arrays = {"mean": learned.mean, "components": learned.components, "recipe": np.array(json.dumps(recipe))}
-        write_arrays(path, arrays, about)
-        archive.tell(
-            f"{name}: whitening of {learned.dimension} dimensions: {path.stat().st_size / _MB:.1f} MB in {path}"
-        )
+    archive.root.mkdir(parents=True, exist_ok=True)
+    with locked(archive.root, "whitening", archive.tell) if not path.exists() else nullcontext():
+        if not path.exists():  # the first counts: bits may differ from machine to machine
+            learned = _learned(extractor, how, database, archive)
+            arrays = {"mean": learned.mean, "components": learned.components, "recipe": np.array(json.dumps(recipe))}
+            write_arrays(path, arrays, about)
+            archive.tell(
+                f"{name}: whitening of {learned.dimension} dimensions: {path.stat().st_size / _MB:.1f} MB in {path}"
+            )
     kept = read_arrays(path, about)
     return Whitening(kept["mean"], kept["components"], origin(extractor))
 

@@ -44,6 +44,7 @@ def match(
     memory: float | None = None,
     devices: Sequence[Device] | None = None,
     store: MatchStore | None = None,
+    rows: Sequence[int] | None = None,
     track: Track = untracked,
 ) -> MatchSet:
     """Matches of every query with its candidates, with their ratio: weights may ask for it.
@@ -58,6 +59,7 @@ def match(
         devices: that share the queries; None = the one that JAX takes.
         store: of these features, candidates and matcher. Only queries that it lacks are matched; some at a time are on
             disk before the next are begun; and what comes back was read from it.
+        rows: of the queries that are matched, and given; None = all.
         track: progress, over queries.
 
     Raises:
@@ -71,18 +73,19 @@ def match(
         pair_matching.matched, queries, database, candidates, matcher=matcher, memory=memory,
         devices=devices or [device_of(())],
     )  # fmt: skip
+    asked = range(len(queries)) if rows is None else rows
     if store is None:
-        rows = [row for _, row in track(made(range(len(queries))), len(queries))]
-        return MatchSet.of([row.matches for row in rows], np.array([row.counts for row in rows]))
-    if missing := np.flatnonzero(~store.done).tolist():
+        found = [row for _, row in track(made(asked), len(asked))]
+        return MatchSet.of([row.matches for row in found], np.array([row.counts for row in found]))
+    if missing := [row for row in asked if not store.done[row]]:
         before = {query: row.indices for query, row in store.read()}
         _require_same(store, candidates, before)  # then nothing is written
         tracked = iter(track(made(missing), len(missing)))
         while batch := dict(itertools.islice(tracked, STORE_BATCH)):
             store.write(batch)
-    match_set, listed = stored_matches(store, memory=memory)
+    match_set, listed = stored_matches(store, rows, memory=memory)
     if not missing:
-        _require_same(store, candidates, dict(enumerate(listed.indices)))
+        _require_same(store, candidates, dict(zip(asked, listed.indices, strict=True)))
     return match_set
 
 
@@ -96,32 +99,40 @@ def _require_same(store: MatchStore, candidates: Shortlist, stored: Mapping[int,
         )
 
 
-def stored_matches(store: MatchStore, *, memory: float | None = None) -> tuple[MatchSet, Shortlist]:
-    """All that a complete store holds, NumPy: the features are not needed any more.
+def stored_matches(
+    store: MatchStore, rows: Sequence[int] | None = None, *, memory: float | None = None
+) -> tuple[MatchSet, Shortlist]:
+    """What a store holds, NumPy: the features are not needed any more.
 
     Args:
         store: of matches.
+        rows: of the queries whose matches are asked for; None = all.
         memory: GB that all matches may take in memory; None = a third of what is free. Where that is not enough, none
             stays there, and they are read whenever they are asked for.
 
     Raises:
         InputError: matches of some queries are missing or damaged.
     """
-    if not store.done.all():
+    rows = range(len(store.done)) if rows is None else rows
+    if not (done := store.done[[*rows]]).all():
         raise InputError(
-            f"{store.folder}: expected the matches of all {len(store.done)} queries, got {store.done.sum()}; finish "
-            "the matching first"
+            f"{store.folder}: expected the matches of all {len(done)} queries, got {done.sum()}; finish the matching "
+            "first"
         )
     left, matches, lists = memory_budget(memory, jax.local_devices(backend="cpu")[:1]), [], []
-    for _, row in store.read():
+    for _, row in store.read(rows):
         left -= sum(leaf.nbytes for leaf in jax.tree.leaves(row.matches))
         matches.append(row.matches)
         if left < 0:
             matches.clear()
         lists.append((row.counts, row.indices, row.filter_scores))
-    counts, indices, scores = map(np.array, zip(*lists, strict=True))
+    counts, indices, scores = (
+        (np.array(values).reshape(len(rows), store.sizes["num_candidates"]) for values in zip(*lists, strict=True))
+        if lists
+        else [np.zeros((0, store.sizes["num_candidates"]), np.int32)] * 3
+    )
     shortlist = Shortlist(indices=indices, scores=scores, mask=indices >= 0)
-    return MatchSet.of(matches or StoredMatches(store), counts), shortlist
+    return MatchSet.of(matches or StoredMatches(store, rows), counts), shortlist
 
 
 @dataclass(frozen=True)

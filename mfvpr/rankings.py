@@ -1,21 +1,17 @@
 """Rankings of a sequence by every system: the filter alone, each scorer, and what is made of several scores."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 
-from mfvpr import pipeline
 from mfvpr.cohort import by_hubness
 from mfvpr.declaration import POSITIVE
 from mfvpr.errors import InputError, require_word
 from mfvpr.frame_correlation import FrameCorrelation
-from mfvpr.numerics import Device
-from mfvpr.progress import Track, untracked
 from mfvpr.reranking import FilterScore, Ties, filter_scores, fuse_scales, fuse_shortlist, rank_shortlist
 from mfvpr.results import COHORT, FILTER, FRAMES, Matched, Ranked
-from mfvpr.scoring import Scorer
 from mfvpr.types import Shortlist
 
 
@@ -87,18 +83,24 @@ class Fusion:
 
 def rank_sequence(
     matched: Matched,
-    scorers: Mapping[str, Scorer],
+    scores: Mapping[str, np.ndarray],
     fused: Mapping[str, Fusion],
     correlated: Mapping[str, FrameCorrelation],
     ties: Ties,
     *,
     hubness: Mapping[str, np.ndarray] | None = None,
-    devices: Sequence[Device] | None = None,
-    track: Track = untracked,
 ) -> dict[str, Ranked]:
-    """Rankings of a sequence by name of the system, see `mfvpr.evaluate`; `hubness` `[N]` is by name of the scorer."""
-    candidates = matched.candidates
-    scores = pipeline.score(scorers, matched.by_scale, candidates, devices=devices, track=track)
+    """Rankings of a sequence by name of the system, see `mfvpr.evaluate`.
+
+    Args:
+        matched: the sequence.
+        scores: `[Q, C]` by name of the scorer.
+        fused: see there.
+        correlated: see there.
+        ties: see there.
+        hubness: `[N]` by name of the scorer; None = no cohort.
+    """
+    candidates, scores = matched.candidates, {**scores}
     scores |= {
         f"{name} + {COHORT}": by_hubness(candidates, scores[name], strengths, who=name)
         for name, strengths in (hubness or {}).items()

@@ -7,6 +7,7 @@ from typing import Any
 
 from mfvpr.features import Extractor, Scale
 from mfvpr.stores import features, vectors
+from mfvpr.stores.bad import known_bad, leave_bad
 from mfvpr.stores.manifest import VECTORS, store_path
 from mfvpr.stores.rows import RowStore
 
@@ -43,13 +44,46 @@ class Sink:
             self.store.write({row: batch[row] for row in self.lacks([*batch])})
 
 
+@dataclass
+class Taken:
+    """What an extractor takes from a folder's images.
+
+    Attributes:
+        sinks: where that is kept.
+        bad: why some gave nothing, by row.
+        announced: whether people know.
+    """
+
+    sinks: list[Sink]
+    bad: dict[int, str] = field(default_factory=dict)
+    announced: bool = False
+
+    def lacks(self, rows: Sequence[int]) -> list[int]:
+        """Those of some rows that are not here, though they are not bad."""
+        return sorted({row for sink in self.sinks for row in sink.lacks(rows)} - self.bad.keys())
+
+    def look(self, rows: Sequence[int]) -> list[int]:
+        """Those of some rows that no shard has taken by now."""
+        for sink in self.sinks if self.lacks(rows) else ():
+            if sink.store is not None:
+                sink.store.look()
+                self.bad |= known_bad(sink.store)
+        return self.lacks(rows)
+
+    def leave_bad(self) -> None:
+        """Tell other shards which images are."""
+        store = self.sinks[0].store
+        if store is not None and store.shard is not None and self.bad:
+            leave_bad(store, self.bad)
+
+
 def open_sinks(
     root: Path | None,
     extractor: Extractor,
     recipe: Mapping[str, Any],
     *,
     num_images: int,
-    waiting: Callable[[str], None] | None,
+    **how: Any,
 ) -> list[Sink]:
     """Those of an extractor: of its global descriptor, where it gives one, then of every scale.
 
@@ -58,10 +92,10 @@ def open_sinks(
         extractor: whose.
         recipe: of what it takes from these images.
         num_images: M.
-        waiting: see `stores.rows.open_rows`.
+        **how: `waiting` and `shard` of `stores.rows.open_rows`.
     """
     name, size = type(extractor).__name__, extractor.vector_size
-    options: dict[str, Any] = {"num_images": num_images, "waiting": waiting}
+    options: dict[str, Any] = {"num_images": num_images} | how
     sinks = []
     if size:
         path = None if root is None else store_path(root, name, recipe, VECTORS)

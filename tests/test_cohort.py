@@ -9,17 +9,17 @@ import pytest
 import mfvpr
 from mfvpr import pipeline
 from mfvpr.archive import Archive
-from mfvpr.cohort import PRIOR, by_hubness, cohort_sequence, hubness, scored_hubness
+from mfvpr.cohort import PRIOR, by_hubness, cohort_sequence, hubness
 from mfvpr.data.contents import Content, Contents
 from mfvpr.data.datasets import ImageFolder, folder_dataset
 from mfvpr.errors import InputError
-from mfvpr.evaluations import match_cohort
 from mfvpr.features import Aggregated
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
 from mfvpr.filters import Retrieval
 from mfvpr.frame_correlation import FrameCorrelation
 from mfvpr.rankings import Fusion
+from mfvpr.sequence_matching import match_cohort
 from mfvpr.types import Shortlist
 from tests.programs import QUERIES, composed, folder, shared, small, typed
 
@@ -176,7 +176,7 @@ def test_every_scorer_is_ranked_with_the_cohort_as_well(dataset, kept, result):
     assert (np.abs(candidates.indices - np.arange(10)[:, None])[candidates.mask] > 2).all()
     for name, scores in pipeline.score(SCORERS, others.by_scale, candidates).items():
         strength = np.array(by_loops(candidates, scores, 10))
-        np.testing.assert_allclose(scored_hubness(others, SCORERS)[name], strength, rtol=1e-12)
+        np.testing.assert_allclose(hubness(candidates, scores, 10), strength, rtol=1e-12)
         assert strength.max() > 1.02
         for alone, ranked in zip(found.systems[name], found.systems[f"{name} + cohort"], strict=True):
             divided = alone.scores / np.maximum(strength, 1)[alone.rows]

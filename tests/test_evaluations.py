@@ -10,13 +10,13 @@ import pytest
 from PIL import Image
 
 import mfvpr
+from mfvpr import pipeline
 from mfvpr.archive import Archive
 from mfvpr.confidence import confidence_inputs, fit_confidence
 from mfvpr.data.datasets import folder_dataset, sequences_dataset
 from mfvpr.errors import InputError
 from mfvpr.evaluation import Positives, halves
 from mfvpr.evaluation.statistics import block_sign_flips
-from mfvpr.evaluations import match_sequence
 from mfvpr.exchange import write_features, write_global_descriptors, write_shortlist
 from mfvpr.features import Aggregated
 from mfvpr.features.sift import Sift
@@ -31,6 +31,7 @@ from mfvpr.report.confidences import Assured
 from mfvpr.report.differences import differences, write_gains
 from mfvpr.report.evaluations import Judged, recall_table, write_rankings
 from mfvpr.retrieval import WhitenedSearch
+from mfvpr.sequence_matching import match_sequence
 from tests.programs import typed
 
 SIFT = Sift(max_keypoints=60, image_size=(160, 120))
@@ -81,7 +82,8 @@ def test_frame_correlation_is_a_ranking_more(result):
     """Of a scorer, or of one that is fused; all others are what they are without it."""
     [matched] = result.matched
     correlated = {"histogram": FrameCorrelation(1), "histogram + filter": FrameCorrelation()}
-    systems = rank_sequence(matched, SCORERS, {"histogram": Fusion(c=10.0)}, correlated, "filter")
+    scores = pipeline.score(SCORERS, matched.by_scale, matched.candidates)
+    systems = rank_sequence(matched, scores, {"histogram": Fusion(c=10.0)}, correlated, "filter")
     assert [*systems] == [*result.systems, "histogram + frames", "histogram + filter + frames"]
     for name, [ranked] in result.systems.items():
         np.testing.assert_array_equal(systems[name].rows, ranked.rows)

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import mfvpr
+from mfvpr import pipeline
 from mfvpr.data.datasets import folder_dataset, sequences_dataset
-from mfvpr.evaluations import match_sequence
 from mfvpr.features import Aggregated
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
@@ -17,6 +17,7 @@ from mfvpr.filters import Retrieval
 from mfvpr.frame_correlation import FrameCorrelation
 from mfvpr.rankings import Fusion, rank_sequence
 from mfvpr.reranking import rank_shortlist
+from mfvpr.sequence_matching import match_sequence
 from mfvpr.types import Shortlist
 from tests import oracles
 
@@ -130,13 +131,17 @@ def matched(dataset):
     return match_sequence(dataset, dataset.only, SIFT, VLAD, 5)
 
 
+def ranked(matched, *how):
+    return rank_sequence(matched, pipeline.score(SCORERS, matched.by_scale, matched.candidates), *how)
+
+
 def test_systems_of_several_scores_are_ranked_beside_the_others(matched):
     fused = {"histogram": BOTH, "count": Fusion("zscore")}
     correlated = {"histogram + count + filter": FrameCorrelation(1)}
-    systems = rank_sequence(matched, SCORERS, fused, correlated, "filter")
+    systems = ranked(matched, fused, correlated, "filter")
     assert [*systems] == ["filter", *SCORERS, "histogram + count + filter", "count + filter",
                           "histogram + count + filter + frames"]  # fmt: skip
-    alone = rank_sequence(matched, SCORERS, {"count": Fusion()}, {}, "filter")
+    alone = ranked(matched, {"count": Fusion()}, {}, "filter")
     for name in ("filter", *SCORERS):
         np.testing.assert_array_equal(systems[name].scores, alone[name].scores)
     np.testing.assert_array_equal(systems["count + filter"].rows, alone["count + filter"].rows)
@@ -154,8 +159,8 @@ def test_systems_of_several_scores_are_ranked_beside_the_others(matched):
 def test_scores_of_several_scales_are_fused_again_with_the_filter(matched):
     """They are standardized sums themselves."""
     twice = replace(matched, matches=matched.matches * 2, weights=(1.0, 1.0))
-    systems = rank_sequence(twice, SCORERS, {"histogram": Fusion("zscore")}, {}, "filter")
-    once = rank_sequence(matched, SCORERS, {"histogram": Fusion("zscore")}, {}, "filter")
+    systems = ranked(twice, {"histogram": Fusion("zscore")}, {}, "filter")
+    once = ranked(matched, {"histogram": Fusion("zscore")}, {}, "filter")
     name = "histogram + filter"
     np.testing.assert_allclose(systems[name].scores, once[name].scores, rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(systems["histogram"].scores.mean(axis=1), 0, atol=1e-5)

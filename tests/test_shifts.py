@@ -9,9 +9,9 @@ import pytest
 
 from experiments import evaluation, prepare
 from mfvpr import HistogramOfShifts
-from mfvpr.evaluations import Stopwatch
 from mfvpr.match_sets import MatchSet
 from mfvpr.pipeline import dominant_shifts
+from mfvpr.progress import Stopwatch
 from mfvpr.report.shifts import HEADER
 from tests.builders import make_matches, of_query
 from tests.programs import composed, shared, small

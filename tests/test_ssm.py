@@ -14,7 +14,6 @@ from mfvpr import Features, Shortlist, pipeline
 from mfvpr.archive import Archive
 from mfvpr.data.datasets import ImageFolder, folder_dataset, sequences_dataset
 from mfvpr.errors import InputError
-from mfvpr.evaluations import match_sequence, matches_recipe
 from mfvpr.features import Aggregated, windows
 from mfvpr.features.sift import Sift
 from mfvpr.features.ssm import SsmCells, SsmMaps, SsmWindows
@@ -26,6 +25,7 @@ from mfvpr.fitting import fitted, whitening_recipe
 from mfvpr.matchers import Matching
 from mfvpr.models.ssm import SsmVgg
 from mfvpr.scoring import GridAnchors
+from mfvpr.sequence_matching import match_sequence, matches_recipe
 from mfvpr.sources import FeatureSet
 from mfvpr.stores.features import _pack, forecast_bytes
 from mfvpr.voting import SsmVoting

@@ -16,13 +16,13 @@ from mfvpr.cohort import by_hubness, hubness
 from mfvpr.data.datasets import Dataset
 from mfvpr.data.files import write_text
 from mfvpr.evaluation.statistics import block_sign_flips, mcnemar
-from mfvpr.evaluations import match_cohort, match_sequence
 from mfvpr.features import Aggregated, Extractor
 from mfvpr.features.vlad import VladFitting
 from mfvpr.filters import Retrieval
 from mfvpr.report.runs import versions
 from mfvpr.report.tables import Table
 from mfvpr.results import Matched
+from mfvpr.sequence_matching import match_cohort, match_sequence
 from mfvpr.types import Shortlist
 from mfvpr.weighting import FeatureScoreWeight, RatioWeight
 

@@ -28,7 +28,6 @@ from mfvpr import (
 from mfvpr.archive import Archive
 from mfvpr.data.datasets import Dataset
 from mfvpr.data.files import write_text
-from mfvpr.evaluations import match_sequence
 from mfvpr.features import Aggregated, Extractor
 from mfvpr.features.aliked import AlikedFeatures
 from mfvpr.features.vlad import VladFitting
@@ -38,6 +37,7 @@ from mfvpr.named_weights import NAMED_WEIGHTS
 from mfvpr.numerics import available_cpus
 from mfvpr.report.runs import versions
 from mfvpr.report.tables import Table
+from mfvpr.sequence_matching import match_sequence
 from mfvpr.sources import FeatureSet
 from mfvpr.types import Shortlist
 from mfvpr.weights.files import load_model

@@ -23,7 +23,6 @@ from mfvpr.data.files import write_text
 from mfvpr.errors import InputError
 from mfvpr.evaluation import hits
 from mfvpr.evaluation.statistics import estimate
-from mfvpr.evaluations import match_sequence
 from mfvpr.features import Aggregated, Extractor
 from mfvpr.features.aliked import AlikedFeatures
 from mfvpr.features.sift import Sift
@@ -36,6 +35,7 @@ from mfvpr.report.tables import Table
 from mfvpr.reranking import rank_shortlist
 from mfvpr.results import FILTER, Matched
 from mfvpr.scoring import Scorer
+from mfvpr.sequence_matching import match_sequence
 from mfvpr.weights.files import load_model
 
 FOLDERS = {"grief_season": ("database", "queries"), "corridor": ("ref", "query")}

@@ -14,9 +14,9 @@ from experiments import build
 from mfvpr import evaluations
 from mfvpr.archive import Archive
 from mfvpr.data.datasets import Dataset, ImageFolder
-from mfvpr.evaluations import Stopwatch
 from mfvpr.maps.vectors import Vectors
 from mfvpr.numerics import available_cpus
+from mfvpr.progress import Stopwatch
 from mfvpr.report import runs
 
 QUERIES, DATABASE = 10, 60  # images; as many of the database as there are candidates, at least

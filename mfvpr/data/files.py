@@ -4,7 +4,7 @@ import os
 import re
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 _TEMPORARY = re.compile(r"\..+-[a-z0-9_]{8}(\.\w+)?")  # names that `replacing` makes
@@ -45,6 +45,18 @@ def clipped(text: str, most: int) -> str:
     """`text` of at most so many characters, the middle left out."""
     half = (most - 1) // 2
     return text if len(text) <= most else f"{text[:half]}\N{HORIZONTAL ELLIPSIS}{text[-half:]}"
+
+
+def written_once(path: Path, text: str) -> str:
+    """What `path` holds: this `printable` text, where it was not there; several may try at the same time."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile("w", encoding="utf-8", dir=path.parent, prefix=f".{path.stem}-") as temporary:
+        temporary.write(printable(text))
+        temporary.flush()
+        os.fchmod(temporary.fileno(), 0o644)
+        with suppress(FileExistsError):
+            os.link(temporary.name, path)
+    return path.read_text(encoding="utf-8")
 
 
 def write_text(path: Path, text: str) -> None:

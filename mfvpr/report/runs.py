@@ -8,7 +8,7 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from functools import cache
@@ -22,7 +22,7 @@ from mfvpr.report.tables import Table
 
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "opencv-python-headless", "pillow")
 _UNFINISHED = ".unfinished"
-_LAST = "results.json"
+LAST = "results.json"  # of the files of a run
 
 Figure = tuple[str, Callable[[Path], None]]  # name of the file, and what draws it there
 
@@ -33,7 +33,7 @@ def new_run_folder(root: Path, name: str) -> Path:
 
 
 @contextmanager
-def claimed(folder: Path, *, numbered: bool = False, own: bool = False) -> Iterator[Path]:
+def claimed(folder: Path, *, numbered: bool = False, own: bool = False, beside: Collection[str] = ()) -> Iterator[Path]:
     """A new or empty folder for this process alone, until the block ends or the process does, however that ends.
 
     It is removed again, with the folders that were made for it, where nothing was left in it.
@@ -42,6 +42,7 @@ def claimed(folder: Path, *, numbered: bool = False, own: bool = False) -> Itera
         folder: of the run.
         numbered: where there is such a folder, `folder-2`, `folder-3`, ... is taken instead.
         own: nobody but runs puts anything into it; what one left that was killed is removed.
+        beside: names of what may be there, and stays.
 
     Raises:
         InputError: the folder cannot be made or written to, is not empty, or another run has it.
@@ -52,7 +53,7 @@ def claimed(folder: Path, *, numbered: bool = False, own: bool = False) -> Itera
     with _telling_why(folder):
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        _take(handle, folder, own)  # until then it may be another's, and must stay
+        _take(handle, folder, own, {*beside})  # until then it may be another's, and must stay
         try:
             yield folder
         finally:
@@ -76,7 +77,7 @@ def _made(folder: Path, numbered: bool) -> Path:
             wanted = folder.with_name(f"{folder.name}-{number}")
 
 
-def _take(handle: int, folder: Path, own: bool) -> None:
+def _take(handle: int, folder: Path, own: bool, beside: set[str]) -> None:
     """Lock an open folder, and check that a run can be written into it."""
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -85,9 +86,9 @@ def _take(handle: int, folder: Path, own: bool) -> None:
     except OSError:
         pass  # a file system without locks of folders, such as NFS
     with _telling_why(folder):
-        found = {path.name for path in folder.iterdir()}
-        if own and _LAST not in found:
-            _empty(folder)
+        found = {path.name for path in folder.iterdir()} - beside
+        if own and LAST not in found:
+            _empty(folder, beside)
         elif found - {_UNFINISHED}:
             raise InputError(f"{folder}: expected a new or empty run folder; remove it, or name another")
         shutil.rmtree(folder / _UNFINISHED, ignore_errors=True)  # of a run that was killed
@@ -95,9 +96,9 @@ def _take(handle: int, folder: Path, own: bool) -> None:
             pass
 
 
-def _empty(folder: Path) -> None:
+def _empty(folder: Path, beside: set[str]) -> None:
     """Without what a run had moved there when it was killed."""
-    for path in folder.iterdir():
+    for path in (path for path in folder.iterdir() if path.name not in beside):
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
         else:
@@ -122,7 +123,7 @@ def writing(folder: Path) -> Iterator[Path]:
     temporary.mkdir(parents=True)  # should somebody have removed the empty folder meanwhile
     try:
         yield temporary
-        for path in sorted(temporary.iterdir(), key=lambda path: path.name == _LAST):
+        for path in sorted(temporary.iterdir(), key=lambda path: path.name == LAST):
             os.replace(path, folder / path.name)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)

@@ -11,7 +11,7 @@ float32 `[N]` and `image_size` float32 `[2]` (px). Padding is left out. What com
 length, and its direction to 5e-4, all else is as it was.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,21 +27,19 @@ FeatureStore = RowStore[Features]
 _NUM_ARRAYS = 5
 
 
-def open_store(
-    folder: Path, recipe: Mapping[str, Any], *, num_images: int, waiting: Callable[[str], None] | None = None
-) -> FeatureStore:
+def open_store(folder: Path, recipe: Mapping[str, Any], *, num_images: int, **options: Any) -> FeatureStore:
     """The store in `folder`; `with` it, rows are written, and while it lacks images no other process can do so.
 
     Args:
         folder: see `manifest.store_path`.
         recipe: what the features are made from (JSON values only): weights, settings, images. Kept in plain text.
         num_images: M.
-        waiting: see `rows.open_rows`.
+        **options: `waiting` and `shard` of `rows.open_rows`.
 
     Raises:
         InputError: made from something else, or no store at all.
     """
-    return open_rows(folder, FEATURES, recipe, {"num_images": num_images}, pack=_pack, unpack=_unpack, waiting=waiting)
+    return open_rows(folder, FEATURES, recipe, {"num_images": num_images}, pack=_pack, unpack=_unpack, **options)
 
 
 def forecast_bytes(num_images: int, features_per_image: float, dimension: int) -> int:

@@ -17,7 +17,9 @@ from mfvpr.fingerprints import difference, fingerprint, shortened
 
 MANIFEST = "manifest.json"
 _OLD_MANIFEST = "zarr.json"  # of format 1
-_LEFTOVER = re.compile(r"\.(manifest|images|\d+-\d+)-\w+\.(json|npz)")  # was being written when its process was killed
+_LEFTOVER = re.compile(
+    r"\.(manifest|images|bad|\d+-\d+)-\w+\.(json|npz)"
+)  # was being written when its process was killed
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,7 @@ class Kind:
 
 
 FEATURES = Kind("feature store", 3, "features", "images", "extracts", compress=False)
+SCORES = Kind("score store", 1, "scores", "queries", "scores", compress=False)
 VECTORS = Kind("descriptor store", 1, "global descriptors", "images", "describes", compress=False)
 MATCHES = Kind("match store", 3, "matches", "queries", "matches", compress=True)
 
@@ -122,6 +125,16 @@ def settle_manifest(folder: Path, kind: Kind, manifest: Mapping[str, Any]) -> No
     """
     for leftover in filter(_is_leftover, folder.iterdir()):
         leftover.unlink()
+    leave_manifest(folder, kind, manifest)
+
+
+def leave_manifest(folder: Path, kind: Kind, manifest: Mapping[str, Any]) -> None:
+    """Write the manifest if it is not there; several may, of one store.
+
+    Raises:
+        InputError: as `is_settled`.
+        OSError: it cannot be read or written.
+    """
     if not is_settled(folder, kind, manifest):
         _write(folder / MANIFEST, manifest)
 

@@ -10,7 +10,7 @@ those of its Matches that are there, by their names. They are compressed, since 
 every candidate: a match takes about 23 bytes of the 32 that it has.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
@@ -37,7 +37,7 @@ def open_match_store(
     *,
     num_queries: int,
     num_candidates: int,
-    waiting: Callable[[str], None] | None = None,
+    **options: Any,
 ) -> MatchStore:
     """The store in `folder`; `with` it, rows are written, and while it lacks queries no other process can do so.
 
@@ -46,31 +46,32 @@ def open_match_store(
         recipe: what the matches are made from (JSON values only): features, shortlist, settings. Kept in plain text.
         num_queries: Q.
         num_candidates: C.
-        waiting: see `rows.open_rows`.
+        **options: `waiting` and `shard` of `rows.open_rows`.
 
     Raises:
         InputError: made from something else, or no store at all.
     """
     sizes, pack = {"num_queries": num_queries, "num_candidates": num_candidates}, partial(_pack, num_candidates)
-    return open_rows(folder, MATCHES, recipe, sizes, pack=pack, unpack=_unpack, waiting=waiting)
+    return open_rows(folder, MATCHES, recipe, sizes, pack=pack, unpack=_unpack, **options)
 
 
 class StoredMatches(Sequence[Matches]):
-    """Matches of each query of a complete store, as in QueryMatches: read whenever they are asked for."""
+    """Matches of some queries of a store, as in QueryMatches: read whenever they are asked for."""
 
-    def __init__(self, store: MatchStore) -> None:
-        self._store = store
+    def __init__(self, store: MatchStore, rows: Sequence[int]) -> None:
+        """Of rows that are done."""
+        self._store, self._rows = store, rows
 
     def __len__(self) -> int:
-        return len(self._store.done)
+        return len(self._rows)
 
     def __getitem__(self, query: Any) -> Matches:
         """Of one query; there are no slices."""
-        [(_, found)] = self._store.read([query])
+        [(_, found)] = self._store.read([self._rows[query]])
         return found.matches
 
     def __iter__(self) -> Iterator[Matches]:
-        return (found.matches for _, found in self._store.read())
+        return (found.matches for _, found in self._store.read(self._rows))
 
 
 def forecast_bytes(num_queries: int, num_candidates: int, matches_per_candidate: float) -> int:

@@ -3,10 +3,9 @@
 A store is a folder with a manifest, which says what the rows were made from, and one file for each row that is done:
 `<row>-<entries>.npz` (`mfvpr.data.arrays`). A file appears as a whole, when it is on disk, so a process may be killed
 at any moment, and the next one goes on. A file knows its store and its row: exchanged ones are noticed like damaged
-ones.
+ones. Shards write stores of their own in the folder `shards` of a store, and whoever reads sees one.
 """
 
-import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
@@ -18,14 +17,17 @@ import numpy as np
 from mfvpr.data.arrays import read_arrays, write_arrays
 from mfvpr.errors import InputError
 from mfvpr.fingerprints import difference
-from mfvpr.stores._disk import free_bytes, locked, told, too_full
+from mfvpr.shards import Shard
+from mfvpr.stores.disk import free_bytes, locked, told, too_full
 from mfvpr.stores.manifest import (
     Kind,
     check_owned,
     is_settled,
+    leave_manifest,
     manifest_of,
     settle_manifest,
 )
+from mfvpr.stores.places import SHARDS, Places, places
 from mfvpr.threads import ordered_map
 
 THREADS = 4  # that read ahead, or write the rows of a batch
@@ -47,18 +49,18 @@ class RowStore(Generic[Item]):
         folder: where it is, absolute.
         kind: what it holds.
         sizes: lengths of axes by name, first M.
-        counts: `[M]` int32 entries of each row, -1 = not done, as they were when the store was opened or last entered.
-            To be read only.
+        shard: which writes, into a folder of its own; None = whoever alone makes the store.
     """
 
     folder: Path
     kind: Kind
     sizes: Mapping[str, int]
-    counts: np.ndarray
+    shard: Shard | None
     _manifest: Mapping[str, Any] = field(repr=False)
     _waiting: Callable[[str], None] | None = field(repr=False)
     _pack: Callable[[Item], Parts] = field(repr=False)
     _unpack: Callable[[Parts], Item] = field(repr=False)
+    _places: Places = field(init=False, repr=False)
     _layout: dict[str, str] | None = field(default=None, repr=False)
     _is_writable: bool = field(default=False, repr=False)
     _held: list[ExitStack] = field(default_factory=list, repr=False)  # of the blocks that are entered
@@ -71,12 +73,14 @@ class RowStore(Generic[Item]):
         """
         with ExitStack() as held, told(self.folder, self.kind.content):
             if not self._held:
-                self.counts = self._counts()
+                self.look()
             if not self._is_writable and not self.done.all():
-                self.folder.mkdir(parents=True, exist_ok=True)
-                held.enter_context(locked(self.folder, self.kind.content, self._waiting))
-                settle_manifest(self.folder, self.kind, self._manifest)
-                self.counts = self._counts()
+                if self.shard is not None:
+                    leave_manifest(self.folder, self.kind, self._manifest)
+                self.own.mkdir(parents=True, exist_ok=True)
+                held.enter_context(locked(self.own, self.kind.content, self._waiting))
+                settle_manifest(self.own, self.kind, self._manifest)
+                self.look()
                 held.callback(setattr, self, "_is_writable", False)
                 self._is_writable = True
             self._held.append(held.pop_all())
@@ -84,6 +88,27 @@ class RowStore(Generic[Item]):
 
     def __exit__(self, *_: object) -> None:
         self._held.pop().close()
+
+    @property
+    def own(self) -> Path:
+        """Where rows are written."""
+        return self.folder if self.shard is None else self.folder / SHARDS / self.shard.folder
+
+    @property
+    def counts(self) -> np.ndarray:
+        """`[M]` int32 entries of each row, -1 = not done, as they were when the store was opened, last entered, or
+        looked at. To be read only."""
+        return self._places.counts
+
+    def look(self) -> None:
+        """See what is done by now, as the names of the files tell.
+
+        Raises:
+            InputError: made from something else.
+        """
+        with told(self.folder, self.kind.content):
+            known = is_settled(self.folder, self.kind, self._manifest)
+            self._places = places(self.folder, next(iter(self.sizes.values())), own=self.own, known=known)
 
     @property
     def done(self) -> np.ndarray:
@@ -130,7 +155,7 @@ class RowStore(Generic[Item]):
         rows = np.flatnonzero(self.done).tolist() if rows is None else list(rows)
         if missing := [row for row in rows if self.counts[row] < 0]:
             raise ValueError(f"{self.folder}: row {missing[0]} is not done")
-        paths = [self._path(row, self.counts[row]) for row in rows]
+        paths = [self._places.path(row) for row in rows]
         damaged: dict[int, Path] = {}
         for row, path, item in zip(rows, paths, ordered_map(self._read_item, paths, workers=THREADS), strict=True):
             if item is None:
@@ -140,15 +165,8 @@ class RowStore(Generic[Item]):
         if damaged:
             raise InputError(self._remove(damaged))
 
-    def _path(self, row: int, count: int) -> Path:
-        return self.folder / f"{row}-{count}.npz"
-
     def _about(self, path: Path) -> str:
         return f"{self._manifest['fingerprint']} {path.name}"
-
-    def _counts(self) -> np.ndarray:
-        """`[M]` int32 entries of each row, as the names of the files tell; -1 = not done."""
-        return _counts(self.folder, len(self.counts), known=is_settled(self.folder, self.kind, self._manifest))
 
     def _packed(self, row: int, item: Item) -> Parts:
         try:
@@ -159,7 +177,7 @@ class RowStore(Generic[Item]):
     def _write_row(self, row_parts: tuple[int, Parts]) -> None:
         row, parts = row_parts
         count = len(next(iter(parts.values())))
-        path = self._path(row, count)
+        path = self._places.add(row, count, self.own)
         write_arrays(path, parts, self._about(path), compress=self.kind.compress)
         self.counts[row] = count
 
@@ -188,7 +206,7 @@ class RowStore(Generic[Item]):
         self._layout = expected
 
     def _stored_layout(self) -> dict[str, str] | None:
-        found = (self._read_parts(self._path(row, self.counts[row])) for row in np.flatnonzero(self.done).tolist())
+        found = (self._read_parts(self._places.path(row)) for row in np.flatnonzero(self.done).tolist())
         return next((_layout_of(parts) for parts in found if parts), None)
 
     def _remove(self, damaged: Mapping[int, Path]) -> str:
@@ -216,6 +234,7 @@ def open_rows(
     pack: Callable[[Item], Parts],
     unpack: Callable[[Parts], Item],
     waiting: Callable[[str], None] | None = None,
+    shard: Shard | None = None,
 ) -> RowStore[Item]:
     """The store in `folder`, which need not be there before the first row is written, nor be writable when all are.
 
@@ -227,18 +246,16 @@ def open_rows(
         pack: what is stored of an item, arrays by name; the first has a value for each of the row's entries.
         unpack: the item again.
         waiting: whoever writes waits for a process that does, and is told, in one line, for which; None = refuses.
+        shard: which writes, beside others.
 
     Raises:
         InputError: made from something else, or no store at all.
     """
     folder = folder.absolute()  # the working directory may change
-    manifest = manifest_of(kind, recipe, sizes)
-    store = RowStore(
-        folder, kind, sizes, np.zeros(next(iter(sizes.values())), np.int32), manifest, waiting, pack, unpack
-    )
+    store = RowStore(folder, kind, sizes, shard, manifest_of(kind, recipe, sizes), waiting, pack, unpack)
     with told(folder, kind.content):
         check_owned(folder, kind)
-        store.counts = store._counts()
+    store.look()
     return store
 
 
@@ -256,17 +273,6 @@ def require_space(folder: Path, num_bytes: int) -> None:
     free = free_bytes(folder)
     if free < num_bytes:
         raise InputError(too_full(folder, num_bytes, free))
-
-
-def _counts(folder: Path, num_rows: int, *, known: bool = True) -> np.ndarray:
-    """`[M]` int32 entries of each row, as the names of the files tell; -1 = not done. Of what is not `known`, none."""
-    counts = np.full(num_rows, -1, np.int32)
-    for path in folder.iterdir() if known else ():
-        if name := re.fullmatch(r"(0|[1-9]\d{0,8})-(0|[1-9]\d{0,8})\.npz", path.name):
-            row, count = map(int, name.groups())
-            if row < num_rows:
-                counts[row] = count
-    return counts
 
 
 def _layout_of(parts: Parts) -> dict[str, str]:

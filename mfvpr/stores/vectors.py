@@ -3,7 +3,7 @@
 A row store (`mfvpr.stores.rows`), whose rows are a `vector` float32 `[D]` or several `[V, D]`, to the bit.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,9 @@ from mfvpr.stores.rows import RowStore, open_rows, row_bytes
 VectorStore = RowStore[np.ndarray]
 
 
-def open_vector_store(
-    folder: Path, recipe: Mapping[str, Any], *, num_images: int, waiting: Callable[[str], None] | None = None
-) -> VectorStore:
+def open_vector_store(folder: Path, recipe: Mapping[str, Any], *, num_images: int, **options: Any) -> VectorStore:
     """The store in `folder`; see `features.open_store`."""
-    return open_rows(folder, VECTORS, recipe, {"num_images": num_images}, pack=_pack, unpack=_unpack, waiting=waiting)
+    return open_rows(folder, VECTORS, recipe, {"num_images": num_images}, pack=_pack, unpack=_unpack, **options)
 
 
 def forecast_bytes(num_images: int, size: int) -> int:

@@ -1,0 +1,146 @@
+"""A run that several tasks share, on one machine or many: its folder knows its settings, and how far each task is.
+
+    DIR/shards/run.json          settings and number of the shards: made once, compared by every task
+    DIR/shards/data.json         what the images hold, likewise
+    DIR/shards/2-of-8/state.json what a task said last
+    DIR/shards/2-of-8/lock       held while it works
+
+What is computed lies in the stores; the results are in DIR, when the last task has left them there.
+"""
+
+import fcntl
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from experiments import build, truth
+from experiments.prepare import Images
+from experiments.settings import SettingsError
+from mfvpr.data.files import write_text, written_once
+from mfvpr.fingerprints import difference
+from mfvpr.report import runs
+from mfvpr.shards import Shard
+from mfvpr.stores.disk import locked
+
+SHARDS = "shards"
+COMPLETE = "complete"
+_FORMAT = "mfvpr shards 1"
+# What may differ from machine to machine. Images are compared by what they hold.
+_OWN = ("shard", "wait", "out", "store", "memory", "devices", "dataset", "multirun", "command")
+
+
+@contextmanager
+def joined(settings: Mapping[str, Any]) -> Iterator[Callable[[str], None]]:
+    """A task of a run, which no other process does meanwhile; what is yielded keeps what it says of itself.
+
+    Raises:
+        SettingsError: the folder is of a run with other settings, or of another number of shards.
+        InputError: the same shard is at work.
+    """
+    shard, folder = Shard.parse(settings["shard"]), _folder(build.expanded(settings["out"]))
+    own = {name: value for name, value in settings.items() if name not in _OWN}
+    about = {"shards": shard.count, "dataset": settings["dataset"]["name"], "settings": own}
+    _agreed(folder / "run.json", about, f"shard={shard}")
+    task = folder / shard.folder
+    task.mkdir(parents=True, exist_ok=True)
+    with locked(task, "the part of a run"):
+        yield lambda state: write_text(task / "state.json", json.dumps({"state": state}))
+
+
+def check_data(settings: Mapping[str, Any], images: Images) -> None:
+    """That all tasks see the same images and the same ground truth, with the same versions.
+
+    Raises:
+        SettingsError: another task has seen others.
+    """
+    if settings.get("shard") is None:
+        return
+    known = images.dataset.sequences[0].truth
+    right = truth.fingerprint(images.dataset, truth.thresholds(settings, known))
+    about = {"images": images.fingerprints, "ground truth": right, "versions": runs.versions()}
+    folder = _folder(build.expanded(settings["out"]))
+    _agreed(folder / "data.json", about, f"shard={settings['shard']}")
+
+
+@contextmanager
+def last(settings: Mapping[str, Any]) -> Iterator[bool]:
+    """Whether the results are still to be written; for one task at a time."""
+    folder = build.expanded(settings["out"])
+    with locked(_folder(folder), "a run", lambda line: None):
+        yield not (folder / runs.LAST).exists()
+
+
+def _folder(out: Path) -> Path:
+    return out / SHARDS
+
+
+def _agreed(path: Path, about: Mapping[str, Any], who: str) -> None:
+    """That this is what the first task wrote."""
+    about = {"format": _FORMAT, **about}
+    try:
+        found = read(path, written_once(path, json.dumps(about, indent=1, ensure_ascii=True, allow_nan=False)))
+    except OSError as error:
+        raise SettingsError(f"{path}: cannot be written or read ({error.strerror}); name another out=DIR") from error
+    if differs := difference(json.loads(json.dumps(about)), found):
+        raise SettingsError(f"{who}: {differs} by the task that came first ({path}); set that, or name another out=DIR")
+
+
+def read(path: Path, text: str | None = None) -> dict[str, Any]:
+    """What a file of a run's shards says.
+
+    Raises:
+        SettingsError: it is none.
+    """
+    try:
+        found = json.loads(path.read_text(encoding="utf-8") if text is None else text)
+        if found["format"] == _FORMAT:
+            return found
+    except (OSError, ValueError, LookupError, TypeError):
+        pass
+    raise SettingsError(f"{path}: expected a file of a run with shard=i/n and out=DIR, got none, or something else")
+
+
+def states(out: Path) -> list[str]:
+    """What each task of a run says of itself, by number.
+
+    Raises:
+        SettingsError: there is no such run.
+    """
+    about = read(_folder(out) / "run.json")
+    return [_state(_folder(out) / Shard(index, about["shards"]).folder) for index in range(about["shards"])]
+
+
+def missing(out: Path) -> list[int]:
+    """Numbers of the tasks that are to be started; the first of all where only the results are missing."""
+    found = states(out)
+    if (out / runs.LAST).exists():
+        return []
+    return [index for index, state in enumerate(found) if state != COMPLETE] or [0]
+
+
+def _state(task: Path) -> str:
+    if _is_held(task / "lock"):
+        return "at work"
+    try:
+        return str(json.loads((task / "state.json").read_text(encoding="utf-8"))["state"])
+    except FileNotFoundError:
+        return "interrupted" if task.exists() else "not begun"
+    except (OSError, ValueError, LookupError, TypeError):
+        return "interrupted"
+
+
+def _is_held(lock: Path) -> bool:
+    try:
+        handle = os.open(lock, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(handle)
+    return False

@@ -1,0 +1,54 @@
+"""How far a run is that several tasks share (evaluate shard=i/n out=DIR). `python -m experiments.shards --help`."""
+
+from pathlib import Path
+
+from experiments.errors import Parser, one_line, unwind_on_sigterm
+
+SHARDS = "python -m experiments.shards"
+
+
+def main() -> None:
+    """Run the command line's command."""
+    unwind_on_sigterm()
+    with one_line():
+        arguments = vars(_parser().parse_args())
+        arguments.pop("run")(**arguments)
+
+
+def _parser() -> Parser:
+    from experiments.launch import version
+
+    parser = Parser(prog=SHARDS, description="Start missing tasks again until none is.")
+    parser.add_argument("--version", action="version", version=version(), help="print it and exit")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    for name, run, words in (
+        ("status", status, "what each task of a run says of itself"),
+        ("missing", missing, "tasks that are to be started, as an array expression; nothing when all is done"),
+    ):
+        command = commands.add_parser(name, help=words)
+        command.add_argument("folder", metavar="DIR", type=Path, help="out=DIR of the run")
+        command.set_defaults(run=run)
+    return parser
+
+
+def status(folder: Path) -> None:
+    """Print a line for each task, and whether the results are there."""
+    from experiments import sharding
+    from mfvpr.report.runs import LAST
+
+    for index, state in enumerate(states := sharding.states(folder)):
+        print(f"{index}/{len(states)}: {state}")
+    print(f"results: {folder if (folder / LAST).exists() else 'not yet'}")
+
+
+def missing(folder: Path) -> None:
+    """Print the expression."""
+    from experiments import sharding
+    from mfvpr.shards import indices
+
+    if left := indices(sharding.missing(folder)):
+        print(left)
+
+
+if __name__ == "__main__":
+    main()

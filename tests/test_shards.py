@@ -1,0 +1,252 @@
+"""Shards: many machines that share an evaluation without a word between them, whatever order they come in."""
+
+import hashlib
+import json
+import random
+import re
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import mfvpr
+from mfvpr.archive import Archive
+from mfvpr.data.datasets import folder_dataset
+from mfvpr.errors import InputError
+from mfvpr.features import Aggregated, Description
+from mfvpr.features.sift import Sift
+from mfvpr.features.vlad import VladFitting
+from mfvpr.filters import Retrieval
+from mfvpr.fingerprints import recipe_of
+from mfvpr.frame_correlation import FrameCorrelation
+from mfvpr.rankings import Fusion
+from mfvpr.shards import NotYet, Shard, indices, shard_of, together
+from mfvpr.stores.vectors import open_vector_store
+
+SIFT = Sift(max_keypoints=60, image_size=(160, 120))
+VLAD = Retrieval(Aggregated(SIFT, VladFitting(num_words=8)))
+SCORERS = {"histogram": mfvpr.HistogramOfShifts(), "count": mfvpr.MatchCount()}
+HOW = {"candidates": 4, "fused": {"histogram": Fusion("zscore")}, "cohort": 1,
+       "correlated": {"count": FrameCorrelation(1)}}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Mean:
+    """A global descriptor: the mean color, of unit length."""
+
+    image_size, interpolation, batch_size, vector_size, scales = (16, 16), "pil_bilinear", 4, 3, ()
+
+    def __call__(self, images):
+        mean = images.mean((1, 2)).astype(np.float32) + 1
+        return [Description(vector / np.linalg.norm(vector)) for vector in mean]
+
+
+class Counted:
+    """SIFT that counts its images."""
+
+    image_size, interpolation, batch_size = SIFT.image_size, SIFT.interpolation, 2
+    vector_size, scales, recipe = SIFT.vector_size, SIFT.scales, recipe_of(SIFT)
+
+    def __init__(self):
+        self.seen = 0
+
+    def __call__(self, images):
+        self.seen += len(images)
+        return SIFT(images)
+
+
+@pytest.fixture(scope="module")
+def dataset(small_street):
+    return folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
+
+
+@pytest.fixture(scope="module")
+def plain(dataset, tmp_path_factory):
+    return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, archive=Archive(tmp_path_factory.mktemp("plain")), **HOW)
+
+
+def shared(root, count, run, seed=0):
+    """Shards in a random order, again and again, as schedulers start them; the result of whichever comes last."""
+    random.seed(seed)
+    waits, results = [], []
+    while not results:
+        for index in random.sample(range(count), count):
+            try:
+                results.append(run(Archive(root, shard=Shard(index, count))))
+            except NotYet as wait:
+                waits.append(str(wait))
+        assert len(waits) < 8 * count
+    return results, waits
+
+
+def assert_same(found, expected):
+    for name, ranked in expected.systems.items():
+        for one, other in zip(found.systems[name], ranked, strict=True):
+            np.testing.assert_array_equal(one.rows, other.rows, err_msg=name)
+            np.testing.assert_array_equal(one.scores, other.scores, err_msg=name)
+    for threshold in (0, 1):
+        for name, recall in expected.recall([threshold]).items():
+            np.testing.assert_array_equal(found.recall([threshold])[name].by_sequence, recall.by_sequence)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_shards_give_what_one_machine_gives(dataset, plain, tmp_path, count):
+    """Frame correlation, which looks at the queries before, and a cohort, which looks at all images, among it."""
+    extractor = Counted()
+    filter = Retrieval(Aggregated(extractor, VladFitting(num_words=8)))
+
+    def run(archive):
+        return mfvpr.evaluate(dataset, extractor, filter, SCORERS, archive=archive, **HOW)
+
+    results, waits = shared(tmp_path, count, run)
+    for result in results:
+        assert_same(result, plain)
+    assert extractor.seen == len(dataset.database) + len(dataset.queries)  # each image once, by whomever
+    assert bool(waits) == (count > 1)
+    assert all(re.search(r"of \d+ are missing, of shards \d", wait) for wait in waits)
+    again = mfvpr.evaluate(dataset, extractor, filter, SCORERS, archive=Archive(tmp_path), **HOW)
+    assert_same(again, plain)  # of anybody who is no shard: nothing is done again
+    assert extractor.seen == len(dataset.database) + len(dataset.queries)
+
+
+def test_local_features_are_those_of_candidates_only(dataset, tmp_path):
+    """With a filter of its own descriptors, as for a single machine."""
+    filter, kept = Retrieval(Mean()), tmp_path / "plain"
+    expected = mfvpr.evaluate(dataset, SIFT, filter, SCORERS, candidates=2, archive=Archive(kept))
+    results, _ = shared(
+        tmp_path / "s", 3, lambda archive: mfvpr.evaluate(dataset, SIFT, filter, SCORERS, candidates=2, archive=archive)
+    )
+    assert_same(results[0], expected)
+
+    def files(root):
+        return sorted(path.name for path in root.rglob("*-*.npz") if path.name[0].isdigit() and "Sift" in str(path))
+
+    assert files(tmp_path / "s") == files(kept)
+
+
+def test_stores_of_shards_have_the_same_rows_byte_by_byte(dataset, tmp_path):
+    def run(archive):
+        return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, archive=archive)
+
+    run(Archive(tmp_path / "plain"))
+    shared(tmp_path / "shards", 2, run)
+
+    def hashes(root):
+        return {
+            (path.relative_to(root).parts[0], path.name): hashlib.sha256(path.read_bytes()).hexdigest()
+            for path in root.rglob("[0-9]*-*.npz") if not path.relative_to(root).parts[0].startswith("scores")
+        }  # fmt: skip
+
+    assert hashes(tmp_path / "shards") == hashes(tmp_path / "plain")
+    for path in (tmp_path / "shards").glob("*/shards/*"):
+        assert path.name in ("0-of-2", "1-of-2")
+        assert json.loads((path / "manifest.json").read_text())["format"].startswith("mfvpr ")
+
+
+def test_a_bad_image_of_one_shard_is_known_to_all(small_street, tmp_path):
+    for side in ("database", "queries"):
+        (tmp_path / side).mkdir()
+        for path in sorted((small_street / side).glob("*.png"))[:6]:
+            (tmp_path / side / path.name).write_bytes(path.read_bytes())
+    (tmp_path / "database" / "0002.png").write_bytes(b"no image")
+    dataset = folder_dataset(tmp_path / "database", tmp_path / "queries", ground_truth="order")
+
+    def run(archive):
+        archive = replace(archive, skip_bad=True)
+        return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, archive=archive)
+
+    expected = run(Archive(tmp_path / "plain"))
+    for count in (2, 4):
+        results, _ = shared(tmp_path / f"s{count}", count, run)
+        assert_same(results[0], expected)
+        assert results[0].matched[0].bad_database.keys() == {2}
+    [bad] = (tmp_path / "s2").glob("Sift*/shards/*/bad.json")
+    bad.write_text("[]")
+    with pytest.raises(InputError, match=r"bad\.json: expected reasons by row"):
+        run(Archive(tmp_path / "s2", shard=Shard(0, 3)))
+
+
+def test_stores_of_two_shards_are_written_at_the_same_time_those_of_one_are_not(tmp_path):
+    def opened(index):
+        return open_vector_store(tmp_path / "s", {"of": "any"}, num_images=4, shard=Shard(index, 2))
+
+    with opened(0) as first, opened(1) as second:
+        first.write({0: np.ones(3)})
+        second.write({1: np.zeros(3), 3: np.ones(3)})
+        with pytest.raises(InputError, match="0-of-2: in use by process"), opened(0):
+            pass
+        first.look()
+        np.testing.assert_array_equal(first.done, [True, True, False, True])
+        assert [row for row, _ in first.read()] == [0, 1, 3]
+    with open_vector_store(tmp_path / "s", {"of": "any"}, num_images=4) as alone:  # of no shard
+        alone.write({2: np.full(3, 2)})
+        np.testing.assert_array_equal([vector[0] for _, vector in alone.read()], [1, 0, 2, 1])
+    with pytest.raises(InputError, match=r'recipe\.of="any"'):
+        open_vector_store(tmp_path / "s", {"of": "another"}, num_images=4, shard=Shard(0, 2))
+
+
+def test_patience():
+    """Who waits goes on as soon as others have done theirs."""
+    calls = []
+
+    def missing():
+        calls.append(1)
+        return [] if len(calls) > 2 else [0]
+
+    Shard(0, 2).wait(missing, ["a"], "images", patience=60)
+    assert len(calls) == 3
+    with pytest.raises(NotYet, match=rf"images: 1 of 1 are missing, of shards {shard_of('a', 2)}"):
+        Shard(0, 2).wait(lambda: [0], ["a"], "images")
+
+
+@given(st.lists(st.text(st.characters(codec="utf-8"), min_size=1), unique=True), st.integers(1, 20), st.randoms())
+def test_every_name_is_of_one_shard_whatever_the_order(names, count, rng):
+    parts = [Shard(index, count).rows(names) for index in range(count)]
+    assert sorted(row for part in parts for row in part) == [*range(len(names))]
+    shuffled = [*names]
+    rng.shuffle(shuffled)
+    for index, part in enumerate(parts):
+        assert {shuffled[row] for row in Shard(index, count).rows(shuffled)} == {names[row] for row in part}
+    assert Shard(0, count).rows(names, [0] if parts[0][:1] == [0] else []) == parts[0][:1][: parts[0][:1] == [0]]
+
+
+def test_names_are_spread_and_assigned_for_ever():
+    names = [f"image{row:04d}.jpg" for row in range(8000)]
+    sizes = np.array([len(Shard(index, 8).rows(names)) for index in range(8)])
+    assert abs(sizes - 1000).max() < 5 * np.sqrt(1000)
+    digest = hashlib.sha256(b"image0000.jpg").digest()
+    assert shard_of("image0000.jpg", 8) == int.from_bytes(digest[:8], "big") % 8
+    assert shard_of("\udcff.jpg", 7) == int.from_bytes(hashlib.sha256(b"\xff.jpg").digest()[:8], "big") % 7
+
+
+@pytest.mark.parametrize(
+    "text", ["", "1", "1/", "/2", "2/2", "-1/2", "0/0", "1.0/2", "0/99999", "0/2/3", " 0/2", "a/b"]
+)
+def test_what_is_no_shard(text):
+    with pytest.raises(InputError, match=r"^shard="):
+        Shard.parse(text)
+
+
+def test_array_expressions():
+    assert indices([]) == ""
+    assert indices([4, 2, 3, 0, 3]) == "0,2-4"
+    assert str(Shard.parse("03/8")) == "3/8"
+
+
+def test_what_waits_does_not_keep_the_rest():
+    done = []
+
+    def wait(line):
+        raise NotYet(line)
+
+    with pytest.raises(NotYet, match=r"^a; b$"):
+        together(lambda: wait("a"), lambda: done.append(1), lambda: wait("b"), lambda: wait("a"))
+    assert done == [1]
+    assert together(lambda: 1, lambda: 2) == [1, 2]
+
+
+def test_a_shard_needs_a_folder():
+    with pytest.raises(InputError, match="shard=0/2: expected a root as well"):
+        Archive(shard=Shard(0, 2))
