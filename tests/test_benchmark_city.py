@@ -45,8 +45,7 @@ def test_no_more_features_are_made_than_there_are_images():
 
 def test_features_are_made_of_the_images_that_are_asked_for(tmp_path):
     data = MadeUp(300, 4, 30, 16, views=1)
-    rows = np.array([*range(0, 120, 2), *data.similar()[:, 0]])
-    rows = np.unique(rows)
+    rows = np.unique([*range(0, 120, 2), *data.similar()[:, 0]])
     store, steps = city.extracted(data, tmp_path, rows)
     np.testing.assert_array_equal(np.flatnonzero(store.done), rows)
     assert len(list(tmp_path.rglob("*.npz"))) == len(rows)

@@ -57,7 +57,7 @@ class Found:
         made: images whose features were made.
         written: bytes that their features take on disk.
         rows_read: in a round.
-        read: bytes of these.
+        read: bytes of these, just written: from the system's cache rather than the disk.
         recall: of the filter, of its whole shortlist, and of the re-ranking.
     """
 
@@ -89,12 +89,12 @@ def walked(data: MadeUp, root: Path, rounds: int) -> Found:
     _, steps["merging"] = repeated("merging", rounds, lambda: merged(candidates, max(MACHINES)))
     store, making = extracted(data, root, np.unique(candidates.indices[candidates.mask]))
     source = Counted(store)
-    database, answers = FeatureSet(source, {}), list[Answer]()
+    database = FeatureSet(source, {})
+    answers: list[Answer] = []
     _, steps["re-ranking"] = repeated(
         "re-ranking", rounds, lambda: answers.append(reranked(queries, database, candidates))
     )
-    made, written = int(store.done.sum()), store.size_bytes
-    rows_read = source.rows / len(answers)
+    made, written, rows_read = int(store.done.sum()), store.size_bytes, source.rows / len(answers)
     right = Positives.from_rows(data.similar(), data.images)
     depths = recall_at_k(candidates.indices, right, [1, CANDIDATES]).tolist()
     return Found(

@@ -3,14 +3,15 @@
 from dataclasses import dataclass
 
 ASSUMED = (
-    "each of the machines is as fast as the one that was measured",
+    "each of the machines is as fast as the one that was measured, its disk too",
     "global descriptors of the whole database are made once, before anybody asks; they stay in memory, in float32",
-    "the filter compares every query with every image: rows of the database are divided evenly over the machines",
-    "one machine merges the shortlists that the machines find, which takes as long for each candidate",
+    "the filter compares every query with every image, as fast whatever their numbers; the database's rows are divided "
+    "evenly over the machines",
+    "one machine sorts the candidates that all machines find, each of which takes as long",
     "local features are made of shortlisted images alone, no two queries share one: an upper bound, divided evenly",
     "local features of a query and its global descriptor are made when it is asked; queries are divided evenly",
-    "a query with its candidates is re-ranked where its time does not depend on the size of the database",
-    "network, waiting for the slowest machine, and failures: nothing",
+    "re-ranking takes a query as long as here, where hardly any candidate is shared, whatever the size of the database",
+    "network, waiting for the slowest machine, failures: nothing",
 )
 
 
