@@ -13,12 +13,10 @@ from mfvpr.threads import ordered_map
 from mfvpr.types import Features
 
 SIZE = 336  # px
-SIMILAR = 3  # images of the database that show the place of a query
 COMMON = 2 / 7  # of the keypoints they share with it
 SHIFT, JITTER = 60.0, 3.0  # px, of all of them at most, and of each
 NOISE = 0.5  # length of what is added to a descriptor
 GLOBAL = 512  # dimensions of a global descriptor
-LIKENESS = 0.25  # cosine similarity of the global descriptors of images of one place; others': 0 +- 0.04
 BATCH = 50  # images that are stored at a time
 
 
@@ -31,12 +29,16 @@ class MadeUp:
         queries: Q.
         keypoints: N of each image.
         dimension: of its descriptors.
+        views: images of the database that show the place of a query.
+        likeness: cosine similarity of the global descriptors of images of one place; others': 0 +- 0.04.
     """
 
     images: int
     queries: int
     keypoints: int
     dimension: int
+    views: int = 3
+    likeness: float = 0.25
 
     @property
     def title(self) -> str:
@@ -44,9 +46,13 @@ class MadeUp:
         return f"{self.images} images, D = {self.dimension}"
 
     def similar(self) -> np.ndarray:
-        """`[Q, SIMILAR]` rows of the database that show what a query shows, each of one query."""
+        """`[Q, views]` rows of the database that show what a query shows, each of one query."""
         rows = np.random.default_rng([self.images, self.queries]).permutation(self.images)
-        return rows[: self.queries * SIMILAR].reshape(self.queries, SIMILAR)
+        return rows[: self.queries * self.views].reshape(self.queries, self.views)
+
+    def shown(self) -> dict[int, int]:
+        """The query whose place an image of the database shows, by row; the others show none."""
+        return {row: query for query, rows in enumerate(self.similar().tolist()) for row in rows}
 
     def query(self, row: int) -> Features:
         """Features `[N, ...]` of a query."""
@@ -70,12 +76,12 @@ class MadeUp:
         rng = np.random.default_rng(2)
         queries, database = (_unit(_normal(rng, count, GLOBAL)) for count in (self.queries, self.images))
         rows = self.similar()
-        database[rows] = _unit(LIKENESS * queries[:, None] + np.sqrt(1 - LIKENESS**2) * database[rows])
+        database[rows] = _unit(self.likeness * queries[:, None] + np.sqrt(1 - self.likeness**2) * database[rows])
         return queries, database
 
     def stores(self, root: Path) -> tuple[FeatureStore, FeatureStore]:
         """Those of queries and database below `root`, complete; what is missing there is made first."""
-        shown = {row: query for query, rows in enumerate(self.similar().tolist()) for row in rows}
+        shown = self.shown()
         return (
             self._complete(root, "queries", self.queries, self.query),
             self._complete(root, "database", self.images, lambda row: self.image(row, shown.get(row))),

@@ -27,7 +27,7 @@ from mfvpr.report.tables import Table
 from mfvpr.reranking import rank_shortlist
 from mfvpr.retrieval import EXACT
 from mfvpr.sources import FeatureSet, FeatureSource, InMemory
-from mfvpr.types import Features
+from mfvpr.types import Features, Shortlist
 
 QUERIES, KEYPOINTS = 100, 700
 SETS = tuple(
@@ -155,7 +155,7 @@ class Session:
 
     def result(self) -> Result:
         """Of all turns; only now is anything held in memory as a whole."""
-        peak = _peak_bytes() / 1e9
+        peak = peak_bytes() / 1e9
         data, answers, per_query = self.data, self.answers, len(self.answers) * self.data.queries
         hits = [best in rows for best, rows in zip(answers[0].rows[:, 0], data.similar(), strict=True)]
         return Result(
@@ -178,7 +178,7 @@ class Session:
         return np.array_equal(answer.rows, expected.rows) and np.array_equal(answer.scores, expected.scores)
 
 
-def _peak_bytes() -> int:
+def peak_bytes() -> int:
     """Resident memory at its most, of this process; where the system keeps no such count, not below its parent's."""
     status = Path("/proc/self/status")
     own = re.findall(r"VmHWM: *(\d+)", status.read_text()) if status.exists() else []
@@ -194,9 +194,18 @@ def ranked(
     memory: float | None = MEMORY,
 ) -> Answer:
     """All steps for all queries; `vectors` are the global descriptors of both sides."""
-    times = [time.perf_counter()]
+    start = time.perf_counter()
     candidates = EXACT.shortlist(*vectors, CANDIDATES)
-    times.append(time.perf_counter())
+    filtering = {"filter": time.perf_counter() - start}
+    answer = reranked(queries, database, candidates, memory=memory)
+    return answer._replace(seconds=filtering | answer.seconds)
+
+
+def reranked(
+    queries: FeatureSet, database: FeatureSet, candidates: Shortlist, *, memory: float | None = MEMORY
+) -> Answer:
+    """All steps after the filter."""
+    times = [time.perf_counter()]
     matches = pipeline.match(queries, database, candidates, memory=memory)
     times.append(time.perf_counter())
     scores = pipeline.score({"histogram": HistogramOfShifts()}, matches, candidates)["histogram"]
@@ -204,7 +213,7 @@ def ranked(
     order = rank_shortlist(candidates, scores)
     times.append(time.perf_counter())
     rows = np.take_along_axis(candidates.indices, order, axis=1)
-    return Answer(rows, scores, dict(zip(STEPS, np.diff(times).tolist(), strict=True)))
+    return Answer(rows, scores, dict(zip(STEPS[1:], np.diff(times).tolist(), strict=True)))
 
 
 def report(sets: Sequence[MadeUp], results: Sequence[Result], out: Path) -> None:
