@@ -17,6 +17,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from experiments import meeting
 from experiments.console import tell
 from experiments.data_sets import first_of
 from experiments.errors import on_interrupt, one_line
@@ -41,11 +42,13 @@ def run(program: Program, config: str) -> None:
                 raise SettingsError(_no_default(name))
             settings: Any = OmegaConf.to_container(found, resolve=True)
             check(settings)
-            work = program()
-            _require_device()
             command = shlex.join(job.overrides.task if many else typed)
-            with on_interrupt(signal.default_int_handler), in_settings(settings):
-                work(settings | {"multirun": many, "command": f"python -m experiments.{PROGRAMS[config]} {command}"})
+            with meeting.met(settings, PROGRAMS[config], [*job.overrides.task] if many else typed):
+                work = program()
+                _require_device()
+                about = {"multirun": many, "command": f"python -m experiments.{PROGRAMS[config]} {command}"}
+                with on_interrupt(signal.default_int_handler), in_settings(settings):
+                    work(settings | about)
 
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises instead of printing and exiting with 1
     with _our_words(config):

@@ -93,11 +93,12 @@ def unwind_on_sigterm() -> None:
 
 def _unwound(code: int) -> NoReturn:
     """Exit where a computation of XLA's may be under way, which would abort an interpreter that ends around it."""
-    atexit.register(_leave_at_once, code)  # asked when the threads of Python's have been joined
+    atexit.register(leave_at_once, code)  # asked when the threads of Python's have been joined
     sys.exit(code)
 
 
-def _leave_at_once(code: int) -> NoReturn:
+def leave_at_once(code: int) -> NoReturn:
+    """End the process without what else is to be done at its end."""
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError):  # whoever read it has left
             stream.flush()

@@ -4,7 +4,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments import build, confidences, prepare, run_folder, sharding, truth
+from experiments import build, confidences, meeting, prepare, run_folder, sharding, truth
 from experiments.prepare import Images, Tools
 from experiments.settings import SettingsError
 from mfvpr import evaluations
@@ -58,6 +58,7 @@ def evaluate(settings: dict[str, Any]) -> None:
             )
             print(f"shard {settings['shard']} has done {done}: {wait}; {again}")
             return
+        meeting.part()
         with sharding.last(settings) as is_last:
             if is_last:
                 with run_folder.claimed(settings, own=True, beside=[sharding.SHARDS]) as folder:

@@ -16,11 +16,12 @@ from mfvpr.data.published import differences
 from mfvpr.data.sequences import OwnRows, own_rows, without_neighbors
 from mfvpr.evaluation import threshold_words
 from mfvpr.features import Extractor, Source
-from mfvpr.filters import Filter
+from mfvpr.filters import Filter, Retrieval
 from mfvpr.match_sets import MatchSet, Scales
 from mfvpr.matchers import Matcher
 from mfvpr.named_weights import how_made
 from mfvpr.progress import Stopwatch
+from mfvpr.retrieval import ExactSearch
 from mfvpr.sequence_matching import match_sequence, matches_recipe
 from mfvpr.types import Shortlist
 
@@ -75,7 +76,16 @@ def begun(settings: dict[str, Any], watch: Stopwatch) -> tuple[Tools, Images]:
 def _tools(settings: dict[str, Any], archive: Archive, dataset: Dataset | None) -> Tools:
     extractor = build.extractor(settings["features"], dataset)
     retrieval = build.filter(settings["retrieval"], extractor, dataset)
+    if settings.get("coordinator"):
+        retrieval = _spread(retrieval)
     return Tools(extractor, retrieval, build.matching(settings["matching"]), archive, build.where(settings))
+
+
+def _spread(filter: Filter) -> Filter:
+    """The same on the devices of all tasks, where it searches exactly."""
+    if not isinstance(filter, Retrieval) or not isinstance(filter.search, ExactSearch):
+        return filter
+    return replace(filter, search=replace(filter.search, spread=True))
 
 
 def _images(settings: dict[str, Any], archive: Archive) -> Images:

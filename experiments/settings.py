@@ -38,6 +38,10 @@ _FIGURES = Rule(
     lambda value: _INDEX.holds(value) or list_of(_QUERY).holds(value),
     "how many (at most 1000000), or a list of rows or names of queries",
 )
+_ADDRESS = Rule(
+    lambda value: isinstance(value, str) and bool(re.fullmatch(r"[^\s:]+:[0-9]{1,5}", value)),
+    "HOST:PORT of the first task, such as node1:7654",
+)
 _FLAG = one_of(True, False)
 
 
@@ -140,6 +144,7 @@ RULES: dict[str, Rule] = {
         None,
     ),
     "wait": number(0, 1e9),
+    "coordinator": either(_ADDRESS, None),
     # sweeps
     "search": one_of("grid", "optuna"),
     "trials": between(1, 100_000),
@@ -197,6 +202,8 @@ def check(settings: Mapping[str, Any]) -> None:
     if fusion.get("weights") and fusion["c"] != "zscore":
         raise SettingsError(f"fusion.weights={fusion['weights']}: expected fusion.c=zscore as well, or "
                             "fusion.weights=null")  # fmt: skip
+    if settings.get("coordinator") is not None and settings["shard"] is None:
+        raise SettingsError(f"coordinator={settings['coordinator']}: expected shard=i/n as well, this task's part")
     if settings.get("shard") is not None:
         for name in ("out", "store"):
             if settings[name] is None:

@@ -29,7 +29,7 @@ SHARDS = "shards"
 COMPLETE = "complete"
 _FORMAT = "mfvpr shards 1"
 # What may differ from machine to machine. Images are compared by what they hold.
-_OWN = ("shard", "wait", "out", "store", "memory", "devices", "dataset", "multirun", "command")
+_OWN = ("shard", "wait", "coordinator", "out", "store", "memory", "devices", "dataset", "multirun", "command")
 
 
 @contextmanager
@@ -40,14 +40,19 @@ def joined(settings: Mapping[str, Any]) -> Iterator[Callable[[str], None]]:
         SettingsError: the folder is of a run with other settings, or of another number of shards.
         InputError: the same shard is at work.
     """
-    shard, folder = Shard.parse(settings["shard"]), _folder(build.expanded(settings["out"]))
+    shard, folder = Shard.parse(settings["shard"]), task_folder(settings).parent
     own = {name: value for name, value in settings.items() if name not in _OWN}
     about = {"shards": shard.count, "dataset": settings["dataset"]["name"], "settings": own}
     _agreed(folder / "run.json", about, f"shard={shard}")
-    task = folder / shard.folder
+    task = task_folder(settings)
     task.mkdir(parents=True, exist_ok=True)
     with locked(task, "the part of a run"):
         yield lambda state: write_text(task / "state.json", json.dumps({"state": state}))
+
+
+def task_folder(settings: Mapping[str, Any]) -> Path:
+    """What a task keeps of itself."""
+    return _folder(build.expanded(settings["out"])) / Shard.parse(settings["shard"]).folder
 
 
 def check_data(settings: Mapping[str, Any], images: Images) -> None:

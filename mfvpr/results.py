@@ -2,12 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 
 from mfvpr.data.datasets import Dataset, QuerySequence
 from mfvpr.errors import InputError
-from mfvpr.evaluation import Positives, hits
+from mfvpr.evaluation import Positives, Tally
 from mfvpr.match_sets import MatchSet, Scales
 from mfvpr.types import Shortlist
 
@@ -49,10 +50,19 @@ class Ranked:
 
 @dataclass(frozen=True)
 class Recall:
-    """Recall of one system at thresholds and ks: `[sequences, thresholds, ks]`, and the number of queries in each."""
+    """Recall of one system: counts for each sequence, and in it for each threshold."""
 
-    by_sequence: np.ndarray
-    queries: np.ndarray
+    tallies: Sequence[Sequence[Tally]]
+
+    @property
+    def by_sequence(self) -> np.ndarray:
+        """`[sequences, thresholds, ks]`."""
+        return np.array([[tally.recall for tally in of_sequence] for of_sequence in self.tallies])
+
+    @property
+    def queries(self) -> np.ndarray:
+        """`[sequences]` how many each has."""
+        return np.array([of_sequence[0].queries for of_sequence in self.tallies])
 
     @property
     def mean(self) -> np.ndarray:
@@ -62,7 +72,7 @@ class Recall:
     @property
     def pooled(self) -> np.ndarray:
         """`[thresholds, ks]` over all queries of all sequences."""
-        return np.tensordot(self.queries / self.queries.sum(), self.by_sequence, axes=1)
+        return np.array([reduce(Tally.merged, of_threshold).recall for of_threshold in zip(*self.tallies, strict=True)])
 
 
 @dataclass(frozen=True, repr=False)
@@ -117,12 +127,11 @@ class Result:
         if min(ks, default=1) < 1:
             raise InputError(f"ks={[*ks]}: expected depths from 1")
         right = [self.positives(threshold) for threshold in thresholds]
-        queries = np.array([len(sequence.candidates.mask) for sequence in self.matched])
 
         def of(ranked: Sequence[Ranked]) -> Recall:
-            return Recall(np.array([
-                [[hits(sequence.rows, positives[number], k).mean() for k in ks] for positives in right]
+            return Recall([
+                [Tally.of(sequence.rows, positives[number], ks) for positives in right]
                 for number, sequence in enumerate(ranked)
-            ]), queries)  # fmt: skip
+            ])  # fmt: skip
 
         return {name: of(ranked) for name, ranked in self.systems.items()}

@@ -1,11 +1,43 @@
 """Recall@K: how many queries have a positive among the first of their ranking."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from mfvpr.evaluation.positives import Positives
+
+
+@dataclass(frozen=True)
+class Tally:
+    """Recall@K as counts, which add up: of shards, of what was done before and after an interruption, of sequences.
+
+    Attributes:
+        right: `[len(ks)]` queries that have a positive among their first k.
+        queries: all that were asked.
+    """
+
+    right: np.ndarray
+    queries: int
+
+    @classmethod
+    def of(cls, order: Any, positives: Positives | np.ndarray, ks: Sequence[int]) -> "Tally":
+        """Of some queries; arguments as of `recall_at_k`."""
+        order = np.asarray(order)
+        if order.size == 0:
+            return cls(np.zeros(len(ks), int), len(order))
+        right = (positives if isinstance(positives, Positives) else Positives.from_matrix(positives)).contains(order)
+        return cls(np.array([right[:, :k].any(axis=1).sum() for k in ks], int), len(order))
+
+    def merged(self, other: "Tally") -> "Tally":
+        """Of both's queries, which are others; the order of merging changes nothing."""
+        return Tally(self.right + other.right, self.queries + other.queries)
+
+    @property
+    def recall(self) -> np.ndarray:
+        """`[len(ks)]` fractions of all queries; 0 without any."""
+        return self.right / max(self.queries, 1)
 
 
 def hits(rows: np.ndarray, positives: Positives, k: int = 1) -> np.ndarray:
@@ -21,8 +53,4 @@ def recall_at_k(order: Any, positives: Positives | np.ndarray, ks: Sequence[int]
         positives: `Positives`, or `[Q, N]` bool. A query without positives counts as a failure.
         ks: depths; beyond C all C candidates count.
     """
-    order = np.asarray(order)
-    if order.size == 0:
-        return np.zeros(len(ks))
-    right = (positives if isinstance(positives, Positives) else Positives.from_matrix(positives)).contains(order)
-    return np.array([right[:, :k].any(axis=1).mean() for k in ks])
+    return Tally.of(order, positives, ks).recall
