@@ -7,7 +7,7 @@
 Others may ask a map while one process adds to it.
 """
 
-from mfvpr.maps.answers import Alternative, Answer
+from mfvpr.maps.answers import Alternative, Answer, Asked
 from mfvpr.maps.map import Map
 
-__all__ = ["Alternative", "Answer", "Map"]
+__all__ = ["Alternative", "Answer", "Asked", "Map"]
