@@ -139,6 +139,7 @@ ALLOWED = {
         "features",
         "learned_weight",
         "learning",
+        "maps",
         "pipeline",
         "report",
         "scoring",
