@@ -17,11 +17,17 @@ class AnswerFigures:
     """Those of images that settings ask for, each as soon as it is answered."""
 
     def __init__(self, known: Map, settings: Mapping[str, Any]) -> None:
-        """None yet."""
+        """None yet.
+
+        Raises:
+            SettingsError: the folder of the map's images is none.
+        """
         shown, self._known, self._failed = settings["figures"], known, 0
         self._wanted = set(range(shown) if isinstance(shown, int) else shown)
         self._missing = set() if isinstance(shown, int) else {*self._wanted}  # there may be fewer than so many
         self._out, self._root = (settings[name] and build.expanded(settings[name]) for name in ("out", "root"))
+        if self._root and not self._root.is_dir():
+            raise SettingsError(f"root={self._root}: expected the folder of the map's images, got no folder")
 
     def draw(self, number: int, name: str, pixels: np.ndarray, asked: Asked) -> dict[str, Any]:
         """What the line of an image, the how manieth from 0, says of its figure; one that fails costs a warning."""

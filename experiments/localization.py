@@ -15,8 +15,7 @@ from mfvpr.confidence import Confidence, read_confidences
 from mfvpr.data.files import printable
 from mfvpr.data.images import read_image
 from mfvpr.errors import InputError
-from mfvpr.maps import Answer, Asked, Map
-from mfvpr.maps.route import Drive, Route
+from mfvpr.maps import Answer, Asked, Drive, Map, Route
 from mfvpr.stores.maps import Entry
 
 
@@ -54,7 +53,6 @@ class _Questions:
     def ask(self, name: str, pixels: np.ndarray) -> tuple[Asked, dict[str, Any]]:
         """What the map says, and the line that tells it. What was added before is asked of the map as it was then."""
         start = time.perf_counter()
-        self._known.refresh()
         row, recent = self._known.row(name) if self._settings["add"] else None, self._settings["recent"]
         asked = self._known.ask(pixels, recent=recent, before=row)
         line = asked.answer.as_json(self._settings["alternatives"]) | self._located(asked.answer, row)

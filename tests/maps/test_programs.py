@@ -128,6 +128,7 @@ def test_an_image_that_cannot_be_read_stops_no_other(folder, small_street, tmp_p
     (["map=MAP", "images=MAP", "every=0"], "every=0: expected"),
     (["map=MAP", "images=MAP", "figures=3"], "figures=3: expected out=DIR as well, where they are drawn"),
     (["map=MAP", "images=MAP", "figures=[a.png]"], "expected out=DIR as well"),
+    (["map=MAP", "images=MAP", "figures=1", "out=MAP/figures", "root=/no"], "root=/no: expected the folder of the map"),
     (["map=MAP", "images=MAP", "figures=[]"], "figures=[]: expected how many"),
     (["map=MAP", "images=MAP", "route=fast"], "route=fast: expected a number from -1000 to 1000, or null"),
     (["map=MAP", "images=MAP", "add=1"], "add=1: expected one of true, false"),
@@ -263,20 +264,21 @@ def test_a_drive_finds_where_it_was_before(twice, small_street, tmp_path, monkey
     for number in (8, 9):  # which the drive does not pass
         shutil.copy(small_street / f"database/{number:04d}.png", start / "database")
     assert built(tmp_path / "map", start, monkeypatch, capsys)[0] == 0
+    Image.fromarray(np.full((240, 320, 3), 90, np.uint8)).save(twice / "16.png")  # which has no features
     drive = [f"map={tmp_path}/map", f"images={twice}", "add=true", "recent=3", "route=1"]
     code, stdout, stderr = called(monkeypatch, capsys, "localize", *drive)
     assert (code, stderr) == (0, "")
-    first, names = lines(stdout), [f"{twice}/{number:02d}.png" for number in range(16)]
+    first, names = lines(stdout), [f"{twice}/{number:02d}.png" for number in range(17)]
     assert [line["image"] for line in first] == names
     assert all(line["added"] for line in first)
-    assert [line["place"] for line in first[8:]] == names[:8]  # the second time, where it was the first
+    assert [line["place"] for line in first[8:]] == [*names[:8], None]  # the second time, where it was the first
     for number, line in enumerate(first):  # nothing of the newest three, nor of itself
         assert all(one["row"] < 2 + number - 3 for one in line["alternatives"])
     assert maps.opened(tmp_path / "map").names[2:] == names
     _, stdout, _ = called(monkeypatch, capsys, "localize", *drive)
     assert without_seconds(lines(stdout)) == without_seconds(first)
     assert not any(line["added"] for line in lines(stdout))
-    assert len(maps.opened(tmp_path / "map")) == 18
+    assert len(maps.opened(tmp_path / "map")) == 19
 
 
 def test_a_drive_that_was_interrupted_goes_on(twice, folder, monkeypatch, capsys):
