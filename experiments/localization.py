@@ -1,25 +1,22 @@
-"""Questions to a map: files, folders, folders that are watched, and videos; answers as lines of JSON."""
+"""Questions to a map; answers as lines of JSON."""
 
 import json
 import time
-from collections.abc import Iterator, Mapping
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from experiments import build, maps
-from experiments.console import tell
+from experiments.answer_figures import AnswerFigures
+from experiments.asked_images import images
 from experiments.settings import SettingsError
 from mfvpr.confidence import Confidence, read_confidences
-from mfvpr.data.datasets import image_folder
 from mfvpr.data.files import printable
-from mfvpr.data.images import SUFFIXES, read_image
-from mfvpr.data.videos import SUFFIXES as VIDEOS
-from mfvpr.data.videos import frames
+from mfvpr.data.images import read_image
 from mfvpr.errors import InputError
-
-POLL = 0.2  # seconds between two looks at a folder
+from mfvpr.maps import Answer, Asked, Drive, Map, Route
+from mfvpr.stores.maps import Entry
 
 
 def localize(settings: dict[str, Any]) -> None:
@@ -28,21 +25,61 @@ def localize(settings: dict[str, Any]) -> None:
         build.expanded(settings["map"]), confidence=_confidence(settings), threshold=settings["threshold"],
         memory=settings["memory"],
     )  # fmt: skip
-    failed = 0
-    for name, image in _images(settings):
-        start = time.perf_counter()
+    questions, figures, failed = _Questions(known, settings), AnswerFigures(known, settings), 0
+    for number, (name, image) in enumerate(images(settings)):
         try:
             pixels = image if isinstance(image, np.ndarray) else read_image(image)
-            answer = known.localize(pixels, recent=settings["recent"])
-            line = answer.as_json(settings["alternatives"]) | {"seconds": round(time.perf_counter() - start, 4)}
+            asked, line = questions.ask(name, pixels)
         except InputError as error:
             if not len(known):
                 raise
             failed += 1
-            line = {"error": str(error)}
+            line = {"error": str(error)} | questions.missed()
+        else:
+            line |= questions.add(name, asked) | figures.draw(number, name, pixels, asked)
         print(printable(json.dumps({"image": name} | line, ensure_ascii=False, allow_nan=False)), flush=True)
     if failed:
         raise SettingsError(f"{failed} of the images could not be answered; their lines say why")
+    figures.finish()
+
+
+class _Questions:
+    """One drive: what is asked of the map, and added to it, image by image."""
+
+    def __init__(self, known: Map, settings: Mapping[str, Any]) -> None:
+        self._known, self._settings = known, settings
+        self._route = None if settings["route"] is None else Route(Drive(advance=settings["route"]))
+
+    def ask(self, name: str, pixels: np.ndarray) -> tuple[Asked, dict[str, Any]]:
+        """What the map says, and the line that tells it. What was added before is asked of the map as it was then."""
+        start = time.perf_counter()
+        row, recent = self._known.row(name) if self._settings["add"] else None, self._settings["recent"]
+        asked = self._known.ask(pixels, recent=recent, before=row)
+        line = asked.answer.as_json(self._settings["alternatives"]) | self._located(asked.answer, row)
+        return asked, line | {"seconds": round(time.perf_counter() - start, 4)}
+
+    def missed(self) -> dict[str, Any]:
+        """What the line of an image says that cannot be asked: the robot drives on."""
+        return self._located(None, None)
+
+    def add(self, name: str, asked: Asked) -> dict[str, Any]:
+        """Whether an image was added now: to the end, unless one of its name is there."""
+        if not self._settings["add"]:
+            return {}
+        features, vector = asked.described
+        is_new = self._known.row(name) is None
+        if is_new:
+            self._known.add_described([Entry(name, name, vector)], [features])
+        return {"added": is_new}
+
+    def _located(self, answer: Answer | None, row: int | None) -> dict[str, Any]:
+        """Where the route says that the robot is, in rows that an answer may be in."""
+        if self._route is None:
+            return {}
+        there = self._known.there[:row]
+        there = there[: max(0, len(there) - self._settings["recent"])]
+        found = self._route(answer, there)
+        return {"route": found and {"place": self._known.place(found.row), "p": round(found.p, 4)}}
 
 
 def _confidence(settings: Mapping[str, Any]) -> Confidence | None:
@@ -55,39 +92,3 @@ def _confidence(settings: Mapping[str, Any]) -> Confidence | None:
         raise SettingsError(f"confidence={settings['confidence']}: expected p of {name}, which the map scores by, got "
                             f"{', '.join(systems) or 'none'}; evaluate with the map's settings")  # fmt: skip
     return systems[name]
-
-
-def _images(settings: Mapping[str, Any]) -> Iterator[tuple[str, Path | np.ndarray]]:
-    """(name, file or pixels), in their order."""
-    paths = settings["images"] if isinstance(settings["images"], list) else [settings["images"]]
-    paths = [build.expanded(path) for path in paths]
-    for path in paths:
-        if not path.exists():
-            raise SettingsError(f"images={path}: expected an image, a folder or a video, got nothing")
-    if settings["watch"] and not (len(paths) == 1 and paths[0].is_dir()):
-        raise SettingsError(f"watch=true: expected images=DIR, one folder, got {settings['images']}")
-    for path in paths:
-        if settings["watch"]:
-            yield from ((str(one), one) for one in _watched(path))
-        elif path.is_dir():
-            yield from ((str(one), one) for one in image_folder(path).paths)
-        elif path.suffix.lower() in VIDEOS:
-            yield from ((f"{path}:{number}", image) for number, image in frames(path, every=settings["every"]))
-        else:
-            yield str(path), path
-
-
-def _watched(folder: Path) -> Iterator[Path]:
-    """Images of a folder, then those that come, once their files do not change any more; until Ctrl-C."""
-    done: set[str] = set()
-    before: dict[str, tuple[int, int]] = {}
-    tell(f"watching {folder}; end with Ctrl-C")
-    while True:
-        found = {path.name: path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES}
-        states = {name: (path.stat().st_size, path.stat().st_mtime_ns) for name, path in found.items()
-                  if name not in done and path.is_file()}  # fmt: skip
-        for name in sorted(name for name, state in states.items() if before.get(name) == state):
-            done.add(name)
-            yield found[name]
-        before = states
-        time.sleep(POLL)

@@ -128,6 +128,9 @@ RULES: dict[str, Rule] = {
     "watch": _FLAG,
     "alternatives": _INDEX,
     "recent": _INDEX,
+    "route": either(number(-1000, 1000), None),
+    "add": _FLAG,
+    ".root": either(_PATH, None),
     # report
     "tolerances": list_of(_INDEX),
     "radius": _POSITIVE,
@@ -198,6 +201,8 @@ def check(settings: Mapping[str, Any]) -> None:
             raise SettingsError(f"{group}={name}: expected none with report=, since the files are of one data set")
     if settings.get("report") and settings["split"] != "both":
         raise SettingsError(f"split={settings['split']}: expected none with report=, since the data sets are the split")
+    if settings.get("images") and settings["figures"] and settings["out"] is None:
+        raise SettingsError(f"figures={settings['figures']}: expected out=DIR as well, where they are drawn")
     fusion = settings.get("fusion", {})
     if fusion.get("weights") and fusion["c"] != "zscore":
         raise SettingsError(f"fusion.weights={fusion['weights']}: expected fusion.c=zscore as well, or "

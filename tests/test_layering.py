@@ -140,6 +140,7 @@ ALLOWED = {
         "features",
         "learned_weight",
         "learning",
+        "maps",
         "pipeline",
         "report",
         "scoring",

@@ -40,8 +40,8 @@ def executed(tmp_path_factory):
     return dict(zip(PATHS, results, strict=True)), folder
 
 
-def test_there_are_three():
-    assert [path.name[0] for path in PATHS] == ["1", "2", "3"]
+def test_there_are_four():
+    assert [path.name[0] for path in PATHS] == ["1", "2", "3", "4"]
 
 
 @pytest.mark.parametrize("path", PATHS, ids=lambda path: path.stem)

@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from mfvpr.errors import InputError
+
 _TEMPORARY = re.compile(r"\..+-[a-z0-9_]{8}(\.\w+)?")  # names that `replacing` makes
 
 
@@ -63,3 +65,18 @@ def write_text(path: Path, text: str) -> None:
     """Write `printable` text as UTF-8, atomically."""
     with replacing(path) as temporary:
         temporary.write_text(printable(text), encoding="utf-8")
+
+
+def below(root: Path, name: str) -> Path:
+    """The file of a folder that a name from elsewhere stands for, which may not be there; its links are followed.
+
+    Raises:
+        InputError: a name that leads out of the folder: absolute, with "..", or by a link.
+    """
+    try:
+        path, is_plain = (root / name).resolve(), not Path(name).is_absolute() and ".." not in Path(name).parts
+        if is_plain and path.is_relative_to(root.resolve()):
+            return path
+    except (OSError, RuntimeError, ValueError):  # links in a circle, a character that no name has
+        pass
+    raise InputError(f"{clipped(name, 200)!r}: expected the name of a file below {root}, got one that leads elsewhere")

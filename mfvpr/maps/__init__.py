@@ -3,11 +3,14 @@
     known = Map("map", Sift(), VladFitting())
     known.build(folder, places)            # or, image by image: known.add(image, place)
     answer = known.localize("query.jpg")   # the place, what else it may be, how sure that is, and where to steer
+    route = Route(Drive(advance=1))        # of images in the order of a drive, of a map in the order of one as well:
+    located = route(answer, known.there)   # the row that the images before, this one and the motion say together
 
 Others may ask a map while one process adds to it.
 """
 
-from mfvpr.maps.answers import Alternative, Answer
+from mfvpr.maps.answers import Alternative, Answer, Asked
 from mfvpr.maps.map import Map
+from mfvpr.maps.route import Drive, Located, Route
 
-__all__ = ["Alternative", "Answer", "Map"]
+__all__ = ["Alternative", "Answer", "Asked", "Drive", "Located", "Map", "Route"]

@@ -2,9 +2,10 @@
 
 import math
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
+from mfvpr.maps.describing import Described
+from mfvpr.types import Matches
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,14 @@ class Answer:
         return values
 
 
-def pair_of(values: np.ndarray) -> tuple[float, float] | None:
-    """(x, y), None where it is not finite."""
-    return (float(values[0]), float(values[1])) if np.isfinite(values).all() else None
+class Asked(NamedTuple):
+    """An answer, and what it was found with.
+
+    answer: to the image.
+    described: the image's features and descriptor, with which it can be added to the map.
+    matches: with the best candidate, `[K, ...]`, NumPy; None where there is none.
+    """
+
+    answer: Answer
+    described: Described
+    matches: Matches | None

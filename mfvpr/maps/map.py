@@ -1,6 +1,5 @@
 """The map itself: what it is made with, what is added to it, and what it is asked."""
 
-import json
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -17,19 +16,18 @@ from mfvpr.errors import InputError
 from mfvpr.features import Aggregation, Extractor
 from mfvpr.features.vlad import Vlad, VladFitting
 from mfvpr.fingerprints import fingerprint, recipe_of
-from mfvpr.maps.answers import Alternative, Answer, pair_of
+from mfvpr.maps.answers import Alternative, Answer, Asked
 from mfvpr.maps.describing import Describing, Image, local_features
 from mfvpr.maps.resident import Resident
+from mfvpr.maps.shifts import shift_of
 from mfvpr.maps.vectors import Vectors
 from mfvpr.matchers import NEIGHBORS, Matcher, match_pairs
-from mfvpr.pipeline import pair_shifts
 from mfvpr.progress import Track, untracked
-from mfvpr.reranking import BIN_STEP, score_candidates
+from mfvpr.reranking import score_candidates
 from mfvpr.results import Ranked
 from mfvpr.scoring import HistogramOfShifts, Scorer
-from mfvpr.scoring.parameters import fit
 from mfvpr.sources import FeatureSet, stacked
-from mfvpr.stores.maps import Entry, MapRows
+from mfvpr.stores.maps import Entry, MapRows, check_place
 from mfvpr.types import Features, Matches
 
 _VOCABULARY = "vocabulary.npz"
@@ -88,7 +86,7 @@ class Map:
         self.scorer: Scorer = HistogramOfShifts() if scorer is None else scorer
         self.confidence, self.threshold = confidence, threshold
         self._fitting = describer if isinstance(describer, VladFitting) else None
-        self._vectors, self._entries, self._made = Vectors(), {}, None
+        self._vectors, self._entries, self._rows, self._made = Vectors(), {}, {}, None
         self._resident_options = {"candidates": candidates, "memory": memory}
         if not isinstance(describer, VladFitting):
             self._use(describer)
@@ -114,6 +112,21 @@ class Map:
         """Of the images, in the order of their rows."""
         return [self._entries[row].name for row in sorted(self._entries)]
 
+    @property
+    def there(self) -> np.ndarray:
+        """`[rows]` bool, which rows have an image: a process that was killed may have left some out."""
+        found = np.zeros(self._vectors.total, bool)
+        found[np.fromiter(self._entries, int, len(self))] = True
+        return found
+
+    def row(self, name: str) -> int | None:
+        """Of an image; None = the map has none of this name."""
+        return self._rows.get(name)
+
+    def place(self, row: int) -> Any:
+        """Of a row that has an image."""
+        return self._entries[row].place
+
     def refresh(self) -> int:
         """Look for what others have added; how many there are.
 
@@ -126,6 +139,7 @@ class Map:
         for row, entry in self._made.rows.new() if self._made else ():
             self._vectors.put(row, entry.vector)
             self._entries[row] = entry._replace(vector=None)
+            self._rows[entry.name] = row
         return len(self) - before
 
     def learn(self, images: ImageFolder, *, track: Track = untracked) -> None:
@@ -158,11 +172,10 @@ class Map:
         if len(places) != len(images):
             raise InputError(f"expected a place of each of {len(images)} images, got {len(places)}")
         for name, place in zip(images.names, places, strict=True):
-            _check_place(name, place)
+            check_place(name, place)
         self.learn(images, track=track)
         with self._adding() as made:
-            known = {*self.names}
-            missing = [row for row, name in enumerate(images.names) if name not in known]
+            missing = [row for row, name in enumerate(images.names) if name not in self._rows]
             for batch in made.describing.folder(images, missing, track):
                 made.rows.add([
                     (features, Entry(images.names[row], places[row], vector))
@@ -201,21 +214,26 @@ class Map:
         if len(entries) != len(features):
             raise InputError(f"expected features of each of {len(entries)} images, got {len(features)}")
         with self._adding() as made:
-            known = {*self.names}
+            new: set[str] = set()
             for name, place, _ in entries:
-                _check_place(name, place)
-                if name in known:
+                check_place(name, place)
+                if name in self._rows or name in new:
                     raise InputError(f"{name}: the map has an image of this name; choose another")
-                known.add(name)
+                new.add(name)
             made.rows.add([*zip(features, entries, strict=True)])
         self.refresh()
 
     def localize(self, image: Image, *, recent: int = 0) -> Answer:
-        """Where an image was taken.
+        """Where an image was taken; see `ask`."""
+        return self.ask(image, recent=recent).answer
+
+    def ask(self, image: Image, *, recent: int = 0, before: int | None = None) -> Asked:
+        """Where an image was taken, and what that was found with.
 
         Args:
             image: a file, or `[H, W, 3]` uint8 RGB.
             recent: so many of the newest rows are left out: of a drive that is being added, the same place.
+            before: rows from this on are left out as well, as if the map ended there; None = none.
 
         Raises:
             InputError: the map is empty, or the image cannot be read.
@@ -223,42 +241,31 @@ class Map:
         self.refresh()
         if not len(self) or self._made is None:
             raise InputError(f"{self.folder}: expected a map with images, got an empty one; add some")
-        features, vector = self._made.describing.image(image)
-        total = max(self._entries) + 1
-        rows, similarity = self._vectors.nearest(vector, self.candidates, before=total - recent)
+        features, vector = described = self._made.describing.image(image)
+        end = (self._vectors.total if before is None else before) - recent
+        rows, similarity = self._vectors.nearest(vector, self.candidates, before=end)
         if not len(rows):
-            return Answer(None, (), 0.0, None, None, None, None)
-        matches = self._matched(self._made.resident, features, rows, total)
+            return Asked(Answer(None, (), 0.0, None, None, None, None), described, None)
+        matches = self._matched(self._made.resident, features, rows)
         scores = np.asarray(score_candidates(self.scorer, matches))[: len(rows)]
         order = np.argsort(-np.where(np.isnan(scores), -np.inf, scores), kind="stable")
         ranked, filtered = Ranked(rows[order][None], scores[order][None]), Ranked(rows[None], similarity[None])
         p = None if self.confidence is None else float(self.confidence(ranked, filtered)[0])
         p = None if p is None or math.isnan(p) else p  # of a score that is not finite nothing is known
         refused = self.threshold is not None and not (p is not None and p >= self.threshold)
-        found = tuple(self._alternative(int(rows[one]), float(scores[one])) for one in order)
-        place = None if refused else found[0].place
-        return Answer(place, found, found[0].score, p, *self._shift(matches, int(order[0])))
+        found = tuple(Alternative(row, self._entries[row].name, self._entries[row].place, float(score))
+                      for row, score in zip(rows[order].tolist(), scores[order], strict=True))  # fmt: skip
+        best = jax.device_get(jax.tree.map(lambda leaf: leaf[order[0] : order[0] + 1], matches))
+        answer = Answer(None if refused else found[0].place, found, found[0].score, p, *shift_of(self.scorer, best))
+        return Asked(answer, described, jax.tree.map(lambda leaf: leaf[0], best))
 
-    def _alternative(self, row: int, score: float) -> Alternative:
-        return Alternative(row, self._entries[row].name, self._entries[row].place, score)
-
-    def _matched(self, resident: Resident, features: Features, rows: np.ndarray, total: int) -> Matches:
+    def _matched(self, resident: Resident, features: Features, rows: np.ndarray) -> Matches:
         """Matches `[C, K, ...]` with all candidates; those that there are not have none."""
-        arrays, slots = resident.hold(rows.tolist(), features, total)
+        arrays, slots = resident.hold(rows.tolist(), features, self._vectors.total)
         query = stacked([features], resident.capacity, total=1)
         pairs = np.zeros((self.candidates, 2), np.int32)
         pairs[: len(slots), 1] = slots
         return match_pairs(query, arrays, pairs, np.int32(len(slots)), self.matcher)
-
-    def _shift(self, matches: Matches, best: int) -> tuple[Any, Any, Any]:
-        """Shift, interval and scale of a candidate."""
-        if not isinstance(self.scorer, HistogramOfShifts):
-            return None, None, None
-        one = jax.tree.map(lambda leaf: leaf[best : best + 1], matches)
-        fitted = fit(self.scorer, one.image_size0, one.image_size1, multiple=BIN_STEP)
-        shift, interval, scale = (np.asarray(values)[0] for values in pair_shifts(fitted, one))
-        ends = pair_of(interval[0]), pair_of(interval[1])
-        return pair_of(shift), ends if None not in ends else None, float(scale) if np.isfinite(scale) else None
 
     @contextmanager
     def _adding(self) -> Iterator["_Made"]:
@@ -283,16 +290,6 @@ class Map:
     def _vocabulary_of(self) -> str:
         """What the vocabulary is of: another's is refused."""
         return fingerprint({"extractor": recipe_of(self.extractor), "vocabulary": recipe_of(self._fitting)})
-
-
-def _check_place(name: str, place: Any) -> None:
-    """None would be no place; what JSON cannot say cannot be kept."""
-    try:
-        if place is None:
-            raise ValueError("None")
-        json.dumps(place, allow_nan=False)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: expected a place that JSON can say, and not null, got {error}") from None
 
 
 class _Made(NamedTuple):

@@ -6,13 +6,17 @@ _FIRST = 1024  # rows; twice as many whenever they are full
 
 
 class Vectors:
-    """Descriptors by row; rows may come in any order, and some may be missing."""
+    """Descriptors by row; rows may come in any order, and some may be missing.
+
+    Attributes:
+        total: one more than the largest row.
+    """
 
     def __init__(self) -> None:
         """None yet."""
         self._values = np.zeros((0, 0), np.float32)
         self._there = np.zeros(0, bool)
-        self._total = 0
+        self.total = 0
 
     def put(self, row: int, vector: np.ndarray) -> None:
         """The descriptor `[D]` of a row."""
@@ -24,7 +28,7 @@ class Vectors:
         self._values[row] = vector
         # Of no features, which resembles all alike: nobody's candidate, as in `mfvpr.filters.Retrieval`.
         self._there[row] = bool(np.isfinite(vector).all() and vector.any())
-        self._total = max(self._total, row + 1)
+        self.total = max(self.total, row + 1)
 
     def nearest(self, query: np.ndarray, number: int, *, before: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """(rows, their products with the query `[D]`), best first, of equal ones the lowest row first.
@@ -34,7 +38,7 @@ class Vectors:
             number: rows, at most.
             before: rows from this on are left out; None = none.
         """
-        total = self._total if before is None else max(0, min(self._total, before))
+        total = self.total if before is None else max(0, min(self.total, before))
         rows = np.flatnonzero(self._there[:total])
         if not len(rows) or not query.any():
             return rows[:0], np.zeros(0, np.float32)

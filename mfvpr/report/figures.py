@@ -60,7 +60,7 @@ def histogram_figure(
     figure = Figure(figsize=(12, 0.2 + 4.8 * len(answers)), layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(printable(title), fontsize=11, parse_math=False)  # a file's name may hold a $
-    top = max(1e-9, *(float(answer.explanation.score) for answer in answers if answer.explanation))
+    top = max([1e-9, *(float(answer.explanation.score) for answer in answers if answer.explanation)])
     for (pair, heat), answer in zip(
         figure.subplots(len(answers), 2, width_ratios=(2, 1.15), squeeze=False), answers, strict=True
     ):

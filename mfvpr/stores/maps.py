@@ -45,6 +45,16 @@ class Entry(NamedTuple):
     vector: np.ndarray
 
 
+def check_place(name: str, place: Any) -> None:
+    """None would be no place; what JSON cannot say cannot be kept."""
+    try:
+        if place is None:
+            raise ValueError("None")
+        json.dumps(place, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: expected a place that JSON can say, and not null, got {error}") from None
+
+
 @dataclass
 class _Segment:
     """Both stores of some rows, as they were when they were opened.

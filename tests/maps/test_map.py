@@ -22,6 +22,7 @@ from mfvpr.features.vlad import VladFitting
 from mfvpr.filters import Retrieval
 from mfvpr.maps import Map
 from mfvpr.maps.resident import Resident
+from mfvpr.pipeline import explain
 from mfvpr.stores import maps as map_store
 from mfvpr.types import Features
 from tests.programs import ROOT
@@ -70,6 +71,31 @@ def test_an_image_of_the_map_is_found_where_it_is(dataset, folder):
     assert answer.scale == 1
     assert not answer.is_refused
     assert len(answer.as_json(2)["alternatives"]) == 2
+
+
+def test_a_question_keeps_what_it_was_answered_with(dataset, folder):
+    known = asked(folder)
+    for path in dataset.queries.paths[:3]:
+        answer, (features, vector), matches = known.ask(path)
+        assert answer == known.localize(path)
+        assert known.scorer(matches) == pytest.approx(answer.score, rel=1e-5)
+        best = answer.alternatives[0]
+        assert (known.row(best.name), known.place(best.row)) == (best.row, best.place)
+        keypoints = {tuple(point) for point in features.keypoints.tolist()}
+        assert {tuple(point) for point in matches.points0[matches.mask].tolist()} <= keypoints
+        assert vector @ vector == pytest.approx(1, rel=1e-5)
+        np.testing.assert_allclose(explain(known.scorer, matches).peak, answer.shift, atol=1e-4)
+    assert known.row("no such") is None
+    assert known.there.tolist() == [True] * len(dataset.database)
+
+
+def test_a_map_can_be_asked_as_it_was(dataset, folder):
+    known = asked(folder)
+    answer, _, matches = known.ask(dataset.database.paths[7], recent=2, before=6)
+    assert sorted(one.row for one in answer.alternatives) == [0, 1, 2, 3]
+    assert matches.mask.any()
+    answer, _, matches = known.ask(dataset.database.paths[7], recent=2, before=2)
+    assert (answer.place, answer.alternatives, matches) == (None, (), None)
 
 
 def test_nothing_is_compiled_after_the_first_query(dataset, folder, compilations):

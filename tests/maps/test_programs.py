@@ -10,7 +10,9 @@ import time
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
+from experiments import maps
 from mfvpr.data.images import read_image
 from mfvpr.data.videos import frames
 from mfvpr.errors import InputError
@@ -124,6 +126,12 @@ def test_an_image_that_cannot_be_read_stops_no_other(folder, small_street, tmp_p
     (["map=MAP", "images=MAP", "threshold=0.5"], "expected confidence=FILE as well"),
     (["map=MAP", "images=MAP", "confidence=/no"], "/no: expected the confidence.json"),
     (["map=MAP", "images=MAP", "every=0"], "every=0: expected"),
+    (["map=MAP", "images=MAP", "figures=3"], "figures=3: expected out=DIR as well, where they are drawn"),
+    (["map=MAP", "images=MAP", "figures=[a.png]"], "expected out=DIR as well"),
+    (["map=MAP", "images=MAP", "figures=1", "out=MAP/figures", "root=/no"], "root=/no: expected the folder of the map"),
+    (["map=MAP", "images=MAP", "figures=[]"], "figures=[]: expected how many"),
+    (["map=MAP", "images=MAP", "route=fast"], "route=fast: expected a number from -1000 to 1000, or null"),
+    (["map=MAP", "images=MAP", "add=1"], "add=1: expected one of true, false"),
 ])  # fmt: skip
 def test_mistakes_are_one_line(folder, monkeypatch, capsys, arguments, words):
     arguments = [one.replace("MAP", str(folder)) for one in arguments]
@@ -146,6 +154,150 @@ def test_other_settings_are_refused(folder, small_street, monkeypatch, capsys, m
     code, _, stderr = built(folder, small_street, monkeypatch, capsys, *more)
     assert code == 2
     assert words in stderr
+
+
+def drawn(path):
+    """Pixels of a figure, and what it tells programs."""
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB")), image.text
+
+
+def test_answers_are_drawn(folder, small_street, tmp_path, monkeypatch, capsys):
+    queries, pictures = small_street / "queries", {}
+    for name, root in (("gray", "null"), ("shown", f"{small_street}/database"), ("elsewhere", str(tmp_path))):
+        code, stdout, stderr = called(
+            monkeypatch, capsys, "localize", f"map={folder}", f"images={queries}", "figures=[0003.png,5]",
+            f"out={tmp_path}/{name}", f"root={root}",
+        )  # fmt: skip
+        assert (code, stderr) == (0, "")
+        paths = [tmp_path / name / "0003_0003.png", tmp_path / name / "0005_0005.png"]
+        assert [line["figure"] for line in lines(stdout) if "figure" in line] == [*map(str, paths)]
+        assert sorted((tmp_path / name).iterdir()) == paths
+        pictures[name], told = drawn(paths[0])
+        assert told["image"] == f"{queries}/0003.png"
+        assert told["place"] == lines(stdout)[3]["place"]
+    np.testing.assert_array_equal(pictures["gray"], pictures["elsewhere"])
+    gray = {name: np.mean((picture == 150).all(axis=2)) for name, picture in pictures.items()}
+    assert gray["shown"] < 0.01 < 0.1 < gray["gray"]
+
+
+def test_so_many_answers_are_drawn_and_those_without_a_candidate(folder, tmp_path, monkeypatch, capsys):
+    (tmp_path / "asked").mkdir()
+    for name in ("a b.png", "c.png", "d.png"):
+        Image.fromarray(np.full((20, 30, 3), 90, np.uint8)).save(tmp_path / "asked" / name)
+    code, stdout, stderr = called(monkeypatch, capsys, "localize", f"map={folder}", f"images={tmp_path}/asked",
+                                  "figures=2", f"out={tmp_path}/out")  # fmt: skip
+    assert (code, stderr) == (0, "")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["0000_a b.png", "0001_c.png"]
+    assert [line["place"] for line in lines(stdout)] == [None] * 3
+
+
+def test_a_map_shows_nothing_outside_of_its_folder(small_street, tmp_path, monkeypatch, capsys):
+    """Its names are data: of a map that somebody gave away they may say anything."""
+    code, *_ = built(tmp_path / "map", small_street, monkeypatch, capsys)
+    known = maps.opened(tmp_path / "map")
+    known.add(small_street / "queries/0004.png", "there", name=f"..{small_street}/queries/0004.png")
+    code, stdout, stderr = called(
+        monkeypatch, capsys, "localize", f"map={tmp_path}/map", f"images={small_street}/queries/0004.png", "figures=1",
+        f"out={tmp_path}/out", f"root={small_street}/database",
+    )  # fmt: skip
+    assert code == 2
+    [line] = lines(stdout)
+    assert (line["place"], line["figure"]) == ("there", None)
+    warning, error = stderr.splitlines()
+    assert warning.startswith(f"warning: {tmp_path}/out/0000_0004.png: not drawn ('..")
+    assert "one that leads elsewhere" in warning
+    assert error == "error: 1 of the figures could not be drawn; warnings say why"
+    assert not (tmp_path / "out").exists()
+
+
+def test_figures_of_what_was_not_asked(folder, small_street, tmp_path, monkeypatch, capsys):
+    code, stdout, stderr = called(monkeypatch, capsys, "localize", f"map={folder}", "figures=[no.png,0003.png,10]",
+                                  f"images={small_street}/database", f"out={tmp_path}/out")  # fmt: skip
+    assert code == 2
+    assert len(lines(stdout)) == 10
+    assert stderr.startswith("error: figures=[10,no.png]: expected rows of images that were answered")
+    assert len([*(tmp_path / "out").iterdir()]) == 1
+
+
+def test_one_wrong_image_does_not_lead_off_the_route(folder, small_street, tmp_path, monkeypatch, capsys):
+    shutil.copytree(small_street / "database", tmp_path / "asked")
+    shutil.copy(tmp_path / "asked/0000.png", tmp_path / "asked/0006.png")
+    asked, names = [f"map={folder}", f"images={tmp_path}/asked"], [f"{row:04d}.png" for row in range(10)]
+    code, stdout, _ = called(monkeypatch, capsys, "localize", *asked, "route=1")
+    assert code == 0
+    assert [line["place"] for line in lines(stdout)] == [*names[:6], names[0], *names[7:]]
+    assert [line["route"]["place"] for line in lines(stdout)] == names
+    assert all(0 < line["route"]["p"] <= 1 for line in lines(stdout))
+    _, plain, _ = called(monkeypatch, capsys, "localize", *asked)
+    assert [line["place"] for line in lines(plain)] == [line["place"] for line in lines(stdout)]
+    assert all("route" not in line and "added" not in line for line in lines(plain))
+
+
+def test_a_route_goes_on_where_an_image_says_nothing(folder, small_street, tmp_path, monkeypatch, capsys):
+    shutil.copytree(small_street / "database", tmp_path / "asked")
+    (tmp_path / "asked/0004.png").write_text("no image")
+    Image.fromarray(np.full((20, 30, 3), 90, np.uint8)).save(tmp_path / "asked/0006.png")
+    code, stdout, _ = called(monkeypatch, capsys, "localize", f"map={folder}", f"images={tmp_path}/asked", "route=1")
+    assert code == 2
+    assert "error" in lines(stdout)[4]
+    assert [line["route"]["place"] for line in lines(stdout)] == [f"{row:04d}.png" for row in range(10)]
+
+
+@pytest.fixture
+def twice(small_street, tmp_path):
+    """A drive that passes eight places, and passes them again."""
+    (tmp_path / "drive").mkdir()
+    for number in range(16):
+        shutil.copy(small_street / f"database/{number % 8:04d}.png", tmp_path / f"drive/{number:02d}.png")
+    return tmp_path / "drive"
+
+
+def without_seconds(found):
+    return [{name: value for name, value in line.items() if name not in ("seconds", "added")} for line in found]
+
+
+def test_a_drive_finds_where_it_was_before(twice, small_street, tmp_path, monkeypatch, capsys):
+    start = tmp_path / "start"
+    (start / "database").mkdir(parents=True)
+    shutil.copytree(twice, start / "queries")
+    for number in (8, 9):  # which the drive does not pass
+        shutil.copy(small_street / f"database/{number:04d}.png", start / "database")
+    assert built(tmp_path / "map", start, monkeypatch, capsys)[0] == 0
+    Image.fromarray(np.full((240, 320, 3), 90, np.uint8)).save(twice / "16.png")  # which has no features
+    drive = [f"map={tmp_path}/map", f"images={twice}", "add=true", "recent=3", "route=1"]
+    code, stdout, stderr = called(monkeypatch, capsys, "localize", *drive)
+    assert (code, stderr) == (0, "")
+    first, names = lines(stdout), [f"{twice}/{number:02d}.png" for number in range(17)]
+    assert [line["image"] for line in first] == names
+    assert all(line["added"] for line in first)
+    assert [line["place"] for line in first[8:]] == [*names[:8], None]  # the second time, where it was the first
+    for number, line in enumerate(first):  # nothing of the newest three, nor of itself
+        assert all(one["row"] < 2 + number - 3 for one in line["alternatives"])
+    assert maps.opened(tmp_path / "map").names[2:] == names
+    _, stdout, _ = called(monkeypatch, capsys, "localize", *drive)
+    assert without_seconds(lines(stdout)) == without_seconds(first)
+    assert not any(line["added"] for line in lines(stdout))
+    assert len(maps.opened(tmp_path / "map")) == 19
+
+
+def test_a_drive_that_was_interrupted_goes_on(twice, folder, monkeypatch, capsys):
+    shutil.copytree(folder, folder.parent / "other")
+    drive, first = [f"images={twice}", "add=true", "recent=2"], [f"images=[{twice}/00.png,{twice}/01.png]"]
+    _, whole, _ = called(monkeypatch, capsys, "localize", f"map={folder}", *drive)
+    called(monkeypatch, capsys, "localize", f"map={folder.parent}/other", *first, "add=true", "recent=2")
+    _, again, _ = called(monkeypatch, capsys, "localize", f"map={folder.parent}/other", *drive)
+    assert without_seconds(lines(again)) == without_seconds(lines(whole))
+    assert [line["added"] for line in lines(again)] == [False, False, *[True] * 14]
+
+
+def test_two_do_not_add_their_drives_at_the_same_time(twice, folder, monkeypatch, capsys):
+    other = maps.opened(folder)
+    with other._adding():
+        code, stdout, stderr = called(monkeypatch, capsys, "localize", f"map={folder}", f"images={twice}", "add=true")
+    assert (code, stdout) == (2, "")
+    assert "in use by process" in stderr
+    assert stderr.count("\n") == 1
 
 
 @pytest.mark.slow

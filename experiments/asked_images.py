@@ -1,0 +1,54 @@
+"""The images that a map is asked with: files, folders, folders that are watched, and videos."""
+
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments import build
+from experiments.console import tell
+from experiments.settings import SettingsError
+from mfvpr.data.datasets import image_folder
+from mfvpr.data.images import SUFFIXES
+from mfvpr.data.videos import SUFFIXES as VIDEOS
+from mfvpr.data.videos import frames
+
+POLL = 0.2  # seconds between two looks at a folder
+
+
+def images(settings: Mapping[str, Any]) -> Iterator[tuple[str, Path | np.ndarray]]:
+    """(name, file or pixels), in their order."""
+    paths = settings["images"] if isinstance(settings["images"], list) else [settings["images"]]
+    paths = [build.expanded(path) for path in paths]
+    for path in paths:
+        if not path.exists():
+            raise SettingsError(f"images={path}: expected an image, a folder or a video, got nothing")
+    if settings["watch"] and not (len(paths) == 1 and paths[0].is_dir()):
+        raise SettingsError(f"watch=true: expected images=DIR, one folder, got {settings['images']}")
+    for path in paths:
+        if settings["watch"]:
+            yield from ((str(one), one) for one in _watched(path))
+        elif path.is_dir():
+            yield from ((str(one), one) for one in image_folder(path).paths)
+        elif path.suffix.lower() in VIDEOS:
+            yield from ((f"{path}:{number}", image) for number, image in frames(path, every=settings["every"]))
+        else:
+            yield str(path), path
+
+
+def _watched(folder: Path) -> Iterator[Path]:
+    """Images of a folder, then those that come, once their files do not change any more; until Ctrl-C."""
+    done: set[str] = set()
+    before: dict[str, tuple[int, int]] = {}
+    tell(f"watching {folder}; end with Ctrl-C")
+    while True:
+        found = {path.name: path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES}
+        states = {name: (path.stat().st_size, path.stat().st_mtime_ns) for name, path in found.items()
+                  if name not in done and path.is_file()}  # fmt: skip
+        for name in sorted(name for name, state in states.items() if before.get(name) == state):
+            done.add(name)
+            yield found[name]
+        before = states
+        time.sleep(POLL)

@@ -1,0 +1,37 @@
+"""Names from elsewhere stay in their folder."""
+
+import pytest
+
+from mfvpr.data.files import below
+from mfvpr.errors import InputError
+
+
+@pytest.fixture
+def root(tmp_path):
+    folder = tmp_path / "images"
+    (folder / "a").mkdir(parents=True)
+    (folder / "a/0.png").touch()
+    (tmp_path / "secret").touch()
+    (folder / "in").symlink_to("a/0.png")
+    (folder / "out").symlink_to("../secret")
+    (folder / "up").symlink_to(tmp_path)
+    (folder / "around").symlink_to("around")
+    return folder
+
+
+def test_files_of_a_folder(root, monkeypatch):
+    assert below(root, "a/0.png") == below(root, "in") == root / "a/0.png"
+    assert below(root, "a/no such..png") == root / "a/no such..png"
+    (root.parent / "link").symlink_to(root)
+    assert below(root.parent / "link", "in") == root / "a/0.png"  # where the folder itself is, its owner knows
+    monkeypatch.chdir(root)
+    assert below(root.relative_to(root), "in") == root / "a/0.png"
+
+
+@pytest.mark.parametrize("name", ["/etc/passwd", "../secret", "a/../../secret", "a/../a/0.png", "out", "up/secret",
+                                  "around", "a\0b", "../\n", "x" * 5000 + "/.."])  # fmt: skip
+def test_names_that_lead_elsewhere(root, name):
+    with pytest.raises(InputError, match="expected the name of a file below") as refused:
+        below(root, name)
+    assert len(str(refused.value)) < 500
+    assert "\n" not in str(refused.value)
