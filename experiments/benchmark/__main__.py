@@ -29,6 +29,7 @@ BENCHMARKS = {
     "sweeps": "grids of a score's parameters on cached matches (7 rounds)",
     "networks": "D2-Net, MixVPR, ALIKED, NetVLAD, Patch-NetVLAD, a generalized mean, SelaVPR (5 rounds; half an hour)",
     "localize": "maps of 1,000 and 10,000 images that are asked: time from file to answer (3 rounds)",
+    "kills": "shards of evaluations that are killed: whether they end as undisturbed ones do (200 kills; 15 minutes)",
     "scale": "databases of 1,000 to 10,000 images on disk: time per query and peak memory (3 rounds)",
     "city": "100,000 images, features of the shortlists alone; what 2.8 million would take (3 rounds, 2 GB of disk)",
 }

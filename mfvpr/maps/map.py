@@ -18,10 +18,11 @@ from mfvpr.features.vlad import Vlad, VladFitting
 from mfvpr.fingerprints import fingerprint, recipe_of
 from mfvpr.maps.answers import Alternative, Answer, Asked
 from mfvpr.maps.describing import Describing, Image, local_features
+from mfvpr.maps.matching import matched
 from mfvpr.maps.resident import Resident
 from mfvpr.maps.shifts import shift_of
 from mfvpr.maps.vectors import Vectors
-from mfvpr.matchers import NEIGHBORS, Matcher, match_pairs
+from mfvpr.matchers import NEIGHBORS, Matcher
 from mfvpr.progress import Track, untracked
 from mfvpr.reranking import score_candidates
 from mfvpr.results import Ranked
@@ -255,7 +256,7 @@ class Map:
         refused = self.threshold is not None and not (p is not None and p >= self.threshold)
         found = tuple(Alternative(row, self._entries[row].name, self._entries[row].place, float(score))
                       for row, score in zip(rows[order].tolist(), scores[order], strict=True))  # fmt: skip
-        best = jax.device_get(jax.tree.map(lambda leaf: leaf[order[0] : order[0] + 1], matches))
+        best = jax.tree.map(lambda leaf: leaf[order[0] : order[0] + 1], matches)
         answer = Answer(None if refused else found[0].place, found, found[0].score, p, *shift_of(self.scorer, best))
         return Asked(answer, described, jax.tree.map(lambda leaf: leaf[0], best))
 
@@ -263,9 +264,7 @@ class Map:
         """Matches `[C, K, ...]` with all candidates; those that there are not have none."""
         arrays, slots = resident.hold(rows.tolist(), features, self._vectors.total)
         query = stacked([features], resident.capacity, total=1)
-        pairs = np.zeros((self.candidates, 2), np.int32)
-        pairs[: len(slots), 1] = slots
-        return match_pairs(query, arrays, pairs, np.int32(len(slots)), self.matcher)
+        return matched(query, arrays, slots, self.candidates, self.matcher)
 
     @contextmanager
     def _adding(self) -> Iterator["_Made"]:

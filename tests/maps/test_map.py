@@ -21,6 +21,7 @@ from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
 from mfvpr.filters import Retrieval
 from mfvpr.maps import Map
+from mfvpr.maps import matching as map_matching
 from mfvpr.maps.resident import Resident
 from mfvpr.pipeline import explain
 from mfvpr.stores import maps as map_store
@@ -59,6 +60,14 @@ def test_answers_are_those_of_an_evaluation_with_a_store(dataset, folder, tmp_pa
         np.testing.assert_allclose(scores, ranked.scores[query], rtol=1e-5)
         assert answer.place == ranked.rows[query, 0]
         assert answer.score == scores[0]
+
+
+def test_answers_do_not_depend_on_the_cores(dataset, folder, monkeypatch):
+    answers = []
+    for cores in (1, 2, 3, 7):
+        monkeypatch.setattr(map_matching, "available_cpus", lambda cores=cores: cores)
+        answers.append([asked(folder).localize(path).as_json() for path in dataset.queries.paths[:4]])
+    assert answers[1:] == answers[:1] * 3
 
 
 def test_an_image_of_the_map_is_found_where_it_is(dataset, folder):

@@ -15,6 +15,7 @@ import pytest
 
 from mfvpr import InputError
 from mfvpr.stores.features import forecast_bytes, open_store
+from tests.small_disks import UNSHARE, mount, need_small_disks
 from tests.stores.made_up import (
     DAMAGE,
     FEATURES,
@@ -277,14 +278,10 @@ def test_killed_processes_end_in_the_same_files(tmp_path, kind, rounds):
 # Disks
 
 
-def _mount(folder: Path, *options: str) -> None:
-    subprocess.run(["mount", "-t", "tmpfs", *options, "none", str(folder)], check=True, capture_output=True)
-
-
 def full_disk(root: str) -> None:
     """A store on a disk of 5 MB, which then grows: what is told, and what is left. Prints JSON."""
     disk, told = Path(root), {}
-    _mount(disk, "-o", "size=5m")
+    mount(disk, "-o", "size=5m")
 
     def extract() -> list[int]:
         with open_store(disk / "s", RECIPE, num_images=12) as store:
@@ -300,20 +297,20 @@ def full_disk(root: str) -> None:
             told[name] = str(error)
     kept = read_all(disk / "s", 12)
     told["kept"] = [row for row, found in kept.items() if (found.scores == features_of(row, 700, 512).scores).all()]
-    _mount(disk, "-o", "remount,size=12m")
+    mount(disk, "-o", "remount,size=12m")
     told["resumed"] = extract()
     told["all"] = len(read_all(disk / "s", 12))
     (disk / "ballast").write_bytes(bytes(shutil.disk_usage(disk).free))
     told["read_when_full"] = len(read_all(disk / "s", 12))
-    _mount(disk, "-o", "remount,ro")
+    mount(disk, "-o", "remount,ro")
     told["read_when_read_only"] = len(read_all(disk / "s", 12))
     try:
         read_all(disk / "new", 12)
     except InputError as error:
         told["new"] = str(error)
-    _mount(disk, "-o", "remount,rw")
+    mount(disk, "-o", "remount,rw")
     DAMAGE["flipped"](file_of(disk / "s", 3))
-    _mount(disk, "-o", "remount,ro")
+    mount(disk, "-o", "remount,ro")
     try:
         read_all(disk / "s", 12)
     except InputError as error:
@@ -322,16 +319,8 @@ def full_disk(root: str) -> None:
 
 
 def test_a_full_disk_is_told_and_extraction_goes_on_when_it_is_not(tmp_path):
-    unshare = ("unshare", "--map-root-user", "--mount")
-    possible = (
-        shutil.which("unshare")
-        and not subprocess.run(
-            [*unshare, "mount", "-t", "tmpfs", "none", str(tmp_path)], capture_output=True
-        ).returncode
-    )
-    if not possible:
-        pytest.skip("the kernel does not let this user mount a small disk")
-    told = json.loads(run_here(f"full_disk({str(tmp_path)!r})", prefix=unshare))
+    need_small_disks(tmp_path)
+    told = json.loads(run_here(f"full_disk({str(tmp_path)!r})", prefix=UNSHARE))
     done = told["kept"]
     assert 5 <= len(done) <= 8
     for name in ("first", "second"):
