@@ -1,6 +1,5 @@
 """Checked settings -> the library's values. Plain tables of names; nothing of a user's YAML is ever called."""
 
-import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
@@ -197,10 +196,11 @@ def _files(group: str, settings: dict[str, Any], data: Dataset | None) -> dict[P
 def archive(settings: dict[str, Any]) -> Archive:
     """Where what is taken from images is kept."""
     root = None if settings["store"] is None else expanded(settings["store"])
-    shard = settings.get("shard") and Shard.parse(settings["shard"])
+    shard = None if settings.get("shard") is None else Shard.parse(settings["shard"])
+    if shard is not None and settings["coordinator"]:
+        shard = replace(shard, meets=True)
     return Archive(root, skip_bad=settings["on_bad_image"] == "skip", track=console.track, tell=console.tell,
-                   wait=settings.get("multirun", False), shard=shard,
-                   patience=math.inf if settings.get("coordinator") else settings.get("wait", 0))  # fmt: skip
+                   wait=settings.get("multirun", False), shard=shard, patience=settings.get("wait", 0))  # fmt: skip
 
 
 def where(settings: dict[str, Any]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ What is computed lies in the stores; the results are in DIR, when the last task 
 import fcntl
 import json
 import os
+import uuid
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -43,11 +44,20 @@ def joined(settings: Mapping[str, Any]) -> Iterator[Callable[[str], None]]:
     shard, folder = Shard.parse(settings["shard"]), task_folder(settings).parent
     own = {name: value for name, value in settings.items() if name not in _OWN}
     about = {"shards": shard.count, "dataset": settings["dataset"]["name"], "settings": own}
+    about["store"] = _identity(build.expanded(settings["store"]))
     _agreed(folder / "run.json", about, f"shard={shard}")
     task = task_folder(settings)
     task.mkdir(parents=True, exist_ok=True)
     with locked(task, "the part of a run"):
         yield lambda state: write_text(task / "state.json", json.dumps({"state": state}))
+
+
+def _identity(store: Path) -> str:
+    """What tells a folder of stores from one of the same path on another machine, whose rows nobody else would see."""
+    try:
+        return written_once(store / "identity", uuid.uuid4().hex)
+    except OSError as error:
+        raise SettingsError(f"store={store}: cannot be written or read ({error.strerror}); name another") from error
 
 
 def task_folder(settings: Mapping[str, Any]) -> Path:
@@ -89,6 +99,9 @@ def _agreed(path: Path, about: Mapping[str, Any], who: str) -> None:
         found = read(path, written_once(path, json.dumps(about, indent=1, ensure_ascii=True, allow_nan=False)))
     except OSError as error:
         raise SettingsError(f"{path}: cannot be written or read ({error.strerror}); name another out=DIR") from error
+    if (own := about.get("store")) != found.get("store"):
+        raise SettingsError(f"{who}: expected the store= of the task that came first, got another folder ({own}); all "
+                            "tasks share one, on whatever machine")  # fmt: skip
     if differs := difference(json.loads(json.dumps(about)), found):
         raise SettingsError(f"{who}: {differs} by the task that came first ({path}); set that, or name another out=DIR")
 

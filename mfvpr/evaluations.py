@@ -137,7 +137,8 @@ def _scored(
     with open_score_store(path, recipe, num_queries=len(names), **archive.store_options) as store:
         own = archive.shard.rows(names)
         missing = [row for row in own if not store.done[row]]
-        if missing or not own:  # then it has images only
+        # One without queries has images to take; and what is done together, all must do or none.
+        if missing or not own or (archive.shard.meets and not store.done.all()):
             part = match(own)
         if missing:  # all are scored, so that what goes on has the bits of one run
             scores = np.stack([*score(part).values()], axis=1)

@@ -75,7 +75,8 @@ def match_sequence(
             recipe = matches_recipe(dataset, sequence, extractor, filter, candidates, matching, archive)
             stores = [held.enter_context(one) for one in _match_stores(sequence, extractor, recipe, archive)]
         weights = tuple(scale.weight for scale in extractor.scales)
-        if kept := _kept(sequence, stores, rows, archive, watch, where.get("memory")):
+        is_joint = rows is not None and archive.shard is not None and archive.shard.meets
+        if kept := None if is_joint else _kept(sequence, stores, rows, archive, watch, where.get("memory")):
             kept = replace(kept, weights=weights)
             return kept if rows is not None else _looked_at(kept, archive)
         with watch("filter"):

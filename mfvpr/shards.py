@@ -8,6 +8,7 @@ not done: started again, it goes on from there. The last one finds everything, a
 """
 
 import hashlib
+import math
 import re
 import time
 from collections.abc import Callable, Sequence
@@ -40,10 +41,13 @@ class Shard:
     Attributes:
         index: of this part, from 0.
         count: of parts.
+        meets: all are at work at the same time: each waits for the others as long as they take, and does what they do
+            together (`mfvpr.distributed`) also where it needs no more of it.
     """
 
     index: int
     count: int
+    meets: bool = False
 
     def __post_init__(self) -> None:
         """Refuse a part that there is not."""
@@ -62,7 +66,7 @@ class Shard:
         """
         if not (found := re.fullmatch(r"(\d{1,9})/(\d{1,9})", text, re.ASCII)):
             raise InputError(f"shard={text}: expected i/n, such as 0/8, the first of eight")
-        return cls(*map(int, found.groups()))
+        return cls(int(found[1]), int(found[2]))
 
     @property
     def folder(self) -> str:
@@ -95,7 +99,9 @@ class Shard:
         Raises:
             NotYet: some still are.
         """
-        end = time.monotonic() + patience  # of this machine alone: clocks of others may say anything
+        end = time.monotonic() + (
+            math.inf if self.meets else patience
+        )  # of this machine alone: clocks of others may say anything
         while lacking := missing():
             if (left := end - time.monotonic()) <= 0:
                 whose = indices([shard_of(names[row], self.count) for row in lacking])

@@ -146,3 +146,11 @@ def test_a_task_that_dies_ends_the_others_and_all_go_on(tmp_path):
     outputs = [one.communicate() for one in again]
     assert [one.returncode for one in again] == [0, 0], outputs
     assert tables(tmp_path / "out") == tables(expected)
+    # One has nothing left to do but what all do together.
+    (tmp_path / "out" / "results.json").unlink()
+    for path in (tmp_path / "store").glob("scores-*/shards/1-of-2/*.npz"):
+        path.unlink()
+    again = tasks()
+    outputs = [one.communicate(timeout=200) for one in again]
+    assert [one.returncode for one in again] == [0, 0], outputs
+    assert tables(tmp_path / "out") == tables(expected)

@@ -103,6 +103,9 @@ def test_tasks_must_agree(task, asked, tmp_path, root, settings):
     assert code == 2
     assert error.count("\n") == 1 or "data.json" in error
     assert "images.database" in error
+    code, _, error = task("1/2", f"store={tmp_path}/local")  # of the same path on another machine, as it were
+    assert code == 2
+    assert "shard=1/2: expected the store= of the task that came first, got another folder" in error
     (tmp_path / "out" / "shards" / "run.json").write_text("{")
     code, _, error = task("1/2")
     assert code == 2
