@@ -46,17 +46,15 @@ def evaluate(settings: dict[str, Any]) -> None:
         with run_folder.claimed(settings) as folder:
             _leave(folder, evaluated(settings))
         return
-    with sharding.joined(settings) as says:
+    with sharding.joined(settings):
         try:
             outcome = evaluated(settings)
-        except NotYet as wait:
-            says(sharding.COMPLETE if wait.is_complete else f"waits: {wait}")
-            done, again = (
-                ("its part", "the last shard leaves the results")
-                if wait.is_complete
-                else ("what it can", "start it again when they are there")
-            )
-            print(f"shard {settings['shard']} has done {done}: {wait}; {again}")
+        except NotYet as needs:
+            sharding.wait(settings, needs)
+            done, then = ("what it can", "start it again when they are there")
+            if needs.is_complete:
+                done, then = ("its part", "the last shard leaves the results")
+            print(f"shard {settings['shard']} has done {done}: {needs}; {then}")
             return
         meeting.part()
         with sharding.last(settings) as is_last:
@@ -65,7 +63,7 @@ def evaluate(settings: dict[str, Any]) -> None:
                     _leave(folder, outcome)
             else:
                 print(f"shard {settings['shard']} is complete; results: {settings['out']}")
-        says(sharding.COMPLETE)
+        sharding.complete(settings)
 
 
 def _leave(folder: Path, outcome: Outcome) -> None:

@@ -12,7 +12,7 @@ import fcntl
 import json
 import os
 import uuid
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -23,19 +23,20 @@ from experiments.settings import SettingsError
 from mfvpr.data.files import write_text, written_once
 from mfvpr.fingerprints import difference
 from mfvpr.report import runs
-from mfvpr.shards import Shard
+from mfvpr.shards import NotYet, Shard
 from mfvpr.stores.disk import locked
 
 SHARDS = "shards"
 COMPLETE = "complete"
 _FORMAT = "mfvpr shards 1"
+_STATE = "state.json"
 # What may differ from machine to machine. Images are compared by what they hold.
 _OWN = ("shard", "wait", "coordinator", "out", "store", "memory", "devices", "dataset", "multirun", "command")
 
 
 @contextmanager
-def joined(settings: Mapping[str, Any]) -> Iterator[Callable[[str], None]]:
-    """A task of a run, which no other process does meanwhile; what is yielded keeps what it says of itself.
+def joined(settings: Mapping[str, Any]) -> Iterator[None]:
+    """A task of a run, which no other process does meanwhile.
 
     Raises:
         SettingsError: the folder is of a run with other settings, or of another number of shards.
@@ -43,13 +44,23 @@ def joined(settings: Mapping[str, Any]) -> Iterator[Callable[[str], None]]:
     """
     shard, folder = Shard.parse(settings["shard"]), task_folder(settings).parent
     own = {name: value for name, value in settings.items() if name not in _OWN}
+    _check_empty(folder)
     about = {"shards": shard.count, "dataset": settings["dataset"]["name"], "settings": own}
     about["store"] = _identity(build.expanded(settings["store"]))
     _agreed(folder / "run.json", about, f"shard={shard}")
     task = task_folder(settings)
     task.mkdir(parents=True, exist_ok=True)
     with locked(task, "the part of a run"):
-        yield lambda state: write_text(task / "state.json", json.dumps({"state": state}))
+        yield
+
+
+def _check_empty(folder: Path) -> None:
+    """That the first task finds nothing of others."""
+    if (folder / "run.json").exists() or not folder.parent.is_dir():
+        return
+    if found := sorted(path.name for path in folder.parent.iterdir() if path.name != SHARDS):
+        raise SettingsError(f"out={folder.parent}: expected a new or empty folder, or that of other shards of this "
+                            f"run, got one that holds {found[0]}; name another")  # fmt: skip
 
 
 def _identity(store: Path) -> str:
@@ -63,6 +74,22 @@ def _identity(store: Path) -> str:
 def task_folder(settings: Mapping[str, Any]) -> Path:
     """What a task keeps of itself."""
     return _folder(build.expanded(settings["out"])) / Shard.parse(settings["shard"]).folder
+
+
+def wait(settings: Mapping[str, Any], needs: NotYet) -> None:
+    """Keep what this task waits for; others that were complete, and are needed again (damaged rows go), are not."""
+    own = task_folder(settings)
+    write_text(own / _STATE, json.dumps({"state": COMPLETE if needs.is_complete else f"waits: {needs}"}))
+    shard = Shard.parse(settings["shard"])
+    for index in needs.shards:
+        other = own.parent / Shard(index, shard.count).folder
+        if _state(other) == COMPLETE:
+            write_text(other / _STATE, json.dumps({"state": f"something is missing again, says {shard}"}))
+
+
+def complete(settings: Mapping[str, Any]) -> None:
+    """Keep that this task has nothing left to do."""
+    write_text(task_folder(settings) / _STATE, json.dumps({"state": COMPLETE}))
 
 
 def check_data(settings: Mapping[str, Any], images: Images) -> None:
@@ -115,8 +142,9 @@ def read(path: Path, text: str | None = None) -> dict[str, Any]:
     try:
         found = json.loads(path.read_text(encoding="utf-8") if text is None else text)
         if found["format"] == _FORMAT:
+            Shard(0, int(found.get("shards", 1)))
             return found
-    except (OSError, ValueError, LookupError, TypeError):
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
         pass
     raise SettingsError(f"{path}: expected a file of a run with shard=i/n and out=DIR, got none, or something else")
 
@@ -143,7 +171,7 @@ def _state(task: Path) -> str:
     if _is_held(task / "lock"):
         return "at work"
     try:
-        return str(json.loads((task / "state.json").read_text(encoding="utf-8"))["state"])
+        return str(json.loads((task / _STATE).read_text(encoding="utf-8"))["state"])
     except FileNotFoundError:
         return "interrupted" if task.exists() else "not begun"
     except (OSError, ValueError, LookupError, TypeError):

@@ -227,6 +227,7 @@ class Archive:
                 for sink in taken.sinks:
                     if sink.store is not None:
                         held.enter_context(sink.store)
+            taken.know_bad()
             own = rows if self.shard is None else self.shard.rows(folder.names, rows)
             missing = taken.lacks(own)
             self._announce(extractor, taken, missing, len(rows), len(folder), label)

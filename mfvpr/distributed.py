@@ -45,6 +45,8 @@ def retrieve_spread(
 ) -> Shortlist:
     """The shortlist that `mfvpr.retrieve` finds: each device looks for the best of its rows, then for those of all.
 
+    Scores may differ in their last bits, and with them the order of near ties.
+
     Args:
         queries: `[Q, D]`, the same in every process.
         database: `[N, D]`, of which a process reads the rows of its own devices alone: it may be mapped from a file.

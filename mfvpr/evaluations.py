@@ -19,6 +19,7 @@ from mfvpr.archive import Archive
 from mfvpr.checks import check_request, nan_scores
 from mfvpr.cohort import cohort_sequence, hubness
 from mfvpr.data.datasets import Dataset, QuerySequence
+from mfvpr.errors import InputError
 from mfvpr.features import Extractor, Source
 from mfvpr.filters import Filter
 from mfvpr.frame_correlation import FrameCorrelation
@@ -32,8 +33,9 @@ from mfvpr.scoring import Scorer
 from mfvpr.sequence_matching import match_sequence, matches_recipe
 from mfvpr.shards import together
 from mfvpr.stores.manifest import SCORES, store_path
-from mfvpr.stores.scores import open_score_store
+from mfvpr.stores.scores import QueryScores, ScoreStore, open_score_store
 
+Tools = tuple[Extractor | Source, Filter, int | Literal["all"]]
 Scored = tuple[Matched, dict[str, np.ndarray]]  # of a sequence, and its scores [Q, C] by name of the scorer
 
 
@@ -109,7 +111,7 @@ def evaluate(
 def _scored(
     dataset: Dataset,
     sequence: QuerySequence,
-    tools: tuple[Extractor | Source, Filter, int | Literal["all"]],
+    tools: Tools,
     scorers: Mapping[str, Scorer],
     watch: Stopwatch,
     *,
@@ -131,26 +133,53 @@ def _scored(
     if archive.shard is None or archive.root is None:
         matched = match()
         return matched, score(matched)
-    made = matches_recipe(dataset, sequence, *tools, how["matching"], archive)
-    recipe = {"matches": made, "scorers": archive.recipe_of(dict(scorers))}
-    names, path = sequence.images.names, store_path(archive.root, "scores", recipe, SCORES)
-    with open_score_store(path, recipe, num_queries=len(names), **archive.store_options) as store:
+    names, who = sequence.images.names, sorted(scorers)
+    with _score_store(dataset, sequence, tools, scorers, how["matching"], archive) as store:
         own = archive.shard.rows(names)
         missing = [row for row in own if not store.done[row]]
         # One without queries has images to take; and what is done together, all must do or none.
         if missing or not own or (archive.shard.meets and not store.done.all()):
             part = match(own)
-        if missing:  # all are scored, so that what goes on has the bits of one run
-            scores = np.stack([*score(part).values()], axis=1)
-            store.write({row: scores[own.index(row)] for row in missing})
+            if missing:  # all are scored, so that what goes on has the bits of one run
+                found = score(part)
+                by_query = np.stack([found[name] for name in who], axis=1)
+                rows = map(QueryScores, by_query, np.asarray(part.candidates.indices))
+                store.write({row: scores for row, scores in zip(own, rows, strict=True) if row in {*missing}})
 
         def lacking() -> Sequence[int]:
             store.look()
             return np.flatnonzero(~store.done).tolist()
 
         archive.shard.wait(lacking, names, f"{sequence.name} scores", patience=archive.patience, is_complete=True)
-        by_query = np.stack([scores for _, scores in store.read()])
-    return match(), dict(zip(scorers, np.moveaxis(by_query, 1, 0), strict=True))
+        stored = [query for _, query in store.read()]
+    matched = match()
+    if (np.stack([query.indices for query in stored]) != matched.candidates.indices).any():
+        raise InputError(f"{store.folder}: expected scores of these candidates, got those of another shortlist; delete "
+                         "this folder, and run again")  # fmt: skip
+    by_scorer = np.stack([query.scores for query in stored], axis=1)
+    return matched, {name: by_scorer[who.index(name)] for name in scorers}
+
+
+def _score_store(
+    dataset: Dataset, sequence: QuerySequence, tools: Tools, scorers: Mapping[str, Scorer], matching: Matcher,
+    archive: Archive,
+) -> ScoreStore:  # fmt: skip
+    """Of a shard; scorers are told by what they are, not by what they call."""
+    if archive.root is None or not scorers:
+        raise InputError("scorers: expected at least one, got none; a shard keeps their scores")
+    recipes, extractor = {}, tools[0]
+    for name, scorer in scorers.items():
+        try:
+            recipes[name] = archive.recipe_of(scorer)
+        except TypeError as error:
+            raise InputError(f"{name}: a shard keeps scores, and must know what makes them: {error}") from None
+    recipe = {
+        "matches": matches_recipe(dataset, sequence, *tools, matching, archive),
+        "scorers": recipes,
+        "scale weights": [scale.weight for scale in extractor.scales],
+    }
+    path = store_path(archive.root, "scores", recipe, SCORES)
+    return open_score_store(path, recipe, num_queries=len(sequence.images), **archive.store_options)
 
 
 def _scored_cohort(

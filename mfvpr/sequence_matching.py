@@ -14,8 +14,9 @@ from mfvpr import pipeline
 from mfvpr.archive import Archive
 from mfvpr.checks import check_matching, checked_candidates, wrong_with
 from mfvpr.cohort import cohort_sequence
+from mfvpr.data.arrays import read_arrays, write_arrays
 from mfvpr.data.datasets import Dataset, ImageFolder, QuerySequence
-from mfvpr.data.files import write_text
+from mfvpr.data.files import placing, write_text
 from mfvpr.features import Extractor, Source
 from mfvpr.filters import Filter, Filtered
 from mfvpr.fingerprints import recipe_of
@@ -26,8 +27,10 @@ from mfvpr.results import Matched
 from mfvpr.shards import together
 from mfvpr.sources import FeatureSet
 from mfvpr.stores.matches import MatchStore
+from mfvpr.types import Shortlist
 
 _REMARKS = "images.json"  # beside the matches: which images are bad
+_SHORTLIST = "shortlist.npz"  # likewise, of shards
 
 
 def match_sequence(
@@ -80,9 +83,7 @@ def match_sequence(
             kept = replace(kept, weights=weights)
             return kept if rows is not None else _looked_at(kept, archive)
         with watch("filter"):
-            filtered = filter.shortlist(sequence, database, num_candidates, archive)
-            sizes = len(sequence.images), len(database), num_candidates
-            filtered = checked_candidates(filtered, type(filter).__name__, *sizes)
+            filtered = _filtered(sequence, database, filter, num_candidates, archive, stores)
         with watch("features"):
             sides, bad = _features(dataset, sequence, extractor, filtered, archive)
         _remark(stores, archive, bad)
@@ -95,6 +96,30 @@ def match_sequence(
     given = filtered.candidates if rows is None else jax.tree.map(lambda of: of[rows], filtered.candidates)
     matched = Matched(sequence, given, matches, bad["queries"], bad["database"], weights)
     return matched if rows is not None else _looked_at(matched, archive)
+
+
+def _filtered(
+    sequence: QuerySequence, database: ImageFolder, filter: Filter, num_candidates: int, archive: Archive,
+    stores: Sequence[MatchStore],
+) -> Filtered:  # fmt: skip
+    """The shortlist; of shards, what the first of them found: on another machine near ties may come out otherwise."""
+
+    def found() -> Filtered:
+        sizes = len(sequence.images), len(database), num_candidates
+        shortlist = filter.shortlist(sequence, database, num_candidates, archive)
+        return checked_candidates(shortlist, type(filter).__name__, *sizes)
+
+    if archive.shard is None:
+        return found()
+    path, about = stores[0].folder / _SHORTLIST, stores[0].folder.name
+    if archive.shard.meets or not path.exists():
+        candidates, *bad = found()
+        arrays = {"indices": candidates.indices, "scores": candidates.scores, "bad": np.array(json.dumps(bad))}
+        with placing(path) as temporary:
+            write_arrays(temporary, arrays, about)
+    kept = read_arrays(path, about)
+    bad = [{int(row): reason for row, reason in side.items()} for side in json.loads(str(kept["bad"]))]
+    return Filtered(Shortlist(kept["indices"], kept["scores"], kept["indices"] >= 0), *bad)
 
 
 def match_cohort(

@@ -3,15 +3,17 @@
     archive = Archive(root, shard=Shard(2, 8))
     mfvpr.evaluate(dataset, extractor, filter, scorers, archive=archive)  # NotYet, until all eight have done theirs
 
-Each takes its own images, then matches and scores its own queries, and stops (`NotYet`) where it needs what others have
-not done: started again, it goes on from there. The last one finds everything, and gives the result.
+Each takes its own images, then matches and scores its own queries, and stops (`NotYet`) where it needs what others
+have not done: started again, it goes on from there. The last one finds everything, and gives the result. Candidates are
+those that the first shard found, whatever bits another machine would give. Scores are kept by what scorers are, as
+features by their extractors, not by what these call: after a change there, the stores must be others.
 """
 
 import hashlib
 import math
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,13 +27,14 @@ class NotYet(Exception):
     """What other shards have not done; its text is one line, which says what and whose.
 
     Attributes:
+        shards: that lack something.
         is_complete: whether this shard has nothing left to do.
     """
 
-    def __init__(self, what: str, *, is_complete: bool = False) -> None:
+    def __init__(self, what: str, shards: Iterable[int] = (), *, is_complete: bool = False) -> None:
         """See the class."""
         super().__init__(what)
-        self.is_complete = is_complete
+        self.shards, self.is_complete = frozenset(shards), is_complete
 
 
 @dataclass(frozen=True)
@@ -104,10 +107,9 @@ class Shard:
         )  # of this machine alone: clocks of others may say anything
         while lacking := missing():
             if (left := end - time.monotonic()) <= 0:
-                whose = indices([shard_of(names[row], self.count) for row in lacking])
-                raise NotYet(
-                    f"{what}: {len(lacking)} of {len(names)} are missing, of shards {whose}", is_complete=is_complete
-                )
+                whose = {shard_of(names[row], self.count) for row in lacking}
+                line = f"{what}: {len(lacking)} of {len(names)} are missing, of shards {indices(whose)}"
+                raise NotYet(line, whose, is_complete=is_complete)
             time.sleep(min(POLL, left))
 
 
@@ -116,7 +118,7 @@ def shard_of(name: str, count: int) -> int:
     return int.from_bytes(hashlib.sha256(name.encode("utf-8", "surrogateescape")).digest()[:8]) % count
 
 
-def indices(some: Sequence[int]) -> str:
+def indices(some: Iterable[int]) -> str:
     """As an array expression, such as `0,2-4`."""
     ordered, parts = sorted(set(some)), []
     for index in ordered:
@@ -141,5 +143,6 @@ def together(*calls: Callable[[], Any]) -> list[Any]:
             waits.append(error)
     if waits:
         lines = dict.fromkeys(map(str, waits))
-        raise NotYet("; ".join(lines), is_complete=len(given) + sum(wait.is_complete for wait in waits) == len(calls))
+        whose = frozenset[int]().union(*(wait.shards for wait in waits))
+        raise NotYet("; ".join(lines), whose, is_complete=all(wait.is_complete for wait in waits))
     return given

@@ -67,8 +67,14 @@ class Taken:
         for sink in self.sinks if self.lacks(rows) else ():
             if sink.store is not None:
                 sink.store.look()
-                self.bad |= known_bad(sink.store)
+        self.know_bad()
         return self.lacks(rows)
+
+    def know_bad(self) -> None:
+        """What shards said is bad stays so, or each would have its own data set."""
+        store = self.sinks[0].store
+        if store is not None and store.shard is not None:
+            self.bad |= known_bad(store)
 
     def leave_bad(self) -> None:
         """Tell other shards which images are."""

@@ -1,6 +1,7 @@
 """Strict arithmetic for every test: no silent rank promotion, warnings are errors (pyproject.toml)."""
 
 import os
+import shutil
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -88,3 +89,16 @@ def weights(tmp_path_factory) -> Path:
 def small_street(tmp_path_factory) -> Path:
     """Ten frames of the drawn street: database/, queries/, ground_truth.csv."""
     return streets_folder(tmp_path_factory.mktemp("cache"), num_frames=10, image_size=(320, 240))
+
+
+@pytest.fixture(scope="session")
+def split(small_street, tmp_path_factory) -> list[Path]:
+    """The queries in two folders, 3 and 7 of them, with the rows of the database that they show."""
+    root = tmp_path_factory.mktemp("split")
+    for name, rows in (("first", range(3)), ("second", range(3, 10))):
+        (root / name).mkdir()
+        for row in rows:
+            shutil.copy(small_street / "queries" / f"{row:04d}.png", root / name)
+        lines = [f"{row:04d}.png,{row:04d}.png\n" for row in rows]
+        (root / name / "truth.csv").write_text("query,database\n" + "".join(lines))
+    return [root / "first", root / "second"]

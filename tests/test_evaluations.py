@@ -49,19 +49,6 @@ def result(dataset):
     return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=5, fused={"histogram": Fusion(c=10.0)})
 
 
-@pytest.fixture(scope="module")
-def split(small_street, tmp_path_factory):
-    """The queries in two folders, 3 and 7 of them, with the rows of the database that they show."""
-    root = tmp_path_factory.mktemp("split")
-    for name, rows in (("first", range(3)), ("second", range(3, 10))):
-        (root / name).mkdir()
-        for row in rows:
-            shutil.copy(small_street / "queries" / f"{row:04d}.png", root / name)
-        lines = [f"{row:04d}.png,{row:04d}.png\n" for row in rows]
-        (root / name / "truth.csv").write_text("query,database\n" + "".join(lines))
-    return [root / "first", root / "second"]
-
-
 def test_systems_and_their_recall(dataset, result):
     assert list(result.systems) == ["filter", "histogram", "count", "histogram + filter"]
     [matched] = result.matched

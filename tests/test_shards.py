@@ -4,8 +4,10 @@ import hashlib
 import json
 import random
 import re
+import shutil
 from dataclasses import dataclass, replace
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import given
@@ -13,17 +15,19 @@ from hypothesis import strategies as st
 
 import mfvpr
 from mfvpr.archive import Archive
-from mfvpr.data.datasets import folder_dataset
+from mfvpr.data.arrays import read_arrays, write_arrays
+from mfvpr.data.datasets import folder_dataset, sequences_dataset
 from mfvpr.errors import InputError
-from mfvpr.features import Aggregated, Description
+from mfvpr.features import Aggregated, Description, Scale
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
-from mfvpr.filters import Retrieval
+from mfvpr.filters import Filtered, Retrieval
 from mfvpr.fingerprints import recipe_of
 from mfvpr.frame_correlation import FrameCorrelation
 from mfvpr.rankings import Fusion
 from mfvpr.shards import NotYet, Shard, indices, shard_of, together
 from mfvpr.stores.vectors import open_vector_store
+from mfvpr.types import Shortlist
 
 SIFT = Sift(max_keypoints=60, image_size=(160, 120))
 VLAD = Retrieval(Aggregated(SIFT, VladFitting(num_words=8)))
@@ -124,6 +128,137 @@ def test_local_features_are_those_of_candidates_only(dataset, tmp_path):
         return sorted(path.name for path in root.rglob("*-*.npz") if path.name[0].isdigit() and "Sift" in str(path))
 
     assert files(tmp_path / "s") == files(kept)
+
+
+class TwoScales:
+    """A global descriptor and local features of two scales from one pass."""
+
+    image_size, interpolation, batch_size, vector_size = SIFT.image_size, SIFT.interpolation, 3, 3
+    scales, recipe = (Scale(128, 60), Scale(128, 30, weight=0.5)), "two scales"
+
+    def __call__(self, images):
+        vectors = [one.vector for one in Mean()(images)]
+        every = [one.features for one in SIFT(images)]
+        halves = [jax.tree.map(lambda field: field if field.shape == (2,) else field[::2], one) for one in every]
+        return [Description(*parts) for parts in zip(vectors, zip(every, halves, strict=True), strict=True)]
+
+
+def test_several_sequences_and_scales_and_more_shards_than_images(small_street, split, tmp_path):
+    """On matches that memory does not hold."""
+    several = sequences_dataset(
+        small_street / "database", split, ground_truth="index", index_file="truth.csv", widen_index=True
+    )
+    extractor = TwoScales()
+    how = {"candidates": 3, "memory": 1e-4}
+    expected = mfvpr.evaluate(several, extractor, Retrieval(extractor), SCORERS, archive=Archive(tmp_path / "s"), **how)
+    for count in (3, 17):
+        results, _ = shared(
+            tmp_path / f"s{count}", count,
+            lambda archive: mfvpr.evaluate(several, extractor, Retrieval(extractor), SCORERS, archive=archive, **how),
+        )  # fmt: skip
+        assert_same(results[0], expected)
+
+
+@pytest.mark.parametrize("store", ["Sift", "matches", "scores"])
+def test_damaged_rows_of_any_shard_are_made_again(dataset, tmp_path, store):
+    def run(archive):
+        try:
+            return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, archive=archive)
+        except InputError as error:  # the row is removed, and its shard makes it again
+            told.append(str(error))
+            raise NotYet(str(error)) from None
+
+    told = []
+    expected = run(Archive(tmp_path / "plain"))
+    shared(tmp_path / "s", 2, run)
+    rows = [path for path in (tmp_path / "s").glob(f"{store}-*/shards/*/[0-9]*-*.npz") if "-0.npz" not in path.name]
+    rows[0].write_bytes(b"damaged")
+    if store == "Sift":  # which nobody reads again, unless what is made of it is gone
+        for path in (tmp_path / "s").glob("[ms]*-*"):
+            shutil.rmtree(path)
+    elif store == "matches":
+        [row] = (tmp_path / "s").glob(f"scores-*/shards/*/{rows[0].name.partition('-')[0]}-*.npz")
+        row.unlink()
+    results, _ = shared(tmp_path / "s", 2, run)
+    assert_same(results[0], expected)
+    assert len(told) == 1
+    assert "are damaged on disk, the first in row" in told[0]
+
+
+def test_scores_are_known_by_their_scorers_and_candidates(dataset, split, small_street, tmp_path):
+    """Whatever the order of the scorers, and the weights of the scales, which no feature depends on."""
+    one = Archive(tmp_path, shard=Shard(0, 1))
+    first = mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, archive=one)
+    turned = mfvpr.evaluate(dataset, SIFT, VLAD, dict(reversed(SCORERS.items())), candidates=3, archive=one)
+    assert [*turned.systems] == ["filter", "count", "histogram"]
+    assert_same(turned, first)
+    for weight in (1.0, 5.0):
+        extractor = TwoScales()
+        extractor.scales = (Scale(128, 60), Scale(128, 30, weight=weight))
+        how = (dataset, extractor, Retrieval(extractor), SCORERS)
+        assert_same(mfvpr.evaluate(*how, archive=one), mfvpr.evaluate(*how, archive=Archive(tmp_path / "plain")))
+    for path in tmp_path.glob("matches-*/shortlist.npz"):
+        kept = read_arrays(path, path.parent.name)
+        write_arrays(path, kept | {"indices": np.roll(kept["indices"], 1, axis=0)}, path.parent.name)
+    for path in tmp_path.glob("matches-*/shards/*/*.npz"):
+        path.unlink()
+    with pytest.raises(InputError, match="expected scores of these candidates, got those of another shortlist"):
+        mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, archive=one)
+
+
+class Drawn:
+    """A filter that draws candidates anew, as machines whose bits differ may."""
+
+    recipe = "drawn"
+
+    def shortlist(self, sequence, database, num_candidates, archive):
+        rng = np.random.default_rng()
+        indices = np.array([rng.permutation(len(database))[:num_candidates] for _ in sequence.images.names], np.int32)
+        return Filtered(Shortlist(indices, np.ones(indices.shape, np.float32), indices >= 0), {}, {})
+
+
+def test_candidates_are_those_of_the_first_shard(dataset, tmp_path):
+    results, _ = shared(
+        tmp_path, 3, lambda archive: mfvpr.evaluate(dataset, SIFT, Drawn(), SCORERS, candidates=3, archive=archive)
+    )
+    kept = [path for path in tmp_path.glob("matches-*/shortlist.npz")]
+    indices = read_arrays(kept[0], kept[0].parent.name)["indices"]
+    np.testing.assert_array_equal(results[0].matched[0].candidates.indices, indices)
+
+
+UNKNOWN = {"own": lambda matches: matches.mask.sum() * 1.0}
+
+
+@pytest.mark.parametrize("scorers, words", [({}, "scorers: expected at least one"), (UNKNOWN, "own: a shard keeps")])
+def test_scorers_that_no_store_can_know(dataset, tmp_path, scorers, words):
+    with pytest.raises(InputError, match=words):
+        mfvpr.evaluate(dataset, SIFT, VLAD, scorers, candidates=3, archive=Archive(tmp_path, shard=Shard(0, 1)))
+
+
+def test_what_was_bad_once_stays_so(small_street, tmp_path, monkeypatch):
+    """An image that one shard could not read, and can be read now: all go on without it."""
+    dataset = folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
+    broken = [True]
+    read = type(dataset.database).read
+
+    def flaky(folder, row):
+        if broken[0] and folder == dataset.database and row == 3:
+            raise InputError("not now")
+        return read(folder, row)
+
+    monkeypatch.setattr(type(dataset.database), "read", flaky)
+
+    def run(archive):
+        try:
+            archive = replace(archive, skip_bad=True)
+            return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=5, archive=archive)
+        finally:
+            broken[0] = False if archive.shard.index == shard_of("0003.png", 2) else broken[0]
+
+    results, _ = shared(tmp_path, 2, run)
+    for result in results:
+        assert result.matched[0].bad_database.keys() == {3}
+        assert not (result.matched[0].candidates.indices == 3).any()
 
 
 def test_stores_of_shards_have_the_same_rows_byte_by_byte(dataset, tmp_path):

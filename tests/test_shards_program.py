@@ -130,6 +130,19 @@ def test_wrong_settings(task, typed_in, words):
     assert error.count("\n") == 1
 
 
+def test_a_folder_of_another_run_is_refused(task, tmp_path, asked, plain):
+    shutil.copytree(plain, tmp_path / "out")
+    code, _, error = task("0/1")
+    assert code == 2
+    assert f"out={tmp_path}/out: expected a new or empty folder, or that of other shards of this run" in error
+    (tmp_path / "out" / "shards").mkdir()
+    for wrong in ('{"format": "mfvpr shards 1", "shards": -2}', '{"format": "mfvpr shards 1", "shards": "x"}', "[]"):
+        (tmp_path / "out" / "shards" / "run.json").write_text(wrong)
+        code, _, error = asked("missing")
+        assert code == 2
+        assert error.startswith(f"error: {tmp_path}/out/shards/run.json: expected a file of a run with shard=i/n")
+
+
 def command(settings, place, shard):
     own = (f"store={place}/store", f"out={place}/out", f"shard={shard}")
     return [sys.executable, "-m", "experiments.evaluate", *settings, *own]
@@ -139,6 +152,21 @@ def command(settings, place, shard):
 def test_the_same_shard_twice_is_refused_and_killed_ones_go_on(settings, plain, tmp_path, asked):
     """Killed at many moments, beside each other; whoever is started again goes on; clocks may differ."""
     place, delays = tmp_path, iter([3, 5, 7, 4])
+
+    def work(delays):
+        while missing := asked("missing")[1].strip():
+            shards = [0, 1] if "-" in missing else [int(missing)]
+            tasks = [subprocess.Popen(command(settings, place, f"{shard}/2"), cwd=ROOT, stdout=subprocess.DEVNULL,
+                                      stderr=subprocess.DEVNULL) for shard in shards]  # fmt: skip
+            if (delay := next(delays, None)) is not None:
+                time.sleep(delay)
+                for one in tasks:
+                    one.send_signal(signal.SIGKILL)
+            for one in tasks:
+                one.wait()
+            for path in (place / "out" / "shards").rglob("*.json"):
+                os.utime(path, (0, 4e9))  # of another clock
+
     first = subprocess.Popen(command(settings, place, "0/2"), cwd=ROOT, stderr=subprocess.DEVNULL)
     while not asked("status")[1].startswith("0/2: at work"):
         time.sleep(0.05)
@@ -148,17 +176,14 @@ def test_the_same_shard_twice_is_refused_and_killed_ones_go_on(settings, plain, 
     assert second.returncode == 2
     assert f"{place}/out/shards/0-of-2: in use by process {first.pid}" in second.stderr
     first.wait()
-    while missing := asked("missing")[1].strip():
-        shards = [0, 1] if "-" in missing else [int(missing)]
-        tasks = [subprocess.Popen(command(settings, place, f"{shard}/2"), cwd=ROOT, stdout=subprocess.DEVNULL,
-                                  stderr=subprocess.DEVNULL) for shard in shards]  # fmt: skip
-        if (delay := next(delays, None)) is not None:
-            time.sleep(delay)
-            for one in tasks:
-                one.send_signal(signal.SIGKILL)
-        for one in tasks:
-            one.wait()
-        for path in (place / "out" / "shards").rglob("*.json"):
-            os.utime(path, (0, 4e9))  # of another clock
+    work(delays)
+    assert tables(place / "out") == tables(plain)
+    # A row of a complete task is damaged, and removed by whoever reads it: both are started again.
+    (place / "out" / "results.json").unlink()
+    for row in (place / "store").glob("scores-*/shards/0-of-2/*.npz"):
+        row.unlink()
+    [row, *_] = (place / "store").glob("matches-*/shards/1-of-2/*.npz")
+    row.write_bytes(b"damaged")
+    work(iter(()))
     assert tables(place / "out") == tables(plain)
     assert json.loads((place / "out" / "run.json").read_text())["settings"]["candidates"]

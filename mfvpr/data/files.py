@@ -15,14 +15,30 @@ _TEMPORARY = re.compile(r"\..+-[a-z0-9_]{8}(\.\w+)?")  # names that `replacing` 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary path beside `path` (same suffix) that replaces it when the block ends without an error."""
+    with _beside(path) as temporary:
+        yield temporary
+        temporary.chmod(0o644)  # mkstemp's 0600 would surprise whoever shares the folder
+        os.replace(temporary, path)
+
+
+@contextmanager
+def placing(path: Path) -> Iterator[Path]:
+    """As `replacing`, but what is there stays: of several that try at the same time, the first counts."""
+    with _beside(path) as temporary:
+        yield temporary
+        temporary.chmod(0o644)
+        with suppress(FileExistsError):
+            os.link(temporary, path)
+
+
+@contextmanager
+def _beside(path: Path) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
     os.close(handle)
     temporary = Path(name)
     try:
         yield temporary
-        temporary.chmod(0o644)  # mkstemp's 0600 would surprise whoever shares the folder
-        os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -50,14 +66,9 @@ def clipped(text: str, most: int) -> str:
 
 
 def written_once(path: Path, text: str) -> str:
-    """What `path` holds: this `printable` text, where it was not there; several may try at the same time."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile("w", encoding="utf-8", dir=path.parent, prefix=f".{path.stem}-") as temporary:
-        temporary.write(printable(text))
-        temporary.flush()
-        os.fchmod(temporary.fileno(), 0o644)
-        with suppress(FileExistsError):
-            os.link(temporary.name, path)
+    """What `path` holds: this `printable` text, where it was not there."""
+    with placing(path) as temporary:
+        temporary.write_text(printable(text), encoding="utf-8")
     return path.read_text(encoding="utf-8")
 
 

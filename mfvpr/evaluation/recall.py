@@ -32,6 +32,8 @@ class Tally:
 
     def merged(self, other: "Tally") -> "Tally":
         """Of both's queries, which are others; the order of merging changes nothing."""
+        if len(self.right) != len(other.right):
+            raise ValueError(f"expected tallies of the same depths, got {len(self.right)} and {len(other.right)}")
         return Tally(self.right + other.right, self.queries + other.queries)
 
     @property

@@ -25,6 +25,7 @@ from mfvpr.types import Array
 
 _FIRST = 1024  # rows; twice as many whenever they do not suffice, and a program for each
 _REACH = 4  # standard deviations of the motion
+MOST = 10_000  # rows from one image to the next
 NEAR = 2  # rows beside a place that are taken for it
 
 
@@ -50,6 +51,9 @@ class Drive:
         if not (math.isfinite(self.advance) and 0 < self.spread < math.inf and 0 < self.sharpness < math.inf):
             raise InputError(f"Drive(advance={self.advance}, spread={self.spread}, sharpness={self.sharpness}): "
                              "expected finite numbers, the latter two above 0")  # fmt: skip
+        if abs(self.advance) > MOST or not MOST**-1 <= self.spread <= MOST:
+            raise InputError(f"Drive(advance={self.advance}, spread={self.spread}): expected up to {MOST} rows an "
+                             f"image, and a spread of {MOST**-1:g} at least")  # fmt: skip
         if not (0 <= self.kidnapped <= 1 and 0 <= self.p_right <= 1):
             raise InputError(f"Drive(kidnapped={self.kidnapped}, p_right={self.p_right}): expected from 0 to 1")
 
@@ -82,12 +86,15 @@ class Route:
         """
         if not there.any():
             return None
+        found = () if answer is None else answer.alternatives
+        if (last := max((one.row for one in found), default=-1)) >= len(there):
+            raise InputError(f"there: expected the rows of the map that answered, up to {last} at least, got "
+                             f"{len(there)}")  # fmt: skip
         while len(there) > len(self._belief):
             self._belief = np.concatenate([self._belief, np.zeros_like(self._belief)])
         drive, allowed = self._drive, np.zeros(len(self._belief), bool)
         allowed[: len(there)] = there
         says = np.zeros(len(self._belief), np.float32)
-        found = () if answer is None else answer.alternatives
         if found:
             rows, scores = np.array([one.row for one in found]), np.array([one.score for one in found])
             says[rows] = shares(scores, drive.sharpness)

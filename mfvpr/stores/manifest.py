@@ -18,7 +18,7 @@ from mfvpr.fingerprints import difference, fingerprint, shortened
 MANIFEST = "manifest.json"
 _OLD_MANIFEST = "zarr.json"  # of format 1
 _LEFTOVER = re.compile(
-    r"\.(manifest|images|bad|\d+-\d+)-\w+\.(json|npz)"
+    r"\.(manifest|images|bad|shortlist|\d+-\d+)-\w+\.(json|npz)"
 )  # was being written when its process was killed
 
 
