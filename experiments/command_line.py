@@ -42,8 +42,9 @@ def run(program: Program, config: str) -> None:
                 raise SettingsError(_no_default(name))
             settings: Any = OmegaConf.to_container(found, resolve=True)
             check(settings)
-            command = shlex.join(job.overrides.task if many else typed)
-            with meeting.met(settings, PROGRAMS[config], [*job.overrides.task] if many else typed):
+            own = [one for one in job.overrides.task if not one.startswith("launcher=")] if many else typed
+            command = shlex.join(own)
+            with meeting.met(settings, PROGRAMS[config], own):
                 work = program()
                 _require_device()
                 about = {"multirun": many, "command": f"python -m experiments.{PROGRAMS[config]} {command}"}
@@ -57,6 +58,8 @@ def run(program: Program, config: str) -> None:
         arguments = first_of(typed) if config == "learn" and not many else typed
         for argument in arguments:
             _check_form(argument, config)
+            if argument.startswith("launcher=") and not (many and "," not in argument):
+                raise SettingsError(f"{argument}: expected one, and --multirun, which starts jobs with it")
         settings = [argument for argument in arguments if argument not in MULTIRUN]
         sys.argv[1:] = many[:1] + [as_typed(argument, several=bool(many)) for argument in settings]
         hydra.main(version_base="1.3", config_path=str(CONF), config_name=config)(task)()
@@ -122,6 +125,8 @@ def _explain(error: Exception, config: str) -> str:
     text = text.partition(" Config search path")[0].partition(" See https")[0]
     if missing := re.search(r"Missing mandatory value: ([\w.]+)", text):
         return _no_default(missing[1])
+    if launcher := re.search(r"Could not find 'hydra/launcher/(\w+)'", text):
+        return f"launcher: {launcher[1]} is not installed; {_how_to_launch(launcher[1])}"
     if unresolved := re.match(r"(.*) full_key: ([\w.]+)", text):
         return f"{unresolved[2]}: {unresolved[1]}"
     if several := re.match(r"Ambiguous value for argument '(.*?)' 1\.", text):
@@ -148,6 +153,11 @@ def _meant(wrong: str, config: str) -> str:
         return f"{' and '.join(others)} {'have' if len(others) > 1 else 'has'} {group}.{name}"
     nearest = max(same_of_own or same or own or names, key=lambda known: _likeness(wrong, known))
     return f"the nearest is {nearest}" if max(_likeness(wrong, nearest)) >= 0.6 else "see --help"
+
+
+def _how_to_launch(launcher: str) -> str:
+    extra = {"joblib": "sweep", "submitit_local": "slurm", "submitit_slurm": "slurm"}.get(launcher)
+    return f"pip install 'mfvpr[{extra}]'" if extra else "see launcher in --help"
 
 
 def _no_default(name: str) -> str:
