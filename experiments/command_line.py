@@ -28,6 +28,7 @@ from experiments.wording import in_settings
 
 MULTIRUN = ("-m", "--multirun")
 _NAME = r"[A-Za-z_][\w/@]*(?:\.\w+)*"  # of a setting, or of a group
+_EXTRAS = {"joblib": "sweep", "submitit_local": "slurm", "submitit_slurm": "slurm"}  # that bring Hydra's launchers
 MOST_DIGITS = 300  # more are no number of float64, and Python refuses to read thousands
 
 
@@ -125,8 +126,9 @@ def _explain(error: Exception, config: str) -> str:
     text = text.partition(" Config search path")[0].partition(" See https")[0]
     if missing := re.search(r"Missing mandatory value: ([\w.]+)", text):
         return _no_default(missing[1])
-    if launcher := re.search(r"Could not find 'hydra/launcher/(\w+)'", text):
-        return f"launcher: {launcher[1]} is not installed; {_how_to_launch(launcher[1])}"
+    if launcher := re.search(r"Could not find 'hydra/launcher/(\w+)'.*: ([\w ]+)", text):
+        mend = f"pip install 'mfvpr[{_EXTRAS[launcher[1]]}]'" if launcher[1] in _EXTRAS else f"there are {launcher[2]}"
+        return f"{launcher[1]}: this launcher is not installed; {mend}"
     if unresolved := re.match(r"(.*) full_key: ([\w.]+)", text):
         return f"{unresolved[2]}: {unresolved[1]}"
     if several := re.match(r"Ambiguous value for argument '(.*?)' 1\.", text):
@@ -153,11 +155,6 @@ def _meant(wrong: str, config: str) -> str:
         return f"{' and '.join(others)} {'have' if len(others) > 1 else 'has'} {group}.{name}"
     nearest = max(same_of_own or same or own or names, key=lambda known: _likeness(wrong, known))
     return f"the nearest is {nearest}" if max(_likeness(wrong, nearest)) >= 0.6 else "see --help"
-
-
-def _how_to_launch(launcher: str) -> str:
-    extra = {"joblib": "sweep", "submitit_local": "slurm", "submitit_slurm": "slurm"}.get(launcher)
-    return f"pip install 'mfvpr[{extra}]'" if extra else "see launcher in --help"
 
 
 def _no_default(name: str) -> str:
