@@ -8,6 +8,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
 
 from experiments.groups import choices
+from experiments.settings import CONF
 from tests.programs import composed, run, small, typed
 from tests.test_shards_program import tables
 
@@ -30,13 +31,10 @@ def test_a_launcher_composes_and_adds_no_setting(launcher):
     """Of a structured configuration, which refuses what the plugin does not know."""
     if f"{PLUGINS[launcher]}.yaml" not in installed():
         pytest.skip(f"pip install 'mfvpr[{EXTRAS[launcher]}]'")
-    from experiments.settings import CONF
-
     for config in ("config", "sweep", "learn"):
         with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
             found = hydra.compose(config, [f"launcher={launcher}"], return_hydra_config=True).hydra
-        expected = str(found.launcher.get("cpus_per_task") or 1)
-        assert found.job.env_set.PJRT_NPROC == expected
+        assert found.job.env_set == {"PJRT_NPROC": str(found.launcher.get("cpus_per_task") or 1)}
         assert PLUGINS[launcher].rpartition("_")[2] in found.launcher._target_.lower()
         assert composed(f"launcher={launcher}", config=config) == composed(config=config)
 
