@@ -28,6 +28,7 @@ from experiments.wording import in_settings
 
 MULTIRUN = ("-m", "--multirun")
 _NAME = r"[A-Za-z_][\w/@]*(?:\.\w+)*"  # of a setting, or of a group
+_EXTRAS = {"joblib": "sweep", "submitit_local": "slurm", "submitit_slurm": "slurm"}  # that bring Hydra's launchers
 MOST_DIGITS = 300  # more are no number of float64, and Python refuses to read thousands
 
 
@@ -42,8 +43,9 @@ def run(program: Program, config: str) -> None:
                 raise SettingsError(_no_default(name))
             settings: Any = OmegaConf.to_container(found, resolve=True)
             check(settings)
-            command = shlex.join(job.overrides.task if many else typed)
-            with meeting.met(settings, PROGRAMS[config], [*job.overrides.task] if many else typed):
+            own = [one for one in job.overrides.task if not one.startswith("launcher=")] if many else typed
+            command = shlex.join(own)
+            with meeting.met(settings, PROGRAMS[config], own):
                 work = program()
                 _require_device()
                 about = {"multirun": many, "command": f"python -m experiments.{PROGRAMS[config]} {command}"}
@@ -57,6 +59,8 @@ def run(program: Program, config: str) -> None:
         arguments = first_of(typed) if config == "learn" and not many else typed
         for argument in arguments:
             _check_form(argument, config)
+            if argument.startswith("launcher=") and not (many and "," not in argument):
+                raise SettingsError(f"{argument}: expected one, and --multirun, which starts jobs with it")
         settings = [argument for argument in arguments if argument not in MULTIRUN]
         sys.argv[1:] = many[:1] + [as_typed(argument, several=bool(many)) for argument in settings]
         hydra.main(version_base="1.3", config_path=str(CONF), config_name=config)(task)()
@@ -122,6 +126,9 @@ def _explain(error: Exception, config: str) -> str:
     text = text.partition(" Config search path")[0].partition(" See https")[0]
     if missing := re.search(r"Missing mandatory value: ([\w.]+)", text):
         return _no_default(missing[1])
+    if launcher := re.search(r"Could not find 'hydra/launcher/(\w+)'.*: ([\w ]+)", text):
+        mend = f"pip install 'mfvpr[{_EXTRAS[launcher[1]]}]'" if launcher[1] in _EXTRAS else f"there are {launcher[2]}"
+        return f"{launcher[1]}: this launcher is not installed; {mend}"
     if unresolved := re.match(r"(.*) full_key: ([\w.]+)", text):
         return f"{unresolved[2]}: {unresolved[1]}"
     if several := re.match(r"Ambiguous value for argument '(.*?)' 1\.", text):

@@ -9,6 +9,7 @@ from experiments.groups import check_choice, choices, defaults, groups
 from experiments.settings import CONF
 
 _WHOLE = ("system", "experiment")  # groups whose choices set values of all others
+_PLACES = {"launcher": "hydra"}  # where a group's settings are, if not in one of its name
 
 
 def help_text(config: str, arguments: Sequence[str]) -> str:
@@ -36,7 +37,7 @@ def _parts(config: str, chosen: dict[str, str | None]) -> Iterator[str]:
     yield "\nSettings:\n"
     for group, choice in chosen.items():
         if choice and group not in _WHOLE:
-            yield from [*_section(group, _merged(CONF / group / f"{choice}.yaml")), ""]
+            yield from [*_section(_PLACES.get(group, group), _merged(CONF / group / f"{choice}.yaml")), ""]
     for file in (*(entry for entry in defaults(CONF / f"{config}.yaml") if _is_file(entry)), config):
         yield from [*_body(CONF / f"{file}.yaml"), ""]
     for group in _WHOLE:
@@ -65,7 +66,7 @@ def _merged(file: Path) -> list[str]:
     own, inherited = _body(file), []
     keys = {line.partition(":")[0] for line in own}
     for entry in defaults(file):
-        if entry == "_self_":
+        if not _is_file(entry):
             continue
         other, _, place = entry.partition("@")
         lines = _merged(file.with_name(f"{other}.yaml"))

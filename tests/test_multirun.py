@@ -84,7 +84,7 @@ def test_a_job_waits_for_the_matches_of_another_and_a_single_run_does_not(root, 
 
 
 def test_jobs_in_several_processes(root, tmp_path):
-    jobs = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "candidates=4,8", f"store={tmp_path}/store", SIGMA)
+    jobs = ("launcher=joblib", "hydra.launcher.n_jobs=2", "candidates=4,8", f"store={tmp_path}/store", SIGMA)
     done = subprocess.run(
         [sys.executable, "-m", "experiments.sweep", "-m", *small(root), *jobs],
         cwd=tmp_path, capture_output=True, text=True, timeout=200, env=os.environ | {"PYTHONPATH": str(ROOT)},
