@@ -39,16 +39,19 @@ def images(settings: Mapping[str, Any]) -> Iterator[tuple[str, Path | np.ndarray
 
 
 def _watched(folder: Path) -> Iterator[Path]:
-    """Images of a folder, then those that come, once their files do not change any more; until Ctrl-C."""
-    done: set[str] = set()
+    """Images of a folder, then those that come, once their files do not change any more; until Ctrl-C.
+
+    One whose file changes later, as where a camera writes slowly, comes again.
+    """
+    done: dict[str, tuple[int, int]] = {}
     before: dict[str, tuple[int, int]] = {}
     tell(f"watching {folder}; end with Ctrl-C")
     while True:
-        found = {path.name: path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES}
-        states = {name: (path.stat().st_size, path.stat().st_mtime_ns) for name, path in found.items()
-                  if name not in done and path.is_file()}  # fmt: skip
-        for name in sorted(name for name, state in states.items() if before.get(name) == state):
-            done.add(name)
-            yield found[name]
+        states = {path.name: (path.stat().st_size, path.stat().st_mtime_ns) for path in sorted(folder.iterdir())
+                  if path.suffix.lower() in SUFFIXES and path.is_file()}  # fmt: skip
+        for name, state in states.items():
+            if before.get(name) == state != done.get(name):
+                done[name] = state
+                yield folder / name
         before = states
         time.sleep(POLL)

@@ -72,6 +72,14 @@ def _otherwise(given: Given, system: str, settings: Mapping[str, Any], images: I
     ]
 
 
+def other_settings(made: Mapping[str, Any], system: str, own: Mapping[str, Any]) -> list[str]:
+    """The settings of a map that its answers depend on, and that were others where a confidence was fitted."""
+    before = _of_system(made.get("settings"), system)
+    now = _of_system({**own, "scorer": build.described(own["scorer"])}, system)
+    groups = [name for name in _NAMES if name in now and name != "candidates" and before.get(name) != now[name]]
+    return groups + (["candidates"] if made.get("candidates") != own["candidates"] else [])
+
+
 def right_within(settings: Mapping[str, Any], images: Images) -> list[Any] | None:
     """What counts as right, and its unit; None without ground truth."""
     right = images.dataset.sequences[0].truth

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from experiments import build, maps
+from experiments import build, confidences, maps
 from experiments.answer_figures import AnswerFigures
 from experiments.asked_images import images
+from experiments.console import tell
 from experiments.settings import SettingsError
 from mfvpr.confidence import Confidence, read_confidences
 from mfvpr.data.files import printable
@@ -86,9 +87,13 @@ def _confidence(settings: Mapping[str, Any]) -> Confidence | None:
     """That of the map's score."""
     if settings["confidence"] is None:
         return None
-    systems, _ = read_confidences(build.expanded(settings["confidence"]))
-    name = maps.read(build.expanded(settings["map"]))["scorer"]["method"]
+    systems, made = read_confidences(build.expanded(settings["confidence"]))
+    own = maps.read(build.expanded(settings["map"]))
+    name = own["scorer"]["method"]
     if name not in systems:
         raise SettingsError(f"confidence={settings['confidence']}: expected p of {name}, which the map scores by, got "
                             f"{', '.join(systems) or 'none'}; evaluate with the map's settings")  # fmt: skip
+    if other := confidences.other_settings(made, name, own):
+        tell(f"warning: confidence={settings['confidence']} was fitted with other settings of {', '.join(other)}: p "
+             "may mean nothing here")  # fmt: skip
     return systems[name]

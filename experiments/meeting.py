@@ -5,12 +5,13 @@ aborts the rest, which no handler of Python's survives: so each task has a proce
 """
 
 import atexit
+import ctypes
 import os
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from experiments.settings import SettingsError
 
 INTERRUPTED = 75  # EX_TEMPFAIL of sysexits.h: to be tried again
 LOST_AFTER = 15  # seconds without a sign of life
+_PR_SET_PDEATHSIG = 1  # of linux/prctl.h
 _OF_A_TASK = "MFVPR_TASK"  # set in the process that works
 
 
@@ -54,7 +56,7 @@ def part() -> None:
 
 def _waited_for(command: list[str], settings: Mapping[str, Any]) -> int:
     """The exit code of a process, to which signals are passed on."""
-    task = subprocess.Popen(command, env=os.environ | {_OF_A_TASK: "1"})
+    task = subprocess.Popen(command, env=os.environ | {_OF_A_TASK: "1"}, preexec_fn=_end_with_parent)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda number, _: task.send_signal(number) if number == signal.SIGTERM else None)
     code = task.wait()
@@ -65,6 +67,12 @@ def _waited_for(command: list[str], settings: Mapping[str, Any]) -> int:
               "what was finished is kept: start all tasks again, which go on from there", file=sys.stderr)  # fmt: skip
         return INTERRUPTED
     return 128 - code
+
+
+def _end_with_parent() -> None:
+    """Of the process that works: no one who kills the other leaves it behind (Linux)."""
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def _join(settings: Mapping[str, Any]) -> None:

@@ -83,9 +83,11 @@ def _tools(settings: dict[str, Any], archive: Archive, dataset: Dataset | None) 
 
 def _spread(filter: Filter) -> Filter:
     """The same on the devices of all tasks, where it searches exactly."""
+    from mfvpr.distributed import retrieve_everywhere  # which few need
+
     if not isinstance(filter, Retrieval) or not isinstance(filter.search, ExactSearch):
         return filter
-    return replace(filter, search=replace(filter.search, spread=True))
+    return replace(filter, search=replace(filter.search, spread=retrieve_everywhere))
 
 
 def _images(settings: dict[str, Any], archive: Archive) -> Images:

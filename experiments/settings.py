@@ -38,10 +38,8 @@ _FIGURES = Rule(
     lambda value: _INDEX.holds(value) or list_of(_QUERY).holds(value),
     "how many (at most 1000000), or a list of rows or names of queries",
 )
-_ADDRESS = Rule(
-    lambda value: isinstance(value, str) and bool(re.fullmatch(r"[^\s:]+:[0-9]{1,5}", value)),
-    "HOST:PORT of the first task, such as node1:7654",
-)
+_ADDRESS = Rule(lambda value: isinstance(value, str) and bool(re.fullmatch(r"[^\s:]+:[0-9]{1,5}", value)),
+                "HOST:PORT of the first task, such as node1:7654")  # fmt: skip
 _FLAG = one_of(True, False)
 
 
@@ -207,8 +205,9 @@ def check(settings: Mapping[str, Any]) -> None:
     if fusion.get("weights") and fusion["c"] != "zscore":
         raise SettingsError(f"fusion.weights={fusion['weights']}: expected fusion.c=zscore as well, or "
                             "fusion.weights=null")  # fmt: skip
-    if settings.get("coordinator") is not None and settings["shard"] is None:
-        raise SettingsError(f"coordinator={settings['coordinator']}: expected shard=i/n as well, this task's part")
+    for name in ("coordinator", "wait"):
+        if settings.get(name) and settings["shard"] is None:
+            raise SettingsError(f"{name}={settings[name]}: expected shard=i/n as well, this task's part")
     if settings.get("shard") is not None:
         for name in ("out", "store"):
             if settings[name] is None:

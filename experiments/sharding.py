@@ -79,7 +79,7 @@ def task_folder(settings: Mapping[str, Any]) -> Path:
 def wait(settings: Mapping[str, Any], needs: NotYet) -> None:
     """Keep what this task waits for; others that were complete, and are needed again (damaged rows go), are not."""
     own = task_folder(settings)
-    write_text(own / _STATE, json.dumps({"state": COMPLETE if needs.is_complete else f"waits: {needs}"}))
+    write_text(own / _STATE, json.dumps({"state": COMPLETE if needs.is_complete else f"ended, waiting for {needs}"}))
     shard = Shard.parse(settings["shard"])
     for index in needs.shards:
         other = own.parent / Shard(index, shard.count).folder

@@ -61,8 +61,8 @@ class Archive:
         track: label -> progress of what follows.
         tell: is told, in one line, what is to be done and how much space that takes, and what is wrong with images.
         wait: for other processes that are making the same, instead of refusing.
-        shard: takes from its own images alone, and asks the others' of their stores; it needs a root.
-        patience: seconds that a shard waits for others, before it says `mfvpr.shards.NotYet`.
+        shard: takes from its own images alone, and the others' of their stores, for which it waits `patience` seconds
+            before it says `mfvpr.shards.NotYet`; it needs a root.
     """
 
     root: Path | None = None
@@ -175,13 +175,13 @@ class Archive:
 
     @contextmanager
     def matches(
-        self, recipe: Mapping[str, Any], num_queries: int, num_candidates: int, *, typical: int, label: str
+        self, recipe: Mapping[str, Any], names: Sequence[str], num_candidates: int, *, typical: int, label: str
     ) -> Iterator[match_stores.MatchStore]:
         """The store of matches that are made so, where there is a root, held while it lacks some.
 
         Args:
             recipe: of the matches.
-            num_queries: Q.
+            names: of Q queries.
             num_candidates: C.
             typical: matches of a pair, about.
             label: for people.
@@ -189,15 +189,18 @@ class Archive:
         if self.root is None:
             raise ValueError("nothing is kept on disk: this archive has no root")
         path = store_path(self.root, "matches", recipe, MATCHES)
-        sizes = {"num_queries": num_queries, "num_candidates": num_candidates}
+        sizes = {"num_queries": len(names), "num_candidates": num_candidates}
+        own = range(len(names)) if self.shard is None else self.shard.rows(names)
         with match_stores.open_match_store(path, recipe, **sizes, **self.store_options) as store:
-            if missing := num_queries - int(store.done.sum()):
+            if missing := sum(not store.done[row] for row in own):
                 needed = match_stores.forecast_bytes(missing, num_candidates, typical)
                 require_space(store.folder, needed)
-                self.tell(f"{label}: {missing} of {num_queries} queries to match with {num_candidates} candidates: "
+                self.tell(f"{label}: {missing} of {len(names)} queries to match with {num_candidates} candidates: "
                           f"about {needed / _MB:.1f} MB in {store.folder}")  # fmt: skip
             else:
-                self.tell(f"{label}: all {num_queries} queries from {store.folder}")
+                self.tell(
+                    f"{label}: {'all' if store.done.all() else 'its part of'} {len(names)} queries from {store.folder}"
+                )
             yield store
 
     @property

@@ -83,6 +83,13 @@ def retrieve_spread(
     return jax.tree.map(np.asarray, _retrieved(*arrays, num_candidates=num_candidates, mesh=mesh))
 
 
+def retrieve_everywhere(
+    queries: np.ndarray, database: np.ndarray, *, num_candidates: int, excluded: Positives | None = None
+) -> Shortlist:
+    """`retrieve_spread` on the devices of all processes, which ask the same at the same time."""
+    return retrieve_spread(queries, database, num_candidates=num_candidates, mesh=all_devices(), excluded=excluded)
+
+
 @partial(jax.jit, static_argnames=("num_candidates", "mesh"))
 def _retrieved(queries: Array, database: Array, allowed: Array, *, num_candidates: int, mesh: Mesh) -> Shortlist:
     rows_of_one = len(database) // mesh.size

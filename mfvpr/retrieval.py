@@ -1,6 +1,6 @@
 """The filter: global descriptors -> Shortlist, by exact search in chunks, and what is fitted on the database before."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Protocol
@@ -38,11 +38,11 @@ class ExactSearch:
 
     Attributes:
         memory: GB of similarities that may exist at the same time; None = a sixteenth of what is free.
-        spread: over the devices of all processes, which must ask the same at the same time (`mfvpr.distributed`).
+        spread: finds the same in another way, as `mfvpr.distributed.retrieve_everywhere`; None = on one device.
     """
 
     memory: float | None = None
-    spread: bool = field(default=False, metadata={"recipe": False})
+    spread: Callable[..., Shortlist] | None = field(default=None, metadata={"recipe": False})
 
     def fit(self, database: np.ndarray) -> "ExactSearch":
         """Itself: it need not know the database."""
@@ -55,22 +55,14 @@ class ExactSearch:
         if queries.shape[1] != database.shape[1]:
             raise InputError(f"global descriptors: expected as many numbers on both sides, got {queries.shape[1]} for "
                              f"queries and {database.shape[1]} for the database")  # fmt: skip
-        if self.spread:
-            return self._spread(queries, database, num_candidates, excluded)
+        if self.spread is not None:
+            return self.spread(queries, database, num_candidates=num_candidates, excluded=excluded)
         some, many = self._chunks(len(queries), len(database))
         parts = []
         for part in _parts(len(queries), some):
             allowed = None if excluded is None else ~excluded.dense(part)
             parts.append(_shortlist(queries[part], database, num_candidates, many, allowed))
         return jax.tree.map(lambda *fields: np.concatenate(fields), *parts)
-
-    def _spread(
-        self, queries: np.ndarray, database: np.ndarray, num_candidates: int, excluded: Positives | None
-    ) -> Shortlist:
-        from mfvpr.distributed import all_devices, retrieve_spread  # which takes this module's `retrieve`
-
-        mesh = all_devices()
-        return retrieve_spread(queries, database, num_candidates=num_candidates, mesh=mesh, excluded=excluded)
 
     def _chunks(self, num_queries: int, num_database: int) -> tuple[int, int]:
         """Queries and database rows at a time: all rows where a tenth of the queries fit with them."""

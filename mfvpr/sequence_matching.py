@@ -245,6 +245,6 @@ def _match_stores(
     share = 1 if recipe["matching"].get("cross_check") in ("none", "candidate") else 3
     for number, scale in enumerate(extractor.scales):
         yield archive.matches(
-            {**recipe, "scale": number} if several else recipe, len(sequence.images), recipe["candidates"],
+            {**recipe, "scale": number} if several else recipe, sequence.images.names, recipe["candidates"],
             typical=scale.typical_count // share, label=f"{sequence.name} matches",
         )  # fmt: skip

@@ -127,8 +127,10 @@ ALLOWED = {
         "scoring",
         "sources",
         "stores",
+        "threads",
         "types",
     },
+    "distributed": {"errors", "evaluation", "numerics", "reranking", "retrieval", "scoring", "types"},
     "report": {
         "archive",
         "confidence",

@@ -66,7 +66,7 @@ def test_tasks_in_any_order_leave_the_results_of_one(task, asked, plain, tmp_pat
     assert asked("missing")[1] == "0-2\n"
     code, out, _ = asked("status")
     assert code == 0
-    assert out.startswith("0/3: not begun\n1/3: not begun\n2/3: waits: database features: ")
+    assert out.startswith("0/3: not begun\n1/3: not begun\n2/3: ended, waiting for database features: ")
     assert out.endswith("results: not yet\n")
     assert task("0/3")[0] == 0
     code, out, _ = task("1/3")  # the last that takes features, so that it goes on
@@ -119,6 +119,8 @@ def test_tasks_must_agree(task, asked, tmp_path, root, settings):
         (("shard=1",), "shard=1: expected i/n"),
         (("shard=a/b",), "shard=a/b: expected i/n"),
         (("wait=-1",), "wait=-1: expected a number"),
+        (("shard=null", "wait=5"), "wait=5: expected shard=i/n as well"),
+        (("shard=null", "coordinator=a:1"), "coordinator=a:1: expected shard=i/n as well"),
         (("store=null",), "shard=0/2: expected store=DIR as well"),
         (("out=null",), "shard=0/2: expected out=DIR as well"),
     ],

@@ -78,7 +78,8 @@ def _disturbed(place: Path, street: Path, seconds: float, rng: random.Random, mo
             for index, (task, end) in list(tasks.items()):
                 if task.poll() is not None:
                     if task.returncode:
-                        raise SettingsError(f"kills: the task {index}/{SHARDS} failed with {task.returncode}")
+                        raise SettingsError(f"kills: the task {index}/{SHARDS} failed with {task.returncode}: "
+                                            f"{_said(place, index)}")  # fmt: skip
                     del tasks[index]
                 elif time.monotonic() > end and where.total() < most:
                     stage = _stage(place)
@@ -103,7 +104,14 @@ def _task(place: Path, street: Path, index: int) -> subprocess.Popen[bytes]:
         "candidates=20", "figures=2", f"store={place}/store", f"out={place}/out", f"shard={index}/{SHARDS}",
     ]  # fmt: skip
     command = [sys.executable, "-m", "experiments.evaluate", *settings]
-    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    place.mkdir(exist_ok=True)
+    with (place / f"{index}.log").open("w", encoding="utf-8") as log:
+        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=log)
+
+
+def _said(place: Path, index: int) -> str:
+    """The last line of a task."""
+    return ([*(place / f"{index}.log").read_text("utf-8").splitlines()] or ["nothing"])[-1]
 
 
 def _missing(place: Path) -> list[int]:

@@ -80,7 +80,7 @@ def check_owned(folder: Path, kind: Kind) -> None:
                 "delete this folder"
             )
         foreign = sorted(path.name for path in folder.iterdir() if path.name != "lock" and not _is_leftover(path))
-        if foreign:
+        if foreign and not (folder / MANIFEST).exists():  # another process may just have written it
             raise InputError(
                 f"{folder}: expected a folder of {kind.content}, got one without {MANIFEST} that holds "
                 f"{shortened(foreign[0])}; choose another path"
