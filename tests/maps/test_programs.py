@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments import maps
+from experiments import build, maps
+from mfvpr.confidence import Confidence, write_confidences
 from mfvpr.data.images import read_image
 from mfvpr.data.videos import frames
 from mfvpr.errors import InputError
@@ -300,6 +301,24 @@ def test_two_do_not_add_their_drives_at_the_same_time(twice, folder, monkeypatch
     assert stderr.count("\n") == 1
 
 
+def test_confidences_of_other_settings_are_told(folder, small_street, tmp_path, monkeypatch, capsys):
+    """Those of an evaluation with the map's settings are not."""
+    own = json.loads((folder / "settings.json").read_text())
+    sure = Confidence(("margin", "height"), 1, (0.0, 0.0), (1.0, 1.0), (1.0, 1.0), 0.0)
+    for candidates in (own["candidates"], own["candidates"] + 1):
+        same = {name: own[name] for name in ("features", "retrieval", "matching")}
+        made = {"settings": same | {"scorer": build.described(own["scorer"])}}
+        write_confidences(tmp_path / "c.json", {"histogram": sure}, made | {"candidates": candidates})
+        code, stdout, stderr = called(
+            monkeypatch, capsys, "localize", f"map={folder}", f"images={small_street}/database/0001.png",
+            f"confidence={tmp_path}/c.json",
+        )  # fmt: skip
+        assert code == 0
+        assert 0 <= json.loads(stdout)["p_right"] <= 1
+        told = "was fitted with other settings of candidates: p may mean nothing here" in stderr
+        assert told == (candidates != own["candidates"])
+
+
 @pytest.mark.slow
 def test_a_folder_is_watched(folder, small_street, tmp_path):
     asked = tmp_path / "asked"
@@ -315,5 +334,10 @@ def test_a_folder_is_watched(folder, small_street, tmp_path):
                 time.sleep(0.05)
                 file.write(content[2000:])
             assert json.loads(running.stdout.readline())["place"] == f"{row:04d}.png"
+        slow = asked / "slow.png"  # by a writer that rests: told, and asked again when it is whole
+        slow.write_bytes(content[:2000])
+        assert "slow.png" in json.loads(running.stdout.readline())["error"]
+        slow.write_bytes(content)
+        assert json.loads(running.stdout.readline())["place"] == "0005.png"
         running.send_signal(signal.SIGINT)
         assert running.wait(30) == 130
