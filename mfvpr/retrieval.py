@@ -55,6 +55,12 @@ class ExactSearch:
         if queries.shape[1] != database.shape[1]:
             raise InputError(f"global descriptors: expected as many numbers on both sides, got {queries.shape[1]} for "
                              f"queries and {database.shape[1]} for the database")  # fmt: skip
+        if not len(queries) or not len(database):
+            raise InputError(f"global descriptors: expected at least one on both sides, got {len(queries)} of queries "
+                             f"and {len(database)} of the database")  # fmt: skip
+        if excluded is not None and (len(excluded), excluded.num_database) != (len(queries), len(database)):
+            raise InputError(f"excluded: expected rows for {len(queries)} queries and {len(database)} database images, "
+                             f"got {len(excluded)} and {excluded.num_database}")  # fmt: skip
         if self.spread is not None:
             return self.spread(queries, database, num_candidates=num_candidates, excluded=excluded)
         some, many = self._chunks(len(queries), len(database))

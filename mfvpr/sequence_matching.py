@@ -17,6 +17,7 @@ from mfvpr.cohort import cohort_sequence
 from mfvpr.data.arrays import read_arrays, write_arrays
 from mfvpr.data.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.data.files import placing, write_text
+from mfvpr.errors import InputError
 from mfvpr.features import Extractor, Source
 from mfvpr.filters import Filter, Filtered
 from mfvpr.fingerprints import recipe_of
@@ -68,6 +69,8 @@ def match_sequence(
         NotYet: of a shard, other ones have not taken their features.
     """
     check_matching(candidates, extractor, matching)
+    if rows is not None and not all(0 <= row < len(sequence.images) for row in rows):
+        raise InputError(f"rows: expected rows of {len(sequence.images)} queries, got {[*rows][:9]}")
     archive, watch, database = archive or Archive(), watch or Stopwatch(), dataset.database
     with watch("filter"):
         extractor, filter = fitted(extractor, database, archive), fitted(filter, database, archive)

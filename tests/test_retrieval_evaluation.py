@@ -7,7 +7,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from mfvpr import frame_positives, radius_positives, recall_at_k, retrieve
+from mfvpr.errors import InputError
 from mfvpr.evaluation import Positives, Tally
+from mfvpr.retrieval import EXACT
 from tests import oracles
 from tests.builders import unit
 
@@ -104,3 +106,15 @@ def test_tallies_add_up_to_the_recall_of_all(order, positives, cut, rng):
     np.testing.assert_array_equal(merged.recall, recall_at_k(order, positives, ks))
     assert merged.queries == 7
     np.testing.assert_array_equal(Tally.of(np.zeros((0, 4), int), positives[:0], ks).recall, [0, 0, 0])
+
+
+@pytest.mark.parametrize("queries, database", [(0, 3), (3, 0)])
+def test_a_search_needs_both_sides(queries, database):
+    with pytest.raises(InputError, match=f"got {queries} of queries and {database} of the database"):
+        EXACT.shortlist(np.ones((queries, 4), np.float32), np.ones((database, 4), np.float32), 2)
+
+
+def test_what_is_excluded_is_of_these_queries():
+    some = np.eye(3, dtype=np.float32)
+    with pytest.raises(InputError, match="expected rows for 3 queries and 3 database images, got 2 and 3"):
+        EXACT.shortlist(some, some, 2, excluded=Positives.from_rows([[0], [1]], 3))

@@ -25,6 +25,7 @@ from mfvpr.filters import Filtered, Retrieval
 from mfvpr.fingerprints import recipe_of
 from mfvpr.frame_correlation import FrameCorrelation
 from mfvpr.rankings import Fusion
+from mfvpr.sequence_matching import match_sequence
 from mfvpr.shards import NotYet, Shard, indices, shard_of, together
 from mfvpr.stores.vectors import open_vector_store
 from mfvpr.types import Shortlist
@@ -224,6 +225,12 @@ def test_candidates_are_those_of_the_first_shard(dataset, tmp_path):
     kept = [path for path in tmp_path.glob("matches-*/shortlist.npz")]
     indices = read_arrays(kept[0], kept[0].parent.name)["indices"]
     np.testing.assert_array_equal(results[0].matched[0].candidates.indices, indices)
+
+
+def test_rows_are_those_of_queries(dataset):
+    for wrong in ([-1], [99]):
+        with pytest.raises(InputError, match=r"rows: expected rows of 10 queries, got \["):
+            match_sequence(dataset, dataset.only, SIFT, VLAD, 3, rows=wrong)
 
 
 UNKNOWN = {"own": lambda matches: matches.mask.sum() * 1.0}
