@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from experiments.errors import Parser, one_line, refuse, unwind_on_sigterm
+from experiments.errors import Parser, refuse, run_command
 
 if TYPE_CHECKING:
     from mfvpr.data.contents import Contents
@@ -22,10 +22,7 @@ _TOLERANCE, _RADIUS = 5, 25.0  # frames, meters: the widest that the paper takes
 
 def main() -> None:
     """Run the command line's command."""
-    unwind_on_sigterm()
-    with one_line():
-        arguments = vars(_parser().parse_args())
-        arguments.pop("run")(**arguments)
+    run_command(_parser)
 
 
 def _parser() -> Parser:

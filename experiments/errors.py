@@ -28,6 +28,14 @@ class Parser(argparse.ArgumentParser):
         refuse(f"{message}; see {self.prog} --help")
 
 
+def run_command(parser: Callable[[], argparse.ArgumentParser]) -> None:
+    """Run the command that is typed: `run` among the parser's defaults, with all else that it gives."""
+    unwind_on_sigterm()
+    with one_line():
+        arguments = vars(parser().parse_args())
+        arguments.pop("run")(**arguments)
+
+
 @contextmanager
 def one_line() -> Iterator[None]:
     """Exit with 2 for wrong input, 130 for Ctrl-C, 141 for a reader who left; faults of our own pass through."""

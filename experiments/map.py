@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from experiments.errors import Parser, one_line, unwind_on_sigterm
+from experiments.errors import Parser, run_command
 from experiments.launch import launch
 
 # Functions import what they need: --help and wrong usage need not wait for JAX.
@@ -18,10 +18,7 @@ def main() -> None:
         del sys.argv[1]
         launch(build, "map")
         return
-    unwind_on_sigterm()
-    with one_line():
-        arguments = vars(_parser().parse_args())
-        arguments.pop("run")(**arguments)
+    run_command(_parser)
 
 
 def build() -> Callable[[dict[str, Any]], None]:

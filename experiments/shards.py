@@ -2,17 +2,14 @@
 
 from pathlib import Path
 
-from experiments.errors import Parser, one_line, unwind_on_sigterm
+from experiments.errors import Parser, run_command
 
 SHARDS = "python -m experiments.shards"
 
 
 def main() -> None:
     """Run the command line's command."""
-    unwind_on_sigterm()
-    with one_line():
-        arguments = vars(_parser().parse_args())
-        arguments.pop("run")(**arguments)
+    run_command(_parser)
 
 
 def _parser() -> Parser:

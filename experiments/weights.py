@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from experiments.errors import WEIGHTS, Parser, how_to_install, one_line, refuse, unwind_on_sigterm, with_command
+from experiments.errors import WEIGHTS, Parser, how_to_install, refuse, run_command, with_command
 
 if TYPE_CHECKING:
     from mfvpr.weights.registry import Entry
@@ -19,10 +19,7 @@ _LARGE = 200  # MiB, which take some seconds to convert
 
 def main() -> None:
     """Run the command line's command."""
-    unwind_on_sigterm()
-    with one_line():
-        arguments = vars(_parser().parse_args())
-        arguments.pop("run")(**arguments)
+    run_command(_parser)
 
 
 def _parser() -> Parser:

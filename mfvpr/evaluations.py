@@ -143,8 +143,8 @@ def _scored(
             if missing:  # all are scored, so that what goes on has the bits of one run
                 found = score(part)
                 by_query = np.stack([found[name] for name in who], axis=1)
-                rows = map(QueryScores, by_query, np.asarray(part.candidates.indices))
-                store.write({row: scores for row, scores in zip(own, rows, strict=True) if row in {*missing}})
+                rows = dict(zip(own, map(QueryScores, by_query, np.asarray(part.candidates.indices)), strict=True))
+                store.write({row: rows[row] for row in missing})
 
         def lacking() -> Sequence[int]:
             store.look()
