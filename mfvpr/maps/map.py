@@ -18,13 +18,12 @@ from mfvpr.features.vlad import Vlad, VladFitting
 from mfvpr.fingerprints import fingerprint, recipe_of
 from mfvpr.maps.answers import Alternative, Answer, Asked
 from mfvpr.maps.describing import Describing, Image, local_features
-from mfvpr.maps.matching import matched
+from mfvpr.maps.matching import scored
 from mfvpr.maps.resident import Resident
 from mfvpr.maps.shifts import shift_of
 from mfvpr.maps.vectors import Vectors
 from mfvpr.matchers import NEIGHBORS, Matcher
 from mfvpr.progress import Track, untracked
-from mfvpr.reranking import score_candidates
 from mfvpr.results import Ranked
 from mfvpr.scoring import HistogramOfShifts, Scorer
 from mfvpr.sources import FeatureSet, stacked
@@ -247,8 +246,7 @@ class Map:
         rows, similarity = self._vectors.nearest(vector, self.candidates, before=end)
         if not len(rows):
             return Asked(Answer(None, (), 0.0, None, None, None, None), described, None)
-        matches = self._matched(self._made.resident, features, rows)
-        scores = np.asarray(score_candidates(self.scorer, matches))[: len(rows)]
+        matches, scores = self._scored(self._made.resident, features, rows)
         order = np.argsort(-np.where(np.isnan(scores), -np.inf, scores), kind="stable")
         ranked, filtered = Ranked(rows[order][None], scores[order][None]), Ranked(rows[None], similarity[None])
         p = None if self.confidence is None else float(self.confidence(ranked, filtered)[0])
@@ -260,11 +258,12 @@ class Map:
         answer = Answer(None if refused else found[0].place, found, found[0].score, p, *shift_of(self.scorer, best))
         return Asked(answer, described, jax.tree.map(lambda leaf: leaf[0], best))
 
-    def _matched(self, resident: Resident, features: Features, rows: np.ndarray) -> Matches:
-        """Matches `[C, K, ...]` with all candidates; those that there are not have none."""
+    def _scored(self, resident: Resident, features: Features, rows: np.ndarray) -> tuple[Matches, np.ndarray]:
+        """Matches `[C, K, ...]` with all candidates, and the scores of those that there are."""
         arrays, slots = resident.hold(rows.tolist(), features, self._vectors.total)
         query = stacked([features], resident.capacity, total=1)
-        return matched(query, arrays, slots, self.candidates, self.matcher)
+        matches, scores = scored(query, arrays, slots, self.candidates, self.matcher, self.scorer)
+        return matches, scores[: len(rows)]
 
     @contextmanager
     def _adding(self) -> Iterator["_Made"]:

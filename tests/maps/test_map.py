@@ -64,6 +64,7 @@ def test_answers_are_those_of_an_evaluation_with_a_store(dataset, folder, tmp_pa
 
 def test_answers_do_not_depend_on_the_cores(dataset, folder, monkeypatch):
     answers = []
+    monkeypatch.setattr(map_matching, "_AT_ONCE", 2)  # of five candidates
     for cores in (1, 2, 3, 7):
         monkeypatch.setattr(map_matching, "available_cpus", lambda cores=cores: cores)
         answers.append([asked(folder).localize(path).as_json() for path in dataset.queries.paths[:4]])
