@@ -28,6 +28,8 @@ def localize(settings: dict[str, Any]) -> None:
     )  # fmt: skip
     questions, figures, failed = _Questions(known, settings), AnswerFigures(known, settings), 0
     for number, (name, image) in enumerate(images(settings)):
+        if number == 0 and len(known):
+            tell(f"{len(known):,} images in the map; the first answer takes seconds more: programs compile")
         try:
             pixels = image if isinstance(image, np.ndarray) else read_image(image)
             asked, line = questions.ask(name, pixels)
