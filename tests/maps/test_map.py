@@ -8,6 +8,7 @@ import sys
 import time
 from dataclasses import dataclass, replace
 
+import jax
 import numpy as np
 import pytest
 
@@ -26,6 +27,7 @@ from mfvpr.maps.resident import Resident
 from mfvpr.pipeline import explain
 from mfvpr.stores import maps as map_store
 from mfvpr.types import Features
+from tests import scorers
 from tests.programs import ROOT
 
 SIFT, VLAD = Sift(max_keypoints=60, image_size=(160, 120)), VladFitting(num_words=8)
@@ -50,16 +52,20 @@ def asked(folder, **options):
 
 
 def test_answers_are_those_of_an_evaluation_with_a_store(dataset, folder, tmp_path):
-    filter, scorers = Retrieval(Aggregated(SIFT, VLAD)), {"histogram": mfvpr.HistogramOfShifts()}
-    result = mfvpr.evaluate(dataset, SIFT, filter, scorers, candidates=5, archive=Archive(tmp_path))
-    [ranked], known = result.systems["histogram"], asked(folder)
-    for query, path in enumerate(dataset.queries.paths):
-        answer = known.localize(path)
-        assert [one.row for one in answer.alternatives] == ranked.rows[query].tolist()
-        scores = [one.score for one in answer.alternatives]
-        np.testing.assert_allclose(scores, ranked.scores[query], rtol=1e-5)
-        assert answer.place == ranked.rows[query, 0]
-        assert answer.score == scores[0]
+    """By the library's scores and by others: a plain function, one that holds a key, and OpenCV's on the host."""
+    own, sampled = mfvpr.HistogramOfShifts(), scorers.Sampled(jax.random.key(0))
+    systems = {"histogram": own, "plain": scorers.plain, "sampled": sampled, "host": mfvpr.OpenCvHomography()}
+    filter = Retrieval(Aggregated(SIFT, VLAD))
+    result = mfvpr.evaluate(dataset, SIFT, filter, systems, candidates=5, archive=Archive(tmp_path))
+    for name, scorer in systems.items():
+        [ranked], known = result.systems[name], asked(folder, scorer=scorer)
+        for query, path in enumerate(dataset.queries.paths):
+            answer = known.localize(path)
+            assert [one.row for one in answer.alternatives] == ranked.rows[query].tolist()
+            found = [one.score for one in answer.alternatives]
+            np.testing.assert_allclose(found, ranked.scores[query], rtol=1e-5)
+            assert answer.place == ranked.rows[query, 0]
+            assert answer.score == found[0]
 
 
 def test_answers_do_not_depend_on_the_cores(dataset, folder, monkeypatch):
