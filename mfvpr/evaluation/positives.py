@@ -25,11 +25,22 @@ class Positives:
         rows: `[P]` int32, the rows of all queries one after the other; ascending, none twice in one query.
         offsets: `[Q + 1]` int64; query q has `rows[offsets[q] : offsets[q + 1]]`.
         num_database: N.
+
+    Raises:
+        InputError: rows and offsets that are not as above.
     """
 
     rows: np.ndarray
     offsets: np.ndarray
     num_database: int
+
+    def __post_init__(self) -> None:
+        rows, offsets, last = self.rows, self.offsets, self.num_database - 1
+        is_there = not len(rows) or 0 <= rows.min() <= rows.max() <= last
+        if [*offsets[[0, -1]]] != [0, len(rows)] or (np.diff(offsets) < 0).any() or not is_there:
+            raise InputError(f"positives: expected rows from 0 to {last}, and offsets that grow from 0 to {len(rows)}")
+        if not _ascending(rows, offsets):
+            raise InputError("positives: expected rows that ascend for each query; from_rows takes them in any order")
 
     @classmethod
     def from_rows(cls, rows: Iterable[Sequence[int] | np.ndarray], num_database: int) -> "Positives":
@@ -46,10 +57,10 @@ class Positives:
             raise InputError(f"positives: expected rows of a database of {num_database} images, got {flat.min()} to "
                              f"{flat.max()}; check the ground truth")  # fmt: skip
         flat, offsets = flat.astype(np.int32, copy=False), _offsets(list(map(len, per_query)))
-        positives, ascending = cls(flat, offsets, num_database), flat[1:] > flat[:-1]
-        starts = offsets[(offsets > 0) & (offsets < len(flat))]  # of another query: its rows begin anew
-        ascending[starts - 1] = True
-        return positives if ascending.all() else positives._with(_distinct(positives._keys()))
+        if _ascending(flat, offsets):
+            return cls(flat, offsets, num_database)
+        none = cls(flat[:0], np.zeros_like(offsets), num_database)
+        return none._with(_distinct(_keys(flat, offsets, num_database)))
 
     @classmethod
     def from_matrix(cls, matrix: Any) -> "Positives":
@@ -144,8 +155,7 @@ class Positives:
         return self._keys(), other._keys()
 
     def _keys(self) -> np.ndarray:
-        """`[P]` int64, query x N + row: ascending, and a set of them is one of pairs."""
-        return np.repeat(np.arange(len(self)) * self.num_database, self.counts) + self.rows
+        return _keys(self.rows, self.offsets, self.num_database)
 
     def _with(self, keys: np.ndarray) -> "Positives":
         """Of the same queries and database, by ascending keys."""
@@ -207,6 +217,19 @@ def radius_positives(query_xy: np.ndarray, database_xy: np.ndarray, *, radius: f
     for right, rows in zip(positives, rows_within(query_xy, database_xy, radius), strict=True):
         right[rows] = True
     return positives
+
+
+def _ascending(rows: np.ndarray, offsets: np.ndarray) -> bool:
+    """Whether the rows of each query ascend, none twice."""
+    ascending = rows[1:] > rows[:-1]
+    starts = offsets[(offsets > 0) & (offsets < len(rows))]  # of another query: its rows begin anew
+    ascending[starts - 1] = True
+    return bool(ascending.all())
+
+
+def _keys(rows: np.ndarray, offsets: np.ndarray, num_database: int) -> np.ndarray:
+    """`[P]` int64, query x N + row: ascending if the rows of each query are, and a set of them is one of pairs."""
+    return np.repeat(np.arange(len(offsets) - 1) * num_database, np.diff(offsets)) + rows
 
 
 def _distinct(keys: np.ndarray) -> np.ndarray:

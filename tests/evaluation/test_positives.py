@@ -105,6 +105,20 @@ def test_rankings_of_others_are_refused(rows, words):
         Positives.from_rows([[0], [0, 1]], 4).contains(rows)
 
 
+@pytest.mark.parametrize(("rows", "offsets", "words"), [
+    ([2, 0], [0, 2, 2], "rows that ascend for each query; from_rows takes them in any order"),
+    ([1, 1], [0, 0, 2], "rows that ascend"),
+    ([0, 4], [0, 1, 2], "rows from 0 to 3, and offsets that grow from 0 to 2"),
+    ([-1, 1], [0, 1, 2], "rows from 0 to 3"),
+    ([0, 1], [0, 1, 1], "offsets that grow from 0 to 2"),
+    ([0, 1], [1, 1, 2], "offsets that grow"),
+    ([0, 1], [0, 3, 2], "offsets that grow"),
+])  # fmt: skip
+def test_made_by_hand_they_are_as_described(rows, offsets, words):
+    with pytest.raises(InputError, match=words):
+        Positives(np.array(rows, np.int32), np.array(offsets), 4)
+
+
 def test_what_does_not_fit_is_refused():
     found = Positives.from_rows([[0], [0, 1]], 4)
     for rows in ([[4]], [[0], [-1]], [[2**32]]):
