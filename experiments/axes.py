@@ -46,7 +46,7 @@ def axes(settings: dict[str, Any]) -> Axes:
         raise SettingsError("grid: expected at least one axis, such as 'grid.sigma=[10,22.5]', or an experiment=; see "
                             "--help")  # fmt: skip
     own = settings["scorer"] | {"max_distance": settings["matching"].get("max_distance")}
-    own |= {"c": _plain_c(settings)} if "c" in values else {}
+    own |= {"c": _plain_c(settings) if settings["final"] == "combined" else 0} if "c" in values else {}
     return Axes(scorer, values, {name: own.get(name) for name in values})
 
 

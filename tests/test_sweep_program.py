@@ -58,11 +58,15 @@ def recall_of(found, **parameters):
 # --- one sweep ---------------------------------------------------------------------------------------------------
 
 
+def results_of(out):
+    return json.loads((out / "results.json").read_text())
+
+
 def evaluated(root, out, **changes):
     """Recall at ks by system and tolerance."""
     overrides = [f"{name}={value}" for name, value in changes.items()]
     evaluation.evaluate(composed(*small(root), "figures=0", f"out={out}", *overrides))
-    rows = json.loads((out / "results.json").read_text())
+    rows = results_of(out)
     return {(row["system"], f"{row['tolerance']}"): row["recall_at"] for row in rows}
 
 
@@ -73,6 +77,17 @@ def test_a_sweep_is_one_evaluation_per_setting(root, swept, tmp_path, sigma, wei
     for system, c in (("histogram", 0), ("histogram + filter", 2)):
         for tolerance, found in recall_of(swept[1], sigma=sigma, weight=weight, c=c).items():
             assert found == pytest.approx(expected[system, tolerance], abs=1e-6)
+
+
+@pytest.mark.parametrize(("final", "c"), [("score", 0), ("combined", 2)])
+def test_the_own_values_score_as_without_a_sweep(root, sweep, swept, tmp_path, final, c):
+    found = sweep(tmp_path / "swept", *GRID, f"final={final}")
+    evaluation.evaluate(
+        composed(*small(root), "figures=0", "scorer=histogram", GRID[-1], f"final={final}", f"out={tmp_path}/evaluated")
+    )
+    assert found["own"] == {"sigma": 22.5, "weight": "fs", "c": c}
+    deciding = [row for row in results_of(tmp_path / "evaluated") if row["decides"]]
+    assert recall_of(found, **found["own"]) == {f"{row['tolerance']}": row["recall_at"] for row in deciding}
 
 
 def test_every_file_tells_the_same(swept):
@@ -104,7 +119,7 @@ def test_the_best_setting_is_chosen_and_told(swept):
     main = {tuple(entry["parameters"].values()): entry["recall_at"]["1"]["1"] for entry in found["settings"]}
     [chosen] = found["chosen"]
     assert main[tuple(chosen.values())] == max(main.values()) > min(main.values())
-    assert found["own"] == {"sigma": 22.5, "weight": "fs", "c": 2}
+    assert found["own"] == {"sigma": 22.5, "weight": "fs", "c": 0}
     for line in found["report"]:
         tolerance = f"{line['threshold']}"
         for name, setting in (("chosen", chosen), ("own", found["own"])):
