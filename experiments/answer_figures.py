@@ -11,6 +11,7 @@ from experiments.console import tell
 from experiments.settings import SettingsError
 from mfvpr.maps import Asked, Map
 from mfvpr.report.answers import answer_figure
+from mfvpr.report.file_names import file_names
 
 
 class AnswerFigures:
@@ -35,7 +36,8 @@ class AnswerFigures:
         if not self._wanted & called:
             return {}
         self._missing -= called
-        path = self._out / f"{number:04d}_{PurePath(name).stem}.png"
+        [file] = file_names([f"{number:04d}_{PurePath(name).stem}"]).values()
+        path = self._out / f"{file}.png"
         try:
             answer_figure(path, self._known, name, pixels, asked, root=self._root)
         except Exception as error:

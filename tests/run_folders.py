@@ -7,8 +7,9 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from mfvpr.data.files import printable
-from mfvpr.report.evaluations import ABOUT
-from mfvpr.report.rankings import Rankings, file_of, write_csv, write_failures, write_predictions
+from mfvpr.report.evaluations import ABOUT, sequence_folder
+from mfvpr.report.file_names import file_names
+from mfvpr.report.rankings import Rankings, write_csv, write_failures, write_predictions
 from mfvpr.report.runs import write_json
 from mfvpr.report.tables import Table
 
@@ -58,7 +59,7 @@ def write_run(folder, *, sequences=("</style><b onclick=alert(3)>",), ranks=RANK
     write_json(folder / "results.json", rows)
     write_json(folder / "run.json", {"command": HOSTILE[3], "commit": None, "settings": {"out": HOSTILE[5], "a": {}}})
     for number, name in enumerate(sequences):
-        own = folder / "sequences" / name if several else folder
+        own = sequence_folder(folder, sequences, number)
         _write_answers(own, ranks, truth, [""] * len(HOSTILE) if not several else [*range(len(HOSTILE))])
         _write_figure(folder / "figures" / f"{name if several else ''}" / f"right_{number:04d}.png", name, 0)
         _write_figure(folder / "figures" / f"{name if several else ''}" / f"wrong_{number:04d}.png", name, 6)
@@ -68,13 +69,14 @@ def write_run(folder, *, sequences=("</style><b onclick=alert(3)>",), ranks=RANK
 
 
 def _write_answers(folder, ranks, truth, places):
+    files = file_names([*ranks])
     for system, first in ranks.items():
         right = np.array([[rank == one for one in range(1, CANDIDATES + 1)] for rank in first])
         rows = (np.arange(len(HOSTILE))[:, None] + np.arange(CANDIDATES)) % len(HOSTILE)
         scores = np.arange(len(HOSTILE))[:, None] + 10.0 - np.arange(CANDIDATES)
         rankings = Rankings(HOSTILE, HOSTILE[::-1], rows, scores, right if truth else None)
-        write_predictions(folder / "predictions" / file_of(system), rankings)
-        write_failures(folder / "failures" / file_of(system), rankings)
+        write_predictions(folder / "predictions" / f"{files[system]}.csv", rankings)
+        write_failures(folder / "failures" / f"{files[system]}.csv", rankings)
     if truth:
         header = ["query", "place", *(column for name in ranks for column in (name, f"{name} rank"))]
         lines = [

@@ -343,6 +343,15 @@ def test_a_sweep_takes_features_whose_files_tell_the_image_size(small_street, fi
     assert "score, import features; recall in %" in stdout
 
 
+def test_predictions_of_systems_of_any_names_are_all_there(result, tmp_path):
+    names = ["count_filter", "count + filter", "../../up", "count"]
+    systems = dict(zip(names, [*result.systems.values()] * 2, strict=False))
+    write_rankings(tmp_path / "out", Judged(replace(result, systems=systems), [0], [1], "count"))
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    for kind in ("predictions", "failures"):
+        assert len([*(tmp_path / "out" / kind).iterdir()]) == len(names)
+
+
 @pytest.mark.parametrize("taken", ["mean", "pooled"])
 def test_no_sequence_is_called_as_a_row_of_the_table(small_street, tmp_path, taken):
     with pytest.raises(InputError, match=f"queries: expected no sequence called {taken}, as results call one of their"):

@@ -140,6 +140,7 @@ ALLOWED = {
         "evaluation",
         "evaluations",
         "features",
+        "fingerprints",
         "learned_weight",
         "learning",
         "maps",

@@ -15,7 +15,8 @@ from mfvpr.evaluation import Positives, middle, threshold_words
 from mfvpr.features import Extractor, Source
 from mfvpr.pipeline import explain
 from mfvpr.report.figures import Answer, histogram_figure
-from mfvpr.report.rankings import Rankings, file_of, write_failures, write_predictions
+from mfvpr.report.file_names import file_names
+from mfvpr.report.rankings import Rankings, write_failures, write_predictions
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table
 from mfvpr.results import Matched, Ranked, Recall, Result
@@ -80,7 +81,7 @@ class Judged:
 
 def sequence_folder(run: Path, sequences: Sequence[str], place: int) -> Path:
     """Where a run's files of one of its sequences are: of several, as a name may be that of any other file, apart."""
-    return run / _SEQUENCES / sequences[place] if len(sequences) > 1 else run
+    return run / _SEQUENCES / file_names(sequences)[sequences[place]] if len(sequences) > 1 else run
 
 
 def recall_table(judged: Judged) -> Table:
@@ -106,7 +107,7 @@ def write_rankings(folder: Path, judged: Judged, refused: Sequence[np.ndarray] |
         judged: what is written.
         refused: `[Q]` bool of each sequence, what is not answered in the headline's predictions; None = none.
     """
-    database = judged.result.dataset.database.names
+    database, files = judged.result.dataset.database.names, file_names([*judged.result.systems])
     for place, sequence in enumerate(judged.sequences):
         own = judged.folder(folder, place)
         for name, ranked in judged.result.systems.items():
@@ -114,7 +115,7 @@ def write_rankings(folder: Path, judged: Judged, refused: Sequence[np.ndarray] |
             rankings = Rankings(
                 sequence.images.names, database, answers.rows, answers.scores, judged.is_right(name, place)
             )
-            file = file_of(name)
+            file = f"{files[name]}.csv"
             write_predictions(own / "predictions" / file, rankings)
             write_failures(own / "failures" / file, rankings)
             if name == judged.headline:
@@ -154,9 +155,9 @@ def figures(
         shown: how many, or rows of queries.
         histogram: which; None = the paper's.
     """
-    several = len(judged.sequences) > 1
+    several, folders = len(judged.sequences) > 1, file_names([sequence.name for sequence in judged.sequences])
     return [
-        (f"{sequence.name}/{name}" if several else name, partial(page.draw, query=query, verdict=verdict))
+        (f"{folders[sequence.name]}/{name}" if several else name, partial(page.draw, query=query, verdict=verdict))
         for place, sequence in enumerate(judged.sequences)
         for page in [_Page(judged, place, extractor, histogram or HistogramOfShifts())]
         for query, verdict in page.shown(shown).items()

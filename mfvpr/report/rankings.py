@@ -77,11 +77,6 @@ def _first_right(rankings: Rankings, right: np.ndarray, query: int) -> list[str 
     return [rank + 1, name, number(scores[rank]), number(margin)]
 
 
-def file_of(system: str) -> str:
-    """The name of a system's file in `predictions/` and `failures/`."""
-    return f"{system.replace(' + ', '_')}.csv"
-
-
 def number(value: Any) -> str:
     """A number in a CSV file."""
     return f"{value:.7g}"

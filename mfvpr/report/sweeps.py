@@ -10,6 +10,7 @@ import numpy as np
 
 from mfvpr import evaluation
 from mfvpr.evaluation.statistics import Estimate
+from mfvpr.report.file_names import file_names
 from mfvpr.report.heat_maps import heat_map_figure
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table, written
@@ -138,7 +139,8 @@ def _heat_maps(outcome: Outcome) -> Iterator[Figure]:
     own = {name: values[name].index(written(value)) if written(value) in values[name] else None
            for name, value in axes.own.items()}  # fmt: skip
     label = judge.label(1, judge.thresholds[judge.main])
-    for first, second in pairs[:MAX_HEAT_MAPS]:
+    files = file_names([first if first == second else f"{first} + {second}" for first, second in pairs])
+    for (first, second), file in zip(pairs[:MAX_HEAT_MAPS], files.values(), strict=False):
         single = first == second
         plane = recall[tuple(slice(None) if name in (first, second) else best[name] for name in values)]
         fixed = [f"{name} = {values[name][place]}" for name, place in best.items() if name not in (first, second)]
@@ -152,7 +154,7 @@ def _heat_maps(outcome: Outcome) -> Iterator[Figure]:
             own=None if row is None or column is None else (row, column),
             title="; ".join([f"{label} in %", *fixed]),
         )
-        yield f"{second}.png" if single else f"{first}_{second}.png", draw
+        yield f"{file}.png", draw
 
 
 def _short(values: list[str]) -> list[str]:

@@ -16,7 +16,7 @@ from mfvpr.data.datasets import MEANS
 from mfvpr.errors import InputError
 from mfvpr.evaluation import Unit, middle, threshold_words
 from mfvpr.report.evaluations import sequence_folder
-from mfvpr.report.rankings import file_of
+from mfvpr.report.file_names import file_names
 from mfvpr.report.tables import Table
 
 _LEFT_BY = "expected the run folder of an evaluation"
@@ -153,7 +153,7 @@ class Run:
 
     def _answers(self, system: str, sequence: str) -> Iterator[Answer]:
         own = sequence_folder(self.folder, self.sequences, self.sequences.index(sequence))
-        path = own / "predictions" / file_of(system)
+        path = own / "predictions" / f"{file_names(self.systems)[system]}.csv"
         first = {line["query"]: line for line in _lines(path) if line["rank"] == "1"}
         if sequence not in self.gains:
             for query, line in first.items():

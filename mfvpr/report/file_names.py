@@ -1,0 +1,44 @@
+"""File names for the names that users give to systems, sequences and images."""
+
+import re
+import unicodedata
+from collections import Counter
+from collections.abc import Sequence
+
+from mfvpr.errors import InputError
+from mfvpr.fingerprints import fingerprint
+
+_MOST_BYTES = 200  # a file system takes 255, and `replacing` adds some
+_PLAIN = re.compile(r'(?!\.)[^\x00-\x1f\x7f/\\:*?"<>|\ud800-\udfff]*[^\x00-\x1f\x7f/\\:*?"<>|\ud800-\udfff. ]')
+_HASHED = re.compile(r".*-[0-9a-f]{16}", re.IGNORECASE | re.DOTALL)
+
+
+def file_names(names: Sequence[str]) -> dict[str, str]:
+    """File names without suffix, by name: different ones, also where the file system ignores case.
+
+    A file is called as its name, with `_` for ` + `. The file name ends in a hash instead where that is not safe on
+    every file system, too long, or the same for two names.
+
+    Raises:
+        InputError: a name is there twice.
+    """
+    if repeated := [name for name, count in Counter(names).items() if count > 1]:
+        raise InputError(f"names: expected different ones, got {repeated[0]} twice. Rename one.")
+    plain = {name: name.replace(" + ", "_") for name in names}
+    counts = Counter(map(_compared, plain.values()))
+    return {
+        name: file if _is_plain(file) and counts[_compared(file)] == 1 else _hashed_name(name)
+        for name, file in plain.items()
+    }
+
+
+def _compared(file: str) -> str:
+    return unicodedata.normalize("NFC", file.casefold())
+
+
+def _is_plain(file: str) -> bool:
+    return bool(_PLAIN.fullmatch(file)) and not _HASHED.fullmatch(file) and len(file.encode()) <= _MOST_BYTES
+
+
+def _hashed_name(name: str) -> str:
+    return f"{re.sub('[^A-Za-z0-9]+', '_', name)[:60]}-{fingerprint(name)}"

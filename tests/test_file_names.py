@@ -1,0 +1,45 @@
+"""File names of what users name: different, safe, and for plain names as they always were."""
+
+import pytest
+
+from mfvpr.errors import InputError
+from mfvpr.report.file_names import file_names
+
+HOSTILE = (
+    "a/b", "a_b", "../up", "..", ".", "", "nul\0", "two\nlines", "a\\b", "c:d", "e*?", "not utf-8 \udcff", "\ud800",
+    ".hidden", "ends in dot.", " ", "x" * 300, "x" * 301, "ü" * 150, "a + b", "A + B", "count", "Count",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [
+        ("histogram", "histogram"),
+        ("histogram + anchor + filter", "histogram_anchor_filter"),
+        ("homography_24 + filter", "homography_24_filter"),
+        ("my score (v2), straße=1", "my score (v2), straße=1"),
+    ],
+)
+def test_plain_names_are_files_of_their_own_name(name, file):
+    assert file_names([name, "other"]) == {name: file, "other": "other"}
+
+
+def test_names_have_different_files_that_every_folder_takes(tmp_path):
+    first = file_names(HOSTILE)
+    names = [*HOSTILE, *first.values()]  # of which some are those of other names' files
+    names = list(dict.fromkeys(names))
+    files = file_names(names)
+    assert len({file.casefold() for file in files.values()}) == len(names)
+    for name, file in files.items():
+        (tmp_path / f"{file}.csv").write_text(repr(name))
+    assert len([*tmp_path.iterdir()]) == len(names)  # none in a folder, or above
+    for name, file in files.items():
+        assert (tmp_path / f"{file}.csv").read_text() == repr(name)
+
+
+def test_two_files_of_one_name_are_told_apart():
+    files = file_names(["count_filter", "count + filter", "filter"])
+    assert len({*files.values()}) == 3
+    assert files["filter"] == "filter"
+    with pytest.raises(InputError, match="got one twice"):
+        file_names(["one", "two", "one"])
