@@ -65,15 +65,15 @@ def differences_table(judged: Judged) -> Table:
 def write_gains(folder: Path, judged: Judged) -> None:
     """`gains.csv` of every sequence, where its predictions are, and of all `differences.csv` and `differences.md`.
 
-    Nothing is written without ground truth. `place` in `gains.csv` is where along the map each query is, empty where
-    they are in the order of their path: intervals and tests across runs need to know whose neighbor it is.
+    Nothing is written without ground truth. `place` in `gains.csv` is where along the map each query is: intervals and
+    tests across runs need to know whose neighbor it is. It is the row of the query where that is the order of the path.
     """
     if not judged.thresholds:
         return
     columns = [column for name in judged.result.systems for column in (name, f"{name} rank")]
     shown = _places(judged)
     sizes = [len(sequence.images) for sequence in judged.sequences]
-    along = [""] * sum(sizes) if shown is None else shown.tolist()
+    along = range(sum(sizes)) if shown is None else shown.tolist()
     for place, start in enumerate(np.cumsum([0, *sizes[:-1]])):
         lines = _gains(judged, place, along[start : start + sizes[place]])
         write_csv(judged.folder(folder, place) / "gains.csv", ["query", "place", *columns], lines)
@@ -87,7 +87,7 @@ def write_gains(folder: Path, judged: Judged) -> None:
     write_text(folder / "differences.md", differences_table(judged).markdown())
 
 
-def _gains(judged: Judged, place: int, along: Sequence[str | int]) -> Iterator[list[str | int]]:
+def _gains(judged: Judged, place: int, along: Sequence[int]) -> Iterator[list[str | int]]:
     """By query: for every system whether its first answer is right, and the rank of the first right one."""
     right = [_right(judged, system, place) for system in judged.result.systems]
     for query, name in enumerate(judged.sequences[place].images.names):
