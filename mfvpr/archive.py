@@ -22,7 +22,7 @@ from mfvpr.errors import InputError
 from mfvpr.extraction import described
 from mfvpr.features import Aggregated, Aggregation, Extractor, Source
 from mfvpr.fingerprints import fingerprint, recipe_of
-from mfvpr.progress import Track, untracked
+from mfvpr.progress import Stopwatch, Track, untracked
 from mfvpr.report.runs import versions
 from mfvpr.shards import Shard
 from mfvpr.sinks import Sink, Taken, account, open_sinks
@@ -63,6 +63,7 @@ class Archive:
         wait: for other processes that are making the same, instead of refusing.
         shard: takes from its own images alone, and the others' of their stores, for which it waits `patience` seconds
             before it says `mfvpr.shards.NotYet`; it needs a root.
+        watch: counts the extraction of local features as the stage `features`, whoever asks for them.
     """
 
     root: Path | None = None
@@ -72,6 +73,7 @@ class Archive:
     wait: bool = False
     shard: Shard | None = None
     patience: float = 0.0
+    watch: Stopwatch | None = None
     _computed: dict[tuple, tuple[Any, Any]] = field(default_factory=dict, repr=False)
     _warned: set[str] = field(default_factory=set, repr=False)
 
@@ -226,6 +228,8 @@ class Archive:
         """Run the extractor on those of the rows that lack something."""
         taken = self.once("taken", lambda: Taken(self._sinks(folder, extractor)), folder, extractor)
         with ExitStack() as held:
+            if self.watch is not None and extractor.scales:
+                held.enter_context(self.watch("features"))
             if any(sink.lacks(rows) for sink in taken.sinks):
                 for sink in taken.sinks:
                     if sink.store is not None:

@@ -9,6 +9,7 @@ Features, shortlist and matches are kept in an archive, where that has a folder.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
 
@@ -77,7 +78,8 @@ def evaluate(
         memory: GB that features of the database may take on the devices, and matches that are kept in memory; None = a
             third of what is free.
         devices: that share the queries; None = the one that JAX takes.
-        watch: gets the seconds of the stages; all that a cohort takes is a stage of its own.
+        watch: gets the seconds of the stages; all that a cohort takes is a stage of its own, but for the extraction of
+            local features, which is the stage `features` also where the filter or a cohort asks for it.
 
     Raises:
         InputError: arguments, images, stores or features that cannot be used, or what an extractor, a filter or a
@@ -86,7 +88,8 @@ def evaluate(
     """
     fused, correlated = fused or {}, correlated or {}
     check_request(scorers, fused, correlated, ties, memory, cohort=cohort is not None)
-    archive, watch = archive or Archive(), watch or Stopwatch()
+    watch = watch or Stopwatch()
+    archive = replace(archive or Archive(), watch=watch)
     tools = (extractor, filter, candidates)
     how = {"matching": matching, "archive": archive, "memory": memory, "devices": devices}
     calls = [partial(_scored, dataset, sequence, tools, scorers, watch, **how) for sequence in dataset.sequences]

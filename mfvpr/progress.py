@@ -17,12 +17,19 @@ def untracked(items: Iterable[Item], total: int) -> Iterable[Item]:
 
 @dataclass
 class Stopwatch:
-    """Seconds by stage."""
+    """Seconds by stage. A stage inside another one counts only for itself."""
 
     seconds: dict[str, float] = field(default_factory=dict)
+    _inside: list[float] = field(default_factory=list, repr=False)  # seconds of other stages inside each open one
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
         start = time.perf_counter()
-        yield
-        self.seconds[stage] = round(self.seconds.get(stage, 0) + time.perf_counter() - start, 3)
+        self._inside.append(0)
+        try:
+            yield
+        finally:
+            spent, inside = time.perf_counter() - start, self._inside.pop()
+            if self._inside:
+                self._inside[-1] += spent
+            self.seconds[stage] = round(self.seconds.get(stage, 0) + spent - inside, 3)

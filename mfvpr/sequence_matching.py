@@ -72,8 +72,11 @@ def match_sequence(
     if rows is not None and not all(0 <= row < len(sequence.images) for row in rows):
         raise InputError(f"rows: expected rows of {len(sequence.images)} queries, got {[*rows][:9]}")
     archive, watch, database = archive or Archive(), watch or Stopwatch(), dataset.database
+    archive = archive if archive.watch else replace(archive, watch=watch)
+    with watch("features"):
+        extractor = fitted(extractor, database, archive)
     with watch("filter"):
-        extractor, filter = fitted(extractor, database, archive), fitted(filter, database, archive)
+        filter = fitted(filter, database, archive)
     num_candidates = _number(candidates, database)
     with ExitStack() as held:
         stores = []

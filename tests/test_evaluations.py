@@ -1,16 +1,18 @@
 """A whole evaluation in one call: sequences, what is kept, and files of other programs in place of our own stages."""
 
+import csv
 import itertools
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
 import mfvpr
-from mfvpr import pipeline
+from mfvpr import archive, pipeline, progress
 from mfvpr.archive import Archive
 from mfvpr.confidence import confidence_inputs, fit_confidence
 from mfvpr.data.datasets import folder_dataset, sequences_dataset
@@ -18,6 +20,7 @@ from mfvpr.errors import InputError
 from mfvpr.evaluation import Positives, halves
 from mfvpr.evaluation.statistics import block_sign_flips
 from mfvpr.exchange import write_features, write_global_descriptors, write_shortlist
+from mfvpr.extraction import described
 from mfvpr.features import Aggregated
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
@@ -83,6 +86,12 @@ def test_frame_correlation_is_a_ranking_more(result):
         np.testing.assert_array_equal(got.scores, np.take_along_axis(expected, order, axis=1))
         np.testing.assert_array_equal(got.rows, np.take_along_axis(alone.rows, order, axis=1))
         assert (got.scores != alone.scores).any()
+
+
+def test_gains_say_where_on_the_path_each_query_is(result, tmp_path):
+    write_gains(tmp_path, Judged(result, [0, 1], [1], "count"))
+    with (tmp_path / "gains.csv").open() as file:
+        assert [line["place"] for line in csv.DictReader(file)] == [*map(str, range(10))]
 
 
 def test_sequences_are_evaluated_by_themselves_with_their_means(dataset, split, small_street, result, tmp_path):
@@ -341,6 +350,21 @@ def test_a_sweep_takes_features_whose_files_tell_the_image_size(small_street, fi
     code, stdout, stderr = typed(monkeypatch, capsys, "sweep", *common, f"out={tmp_path}/out")
     assert code == 0, stderr
     assert "score, import features; recall in %" in stdout
+
+
+def test_extraction_counts_as_features_whoever_asks_for_them(dataset, monkeypatch):
+    """VLAD and a cohort ask first; a clock that only extraction moves."""
+    clock = [0.0]
+    monkeypatch.setattr(progress, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
+
+    def slow(*arguments, **options):
+        clock[0] += 10
+        yield from described(*arguments, **options)
+
+    monkeypatch.setattr(archive, "described", slow)
+    seconds = mfvpr.evaluate(dataset, SIFT, VLAD, {}, candidates=2, cohort=1).seconds
+    assert seconds.pop("features") >= 20
+    assert {*seconds.values()} == {0}
 
 
 def test_predictions_of_systems_of_any_names_are_all_there(result, tmp_path):

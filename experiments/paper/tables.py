@@ -121,7 +121,7 @@ def tables(found: Found) -> Iterator[tuple[str, str, Table]]:
         ("averages", f"Average Recall@1 in % (figure 8), here over {listed(found)}", averages(found)),
         ("depths", "Recall@1, @5 and @10 in %, by data set (Table VIII)", depths(found)),
         ("sizes", "Size of the database in MiB, of float32 (Table V)", sizes(found)),
-        ("seconds", "Seconds of a query by step, those of features that the filter takes under filter (Table VI: "
+        ("seconds", "Seconds of a query by step (Table VI: "
          f"RobotCar's snow, an RTX 2080 Ti; here {found.timed_on})", seconds(found)),
     )  # fmt: skip
     for name, heading, table in candidates:
