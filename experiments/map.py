@@ -60,10 +60,10 @@ def info(folder: Path) -> None:
     import json
 
     from experiments import maps
+    from mfvpr.stores.disk import used_bytes
 
     settings, known = maps.read(folder), maps.opened(folder)
-    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-    print(f"{folder}: {len(known)} images, {size / 1e6:.1f} MB")
+    print(f"{folder}: {len(known)} images, {used_bytes(folder) / 1e6:.1f} MB")
     print(json.dumps(settings, indent=1, ensure_ascii=False))
 
 

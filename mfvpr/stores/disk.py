@@ -47,22 +47,32 @@ def _take(handle: int, folder: Path, waiting: Callable[[str], None] | None) -> N
 
 
 @contextmanager
-def told(folder: Path, content: str, needed: int = 10**6) -> Iterator[None]:
+def told(folder: Path, content: str, needed: Callable[[], int] = lambda: 10**6) -> Iterator[None]:
     """What the file system raises, as one line.
 
     Args:
         folder: the store's.
         content: what it holds.
-        needed: bytes that what is under way takes.
+        needed: bytes that are still to be written when the disk is full.
     """
     try:
         yield
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise InputError(too_full(folder, needed, free_bytes(folder))) from None
+            raise InputError(too_full(folder, needed(), free_bytes(folder))) from None
         raise InputError(
             f"{folder}: cannot hold {content} ({error.strerror}); check the path, its permissions and its disk"
         ) from None
+
+
+def used_bytes(folder: Path) -> int:
+    """Bytes on disk of all that is below a folder; nothing for what others remove or rename meanwhile."""
+    total = 0
+    for parent, folders, files in os.walk(folder):
+        for name in (*folders, *files):
+            with suppress(FileNotFoundError):
+                total += os.stat(os.path.join(parent, name)).st_blocks * 512
+    return total
 
 
 def free_bytes(folder: Path) -> int:

@@ -9,6 +9,7 @@ ones. Shards write stores of their own in the folder `shards` of a store, and wh
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
 
@@ -18,7 +19,7 @@ from mfvpr.data.arrays import read_arrays, write_arrays
 from mfvpr.errors import InputError
 from mfvpr.fingerprints import difference
 from mfvpr.shards import Shard
-from mfvpr.stores.disk import free_bytes, locked, told, too_full
+from mfvpr.stores.disk import free_bytes, locked, told, too_full, used_bytes
 from mfvpr.stores.manifest import (
     Kind,
     check_owned,
@@ -118,7 +119,7 @@ class RowStore(Generic[Item]):
     @property
     def size_bytes(self) -> int:
         """Bytes that the store takes on disk."""
-        return sum(path.stat().st_blocks * 512 for path in self.folder.rglob("*"))
+        return used_bytes(self.folder)
 
     def write(self, items: Mapping[int, Item]) -> None:
         """Store a batch of rows. When this returns they are done, and on disk.
@@ -139,8 +140,9 @@ class RowStore(Generic[Item]):
             raise ValueError(f"{self.folder}: is read only, or was complete; write `with store:`")
         rows = {row: self._packed(row, item) for row, item in items.items()}
         self._check_layouts(rows)
-        taken = [row_bytes(sum(part.nbytes for part in parts.values()), len(parts)) for parts in rows.values()]
-        with told(self.folder, self.kind.content, int(np.sum(~self.done) * np.mean(taken))):
+        sizes = {row: row_bytes(sum(part.nbytes for part in parts.values()), len(parts)) for row, parts in rows.items()}
+        missing = partial(self._missing_bytes, sizes)
+        with told(self.folder, self.kind.content, missing):
             for _ in ordered_map(self._write_row, rows.items(), workers=THREADS):
                 pass
 
@@ -173,6 +175,9 @@ class RowStore(Generic[Item]):
             return self._pack(item)
         except ValueError as error:
             raise ValueError(f"{self.folder}: row {row}: {error}") from None
+
+    def _missing_bytes(self, sizes: Mapping[int, int]) -> int:
+        return sum(size for row, size in sizes.items() if self.counts[row] < 0)
 
     def _write_row(self, row_parts: tuple[int, Parts]) -> None:
         row, parts = row_parts

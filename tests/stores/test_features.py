@@ -1,6 +1,8 @@
 """The feature store: what comes back, and what is refused."""
 
+import errno
 import json
+import os
 from dataclasses import fields
 from pathlib import Path
 
@@ -8,6 +10,7 @@ import numpy as np
 import pytest
 
 from mfvpr import Features, InputError
+from mfvpr.stores import rows
 from mfvpr.stores.features import forecast_bytes, open_store, require_space
 from mfvpr.stores.manifest import recipe_fingerprint, store_path
 from tests.builders import make_features
@@ -132,6 +135,39 @@ def test_size_on_disk(tmp_path):
     apparent = sum(path.stat().st_size for path in (tmp_path / "s").rglob("*") if path.is_file())
     assert apparent <= size < 0.52 * 2064 * sum(counts)
     assert 0.95 * size < forecast_bytes(len(counts), np.mean(counts), 512) < 1.2 * size
+
+
+def test_the_size_of_a_store_is_known_while_others_write(tmp_path, monkeypatch):
+    with open_store(tmp_path / "s", RECIPE, num_images=3) as store:
+        store.write({0: features_of(0)})
+        size, walk = store.size_bytes, os.walk
+        (tmp_path / "s" / ".unfinished").write_bytes(bytes(10**5))
+
+        def walk_while_others_rename(folder):
+            for entries in walk(folder):
+                (tmp_path / "s" / ".unfinished").unlink()
+                yield entries
+
+        monkeypatch.setattr(os, "walk", walk_while_others_rename)
+        assert store.size_bytes == size
+
+
+def test_a_full_disk_lacks_what_is_not_written_yet(tmp_path, monkeypatch):
+    written = []
+
+    def write(path, *arguments, **options):
+        if len(written) == 2:
+            raise OSError(errno.ENOSPC, "full")
+        written.append(path)
+
+    monkeypatch.setattr(rows, "write_arrays", write)
+    monkeypatch.setattr(rows, "THREADS", 1)
+    needed = f"{forecast_bytes(1, 700, 512) / 1e6:.1f} MB"
+    with (
+        pytest.raises(InputError, match=f"expected about {needed} of free disk space"),
+        open_store(tmp_path / "s", RECIPE, num_images=1000) as store,
+    ):
+        store.write({row: features_of(row, 700, 512) for row in range(3)})
 
 
 def test_a_global_descriptor_takes_the_space_of_one(tmp_path):
