@@ -14,7 +14,7 @@ import pytest
 
 from mfvpr.errors import InputError
 from mfvpr.evaluation.statistics import block_sign_flips, mcnemar, recall_interval
-from mfvpr.report.pages import sections, several_runs
+from mfvpr.report.pages import one_run, sections, several_runs
 from mfvpr.report.pages.files import read_run
 from mfvpr.report.pages.one_run import write_report
 from mfvpr.report.pages.several_runs import write_comparison
@@ -260,6 +260,52 @@ def test_what_is_no_run_is_refused_in_one_line(run, tmp_path, monkeypatch, capsy
     assert stderr.endswith("one: expected different run folders, got this one twice\n")
     with pytest.raises(InputError, match="expected different"):
         write_comparison([run, run.parent / "." / "one"], tmp_path / "page.html")
+
+
+@pytest.fixture
+def edited(run, tmp_path, monkeypatch):
+    """A run folder whose page is made of an edited file, but not written."""
+    monkeypatch.setattr(one_run, "write_page", lambda *_, **parts: None)
+    monkeypatch.setattr(sections, "pictures", lambda *_: [])
+    shutil.copytree(run, tmp_path / "run")
+
+    def refused(name, text):
+        """The reason; None where there is a page."""
+        path = tmp_path / "run" / name
+        before = path.read_bytes()
+        path.write_text(text, "utf-8", "surrogateescape")
+        try:
+            write_report(tmp_path / "run")
+            return None
+        except InputError as error:
+            return str(error).removeprefix(f"{tmp_path}/run: ")
+        finally:
+            path.write_bytes(before)
+
+    return refused
+
+
+def test_edited_results_are_refused_in_one_line(edited, run):
+    text = (run / "results.json").read_text("utf-8")
+    for before, after in (
+        ('"unit"', '"units"'), ('"frames"', '"miles"'), ('"scores": 2.0', '"scores": "2"'),
+        ('"scores": 2.0', '"scores": NaN'),
+        ('"recall_at": {', '"recall_at": {"x": 1,'), ('"recall_at": {', '"recall_at": {"5": 1,'), ('"1":', '"01":'),
+        ('"tolerance": 2', '"tolerance": null'), ('"name"', '"named"'), ('"system"', '"systems"'),
+        ('"thresholds": [', '"thresholds": ["0",'),
+        ('"dataset"', '"sequence"'), ('"ground_truth"', '"truth"'),
+    ):  # fmt: skip
+        reason = edited("results.json", text.replace(before, after, 1))
+        assert reason is not None, after
+        assert "\n" not in reason
+        assert "run folder" in reason
+
+
+def test_edited_tables_are_refused_or_nothing_but_text(edited, run):
+    for path in sorted(run.glob("*.csv")):
+        text = path.read_text("utf-8", "surrogateescape")
+        reasons = [edited(path.name, new) for new in ("", text.replace("1", "one"), f"{text}x", "x,y\n1,2")]
+        assert path.name in ("confidence.csv", "skipped.csv") or any(reasons[1:]), path
 
 
 def test_help_and_the_library_wait_for_no_charts():

@@ -1,11 +1,14 @@
 """What the files of a run folder say."""
 
 import csv
+import functools
 import itertools
 import json
-from collections.abc import Iterator, Mapping, Sequence
+import math
+import operator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from mfvpr.data.datasets import MEANS
-from mfvpr.errors import InputError
+from mfvpr.errors import InputError, require_word
 from mfvpr.evaluation import Unit, middle, threshold_words
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.file_names import file_names
@@ -21,9 +24,12 @@ from mfvpr.report.tables import Table
 
 _LEFT_BY = "expected the run folder of an evaluation"
 _KINDS_OF_A_ROW = {"system": str, "decides": bool, "parameters": dict, "recall_at": dict}
-_KINDS = {"dataset": str, "ground_truth": dict, "data_fingerprint": dict, "filter": dict, "features": dict,
+_KINDS = {"dataset": str, "ground_truth": dict, "data_fingerprint": dict, "filter.name": str, "features.name": str,
           "versions": dict, "seconds": dict, "queries": int, "database": int, "candidates": int,
           "bytes_per_image": int | None}  # fmt: skip
+# Columns of text in front of the numbers; None = all.
+_TABLES = {"table.csv": 1, "differences.csv": 2, "confidence.csv": None, "rerank_share.csv": 0,
+           "precision_recall.csv": 2, "skipped.csv": None}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -78,12 +84,14 @@ class Run:
         results: of `results.json`, at least one row.
         about: of `run.json`.
         gains: by sequence; none without ground truth.
+        tables: of its CSV files, by name; numbers are finite.
     """
 
     folder: Path
     results: Sequence[Mapping[str, Any]]
     about: Mapping[str, Any]
     gains: Mapping[str, Gains]
+    tables: Mapping[str, Table]
 
     @property
     def common(self) -> Mapping[str, Any]:
@@ -136,13 +144,9 @@ class Run:
         )
 
     def table(self, name: str, text_columns: int = 1) -> Table | None:
-        """A CSV file of the folder; None where there is none."""
-        path = self.folder / name
-        if not path.exists():
-            return None
-        with _telling_which(self.folder), path.open(encoding="utf-8", errors="surrogateescape", newline="") as file:
-            header, *rows = csv.reader(file)
-        return Table(header, rows, text_columns)
+        """A CSV file of the folder, so many columns of it left-aligned; None where there is none."""
+        found = self.tables.get(name)
+        return found and replace(found, text_columns=text_columns)
 
     def answers(self) -> Iterator[Answer]:
         """The first answers of all systems, those of the system that decides first."""
@@ -179,12 +183,18 @@ def read_run(folder: Path) -> Run:
         results, about = (json.loads((folder / name).read_text("utf-8")) for name in ("results.json", "run.json"))
         _check(results, about)
         sequences = _sequences(results)
+        if not sequences:
+            raise ValueError("results.json has no sequence")
         paths = {name: sequence_folder(folder, sequences, place) / "gains.csv" for place, name in enumerate(sequences)}
-        run = Run(folder, results, about, {name: _gains(path) for name, path in paths.items() if path.exists()})
+        gains = {name: _gains(path) for name, path in paths.items() if path.exists()}
+        tables = {name: _table(folder / name, text) for name, text in _TABLES.items() if (folder / name).exists()}
+        run = Run(folder, results, about, gains, tables)
         if len(run.gains) != (len(sequences) if run.thresholds else 0):
             raise ValueError("each sequence with ground truth has a gains.csv, and no other")
-        if any({*one.ranks} < {*run.systems} for one in run.gains.values()):
+        if any(not {*run.systems} <= {*one.ranks} for one in run.gains.values()):
             raise ValueError("gains.csv lacks a system")
+        if "table.csv" in tables and not {row[0] for row in tables["table.csv"].rows} <= {*run.systems}:
+            raise ValueError("table.csv has another system")
         return run
 
 
@@ -194,19 +204,40 @@ def _check(results: Any, about: Any) -> None:
         raise ValueError("results.json has no rows")
     for kinds, rows in ((_KINDS_OF_A_ROW, results), (_KINDS, results[:1]), ({"settings": dict}, [about])):
         for row, (name, kind) in itertools.product(rows, kinds.items()):
-            if not isinstance(row[name], kind):
-                raise ValueError(f"{name} is {type(row[name]).__name__}")
+            value = functools.reduce(operator.getitem, name.split("."), row)
+            if not isinstance(value, kind):
+                raise ValueError(f"{name} is {type(value).__name__}")
     if not any(row["decides"] for row in results):
         raise ValueError("no system decides")
+    first, truth = results[0], results[0]["ground_truth"]
+    if not all(isinstance(name, str) for name in first.get("incomplete", [])):
+        raise ValueError("incomplete is no list of text")
+    _check_numbers("seconds", first["seconds"].values())
+    if thresholds := truth.get("thresholds", []):
+        _check_numbers("thresholds", thresholds)
+        _check_numbers("recall_at", map(int, first["recall_at"] or [""]))
+        require_word("unit", truth["unit"], Unit)
+    for row in results:
+        _check_numbers("recall_at", row["recall_at"].values())
+        if [*row["recall_at"]] != [*first["recall_at"]]:
+            raise ValueError("recall_at has other depths in some rows")
+        if len(thresholds) > 1:
+            _check_numbers("tolerance or radius", [row.get("tolerance", row.get("radius"))])
+        if not isinstance(row.get("sequence", ""), str) or ("sequence" in row) != ("sequence" in first):
+            raise ValueError("sequence is missing in some rows, or no text")
+
+
+def _check_numbers(name: str, values: Iterable[Any]) -> None:
+    for value in values:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise ValueError(f"{name} has {value!r} instead of a number")
 
 
 @contextmanager
 def _telling_which(folder: Path) -> Iterator[None]:
     try:
         yield
-    except (ValueError, LookupError, TypeError, AttributeError, StopIteration, csv.Error) as error:
-        if isinstance(error, InputError):
-            raise
+    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, StopIteration, csv.Error) as error:
         raise InputError(
             f"{folder}: {_LEFT_BY} of this version, got other files ({type(error).__name__}: {error})"
         ) from None
@@ -218,6 +249,19 @@ def _sequences(results: Sequence[Mapping[str, Any]]) -> list[str]:
     if "sequence" not in first:
         return [first["dataset"]]
     return list(dict.fromkeys(row["sequence"] for row in results))[: -len(MEANS)]
+
+
+def _table(path: Path, num_texts: int | None) -> Table:
+    with path.open(encoding="utf-8", errors="surrogateescape", newline="") as file:
+        header, *rows = csv.reader(file)
+    if any(len(row) != len(header) for row in rows):
+        raise ValueError(f"{path.name} has lines of different lengths")
+    if num_texts is not None:
+        columns = range(num_texts + ("sequence" in header), len(header))
+        numbers = {header[place]: [float(row[place]) for row in rows] for place in columns}
+        numbers.pop("threshold", None)  # of scores, which may be infinite
+        _check_numbers(path.name, itertools.chain.from_iterable(numbers.values()))
+    return Table(header, rows)
 
 
 def _gains(path: Path) -> Gains:

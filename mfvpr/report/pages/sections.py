@@ -120,7 +120,7 @@ def confidence_section(run: Run) -> Section | None:
         if curves := precision_by_recall(run, {name: name for name in run.systems}, by):
             title = f"Precision and recall {words}"
             charts.append(lines(f"precision-{by}", title, curves, axes=PRECISION_AXES, scale="percent"))
-    if shares is not None and shares.rows:
+    if shares is not None and shares.rows and len(shares.header) > 1:
         axes, title = ("queries re-ranked, %", "recall at 1, %"), "Re-ranking only what the filter is unsure of"
         charts.append(lines("shares", title, _by_share(shares), axes=axes, scale="percent"))
     sheets = [] if table is None or not table.rows else [Sheet("Confidence of first answers, in %", table)]
