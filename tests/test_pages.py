@@ -162,6 +162,17 @@ def test_answers_are_pictures_and_rows(page, several, run):
     assert len([row for row in several.rows if len(row) == 7 and row[0] in SYSTEMS]) == 60
 
 
+def test_own_folders_are_the_title_of_a_page_unless_they_have_a_name(tmp_path, monkeypatch):
+    titles = []
+    monkeypatch.setattr(one_run, "write_page", lambda path, title, **parts: titles.append(title))
+    for name in ("folder", "my street"):
+        folder = write_run(tmp_path / name, sequences=(name,))
+        dataset = {"name": name, "queries": "/data/street/night", "database": "/data/street/day"}
+        change_json(folder / "run.json", lambda about, dataset=dataset: about | {"settings": {"dataset": dataset}})
+        write_report(folder)
+    assert titles == ["street/night in street/day", "my street"]
+
+
 def test_too_many_answers_are_left_to_the_files(run, tmp_path, monkeypatch):
     monkeypatch.setattr(sections, "MOST_ANSWERS", 7)
     text = write_report(run, tmp_path / "page.html").read_text("utf-8")

@@ -10,7 +10,7 @@ from mfvpr.errors import InputError
 from mfvpr.features import Extractor
 from mfvpr.maps import Asked, Map
 from mfvpr.pipeline import explain
-from mfvpr.report.figures import Answer, histogram_figure
+from mfvpr.report.figures import Answer, aspect_of_resized, histogram_figure
 from mfvpr.scoring import HistogramOfShifts
 
 _GRAY, _MOST = 150, 80  # of an image that is not at hand; characters of a name or a place
@@ -45,7 +45,8 @@ def answer_figure(
         beside = Answer(shown, caption, asked.matches, explain(histogram, asked.matches))
     query = resize(image, extractor.image_size, extractor.interpolation)
     title = f"{clipped(name, _MOST)} -> {place}"
-    histogram_figure(path, query, [beside], title=title, about={"image": name, "place": str(answer.place)})
+    about = {"image": name, "place": str(answer.place)}
+    histogram_figure(path, query, [beside], title=title, pixel_aspect=aspect_of_resized(image, query), about=about)
 
 
 def _candidate(extractor: Extractor, name: str, root: Path | None) -> tuple[np.ndarray, str]:

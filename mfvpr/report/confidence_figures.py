@@ -2,14 +2,24 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from mfvpr.data.files import replacing
+from mfvpr.data.files import clipped, printable, replacing
 from mfvpr.evaluation.precision import PrecisionRecall, Reliability
+from mfvpr.report.colors import color_and_dash
+
+_LINE_STYLES = {
+    "solid": "solid",
+    "dash": "dashed",
+    "dot": "dotted",
+    "dashdot": "dashdot",
+}  # by plotly's words
+_MOST_OF_A_NAME = 34  # characters that fit above a panel
 
 
 def precision_recall_figure(path: Path, curves: Mapping[str, Mapping[str, PrecisionRecall]]) -> None:
@@ -22,11 +32,11 @@ def precision_recall_figure(path: Path, curves: Mapping[str, Mapping[str, Precis
     kinds = list(dict.fromkeys(kind for by in curves.values() for kind in by))
     figure, panels = _panels(len(kinds), width=5.0)
     for panel, kind in zip(panels, kinds, strict=False):
-        for name, by in curves.items():
+        for place, (name, by) in enumerate(curves.items()):
             if kind in by:
                 curve = by[kind]
-                label = f"{name}: AP {100 * curve.average_precision:.1f}"
-                panel.plot(curve.recall, curve.precision, label=label, linewidth=1.2)
+                label = f"{_short(name)}: AP {100 * curve.average_precision:.1f}"
+                panel.plot(curve.recall, curve.precision, label=label, **_line(place))
         panel.set_title(f"by {kind}", fontsize=9)
         _label(panel, "recall of the queries that have an answer", "precision of the answers")
         panel.legend(fontsize=7, loc="lower left")
@@ -41,10 +51,11 @@ def reliability_figure(path: Path, reliabilities: Mapping[str, Reliability]) -> 
         reliabilities: by system.
     """
     figure, panels = _panels(len(reliabilities), width=2.6)
-    for panel, (name, found) in zip(panels, reliabilities.items(), strict=False):
+    for place, (panel, (name, found)) in enumerate(zip(panels, reliabilities.items(), strict=False)):
         panel.plot([0, 1], [0, 1], color="gray", linewidth=0.8)
-        panel.scatter(found.probability, found.right, s=200 * found.count / max(found.count.sum(), 1) + 4, alpha=0.8)
-        panel.set_title(f"{name}: ECE {100 * found.calibration_error:.1f} %", fontsize=8)
+        sizes = 200 * found.count / max(found.count.sum(), 1) + 4
+        panel.scatter(found.probability, found.right, s=sizes, alpha=0.8, color=color_and_dash(place)[0])
+        panel.set_title(f"{_short(name)}\nECE {100 * found.calibration_error:.1f} %", fontsize=8, parse_math=False)
         _label(panel, "p(right)", "right")
     _save(figure, path)
 
@@ -55,14 +66,23 @@ def shares_figure(path: Path, shares: Sequence[float], recall: Mapping[str, np.n
     Args:
         path: image file to write.
         shares: of all queries.
-        recall: `[shares]` by system.
+        recall: `[shares]` by system, all but the filter.
     """
     figure, [panel] = _panels(1, width=5.0)
-    for name, values in recall.items():
-        panel.plot(shares, values, label=name, linewidth=1.2)
+    for place, (name, values) in enumerate(recall.items(), start=1):
+        panel.plot(shares, values, label=_short(name), **_line(place))
     _label(panel, "share of queries re-ranked", "recall at 1")
     panel.legend(fontsize=7)
     _save(figure, path)
+
+
+def _line(place: int) -> dict[str, Any]:
+    color, dash = color_and_dash(place)
+    return {"color": color, "linestyle": _LINE_STYLES[dash], "linewidth": 1.2}
+
+
+def _short(name: str) -> str:
+    return clipped(printable(name), _MOST_OF_A_NAME)
 
 
 def _panels(number: int, *, width: float) -> tuple[Figure, list[Axes]]:
@@ -85,4 +105,4 @@ def _label(panel: Axes, x: str, y: str) -> None:
 
 def _save(figure: Figure, path: Path) -> None:
     with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+        figure.savefig(temporary, dpi=110, bbox_inches="tight")  # titles may be wider than their panel

@@ -9,12 +9,12 @@ import jax
 import numpy as np
 
 from mfvpr.data.datasets import MEANS, ImageFolder, QuerySequence
-from mfvpr.data.files import write_text
+from mfvpr.data.files import clipped, printable, write_text
 from mfvpr.data.images import resize
 from mfvpr.evaluation import Positives, middle, threshold_words
 from mfvpr.features import Extractor, Source
 from mfvpr.pipeline import explain
-from mfvpr.report.figures import Answer, histogram_figure
+from mfvpr.report.figures import Answer, aspect_of_resized, histogram_figure
 from mfvpr.report.file_names import file_names
 from mfvpr.report.rankings import Rankings, write_failures, write_predictions
 from mfvpr.report.runs import Figure
@@ -23,6 +23,7 @@ from mfvpr.results import Matched, Ranked, Recall, Result
 from mfvpr.scoring import HistogramOfShifts
 
 ABOUT: tuple[str, ...] = ("system", "sequence", "outcome", "query", "answer")  # what the file of a figure tells
+_MOST_OF_A_NAME = 40  # characters in the title of a figure
 _SEQUENCES = "sequences"  # the folder of a run in which each of several has its own
 
 
@@ -209,15 +210,18 @@ class _Page:
         answer = self.database.names[self.ranked.rows[query, 0]]
         about = dict(zip(ABOUT, (self.judged.headline, self.sequence.name, verdict, names[query], answer), strict=True))
         verdict += " at" * bool(within) + within
-        title = f"{self.judged.headline}, {verdict}: {names[query]} -> {answer}"
-        histogram_figure(path, self._image(self.sequence.images, query), answers, title=title, about=about)
+        title = f"{self.judged.headline}, {verdict}: {_short(names[query])} -> {_short(answer)}"
+        original = self.sequence.images.read(query)
+        image = self._resized(original)
+        aspect = aspect_of_resized(original, image)
+        histogram_figure(path, image, answers, title=title, pixel_aspect=aspect, about=about)
 
     def _answer(self, query: int, rank: int, verdict: str) -> Answer:
         """The candidate at a rank from 0."""
         row, score = int(self.ranked.rows[query, rank]), self.ranked.scores[query, rank]
         place = int(np.flatnonzero(self.matched.candidates.indices[query] == row)[0])
         pair = jax.tree.map(lambda values: values[place], self.matched.matches[0][query])
-        caption = f"{verdict}: {self.database.names[row]}, rank {rank + 1}, score {score:.5g}"
+        caption = f"{verdict}: {_short(self.database.names[row])}, rank {rank + 1}, score {score:.5g}"
         return Answer(self._image(self.database, row), caption, pair, explain(self.histogram, pair))
 
     def _right_answer(self, query: int) -> list[Answer]:
@@ -231,12 +235,19 @@ class _Page:
         nearest, rows = truth.place(query), right.of(query)
         row = nearest if nearest is not None and nearest in rows else int(rows[0])
         num_candidates = self.matched.candidates.indices.shape[1]
-        caption = f"right: {self.database.names[row]}, not among the {num_candidates} candidates"
+        caption = f"right: {_short(self.database.names[row])}, not among the {num_candidates} candidates"
         return [Answer(self._image(self.database, row), caption, None, None)]
 
     def _image(self, folder: ImageFolder, row: int) -> np.ndarray:
-        image, size = folder.read(row), self.extractor.image_size
+        return self._resized(folder.read(row))
+
+    def _resized(self, image: np.ndarray) -> np.ndarray:
+        size = self.extractor.image_size
         return image if size is None else resize(image, size, self.extractor.interpolation)
+
+
+def _short(name: str) -> str:
+    return clipped(printable(name), _MOST_OF_A_NAME)
 
 
 def _spread(values: np.ndarray, number: int) -> list[int]:

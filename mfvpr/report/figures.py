@@ -13,12 +13,13 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
 
-from mfvpr.data.files import printable, replacing
+from mfvpr.data.files import clipped, printable, replacing
 from mfvpr.pipeline import Explanation
 from mfvpr.types import Matches
 
 _AGREES, _DIFFERS = "#2fa8ff", "#ff9a1f"  # told apart by color-blind people as well
 _GAP = 12  # px between the two images
+_MOST_TITLE, _MOST_CAPTION = 140, 100  # characters that fit
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,7 @@ def histogram_figure(
     answers: Sequence[Answer],
     *,
     title: str,
+    pixel_aspect: float = 1.0,
     about: Mapping[str, str] | None = None,
     max_lines: int = 30,
 ) -> None:
@@ -54,17 +56,19 @@ def histogram_figure(
         query_image: `[H, W, 3]` uint8, at the size that the points refer to.
         answers: one below the other, their histograms in the same colors.
         title: above everything.
+        pixel_aspect: height of a pixel by its width, so that images are drawn in the shape that they were taken in.
         about: what it shows, for programs: text by keyword, in the file itself.
         max_lines: matches drawn, the heaviest (the paper shows 30); blue where they agree with the peak.
     """
     figure = Figure(figsize=(12, 0.2 + 4.8 * len(answers)), layout="constrained")
     FigureCanvasAgg(figure)
-    figure.suptitle(printable(title), fontsize=11, parse_math=False)  # a file's name may hold a $
+    figure.suptitle(clipped(printable(title), _MOST_TITLE), fontsize=11, parse_math=False)  # a file's name may hold a $
     top = max([1e-9, *(float(answer.explanation.score) for answer in answers if answer.explanation)])
     for (pair, heat), answer in zip(
         figure.subplots(len(answers), 2, width_ratios=(2, 1.15), squeeze=False), answers, strict=True
     ):
         _draw_pair(pair, query_image, answer, max_lines)
+        pair.set_aspect(pixel_aspect)
         if answer.explanation is None:
             heat.set_axis_off()
         else:
@@ -73,6 +77,12 @@ def histogram_figure(
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # names in scripts that the font lacks
         metadata = {keyword: printable(text) for keyword, text in (about or {}).items()}
         figure.savefig(temporary, dpi=110, bbox_inches="tight", pad_inches=0.15, metadata=metadata)
+
+
+def aspect_of_resized(original: np.ndarray, resized: np.ndarray) -> float:
+    """Height of a pixel of a resized image by its width, where pixels of the original are squares."""
+    (height, width), (new_height, new_width) = original.shape[:2], resized.shape[:2]
+    return (height / new_height) / (width / new_width)
 
 
 def _draw_pair(axes: Axes, query: np.ndarray, answer: Answer, max_lines: int) -> None:
@@ -86,7 +96,7 @@ def _draw_pair(axes: Axes, query: np.ndarray, answer: Answer, max_lines: int) ->
     words = "query | candidate"
     if answer.matches is not None and answer.explanation is not None:
         words = _draw_matches(axes, offset, answer.matches, answer.explanation, max_lines)
-    axes.set_title(f"{printable(answer.caption)}\n{words}", fontsize=9, parse_math=False)
+    axes.set_title(f"{clipped(printable(answer.caption), _MOST_CAPTION)}\n{words}", fontsize=9, parse_math=False)
 
 
 def _draw_matches(axes: Axes, offset: int, matches: Matches, explanation: Explanation, max_lines: int) -> str:

@@ -83,6 +83,9 @@ def number(value: Any) -> str:
 
 
 def write_csv(path: Path, header: Sequence[str], lines: Iterable[Sequence[str | int]]) -> None:
-    """Names in it are the very bytes that the file system has, so that they can be looked up again."""
+    """Names in it are the very bytes that the file system has, so that they can be looked up again.
+
+    A spreadsheet may take a name that begins with `=`, `+`, `-` or `@` for a formula: import such columns as text.
+    """
     with replacing(path) as temporary, temporary.open("w", encoding="utf-8", errors="surrogateescape") as file:
         csv.writer(file, lineterminator="\n").writerows([header, *lines])

@@ -6,16 +6,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 from mfvpr.data.files import printable
+from mfvpr.report.colors import COLORS, color_and_dash
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
 # plotly is imported where it is needed, since everything else can do without.
-_COLORS = ("#0b84c6", "#e1701a", "#1a9e6f", "#c9559d", "#9a7bd0", "#b58900", "#d1495b", "#5f9ea0")  # on dark and light
 _POWERS = [step * 10.0**power for power in range(-4, 4) for step in (1, 2, 5)]
 _HEIGHT = 380  # px
-_FIRST = "#8a8f98"  # of what all others are compared with
-_DASHES = ("solid", "dash", "dot", "dashdot")  # told apart without colors, too
 
 Scale = Literal["linear", "log", "percent"]
 _SCALES: dict[Scale, dict[str, Any]] = {
@@ -97,7 +95,7 @@ def bars(name: str, title: str, groups: Mapping[str, Mapping[str, Bar]], *, axis
 
     figure, alone = graph_objects.Figure(), len(groups) == 1
     for place, (label, members) in enumerate(groups.items()):
-        own = alone and len(members) <= 1 + len(_COLORS)
+        own = alone and len(members) <= 1 + len(COLORS)
         colors = [_line(one)["color"] for one in range(len(members))] if own else _line(place + alone)["color"]
         figure.add_bar(
             x=[bar.percent for bar in members.values()], y=[*map(_plain, members)], name=_plain(label),
@@ -118,7 +116,7 @@ def amounts(name: str, title: str, values: Mapping[str, float], *, axis: str) ->
 
     figure = graph_objects.Figure()
     figure.add_bar(
-        x=[*values.values()], y=[*map(_plain, values)], orientation="h", marker_color=_COLORS[0],
+        x=[*values.values()], y=[*map(_plain, values)], orientation="h", marker_color=COLORS[0],
         hovertemplate="%{y}: %{x:.4g}", texttemplate="%{x:.3g}", textposition="auto",
     )  # fmt: skip
     _lay_out(figure, (axis, ""), legend=False)
@@ -133,13 +131,8 @@ def _plain(text: str) -> str:
 
 
 def _line(place: int) -> dict[str, Any]:
-    if place == 0:
-        return {"color": _FIRST, "dash": "solid", "width": 2}
-    return {
-        "color": _COLORS[(place - 1) % len(_COLORS)],
-        "dash": _DASHES[(place - 1) // len(_COLORS) % len(_DASHES)],
-        "width": 2,
-    }
+    color, dash = color_and_dash(place)
+    return {"color": color, "dash": dash, "width": 2}
 
 
 def _whiskers(members: Sequence[Bar]) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from mfvpr.report.pages.rendering import write_page
 from mfvpr.results import FILTER
 
 PAGE = "report.html"  # in a run folder
+_NAMELESS = "folder"  # the default name of a data set of own folders
 
 
 def write_report(folder: Path, path: Path | None = None) -> Path:
@@ -23,9 +24,18 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
     judged = [sections.recall_section(run), sections.differences_section(run)] if run.gains else []
     parts = [*judged, sections.confidence_section(run), sections.answers_section(run), sections.costs_section(run),
              sections.settings_section(run)]  # fmt: skip
-    write_page(path, title=str(run.common["dataset"]), words=in_words(run), facts=_facts(run),
+    write_page(path, title=_title(run), words=in_words(run), facts=_facts(run),
                sections=[part for part in parts if part is not None])  # fmt: skip
     return path
+
+
+def _title(run: Run) -> str:
+    """The name of the data set; of folders without a name of their own, the ends of their paths."""
+    name, dataset = run.common["dataset"], run.about["settings"].get("dataset")
+    sides = [dataset.get(side) for side in ("queries", "database")] if isinstance(dataset, dict) else [None]
+    if name != _NAMELESS or not all(isinstance(side, str) for side in sides):
+        return name
+    return " in ".join("/".join(Path(str(side)).parts[-2:]) for side in sides)
 
 
 def in_words(run: Run) -> str:

@@ -1,0 +1,63 @@
+"""Figures: nothing is cut off or shrunk by long names, images keep their shape, systems their colors."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mfvpr.evaluation.precision import precision_recall, reliability
+from mfvpr.report import confidence_figures, figures
+from mfvpr.report.pages.charts import lines
+
+SYSTEMS = ["filter", *(f"histogram + anchor + cohort + filter {number}" for number in range(10))]
+P, RIGHT = np.linspace(0, 1, 20), np.arange(20) % 3 > 0
+
+
+def pixels(path):
+    return np.asarray(Image.open(path).convert("L"))
+
+
+@pytest.fixture
+def query():
+    return np.zeros((90, 90, 3), np.uint8)
+
+
+def drawn(path, query, name, **options):
+    answer = figures.Answer(query, f"wrong: {name}, rank 1", None, None)
+    figures.histogram_figure(path, query, [answer], title=f"histogram: {name} -> {name}", **options)
+    return pixels(path)
+
+
+def test_a_long_name_leaves_the_figure_as_large(tmp_path, query):
+    short, long = (drawn(tmp_path / f"{len(name)}.png", query, name) for name in ("x" * 30, "x" * 200))
+    assert (short < 20).sum() == pytest.approx((long < 20).sum(), rel=0.1)  # of the images
+    assert long.shape[1] == pytest.approx(short.shape[1], rel=0.1)
+
+
+def test_images_are_drawn_in_the_shape_they_were_taken_in(tmp_path, query):
+    aspect = figures.aspect_of_resized(np.zeros((384, 1024, 3)), query)
+    assert aspect == 384 / 1024
+    rows, columns = np.nonzero(drawn(tmp_path / "a.png", query, "name", pixel_aspect=aspect) == 0)
+    half = columns[columns < np.mean(columns)]  # the two images stand side by side
+    rows_of_images = [row for row in np.unique(rows) if (rows == row).sum() > 100]
+    assert len(rows_of_images) / (half.max() - half.min()) == pytest.approx(aspect, rel=0.1)
+
+
+def test_titles_of_panels_are_not_cut_off(tmp_path):
+    found = {name: reliability(P, RIGHT) for name in SYSTEMS[:4]}
+    confidence_figures.reliability_figure(tmp_path / "a.png", found)
+    image = pixels(tmp_path / "a.png")
+    assert {*np.concatenate([image[:, 0], image[:, -1], image[0], image[-1]]).tolist()} == {255}
+
+
+def test_systems_have_the_same_colors_in_figures_and_pages(tmp_path, monkeypatch):
+    curve = precision_recall(P, RIGHT, np.ones(20, bool))
+    saved = []
+    monkeypatch.setattr(confidence_figures, "_save", lambda figure, path: saved.append(figure))
+    confidence_figures.precision_recall_figure(tmp_path / "a.png", {name: {"score": curve} for name in SYSTEMS})
+    confidence_figures.shares_figure(tmp_path / "b.png", [0, 1], {name: np.zeros(2) for name in SYSTEMS[1:]})
+    chart = lines("name", "title", {name: [(0, 0), (1, 1)] for name in SYSTEMS}, axes=("x", "y"))
+    expected = [trace["line"]["color"] for trace in chart.figure["data"]]
+    colors = [[line.get_color() for line in figure.axes[0].lines] for figure in saved]
+    assert colors == [expected, expected[1:]]
+    styles = [line.get_linestyle() for line in saved[0].axes[0].lines]
+    assert len({*zip(expected, styles, strict=True)}) == len(SYSTEMS)
