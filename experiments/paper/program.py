@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from mfvpr.data.published import differences
 from mfvpr.errors import InputError
 from mfvpr.report import runs as run_folders
 from mfvpr.report.pages.one_run import PAGE
+from mfvpr.report.tables import Table
 from mfvpr.results import FILTER
 
 _BEST = ("mix_hist_50", "aliked_hist_50", "sift_hist_50")  # whose failures are shown: the first that is here
@@ -29,13 +31,26 @@ def paper(settings: dict[str, Any]) -> None:
     rows = lineup.chosen_rows(settings["systems"])
     found, missing = lineup.places(settings["data"], settings["datasets"])
     rows, lacking = _with_weights(rows, found, settings)
+    out = Path(settings["out"]).expanduser()
+    if found and rows:
+        tell(_plan(rows, found, settings))
     for line in (*missing, *lacking):
         tell(f"left out: {line}")
     if not found or not rows:
         raise SettingsError("nothing to evaluate: the lines above say what is missing")
-    out = Path(settings["out"]).expanduser()
     with runs.held(out):
         _make(rows, found, settings, out, [*missing, *lacking])
+
+
+def _plan(rows: Sequence[Row], found: Sequence[Place], settings: Mapping[str, Any]) -> str:
+    """What will be done, in one line."""
+    names = list(dict.fromkeys(row.run for row in rows))
+    done = sum(runs.is_finished(runs.folder_of(run, place, settings)) for place in found for run in names)
+    return (
+        f"plan: {len(names)} evaluations ({', '.join(names)}) on each of {len(found)} data sets "
+        f"({', '.join(place.name for place in found)}), {done} of {len(names) * len(found)} finished; then tables, "
+        f"seconds of a query, and figures in {settings['out']}"
+    )
 
 
 def _make(
@@ -48,10 +63,14 @@ def _make(
     finished = _finished(rows, here, settings)
     results = _collected(rows, finished)
     timed_on = next((one for one in here if one.name == "robotcar_seasons"), here[0])
+    about = f"{timed_on.name}, on {timing.device()['cores']} cores of {timing.device()['device']}"
+    whole = Found(rows, datasets, results, {}, _sizes(rows, finished), about)
+    for name, (heading, table) in _write_tables(out, whole).items():  # before the seconds, which take a while
+        if name in ("recall", "averages"):
+            print(f"\n{heading}\n\n{table.text()}", end="", flush=True)
     times = _timed(rows, timed_on, datasets[timed_on.name], settings, out)
     seconds = {row.name: times[row.run] for row in rows if row.run in times and row.leads}
-    about = f"{timed_on.name}, on {timing.device()['cores']} cores of {timing.device()['device']}"
-    _write(out, Found(rows, datasets, results, seconds, _sizes(rows, finished), about), finished, [*left_out, *failed])
+    _write(out, replace(whole, seconds=seconds), finished, [*left_out, *failed])
     if failed:
         raise SettingsError(f"{len(failed)} of the evaluations could not be made: {failed[0]}")
 
@@ -171,14 +190,18 @@ def _finished(rows: Sequence[Row], here: Sequence[Place], settings: Mapping[str,
     return {key: folder for key, folder in folders.items() if runs.is_finished(folder)}
 
 
-def _write(out: Path, found: Found, finished: Mapping[tuple[str, str], Path], left_out: Sequence[str]) -> None:
-    for name in ("tables", "figures", "comparisons"):  # of other rows and data sets, perhaps
-        shutil.rmtree(out / name, ignore_errors=True)
+def _write_tables(out: Path, found: Found) -> dict[str, tuple[str, Table]]:
+    shutil.rmtree(out / "tables", ignore_errors=True)  # of other rows and data sets, perhaps
     made = {name: (heading, table) for name, heading, table in tables(found)}
     for name, (heading, table) in made.items():
         run_folders.write_table(out / "tables", table, heading, name=name)
-        if name in ("recall", "averages"):
-            print(f"\n{heading}\n\n{table.text()}", end="")
+    return made
+
+
+def _write(out: Path, found: Found, finished: Mapping[tuple[str, str], Path], left_out: Sequence[str]) -> None:
+    for name in ("figures", "comparisons"):  # likewise
+        shutil.rmtree(out / name, ignore_errors=True)
+    made = _write_tables(out, found)
     best = [row for name in _BEST for row in found.rows if row.name == name]
     growth = _growth(best, found, finished, out)
     shown = {}

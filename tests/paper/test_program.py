@@ -13,8 +13,10 @@ from pathlib import Path
 
 import pytest
 
+from experiments.paper import lineup, program
 from experiments.paper.runs import held
-from tests.programs import ROOT, typed
+from mfvpr.report.tables import Table
+from tests.programs import ROOT, composed, typed
 from tests.programs import run as run_program
 
 SYSTEMS = "systems=[sift_hist_10,sift_hist_comb_10,mix_hist_10]"
@@ -131,6 +133,27 @@ def test_damaged_runs_are_told(finished, data, tmp_path, monkeypatch, capsys, na
     code, _, stderr = typed(monkeypatch, capsys, "paper", *arguments(data, out))
     assert code == 2
     assert f"sift_10/{name}: is damaged, or missing; remove the folder, and run this again" in stderr
+
+
+def test_the_plan_comes_first_and_tables_before_the_seconds(tmp_path, monkeypatch, capsys):
+    """An interrupted timing costs no table."""
+    place = lineup.Place("streets_seasons", ("dataset=streets_seasons",))
+    monkeypatch.setattr(program.lineup, "places", lambda *_: ([place], ["corridor: needs a folder"]))
+    monkeypatch.setattr(program, "_evaluate_all", lambda *_: ({place.name: None}, []))
+    monkeypatch.setattr(program, "tables", lambda found: [("recall", "heading", Table(["system"], [["SIFT"]]))])
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(program, "_timed", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        program.paper(composed("systems=[sift_hist_10]", f"out={tmp_path}/out", config="paper"))
+    assert (tmp_path / "out" / "tables" / "recall.csv").read_text() == "system\nSIFT\n"
+    stdout, stderr = capsys.readouterr()
+    assert "SIFT" in stdout
+    first, second = stderr.splitlines()
+    assert first.startswith("plan: 1 evaluations (sift_10) on each of 1 data sets (streets_seasons), 0 of 1 finished")
+    assert second == "left out: corridor: needs a folder"
 
 
 def test_two_do_not_evaluate_into_one_folder(finished, data, monkeypatch, capsys):
