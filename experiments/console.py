@@ -27,15 +27,17 @@ def bar(label: str, total: int, items: Iterable[Any] | None = None) -> tqdm:
 
 
 class _Lines(tqdm):
-    """Progress without a terminal, in a file or a log: a line per 10 %."""
+    """Progress without a terminal, in a file or a log: a line per 10 %, and one after the first item."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
-        self._tenths = -1
+        self._shown = (-1, 0)
         super().__init__(*arguments, mininterval=0, miniters=1, leave=False, **options)
 
     def display(self, msg: str | None = None, pos: int | None = None) -> None:
         """What tqdm calls wherever a bar would be drawn."""
         tenths = 10 * self.n // self.total
-        if tenths > self._tenths:
-            self._tenths = tenths
-            tell(f"{self.desc} {10 * tenths:3d} %  {self.n} of {self.total}  {self.format_dict['elapsed']:.0f} s")
+        if (tenths, min(self.n, 1)) > self._shown:
+            self._shown = tenths, min(self.n, 1)
+            elapsed = self.format_dict["elapsed"]
+            left = f", about {elapsed * (self.total - self.n) / self.n:.0f} s left" if 0 < self.n < self.total else ""
+            tell(f"{self.desc} {10 * tenths:3d} %  {self.n} of {self.total}  {elapsed:.0f} s{left}")

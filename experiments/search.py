@@ -31,6 +31,10 @@ def sweep(settings: dict[str, Any]) -> None:
             "devices": tools.where["devices"],
             "settings_per_block": settings["chunk"]["settings"], "queries_per_block": settings["chunk"]["queries"],
         }  # fmt: skip
+        number = varied.size if settings["search"] == "grid" else settings["trials"]
+        console.tell(f"sweep: {number:,} settings on {int(candidates.mask.sum()):,} pairs of {len(candidates.mask):,} "
+                     f"queries with their candidates, {number * int(candidates.mask.sum()):,} scores; the time left "
+                     "stands beside the progress")  # fmt: skip
         with watch("sweep"):
             if settings["search"] == "grid":
                 varied.check(matches.image_sizes)

@@ -388,8 +388,10 @@ def test_names_that_are_no_utf8_cost_nothing(root, tmp_path, monkeypatch, capsys
 def test_progress_without_a_terminal_is_a_line_per_tenth(capsys):
     assert list(console.track("matching")(range(234), 234)) == list(range(234))
     lines = capsys.readouterr().err.splitlines()
-    assert [line.split()[1] for line in lines] == [f"{percent}" for percent in range(0, 101, 10)]
-    assert lines[5].startswith("matching              50 %  117 of 234  ")
+    assert [line.split()[1] for line in lines] == ["0", *(f"{percent}" for percent in range(0, 101, 10))]
+    assert lines[1].startswith("matching               0 %  1 of 234  ")  # says soon how long the rest takes
+    assert lines[6].startswith("matching              50 %  117 of 234  ")
+    assert all(line.endswith(" s left") for line in lines[1:-1])
     bar = console.bar("drawing", 3)
     bar.update(3)
     bar.close()

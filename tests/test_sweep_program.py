@@ -174,6 +174,7 @@ def test_no_features_are_read_where_the_matches_are_stored(sweep, swept, tmp_pat
     sweep(tmp_path / "out", *GRID)
     stderr = capsys.readouterr().err
     assert "folder matches: all 24 queries from" in stderr
+    assert f"sweep: 8 settings on {QUERIES * CANDIDATES} pairs of {QUERIES} queries" in stderr
     assert "features" not in stderr
 
 
