@@ -11,7 +11,7 @@ from mfvpr.exchange.checks import Lengths, as_float32, require_lengths, with_len
 from mfvpr.exchange.containers import reading, require_file, shortened
 from mfvpr.exchange.feature_files import as_written
 from mfvpr.exchange.h5 import H5File, write_h5
-from mfvpr.exchange.names import match_names, require_all
+from mfvpr.exchange.names import match_names, require_all, require_different
 from mfvpr.exchange.npz import parse_npy, read_npz, write_npz
 
 PART = "global_descriptor"  # what hloc calls it
@@ -54,6 +54,7 @@ def write_global_descriptors(path: Path, names: Sequence[str], descriptors: np.n
         descriptors: `[M, D]` in the order of `names`.
         half: float16 instead of float32, as hloc by default.
     """
+    require_different(path, names)
     values = as_written(str(path), np.asarray(descriptors), half)
     if values.ndim != 2 or len(values) != len(names):
         raise InputError(f"{path}: expected descriptors [{len(names)}, D] to write, got {list(values.shape)}")

@@ -8,6 +8,7 @@ import numpy as np
 from mfvpr.errors import InputError
 from mfvpr.exchange.containers import shortened
 from mfvpr.exchange.h5 import write_h5
+from mfvpr.exchange.names import require_different
 from mfvpr.exchange.npz import write_npz
 from mfvpr.types import Features
 
@@ -27,8 +28,9 @@ def write_features(
         half: float16 instead of float32, as hloc by default. Positions lose up to 0.5 px beyond 1024 px.
 
     Raises:
-        InputError: values that float16 cannot hold, or names that no file can have.
+        InputError: values that float16 cannot hold, names that no file can have, or two images with one name.
     """
+    require_different(path, names)
     parts = ((names[row], _parts(names[row], features, half)) for row, features in rows)
     if path.suffix.lower() in (".h5", ".hdf5"):
         write_h5(path, ((name, arrays | {"descriptors": arrays["descriptors"].T}) for name, arrays in parts))

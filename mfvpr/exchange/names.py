@@ -9,35 +9,45 @@ from mfvpr.data.images import SUFFIXES
 from mfvpr.errors import InputError
 from mfvpr.exchange.containers import shortened
 
+Prefix = tuple[tuple[str, ...], tuple[str, ...]]  # folders that only the file's names have, only the images' names
+
 
 def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> list[str | None]:
-    """What a file calls each image.
+    """The name that a file has for each image.
 
-    An image is called by its relative path, as in hloc; else by a path that is the end of its own or has its own as its
-    end (so a file name alone, or a path from another root); else the same without the suffixes of images. Paths that
-    differ in a folder are different images.
+    A name is the relative path of an image, as in hloc; else a path that is the end of the image's path or ends in it
+    (a file name alone, or a path from another root); else the same without the suffixes of images. One prefix holds
+    for all images: where `1.jpg` is `db/1.jpg`, `2.jpg` is never `query/2.jpg`.
 
     Args:
         path: file, for messages.
         names: `[M]` relative POSIX paths of the data set's images.
-        foreign: all that the file calls images; those of other data sets are not looked at.
+        foreign: all names of the file; names of images of other data sets are ignored.
 
     Returns:
         `[M]` names in the file; None = the file lacks the image.
 
     Raises:
-        InputError: several could be meant, or the data set has a name twice.
+        InputError: an image has several possible names, images have different prefixes, or two images have one name.
     """
-    if twice := [name for name, count in Counter(names).items() if count > 1]:
-        raise InputError(f"{path}: expected images with different names, got {shortened(twice[0])} twice")
-    plain = {printable(name): name for name in foreign}
-    matched: list[str | None] = [printable(name) if printable(name) in plain else None for name in names]
+    require_different(path, names)
+    foreign = dict.fromkeys(foreign)
+    texts = {printable(name): name for name in foreign} | {printable(name): name for name in names if name in foreign}
+    matched = [texts.get(printable(name)) for name in names]
     for variants in (_whole, _stems):
-        free = plain.keys() - set(matched)
+        free = foreign.keys() - set(matched)
         rows = [row for row, match in enumerate(matched) if match is None]
         if free and rows:
             _match_ends(path, names, rows, _Ends(free, variants), matched)
-    return [None if match is None else plain[match] for match in matched]
+    return matched
+
+
+def require_different(path: Path, names: Sequence[str]) -> None:
+    """Refuse images whose names are the same, or become the same where a file holds them as text."""
+    if twice := [name for name, count in Counter(map(printable, names)).items() if count > 1]:
+        raise InputError(
+            f"{path}: expected images with different names, got {shortened(twice[0])} twice; rename one of the images"
+        )
 
 
 def require_all(path: Path, names: Sequence[str], matched: Sequence[str | None], what: str) -> None:
@@ -61,21 +71,28 @@ class _Ends:
         self.by_variant: dict[str, set[str]] = defaultdict(set)
         self.by_end: dict[str, set[str]] = defaultdict(set)
         for name in foreign:
-            for variant in variants(name):
+            for variant in variants(printable(name)):
                 self.by_variant[variant].add(name)
                 for end in _ends(variant):
                     self.by_end[end].add(name)
 
     def candidates(self, name: str) -> set[str]:
         """Foreign names that may mean this image."""
-        wanted = self.variants(name)[0]
+        wanted = self.variants(printable(name))[0]
         shorter = (self.by_variant.get(end, set()) for end in _ends(wanted))
         return set().union(self.by_end.get(wanted, set()), *shorter)
 
 
 def _match_ends(path: Path, names: Sequence[str], rows: list[int], ends: _Ends, matched: list[str | None]) -> None:
-    """Fill `matched` where one foreign name and one image mean each other alone."""
-    candidates = {row: ends.candidates(printable(names[row])) for row in rows}
+    """Fill `matched` where one foreign name and one image mean each other alone, with the prefix of earlier matches."""
+    examples: dict[Prefix, tuple[str, str]] = {}  # an image and its name in the file
+    for name, match in zip(names, matched, strict=True):
+        if match is not None:
+            examples.setdefault(_prefix(name, match), (name, match))
+    candidates = {
+        row: {match for match in ends.candidates(names[row]) if not examples or _prefix(names[row], match) in examples}
+        for row in rows
+    }
     claims = Counter(name for possible in candidates.values() for name in possible)
     for row, possible in candidates.items():
         if not possible:
@@ -86,7 +103,21 @@ def _match_ends(path: Path, names: Sequence[str], rows: list[int], ends: _Ends, 
                 f"{path}: {shortened(names[row])}: expected its relative path in the file, got {several}, which may "
                 "mean other images as well; give names with their folders as the file has them"
             )
-        matched[row] = next(iter(possible))
+        matched[row] = match = next(iter(possible))
+        examples.setdefault(_prefix(names[row], match), (names[row], match))
+    if len(examples) > 1:
+        pairs = " but ".join(f"{shortened(match)} for {shortened(name)}" for name, match in [*examples.values()][:2])
+        raise InputError(
+            f"{path}: expected names with one prefix for all images of a folder, got {pairs}; give the prefix of the "
+            "folder, or name the images by their relative paths"
+        )
+
+
+def _prefix(name: str, match: str) -> Prefix:
+    """Folders before the part that both names share."""
+    ours, theirs = (tuple(_parts(text)) for text in (name, match))
+    shared = min(len(ours), len(theirs))
+    return theirs[: len(theirs) - shared], ours[: len(ours) - shared]
 
 
 def _whole(name: str) -> list[str]:
@@ -101,5 +132,9 @@ def _stems(name: str) -> list[str]:
 
 def _ends(name: str) -> Iterator[str]:
     """The path and every end of it: a/b/c, b/c, c."""
-    parts = [part for part in name.split("/") if part not in ("", ".")]
+    parts = _parts(name)
     return ("/".join(parts[start:]) for start in range(len(parts)))
+
+
+def _parts(name: str) -> list[str]:
+    return [part for part in name.split("/") if part not in ("", ".")]

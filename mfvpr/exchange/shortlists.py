@@ -9,7 +9,7 @@ import numpy as np
 from mfvpr.data.files import write_text
 from mfvpr.errors import InputError
 from mfvpr.exchange.containers import require_file, shortened
-from mfvpr.exchange.names import match_names
+from mfvpr.exchange.names import match_names, require_different
 from mfvpr.exchange.npz import read_npz, write_npz
 from mfvpr.exchange.pairs import Pair, read_pairs, require_lines
 from mfvpr.types import Ranking, Shortlist
@@ -87,7 +87,9 @@ def write_shortlist(
         predictions = np.where(mask, indices, -1).astype(np.int32)
         write_npz(path, {"predictions": predictions, "scores": np.where(mask, scores, 0).astype(np.float32)}.items())
         return
-    require_lines(path, (*query_names, *database_names))
+    for names in (query_names, database_names):
+        require_different(path, names)
+        require_lines(path, names)
     lines = ["# kapture format: 1.0", "# query_image, map_image, score"] if layout == "kapture" else []
     for query, position in np.argwhere(mask).tolist():
         names = (query_names[query], database_names[int(indices[query, position])])

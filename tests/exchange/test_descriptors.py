@@ -26,7 +26,7 @@ def test_npy_is_in_sorted_order(tmp_path, descriptors):
 
 
 def test_npz_with_names(tmp_path, descriptors):
-    foreign = ["/data/sub/image 1.jpg", "other.jpg", "image10.jpg", "image2.jpg"]
+    foreign = ["/data/sub/image 1.jpg", "other.jpg", "/data/image10.jpg", "/data/image2.jpg"]
     np.savez(tmp_path / "g.npz", names=foreign, descriptors=np.r_[descriptors, descriptors[:1]][[2, 0, 1, 3]])
     np.testing.assert_array_equal(read_global_descriptors(tmp_path / "g.npz", NAMES), descriptors[[0, 1, 2]])
 

@@ -2,12 +2,15 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mfvpr import InputError
+from mfvpr import InputError, Shortlist
+from mfvpr.exchange import write_features, write_global_descriptors, write_shortlist
 from mfvpr.exchange.names import match_names, require_all
+from tests.exchange.foreign import feature
 
 FILE = Path("feats.h5")
 
@@ -33,6 +36,11 @@ FILE = Path("feats.h5")
         (["a.jpg"], ["queries/b.jpg"], [None]),
         (["a\udce9.jpg"], ["a\udce9.jpg"], ["a\udce9.jpg"]),  # bytes that are no UTF-8 ...
         (["a\udce9.jpg"], [r"a\udce9.jpg"], [r"a\udce9.jpg"]),  # ... as text can hold them
+        (["a\udce9.jpg"], ["a\udce9.jpg", r"a\udce9.jpg"], ["a\udce9.jpg"]),  # bytes and text in one file
+        ([r"a\udce9.jpg"], ["a\udce9.jpg", r"a\udce9.jpg"], [r"a\udce9.jpg"]),
+        (["1.jpg", "2.jpg"], ["1.jpg", "query/2.jpg"], ["1.jpg", None]),  # one prefix for all images
+        (["1.jpg", "2.jpg"], ["db/1.jpg", "db/2", "query/2"], ["db/1.jpg", "db/2"]),
+        (["a/1.jpg", "a/2.jpg"], ["1.jpg", "a/2.png"], ["1.jpg", None]),
         ([], ["a.jpg"], []),
     ],
 )
@@ -47,6 +55,12 @@ def test_matches(names, foreign, expected):
         (["a/1.jpg", "b/1.jpg"], ["1.jpg"], r"a/1\.jpg: expected .* got 1\.jpg, which may mean other images"),
         (["1.jpg", "1.png"], ["1"], r"1\.jpg: expected .* got 1, which may mean other images"),
         (["1.jpg"], ["1.png", "1"], r"1\.jpg: expected .* got 1 and 1\.png"),
+        (
+            ["0.jpg", "1.jpg", "2.jpg"],
+            ["db/0.jpg", "db/1.jpg", "query/2.jpg"],
+            r"one prefix for all .* got db/0\.jpg for 0\.jpg but query/2\.jpg for 2\.jpg",
+        ),
+        (["a/1.jpg", "b/2.jpg"], ["1.jpg", "2.jpg"], r"one prefix .* got 1\.jpg for a/1\.jpg but 2\.jpg for b/2\.jpg"),
     ],
 )
 def test_nothing_is_guessed(names, foreign, several):
@@ -55,9 +69,23 @@ def test_nothing_is_guessed(names, foreign, several):
     assert "\n" not in str(error.value)
 
 
-def test_a_name_twice():
-    with pytest.raises(InputError, match=r"feats\.h5: expected images with different names, got a\.jpg twice"):
-        match_names(FILE, ["a.jpg", "b.jpg", "a.jpg"], [])
+@pytest.mark.parametrize("names", [["a.jpg", "b.jpg", "a.jpg"], ["\udcff.jpg", r"\udcff.jpg"]])
+def test_a_name_twice(tmp_path, names):
+    """Bytes that are no UTF-8, and the text that stands for them in a file, are one name."""
+    features = [(row, feature(row, count=3)) for row in range(len(names))]
+    shortlist = Shortlist(
+        indices=np.zeros((len(names), 1)), scores=np.ones((len(names), 1)), mask=np.ones((len(names), 1), bool)
+    )
+    for use in (
+        lambda: match_names(FILE, names, names),
+        lambda: write_features(tmp_path / "a.h5", names, features),
+        lambda: write_features(tmp_path / "a.npz", names, features),
+        lambda: write_global_descriptors(tmp_path / "a.h5", names, np.eye(len(names))),
+        lambda: write_shortlist(tmp_path / "a.txt", shortlist, names, ["d.jpg"]),
+    ):
+        with pytest.raises(InputError, match=r"expected images with different names, got (a|\\udcff)\.jpg twice"):
+            use()
+    assert not list(tmp_path.iterdir())
 
 
 def test_missing_images_are_counted():
@@ -76,6 +104,9 @@ def test_whatever_is_matched_is_called_so_alone(names, foreign):
         return
     found = [name for name in matched if name is not None]
     assert len(set(found)) == len(found)
+    pairs = [(name.split("/"), other.split("/")) for name, other in zip(names, matched, strict=True) if other]
+    shared = [(ours, theirs, min(len(ours), len(theirs))) for ours, theirs in pairs]
+    assert len({(*ours[: len(ours) - n], "|", *theirs[: len(theirs) - n]) for ours, theirs, n in shared}) <= 1
     for name, other in zip(names, matched, strict=True):
         assert (other == name) if name in foreign else True
         if other is not None:

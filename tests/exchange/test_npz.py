@@ -45,9 +45,9 @@ def test_one_for_each_image_by_path_or_stem(tmp_path):
     made = feature(0)
     (tmp_path / "a").mkdir()
     np.savez(tmp_path / "a" / "1.jpg.npz", **parts_of(made))
-    np.savez(tmp_path / "2.npz", **parts_of(made))
+    np.savez(tmp_path / "a" / "2.npz", **parts_of(made))
     np.savez(tmp_path / ".hidden.npz", nothing=0)
-    for names in (["a/1.jpg", "b/2.jpg"], ["1.jpg", "2.png"]):
+    for names in (["a/1.jpg", "a/2.jpg"], ["1.jpg", "2.png"]):
         for _, found in open_features(tmp_path, names).read():
             assert_equal(found, made)
 
