@@ -43,6 +43,17 @@ def _beside(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def require_file(path: Path, expected: str = "a file") -> None:
+    """Refuse a path that is no regular file: a pipe would block its reader forever.
+
+    Raises:
+        InputError: the path is something else, or there is nothing.
+    """
+    if not path.is_file():
+        got = "a folder" if path.is_dir() else "a pipe or device" if path.exists() else "nothing"
+        raise InputError(f"{path}: expected {expected}, got {got}; check the path")
+
+
 def remove_leftovers(folder: Path) -> None:
     """Remove what `replacing` left below a folder when its process was killed; nobody may be writing there."""
     for path in folder.rglob(".*"):

@@ -4,6 +4,7 @@ Truth comes in three kinds. Two have a threshold that decides what still counts:
 radius in meters. The third is exact: a database image is right or it is not.
 """
 
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
@@ -11,6 +12,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from mfvpr.data.numbers import parse_number
 from mfvpr.errors import InputError
 from mfvpr.evaluation import Positives, Truth, Unit, rows_within
 
@@ -34,11 +36,13 @@ class FrameTruth(Truth):
         rows: per query; empty = unknown place, which counts as a failure.
         num_database: N.
         widened: False = no neighbors count, at any tolerance.
+        starts: database rows at which a new drive begins, ascending: neighbors are of the same drive.
     """
 
     rows: tuple[tuple[int, ...], ...]
     num_database: int
     widened: bool = True
+    starts: tuple[int, ...] = ()
 
     @property
     def unit(self) -> Unit:
@@ -47,19 +51,28 @@ class FrameTruth(Truth):
 
     def positives(self, threshold: float) -> Positives:
         """Those for a tolerance in frames, inclusive."""
-        tolerance, last = int(min(threshold, self.num_database)) if self.widened else 0, self.num_database
+        tolerance = int(min(threshold, self.num_database)) if self.widened else 0
 
         def around(row: int) -> np.ndarray:
-            return np.arange(max(row - tolerance, 0), min(row + tolerance + 1, last), dtype=np.int32)
+            first, last = self._drive(row)
+            return np.arange(max(row - tolerance, first), min(row + tolerance + 1, last), dtype=np.int32)
 
-        return Positives.from_rows((np.concatenate([_NONE, *map(around, rows)]) for rows in self.rows), last)
+        rows = (np.concatenate([_NONE, *map(around, rows)]) for rows in self.rows)
+        return Positives.from_rows(rows, self.num_database)
 
     def distance(self, query: int) -> np.ndarray:
         """`[N]` frames to the nearest of the query's rows."""
         distance = np.full(self.num_database, np.inf)
         for row in self.rows[query]:
-            distance = np.minimum(distance, np.abs(np.arange(self.num_database) - row))
+            drive = slice(*self._drive(row))
+            distance[drive] = np.minimum(distance[drive], np.abs(np.arange(self.num_database) - row)[drive])
         return distance if self.widened else np.where(distance > 0, np.inf, 0.0)
+
+    def _drive(self, row: int) -> tuple[int, int]:
+        """First database row of a row's drive, and the row behind its last."""
+        bounds = (0, *self.starts, self.num_database)
+        number = bisect_right(bounds, row)
+        return bounds[number - 1], bounds[number]
 
 
 @dataclass(frozen=True)
@@ -154,7 +167,7 @@ def _position(name: str) -> tuple[float, float]:
     """Easting, northing of one name; folders above the file may contain '@' as well."""
     fields = PurePosixPath(name).name.split("@")
     try:
-        easting, northing = float(fields[1]), float(fields[2])
+        easting, northing = parse_number(fields[1]), parse_number(fields[2])
     except (IndexError, ValueError):
         raise InputError(
             f"{name}: expected a name like @easting@northing@...; or choose another ground truth"

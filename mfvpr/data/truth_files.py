@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from mfvpr.data.files import require_file
 from mfvpr.data.ground_truth import FARTHEST, FrameTruth, LabelTruth, RadiusTruth
 from mfvpr.errors import InputError
 from mfvpr.evaluation import Truth
@@ -59,9 +60,7 @@ def truth_from_file(
 
 def _parsed(path: Path, reader: Callable[[Path], Any]) -> Any:
     """What `reader` finds in a foreign file."""
-    if not path.is_file():
-        found = "a folder" if path.is_dir() else "nothing"
-        raise InputError(f"{path}: expected a ground truth file, got {found}; check the path")
+    require_file(path, "a ground truth file")
     try:
         return reader(path)
     except InputError:
@@ -121,7 +120,7 @@ def _csv_columns(path: Path, *choices: tuple[str, str]) -> list[tuple[str, str]]
         lines = csv.reader(file)
         names = [name.strip().lower() for name in next(lines, [])]
         for pair in choices:
-            if {*pair} <= {*names}:
+            if all(names.count(column) == 1 for column in pair):
                 first, second = map(names.index, pair)
                 short = [""] * len(names)  # cells that a line lacks are empty
                 return [((line + short)[first], (line + short)[second]) for line in lines if line]
@@ -139,6 +138,8 @@ def _csv_labels(path: Path) -> list[tuple[str, str]]:
 
 def _npz_pairs(path: Path) -> list[tuple[Any, Any]] | RadiusTruth:
     with np.load(path, allow_pickle=False) as arrays:
+        if len({*arrays.files}) < len(arrays.files):
+            raise InputError(f"{path}: expected every array once, got {', '.join(arrays.files)}; write the file anew")
         if {"utmQ", "utmDb"} <= set(arrays):
             positions = [arrays[name].astype(np.float64) for name in ("utmQ", "utmDb")]
             for name, xy in zip(("utmQ", "utmDb"), positions, strict=True):

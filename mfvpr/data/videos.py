@@ -6,19 +6,20 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from mfvpr.data.files import require_file
 from mfvpr.errors import InputError
 
 SUFFIXES = frozenset({".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm"})
 
 
-def frames(path: Path, *, every: int = 1) -> Iterator[tuple[int, np.ndarray]]:
+def frames(path: Path | str, *, every: int = 1) -> Iterator[tuple[int, np.ndarray]]:
     """(number from 0, `[H, W, 3]` uint8 RGB) of every so many frames.
 
     Raises:
         InputError: no video, or one without frames that can be read.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: expected a video file, got {'a folder' if path.is_dir() else 'nothing'}")
+    path = Path(path)
+    require_file(path, "a video file")
     video, number = cv2.VideoCapture(str(path)), 0
     try:
         while video.grab():

@@ -55,13 +55,6 @@ def reading(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: cannot be read ({shortened(reason, 160)}); is it whole, and of this kind?") from None
 
 
-def require_file(path: Path) -> None:
-    """Refuse a path that is no file."""
-    if not path.is_file():
-        got = "a folder" if path.is_dir() else "nothing"
-        raise InputError(f"{path}: expected a file, got {got}; check the path")
-
-
 def shortened(text: str, limit: int = 60) -> str:
     """Foreign text, for a message of one line."""
     text = text.encode("unicode_escape").decode("ascii") if not text.isprintable() else text

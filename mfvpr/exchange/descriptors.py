@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mfvpr.data.files import printable, replacing
+from mfvpr.data.files import printable, replacing, require_file
 from mfvpr.errors import InputError
 from mfvpr.exchange.checks import Lengths, as_float32, require_lengths, with_length
-from mfvpr.exchange.containers import reading, require_file, shortened
+from mfvpr.exchange.containers import reading, shortened
 from mfvpr.exchange.feature_files import as_written
 from mfvpr.exchange.h5 import H5File, write_h5
 from mfvpr.exchange.names import match_names, require_all, require_different

@@ -21,9 +21,10 @@ from typing import Any
 
 import numpy as np
 
+from mfvpr.data.files import require_file
 from mfvpr.errors import InputError
 from mfvpr.exchange.checks import Lengths, as_float32, require_lengths, with_length
-from mfvpr.exchange.containers import Container, Contents, require_file, shortened
+from mfvpr.exchange.containers import Container, Contents, shortened
 from mfvpr.exchange.h5 import H5File
 from mfvpr.exchange.names import match_names, require_all
 from mfvpr.exchange.npz import NpzFile, NpzFolder

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from mfvpr.data.files import printable, replacing
+from mfvpr.data.files import printable, replacing, require_file
 from mfvpr.errors import InputError
-from mfvpr.exchange.containers import Contents, reading, require_file, require_plain, shortened
+from mfvpr.exchange.containers import Contents, reading, require_plain, shortened
 
 
 class H5File:

@@ -4,16 +4,17 @@ import io
 import math
 import os
 import zipfile
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
 import numpy as np
 
-from mfvpr.data.files import printable, replacing
+from mfvpr.data.files import printable, replacing, require_file
 from mfvpr.errors import InputError
-from mfvpr.exchange.containers import Contents, reading, require_file, require_plain, shortened
+from mfvpr.exchange.containers import Contents, reading, require_plain, shortened
 
 SUFFIXES = (".npz", ".d2-net")  # of the files of images; D2-Net names its own so
 
@@ -27,9 +28,8 @@ class NpzFile:
     transposed = False
 
     def __init__(self, path: Path) -> None:
-        require_file(path)
         self.path = path
-        with reading(path), zipfile.ZipFile(path) as archive:
+        with _open_archive(path) as archive:
             members = [name.removesuffix(".npy") for name in archive.namelist()]
         self.images = tuple(dict.fromkeys(name.rpartition("/")[0] for name in members if "/" in name))
         if not self.images:
@@ -40,7 +40,7 @@ class NpzFile:
             )
 
     def contents(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Contents]:
-        with reading(self.path), zipfile.ZipFile(self.path) as archive:
+        with _open_archive(self.path) as archive:
             members: dict[str, set[str]] = defaultdict(set)
             for name in archive.namelist():
                 image, _, part = name.rpartition("/")
@@ -49,7 +49,7 @@ class NpzFile:
                 yield _contents(archive, members[image], f"{image}/", parts)
 
     def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:
-        with reading(self.path), zipfile.ZipFile(self.path) as archive:
+        with _open_archive(self.path) as archive:
             members = set(archive.namelist())
             for image in images:
                 yield {part: _array(archive, name) for part, name in _members(members, f"{image}/", parts)}
@@ -79,7 +79,7 @@ class NpzFolder:
 
     def contents(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Contents]:
         for image in images:
-            with reading(self._paths[image]), zipfile.ZipFile(self._paths[image]) as archive:
+            with _open_archive(self._paths[image]) as archive:
                 yield _contents(archive, set(archive.namelist()), "", parts)
 
     def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:
@@ -96,8 +96,7 @@ def read_npz(path: Path, parts: Sequence[str]) -> dict[str, np.ndarray]:
     Raises:
         InputError: no archive, a damaged one, or an array of objects.
     """
-    require_file(path)
-    with reading(path), zipfile.ZipFile(path) as archive:
+    with _open_archive(path) as archive:
         return {part: _array(archive, name) for part, name in _members(set(archive.namelist()), "", parts)}
 
 
@@ -107,6 +106,16 @@ def write_npz(path: Path, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
         for name, array in arrays:
             with archive.open(f"{printable(name)}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, array, allow_pickle=False)
+
+
+@contextmanager
+def _open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
+    """An archive whose members have different names: of several, readers take the first or the last."""
+    require_file(path)
+    with reading(path), zipfile.ZipFile(path) as archive:
+        if twice := [name for name, count in Counter(archive.namelist()).items() if count > 1]:
+            raise InputError(f"{path}: expected every array once, got {shortened(twice[0])} again; write the file anew")
+        yield archive
 
 
 def _members(members: set[str], prefix: str, parts: Sequence[str]) -> Iterator[tuple[str, str]]:

@@ -6,6 +6,7 @@ from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 from mfvpr.data.files import printable
+from mfvpr.data.numbers import parse_number
 from mfvpr.errors import InputError
 from mfvpr.exchange.containers import shortened
 
@@ -81,7 +82,7 @@ def _splits(line: str) -> Iterator[Pair]:
 
 def _number(text: str) -> float | None:
     try:
-        return float(text)
+        return parse_number(text)
     except ValueError:
         return None
 

@@ -6,9 +6,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from mfvpr.data.files import write_text
+from mfvpr.data.files import require_file, write_text
 from mfvpr.errors import InputError
-from mfvpr.exchange.containers import require_file, shortened
+from mfvpr.exchange.containers import shortened
 from mfvpr.exchange.names import match_names, require_different
 from mfvpr.exchange.npz import read_npz, write_npz
 from mfvpr.exchange.pairs import Pair, read_pairs, require_lines

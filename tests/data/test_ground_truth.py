@@ -1,7 +1,10 @@
 """Ground truth of every kind, right and wrong."""
 
 import json
+import os
 import tracemalloc
+import warnings
+import zipfile
 
 import numpy as np
 import pytest
@@ -259,6 +262,12 @@ def bad_npz(path):
     np.savez(path, query=np.array([{"a": 1}], dtype=object), database=np.array([0]))
 
 
+def twice(path):
+    np.savez(path, query=np.array([0, 1]), database=np.array([0, 1]))
+    with zipfile.ZipFile(path, "a") as archive, warnings.catch_warnings(action="ignore"):
+        archive.writestr("query.npy", archive.read("query.npy"))
+
+
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
@@ -297,6 +306,9 @@ def bad_npz(path):
         ("gt.npz", lambda p: np.savez(p, utmQ=np.zeros(()), utmDb=np.zeros((3, 2))), "utmQ: expected positions [n, 2]"),
         ("gt.npz", lambda p: np.savez(p, query=np.arange(2), database=np.arange(3)), "of one length"),
         ("gt.npz", lambda p: np.savez(p, other=np.zeros(2)), "got other"),
+        ("gt.npz", twice, "expected every array once, got query, database, query"),
+        ("gt.csv", "query,database,query\n0,0,1\n1,1,0\n", "got query,database,query"),
+        ("gt.csv", os.mkfifo, "expected a ground truth file, got a pipe or device"),
         ("gt.npz", lambda p: np.savez(p, utmQ=np.zeros((5, 2)), utmDb=np.zeros((3, 2))), "expected 2 query positions"),
     ],
 )
@@ -314,7 +326,17 @@ def test_wrong_index_files_are_named_in_one_line(folders, tmp_path, name, conten
 
 
 @pytest.mark.parametrize(
-    "name", ["plain.png", "@a@b@.png", "@1.png", "@nan@1@.png", "@inf@1@.png", "@1e308@1e308@.png", "@5@-1e10@.png"]
+    "name",
+    [
+        "plain.png",
+        "@a@b@.png",
+        "@1.png",
+        "@nan@1@.png",
+        "@inf@1@.png",
+        "@1e308@1e308@.png",
+        "@5@-1e10@.png",
+        "@1_0@5@.png",
+    ],
 )
 def test_names_without_coordinates_are_named(tmp_path, name):
     folder = fill(tmp_path / "db", [name])

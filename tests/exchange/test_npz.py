@@ -1,12 +1,14 @@
 """Features in npz: D2-Net's files, one for each image, one for all."""
 
+import os
+import warnings
 import zipfile
 
 import numpy as np
 import pytest
 
 from mfvpr import InputError
-from mfvpr.exchange import open_features
+from mfvpr.exchange import open_features, read_global_descriptors
 from tests.exchange.foreign import SIZE, assert_equal, feature
 
 
@@ -85,6 +87,46 @@ def test_only_what_is_asked_for_is_read(tmp_path):
     assert_equal(found, made["a.jpg"])
     with pytest.raises(InputError, match=r"all\.npz: cannot be read \(Bad CRC-32 for file 'b\.jpg/descriptors\.npy'\)"):
         list(source.read([1]))
+
+
+def test_pipes_are_not_waited_for(tmp_path):
+    made, names = feature(0), ["1.jpg", "2.jpg"]
+    np.savez(tmp_path / "1.jpg.npz", **parts_of(made))
+    os.mkfifo(tmp_path / "2.jpg.npz")
+    for path, wanted in ((tmp_path, names), (tmp_path / "2.jpg.npz", names)):
+        with pytest.raises(InputError, match=r"2\.jpg\.npz: expected a file, got a pipe or device"):
+            open_features(path, wanted)
+    [(_, found)] = open_features(tmp_path, names[:1]).read()
+    assert_equal(found, made)
+    (tmp_path / "2.jpg.npz").unlink()
+    np.savez(tmp_path / "2.jpg.npz", **parts_of(made))
+    source = open_features(tmp_path, names)
+    (tmp_path / "2.jpg.npz").unlink()
+    os.mkfifo(tmp_path / "2.jpg.npz")
+    with pytest.raises(InputError, match=r"2\.jpg\.npz: expected a file, got a pipe or device"):
+        list(source.read([1]))
+    for name in ("a.h5", "a.npy"):
+        os.mkfifo(tmp_path / name)
+        with pytest.raises(InputError, match="got a pipe or device"):
+            read_global_descriptors(tmp_path / name, names)
+
+
+def test_an_array_twice(tmp_path):
+    """Of several arrays with one name, NumPy takes the last and others the first."""
+    np.savez(tmp_path / "1.jpg.npz", **parts_of(feature(0)))
+    np.savez(tmp_path / "all.npz", **{f"1.jpg/{part}": array for part, array in parts_of(feature(0)).items()})
+    source, whole = (open_features(path, ["1.jpg"]) for path in (tmp_path / "all.npz", tmp_path))
+    for path, member in ((tmp_path / "1.jpg.npz", "scores.npy"), (tmp_path / "all.npz", "1.jpg/scores.npy")):
+        with zipfile.ZipFile(path, "a") as archive, warnings.catch_warnings(action="ignore"):
+            archive.writestr(member, archive.read(member))
+    for use in (
+        lambda: open_features(tmp_path / "all.npz", ["1.jpg"]),
+        lambda: open_features(tmp_path, ["1.jpg"]),
+        lambda: list(source.read()),
+        lambda: list(whole.read()),
+    ):
+        with pytest.raises(InputError, match=r"npz: expected every array once, got .*scores\.npy again"):
+            use()
 
 
 def test_pickles_are_never_loaded(tmp_path):

@@ -1,5 +1,7 @@
 """Shortlists: pairs of hloc and kapture, predictions in npz."""
 
+import os
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -87,6 +89,7 @@ def test_a_candidate_twice_counts_where_it_comes_first(tmp_path):
         ("q/1.jpg", "line 1: expected the names"),
         ("q/1.jpg d/1.jpg 0.5", "line 1: expected the names"),
         ("q/1.jpg, d/1.jpg, high", "line 1: expected the names"),
+        ("q/1.jpg, d/1.jpg, 1_0", "line 1: expected the names"),
         ("q/1.jpg, d/1.jpg, 0.5\nq/2.jpg, d/2.jpg", "expected scores of all pairs or of none"),
         ("q/1.jpg, d/1.jpg, 0.5\nq/1.jpg, d/2.jpg, 0.6", r"q/1\.jpg: expected scores, .* descend .* negate distances"),
         ("q/1.jpg, d/1.jpg, nan", r"q/1\.jpg: expected finite scores"),
@@ -136,7 +139,10 @@ def test_predictions_that_cannot_be_used(tmp_path, arrays, message):
 
 
 def test_not_a_file(tmp_path):
-    for name, got in (("p.txt", "nothing"), ("p.npz", "nothing"), (".", "a folder")):
+    os.mkfifo(tmp_path / "pipe.txt")
+    os.mkfifo(tmp_path / "pipe.npz")
+    for name, got in (("p.txt", "nothing"), ("p.npz", "nothing"), (".", "a folder"), ("pipe.txt", "a pipe or device"),
+                      ("pipe.npz", "a pipe or device")):  # fmt: skip
         with pytest.raises(InputError, match=f"expected a file, got {got}"):
             read_shortlist(tmp_path / name, QUERIES, DATABASE)
 

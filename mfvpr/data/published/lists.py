@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from mfvpr.data.datasets import ImageFolder
+from mfvpr.data.files import require_file
 from mfvpr.errors import InputError
 from mfvpr.foreign.numpy_objects import Array, read_objects
 
@@ -47,6 +48,7 @@ def read_lines(path: Path) -> list[str]:
     Raises:
         InputError: the file cannot be read.
     """
+    require_file(path, "a list")
     try:
         text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")
     except OSError as error:
@@ -79,6 +81,7 @@ def read_rows(path: Path, num_database: int) -> list[tuple[int, ...]]:
 
 
 def _rows(path: Path) -> list[tuple[int, ...]]:
+    require_file(path, "a list")
     try:
         with path.open("rb") as file:
             if _OBJECTS not in file.read(128):
@@ -105,8 +108,10 @@ def _whole(numbers: np.ndarray, path: Path) -> np.ndarray:
 
 
 def _array(path: Path) -> np.ndarray:
+    require_file(path, "a list")
     try:
-        return np.load(path, allow_pickle=False)
+        with path.open("rb") as file:
+            return np.lib.format.read_array(file, allow_pickle=False)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
     except (ValueError, EOFError):
