@@ -18,7 +18,7 @@ MAGIC = b"\x93NUMPY"
 # By the version: bytes of the length of the header, which says that one object follows and no array.
 _LENGTHS = {b"\1\0": 2, b"\2\0": 4, b"\3\0": 4}
 _HEADER = re.compile(rb"\{'descr': '\|O', 'fortran_order': (False|True), 'shape': \((\d*)(?:, ?)?\)(, )?\}\s*")
-_TYPES = ("f4", "f8", "i8", "i4", "i2", "i1", "u1", "b1")  # NumPy's codes
+_TYPES = ("f4", "f8", "i8", "i4", "i2", "i1", "u8", "u4", "u2", "u1", "b1")  # NumPy's codes
 _OBJECTS = ("O8", "O4")  # of a pointer's size where they were written
 _MOST_AXES = 64  # NumPy's
 
@@ -163,4 +163,4 @@ def _refused(name: Name) -> InputError:
 
 
 def _unexpected(kind: Type, where: str = "") -> str:
-    return f"expected arrays of float32 or float64, got {excerpt(kind.code)}{where}; use the official file"
+    return f"expected arrays of integers, float32 or float64, got {excerpt(kind.code)}{where}; use the official file"

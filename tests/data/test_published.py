@@ -2,6 +2,7 @@
 
 import csv
 import itertools
+import os
 import pickle
 
 import cv2
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from mfvpr.data.published import PUBLISHED, differences, published_dataset
+from mfvpr.data.published.lists import read_lines, read_names, read_rows
 from mfvpr.data.published.robotcar import CONDITIONS, REFERENCE, nearest_places
 from mfvpr.errors import InputError
 from tests.checkpoints import write_matlab
@@ -152,7 +154,7 @@ def test_robotcar_knows_one_pose_of_each_image(tmp_path):
 
 
 def test_robotcar_lacks_something(tmp_path):
-    refused("robotcar_seasons", tmp_path, "robotcar_v2_train.txt: cannot be read")
+    refused("robotcar_seasons", tmp_path, "robotcar_v2_train.txt: expected a list, got nothing")
     centers = {place(condition, 1): (0, 0, 0) for condition in (REFERENCE, *CONDITIONS)}
     write_poses(tmp_path, centers)
     (tmp_path / "images/snow/rear/1.jpg").unlink()
@@ -161,8 +163,20 @@ def test_robotcar_lacks_something(tmp_path):
     refused("robotcar_seasons", tmp_path, "expected poses of night-rain/rear, got none")
     for line in ("dawn/rear/1.jpg 1 2 3", "dawn/rear/1.jpg " + "nan " * 16, "dawn/rear/1.jpg " + "x " * 16):
         (tmp_path / "robotcar_v2_train.txt").write_text(f"\n{line}\n")
-        refused("robotcar_seasons", tmp_path, "line 1: expected a name and the 16 numbers of a pose, got 'dawn")
-    (tmp_path / "robotcar_v2_train.txt").write_text(f"{REFERENCE}/rear/../../../x.jpg {'0 ' * 16}\n")
+        refused("robotcar_seasons", tmp_path, "line 1: expected a name and the 16 numbers of a pose")
+    identity = np.eye(4)
+    identity[:3, 3] = 7
+    for numbers in (identity.T, 10 * identity):  # transposed, and in other units
+        (tmp_path / "robotcar_v2_train.txt").write_text(f"dawn/rear/1.jpg {' '.join(map(str, numbers.ravel()))}\n")
+        refused(
+            "robotcar_seasons",
+            tmp_path,
+            "line 1: expected a name and the 16 numbers of a pose by rows, the last 0 0 0 1",
+        )
+    digits = " ".join(map(str, identity.ravel())).replace("7.0", "7_0")
+    (tmp_path / "robotcar_v2_train.txt").write_text(f"dawn/rear/1.jpg {digits}\n")
+    refused("robotcar_seasons", tmp_path, "line 1: expected a name and the 16 numbers of a pose")
+    (tmp_path / "robotcar_v2_train.txt").write_text(f"{REFERENCE}/rear/../../../x.jpg {'0 ' * 15}1\n")
     refused("robotcar_seasons", tmp_path, "expected names below")
 
 
@@ -204,6 +218,8 @@ def test_nordlands_test_part_is_two_sections(tmp_path):
     dataset = published_dataset("nordland_3450", tmp_path)
     assert dataset.database.names == ("section1/9.png", "section1/10.png", "section2/9.png", "section2/10.png")
     assert rows(dataset, 0) == [[0], [1], [2], [3]]
+    assert rows(dataset, 2) == [[0, 1], [0, 1], [2, 3], [2, 3]]  # a frame of section 2 is none of section 1
+    assert dataset.truth.distance(1).tolist() == [1, 0, np.inf, np.inf]
 
 
 def test_vpr_bench_asks_every_tenth_frame(tmp_path):
@@ -235,7 +251,7 @@ def cells(names):
 
 def write_structure(path, places=PLACES, **changes):
     path.parent.mkdir(exist_ok=True)
-    content = {"whichSet": "val", "dbImage": cells(DATABASE), "utmDb": places.T, "qImage": cells(QUERIES),
+    content = {"whichSet": "val", "dbImageFns": cells(DATABASE), "utmDb": places.T, "qImageFns": cells(QUERIES),
                "utmQ": ASKED.T, "numImages": 3, "numQueries": 2, "posDistThr": 25, "posDistSqThr": 625,
                "nonTrivPosDistSqThr": 100}  # fmt: skip
     write_matlab(path, {"dbStruct": content | changes})
@@ -263,9 +279,19 @@ def test_pittsburgh_is_right_within_25_m(pittsburgh, folder):
     refused("pitts30k_test", pittsburgh, "expected datasets/pitts30k_test.mat, or pitts30k_test_dbImages.npy")
 
 
+def test_pittsburghs_names_pack_well(pittsburgh):
+    """To a 27th and less, where those of weights hardly do."""
+    path = pittsburgh / "datasets/pitts30k_val.mat"
+    names = [f"{i // 1000:03d}/{i // 24:06d}_pitch{i % 24 // 12 + 1}_yaw{i % 12 + 1}.jpg" for i in range(500)]
+    write_structure(path, np.zeros((500, 2)), dbImageFns=cells(names))
+    refused("pitts30k_val", pittsburgh, "500 of the 500 images of pitts30k_val.mat are missing")
+
+
 @pytest.mark.parametrize("suffix", ["gt", "gt_25m"])
 @pytest.mark.parametrize(
-    "truth", [objects(np.array([1]), np.array([0, 1])), objects([1], [0, 1])], ids=["arrays", "lists"]
+    "truth",
+    [objects(*(np.array(some, kind) for some in ([1], [0, 1]))) for kind in (int, "u2", "u4", "u8")]
+    + [objects([1], [0, 1])],
 )
 def test_pittsburgh_of_lists(pittsburgh, truth, suffix):
     write_lists(pittsburgh, "pitts30k_test", truth)
@@ -313,6 +339,9 @@ def test_damaged_lists(pittsburgh):
     refused("pitts30k_test", pittsburgh, "expected a list of names")
     np.save(names, np.array(["../../secret.jpg"]))
     refused("pitts30k_test", pittsburgh, "expected names below")
+    with names.open("wb") as file:
+        np.savez(file, np.array(DATABASE))
+    refused("pitts30k_test", pittsburgh, "expected an array of NumPy")
 
 
 def test_structures_that_are_not_pittsburghs(pittsburgh):
@@ -321,7 +350,7 @@ def test_structures_that_are_not_pittsburghs(pittsburgh):
     refused("pitts30k_val", pittsburgh, "expected a position for each of 3 images, got [2, 2]")
     write_structure(path, places=np.full((3, 2), np.nan))
     refused("pitts30k_val", pittsburgh, "expected a position for each")
-    write_structure(path, qImage=cells(["../x.jpg", "y.jpg"]))
+    write_structure(path, qImageFns=cells(["../x.jpg", "y.jpg"]))
     refused("pitts30k_val", pittsburgh, "expected names below")
     write_matlab(path, {"other": np.ones(3)})
     refused("pitts30k_val", pittsburgh, "expected the structure dbStruct")
@@ -369,6 +398,28 @@ def test_msls_of_tables(tmp_path):
     assert rows(dataset, 25) == [[0], [2]]
 
 
+@pytest.mark.parametrize("words", [("TRUE", "FALSE"), ("true", "false"), ("1", "0")])
+def test_msls_flags_may_have_been_saved_again(tmp_path, words):
+    write_msls(tmp_path)
+    for table in ("raw", "subtask_index"):
+        for path in tmp_path.glob(f"train_val/*/*/{table}.csv"):
+            path.write_text(path.read_text().replace("True", words[0]).replace("False", words[1]))
+    dataset = published_dataset("msls_val", tmp_path)
+    assert [name[-6:] for name in dataset.database.names] == ["d0.jpg", "d2.jpg"] * 2
+    assert [name[-6:] for name in dataset.queries.names] == ["q0.jpg"] * 2
+
+
+@pytest.mark.parametrize("table", ["raw", "postprocessed", "subtask_index"])
+def test_msls_tables_are_joined_by_their_keys(tmp_path, table):
+    write_msls(tmp_path)
+    for path in tmp_path.glob(f"train_val/*/*/{table}.csv"):
+        header, *lines = path.read_text().splitlines()
+        path.write_text("\n".join([header, *lines[::-1]]))
+    dataset = published_dataset("msls_val", tmp_path)
+    assert sorted(name[-6:] for name in dataset.database.names) == ["d0.jpg"] * 2 + ["d2.jpg"] * 2
+    assert [name[-6:] for name in dataset.queries.names] == ["q0.jpg"] * 2
+
+
 def test_msls_of_lists(tmp_path):
     write_msls(tmp_path)
     names = [f"train_val/{city}/database/images/d{row}.jpg" for city in ("cph", "sf") for row in (0, 2)]
@@ -389,15 +440,39 @@ def test_msls_of_lists(tmp_path):
 
 
 def test_msls_lacks_something(tmp_path):
-    refused("msls_val", tmp_path, "raw.csv: cannot be read")
+    refused("msls_val", tmp_path, "raw.csv: expected a table of the data set, got nothing")
     write_msls(tmp_path)
     table = tmp_path / "train_val/sf/query/postprocessed.csv"
     text = table.read_text()
     table.write_text("".join(text.splitlines(keepends=True)[:-1]))
-    refused("msls_val", tmp_path, "postprocessed.csv, subtask_index.csv, got 4, 3, 4; get them again")
-    for change in (text.replace("easting", "east"), text.replace("5000000.0", "nan"), text.replace("5000000.0", "x")):
+    refused(
+        "msls_val", tmp_path, "expected the same keys in raw.csv, postprocessed.csv, subtask_index.csv, got 4, 3 and 4"
+    )
+    table.write_text(text.replace("q3", "q4"))
+    refused("msls_val", tmp_path, "expected the same keys")
+    table.write_text(text.replace("q3", "q2"))
+    refused("msls_val", tmp_path, "postprocessed.csv: expected a different key in every line, got 3 in 4 lines")
+    for change in (text.replace("easting", "east"), *(text.replace("5000000.0", word) for word in ("nan", "x", "5_0"))):
         table.write_text(change)
-        refused("msls_val", tmp_path, "line 1: expected pano in raw.csv")
+        refused("msls_val", tmp_path, "key 'q0': expected pano in raw.csv")
+    table.write_text(text)
+    raw = table.with_name("raw.csv")
+    raw.write_text(raw.read_text().replace("False", "maybe"))
+    refused("msls_val", tmp_path, "key 'q0': expected pano in raw.csv")
+
+
+@pytest.mark.parametrize("pipe", ["robotcar_v2_train.txt", "msls_val_dbImages.npy", "train_val/cph/database/raw.csv",
+                                  "pitts30k_val.mat", "nordland_imageNames_index.txt"])  # fmt: skip
+def test_pipes_are_not_waited_for(tmp_path, pipe):
+    path = tmp_path / pipe
+    path.parent.mkdir(parents=True, exist_ok=True)
+    os.mkfifo(path)
+    for name in ("robotcar_seasons", "msls_val", "pitts30k_val", "nordland_27592"):
+        with pytest.raises(InputError):
+            published_dataset(name, tmp_path)
+    for read in (read_lines, read_names, lambda path: read_rows(path, 1)):
+        with pytest.raises(InputError, match=r"expected a list, got a pipe or device"):
+            read(path)
 
 
 # All

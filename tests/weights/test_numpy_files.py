@@ -192,7 +192,10 @@ def test_other_names_are_refused(path, call, words):
 @pytest.mark.parametrize(
     ("kind", "words"),
     [
-        (typed("O8", OBJECT), "expected arrays of float32 or float64, got O8 at conv.weights; use the official file"),
+        (
+            typed("O8", OBJECT),
+            "expected arrays of integers, float32 or float64, got O8 at conv.weights; use the official file",
+        ),
         (typed("f2"), "got f2 at conv.weights"),
         (typed("c8"), "got c8"),
         (typed("S4", (3, "|", None, None, None, 4, 1, 0)), "got S4"),
@@ -230,7 +233,7 @@ def test_other_types_that_numpy_writes_are_refused(path):
         (np.zeros(2, np.dtype("f4", metadata={"a": 1})), "f4"),
     ):
         write_numpy(path, {"a": {"b": values}})
-        assert f"expected arrays of float32 or float64, got {code}" in refused(path)
+        assert f"expected arrays of integers, float32 or float64, got {code}" in refused(path)
     for values in (np.ma.zeros(3), np.zeros(3).view(np.recarray), np.float32(3)):
         assert "it asks for numpy" in refused(write_numpy(path, {"a": {"b": values}}))
 

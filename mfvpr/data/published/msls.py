@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from mfvpr.data.datasets import Dataset, QuerySequence
+from mfvpr.data.files import require_file
 from mfvpr.data.ground_truth import FARTHEST, FrameTruth, RadiusTruth
+from mfvpr.data.numbers import parse_number
 from mfvpr.data.published.lists import listed_images, read_names, read_rows
 from mfvpr.errors import InputError
 from mfvpr.evaluation import rows_within
@@ -63,28 +65,43 @@ def _of_tables(root: Path, name: str) -> Dataset:
 
 def _images(folder: Path, root: Path) -> Iterator[tuple[str, tuple[float, float]]]:
     """Name and position of what the task "all" takes, without panoramas."""
-    tables = [_table(folder / f"{name}.csv") for name in TABLES]
-    if len({len(table) for table in tables}) > 1:
-        raise InputError(f"{folder}: expected as many lines in {', '.join(f'{name}.csv' for name in TABLES)}, got "
-                         f"{', '.join(str(len(table)) for table in tables)}; get them again")  # fmt: skip
-    for number, (raw, processed, task) in enumerate(zip(*tables, strict=True), start=1):
+    raw, processed, tasks = (_table(folder / f"{name}.csv") for name in TABLES)
+    if not raw.keys() == processed.keys() == tasks.keys():
+        raise InputError(f"{folder}: expected the same keys in {', '.join(f'{name}.csv' for name in TABLES)}, got "
+                         f"{len(raw)}, {len(processed)} and {len(tasks)} keys with differences; get them "
+                         "again")  # fmt: skip
+    for key, line in processed.items():
         try:
-            if raw["pano"] == "True" or task["all"] != "True":
+            if _flag(raw[key]["pano"]) or not _flag(tasks[key]["all"]):
                 continue
-            position = float(processed["easting"]), float(processed["northing"])
-            if not all(abs(one) <= FARTHEST for one in position):  # NaN neither
+            position = parse_number(line["easting"]), parse_number(line["northing"])
+            if not all(abs(meters) <= FARTHEST for meters in position):  # NaN neither
                 raise ValueError
-            yield f"{(folder / 'images').relative_to(root).as_posix()}/{processed['key']}.jpg", position
-        except (KeyError, TypeError, ValueError):
-            raise InputError(f"{folder}: line {number}: expected pano in raw.csv, all in subtask_index.csv, key, "
-                             "easting and northing in postprocessed.csv; get them again") from None  # fmt: skip
+            yield f"{(folder / 'images').relative_to(root).as_posix()}/{key}.jpg", position
+        except (AttributeError, KeyError, TypeError, ValueError):  # cells that a line lacks are None
+            raise InputError(
+                f"{folder}: key {key[:60]!r}: expected pano in raw.csv and all in subtask_index.csv (True or False), "
+                "easting and northing in postprocessed.csv (meters); get them again"
+            ) from None
 
 
-def _table(path: Path) -> list[dict[str, str]]:
+def _flag(text: str) -> bool:
+    """A flag as pandas reads it from a table."""
+    return {"true": True, "1": True, "false": False, "0": False}[text.strip().lower()]
+
+
+def _table(path: Path) -> dict[str, dict[str, str]]:
+    """Lines by key."""
+    require_file(path, "a table of the data set")
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            return list(csv.DictReader(file))
+            lines = list(csv.DictReader(file))
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}; get the whole data set") from None
     except (UnicodeDecodeError, csv.Error):
         raise InputError(f"{path}: expected a table of commas; get it again") from None
+    table = {line.get("key") or "": line for line in lines}
+    if len(table) < len(lines) or "" in table:
+        raise InputError(f"{path}: expected a different key in every line, got {len(table)} in {len(lines)} lines; get "
+                         "the table again")  # fmt: skip
+    return table

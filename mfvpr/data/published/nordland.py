@@ -30,7 +30,7 @@ def nordland_27592(root: Path, name: str, *, seasons: tuple[str, str]) -> Datase
 
 
 def nordland_3450(root: Path, name: str, *, seasons: tuple[str, str]) -> Dataset:
-    """The test part of Olid, Facil and Civera's (2018); right within 2 frames.
+    """The test part of Olid, Facil and Civera's (2018); right within 2 frames of the same section.
 
     Raises:
         InputError: images are missing, or the seasons' frames differ.
@@ -62,7 +62,7 @@ def _listed(root: Path, season: str, side: str) -> ImageFolder:
 
 
 def _paired(name: str, database: ImageFolder, queries: ImageFolder) -> Dataset:
-    """The same frame of both."""
+    """The same frame of both; each folder of the database is a drive."""
     if len(database) != len(queries):
         raise InputError(f"{queries.root}: expected as many frames as in {database.root}, got {len(queries):,} and "
                          f"{len(database):,}; get the whole data set")  # fmt: skip
@@ -70,5 +70,7 @@ def _paired(name: str, database: ImageFolder, queries: ImageFolder) -> Dataset:
         if PurePosixPath(query).with_suffix("") != PurePosixPath(place).with_suffix(""):
             raise InputError(f"{queries.root}: expected the frames of {database.root}, got {query} where that has "
                              f"{place}; a gap in one of them would spoil every number behind it")  # fmt: skip
-    truth = FrameTruth(tuple((row,) for row in range(len(queries))), len(database))
+    folders = [PurePosixPath(place).parent for place in database.names]
+    starts = tuple(row for row in range(1, len(folders)) if folders[row] != folders[row - 1])
+    truth = FrameTruth(tuple((row,) for row in range(len(queries))), len(database), starts=starts)
     return Dataset(name, database, (QuerySequence(name, queries, truth),))

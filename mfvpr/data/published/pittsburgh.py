@@ -50,7 +50,7 @@ def _of_structure(root: Path, name: str, path: Path) -> Dataset:
     try:
         with path.open("rb") as file:
             found = read_matlab(file, text=True)
-        names = [_texts(found, f"dbStruct.{field}.") for field in ("dbImage", "qImage")]
+        names = [_texts(found, f"dbStruct.{field}.") for field in ("dbImageFns", "qImageFns")]
         positions = [found[f"dbStruct.{field}"].T.astype(np.float64) for field in ("utmDb", "utmQ")]
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None

@@ -12,6 +12,7 @@ import numpy as np
 
 from mfvpr.data.datasets import Dataset, QuerySequence
 from mfvpr.data.ground_truth import FARTHEST, FrameTruth
+from mfvpr.data.numbers import parse_number
 from mfvpr.data.published.lists import listed_images, read_lines
 from mfvpr.errors import InputError
 
@@ -19,6 +20,7 @@ REFERENCE = "overcast-summer"  # the paper's figure; its text says overcast-refe
 CONDITIONS = ("dawn", "dusk", "night", "night-rain", "overcast-winter", "rain", "snow")
 REACH = 5.0  # meters
 POSES = "robotcar_v2_train.txt"
+_LAST_ROW = 1e-6  # tolerance of its numbers
 LAYOUT = f"""images/CONDITION/rear/TIMESTAMP.jpg  of {REFERENCE} (the database),
                                      {", ".join(CONDITIONS)}
 {POSES}                per line CONDITION/rear/TIMESTAMP.jpg and 16 numbers, camera to world"""
@@ -56,12 +58,16 @@ def camera_centers(path: Path) -> dict[str, np.ndarray]:
     for number, line in enumerate(read_lines(path), start=1):
         name, *texts = line.split()
         try:
-            numbers = [float(text) for text in texts]
+            numbers = [parse_number(text) for text in texts]
         except ValueError:
             numbers = []
         center = np.array(numbers[3:12:4])
-        if len(numbers) != 16 or not np.all(np.abs(center) <= FARTHEST):
-            raise InputError(f"{path}: line {number}: expected a name and the 16 numbers of a pose, got {line[:60]!r}")
+        is_pose = len(numbers) == 16 and np.allclose(numbers[12:], (0, 0, 0, 1), rtol=0, atol=_LAST_ROW)
+        if not is_pose or not np.all(np.abs(center) <= FARTHEST):
+            raise InputError(
+                f"{path}: line {number}: expected a name and the 16 numbers of a pose by rows, the last 0 0 0 1, got "
+                f"{line[:60]!r}; get the file again"
+            )
         image = str(Path(name).with_suffix(".jpg").as_posix())
         if image in centers and not np.array_equal(centers[image], center):
             raise InputError(f"{path}: line {number}: expected one pose of {image}, got another; get the file again")
