@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mfvpr.data.files import clipped
 from mfvpr.errors import InputError
 from mfvpr.stores.features import FeatureStore, open_store
 from mfvpr.stores.manifest import Kind
@@ -28,6 +29,7 @@ from mfvpr.stores.rows import RowStore, open_rows
 from mfvpr.types import Features
 
 SEGMENT = 4096  # rows
+DEEPEST = 50  # levels of a place: Python's JSON reads fewer levels, the more functions are called already
 MAP = Kind("map", 1, "places", "images", "adds", compress=False)
 _TICK = 3.0  # seconds, at most, of the clocks by which file systems tell when a folder has changed
 
@@ -46,13 +48,26 @@ class Entry(NamedTuple):
 
 
 def check_place(name: str, place: Any) -> None:
-    """None would be no place; what JSON cannot say cannot be kept."""
+    """Refuse a place that is None, or that JSON would not give back as it is: a tuple comes back as a list."""
     try:
-        if place is None:
-            raise ValueError("None")
-        json.dumps(place, allow_nan=False)
+        text = json.dumps(place, allow_nan=False)
+        if place is None or json.loads(text) != place:
+            raise ValueError(f"{clipped(repr(place), 80)}, which JSON gives back as {clipped(text, 80)}")
+        if _levels(place) > DEEPEST:
+            raise RecursionError
+    except RecursionError:
+        raise InputError(
+            f"{name}: expected a place of at most {DEEPEST} levels, got a deeper one; flatten it"
+        ) from None
     except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: expected a place that JSON can say, and not null, got {error}") from None
+        raise InputError(f"{name}: expected a place that JSON can say, and not null, got {error}; use text, numbers, "
+                         "lists, and dictionaries by text") from None  # fmt: skip
+
+
+def _levels(place: Any) -> int:
+    """Number of lists and dictionaries within each other."""
+    parts = place.values() if isinstance(place, dict) else place if isinstance(place, list) else None
+    return 0 if parts is None else 1 + max(map(_levels, parts), default=0)
 
 
 @dataclass

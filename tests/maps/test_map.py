@@ -1,6 +1,8 @@
 """A map that is asked: the same answers as an evaluation gives, whole rows only, and nothing that is not there."""
 
+import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -270,6 +272,36 @@ def test_places_are_what_json_can_say(dataset, tmp_path, place):
     with pytest.raises(InputError, match="expected a place that JSON can say"):
         known.add(dataset.queries.paths[0], place)
     assert len(known) == len(dataset.database)
+
+
+@pytest.mark.parametrize(
+    "place", ["here", 3, 1.5, True, np.float64(0.1), [1, [2.5, "b"]], {"x": {"y": [None]}}, "\udcff"]
+)
+def test_places_come_back_as_they_are(place):
+    map_store.check_place("a.jpg", place)
+    assert json.loads(json.dumps(place)) == place
+
+
+def nested(levels):
+    place = []
+    for _ in range(levels - 1):
+        place = [place]
+    return place
+
+
+@pytest.mark.parametrize(("place", "words"), [
+    ((1.0, 2.0), "(1.0, 2.0), which JSON gives back as [1.0, 2.0]"),
+    ({"at": [(1, 2)]}, "which JSON gives back as"),
+    ({3: "room"}, "which JSON gives back as"),
+    (10**5000, "expected a place that JSON can say"),
+    (nested(map_store.DEEPEST + 1), "expected a place of at most"),
+    (nested(100_000), "expected a place of at most"),
+], ids=["tuple", "tuple inside", "number as key", "digits", "deep", "very deep"])  # fmt: skip
+def test_places_that_would_come_back_as_others(place, words):
+    with pytest.raises(InputError, match=re.escape(words)) as error:
+        map_store.check_place("a.jpg", place)
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 400
 
 
 def test_of_a_score_that_is_not_finite_nothing_is_sure(dataset, folder):
