@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy import optimize, special
 
-from mfvpr.data.files import write_text
+from mfvpr.data.files import require_file, write_text
 from mfvpr.errors import InputError
 from mfvpr.results import Ranked
 
@@ -141,19 +141,21 @@ def fit_confidence(
     return Confidence(tuple(inputs), apart, tuple(center.tolist()), tuple(scale.tolist()), tuple(weights), bias)
 
 
-def write_confidences(path: Path, systems: Mapping[str, Confidence], made: Mapping[str, Any]) -> None:
+def write_confidences(path: Path | str, systems: Mapping[str, Confidence], made: Mapping[str, Any]) -> None:
     """Write the confidences of systems by name as JSON, with how they were made (JSON values)."""
     values = {name: {field.name: getattr(one, field.name) for field in fields(one)} for name, one in systems.items()}
     found = {"format": _FORMAT, "made": made, "systems": values}
-    write_text(path, json.dumps(found, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    write_text(Path(path), json.dumps(found, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
-def read_confidences(path: Path) -> tuple[dict[str, Confidence], dict[str, Any]]:
+def read_confidences(path: Path | str) -> tuple[dict[str, Confidence], dict[str, Any]]:
     """Those of `write_confidences` by system, and how they were made.
 
     Raises:
         InputError: no such file, or another one.
     """
+    path = Path(path)
+    require_file(path, "the confidence.json that an evaluation wrote")
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
         if found["format"] != _FORMAT:
@@ -166,7 +168,10 @@ def read_confidences(path: Path) -> tuple[dict[str, Confidence], dict[str, Any]]
 
 
 def _confidence(*, inputs: list[Input], apart: int, bias: float, **vectors: list[float]) -> Confidence:
-    center, scale, weights = (tuple(map(float, vectors.pop(name))) for name in ("center", "scale", "weights"))
+    arrays = [np.array(vectors.pop(name)) for name in ("center", "scale", "weights")]
+    if any(array.dtype.kind not in "fi" for array in arrays):
+        raise ValueError("expected lists of numbers")
+    center, scale, weights = (tuple(array.astype(float).tolist()) for array in arrays)
     numbers = [bias, *center, *scale, *weights]
     same = len(inputs) == len(center) == len(scale) == len(weights)
     known = set(inputs) <= {"margin", "height", "filter", "score"}

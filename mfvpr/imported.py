@@ -31,6 +31,9 @@ class File:
     path: Path
     prefix: str = ""
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "path", Path(self.path))  # recipes know files by type, and tell them by their content
+
     def names(self, folder: ImageFolder) -> list[str]:
         """What a folder's images are called in it."""
         return [self.prefix + name for name in folder.names]
@@ -119,6 +122,7 @@ class ShortlistFiles:
 
 def _file_of(files: Mapping[Path, File], folder: ImageFolder) -> File:
     """The file of a folder's images."""
+    files = {Path(root): file for root, file in files.items()}
     if folder.root not in files:
         known = ", ".join(map(str, files)) or "none"
         raise InputError(f"{folder.root}: expected a folder that a file was given of, one of: {known}; give one of "

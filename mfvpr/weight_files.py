@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from mfvpr.data.files import write_text
+from mfvpr.data.files import require_file, write_text
 from mfvpr.errors import InputError
 from mfvpr.learned_weight import INPUTS, LearnedWeight
 
@@ -17,7 +17,7 @@ SUFFIX = ".json"
 _FORMAT = "mfvpr match weight 1"
 
 
-def write_weight(path: Path, weight: LearnedWeight, made: Mapping[str, Any]) -> None:
+def write_weight(path: Path | str, weight: LearnedWeight, made: Mapping[str, Any]) -> None:
     """Write a weight as JSON, to the last bit, with how it was made (JSON values).
 
     Raises:
@@ -25,17 +25,19 @@ def write_weight(path: Path, weight: LearnedWeight, made: Mapping[str, Any]) -> 
     """
     arrays = {f.name: np.asarray(getattr(weight, f.name)).tolist() for f in fields(weight) if f.name != "names"}
     content = {"format": _FORMAT, "made": made, "inputs": list(weight.names), **arrays}
-    write_text(path, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    write_text(Path(path), json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
-def read_weight(path: str | Path) -> tuple[LearnedWeight, dict[str, Any]]:
+def read_weight(path: Path | str) -> tuple[LearnedWeight, dict[str, Any]]:
     """That of `write_weight`, to the last bit, and how it was made.
 
     Raises:
         InputError: no such file, or another one.
     """
+    path = Path(path)
+    require_file(path, "a match weight that experiments.learn wrote")
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8"))
         if content.pop("format") != _FORMAT:
             raise ValueError("another format")
         return _weight(content.pop("inputs"), content), dict(content["made"])

@@ -167,6 +167,7 @@ def broken(**changes):
     "content",
     ["", "[]", '{"format": 3}', *(json.dumps(broken(**changes)) for changes in (
         {"inputs": ["else"]}, {"center": [0, 1]}, {"scale": [0]}, {"bias": float("nan")}, {"weights": ["a"]},
+        {"weights": ["1_0"]}, {"scale": "1"}, {"center": [True]}, {"bias": "0"}, {"center": [10**400]},
         {"more": [1]}, {"apart": -1}, {"bias": None}, {"apart": 2.5}, {"apart": True}, {"weights": [-1.0]},
         {name: one * 2 for name, one in broken()["systems"]["histogram"].items() if isinstance(one, list)})),
      '{"format": "mfvpr confidence 2", "made": ' + "[" * 100_000 + "]" * 100_000 + "}"],
@@ -179,7 +180,7 @@ def test_other_files_are_refused_in_one_line(content, tmp_path):
     ) as told:
         read_confidences(path)
     assert "\n" not in str(told.value)
-    with pytest.raises(InputError, match="No such file"):
+    with pytest.raises(InputError, match="got nothing"):
         read_confidences(tmp_path / "none.json")
 
 

@@ -148,7 +148,7 @@ def test_no_place_is_right_where_the_database_does_not_show_it(evaluate, root, t
     [
         (["threshold=0.5"], "threshold=0.5: expected confidence=FILE as well"),
         (["threshold=2"], "threshold=2: expected a number from 0 to 1"),
-        (["confidence=/none.json"], "/none.json: expected the confidence.json that an evaluation wrote (No such file"),
+        (["confidence=/none.json"], "/none.json: expected the confidence.json that an evaluation wrote, got nothing"),
     ],
 )
 def test_what_cannot_say_how_sure_answers_are_is_refused(evaluate, settings, words):

@@ -117,7 +117,7 @@ def test_a_changed_file_is_another_setting_of_a_confidence(
 @pytest.mark.parametrize(
     ("value", "words"),
     [
-        ("FOLDER/none.json", "none.json: expected a match weight that experiments.learn wrote (No such file"),
+        ("FOLDER/none.json", "none.json: expected a match weight that experiments.learn wrote, got nothing"),
         ("FOLDER/text.json", "text.json: expected a match weight that experiments.learn wrote"),
         ("FOLDER/mine.txt", "expected one of fs, dmf, ratio, unit"),
         ("7", "expected one of fs, dmf, ratio, unit"),

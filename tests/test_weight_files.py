@@ -60,6 +60,6 @@ def test_another_file_is_refused(tmp_path, weight, change):
 def test_no_file_and_no_json_are_refused(tmp_path):
     (tmp_path / "text.json").write_text("[]")
     (tmp_path / "deep.json").write_text("[" * 100_000)
-    for name, reason in (("none.json", "No such file"), ("text.json", ""), ("deep.json", "Recursion")):
-        with pytest.raises(InputError, match=f"{name}: expected a match weight that experiments.learn wrote .{reason}"):
+    for name, reason in (("none.json", "got nothing"), ("text.json", ""), ("deep.json", "Recursion")):
+        with pytest.raises(InputError, match=f"{name}: expected a match weight that experiments.learn wrote.*{reason}"):
             read_weight(tmp_path / name)

@@ -78,7 +78,7 @@ class Contents:
         }
 
 
-def contents(folder: ImageFolder, cache: Path | None = None) -> Contents:
+def contents(folder: ImageFolder, cache: Path | str | None = None) -> Contents:
     """What the files of `folder` hold.
 
     Args:
@@ -87,7 +87,7 @@ def contents(folder: ImageFolder, cache: Path | None = None) -> Contents:
             process replaces meanwhile, costs time only.
     """
     root = folder.root.absolute()
-    record = None if cache is None else cache / f"{hashlib.sha256(os.fsencode(root)).hexdigest()[:32]}.json"
+    record = None if cache is None else Path(cache) / f"{hashlib.sha256(os.fsencode(root)).hexdigest()[:32]}.json"
     known, begun = {} if record is None else _recalled(record), time.time_ns()
     states = dict(zip(folder.names, map(state_of, folder.paths), strict=True))
     trusted = {name for name, state in states.items() if state and name in known and known[name][:4] == state}

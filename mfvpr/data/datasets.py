@@ -33,6 +33,9 @@ class ImageFolder:
     orient: bool = True
     bits: int | None = 16
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "root", Path(self.root))
+
     @property
     def paths(self) -> list[Path]:
         """Full paths, in order."""
@@ -106,7 +109,7 @@ class Dataset:
         return self.only.excluded
 
 
-def image_folder(root: Path, *, orient: bool = True, bits: int | None = 16) -> ImageFolder:
+def image_folder(root: Path | str, *, orient: bool = True, bits: int | None = 16) -> ImageFolder:
     """All images below `root`, subfolders included, linked ones as well; hidden files and folders are not.
 
     Args:
@@ -118,6 +121,7 @@ def image_folder(root: Path, *, orient: bool = True, bits: int | None = 16) -> I
         InputError: no such folder, one that cannot be listed, a link that leads to nothing or back to a folder that it
             is in, or no images.
     """
+    root = Path(root)
     if not root.is_dir():
         found = "a file" if os.path.lexists(root) else "nothing"
         raise InputError(f"{root}: expected a folder of images, got {found}; check the path")
@@ -130,15 +134,15 @@ def image_folder(root: Path, *, orient: bool = True, bits: int | None = 16) -> I
 
 
 def folder_dataset(
-    database: Path,
-    queries: Path,
+    database: Path | str,
+    queries: Path | str,
     *,
-    ground_truth: str | None,
+    ground_truth: str,
     name: str = "folder",
-    index_file: Path | None = None,
+    index_file: Path | str | None = None,
     widen_index: bool = False,
-    database_labels: Path | None = None,
-    query_labels: Path | None = None,
+    database_labels: Path | str | None = None,
+    query_labels: Path | str | None = None,
     orient: bool = True,
     bits: int | None = 16,
 ) -> Dataset:
@@ -147,7 +151,8 @@ def folder_dataset(
     Args:
         database: folder of database images.
         queries: folder of query images.
-        ground_truth: one of `ground_truth.KINDS`, which says what each means. Nothing is assumed.
+        ground_truth: one of `ground_truth.KINDS`, which says what each means; "none" = rankings only. Nothing is
+            assumed.
         name: what results call it.
         index_file: for `index`, see `truth_files.truth_from_file`.
         widen_index: for `index`, whether database images within a tolerance in frames count as well.
@@ -165,10 +170,10 @@ def folder_dataset(
 
 
 def sequences_dataset(
-    database: Path,
-    queries: Sequence[Path],
+    database: Path | str,
+    queries: Sequence[Path | str],
     *,
-    ground_truth: str | None,
+    ground_truth: str,
     name: str = "sequences",
     index_file: str | None = None,
     widen_index: bool = False,
@@ -190,7 +195,8 @@ def sequences_dataset(
     Raises:
         InputError: no sequence, two of one name, or one with the name of a mean; or as `folder_dataset`.
     """
-    names = [(folder.resolve() if folder.name in ("", "..") else folder).name for folder in queries]
+    folders = [Path(folder) for folder in queries]
+    names = [(folder.resolve() if folder.name in ("", "..") else folder).name for folder in folders]
     if not names:
         raise InputError("queries: expected the folder of at least one sequence, got none")
     for twice in {one for one in names if names.count(one) > 1}:
@@ -207,7 +213,7 @@ def sequences_dataset(
             one, images, folder, ground_truth=ground_truth, index_file=folder / index_file if index_file else None,
             widen_index=widen_index, database_labels=None, query_labels=None,
         )
-        for one, folder in zip(names, queries, strict=True)
+        for one, folder in zip(names, folders, strict=True)
     )  # fmt: skip
     return Dataset(name, images, tuple(sequences))
 
@@ -215,13 +221,13 @@ def sequences_dataset(
 def _sequence(
     name: str,
     database: ImageFolder,
-    queries: Path,
+    queries: Path | str,
     *,
-    ground_truth: str | None,
-    index_file: Path | None,
+    ground_truth: str,
+    index_file: Path | str | None,
     widen_index: bool,
-    database_labels: Path | None,
-    query_labels: Path | None,
+    database_labels: Path | str | None,
+    query_labels: Path | str | None,
 ) -> QuerySequence:
     """The queries of a folder, read as the database is, with their ground truth."""
     images = image_folder(queries, orient=database.orient, bits=database.bits)
@@ -240,7 +246,7 @@ def _sequence(
     return QuerySequence(name, images, truth)
 
 
-def _check_files(ground_truth: str | None, files: Mapping[str, Path | None]) -> None:
+def _check_files(ground_truth: str, files: Mapping[str, Path | str | None]) -> None:
     """Refuse an unknown kind of ground truth, and files that it lacks or does not read."""
     if ground_truth not in KINDS:
         raise InputError(f"ground_truth={ground_truth}: expected one of {CHOICES}")

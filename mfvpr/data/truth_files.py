@@ -17,20 +17,20 @@ MAX_DIGITS = 20  # of a row number
 
 
 def truth_from_labels(
-    query_file: Path, database_file: Path, query_names: Sequence[str], database_names: Sequence[str]
+    query_file: Path | str, database_file: Path | str, query_names: Sequence[str], database_names: Sequence[str]
 ) -> LabelTruth:
     """Same label = right, from a csv with the columns `name,label` for each side, one line per image.
 
     A query with an empty label has no right answer, and a database image with one is nobody's; labels are compared as
     they are written, but for spaces around them.
     """
-    labels = [_labels(query_file, query_names), _labels(database_file, database_names)]
+    labels = [_labels(Path(query_file), query_names), _labels(Path(database_file), database_names)]
     numbers = {"": -1} | {label: number for number, label in enumerate(sorted({*labels[0], *labels[1]} - {""}))}
     return LabelTruth(*(np.array([numbers[label] for label in side], np.int32) for side in labels))
 
 
 def truth_from_file(
-    path: Path, query_names: Sequence[str], database_names: Sequence[str], *, widened: bool = False
+    path: Path | str, query_names: Sequence[str], database_names: Sequence[str], *, widened: bool = False
 ) -> Truth:
     """Truth from an index file.
 
@@ -47,6 +47,7 @@ def truth_from_file(
         widened: whether database images within a tolerance in frames of a pair's count as well, as in a sequence; if
             not, the pairs are all that is right.
     """
+    path = Path(path)
     readers = {".csv": _csv_pairs, ".npz": _npz_pairs, ".json": _json_pairs}
     if path.suffix.lower() not in readers:
         raise InputError(f"{path}: expected an index file named .csv, .npz or .json, got {path.suffix or 'no suffix'}")

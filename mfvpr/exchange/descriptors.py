@@ -17,7 +17,7 @@ from mfvpr.exchange.npz import parse_npy, read_npz, write_npz
 PART = "global_descriptor"  # what hloc calls it
 
 
-def read_global_descriptors(path: Path, names: Sequence[str], *, lengths: Lengths = "unit") -> np.ndarray:
+def read_global_descriptors(path: Path | str, names: Sequence[str], *, lengths: Lengths = "unit") -> np.ndarray:
     """Global descriptors of the images `names`.
 
     Args:
@@ -34,6 +34,7 @@ def read_global_descriptors(path: Path, names: Sequence[str], *, lengths: Length
         InputError: no such file, damaged, images that are missing or could be several, values that are not finite, or
             not of unit length.
     """
+    path = Path(path)
     require_lengths(lengths)
     readers = {".npy": _from_npy, ".npz": _from_npz, ".h5": _from_h5, ".hdf5": _from_h5}
     require_file(path)
@@ -45,7 +46,9 @@ def read_global_descriptors(path: Path, names: Sequence[str], *, lengths: Length
     return with_length(str(path), as_float32(str(path), found), lengths)
 
 
-def write_global_descriptors(path: Path, names: Sequence[str], descriptors: np.ndarray, *, half: bool = False) -> None:
+def write_global_descriptors(
+    path: Path | str, names: Sequence[str], descriptors: np.ndarray, *, half: bool = False
+) -> None:
     """Write global descriptors `[M, D]` as `read_global_descriptors` reads them, atomically.
 
     Args:
@@ -54,6 +57,7 @@ def write_global_descriptors(path: Path, names: Sequence[str], descriptors: np.n
         descriptors: `[M, D]` in the order of `names`.
         half: float16 instead of float32, as hloc by default.
     """
+    path = Path(path)
     require_different(path, names)
     values = as_written(str(path), np.asarray(descriptors), half)
     if values.ndim != 2 or len(values) != len(names):

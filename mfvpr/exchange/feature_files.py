@@ -14,7 +14,7 @@ from mfvpr.types import Features
 
 
 def write_features(
-    path: Path, names: Sequence[str], rows: Iterable[tuple[int, Features]], *, half: bool = False
+    path: Path | str, names: Sequence[str], rows: Iterable[tuple[int, Features]], *, half: bool = False
 ) -> None:
     """Write features, which `open_features` reads back, one image after the other; padding is left out.
 
@@ -30,6 +30,7 @@ def write_features(
     Raises:
         InputError: values that float16 cannot hold, names that no file can have, or two images with one name.
     """
+    path = Path(path)
     require_different(path, names)
     parts = ((names[row], _parts(names[row], features, half)) for row, features in rows)
     if path.suffix.lower() in (".h5", ".hdf5"):

@@ -111,7 +111,7 @@ class ImportedFeatures:
 
 
 def open_features(
-    path: Path,
+    path: Path | str,
     names: Sequence[str],
     *,
     image_size: Any = None,
@@ -133,6 +133,7 @@ def open_features(
         InputError: no such file, not of this kind, damaged; images that are missing or could be several; arrays that do
             not fit each other.
     """
+    path = Path(path)
     require_lengths(lengths)
     sizes = None if image_size is None else _given_sizes(image_size, len(names))
     container = open_container(path)

@@ -19,7 +19,7 @@ Candidates = list[tuple[int, float | None]]  # of one query: database rows and t
 
 
 def read_shortlist(
-    path: Path, query_names: Sequence[str], database_names: Sequence[str], *, num_candidates: int | None = None
+    path: Path | str, query_names: Sequence[str], database_names: Sequence[str], *, num_candidates: int | None = None
 ) -> Shortlist:
     """The candidates that another program chose.
 
@@ -40,6 +40,7 @@ def read_shortlist(
         InputError: no such file, damaged, unknown or ambiguous names, rows out of range, scores of some pairs only, not
             finite, or ascending.
     """
+    path = Path(path)
     require_file(path)
     if num_candidates is not None and num_candidates < 1:
         raise InputError(f"num_candidates={num_candidates}: expected at least 1")
@@ -54,7 +55,7 @@ def read_shortlist(
 
 
 def write_shortlist(
-    path: Path,
+    path: Path | str,
     shortlist: Shortlist,
     query_names: Sequence[str],
     database_names: Sequence[str],
@@ -73,6 +74,7 @@ def write_shortlist(
     Raises:
         InputError: names that are missing or no line can have; scores to write that are not finite, or ascending.
     """
+    path = Path(path)
     if layout not in ("hloc", "kapture"):
         raise InputError(f"layout={layout}: expected hloc or kapture")
     indices, scores, mask = (np.asarray(part) for part in (shortlist.indices, shortlist.scores, shortlist.mask))

@@ -102,7 +102,7 @@ PUBLISHED = {
 }  # fmt: skip
 
 
-def published_dataset(name: str, root: Path, *, seasons: tuple[str, str] | None = None) -> Dataset:
+def published_dataset(name: str, root: Path | str, *, seasons: tuple[str, str] | None = None) -> Dataset:
     """A published data set, from the folder that holds it.
 
     Args:
@@ -113,7 +113,7 @@ def published_dataset(name: str, root: Path, *, seasons: tuple[str, str] | None 
     Raises:
         InputError: no such folder, or another layout than the data set's.
     """
-    entry = PUBLISHED[name]
+    entry, root = PUBLISHED[name], Path(root)
     if not root.is_dir():
         found = "a file" if root.exists() else "nothing"
         raise InputError(f"{root}: expected the folder of {name}, got {found}; it is to be had at {entry.source}")

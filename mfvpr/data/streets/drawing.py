@@ -39,7 +39,7 @@ class Shot:
 
 
 def streets_folder(
-    cache: Path,
+    cache: Path | str,
     *,
     seed: int = 0,
     num_frames: int = 100,
@@ -49,7 +49,7 @@ def streets_folder(
     """The folder of the drawn street inside `cache`, drawn now if it is not there yet; see `draw_streets`."""
     name = f"streets-v{VERSION}-seed{seed}-{num_frames}x{image_size[0]}x{image_size[1]}"
     draw = partial(draw_streets, seed=seed, num_frames=num_frames, image_size=image_size, progress=progress)
-    return kept(cache / name, draw)
+    return kept(Path(cache) / name, draw)
 
 
 def kept(folder: Path, draw: Callable[[Path], None]) -> Path:
@@ -71,7 +71,7 @@ def kept(folder: Path, draw: Callable[[Path], None]) -> Path:
 
 
 def draw_streets(
-    folder: Path,
+    folder: Path | str,
     *,
     seed: int = 0,
     num_frames: int = 100,
@@ -97,6 +97,7 @@ def draw_streets(
     Raises:
         FileExistsError: the folder exists.
     """
+    folder = Path(folder)
     folder.mkdir(parents=True)
     for name in ("database", "queries"):
         (folder / name).mkdir()

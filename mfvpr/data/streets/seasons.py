@@ -14,7 +14,7 @@ TRUTH = "ground_truth.csv"  # in the folder of each
 
 
 def seasons_folder(
-    cache: Path,
+    cache: Path | str,
     *,
     seed: int = 0,
     num_frames: int = 100,
@@ -24,11 +24,11 @@ def seasons_folder(
     """The folder of the drawn seasons inside `cache`, drawn now if it is not there yet; see `draw_seasons`."""
     name = f"seasons-v{VERSION}-seed{seed}-{num_frames}x{image_size[0]}x{image_size[1]}"
     draw = partial(draw_seasons, seed=seed, num_frames=num_frames, image_size=image_size, progress=progress)
-    return kept(cache / name, draw)
+    return kept(Path(cache) / name, draw)
 
 
 def draw_seasons(
-    folder: Path,
+    folder: Path | str,
     *,
     seed: int = 0,
     num_frames: int = 100,
@@ -51,6 +51,7 @@ def draw_seasons(
     Raises:
         FileExistsError: the folder exists.
     """
+    folder = Path(folder)
     folder.mkdir(parents=True)
     scene = build_scene(seed, SPACING * (num_frames + 1) + SIGHT)
     database, _ = plan_drives(seed, num_frames, image_size)

@@ -1,0 +1,85 @@
+"""Every public function that takes a path takes it as text as well."""
+
+import inspect
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mfvpr import InputError, Shortlist, confidence, exchange, weight_files
+from mfvpr.confidence import Confidence, read_confidences, write_confidences
+from mfvpr.data import datasets, truth_files, videos
+from mfvpr.data.datasets import ImageFolder, folder_dataset, sequences_dataset
+from mfvpr.data.published import published_dataset
+from mfvpr.data.streets import draw_streets, streets_folder
+from mfvpr.imported import DescriptorFiles, FeatureFiles, File
+from mfvpr.weight_files import read_weight
+from tests.builders import fill
+from tests.exchange.foreign import feature
+
+
+def public_functions():
+    modules = (confidence, datasets, exchange, truth_files, videos, weight_files)
+    functions = [value for module in modules for name, value in vars(module).items() if not name.startswith("_")]
+    return {function for function in (*functions, draw_streets, published_dataset, streets_folder)
+            if inspect.isfunction(function) and function.__module__.startswith("mfvpr.")}  # fmt: skip
+
+
+def test_signatures_say_so():
+    checked = {function.__name__ for function in public_functions()}
+    assert {"open_features", "image_folder", "frames", "read_confidences", "truth_from_file"} <= checked
+    internal = {"require_file", "replacing", "write_text"}
+    for function in public_functions():
+        if function.__name__ not in internal:
+            for parameter in inspect.signature(function).parameters.values():
+                assert parameter.annotation not in (Path, Path | None), (function.__name__, parameter.name)
+
+
+def test_files_of_other_programs(tmp_path):
+    names, path = ["1.jpg", "2.jpg"], str(tmp_path / "all.npz")
+    exchange.write_features(path, names, [(row, feature(row, count=4)) for row in range(2)])
+    assert exchange.open_features(path, names).counts.tolist() == [4, 4]
+    folder = ImageFolder(str(tmp_path), tuple(names))  # type: ignore[arg-type]
+    files = FeatureFiles({str(tmp_path): File(path)})  # type: ignore[dict-item]
+    assert files.opened(folder, partial=False).counts.tolist() == [4, 4]
+    assert File(path) == File(Path(path))  # type: ignore[arg-type]
+    assert folder.paths == [tmp_path / name for name in names]
+    path = str(tmp_path / "g.npy")
+    exchange.write_global_descriptors(path, names, np.eye(2))
+    np.testing.assert_array_equal(exchange.read_global_descriptors(path, names), np.eye(2))
+    np.testing.assert_array_equal(DescriptorFiles({str(tmp_path): File(path)})._read(folder), np.eye(2))  # type: ignore
+    path = str(tmp_path / "pairs.txt")
+    exchange.write_shortlist(
+        path, Shortlist(np.zeros((2, 1), int), np.ones((2, 1)), np.ones((2, 1), bool)), names, names
+    )
+    assert exchange.read_shortlist(path, names, names).indices.tolist() == [[0], [0]]
+
+
+def test_data_sets(tmp_path):
+    database, queries = (str(fill(tmp_path / name, ["0.png", "1.png"])) for name in ("db", "q"))
+    index = tmp_path / "q/pairs.csv"
+    index.write_text("query,database\n0,0\n1,1\n")
+    labels = tmp_path / "labels.csv"
+    labels.write_text("name,label\n0.png,a\n1.png,b\n")
+    files = {"database_labels": str(labels), "query_labels": str(labels)}
+    for options in ({"ground_truth": "index", "index_file": str(index)}, {"ground_truth": "label"} | files):
+        dataset = folder_dataset(database, queries, **options)
+        assert dataset.truth.positives(0).counts.tolist() == [1, 1]
+    dataset = sequences_dataset(database, [queries], ground_truth="index", index_file="pairs.csv")
+    assert dataset.only.name == "q"
+    assert folder_dataset(database, queries, ground_truth="none").truth is None
+    with pytest.raises(InputError, match="ground_truth=None: expected one of order "):
+        folder_dataset(database, queries, ground_truth=None)  # type: ignore[arg-type]
+
+
+def test_confidences_and_weights(tmp_path):
+    path = tmp_path / "confidence.json"
+    model = Confidence(("margin",), 5, (0.0,), (1.0,), (1.0,), 0.0)
+    write_confidences(str(path), {"histogram": model}, {})
+    assert read_confidences(str(path)) == ({"histogram": model}, {})
+    os.mkfifo(tmp_path / "pipe.json")
+    for read in (read_confidences, read_weight):
+        for name, got in (("pipe.json", "a pipe or device"), ("no.json", "nothing"), ("", "a folder")):
+            with pytest.raises(InputError, match=f"got {got}"):
+                read(str(tmp_path / name))
