@@ -1,6 +1,8 @@
 """The map itself: what it is made with, what is added to it, and what it is asked."""
 
+import itertools
 import math
+import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +19,7 @@ from mfvpr.features import Aggregation, Extractor
 from mfvpr.features.vlad import Vlad, VladFitting
 from mfvpr.fingerprints import fingerprint, recipe_of
 from mfvpr.maps.answers import Alternative, Answer, Asked
-from mfvpr.maps.describing import Describing, Image, local_features
+from mfvpr.maps.describing import Described, Describing, Image, local_features
 from mfvpr.maps.matching import scored
 from mfvpr.maps.resident import Resident
 from mfvpr.maps.shifts import shift_of
@@ -27,10 +29,13 @@ from mfvpr.progress import Track, untracked
 from mfvpr.results import Ranked
 from mfvpr.scoring import HistogramOfShifts, Scorer
 from mfvpr.sources import FeatureSet, stacked
-from mfvpr.stores.maps import Entry, MapRows, check_place
+from mfvpr.stores.disk import told
+from mfvpr.stores.features import FeatureStore, open_store
+from mfvpr.stores.maps import MAP, Entry, MapRows, check_place, has_rows, hold_map, is_map_settled, settle_map
 from mfvpr.types import Features, Matches
 
 _VOCABULARY = "vocabulary.npz"
+_LEARNING = "learning"  # the folder of features that a vocabulary is being learned from
 _NO_VOCABULARY = "{}: this map has no vocabulary yet; learn it from some images first (`learn`)"
 
 
@@ -88,6 +93,8 @@ class Map:
         self._fitting = describer if isinstance(describer, VladFitting) else None
         self._vectors, self._entries, self._rows, self._made = Vectors(), {}, {}, None
         self._resident_options = {"candidates": candidates, "memory": memory}
+        self._settings = {"extractor": recipe_of(extractor), "describer": recipe_of(describer)}
+        self._is_settled = False  # whether they are known to be those of the folder
         if not isinstance(describer, VladFitting):
             self._use(describer)
         self.refresh()
@@ -134,8 +141,14 @@ class Map:
             InputError: it was made with something else, or is damaged.
         """
         before = len(self)
-        if self._made is None and (self.folder / _VOCABULARY).exists():
-            self._use(self._vocabulary())
+        self._is_settled = self._is_settled or is_map_settled(self.folder, self._settings)
+        if self._made is None:
+            expects_vocabulary = has_rows(self.folder)  # looked at first: another process may be making the map
+            if (self.folder / _VOCABULARY).exists():
+                self._use(self._vocabulary())
+            elif expects_vocabulary:
+                raise InputError(f"{self.folder / _VOCABULARY}: expected the vocabulary of the rows, got none. Put it "
+                                 "back.")  # fmt: skip
         for row, entry in self._made.rows.new() if self._made else ():
             self._vectors.put(row, entry.vector)
             self._entries[row] = entry._replace(vector=None)
@@ -146,22 +159,18 @@ class Map:
         """Learn the vocabulary from some images, unless the map has one.
 
         Raises:
-            InputError: images cannot be read, or have too few features.
+            InputError: images cannot be read, or have too few features, or another process adds.
         """
-        if self._made is not None or self._fitting is None:
-            return
-        features = FeatureSet.of([*local_features(images, self.extractor, track)], unit_length=False)
-        learned = self._fitting.fit(features)
-        self.folder.mkdir(parents=True, exist_ok=True)
-        arrays = {"centers": learned.centers, "power": np.array(learned.power)}
-        write_arrays(self.folder / _VOCABULARY, arrays, self._vocabulary_of())
-        self._use(self._vocabulary())
+        if self._made is None:
+            with hold_map(self.folder), self._learning(images, track):
+                pass
 
     def build(self, images: ImageFolder, places: Sequence[Any] | None = None, *, track: Track = untracked) -> int:
         """Add images that are not there yet, by their names; how many were added.
 
         Args:
-            images: of which the vocabulary is learned as well, where there is none.
+            images: of which the vocabulary is learned as well, where there is none; meanwhile the folder takes twice
+                the space.
             places: of each, JSON values; None = the names.
             track: progress.
 
@@ -173,10 +182,13 @@ class Map:
             raise InputError(f"expected a place of each of {len(images)} images, got {len(places)}")
         for name, place in zip(images.names, places, strict=True):
             check_place(name, place)
-        self.learn(images, track=track)
-        with self._adding() as made:
+        with hold_map(self.folder), self._learning(images, track) as features, self._adding() as made:
             missing = [row for row, name in enumerate(images.names) if name not in self._rows]
-            for batch in made.describing.folder(images, missing, track):
+            if features is None:
+                batches = made.describing.folder(images, missing, track)
+            else:
+                batches = _aggregated(made.describing.describer, features, missing, self.extractor.batch_size)
+            for batch in batches:
                 made.rows.add([
                     (features, Entry(images.names[row], places[row], vector))
                     for row, (features, vector) in batch.items()
@@ -213,7 +225,7 @@ class Map:
         """
         if len(entries) != len(features):
             raise InputError(f"expected features of each of {len(entries)} images, got {len(features)}")
-        with self._adding() as made:
+        with hold_map(self.folder), self._adding() as made:
             new: set[str] = set()
             for name, place, _ in entries:
                 check_place(name, place)
@@ -266,28 +278,70 @@ class Map:
         return matches, scores[: len(rows)]
 
     @contextmanager
+    def _learning(self, images: ImageFolder, track: Track) -> Iterator[FeatureStore | None]:
+        """Learn the vocabulary, within `hold_map`; the images' features while they are there, None = it was learned."""
+        self.refresh()
+        if self._made is not None or self._fitting is None:
+            yield None
+            return
+        folder = self.folder / _LEARNING
+        shutil.rmtree(folder, ignore_errors=True)  # left by a process that was killed
+        try:
+            with open_store(folder, self._settings, num_images=len(images)) as store:
+                features = enumerate(local_features(images, self.extractor, track))
+                while batch := dict(itertools.islice(features, self.extractor.batch_size)):
+                    store.write(batch)
+            vocabulary = self._fitting.fit(FeatureSet(store, {}))
+            settle_map(self.folder, self._settings)
+            with told(self.folder, MAP.content):
+                arrays = {"centers": vocabulary.centers, "power": np.array(vocabulary.power)}
+                write_arrays(self.folder / _VOCABULARY, arrays, self._vocabulary_of())
+            self._use(self._vocabulary())
+            yield store
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    @contextmanager
     def _adding(self) -> Iterator["_Made"]:
         """What rows are made with, while nobody else adds any; what others added is known."""
         made = self._made
         if made is None:
             raise InputError(_NO_VOCABULARY.format(self.folder))
+        settle_map(self.folder, self._settings)
         with made.rows.adding():
             self.refresh()
             yield made
 
     def _use(self, describer: Extractor | Aggregation) -> None:
         describing = Describing(self.extractor, describer)
-        rows = MapRows(self.folder, describing.recipe)
+        rows = MapRows(self.folder, self._settings if self._fitting is None else describing.recipe)
         typical = self.extractor.scales[0].typical_count
         self._made = _Made(describing, rows, Resident(rows, typical=typical, **self._resident_options))
 
     def _vocabulary(self) -> Vlad:
-        kept = read_arrays(self.folder / _VOCABULARY, self._vocabulary_of())
-        return Vlad(kept["centers"], float(kept["power"]))
+        path = self.folder / _VOCABULARY
+        try:
+            arrays = read_arrays(path, self._vocabulary_of())
+        except InputError:
+            raise InputError(
+                f"{path}: expected the vocabulary that {self._fitting} learned from features of "
+                f"{type(self.extractor).__name__} with these settings, got another or a damaged one. Use the extractor "
+                "and the settings that the map was made with, or put a copy of the file back."
+            ) from None
+        return Vlad(arrays["centers"], float(arrays["power"]))
 
     def _vocabulary_of(self) -> str:
         """What the vocabulary is of: another's is refused."""
-        return fingerprint({"extractor": recipe_of(self.extractor), "vocabulary": recipe_of(self._fitting)})
+        return fingerprint({"extractor": self._settings["extractor"], "vocabulary": self._settings["describer"]})
+
+
+def _aggregated(
+    aggregation: Any, features: FeatureStore, rows: Sequence[int], size: int
+) -> Iterator[dict[int, Described]]:
+    """Features of some rows and their descriptors, by row, so many rows at a time."""
+    for start in range(0, len(rows), size):
+        images = dict(features.read(rows[start : start + size]))
+        yield dict(zip(images, zip(images.values(), aggregation([*images.values()]), strict=True), strict=True))
 
 
 class _Made(NamedTuple):

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from mfvpr.stores.manifest import FEATURES
+from mfvpr.stores.manifest import FEATURES, Kind
 from mfvpr.stores.rows import RowStore, open_rows, require_space, row_bytes
 from mfvpr.types import Features
 
@@ -27,19 +27,22 @@ FeatureStore = RowStore[Features]
 _NUM_ARRAYS = 5
 
 
-def open_store(folder: Path, recipe: Mapping[str, Any], *, num_images: int, **options: Any) -> FeatureStore:
+def open_store(
+    folder: Path, recipe: Mapping[str, Any], *, num_images: int, kind: Kind = FEATURES, **options: Any
+) -> FeatureStore:
     """The store in `folder`; `with` it, rows are written, and while it lacks images no other process can do so.
 
     Args:
         folder: see `manifest.store_path`.
         recipe: what the features are made from (JSON values only): weights, settings, images. Kept in plain text.
         num_images: M.
-        **options: `waiting` and `shard` of `rows.open_rows`.
+        kind: with messages of its own, where the store is part of something else.
+        **options: `waiting`, `shard` and `tokens` of `rows.open_rows`.
 
     Raises:
         InputError: made from something else, or no store at all.
     """
-    return open_rows(folder, FEATURES, recipe, {"num_images": num_images}, pack=_pack, unpack=_unpack, **options)
+    return open_rows(folder, kind, recipe, {"num_images": num_images}, pack=_pack, unpack=_unpack, **options)
 
 
 def forecast_bytes(num_images: int, features_per_image: float, dimension: int) -> int:

@@ -18,7 +18,7 @@ from mfvpr.fingerprints import difference, fingerprint, shortened
 MANIFEST = "manifest.json"
 _OLD_MANIFEST = "zarr.json"  # of format 1
 _LEFTOVER = re.compile(
-    r"\.(manifest|images|bad|shortlist|\d+-\d+)-\w+\.(json|npz)"
+    r"\.(manifest|images|bad|shortlist|vocabulary|\d+-\d+)-\w+\.(json|npz)"
 )  # was being written when its process was killed
 
 
@@ -31,7 +31,8 @@ class Kind:
         version: of its arrays on disk.
         content: what a row is made of.
         rows: what a row belongs to.
-        remake: what the next run does with a row that is not done.
+        remake: what the next run does with a row that is not done; None = nothing can make it again, so that nothing is
+            removed, and nobody is advised to.
         compress: whether that is worth its time.
     """
 
@@ -39,13 +40,17 @@ class Kind:
     version: int
     content: str
     rows: str
-    remake: str
+    remake: str | None
     compress: bool
 
     @property
     def format(self) -> str:
         """What the manifest says of the arrays on disk."""
         return f"mfvpr {self.store} {self.version}"
+
+    def advice(self, irreplaceable: str) -> str:
+        """How to mend a store that cannot be used as it is; `irreplaceable` where no run can make it again."""
+        return "choose another path, or delete this folder" if self.remake else irreplaceable
 
 
 FEATURES = Kind("feature store", 3, "features", "images", "extracts", compress=False)
@@ -110,9 +115,8 @@ def is_settled(folder: Path, kind: Kind, manifest: Mapping[str, Any]) -> bool:
     if not path.exists():
         return False
     if differs := difference(_read(path, kind), manifest):
-        raise InputError(
-            f"{path}: these {kind.content} were made with {differs}; choose another path, or delete this folder"
-        )
+        advice = kind.advice(f"use the settings that this {kind.store} was made with, or choose another path")
+        raise InputError(f"{path}: these {kind.content} were made with {differs}; {advice}")
     return True
 
 
@@ -157,7 +161,5 @@ def _read(path: Path, kind: Kind) -> Any:
             return content
     except (ValueError, TypeError):
         pass
-    raise InputError(
-        f"{path}: expected the manifest of a {kind.store}, got something else; choose another path, or delete this "
-        "folder"
-    )
+    raise InputError(f"{path}: expected the manifest of a {kind.store}, got something else; "
+                     f"{kind.advice('put back a copy of this file')}")  # fmt: skip

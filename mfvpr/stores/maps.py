@@ -1,21 +1,27 @@
 """The rows of a map on disk: of every image its features, and behind them its descriptor, its name and its place.
 
     rows = MapRows(folder, recipe)
-    with rows.adding():
-        rows.add([(features, Entry(name, place, vector)), ...])
+    with hold_map(folder):
+        settle_map(folder, settings)
+        with rows.adding():
+            rows.add([(features, Entry(name, place, vector)), ...])
     for row, entry in rows.new():  # since the last time, whoever added them
         ...
 
-One process adds at a time, any number read. A row is there when its second part is, which is written last, so nobody
-sees half of one. Rows lie in segments of `SEGMENT`, each of two row stores (`mfvpr.stores.rows`), so that no folder
-holds too many files; a process that is killed leaves out a number at most.
+One process adds at a time, any number read. Rows lie in segments of `SEGMENT`, each of two row stores
+(`mfvpr.stores.rows`), so that no folder holds too many files, and of a file of tokens: a random number of each row,
+which the files of both stores know as well. So features and entries that were not written together, here, are noticed.
+A row is there when its token is, which is written last: nobody sees half of one, and a file that is removed later is
+missed. A process that is killed leaves out some numbers.
+
+A map of format 1 has no tokens, and no manifest beside its segments. It can be read, but not added to.
 """
 
 import json
-import time
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,15 +29,17 @@ import numpy as np
 
 from mfvpr.data.files import clipped
 from mfvpr.errors import InputError
+from mfvpr.stores.disk import locked, told
 from mfvpr.stores.features import FeatureStore, open_store
-from mfvpr.stores.manifest import Kind
+from mfvpr.stores.manifest import FEATURES, MANIFEST, Kind, is_settled, manifest_of, settle_manifest
 from mfvpr.stores.rows import RowStore, open_rows
 from mfvpr.types import Features
 
 SEGMENT = 4096  # rows
 DEEPEST = 50  # levels of a place: Python's JSON reads fewer levels, the more functions are called already
-MAP = Kind("map", 1, "places", "images", "adds", compress=False)
-_TICK = 3.0  # seconds, at most, of the clocks by which file systems tell when a folder has changed
+MAP = Kind("map", 2, "places", "images", None, compress=False)
+_MAP_1, _FEATURES = replace(MAP, version=1), replace(FEATURES, remake=None)
+_TOKENS, _TOKEN = "tokens", np.dtype("<u8")
 
 
 class Entry(NamedTuple):
@@ -70,36 +78,129 @@ def _levels(place: Any) -> int:
     return 0 if parts is None else 1 + max(map(_levels, parts), default=0)
 
 
+@contextmanager
+def hold_map(folder: Path) -> Iterator[None]:
+    """Hold a map, which need not be there yet, so that nobody else learns its vocabulary or adds to it.
+
+    Raises:
+        InputError: another process does, or the folder cannot be written.
+    """
+    with told(folder, MAP.content):
+        folder.mkdir(parents=True, exist_ok=True)
+    with locked(folder, MAP.content):
+        yield
+
+
+def settle_map(folder: Path, settings: Mapping[str, Any]) -> None:
+    """Write down what a map is made with, where that is not there; within `hold_map`.
+
+    Raises:
+        InputError: it is made with something else, or of format 1, or the folder cannot be written.
+    """
+    if _is_old(folder):
+        raise InputError(f"{folder}: expected {MAP.format!r}, got {_MAP_1.format!r}, which can only be read. Build the "
+                         "map anew in another folder.")  # fmt: skip
+    with told(folder, MAP.content):
+        settle_manifest(folder, MAP, manifest_of(MAP, settings, {}))
+
+
+def is_map_settled(folder: Path, settings: Mapping[str, Any]) -> bool:
+    """Whether it is written down what a map is made with.
+
+    Raises:
+        InputError: it is made with something else.
+    """
+    with told(folder, MAP.content):
+        return is_settled(folder, MAP, manifest_of(MAP, settings, {}))
+
+
+def has_rows(folder: Path) -> bool:
+    """Whether rows were ever added to a map."""
+    return _segment_folder(folder, 0).is_dir()
+
+
+def _is_old(folder: Path) -> bool:
+    """Whether a map is of format 1."""
+    return has_rows(folder) and not ((folder / MANIFEST).exists() or (_segment_folder(folder, 0) / _TOKENS).exists())
+
+
+def _segment_folder(folder: Path, number: int) -> Path:
+    return folder / f"{number:04d}"
+
+
 @dataclass
 class _Segment:
-    """Both stores of some rows, as they were when they were opened.
+    """Both stores of some rows, and their tokens, as they were when they were opened.
 
     Attributes:
-        features: and
-        entries: the stores.
-        changed: when the folder of entries had changed by then, ns, by the file system's own clock; None = no folder.
-        seen: when that time was first seen, and
-        opened: when they were opened, seconds of a clock of this process.
+        features: local ones.
+        entries: all else.
+        tokens: `[SEGMENT]` of the rows that are there; 0 = there is none.
+        size: of the file of tokens, bytes; None = there was none.
         is_held: rows may be added.
     """
 
     features: FeatureStore
     entries: RowStore[Entry]
-    changed: int | None
-    seen: float
-    opened: float
+    tokens: np.ndarray
+    size: int | None
     is_held: bool = False
 
     @property
+    def folder(self) -> Path:
+        return self.entries.folder.parent
+
+    @property
+    def done(self) -> np.ndarray:
+        """`[SEGMENT]` bool, rows that are there."""
+        return (self.tokens > 0) & self.entries.done
+
+    @property
     def taken(self) -> np.ndarray:
-        """`[SEGMENT]` bool, rows that are there, or were begun."""
-        return self.features.done | self.entries.done
+        """`[SEGMENT]` bool, rows that are there, or were begun, or are gone."""
+        return (self.tokens > 0) | self.features.done | self.entries.done
 
     @property
     def is_current(self) -> bool:
-        """Whether nothing can have been added since; what changes within the same tick of a clock has the same time."""
-        same = self.changed is not None and self.changed == _changed(self.entries.folder)
-        return self.is_held or (same and self.opened - self.seen > _TICK)
+        """Whether nothing was added since: the file of tokens would have grown."""
+        path = self.folder / _TOKENS
+        return self.is_held or self.size == (path.stat().st_size if path.exists() else None)
+
+    def add(self, first: int, items: Sequence[tuple[Features, Entry]]) -> range:
+        """Rows of images that are now on disk, from the first on."""
+        rows = range(first, first + len(items))
+        new = np.random.default_rng().integers(1, 2**64 - 1, len(items), np.uint64)
+        self.tokens[first : rows.stop] = new
+        try:
+            self.features.write({row: features for row, (features, _) in zip(rows, items, strict=True)})
+            self.entries.write({row: entry for row, (_, entry) in zip(rows, items, strict=True)})
+            with told(self.folder, MAP.content), (self.folder / _TOKENS).open("r+b") as file:
+                file.seek(first * _TOKEN.itemsize)
+                file.write(new.astype(_TOKEN).tobytes())
+                file.flush()
+                os.fsync(file.fileno())
+        except BaseException:
+            self.tokens[first : rows.stop] = 0
+            raise
+        self.size = rows.stop * _TOKEN.itemsize
+        return rows
+
+    def check(self) -> None:
+        """Compare the files that are there with the tokens.
+
+        Raises:
+            InputError: one of the two files of a row is gone, or that of the tokens.
+        """
+        if self.entries.done.any() and not (self.folder / _TOKENS).exists():
+            raise InputError(f"{self.folder / _TOKENS}: expected a file, got none. Put it back.")
+        halves = np.flatnonzero((self.tokens > 0) & (self.features.done != self.entries.done))
+        if len(halves):
+            row = halves[0]
+            stores = self.features, self.entries
+            missing, other = stores if self.entries.done[row] else stores[::-1]
+            raise InputError(f"{missing.folder}: expected a file of row {row}, got none ({len(halves)} rows lack one). "
+                             f"Put it back, or delete {other.folder}/{row}-{other.counts[row]}.npz as well, which "
+                             "leaves the row out.")  # fmt: skip
 
 
 @dataclass(eq=False)
@@ -109,6 +210,8 @@ class MapRows:
     Attributes:
         folder: of the map.
         recipe: what its rows are made with (JSON values): another is refused.
+
+    Rows are added within `hold_map`.
     """
 
     folder: Path
@@ -125,12 +228,11 @@ class MapRows:
         """
         number = next((number for number, known in enumerate(self._known) if not known.all()), len(self._known))
         while self._open(number):
-            entries, known = self._segments[number].entries, self._known[number]
-            rows = np.flatnonzero(entries.done & ~known).tolist()
-            for row, entry in entries.read(rows):
+            segment, known = self._segments[number], self._known[number]
+            for row, entry in segment.entries.read(np.flatnonzero(segment.done & ~known).tolist()):
                 known[row] = True
                 yield number * SEGMENT + row, entry
-            if not self._segments[number].taken[-1]:
+            if not segment.taken[-1]:
                 break
             number += 1
 
@@ -150,21 +252,18 @@ class MapRows:
             segments.setdefault(row // SEGMENT, []).append(row % SEGMENT)
         for number, own in segments.items():
             if gone := [row for row in own if self._segments[number].features.counts[row] < 0]:
-                raise InputError(f"{self.folder}: the features of row {number * SEGMENT + gone[0]} were damaged, and "
-                                 "are gone; make the map anew")  # fmt: skip
+                raise InputError(f"{self.folder}: expected features of row {number * SEGMENT + gone[0]}, got none. "
+                                 "Open the map again, without rows that were deleted.")  # fmt: skip
             for row, features in self._segments[number].features.read(own):
                 yield number * SEGMENT + row, features
 
     @contextmanager
     def adding(self) -> Iterator[None]:
-        """Hold the map, so that nobody else adds to it.
+        """Hold the rows, so that nobody else adds any.
 
         Raises:
             InputError: another process does, the map is of something else, or its folder cannot be written.
         """
-        if self._held is not None:
-            yield
-            return
         with ExitStack() as held:
             self._held = held
             try:
@@ -184,12 +283,8 @@ class MapRows:
         rows: list[int] = []
         while len(rows) < len(items):
             number, free = self._hold_last()
-            some = items[len(rows) : len(rows) + SEGMENT - free]
-            own = range(free, free + len(some))
-            segment = self._segments[number]
-            segment.features.write({row: features for row, (features, _) in zip(own, some, strict=True)})
-            segment.entries.write({row: entry for row, (_, entry) in zip(own, some, strict=True)})
-            rows += [number * SEGMENT + row for row in own]
+            part = items[len(rows) : len(rows) + SEGMENT - free]
+            rows += [number * SEGMENT + row for row in self._segments[number].add(free, part)]
         return rows
 
     def _hold_last(self) -> tuple[int, int]:
@@ -201,7 +296,9 @@ class MapRows:
             segment = self._opened(number)
             if not segment.is_held and not segment.taken[-1]:
                 for store in (segment.features, segment.entries):
-                    self._held.enter_context(store)  # which looks again at what is there
+                    self._held.enter_context(store)
+                with told(segment.folder, MAP.content):
+                    (segment.folder / _TOKENS).touch()
                 segment.is_held = True
             if not segment.taken[-1]:
                 return number, int(np.max(np.flatnonzero(segment.taken), initial=-1)) + 1
@@ -211,7 +308,7 @@ class MapRows:
         """Have a segment as it is on disk; False where there is none."""
         if number < len(self._segments) and self._segments[number].is_current:
             return True
-        there = (self.folder / f"{number:04d}").is_dir()
+        there = _segment_folder(self.folder, number).is_dir()
         if there:
             self._opened(number)
         return there
@@ -221,14 +318,17 @@ class MapRows:
         before = self._segments[number] if number < len(self._segments) else None
         if before is not None and before.is_held:
             return before
-        folder, now = self.folder / f"{number:04d}", time.monotonic()
-        changed = _changed(folder / "entries")
-        seen = before.seen if before is not None and before.changed == changed else now
-        sizes = {"num_images": SEGMENT}
-        # Entries first: what is added in between then has features, as these are written before.
-        entries = open_rows(folder / "entries", MAP, self.recipe, sizes, pack=_pack, unpack=_unpack)
-        features = open_store(folder / "features", self.recipe, num_images=SEGMENT)
-        segment = _Segment(features, entries, changed, seen, now)
+        folder, is_old = _segment_folder(self.folder, number), _is_old(self.folder)
+        tokens, size = _read_tokens(folder / _TOKENS)  # before the names of files, which come first on disk
+        options: dict[str, Any] = {"tokens": None if is_old else tokens}
+        entries = open_rows(folder / "entries", _MAP_1 if is_old else MAP, self.recipe, {"num_images": SEGMENT},
+                            pack=_pack, unpack=_unpack, **options)  # fmt: skip
+        features = open_store(folder / "features", self.recipe, num_images=SEGMENT, kind=_FEATURES, **options)
+        segment = _Segment(features, entries, tokens, size)
+        if is_old:
+            tokens[entries.done] = 1
+        else:
+            segment.check()
         if before is None:
             self._segments.append(segment)
             self._known.append(np.zeros(SEGMENT, bool))
@@ -237,11 +337,14 @@ class MapRows:
         return segment
 
 
-def _changed(folder: Path) -> int | None:
-    try:
-        return folder.stat().st_mtime_ns
-    except FileNotFoundError:
-        return None
+def _read_tokens(path: Path) -> tuple[np.ndarray, int | None]:
+    """`[SEGMENT]`, 0 beyond the end of the file, and its size in bytes; None = there is no file."""
+    tokens = np.zeros(SEGMENT, _TOKEN)
+    with told(path.parent, MAP.content):
+        content = path.read_bytes() if path.exists() else None
+    stored = np.frombuffer(content or b"", _TOKEN, len(content or b"") // _TOKEN.itemsize)
+    tokens[: len(stored)] = stored
+    return tokens, None if content is None else len(content)
 
 
 def _pack(entry: Entry) -> dict[str, np.ndarray]:

@@ -51,6 +51,8 @@ class RowStore(Generic[Item]):
         kind: what it holds.
         sizes: lengths of axes by name, first M.
         shard: which writes, into a folder of its own; None = whoever alone makes the store.
+        tokens: `[M]` a number of each row that its file knows as well: a file of the same name that was written with
+            another number is a damaged one. None = names alone tell rows apart.
     """
 
     folder: Path
@@ -61,6 +63,7 @@ class RowStore(Generic[Item]):
     _waiting: Callable[[str], None] | None = field(repr=False)
     _pack: Callable[[Item], Parts] = field(repr=False)
     _unpack: Callable[[Parts], Item] = field(repr=False)
+    tokens: np.ndarray | None = field(default=None, repr=False)
     _places: Places = field(init=False, repr=False)
     _layout: dict[str, str] | None = field(default=None, repr=False)
     _is_writable: bool = field(default=False, repr=False)
@@ -151,24 +154,24 @@ class RowStore(Generic[Item]):
 
         Raises:
             InputError: some are damaged on disk; all that are asked for are looked at, none is given after the first,
-                and they are removed, so that the next run makes them anew. Or the disk cannot be read.
+                and they are removed, so that the next run makes them anew, where it can. Or the disk cannot be read.
             ValueError: a row that is not done.
         """
         rows = np.flatnonzero(self.done).tolist() if rows is None else list(rows)
         if missing := [row for row in rows if self.counts[row] < 0]:
             raise ValueError(f"{self.folder}: row {missing[0]} is not done")
-        paths = [self._places.path(row) for row in rows]
         damaged: dict[int, Path] = {}
-        for row, path, item in zip(rows, paths, ordered_map(self._read_item, paths, workers=THREADS), strict=True):
+        for row, item in zip(rows, ordered_map(self._read_item, rows, workers=THREADS), strict=True):
             if item is None:
-                damaged[row] = path
+                damaged[row] = self._places.path(row)
             elif not damaged:
                 yield row, item
         if damaged:
             raise InputError(self._remove(damaged))
 
-    def _about(self, path: Path) -> str:
-        return f"{self._manifest['fingerprint']} {path.name}"
+    def _about(self, row: int, path: Path) -> str:
+        token = "" if self.tokens is None else f" {self.tokens[row]:x}"
+        return f"{self._manifest['fingerprint']} {path.name}{token}"
 
     def _packed(self, row: int, item: Item) -> Parts:
         try:
@@ -183,18 +186,19 @@ class RowStore(Generic[Item]):
         row, parts = row_parts
         count = len(next(iter(parts.values())))
         path = self._places.add(row, count, self.own)
-        write_arrays(path, parts, self._about(path), compress=self.kind.compress)
+        write_arrays(path, parts, self._about(row, path), compress=self.kind.compress)
         self.counts[row] = count
 
-    def _read_item(self, path: Path) -> Item | None:
-        parts = self._read_parts(path)
+    def _read_item(self, row: int) -> Item | None:
+        parts = self._read_parts(row)
         return None if parts is None else self._unpack(parts)
 
-    def _read_parts(self, path: Path) -> Parts | None:
+    def _read_parts(self, row: int) -> Parts | None:
         """None where the file is damaged, or another's, or gone."""
+        path = self._places.path(row)
         with told(self.folder, self.kind.content):
             try:
-                return read_arrays(path, self._about(path))
+                return read_arrays(path, self._about(row, path))
             except (InputError, FileNotFoundError):
                 return None
 
@@ -204,26 +208,27 @@ class RowStore(Generic[Item]):
         expected = self._layout or self._stored_layout() or next(iter(layouts.values()))
         for row, layout in layouts.items():
             if differs := difference(layout, expected):
-                raise InputError(
-                    f"{self.folder}: row {row}: {differs} as in the other {self.kind.rows}; choose another path, or "
-                    "delete this folder"
-                )
+                advice = self.kind.advice("describe all of them alike")
+                raise InputError(f"{self.folder}: row {row}: {differs} as in the other {self.kind.rows}; {advice}")
         self._layout = expected
 
     def _stored_layout(self) -> dict[str, str] | None:
-        found = (self._read_parts(self._places.path(row)) for row in np.flatnonzero(self.done).tolist())
+        found = (self._read_parts(row) for row in np.flatnonzero(self.done).tolist())
         return next((_layout_of(parts) for parts in found if parts), None)
 
     def _remove(self, damaged: Mapping[int, Path]) -> str:
-        """What is told of damaged rows, which are no longer done."""
-        self.counts[list(damaged)] = -1
+        """What is told of damaged rows, which are no longer done where they can be made anew."""
         row, path = next(iter(damaged.items()))
-        mend = f"run again, which {self.kind.remake} them anew"
-        for file in damaged.values():
-            with suppress(OSError):
-                file.unlink(missing_ok=True)
-        if any(file.exists() for file in damaged.values()):
-            mend = f"they cannot be removed; make the folder writable and {mend}"
+        if self.kind.remake is None:
+            mend = "put back the files that were written here, or delete these to leave the rows out"
+        else:
+            self.counts[list(damaged)] = -1
+            mend = f"run again, which {self.kind.remake} them anew"
+            for file in damaged.values():
+                with suppress(OSError):
+                    file.unlink(missing_ok=True)
+            if any(file.exists() for file in damaged.values()):
+                mend = f"they cannot be removed; make the folder writable and {mend}"
         return (
             f"{self.folder}: {self.kind.content} of {len(damaged)} {self.kind.rows} are damaged on disk, the first in "
             f"row {row} ({path.name}); {mend}"
@@ -240,6 +245,7 @@ def open_rows(
     unpack: Callable[[Parts], Item],
     waiting: Callable[[str], None] | None = None,
     shard: Shard | None = None,
+    tokens: np.ndarray | None = None,
 ) -> RowStore[Item]:
     """The store in `folder`, which need not be there before the first row is written, nor be writable when all are.
 
@@ -252,12 +258,13 @@ def open_rows(
         unpack: the item again.
         waiting: whoever writes waits for a process that does, and is told, in one line, for which; None = refuses.
         shard: which writes, beside others.
+        tokens: see `RowStore`.
 
     Raises:
         InputError: made from something else, or no store at all.
     """
     folder = folder.absolute()  # the working directory may change
-    store = RowStore(folder, kind, sizes, shard, manifest_of(kind, recipe, sizes), waiting, pack, unpack)
+    store = RowStore(folder, kind, sizes, shard, manifest_of(kind, recipe, sizes), waiting, pack, unpack, tokens)
     with told(folder, kind.content):
         check_owned(folder, kind)
     store.look()

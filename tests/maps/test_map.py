@@ -184,32 +184,49 @@ def test_segments_follow_each_other(dataset, tmp_path, monkeypatch):
     known.build(dataset.database)
     other.refresh()
     assert other.names == known.names == list(dataset.database.names)
-    assert sorted(path.name for path in (tmp_path / "map").iterdir()) == ["0000", "0001", "0002", "0003",
-                                                                          "vocabulary.npz"]  # fmt: skip
+    files = sorted(path.name for path in (tmp_path / "map").iterdir())
+    assert files == ["0000", "0001", "0002", "0003", "lock", "manifest.json", "vocabulary.npz"]
     for row, path in enumerate(dataset.database.paths):
         assert other.localize(path).alternatives[0].row == row
 
 
-@pytest.mark.parametrize(("extractor", "vocabulary"), [
-    (replace(SIFT, image_size=(120, 120)), VLAD), (replace(SIFT, max_keypoints=50), VLAD),
-    (SIFT, VladFitting(num_words=4)),
+@pytest.mark.parametrize(("extractor", "describer", "difference"), [
+    (replace(SIFT, image_size=(120, 120)), VLAD, "recipe.extractor.image_size[0]=160, expected 120"),
+    (replace(SIFT, max_keypoints=50), VLAD, "recipe.extractor.max_keypoints=60, expected 50"),
+    (SIFT, VladFitting(num_words=4), "recipe.describer.num_words=8, expected 4"),
+    (SIFT, "constant", "recipe.describer.class="),
 ])  # fmt: skip
-def test_other_features_are_refused(folder, extractor, vocabulary):
-    with pytest.raises(InputError, match=r"vocabulary.npz: expected arrays as they were written here"):
-        Map(folder, extractor, vocabulary)
+def test_a_map_of_other_settings_is_refused(folder, extractor, describer, difference):
+    with pytest.raises(InputError) as error:
+        Map(folder, extractor, Constant() if describer == "constant" else describer)
+    assert difference in str(error.value)
+    assert "delete" not in str(error.value)
 
 
-def test_another_describer_is_refused(folder):
-    with pytest.raises(InputError, match=r"were made with recipe\.describer"):
-        Map(folder, SIFT, Constant())
-
-
-def test_damaged_rows_are_told(dataset, folder, tmp_path):
+def test_a_vocabulary_that_is_damaged_or_gone_is_to_be_put_back(dataset, folder, tmp_path):
     shutil.copytree(folder, tmp_path / "map")
-    [path] = (tmp_path / "map/0000/entries").glob("2-*.npz")
-    path.write_bytes(path.read_bytes()[:-50])
-    with pytest.raises(InputError, match="damaged on disk"):
-        asked(tmp_path / "map")
+    path = tmp_path / "map/vocabulary.npz"
+    content = path.read_bytes()
+    for damage in (lambda: path.write_bytes(content[:-50]), path.unlink):
+        damage()
+        with pytest.raises(InputError, match=r"vocabulary\.npz: expected the vocabulary .* [pP]ut .* back") as error:
+            asked(tmp_path / "map")
+        assert "delete" not in str(error.value)
+    path.write_bytes(content)
+    assert asked(tmp_path / "map").names == list(dataset.database.names)
+
+
+@pytest.mark.parametrize("part", ["entries", "features"])
+def test_damaged_rows_are_told_and_stay(dataset, folder, tmp_path, part):
+    shutil.copytree(folder, tmp_path / "map")
+    [path] = (tmp_path / f"map/0000/{part}").glob("8-*.npz")
+    content = path.read_bytes()
+    path.write_bytes(content[:-50])
+    for _ in range(2):
+        with pytest.raises(InputError, match="damaged on disk, the first in row 8"):
+            asked(tmp_path / "map", candidates=2).localize(dataset.database.paths[8])
+    path.write_bytes(content)
+    assert asked(tmp_path / "map").localize(dataset.database.paths[8]).place == 8
 
 
 class Unsteady:
@@ -243,24 +260,19 @@ def test_rows_that_cannot_be_read_leave_no_others_in_their_slots():
         assert np.asarray(arrays.scores)[slots, 0].tolist() == asked_for
 
 
-def test_features_that_are_gone_are_told(dataset, folder, tmp_path):
+def test_a_row_that_is_added_while_its_segment_is_opened_comes_whole_or_later(dataset, folder, tmp_path, monkeypatch):
     shutil.copytree(folder, tmp_path / "map")
-    known, images = asked(tmp_path / "map", candidates=2), dataset.database.paths
-    [path] = (tmp_path / "map/0000/features").glob("8-*.npz")
-    path.write_bytes(path.read_bytes()[:-50])
-    for words in ("damaged on disk", "of row 8 were damaged, and are gone; make the map anew"):
-        with pytest.raises(InputError, match=words):
-            known.localize(images[8])
+    adding, number, open_rows = asked(tmp_path / "map"), len(dataset.database), map_store.open_rows
 
+    def add_and_open(*arguments, **options):
+        monkeypatch.undo()
+        adding.add(dataset.queries.paths[0], "new", name="new")
+        return open_rows(*arguments, **options)
 
-def test_a_row_that_is_added_while_its_segment_is_opened_has_features(dataset, folder, tmp_path, monkeypatch):
-    """The entries are listed before the features, which are written before the entries."""
-    opened = []
-    for name in ("open_store", "open_rows"):
-        made = getattr(map_store, name)
-        monkeypatch.setattr(map_store, name, lambda *a, name=name, made=made, **o: opened.append(name) or made(*a, **o))
-    asked(folder)
-    assert opened[:2] == ["open_rows", "open_store"]
+    monkeypatch.setattr(map_store, "open_rows", add_and_open)
+    other = asked(tmp_path / "map")
+    assert len(other) == number
+    assert other.localize(dataset.queries.paths[0]).place == "new"
 
 
 @pytest.mark.parametrize("place", [None, float("nan"), {1, 2}])
@@ -374,15 +386,15 @@ def test_killed_while_adding_it_has_whole_rows(small_street, tmp_path):
         "root = Path(sys.argv[1]); data = folder_dataset(root / 'database', root / 'queries', ground_truth='order')\n"
         "known = Map(sys.argv[2], SIFT, VLAD); known.learn(data.database); print('ready', flush=True)\n"
         "for turn in range(int(sys.argv[3]), 10**6):\n"
-        "    known.add(data.database.paths[turn % 10], turn, name=str(turn))\n"
+        "    known.add(data.database.paths[turn % 10], turn, name=str(turn)); print('added', flush=True)\n"
     )
     seen, known, start = 0, None, 0
     for turn in range(5):
         command = [sys.executable, "-c", program, str(small_street), str(tmp_path / "map"), str(start)]
         environment = os.environ | {"PYTHONPATH": str(ROOT)}
         running = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, start_new_session=True)
-        running.stdout.readline()
-        time.sleep(0.2 + 0.1 * turn)
+        assert [running.stdout.readline() for _ in range(2)] == [b"ready\n", b"added\n"]
+        time.sleep(0.1 * turn)
         os.killpg(running.pid, signal.SIGKILL)
         running.communicate()
         known = asked(tmp_path / "map") if known is None else known

@@ -1,0 +1,134 @@
+"""One map used by several threads or builders, and files of several maps: nobody gets what is another's."""
+
+import shutil
+from dataclasses import dataclass, field, replace
+
+import pytest
+
+import mfvpr
+from mfvpr.data.datasets import image_folder
+from mfvpr.errors import InputError
+from mfvpr.features.vlad import VladFitting
+from mfvpr.fingerprints import recipe_of
+from mfvpr.maps import Map
+from mfvpr.maps.describing import Describing
+from mfvpr.stores import maps as map_store
+from mfvpr.stores.features import open_store
+from mfvpr.stores.rows import open_rows
+from tests.maps.test_map import Constant
+from tests.stores.made_up import file_of
+
+
+@pytest.fixture(scope="module")
+def images(small_street):
+    return image_folder(small_street / "database")
+
+
+@pytest.fixture
+def folder(images, tmp_path):
+    """A map of the first six images."""
+    opened(tmp_path / "map").build(first(images, 6))
+    return tmp_path / "map"
+
+
+def first(images, number):
+    return replace(images, names=images.names[:number])
+
+
+def opened(folder, extractor=None, describer=None):
+    extractor = extractor or Constant()
+    return Map(folder, extractor, describer or extractor, scorer=mfvpr.MatchCount(), candidates=3)
+
+
+def test_builders_share_one_vocabulary(images, tmp_path):
+    learning, other = (opened(tmp_path / "map", describer=VladFitting(num_words=2)) for _ in range(2))
+
+    def refused_meanwhile(items, total):
+        with pytest.raises(InputError, match=f"{tmp_path}/map: in use by process"):
+            other.build(images)
+        return items
+
+    learning.build(first(images, 6), track=refused_meanwhile)
+    vocabulary = (tmp_path / "map/vocabulary.npz").read_bytes()
+    other.learn(images)
+    assert other.build(images) == 4
+    assert (tmp_path / "map/vocabulary.npz").read_bytes() == vocabulary
+    again = opened(tmp_path / "map", describer=VladFitting(num_words=2))
+    assert again.names == list(images.names)
+
+
+@dataclass(frozen=True)
+class Counting(Constant):
+    """Counts the images that it gets."""
+
+    calls: list = field(default_factory=list, compare=False, metadata={"recipe": False})
+
+    def __call__(self, images):
+        self.calls.extend(range(len(images)))
+        return super().__call__(images)
+
+
+def test_the_vocabulary_is_learned_from_the_features_that_are_added(images, tmp_path):
+    extractor, maps = Counting(), []
+    for name in ("at once", "one after the other"):
+        maps.append(opened(tmp_path / name, extractor, VladFitting(num_words=2)))
+        if name == "one after the other":
+            maps[-1].learn(images)
+        extractor.calls.clear()
+        assert maps[-1].build(images) == len(images)
+        assert len(extractor.calls) == len(images)
+        assert not (tmp_path / name / "learning").exists()
+    answers = [[known.localize(path) for path in images.paths] for known in maps]
+    assert answers[0] == answers[1]
+    assert maps[0].names == maps[1].names
+
+
+@pytest.mark.parametrize("parts", [["entries"], ["features"], ["entries", "features"]])
+def test_rows_of_a_copy_that_grew_are_refused(images, folder, tmp_path, parts):
+    shutil.copytree(folder, tmp_path / "copy")
+    for known, row in ((folder, 6), (tmp_path / "copy", 7)):
+        opened(known).add(images.paths[row], row, name=str(row))
+    for part in parts:
+        shutil.copy(file_of(tmp_path / "copy/0000" / part, 6), folder / "0000" / part)
+    with pytest.raises(InputError, match="damaged on disk, the first in row 6"):
+        opened(folder).localize(images.paths[6])
+    assert opened(tmp_path / "copy").localize(images.paths[7]).place == 7
+
+
+@pytest.mark.parametrize(("part", "other"), [("entries", "features"), ("features", "entries")])
+def test_a_file_that_was_removed_is_missed(images, folder, part, other):
+    """Unless both of its row were, which leaves the row out."""
+    file_of(folder / "0000" / part, 2).unlink()
+    with pytest.raises(InputError, match=f"0000/{part}: expected .* row 2, got none .*0000/{other}/2-") as error:
+        opened(folder)
+    assert "\n" not in str(error.value)
+    file_of(folder / "0000" / other, 2).unlink()
+    known = opened(folder)
+    assert known.there.tolist() == [True, True, False, True, True, True]
+    assert known.build(first(images, 6)) == 1
+    assert known.row(images.names[2]) == 6
+
+
+def test_tokens_that_were_removed_are_missed(folder):
+    (folder / "0000/tokens").unlink()
+    with pytest.raises(InputError, match="0000/tokens: expected a file, got none"):
+        opened(folder)
+
+
+def test_a_map_of_format_1_is_read_but_not_added_to(images, tmp_path):
+    extractor = Constant()
+    recipe, sizes = {"extractor": recipe_of(extractor), "describer": recipe_of(extractor)}, {"num_images": 4096}
+    kind, folder = replace(map_store.MAP, version=1), tmp_path / "map/0000"
+    options = {"pack": map_store._pack, "unpack": map_store._unpack}
+    with open_store(folder / "features", recipe, **sizes) as features, \
+            open_rows(folder / "entries", kind, recipe, sizes, **options) as entries:  # fmt: skip
+        for row, path in enumerate(images.paths[:4]):
+            local, vector = Describing(extractor, extractor).image(path)
+            features.write({row: local})
+            entries.write({row: map_store.Entry(images.names[row], row, vector)})
+    files = sorted(folder.rglob("*"))
+    known = opened(tmp_path / "map", extractor)
+    assert [known.localize(path).place for path in images.paths[:4]] == [0, 1, 2, 3]
+    with pytest.raises(InputError, match=r"expected 'mfvpr map 2', got 'mfvpr map 1', .* Build the map anew"):
+        known.build(images)
+    assert sorted(folder.rglob("*")) == files
