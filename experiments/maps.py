@@ -7,9 +7,9 @@ from typing import Any
 
 from experiments import build
 from experiments.settings import SettingsError, check
+from mfvpr.data.files import written_once
 from mfvpr.features import Aggregated
 from mfvpr.maps import Map
-from mfvpr.report import runs
 
 SETTINGS = "settings.json"
 _FORMAT = "mfvpr map 1"
@@ -24,16 +24,14 @@ def made(settings: Mapping[str, Any]) -> Map:
     """
     folder, own = build.expanded(settings["map"]), {name: settings[name] for name in _GROUPS}
     _check(own)
+    is_foreign = folder.is_dir() and any(not path.name.startswith(".") for path in folder.iterdir())
     if (folder / SETTINGS).exists():
-        before = read(folder)
-        if differing := [name for name in _GROUPS if before[name] != own[name]]:
-            raise SettingsError(f"map={folder}: was made with other {' and '.join(differing)}; name another folder, or "
-                                "set what it was made with (python -m experiments.map info)")  # fmt: skip
-    elif folder.is_dir() and any(folder.iterdir()):
+        _compare(folder, own)
+    elif is_foreign:
         raise SettingsError(f"map={folder}: expected a new or empty folder, or a map; name another")
     opened = _map(folder, own)  # before the settings, which then are of a map that can be
-    folder.mkdir(parents=True, exist_ok=True)
-    runs.write_json(folder / SETTINGS, {"format": _FORMAT} | own)
+    written_once(folder / SETTINGS, json.dumps({"format": _FORMAT} | own, indent=1, ensure_ascii=False) + "\n")
+    _compare(folder, own)  # another process may have begun a map here
     return opened
 
 
@@ -59,6 +57,14 @@ def read(folder: Path) -> dict[str, Any]:
     own = {name: found[name] for name in _GROUPS}
     check(own)
     return own
+
+
+def _compare(folder: Path, own: Mapping[str, Any]) -> None:
+    """Refuse settings that a map was not made with."""
+    before = read(folder)
+    if differing := [name for name in _GROUPS if before[name] != own[name]]:
+        raise SettingsError(f"map={folder}: was made with other {' and '.join(differing)}; name another folder, or "
+                            "set what it was made with (python -m experiments.map info)")  # fmt: skip
 
 
 def _check(settings: Mapping[str, Any]) -> None:

@@ -13,11 +13,12 @@ import pytest
 from PIL import Image
 
 from experiments import build, maps
+from experiments.settings import SettingsError
 from mfvpr.confidence import Confidence, write_confidences
 from mfvpr.data.images import read_image
 from mfvpr.data.videos import frames
 from mfvpr.errors import InputError
-from tests.programs import ROOT, typed
+from tests.programs import ROOT, composed, typed
 
 QUICK = ["features.max_keypoints=60", "features.image_size=[160,120]", "retrieval.num_words=8", "candidates=5"]
 
@@ -160,6 +161,21 @@ def test_other_settings_are_refused(folder, small_street, monkeypatch, capsys, m
     code, _, stderr = built(folder, small_street, monkeypatch, capsys, *more)
     assert code == 2
     assert words in stderr
+
+
+def test_settings_that_another_build_wrote_meanwhile_stay(tmp_path, monkeypatch):
+    settings = [composed(f"map={tmp_path}/map", *QUICK[:-1], f"candidates={number}", config="map") for number in (5, 6)]
+    open_map = maps._map
+
+    def build_other_first(*arguments):
+        monkeypatch.undo()
+        maps.made(settings[1])
+        return open_map(*arguments)
+
+    monkeypatch.setattr(maps, "_map", build_other_first)
+    with pytest.raises(SettingsError, match="was made with other candidates"):
+        maps.made(settings[0])
+    assert maps.read(tmp_path / "map")["candidates"] == 6
 
 
 def drawn(path):
