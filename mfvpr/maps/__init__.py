@@ -6,7 +6,7 @@
     route = Route(Drive(advance=1))        # of images in the order of a drive, of a map in the order of one as well:
     located = route(answer, known.there)   # the row that the images before, this one and the motion say together
 
-Others may ask a map while one process adds to it.
+Other processes may ask a map while one process adds to it, and several threads may share one `Map`.
 """
 
 from mfvpr.maps.answers import Alternative, Answer, Asked

@@ -3,10 +3,12 @@
 import itertools
 import math
 import shutil
-from collections.abc import Iterator, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import wraps
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -38,6 +40,19 @@ _VOCABULARY = "vocabulary.npz"
 _LEARNING = "learning"  # the folder of features that a vocabulary is being learned from
 _NO_VOCABULARY = "{}: this map has no vocabulary yet; learn it from some images first (`learn`)"
 
+Method = TypeVar("Method", bound=Callable[..., Any])
+
+
+def _exclusive(method: Method) -> Method:
+    """A method of `Map` that one thread at a time runs."""
+
+    @wraps(method)
+    def run(self: "Map", *arguments: Any, **options: Any) -> Any:
+        with self._lock:
+            return method(self, *arguments, **options)
+
+    return run  # pyright: ignore[reportReturnType]  # of the same arguments
+
 
 class Map:
     """Images with their places in a folder, which is asked with one image at a time.
@@ -46,7 +61,8 @@ class Map:
         known.build(images, places)
         known.localize("query.jpg").place
 
-    Any number of processes ask the same folder, while one adds to it: they see whole rows only.
+    Any number of processes ask the same folder, while one adds to it: they see whole rows only. Any number of threads
+    use the same `Map`, which serves one at a time; open another one to ask while `build` runs.
     """
 
     def __init__(
@@ -95,6 +111,7 @@ class Map:
         self._resident_options = {"candidates": candidates, "memory": memory}
         self._settings = {"extractor": recipe_of(extractor), "describer": recipe_of(describer)}
         self._is_settled = False  # whether they are known to be those of the folder
+        self._lock = threading.RLock()
         if not isinstance(describer, VladFitting):
             self._use(describer)
         self.refresh()
@@ -115,11 +132,13 @@ class Map:
         return self._made.describing
 
     @property
+    @_exclusive
     def names(self) -> list[str]:
         """Of the images, in the order of their rows."""
         return [self._entries[row].name for row in sorted(self._entries)]
 
     @property
+    @_exclusive
     def there(self) -> np.ndarray:
         """`[rows]` bool, which rows have an image: a process that was killed may have left some out."""
         found = np.zeros(self._vectors.total, bool)
@@ -134,6 +153,7 @@ class Map:
         """Of a row that has an image."""
         return self._entries[row].place
 
+    @_exclusive
     def refresh(self) -> int:
         """Look for what others have added; how many there are.
 
@@ -155,6 +175,7 @@ class Map:
             self._rows[entry.name] = row
         return len(self) - before
 
+    @_exclusive
     def learn(self, images: ImageFolder, *, track: Track = untracked) -> None:
         """Learn the vocabulary from some images, unless the map has one.
 
@@ -165,6 +186,7 @@ class Map:
             with hold_map(self.folder), self._learning(images, track):
                 pass
 
+    @_exclusive
     def build(self, images: ImageFolder, places: Sequence[Any] | None = None, *, track: Track = untracked) -> int:
         """Add images that are not there yet, by their names; how many were added.
 
@@ -196,6 +218,7 @@ class Map:
         self.refresh()
         return len(missing)
 
+    @_exclusive
     def add(self, image: Image, place: Any, *, name: str | None = None) -> None:
         """Add one image.
 
@@ -213,6 +236,7 @@ class Map:
         features, vector = self.describing.image(image)
         self.add_described([Entry(name, place, vector)], [features])
 
+    @_exclusive
     def add_described(self, entries: Sequence[Entry], features: Sequence[Features]) -> None:
         """Add images that are described already, as `describing` does it.
 
@@ -239,6 +263,7 @@ class Map:
         """Where an image was taken; see `ask`."""
         return self.ask(image, recent=recent).answer
 
+    @_exclusive
     def ask(self, image: Image, *, recent: int = 0, before: int | None = None) -> Asked:
         """Where an image was taken, and what that was found with.
 

@@ -1,6 +1,7 @@
 """One map used by several threads or builders, and files of several maps: nobody gets what is another's."""
 
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import pytest
@@ -38,6 +39,26 @@ def first(images, number):
 def opened(folder, extractor=None, describer=None):
     extractor = extractor or Constant()
     return Map(folder, extractor, describer or extractor, scorer=mfvpr.MatchCount(), candidates=3)
+
+
+def test_threads_get_the_answers_of_one_thread(images, tmp_path):
+    opened(tmp_path / "map").build(images)
+    alone = opened(tmp_path / "map")
+    expected = [alone.localize(path) for path in images.paths]
+    shared, questions = opened(tmp_path / "map"), [*images.paths] * 4
+    with ThreadPoolExecutor(4) as threads:
+        assert [*threads.map(shared.localize, questions)] == expected * 4
+    assert [shared.localize(path) for path in images.paths] == expected
+
+
+def test_threads_add_to_one_map(images, tmp_path):
+    shared = opened(tmp_path / "map")
+    with ThreadPoolExecutor(4) as threads:
+        [*threads.map(lambda row: shared.add(images.paths[row], row, name=str(row)), range(len(images)))]
+    assert sorted(shared.names) == sorted(map(str, range(len(images))))
+    again = opened(tmp_path / "map")
+    assert again.names == shared.names
+    assert [again.localize(path).place for path in images.paths] == [*range(len(images))]
 
 
 def test_builders_share_one_vocabulary(images, tmp_path):
