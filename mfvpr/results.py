@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
+from typing import Literal
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from mfvpr.types import Shortlist
 FILTER = "filter"  # the name of the filter's own ranking
 FRAMES = "frames"  # in the names of those that the queries before take part in
 COHORT = "cohort"  # in the names of those that other places of the map take part in
+Reason = Literal["no candidates", "too few features", "too few matches", "low confidence"]  # why there is no place
 
 
 @dataclass(frozen=True)

@@ -101,15 +101,20 @@ def test_below_the_threshold_the_answer_is_no_place(evaluate):
     assert 0 < refused.sum() < QUERIES
     assert score[~refused].mean() > score[refused].mean()
     assert [line["answer"] == "no place" for line in answers] == refused.tolist()
-    assert {line["right"] for line, none in zip(answers, refused, strict=True) if none} == {"0"}  # all have a place
+    assert [line["reason"] for line in answers] == np.where(refused, "low confidence", "").tolist()
+    assert {line["in_database"] for line in answers} == {"1"}
     right = np.array([line["histogram"] == "1" for line in rows(out / "gains.csv")])
+    assert [line["right"] for line in answers] == right.astype(int).astype(str).tolist()
     line = next(line for line in rows(out / "confidence.csv") if line["system"] == "histogram")
     counts = [int(line[name]) for name in ("right", "wrong", "refused", "of these right")]
     assert counts == [(right & ~refused).sum(), (~right & ~refused).sum(), refused.sum(), (right & refused).sum()]
+    assert line["ECE of p"] == f"{100 * reliability(probability, right).calibration_error:.1f}"
     predictions = rows(out / "predictions.csv")
     none = [line for line in predictions if line["database"] == "no place"]
     assert [line["query"] for line in none] == [line["query"] for line in answers if line["answer"] == "no place"]
-    assert [(line["rank"], line["score"], line["right"]) for line in none] == [("1", "", "")] * len(none)
+    assert [(line["rank"], line["score"], line["right"]) for line in none] == [
+        ("1", line["score"], line["right"]) for line in answers if line["answer"] == "no place"
+    ]
     every = rows(out / "predictions" / "histogram.csv")
     refusing = {line["query"] for line in none}
     assert [line for line in predictions if line not in none] == [
@@ -119,7 +124,7 @@ def test_below_the_threshold_the_answer_is_no_place(evaluate):
         "third", *given, "dataset.ground_truth=none", "dataset.index_file=null", "figures=0"
     )
     assert code == 0, stderr
-    assert [{**line, "right": ""} for line in answers] == rows(unknown / "answers.csv")
+    assert [{**line, "right": "", "in_database": ""} for line in answers] == rows(unknown / "answers.csv")
     assert not (unknown / "confidence.csv").exists()
 
 
@@ -136,7 +141,10 @@ def test_no_place_is_right_where_the_database_does_not_show_it(evaluate, root, t
     assert code == 0, stderr
     answers = rows(out / "answers.csv")
     assert {line["answer"] for line in answers} == {"no place"}
-    assert [line["right"] for line in answers] == ["1"] + ["0"] * (QUERIES - 1)
+    assert [line["in_database"] for line in answers] == ["0"] + ["1"] * (QUERIES - 1)
+    hits = [str(int(line["histogram"] == "1")) for line in rows(out / "gains.csv")]
+    assert [line["right"] for line in answers] == hits
+    assert hits[0] == "0"
     last = [line for line in rows(out / "precision_recall.csv") if line["system"] == "histogram"][-1]
     right = sum(line["histogram"] == "1" for line in rows(out / "gains.csv"))
     assert float(last["recall"]) == pytest.approx(right / (QUERIES - 1))

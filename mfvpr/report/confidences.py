@@ -23,7 +23,7 @@ from mfvpr.report.evaluations import Judged
 from mfvpr.report.rankings import NO_PLACE, number, write_csv
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table
-from mfvpr.results import FILTER
+from mfvpr.results import FILTER, Reason
 
 _COUNTS = ("right", "wrong", "refused", "of these right")
 SHARES = tuple(share / 20 for share in range(21))
@@ -200,7 +200,12 @@ def write_confidence(folder: Path, assured: Assured, made: Mapping[str, Any]) ->
 
 
 def _write_answers(folder: Path, assured: Assured) -> None:
-    """`query,answer,score,p,right`: `right` is of what was answered, also where that is `NO_PLACE`."""
+    """`query,answer,score,p,right,reason,in_database`: score, p and `right` are of the first candidate, also where the
+    answer is `NO_PLACE`, so that calibration can be computed from the file.
+
+    `reason` says why the answer is `NO_PLACE`. `in_database` is 1 where the database shows the query's place: elsewhere
+    `NO_PLACE` is correct. `right` and `in_database` are empty without ground truth.
+    """
     judged, name = assured.judged, assured.judged.headline
     database = judged.result.dataset.database.names
     refused, probabilities = assured.refused_of_headline, assured.by_sequence(assured.probabilities[name])
@@ -208,14 +213,15 @@ def _write_answers(folder: Path, assured: Assured) -> None:
         is_right, truth = judged.is_right(name, place), judged.right[place]
         lines = []
         for query, image in enumerate(judged.sequences[place].images.names):
-            none = refused[place][query] or ranked.rows[query, 0] < 0
-            right = "" if is_right is None or truth is None else int(
-                not truth.counts[query] if none else is_right[query, 0]
-            )  # fmt: skip
+            row, unsure = ranked.rows[query, 0], refused[place][query]
+            reason: Reason | None = "no candidates" if row < 0 else "low confidence" if unsure else None
             values = (ranked.scores[query, 0], probabilities[place][query])
             written = ["" if np.isnan(value) else number(value) for value in values]
-            lines.append([image, NO_PLACE if none else database[ranked.rows[query, 0]], *written, right])
-        write_csv(judged.folder(folder, place) / "answers.csv", ["query", "answer", "score", "p", "right"], lines)
+            right = "" if is_right is None else int(is_right[query, 0])
+            in_database = "" if truth is None else int(truth.counts[query] > 0)
+            lines.append([image, NO_PLACE if reason else database[row], *written, right, reason or "", in_database])
+        header = ["query", "answer", "score", "p", "right", "reason", "in_database"]
+        write_csv(judged.folder(folder, place) / "answers.csv", header, lines)
 
 
 def _points(assured: Assured) -> Iterator[Sequence[str]]:

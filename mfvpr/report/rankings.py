@@ -37,12 +37,13 @@ class Rankings:
 def write_predictions(path: Path, rankings: Rankings) -> None:
     """CSV with a line per query and candidate, best first: `query,rank,database,score,right`.
 
-    `right` is 1 or 0, or empty where it is unknown. Of a query that is refused there is one line, `NO_PLACE`.
+    `right` is 1 or 0, or empty where it is unknown. A query that is refused has one line, `NO_PLACE`, with score and
+    `right` of its first candidate.
     """
     refused = np.zeros(len(rankings.rows), bool) if rankings.refused is None else rankings.refused
     lines = (
-        [rankings.queries[query], 1, NO_PLACE, "", ""] if refused[query] else
-        [rankings.queries[query], rank + 1, rankings.database[row], number(rankings.scores[query, rank]),
+        [rankings.queries[query], rank + 1, NO_PLACE if refused[query] else rankings.database[row],
+         number(rankings.scores[query, rank]) if row >= 0 else "",
          "" if rankings.right is None else int(rankings.right[query, rank])]
         for (query, rank), row in np.ndenumerate(rankings.rows)
         if (rank == 0 if refused[query] else row >= 0)
