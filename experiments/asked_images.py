@@ -1,5 +1,6 @@
 """The images that a map is asked with: files, folders, folders that are watched, and videos."""
 
+import stat
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -47,11 +48,20 @@ def _watched(folder: Path) -> Iterator[Path]:
     before: dict[str, tuple[int, int]] = {}
     tell(f"watching {folder}; end with Ctrl-C")
     while True:
-        states = {path.name: (path.stat().st_size, path.stat().st_mtime_ns) for path in sorted(folder.iterdir())
-                  if path.suffix.lower() in SUFFIXES and path.is_file()}  # fmt: skip
+        paths = (path for path in sorted(folder.iterdir()) if path.suffix.lower() in SUFFIXES)
+        states = {path.name: state for path in paths if (state := _state(path)) is not None}
         for name, state in states.items():
             if before.get(name) == state != done.get(name):
                 done[name] = state
                 yield folder / name
         before = states
         time.sleep(POLL)
+
+
+def _state(path: Path) -> tuple[int, int] | None:
+    """Size and time of the last change; None if there is no regular file, as where it was removed meanwhile."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return (status.st_size, status.st_mtime_ns) if stat.S_ISREG(status.st_mode) else None

@@ -6,13 +6,14 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
-from experiments import build, maps
+from experiments import asked_images, build, maps
 from experiments.settings import SettingsError
 from mfvpr.confidence import Confidence, write_confidences
 from mfvpr.data.images import read_image
@@ -311,6 +312,16 @@ def test_a_drive_that_was_interrupted_goes_on(twice, folder, monkeypatch, capsys
     _, again, _ = called(monkeypatch, capsys, "localize", f"map={folder.parent}/other", *drive)
     assert without_seconds(lines(again)) == without_seconds(lines(whole))
     assert [line["added"] for line in lines(again)] == [False, False, *[True] * 14]
+
+
+def test_a_file_that_vanishes_while_its_folder_is_listed_does_not_end_the_watch(tmp_path, monkeypatch):
+    (tmp_path / "a.png").symlink_to("gone")
+    (tmp_path / "b.png").write_bytes(b"image")
+    (tmp_path / "c.png").mkdir()
+    monkeypatch.setattr(Path, "is_file", lambda _: True)  # as it was when it was asked
+    monkeypatch.setattr(asked_images, "POLL", 0)
+    name, path = next(asked_images.images({"images": str(tmp_path), "watch": True}))
+    assert (name, path) == (str(tmp_path / "b.png"), tmp_path / "b.png")
 
 
 def test_two_do_not_add_their_drives_at_the_same_time(twice, folder, monkeypatch, capsys):
