@@ -12,6 +12,7 @@ from experiments import build
 from experiments.console import tell
 from experiments.settings import SettingsError
 from mfvpr.data.datasets import image_folder
+from mfvpr.data.files import canonical_name
 from mfvpr.data.images import SUFFIXES
 from mfvpr.data.videos import SUFFIXES as VIDEOS
 from mfvpr.data.videos import frames
@@ -20,7 +21,7 @@ POLL = 0.2  # seconds between two looks at a folder
 
 
 def images(settings: Mapping[str, Any]) -> Iterator[tuple[str, Path | np.ndarray]]:
-    """(name, file or pixels), in their order."""
+    """(name, file or pixels), in their order; names do not depend on how a path is spelled."""
     paths = settings["images"] if isinstance(settings["images"], list) else [settings["images"]]
     paths = [build.expanded(path) for path in paths]
     for path in paths:
@@ -30,13 +31,14 @@ def images(settings: Mapping[str, Any]) -> Iterator[tuple[str, Path | np.ndarray
         raise SettingsError(f"watch=true: expected images=DIR, one folder, got {settings['images']}")
     for path in paths:
         if settings["watch"]:
-            yield from ((str(one), one) for one in _watched(path))
+            yield from ((canonical_name(image), image) for image in _watched(path))
         elif path.is_dir():
-            yield from ((str(one), one) for one in image_folder(path).paths)
+            yield from ((canonical_name(image), image) for image in image_folder(path).paths)
         elif path.suffix.lower() in VIDEOS:
-            yield from ((f"{path}:{number}", image) for number, image in frames(path, every=settings["every"]))
+            name = canonical_name(path)
+            yield from ((f"{name}:{number}", image) for number, image in frames(path, every=settings["every"]))
         else:
-            yield str(path), path
+            yield canonical_name(path), path
 
 
 def _watched(folder: Path) -> Iterator[Path]:

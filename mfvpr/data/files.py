@@ -89,15 +89,21 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(printable(text), encoding="utf-8")
 
 
+def canonical_name(path: Path | str) -> str:
+    """Absolute path that is the same for every spelling: links to folders are followed, a link to a file is not."""
+    path = Path(path)
+    return str(path.parent.resolve() / path.name)
+
+
 def below(root: Path, name: str) -> Path:
     """The file of a folder that a name from elsewhere stands for, which may not be there; its links are followed.
 
     Raises:
-        InputError: a name that leads out of the folder: absolute, with "..", or by a link.
+        InputError: a name that leads out of the folder: from another root, with "..", or by a link.
     """
     try:
-        path, is_plain = (root / name).resolve(), not Path(name).is_absolute() and ".." not in Path(name).parts
-        if is_plain and path.is_relative_to(root.resolve()):
+        path = (root / name).resolve()
+        if ".." not in Path(name).parts and path.is_relative_to(root.resolve()):
             return path
     except (OSError, RuntimeError, ValueError):  # links in a circle, a character that no name has
         pass

@@ -16,6 +16,7 @@ import numpy as np
 from mfvpr.confidence import Confidence
 from mfvpr.data.arrays import read_arrays, write_arrays
 from mfvpr.data.datasets import ImageFolder
+from mfvpr.data.files import canonical_name
 from mfvpr.errors import InputError
 from mfvpr.features import Aggregation, Extractor
 from mfvpr.features.vlad import Vlad, VladFitting
@@ -225,12 +226,12 @@ class Map:
         Args:
             image: a file, or `[H, W, 3]` uint8 RGB.
             place: where it was taken, any JSON value.
-            name: None = the file's; an array needs one.
+            name: None = the file's absolute path, see `canonical_name`; an array needs one.
 
         Raises:
             InputError: as `build`; a name that is there; or a map whose vocabulary is not learned.
         """
-        name = str(image) if name is None and not isinstance(image, np.ndarray) else name
+        name = canonical_name(image) if name is None and not isinstance(image, np.ndarray) else name
         if name is None:
             raise InputError("name: expected one for an image that is no file")
         features, vector = self.describing.image(image)

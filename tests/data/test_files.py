@@ -22,6 +22,7 @@ def root(tmp_path):
 def test_files_of_a_folder(root, monkeypatch):
     assert below(root, "a/0.png") == below(root, "in") == root / "a/0.png"
     assert below(root, "a/no such..png") == root / "a/no such..png"
+    assert below(root, str(root / "a/0.png")) == root / "a/0.png"
     (root.parent / "link").symlink_to(root)
     assert below(root.parent / "link", "in") == root / "a/0.png"  # where the folder itself is, its owner knows
     monkeypatch.chdir(root)

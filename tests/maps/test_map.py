@@ -159,6 +159,17 @@ def test_images_come_one_by_one_and_others_see_them(dataset, tmp_path):
         adding.add(dataset.database.read(0), 0)
 
 
+def test_a_file_has_one_name_under_every_spelling(dataset, tmp_path, monkeypatch):
+    known, (root, name) = asked(tmp_path / "map"), (dataset.database.root, dataset.database.names[0])
+    known.learn(dataset.database)
+    (tmp_path / "link").symlink_to(root)
+    monkeypatch.chdir(root.parent)
+    known.add(f"{root.name}/{name}", 0)
+    for spelling in (root / name, f"{root.name}/./{name}", tmp_path / "link" / name):
+        with pytest.raises(InputError, match="the map has an image of this name"):
+            known.add(spelling, 0)
+
+
 def test_the_newest_rows_can_be_left_out(dataset, folder):
     known, last = asked(folder), len(dataset.database) - 1
     answer = known.localize(dataset.database.paths[last], recent=3)

@@ -314,6 +314,28 @@ def test_a_drive_that_was_interrupted_goes_on(twice, folder, monkeypatch, capsys
     assert [line["added"] for line in lines(again)] == [False, False, *[True] * 14]
 
 
+def test_names_do_not_depend_on_the_spelling_of_a_path(small_street, video, tmp_path, monkeypatch):
+    (tmp_path / "link").symlink_to(small_street)
+    monkeypatch.chdir(small_street)
+    expected = [str(small_street / f"queries/{row:04d}.png") for row in range(10)]
+    for folder in ("queries", small_street / "queries", "./database/../queries/", tmp_path / "link/queries"):
+        found = asked_images.images({"images": str(folder), "watch": False})
+        assert [name for name, _ in found] == expected
+    monkeypatch.chdir(tmp_path)
+    name, _ = next(asked_images.images({"images": video.name, "watch": False, "every": 1}))
+    assert name == f"{video}:0"
+
+
+def test_a_drive_is_not_added_again_under_another_spelling_of_its_path(folder, small_street, monkeypatch, capsys):
+    monkeypatch.chdir(small_street)
+    for root, is_new in ((small_street, True), (".", False)):
+        images = f"images=[{root}/queries/0000.png,{root}/queries/0001.png]"
+        code, stdout, _ = called(monkeypatch, capsys, "localize", f"map={folder}", images, "add=true", "recent=2")
+        assert code == 0
+        assert [line["added"] for line in lines(stdout)] == [is_new] * 2
+        assert not any(line["place"] == line["image"] for line in lines(stdout))
+
+
 def test_a_file_that_vanishes_while_its_folder_is_listed_does_not_end_the_watch(tmp_path, monkeypatch):
     (tmp_path / "a.png").symlink_to("gone")
     (tmp_path / "b.png").write_bytes(b"image")
