@@ -194,8 +194,9 @@ def _color_values(content: np.ndarray) -> np.ndarray:
 def _check_file(path: Path) -> None:
     try:
         status = path.stat()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be opened ({error.strerror}); check the path and its permissions") from None
+    except (OSError, ValueError) as error:  # a character that no file name has is a ValueError
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{path}: cannot be opened ({reason}); check the path and its permissions") from None
     if not stat.S_ISREG(status.st_mode):
         kind = "a directory" if stat.S_ISDIR(status.st_mode) else "a device or pipe"
         raise InputError(f"{path}: expected an image file, got {kind}; rename or remove it")

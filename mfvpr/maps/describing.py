@@ -1,11 +1,13 @@
 """Images -> local features and a global descriptor, as a map keeps them of its own images and takes them of queries."""
 
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mfvpr.data.datasets import ImageFolder
 from mfvpr.data.images import read_image, resize
@@ -17,7 +19,7 @@ from mfvpr.progress import Track, untracked
 from mfvpr.stores.features import as_stored
 from mfvpr.types import Features
 
-Image = Path | str | np.ndarray
+Image = Path | str | ArrayLike
 Described = tuple[Features, np.ndarray]
 
 
@@ -39,14 +41,12 @@ class Describing:
         return {"extractor": recipe_of(self.extractor), "describer": recipe_of(self.describer)}
 
     def image(self, image: Image) -> Described:
-        """Of one image: a file, or `[H, W, 3]` uint8 RGB.
+        """Of one image: a file, or `[H, W, 3]` uint8 RGB, in whatever `np.asarray` converts.
 
         Raises:
-            InputError: it cannot be read, or something is not finite.
+            InputError: it cannot be read, is something else, or something is not finite.
         """
-        pixels, name = (image, "image") if isinstance(image, np.ndarray) else (read_image(image), str(image))
-        if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint8:
-            raise InputError(f"{name}: expected [H, W, 3] uint8 RGB, got {list(pixels.shape)} {pixels.dtype}")
+        pixels, name = (read_image(image), str(image)) if is_file(image) else (_pixels(image), "image")
         description = _one(self.extractor, pixels, name)
         features = as_stored(description.features)
         if self.describer is self.extractor:
@@ -73,6 +73,25 @@ class Describing:
             else:
                 vectors = dict(zip(features, describer([*features.values()]), strict=True))
             yield {row: (features[row], vectors[row]) for row in features}
+
+
+def is_file(image: Image) -> TypeGuard[Path | str]:
+    """Whether an image is given by its path."""
+    return isinstance(image, str | os.PathLike)
+
+
+def _pixels(image: Any) -> np.ndarray:
+    try:
+        pixels = np.asarray(image)
+    except Exception as error:  # other libraries raise what they like, as torch for tensors with gradients
+        reason = " ".join(str(error).split())
+        raise InputError(f"image: expected a file or [H, W, 3] uint8 RGB, got {type(image).__name__} ({reason}). "
+                         "Convert it to a NumPy array.") from None  # fmt: skip
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size or pixels.dtype != np.uint8:
+        what = f"{list(pixels.shape)} {pixels.dtype}" if pixels.shape else type(image).__name__
+        raise InputError(f"image: expected a file or [H, W, 3] uint8 RGB, got {what}. Check that the camera gave an "
+                         "image.")  # fmt: skip
+    return pixels
 
 
 def local_features(images: ImageFolder, extractor: Extractor, track: Track = untracked) -> Iterator[Features]:

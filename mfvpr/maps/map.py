@@ -22,7 +22,7 @@ from mfvpr.features import Aggregation, Extractor
 from mfvpr.features.vlad import Vlad, VladFitting
 from mfvpr.fingerprints import fingerprint, recipe_of
 from mfvpr.maps.answers import Alternative, Answer, Asked
-from mfvpr.maps.describing import Described, Describing, Image, local_features
+from mfvpr.maps.describing import Described, Describing, Image, is_file, local_features
 from mfvpr.maps.matching import scored
 from mfvpr.maps.resident import Resident
 from mfvpr.maps.shifts import shift_of
@@ -224,14 +224,14 @@ class Map:
         """Add one image.
 
         Args:
-            image: a file, or `[H, W, 3]` uint8 RGB.
+            image: as of `ask`.
             place: where it was taken, any JSON value.
             name: None = the file's absolute path, see `canonical_name`; an array needs one.
 
         Raises:
             InputError: as `build`; a name that is there; or a map whose vocabulary is not learned.
         """
-        name = canonical_name(image) if name is None and not isinstance(image, np.ndarray) else name
+        name = canonical_name(image) if name is None and is_file(image) else name
         if name is None:
             raise InputError("name: expected one for an image that is no file")
         features, vector = self.describing.image(image)
@@ -269,7 +269,7 @@ class Map:
         """Where an image was taken, and what that was found with.
 
         Args:
-            image: a file, or `[H, W, 3]` uint8 RGB.
+            image: a file, or `[H, W, 3]` uint8 RGB, in whatever `np.asarray` converts.
             recent: so many of the newest rows are left out: of a drive that is being added, the same place.
             before: rows from this on are left out as well, as if the map ended there; None = none.
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import jax
 import numpy as np
 import pytest
+from PIL import Image
 
 import mfvpr
 from mfvpr.archive import Archive
@@ -155,8 +156,9 @@ def test_images_come_one_by_one_and_others_see_them(dataset, tmp_path):
     assert other.names == adding.names == list(names)
     with pytest.raises(InputError, match="has an image of this name"):
         adding.add(dataset.database.paths[0], 0, name=names[0])
-    with pytest.raises(InputError, match="expected one for an image that is no file"):
-        adding.add(dataset.database.read(0), 0)
+    for image in (dataset.database.read(0), None):
+        with pytest.raises(InputError, match="expected one for an image that is no file"):
+            adding.add(image, 0)
 
 
 def test_a_file_has_one_name_under_every_spelling(dataset, tmp_path, monkeypatch):
@@ -344,10 +346,27 @@ def test_two_do_not_add_at_the_same_time(dataset, tmp_path):
     assert first.localize(dataset.database.paths[0]).place == 0
 
 
-@pytest.mark.parametrize("image", [np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3)), np.zeros((4, 4, 4), np.uint8)])
+class Tensor:
+    """Refuses to become an array, as tensors with gradients do."""
+
+    def __array__(self, *_, **__):
+        raise RuntimeError("call detach()\nfirst")
+
+
+@pytest.mark.parametrize("image", [
+    np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3)), np.zeros((4, 4, 4), np.uint8), np.zeros((0, 4, 3), np.uint8),
+    None, Tensor(), b"0.png", [[[0, 0, 0]], []],
+])  # fmt: skip
 def test_arrays_are_images(folder, image):
-    with pytest.raises(InputError, match=r"expected \[H, W, 3\] uint8 RGB"):
+    with pytest.raises(InputError, match=r"^image: expected a file or \[H, W, 3\] uint8 RGB, got [^\n]+$"):
         asked(folder).localize(image)
+
+
+def test_images_may_be_what_numpy_converts(dataset, folder):
+    known, pixels = asked(folder), dataset.database.read(3)
+    expected = known.describing.image(dataset.database.paths[3])[1]
+    for image in (pixels, jax.numpy.asarray(pixels), Image.fromarray(pixels)):
+        np.testing.assert_array_equal(known.describing.image(image)[1], expected)
 
 
 def test_a_plain_image_is_nowhere(folder):
