@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
 from mfvpr.maps.describing import Described
+from mfvpr.results import Reason
 from mfvpr.types import Matches
 
 
@@ -30,14 +31,16 @@ class Answer:
     """Where an image was taken.
 
     Attributes:
-        place: of the best candidate; None = no place: none was found, or it is too unsure.
-        alternatives: the candidates, best first, the answer's own among them, also where there is no place.
+        place: of the best candidate; None = no place, and `reason` says why.
+        alternatives: the candidates, best first, the answer's own among them, also where p is below the threshold;
+            none for every other reason.
         score: of the best candidate; 0 where there is none.
         p_right: how probably that is right; None where no confidence was given, or there is no candidate.
         shift: (x, y) px of the image that the detector saw, from what is at the query's center to where the candidate
-            shows it; None where nothing votes for one, or the score is no histogram of shifts.
+            shows it; None where there is no place, nothing votes for one, or the score is no histogram of shifts.
         shift_interval: 95 %: (low, high), each (x, y); None likewise.
         scale: how much larger the candidate shows the place; None likewise.
+        reason: why there is no place; None where there is one.
     """
 
     place: Any
@@ -47,11 +50,12 @@ class Answer:
     shift: tuple[float, float] | None
     shift_interval: tuple[tuple[float, float], tuple[float, float]] | None
     scale: float | None
+    reason: Reason | None = None
 
     @property
     def is_refused(self) -> bool:
-        """Whether there was a candidate, and it is no answer."""
-        return self.place is None and bool(self.alternatives)
+        """Whether there is no place although the map has images to compare with."""
+        return self.reason not in (None, "no candidates")
 
     def as_json(self, most: int = 5) -> dict[str, Any]:
         """JSON values, with so many alternatives."""
@@ -72,3 +76,8 @@ class Asked(NamedTuple):
     answer: Answer
     described: Described
     matches: Matches | None
+
+
+def refusal(reason: Reason, described: Described) -> Asked:
+    """An answer without place and candidates."""
+    return Asked(Answer(None, (), 0.0, None, None, None, None, reason), described, None)

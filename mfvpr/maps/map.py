@@ -6,6 +6,7 @@ import shutil
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import wraps
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -21,8 +22,9 @@ from mfvpr.errors import InputError
 from mfvpr.features import Aggregation, Extractor
 from mfvpr.features.vlad import Vlad, VladFitting
 from mfvpr.fingerprints import fingerprint, recipe_of
-from mfvpr.maps.answers import Alternative, Answer, Asked
+from mfvpr.maps.answers import Alternative, Answer, Asked, refusal
 from mfvpr.maps.describing import Described, Describing, Image, is_file, local_features
+from mfvpr.maps.evidence import LEAST_MATCHES, LEAST_STRENGTH, MapStrength, strength
 from mfvpr.maps.matching import scored
 from mfvpr.maps.resident import Resident
 from mfvpr.maps.shifts import shift_of
@@ -268,6 +270,9 @@ class Map:
     def ask(self, image: Image, *, recent: int = 0, before: int | None = None) -> Asked:
         """Where an image was taken, and what that was found with.
 
+        There is no place, and `reason` says why, for a query with too few features or matches (`mfvpr.maps.evidence`),
+        without candidates, or with p(right) below the threshold.
+
         Args:
             image: a file, or `[H, W, 3]` uint8 RGB, in whatever `np.asarray` converts.
             recent: so many of the newest rows are left out: of a drive that is being added, the same place.
@@ -280,20 +285,27 @@ class Map:
         if not len(self) or self._made is None:
             raise InputError(f"{self.folder}: expected a map with images, got an empty one; add some")
         features, vector = described = self._made.describing.image(image)
-        end = (self._vectors.total if before is None else before) - recent
+        total = self._vectors.total
+        end = max(0, (total if before is None else min(before, total)) - recent)
+        if strength(features) < LEAST_STRENGTH * self._made.strength(end):
+            return refusal("too few features", described)
         rows, similarity = self._vectors.nearest(vector, self.candidates, before=end)
         if not len(rows):
-            return Asked(Answer(None, (), 0.0, None, None, None, None), described, None)
+            return refusal("no candidates", described)
         matches, scores = self._scored(self._made.resident, features, rows)
         order = np.argsort(-np.where(np.isnan(scores), -np.inf, scores), kind="stable")
+        best = jax.tree.map(lambda leaf: leaf[order[0] : order[0] + 1], matches)
+        if best.mask.sum() < LEAST_MATCHES:
+            return refusal("too few matches", described)
         ranked, filtered = Ranked(rows[order][None], scores[order][None]), Ranked(rows[None], similarity[None])
         p = None if self.confidence is None else float(self.confidence(ranked, filtered)[0])
         p = None if p is None or math.isnan(p) else p  # of a score that is not finite nothing is known
-        refused = self.threshold is not None and not (p is not None and p >= self.threshold)
+        is_unsure = self.threshold is not None and not (p is not None and p >= self.threshold)
         found = tuple(Alternative(row, self._entries[row].name, self._entries[row].place, float(score))
                       for row, score in zip(rows[order].tolist(), scores[order], strict=True))  # fmt: skip
-        best = jax.tree.map(lambda leaf: leaf[order[0] : order[0] + 1], matches)
-        answer = Answer(None if refused else found[0].place, found, found[0].score, p, *shift_of(self.scorer, best))
+        answer = Answer(found[0].place, found, found[0].score, p, *shift_of(self.scorer, best))
+        if is_unsure:
+            answer = replace(answer, place=None, shift=None, shift_interval=None, scale=None, reason="low confidence")
         return Asked(answer, described, jax.tree.map(lambda leaf: leaf[0], best))
 
     def _scored(self, resident: Resident, features: Features, rows: np.ndarray) -> tuple[Matches, np.ndarray]:
@@ -342,7 +354,8 @@ class Map:
         describing = Describing(self.extractor, describer)
         rows = MapRows(self.folder, self._settings if self._fitting is None else describing.recipe)
         typical = self.extractor.scales[0].typical_count
-        self._made = _Made(describing, rows, Resident(rows, typical=typical, **self._resident_options))
+        resident = Resident(rows, typical=typical, **self._resident_options)
+        self._made = _Made(describing, rows, resident, MapStrength(rows))
 
     def _vocabulary(self) -> Vlad:
         path = self.folder / _VOCABULARY
@@ -371,8 +384,9 @@ def _aggregated(
 
 
 class _Made(NamedTuple):
-    """What needs a describer: how images are described, the rows on disk, and those on the device."""
+    """What needs a describer: how images are described, the rows on disk, those on the device, and their strength."""
 
     describing: Describing
     rows: MapRows
     resident: Resident
+    strength: MapStrength

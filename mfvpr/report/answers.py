@@ -35,7 +35,7 @@ def answer_figure(
     """
     answer, extractor = asked.answer, known.extractor
     p = "" if answer.p_right is None else f", p(right) {answer.p_right:.2f}"
-    place = "no place" if answer.place is None else clipped(str(answer.place), _MOST)
+    place = f"no place ({answer.reason})" if answer.place is None else clipped(str(answer.place), _MOST)
     beside = Answer(_gray(extractor), "no candidate", None, None)
     if asked.matches is not None:
         best = answer.alternatives[0].name

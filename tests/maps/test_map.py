@@ -26,6 +26,7 @@ from mfvpr.features.vlad import VladFitting
 from mfvpr.filters import Retrieval
 from mfvpr.maps import Map
 from mfvpr.maps import matching as map_matching
+from mfvpr.maps.evidence import LEAST_MATCHES, MapStrength
 from mfvpr.maps.resident import Resident
 from mfvpr.pipeline import explain
 from mfvpr.stores import maps as map_store
@@ -115,6 +116,7 @@ def test_a_map_can_be_asked_as_it_was(dataset, folder):
     assert matches.mask.any()
     answer, _, matches = known.ask(dataset.database.paths[7], recent=2, before=2)
     assert (answer.place, answer.alternatives, matches) == (None, (), None)
+    assert (answer.reason, answer.is_refused) == ("no candidates", False)
 
 
 def test_nothing_is_compiled_after_the_first_query(dataset, folder, compilations):
@@ -131,10 +133,12 @@ def test_unsure_answers_are_no_place(dataset, folder):
     sure = asked(folder, confidence=SURE).localize(image)
     assert 0.5 < sure.p_right <= 1
     assert sure.place is not None
+    assert sure.reason is None
     refused = asked(folder, confidence=replace(SURE, bias=-100.0), threshold=0.5).localize(image)
     assert refused.place is None
     assert refused.is_refused
     assert refused.p_right < 1e-9
+    assert (refused.reason, refused.shift, refused.shift_interval, refused.scale) == ("low confidence", *[None] * 3)
     assert refused.alternatives == sure.alternatives
     with pytest.raises(InputError, match="expected a confidence as well"):
         asked(folder, threshold=0.5)
@@ -369,10 +373,41 @@ def test_images_may_be_what_numpy_converts(dataset, folder):
         np.testing.assert_array_equal(known.describing.image(image)[1], expected)
 
 
-def test_a_plain_image_is_nowhere(folder):
-    answer = asked(folder).localize(np.full((120, 160, 3), 90, np.uint8))
-    assert (answer.place, answer.alternatives, answer.shift) == (None, (), None)
-    assert not answer.is_refused
+@pytest.mark.parametrize("kind", ["black", "gray", "dark noise", "lens cap"])
+def test_images_of_nothing_have_no_place_whatever_the_confidence(folder, kind):
+    rng, values = np.random.default_rng(0), {"black": 0, "gray": 90, "dark noise": 5}
+    image = np.full((480, 640, 3), values.get(kind, 0), np.uint8)
+    if kind == "dark noise":
+        image += rng.integers(0, 5, image.shape, np.uint8)
+    if kind == "lens cap":  # with a little light at its rim
+        image[:, :40] = np.arange(40, 0, -1)[:, None]
+    answer, _, matches = asked(folder, confidence=replace(SURE, bias=100.0)).ask(image)
+    assert (answer.place, answer.alternatives, answer.shift, answer.p_right) == (None, (), None, None)
+    assert (answer.reason, answer.is_refused, matches) == ("too few features", True, None)
+    assert "reason='too few features'" in repr(answer)
+    assert answer.as_json()["reason"] == "too few features"
+
+
+def test_strong_features_with_few_matches_have_no_place(folder):
+    image = np.zeros((120, 160, 3), np.uint8)
+    image[40:60, 70:95] = 255
+    answer, (features, _), matches = asked(folder, confidence=SURE).ask(image)
+    assert 0 < len(features.scores) < LEAST_MATCHES
+    assert (answer.reason, answer.place, answer.shift, answer.p_right, matches) == ("too few matches", *[None] * 4)
+
+
+def test_the_strength_of_a_map_is_of_a_few_of_its_rows():
+    """Rows of one keypoint each, whose score is the row."""
+    rows, read = Unsteady(), []
+    mean = MapStrength(rows)
+    rows.features = lambda wanted: (read.extend(wanted), Unsteady().features(wanted))[1]
+    assert mean(0) == 0
+    assert mean(50) == np.mean(range(50))
+    assert mean(1000) == np.mean(range(0, 1000, 16))
+    assert len(read) == len({*read}) < 110
+    count, rows.counts = len(read), lambda wanted: np.where(np.array(wanted) == 16, -1, 1)
+    assert mean(1000) == np.mean([0, *range(32, 1000, 16)])  # a row that was damaged, and is gone
+    assert len(read) == count
 
 
 @dataclass(frozen=True)
@@ -383,7 +418,7 @@ class Constant:
     interpolation: str = "pil_bilinear"
     batch_size: int = 4
     vector_size: int = 36
-    scales: tuple[Scale, ...] = (Scale(3, 4),)
+    scales: tuple[Scale, ...] = (Scale(9, 9),)
 
     def __call__(self, images):
         return [self.one(image) for image in images]
@@ -391,9 +426,9 @@ class Constant:
     def one(self, image):
         small = image[::4, ::4].astype(np.float32).reshape(-1)
         vector = (small - small.mean()) / (np.linalg.norm(small - small.mean()) + 1e-9)
-        descriptors = np.eye(3, dtype=np.float32)
-        points = np.array([[1.0, 2.0], [5.0, 6.0], [9.0, 3.0]], np.float32)
-        features = Features(points, descriptors, np.ones(3, np.float32), np.ones(3, bool), np.array([16.0, 12.0]))
+        points = np.array([[x, y] for x in (1.0, 5.0, 9.0) for y in (2.0, 3.0, 6.0)], np.float32)
+        features = Features(points, np.eye(9, dtype=np.float32), np.ones(9, np.float32), np.ones(9, bool),
+                            np.array([16.0, 12.0]))  # fmt: skip
         return Description(vector, (features,))
 
 

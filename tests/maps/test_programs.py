@@ -212,7 +212,7 @@ def test_so_many_answers_are_drawn_and_those_without_a_candidate(folder, tmp_pat
                                   "figures=2", f"out={tmp_path}/out")  # fmt: skip
     assert (code, stderr) == (0, "")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["0000_a b.png", "0001_c.png"]
-    assert [line["place"] for line in lines(stdout)] == [None] * 3
+    assert [(line["place"], line["reason"]) for line in lines(stdout)] == [(None, "too few features")] * 3
 
 
 def test_a_map_shows_nothing_outside_of_its_folder(small_street, tmp_path, monkeypatch, capsys):
