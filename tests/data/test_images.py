@@ -81,6 +81,11 @@ def test_broken_files_are_named_in_one_line(tmp_path, photo, kind, suffix):
     assert "\n" not in str(caught.value)
 
 
+def test_a_name_that_no_file_has_is_one_line():
+    with pytest.raises(InputError, match="cannot be opened"):
+        read_image("a\0.png")
+
+
 @pytest.mark.parametrize("size", [(336, 336), (20, 10), (60, 40)])
 def test_resize_is_the_librarys_own(photo, size):
     pillow = Image.fromarray(photo)
