@@ -14,7 +14,8 @@ import numpy as np
 from mfvpr.maps.resident import Rows
 from mfvpr.types import Features
 
-# A quarter of the darkest night query of the synthetic street (SIFT: 0.20); real sets had no part in the choice.
+# Round numbers, not fitted. They were chosen with two real sets in view, a park path and a corridor: results on those
+# sets are no independent test. The darkest night query of the synthetic street has 0.20 of the mean strength (SIFT).
 LEAST_STRENGTH = 0.05  # of the mean strength of the map's images
 LEAST_MATCHES = 8  # of a query with its best candidate
 _SAMPLE = 32  # images; a sample has up to twice as many
