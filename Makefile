@@ -1,15 +1,24 @@
-# Two commands: `make demo` runs the main job on the embedded data set, `make test` the tests.
+# `make demo` runs the main job on the embedded data set. Tests: `make test-fast` while editing, `make test` before a
+# commit, `make test-all` before a release.
 PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: demo test setup check conf benchmark clean
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
+
+.PHONY: demo test test-fast test-all setup check conf benchmark clean
 
 demo: setup
 	$(BIN)/python -m experiments.evaluate scorer=demo
 
+test-fast: .venv/.test
+	$(PYTEST) --quick-compile -m 'not slow and not thorough'
+
 test: .venv/.test
-	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
+	$(PYTEST) --quick-compile -m 'not slow'
+
+test-all: .venv/.test
+	$(PYTEST)
 
 setup: .venv/.setup
 

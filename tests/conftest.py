@@ -22,14 +22,19 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 # Compiled programs are shared by this process, those it starts, and the next run.
-COMPILED = Path(__file__).parent.parent / ".pytest_cache" / "xla"
-for name, value in (
-    ("jax_compilation_cache_dir", str(COMPILED)),
-    ("jax_persistent_cache_min_compile_time_secs", 0.0),
-    ("jax_persistent_cache_min_entry_size_bytes", -1),
-):
+COMPILED = Path(__file__).parent.parent / ".xla_cache"
+MOST_MEMORY_MAPS = 30_000  # Linux gives a process 65,530, a compiled program takes several, and XLA dies without
+
+
+def configure_jax(name: str, value: object) -> None:
+    """Set an option of JAX for this process and for those it starts."""
     jax.config.update(name, value)
     os.environ[name.upper()] = str(value)
+
+
+configure_jax("jax_compilation_cache_dir", str(COMPILED))
+configure_jax("jax_persistent_cache_min_compile_time_secs", 0.0)
+configure_jax("jax_persistent_cache_min_entry_size_bytes", -1)
 settings.register_profile("mfvpr", deadline=None, derandomize=True, max_examples=40)
 settings.load_profile("mfvpr")
 
@@ -53,15 +58,39 @@ _compilations = Compilations()
 
 @pytest.fixture
 def compilations() -> Compilations:
+    """The counter, with nothing compiled yet."""
+    jax.clear_caches()
     _compilations.reset()
     return _compilations
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--quick-compile",
+        action="store_true",
+        help="compile without most optimizations, but for tests marked optimized",
+    )
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark all cases but the first of a test that is marked `first_case` as slow."""
+    seen = set()
+    for item in items:
+        test = item.nodeid.split("[")[0]
+        if item.get_closest_marker("first_case") and test in seen:
+            item.add_marker("slow")
+        seen.add(test)
+
+
 @pytest.fixture(scope="module", autouse=True)
-def few_programs() -> Iterator[None]:
-    """A compiled program takes several of the 65,530 memory maps that Linux gives a process; XLA dies without."""
-    yield
-    jax.clear_caches()
+def compiler(request: pytest.FixtureRequest) -> None:
+    """Choose how the programs of a module are compiled, and drop compiled programs where they are too many."""
+    quick = request.config.getoption("--quick-compile") and not request.node.get_closest_marker("optimized")
+    changes = quick != jax.config.read("jax_disable_most_optimizations")
+    if changes or len(Path("/proc/self/maps").read_bytes().splitlines()) > MOST_MEMORY_MAPS:
+        jax.clear_caches()
+    configure_jax("jax_disable_most_optimizations", quick)
 
 
 @pytest.fixture(scope="session", autouse=True)

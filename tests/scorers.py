@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import pytest
 
 import mfvpr
 from mfvpr import (
@@ -97,3 +98,12 @@ FOREIGN = [plain, *FOREIGN_VALUES, HistogramOfShifts(weight=closest)]
 def title(scorer):
     """For the names of tests."""
     return getattr(scorer, "__name__", type(scorer).__name__)
+
+
+def one_of_each_class(scorers):
+    """Cases of a test: the first scorer of each class for `make test`, the others for `make test-all`."""
+    classes = [type(scorer) for scorer in scorers]
+    return [
+        pytest.param(scorer, marks=[pytest.mark.slow] if type(scorer) in classes[:place] else [])
+        for place, scorer in enumerate(scorers)
+    ]

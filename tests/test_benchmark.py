@@ -26,6 +26,8 @@ from mfvpr.weights.registry import entry_of
 from mfvpr.weights.tables import SELAVPR
 from tests import checkpoints
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parent.parent
 
 
@@ -66,7 +68,6 @@ def peers(results):
     return ours, others.values()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("step", ["D2-Net", "aliked-n16"])
 def test_keypoints_are_the_same(contest, step):
     ours, others = peers(contest[0][f"{step} features, batch 2"])
@@ -84,7 +85,6 @@ def test_keypoints_are_the_same(contest, step):
             np.testing.assert_allclose(one.scores[same], found[1], rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.slow
 def test_dense_maps_are_the_same(contest):
     ours, others = peers(contest[0]["D2-Net dense map, batch 2"])
     ours = np.concatenate([np.asarray(one) for one in ours]).transpose(0, 3, 1, 2)
@@ -92,14 +92,12 @@ def test_dense_maps_are_the_same(contest):
         np.testing.assert_allclose(ours, np.stack([np.asarray(one) for one in theirs]), atol=1e-4 * ours.max())
 
 
-@pytest.mark.slow
 def test_descriptors_are_the_same(contest):
     ours, others = peers(contest[0]["MixVPR descriptor, batch 2"])
     for theirs in others:
         np.testing.assert_allclose(ours, theirs, atol=1e-5)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("step", ["NetVLAD descriptor", "generalized mean of ResNet-50"])
 def test_global_descriptors_are_the_same(contest, step):
     ours, others = peers(contest[0][f"{step}, batch 2"])
@@ -107,7 +105,6 @@ def test_global_descriptors_are_the_same(contest, step):
         np.testing.assert_allclose(ours, theirs, atol=1e-5)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("step", [
     "Patch-NetVLAD features, sizes 5, 512 dimensions", "Patch-NetVLAD features, sizes 2, 5, 8, 4096 dimensions",
     "SelaVPR features",
@@ -123,7 +120,6 @@ def test_local_descriptors_are_the_same(contest, step):
                 np.testing.assert_allclose(features.descriptors.ravel(), expected.ravel(), atol=2e-5)
 
 
-@pytest.mark.slow
 def test_report_has_everyone(contest):
     by_step, written = contest
     names = {(entry["step"], entry["name"]) for entry in written["results"]}
@@ -134,7 +130,6 @@ def test_report_has_everyone(contest):
         assert wanted in remarks
 
 
-@pytest.mark.slow
 def test_a_small_database_is_ranked_in_its_own_process(tmp_path, monkeypatch, capsys):
     from experiments.benchmark import scale
     from experiments.benchmark.made_up import MadeUp
@@ -199,7 +194,6 @@ def test_maps_are_matched_and_scored_as_in_torch(monkeypatch):
         assert wanted in remarks
 
 
-@pytest.mark.slow
 def test_cells_are_matched_and_scored_as_by_the_public_program(monkeypatch):
     from experiments.benchmark import cells
 
@@ -382,7 +376,6 @@ def test_hubs_are_divided_as_an_evaluation_does_it(two_places, small_street, mon
         assert drawn[f"all by the mean, {listed}"][f"{listed}, ±0"] == pytest.approx(np.mean(some))
 
 
-@pytest.mark.slow
 def test_shifts_of_a_drawn_street_are_near_the_true_ones(tmp_path, monkeypatch, capsys):
     from experiments.benchmark import shifts
 
@@ -400,7 +393,6 @@ def test_shifts_of_a_drawn_street_are_near_the_true_ones(tmp_path, monkeypatch, 
     assert "5 px bins, sigma 10" in capsys.readouterr().out
 
 
-@pytest.mark.slow
 def test_lightglue_matches_what_candidates_have_in_common(monkeypatch):
     """Early stop or not; of the keypoints that are moved all alike, most."""
     from experiments.benchmark import lightglue

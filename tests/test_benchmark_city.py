@@ -11,6 +11,8 @@ from experiments.benchmark.projection import Rates, projected
 from mfvpr.stores.features import open_store
 from mfvpr.stores.manifest import store_path
 
+pytestmark = pytest.mark.slow
+
 RATES = Rates(
     describing=0.5, comparing=1e-3, merging=1e-2, extracting=0.25, storing=0.125, reranking=2.0,
     vector_bytes=2048, row_bytes=1000,

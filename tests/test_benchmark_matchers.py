@@ -15,6 +15,8 @@ from mfvpr.filters import Retrieval
 from mfvpr.weights.files import load_model
 from tests import checkpoints
 
+pytestmark = pytest.mark.slow
+
 SMALL = {"SIZE": (96, 96), "KEYPOINTS": 30, "CANDIDATES": 3}
 
 

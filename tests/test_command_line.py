@@ -165,6 +165,7 @@ def test_mistakes_are_one_line_and_leave_nothing(tmp_path, monkeypatch, capsys, 
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_device_that_is_not_there_is_one_line():
     for name in ("cuda", "nonsense"):
         done = run("candidates=3", JAX_PLATFORMS=name)

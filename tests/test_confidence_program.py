@@ -177,6 +177,7 @@ def test_confidence_of_other_systems_is_refused(evaluate, tmp_path):
     assert words in stderr.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_confidence_of_other_settings_is_said(evaluate):
     first, *_ = evaluate("first", "figures=0")
     given = (f"confidence={first}/confidence.json", "figures=0")

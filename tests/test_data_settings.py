@@ -120,6 +120,7 @@ def test_pairs_of_an_index_file_are_all_that_is_right_unless_asked(small_street,
     assert recall(exact) == recall(widened, tolerance=0)
 
 
+@pytest.mark.slow
 def test_turned_and_16_bit_copies_give_the_same_and_it_is_said(small_street, tmp_path, run):
     exif = Image.Exif()
     exif[0x0112] = 6

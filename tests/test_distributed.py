@@ -20,6 +20,8 @@ from tests.builders import make_matches, unit
 from tests.programs import ROOT, run, small
 from tests.test_shards_program import tables
 
+pytestmark = pytest.mark.optimized
+
 FLAGS = {"XLA_FLAGS": "--xla_force_host_platform_device_count=4", "PYTHONPATH": str(ROOT)}
 CANDIDATES = 9
 
@@ -72,6 +74,7 @@ def free_address():
         return f"127.0.0.1:{one.getsockname()[1]}"
 
 
+@pytest.mark.slow
 def test_two_processes_of_four_devices_find_what_one_finds(tmp_path):
     address = free_address()
     code = "import sys; from tests.test_distributed import process; process(*sys.argv[1:])"

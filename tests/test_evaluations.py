@@ -321,6 +321,7 @@ def test_bad_images_of_the_database_are_told_once(split, small_street, tmp_path)
         assert "0005.png: no keypoints, so no matches (1 such images of 10)" in warned[1]
 
 
+@pytest.mark.slow
 def test_programs_take_sequences_and_files(split, small_street, files, tmp_path, monkeypatch, capsys):
     common = ("dataset=sequences", f"dataset.database={small_street}/database", "dataset.ground_truth=index",
               f"dataset.queries=[{split[0]},{split[1]}]", "dataset.index_file=truth.csv", "dataset.widen_index=true",

@@ -24,6 +24,7 @@ def ranked(out, name):
         return [(line["query"], line["database"], float(line["score"])) for line in csv.DictReader(file)]
 
 
+@pytest.mark.slow
 def test_a_run_ranks_by_what_is_fused(root, tmp_path):
     out = tmp_path / "out"
     more = ("final=combined", "previous_queries=1", "figures=1", f"out={out}")

@@ -10,6 +10,8 @@ from experiments import data_sets, evaluation, learning
 from mfvpr.data.streets import streets_folder
 from tests.programs import QUERIES, composed, results, shared, small, typed
 
+pytestmark = pytest.mark.slow
+
 SHORT = ("scorer=sum", "steps=2", "every=1", "batch=4", "grid.c=[1]", "grid.weight=[dmf,ratio]")
 
 

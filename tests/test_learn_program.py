@@ -15,6 +15,8 @@ from mfvpr.learning.training import Fit, Record
 from mfvpr.weight_files import read_weight
 from tests.programs import QUERIES, composed, results, shared, small, snapshot, typed
 
+pytestmark = pytest.mark.slow
+
 SUM = ("scorer=sum",)
 SHORT = (*SUM, "split=first_half", "steps=4", "every=2", "batch=4", "learning_rate=0.05")
 ROWS = [name + filtered for name in ("paper", "1 - ratio", "grid search", "gradient", "match weights", "match labels")
@@ -133,6 +135,7 @@ def test_nothing_that_is_reported_on_was_seen(learn, untrained, tmp_path, monkey
         assert {*queries} <= {*split.train} or {*queries} <= {*split.validation}
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize("changes", [(), ("matching.max_distance=0.3", "ties=index")])
 def test_the_papers_rows_are_an_evaluation(root, learn, untrained, tmp_path, changes):
     changes = ("scorer=sum", "fusion.c=1e6", *changes)
@@ -237,6 +240,7 @@ def test_whatever_changes_the_result_changes_the_checkpoint(root, untrained, tmp
     assert len({json.dumps(asked["recipe"]) for asked in untrained}) == 5 * len(changes)
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize(
     ("rate", "step", "kept"), [(20, 4, "the last good checkpoint is {}/4;"), (1e12, 1, "there is no checkpoint yet;")]
 )

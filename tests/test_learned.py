@@ -12,6 +12,8 @@ from mfvpr.weights.files import load_model
 from tests import checkpoints
 from tests.programs import ROOT, typed
 
+pytestmark = pytest.mark.slow
+
 
 def system(name, street, out, *more):
     folders = f"dataset.database={street}/database", f"dataset.queries={street}/queries", "dataset.ground_truth=order"
@@ -32,7 +34,6 @@ def evaluate(weights, monkeypatch, capsys):
     return evaluate
 
 
-@pytest.mark.slow
 def test_the_papers_system_runs_and_is_read_from_its_stores_ever_after(evaluate, small_street, tmp_path, monkeypatch):
     monkeypatch.setenv("MFVPR_CACHE", str(tmp_path / "cache"))
     first = evaluate(*system("mix_hist_comb_10", small_street, tmp_path / "first"))
@@ -56,7 +57,6 @@ def test_the_papers_system_runs_and_is_read_from_its_stores_ever_after(evaluate,
         assert one.read_text() == two.read_text()
 
 
-@pytest.mark.slow
 def test_ssm_vpr_runs_on_what_it_learned_from_the_database(evaluate, small_street, tmp_path, monkeypatch):
     monkeypatch.setenv("MFVPR_CACHE", str(tmp_path / "cache"))
     few = ("features.max_images=3", "retrieval.max_images=4", "features.dimension=20", "retrieval.dimension=30")
@@ -73,7 +73,6 @@ def test_ssm_vpr_runs_on_what_it_learned_from_the_database(evaluate, small_stree
     assert rows[-1]["scorer"] == "grid"
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(not checkpoints.ALIKED.is_dir(), reason="no ../shared/weights: ALIKED's are not shipped")
 @pytest.mark.parametrize(
     ("name", "decides"), [("mix_hist_aliked_50", "histogram"), ("mfvpr", "histogram + anchor + filter")]
@@ -88,7 +87,6 @@ def test_aliked_recognizes_the_street(evaluate, small_street, tmp_path, name, de
     assert (out / "predictions.csv").read_bytes() == (out / file).read_bytes()
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(not checkpoints.LIGHTGLUE.is_file(), reason="no ../shared/weights: LightGlue's are not shipped")
 def test_lightglue_matches_the_street_and_its_store_is_its_own(evaluate, small_street, tmp_path, monkeypatch):
     monkeypatch.setenv("MFVPR_CACHE", str(tmp_path / "cache"))

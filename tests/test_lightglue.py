@@ -23,6 +23,8 @@ from mfvpr.weights.networks import planned
 from mfvpr.weights.tables import LIGHTGLUE
 from tests.golden.make_lightglue import SIZES, SMALL, checkpoint, pair
 
+pytestmark = pytest.mark.optimized
+
 INPUTS = SMALL["inputs"]
 COUNTS = SIZES[0]
 OPTIONS = {"filter_threshold": 1e-3}  # random weights are sure of little
@@ -91,6 +93,7 @@ def test_matches_are_the_largest_of_their_row_and_column_and_above_the_threshold
     assert 0 < len(fewer["index0"]) < len(expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunk_size", [None, 3])
 def test_a_pair_depends_neither_on_its_batch_nor_on_its_padding(chunk_size):
     """Also where some pairs of a chunk stop early, and what is padding holds NaN."""
@@ -132,6 +135,7 @@ def shortlist():
     return Shortlist(indices, np.zeros(indices.shape, np.float32), indices >= 0)
 
 
+@pytest.mark.slow
 def test_stores_keep_the_confidence_for_the_scorers(tmp_path):
     queries, database = sets()
     in_memory = pipeline.match(queries, database, shortlist(), matcher())

@@ -15,6 +15,8 @@ from mfvpr.types import per_match, per_pair
 from tests import oracles
 from tests.builders import make_features, random_matches, unit
 
+pytestmark = pytest.mark.optimized
+
 MODES = ["mutual", "opencv_legacy", "none", "candidate"]
 # Compiled as a whole, not operation by operation: seconds, where every test has its own shapes.
 match_once = jax.jit(match, static_argnames=("cross_check", "with_ratio"))

@@ -36,6 +36,7 @@ def test_a_multirun_makes_one_run_folder_per_job(root, tmp_path, monkeypatch, ca
     assert [number for number in range(4) if f"job {number}: " in stderr] == [0, 1, 2, 3]
 
 
+@pytest.mark.slow
 def test_weights_of_every_score_are_one_command(root, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     arguments = ("-m", *small(root), "experiment=weight", "grid.weight=[fs,unit]")
@@ -83,6 +84,7 @@ def test_a_job_waits_for_the_matches_of_another_and_a_single_run_does_not(root, 
     assert {place.name for place in tmp_path.iterdir()} == {"runs", "first", "second", "job"}
 
 
+@pytest.mark.slow
 def test_jobs_in_several_processes(root, tmp_path):
     jobs = ("launcher=joblib", "hydra.launcher.n_jobs=2", "candidates=4,8", f"store={tmp_path}/store", SIGMA)
     done = subprocess.run(

@@ -79,6 +79,7 @@ def test_another_file_is_refused(tmp_path):
         NAMED_WEIGHTS[str(tmp_path / "none.json")]
 
 
+@pytest.mark.slow
 def test_programs_take_it(file, weight, tmp_path, tmp_path_factory, monkeypatch, capsys):
     """The weight of a file and the word that it equals rank alike; another ranks otherwise."""
     constant = replace(weight, output=np.zeros(3, np.float32))  # 1 for every match

@@ -6,6 +6,8 @@ import pytest
 
 from mfvpr.neighbors import nearest, nearest_two
 
+pytestmark = pytest.mark.optimized
+
 nearest_of = jax.jit(nearest, static_argnames="axis")
 two_of = jax.jit(nearest_two)
 

@@ -16,7 +16,7 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 WHY_NOT = "" if CHROMIUM else "no chromium, chromium-browser or google-chrome on the PATH"
 WHY_NOT = WHY_NOT or ("" if find_spec("playwright") else "playwright is not installed: pip install 'mfvpr[test]'")
 
-pytestmark = pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT)
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT)]
 SEQUENCES = ("day", "night " * 12)
 
 

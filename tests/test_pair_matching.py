@@ -25,6 +25,8 @@ from mfvpr.types import Shortlist, per_match, per_pair
 from tests.builders import make_features
 from tests.test_sources import Counting
 
+pytestmark = pytest.mark.optimized
+
 ROOT = Path(__file__).parent.parent
 COUNTS0 = [20, 30, 20, 0] * 5
 COUNTS1 = [20, 20, 0, 100] * 20  # two capacities, and images without keypoints
@@ -106,6 +108,7 @@ def assert_same(one, other):
 # Every pair
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize(
     "options",
     [
@@ -237,6 +240,7 @@ def on_devices(out):
     Path(out).write_text(json.dumps({"devices": jax.device_count(), "results": results}))
 
 
+@pytest.mark.slow
 def test_eight_devices_give_what_one_gives(tmp_path):
     call = f"from tests.test_pair_matching import on_devices; on_devices({str(tmp_path / 'out.json')!r})"
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=8"

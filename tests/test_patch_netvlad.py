@@ -26,6 +26,8 @@ from tests.golden import make_patch_scores as patch_scores
 from tests.golden.make_netvlad import GOLDEN, POSITIONS, image, name
 from tests.programs import results, typed
 
+pytestmark = pytest.mark.optimized
+
 SIZE = (160, 128)
 
 
@@ -49,6 +51,7 @@ def dataset(small_street):
     return folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize("position", POSITIONS, ids=map(str, POSITIONS))
 def test_patches_are_where_the_public_code_has_them(model, position):
     size, patch = position
@@ -60,6 +63,7 @@ def test_patches_are_where_the_public_code_has_them(model, position):
     assert scale == (16, len(expected), 1.0)
 
 
+@pytest.mark.slow
 def test_one_pass_gives_what_the_network_gives(model):
     extractor = PatchNetVladFeatures(model, SIZE, patch_sizes=(1, 3))
     [found] = extractor(image(SIZE))
@@ -87,6 +91,7 @@ def test_what_cannot_be_is_refused(model, options, words):
         PatchNetVladFeatures(model, SIZE)(np.zeros((1, 160, 128, 3), np.uint8))
 
 
+@pytest.mark.slow
 def test_scales_are_standardized_weighted_and_summed(model, dataset, tmp_path):
     """As the public code does: z-scores over a query's candidates by scale, by float64 loops; also out of its store."""
     sizes, weights = (2, 3, 5), (0.45, 0.15, 0.4)
@@ -132,6 +137,7 @@ def test_databases_are_of_the_published_size(images, size, patch_sizes, outputs,
     assert stored / 2**20 == pytest.approx(printed / 2, rel=0.03)
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize(("matcher", "scorer", "unit"), [
     ("RANSAC", lambda patch: mfvpr.Homography(24.0, few="zero", per_feature=True), 1),
     ("spatialApproximator", lambda patch: mfvpr.RapidSpatialScore(
@@ -177,6 +183,7 @@ def program(weights, small_street, tmp_path, monkeypatch, capsys):
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("system", "scorer"), [
     ("patch_netvlad_performance", "homography"), ("patch_netvlad_speed", "rapid"), ("patch_netvlad_storage", "rapid"),
 ])  # fmt: skip
@@ -194,6 +201,7 @@ def test_its_configurations_run_by_name(program, system, scorer):
     assert rows[0]["filter"]["name"] == "same"
 
 
+@pytest.mark.slow
 def test_a_sweep_fuses_the_scales_as_an_evaluation_does(program):
     options = ("features=patch_netvlad", "features.patch_sizes=[2,4]", "retrieval=same", "scorer=count")
     many = (*options, "scorer=histogram", "features.scale_weights=[1,3]")

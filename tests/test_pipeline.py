@@ -26,7 +26,7 @@ from mfvpr.sweeping import sweep
 from mfvpr.types import Shortlist
 from tests import oracles
 from tests.builders import of_query, random_matches, real
-from tests.scorers import FOREIGN, OWN, plain, title
+from tests.scorers import FOREIGN, OWN, one_of_each_class, plain, title
 
 SIFT = Sift(max_keypoints=400)
 
@@ -288,7 +288,7 @@ def mixed_sizes():
     return MatchSet(flat, np.array(counts), 64), listed
 
 
-@pytest.mark.parametrize("scorer", [*OWN, *FOREIGN], ids=title)
+@pytest.mark.parametrize("scorer", one_of_each_class([*OWN, *FOREIGN]), ids=title)
 def test_every_scorer_on_images_of_two_sizes_with_a_confidence(mixed_sizes, scorer):
     match_set, listed = mixed_sizes
     got = pipeline.score({"it": scorer}, match_set, listed)["it"]

@@ -11,6 +11,8 @@ from mfvpr import balancing_c, combine, rank, rerank
 from mfvpr.reranking import fuse, fuse_scales
 from tests import oracles
 
+pytestmark = pytest.mark.optimized
+
 
 @given(st.lists(st.sampled_from([0.0, 1.0, 2.5, -1.0, np.nan, np.inf, -np.inf]), min_size=1, max_size=12), st.data())
 def test_rank_is_stable_with_nan_and_masked_last(scores, data):

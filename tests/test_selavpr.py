@@ -63,6 +63,7 @@ def checkpoint(folder, name="SelaVPR_msls", registers=0):
     return write_zip(folder / f"{name}.pth", training(tensors))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("system", "file"), [
     ("selavpr_msls", "SelaVPR_msls"), ("selavpr_pitts", "SelaVPR_pitts30k"),
 ])  # fmt: skip
@@ -80,6 +81,7 @@ def test_it_runs_by_name_once_its_weights_are_converted(program, tmp_path, syste
     assert {row["parameters"]["single"] for row in rows if row["system"] == "count"} == {"zero"}
 
 
+@pytest.mark.slow
 def test_its_positions_serve_the_scores_of_shifts(program, tmp_path):
     assert program("weights", "convert", checkpoint(tmp_path))[0] == 0
     options = "features=selavpr", "features.image_size=[112,84]", "retrieval=same", "scorer=histogram", "candidates=6"
@@ -103,6 +105,7 @@ def test_the_variant_with_registers_takes_its_own_weights_alone(program, tmp_pat
     assert code == 0, stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pooling", ["cls", "gem"])
 def test_dinov2_is_a_filter(program, tmp_path, pooling):
     tensors = transformer_checkpoint(dinov2_shapes(64, 1))

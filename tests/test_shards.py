@@ -142,6 +142,7 @@ class TwoScales:
         return [Description(*parts) for parts in zip(vectors, zip(every, halves, strict=True), strict=True)]
 
 
+@pytest.mark.slow
 def test_several_sequences_and_scales_and_more_shards_than_images(small_street, split, tmp_path):
     """On matches that memory does not hold."""
     several = sequences_dataset(

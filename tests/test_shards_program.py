@@ -12,6 +12,8 @@ import pytest
 
 from tests.programs import ROOT, folder, run, small, typed
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
@@ -150,7 +152,6 @@ def command(settings, place, shard):
     return [sys.executable, "-m", "experiments.evaluate", *settings, *own]
 
 
-@pytest.mark.slow
 def test_the_same_shard_twice_is_refused_and_killed_ones_go_on(settings, plain, tmp_path, asked):
     """Killed at many moments, beside each other; whoever is started again goes on; clocks may differ."""
     place, delays = tmp_path, iter([3, 5, 7, 4])

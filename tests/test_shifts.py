@@ -29,6 +29,7 @@ def lines_of(file):
         return [*csv.DictReader(opened)]
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize("final", ["score", "combined"])
 def test_every_first_answer_has_the_shift_that_the_library_says(root, tmp_path, final):
     settings = composed(*small(root), *STEERING, f"final={final}", f"out={tmp_path}/out")

@@ -337,6 +337,7 @@ def test_the_database_is_looked_at_once_for_all_sequences(cells, small_street, d
         mfvpr.evaluate(several, cells, FILTER, {"grid": GridAnchors(3)}, **options)
 
 
+@pytest.mark.slow
 def test_an_image_is_found_by_itself_with_every_cell(model, dataset, tmp_path):
     """4 x 4 cells, each of which is nearest to itself, so that each agrees with all others."""
     square = SsmCells(model, SMALL[:1] * 2, whitening=WindowFitting(15))

@@ -29,6 +29,8 @@ from tests.golden.make_ssm import (
     picture,
 )
 
+pytestmark = pytest.mark.optimized
+
 FITTINGS = WindowFitting(DIMENSIONS[0]), WindowFitting(DIMENSIONS[1], zero_row=True, dtype="float64")
 SIZES = 9, 3
 project = jax.jit(whitened, static_argnames="stride")

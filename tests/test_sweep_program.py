@@ -70,6 +70,7 @@ def evaluated(root, out, **changes):
     return {(row["system"], f"{row['tolerance']}"): row["recall_at"] for row in rows}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sigma", "weight"), [(10, "unit"), (22.5, "fs")])
 def test_a_sweep_is_one_evaluation_per_setting(root, swept, tmp_path, sigma, weight):
     own = {"scorer.sigma": sigma, "scorer.weight": weight, "fusion.c": 2}
@@ -224,6 +225,7 @@ def test_experiments_of_conf_run(sweep, swept, tmp_path, experiment, changes, co
     assert (tmp_path / "out" / "figures").is_dir()
 
 
+@pytest.mark.slow
 def test_optuna_finds_the_same_with_the_same_seed(sweep, swept, tmp_path):
     def find(name, seed):
         space = ("search=optuna", "trials=5", "grid.sigma=[5,30]", "grid.weight=[fs,unit]")
@@ -341,6 +343,7 @@ def test_results_are_not_overwritten(root, swept, monkeypatch, capsys):
     assert snapshot(swept[0]) == before
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_what_is_finished_and_the_next_run_does_the_rest(root, sweep, swept, tmp_path, monkeypatch):
     """Finished blocks are kept, and go when the whole sweep is done."""
     grid = ("grid.sigma=[5,10,15,20,22.5,30]", "chunk.settings=1", "chunk.queries=1")

@@ -8,10 +8,10 @@ import pytest
 import mfvpr
 from mfvpr import testing
 from mfvpr.testing import check_scorer
-from tests.scorers import FOREIGN, OWN, title
+from tests.scorers import FOREIGN, OWN, one_of_each_class, title
 
 
-@pytest.mark.parametrize("scorer", [*OWN, *FOREIGN], ids=title)
+@pytest.mark.parametrize("scorer", one_of_each_class([*OWN, *FOREIGN]), ids=title)
 def test_what_keeps_the_contract_passes(scorer, monkeypatch):
     """These scores more closely than other people's need to."""
     monkeypatch.setattr(testing, "TOLERANCE", 3e-6)

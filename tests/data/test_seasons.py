@@ -23,6 +23,7 @@ def drawn(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_same_seed_gives_same_bytes_and_another_other_ones(drawn, tmp_path):
     draw_seasons(tmp_path / "again", num_frames=FRAMES, image_size=SIZE)
     draw_seasons(tmp_path / "other", seed=1, num_frames=FRAMES, image_size=SIZE)

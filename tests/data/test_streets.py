@@ -33,6 +33,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_same_seed_gives_same_bytes(drawn: Path, tmp_path: Path) -> None:
     draw_streets(tmp_path / "again", num_frames=FRAMES, image_size=SIZE)
     assert contents(drawn) == contents(tmp_path / "again")

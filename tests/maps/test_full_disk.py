@@ -6,6 +6,8 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from mfvpr.data.streets import streets_folder
 from mfvpr.errors import InputError
 from mfvpr.features.sift import Sift
@@ -38,6 +40,7 @@ def fill(disk, street):
     print(json.dumps({"told": told, "right": places == list(images.names), "number": len(known)}))
 
 
+@pytest.mark.slow
 def test_what_was_added_stays_and_adding_goes_on(tmp_path):
     need_small_disks(tmp_path)
     street = streets_folder(tmp_path / "data", num_frames=12, image_size=(160, 120))

@@ -185,6 +185,7 @@ def drawn(path):
         return np.asarray(image.convert("RGB")), image.text
 
 
+@pytest.mark.slow
 def test_answers_are_drawn(folder, small_street, tmp_path, monkeypatch, capsys):
     queries, pictures = small_street / "queries", {}
     for name, root in (("gray", "null"), ("shown", f"{small_street}/database"), ("elsewhere", str(tmp_path))):

@@ -23,6 +23,8 @@ from tests.builders import local
 from tests.golden.make_aliked import DRAWN, GOLDEN, REAL, checkpoint, picture, projections, samples, texture
 from tests.models import aliked_oracle as oracle
 
+pytestmark = pytest.mark.optimized
+
 SLOTS = 1500
 IMAGES = checkpoints.ALIKED.parent.parent / "data" / "grief_season"
 
@@ -87,6 +89,7 @@ def test_another_variant_is_refused():
         Aliked("aliked-n64", rngs=nnx.Rngs(0))
 
 
+@pytest.mark.first_case
 @pytest.mark.skipif(
     not checkpoints.ALIKED.is_dir(), reason="no ../shared/weights: weights do not ship with the project"
 )

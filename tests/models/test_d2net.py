@@ -21,6 +21,8 @@ from tests.checkpoints import d2net_shapes, random_checkpoint
 from tests.golden.make_d2net import CASES, GOLDEN, PLAIN, projections, samples, texture
 from tests.models import d2net_oracle as oracle
 
+pytestmark = pytest.mark.optimized
+
 
 @pytest.fixture(scope="module")
 def model() -> D2Net:
@@ -86,6 +88,7 @@ def test_the_network_has_the_published_size():
         assert jax.eval_shape(model, image).shape == (1, side, side, 512)
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_maps_and_features_are_those_of_the_public_code(model, case):
     with np.load(GOLDEN) as file:
@@ -123,6 +126,7 @@ def plain(model) -> D2NetFeatures:
     return D2NetFeatures(model, (PLAIN[0].width, PLAIN[0].height))
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize("case", PLAIN, ids=str)
 def test_plain_areas_have_the_keypoints_of_the_public_code_and_no_more(plain, case):
     """Fast convolutions that round by position would make peaks of what is level, and lose those at its rim."""
@@ -235,6 +239,7 @@ def test_crowded_images_are_extracted_again(small, images, monkeypatch):
         jax.tree.map(lambda ours, theirs: np.testing.assert_allclose(ours, theirs, rtol=1e-5), ours, expected)
 
 
+@pytest.mark.slow
 def test_images_of_a_batch_do_not_mix(model, images):
     extracted = compiled(model, extract)
     order = np.array([2, 0, 1])
@@ -260,6 +265,7 @@ def test_the_highest_scores_are_kept_in_order(small, images):
         np.testing.assert_array_equal(ours.keypoints, everything.keypoints[kept])
 
 
+@pytest.mark.slow
 def test_an_image_without_keypoints_gives_empty_features(images):
     graph, state = nnx.split(Tiny())
     blind = nnx.merge(graph, jax.tree.map(jnp.zeros_like, state))
@@ -284,6 +290,7 @@ def test_images_too_small_are_refused(size, multiscale, smallest):
         D2NetFeatures(Tiny(), image_size=size, multiscale=multiscale)
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize("size, multiscale", [((12, 12), False), ((24, 24), True)])
 def test_the_smallest_images_are_taken(model, size, multiscale):
     D2NetFeatures(Tiny(), size, multiscale=multiscale)(texture(*size)[None])

@@ -1,8 +1,11 @@
 """Pixels as the networks take them."""
 
 import numpy as np
+import pytest
 
 from mfvpr.models.imagenet import preprocess
+
+pytestmark = pytest.mark.optimized
 
 
 def test_bytes_are_preprocessed_to_the_last_bit():

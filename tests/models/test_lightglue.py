@@ -22,6 +22,8 @@ from tests import checkpoints
 from tests.golden import make_lightglue_real
 from tests.golden.make_lightglue import DEPTH, GOLDEN, REAL, SEEDS, SIZES, SMALL, SURE, checkpoint, pair
 
+pytestmark = pytest.mark.optimized
+
 INPUTS = SMALL["inputs"]
 assigned = jax.jit(assignment)
 
@@ -85,6 +87,7 @@ def test_assignments_are_the_public_codes(golden, counts, seed):
     assert (found[:, counts[1] :] == -np.inf).all()
 
 
+@pytest.mark.slow
 def test_in_double_precision_nothing_but_rounding_is_left(golden):
     with jax.enable_x64(True):
         found = assigned(small(dtype=np.float64), *map(as_double, pair(SIZES[0], INPUTS, 0)))

@@ -19,6 +19,8 @@ from mfvpr.weights.tables import MIXVPR
 from tests.checkpoints import mixvpr_shapes, random_checkpoint
 from tests.golden.make_mixvpr import GOLDEN, SIZES, faint_maps, images, samples
 
+pytestmark = pytest.mark.optimized
+
 RELATIVE = 1e-5
 PARAMETERS = {4096: 10_880_900, 512: 10_092_898, 128: 9_896_098}
 
@@ -76,6 +78,7 @@ def test_each_mixer_is_the_public_codes(computed, golden):
         assert_close(samples(np.asarray(mixed)), golden[f"mixer{place}"])
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize("channels, rows", SIZES)
 def test_descriptors_are_the_public_codes(computed, golden, channels, rows):
     aggregate = jax.jit(MixVPR.aggregate)

@@ -19,6 +19,8 @@ from mfvpr.weights.tables import NETVLAD, NETVLAD_MATLAB
 from tests.checkpoints import gem_checkpoint, matlab_netvlad, netvlad_checkpoint, write_matlab
 from tests.golden.make_netvlad import CASES, GEM, GOLDEN, MATLAB, PATCHES, image, name, samples
 
+pytestmark = pytest.mark.optimized
+
 RELATIVE = 1e-5  # of the largest value
 
 
@@ -36,6 +38,7 @@ def assert_close(actual, expected):
     np.testing.assert_allclose(actual, expected, rtol=0, atol=RELATIVE * np.abs(expected).max())
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize("case", CASES, ids=map(str, CASES))
 def test_descriptors_and_patches_are_the_public_codes(golden, case):
     clusters, outputs, size, seed = case
@@ -51,6 +54,7 @@ def test_descriptors_and_patches_are_the_public_codes(golden, case):
         assert_close(np.asarray(found[0], np.float64).mean(axis=0), golden[f"{key}/{patch}/means"])
 
 
+@pytest.mark.slow
 def test_the_originals_file_gives_the_descriptors_of_hlocs_code(golden, tmp_path):
     clusters, outputs, size, seed = MATLAB
     read = read_checkpoint(write_matlab(tmp_path / "struct.mat", matlab_netvlad(clusters, outputs, seed)))
@@ -61,6 +65,7 @@ def test_the_originals_file_gives_the_descriptors_of_hlocs_code(golden, tmp_path
     np.testing.assert_allclose(floats, found, atol=1e-7)
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize("case", GEM, ids=map(str, GEM))
 def test_generalized_means_are_cosplaces(golden, case):
     backbone, outputs, size, seed = case
@@ -124,6 +129,7 @@ def small():
     return filled(partial(VggNetVlad, 4, 8), NETVLAD, netvlad_checkpoint(4, 8))
 
 
+@pytest.mark.slow
 def test_fewer_components_are_the_first_of_all(small):
     every, first = (GlobalDescriptor(small, (64, 48), components=number) for number in (None, 3))
     assert (every.vector_size, first.vector_size) == (8, 3)

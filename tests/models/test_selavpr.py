@@ -24,6 +24,8 @@ from tests.golden.make_netvlad import image, name, samples
 from tests.golden.make_selavpr import BACKBONES, GOLDEN, MATCHES, NETWORKS, SIZE, WIDTH, maps
 from tests.models.test_netvlad import assert_close, filled
 
+pytestmark = pytest.mark.optimized
+
 
 @pytest.fixture(scope="module")
 def golden():
@@ -35,6 +37,7 @@ def network(depth=1, registers=0, seed=0, width=1024, prefix=""):
     return filled(build, SELAVPR, transformer_checkpoint(selavpr_shapes(width, depth, registers, prefix), seed))
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize("case", NETWORKS, ids=map(str, NETWORKS))
 def test_descriptors_are_the_public_codes(golden, case):
     [found] = SelaVprFeatures(network(*case))(image(SIZE))
@@ -110,6 +113,7 @@ def test_upsampling_is_the_sum_of_what_positions_add():
     np.testing.assert_allclose(layer(jnp.asarray(x)), expected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_without_adapters_an_adapted_block_is_a_plain_one():
     with jax.numpy_dtype_promotion("standard"):
         plain, adapted = (kind(64, 2, precision="highest", rngs=nnx.Rngs(0)) for kind in (Block, AdaptedBlock))

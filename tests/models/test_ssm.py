@@ -17,6 +17,8 @@ from mfvpr.weights.tables import SSM
 from tests.golden.make_d2net import samples
 from tests.golden.make_ssm_maps import CASES, GOLDEN, checkpoint
 
+pytestmark = pytest.mark.optimized
+
 RELATIVE = 1e-5  # of the map's largest value
 
 
@@ -60,6 +62,7 @@ def test_one_pass_gives_both_maps_of_the_public_code(case, golden):
     assert_same_map(second, f"{case}/stage2", golden)
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize("case", [case for case in CASES if case.width != 224], ids=str)
 def test_each_map_alone_is_the_public_codes(case, golden):
     """The last of images that do not see each other."""

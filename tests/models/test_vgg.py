@@ -9,6 +9,8 @@ from flax import nnx
 from mfvpr.models.convolution import Conv3x3, winograd
 from mfvpr.models.vgg import Vgg16
 
+pytestmark = pytest.mark.optimized
+
 
 def convolved(x, kernel, dilation):
     """`[B, H, W, C]` with `[3, 3, C, D]`, zeros outside, in float64."""

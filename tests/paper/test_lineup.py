@@ -1,5 +1,7 @@
 """What is evaluated: rows, settings and data sets."""
 
+from pathlib import Path
+
 import pytest
 
 from experiments.paper import lineup
@@ -122,7 +124,7 @@ def result(system, recall, *, decides=False, **more):
 
 
 def dataset(name, *parts, database=10):
-    folder = ImageFolder(None, tuple(map(str, range(database))))
+    folder = ImageFolder(Path(), tuple(map(str, range(database))))
     return Dataset(name, folder, tuple(QuerySequence(part, folder, None) for part in parts))
 
 
@@ -223,7 +225,7 @@ def test_data_sets_that_lack_images_are_called_so():
 
 
 def test_another_ground_truth_of_the_same_images_is_another_run(tmp_path):
-    folder, settings = ImageFolder(None, ("0", "1", "2")), made("sift_50", "corridor", tmp_path)
+    folder, settings = ImageFolder(Path(), ("0", "1", "2")), made("sift_50", "corridor", tmp_path)
     known = []
     for rows in (((0,), (1,), (2,)), ((0,), (2,), (1,))):
         dataset = Dataset("corridor", folder, (QuerySequence("one", folder, FrameTruth(rows, 3)),))

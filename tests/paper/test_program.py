@@ -19,6 +19,8 @@ from mfvpr.report.tables import Table
 from tests.programs import ROOT, composed, typed
 from tests.programs import run as run_program
 
+pytestmark = pytest.mark.slow
+
 SYSTEMS = "systems=[sift_hist_10,sift_hist_comb_10,mix_hist_10]"
 QUERIES = 8
 

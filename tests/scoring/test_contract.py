@@ -25,10 +25,10 @@ from mfvpr.errors import InputError
 from mfvpr.numerics import held
 from mfvpr.scoring.parameters import fit
 from tests.builders import SIZE, per_match, random_matches
-from tests.scorers import FOREIGN, OWN, Wrapped, plain, title
+from tests.scorers import FOREIGN, OWN, Wrapped, one_of_each_class, plain, title
 
-everyone = pytest.mark.parametrize("scorer", [*OWN, *FOREIGN], ids=title)
-own = pytest.mark.parametrize("scorer", OWN, ids=title)
+everyone = pytest.mark.parametrize("scorer", one_of_each_class([*OWN, *FOREIGN]), ids=title)
+own = pytest.mark.parametrize("scorer", one_of_each_class(OWN), ids=title)
 _score = jax.jit(lambda scorer, matches: scorer(matches))  # compiled once per shape: hence 60 slots, 5 pairs
 _score_all = jax.jit(score_candidates)
 SIZES = np.array([SIZE, SIZE], np.float32)

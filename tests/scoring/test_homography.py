@@ -18,6 +18,8 @@ from mfvpr.types import per_match
 from tests import ransac_oracle
 from tests.builders import SIZE, make_matches
 
+pytestmark = pytest.mark.optimized
+
 PLANE = np.array([[1.05, 0.05, 8.0], [-0.03, 0.97, -5.0], [1e-4, -5e-5, 1.0]])  # candidate -> query
 estimate = jax.jit(lambda scorer, matches: scorer.estimate(matches))  # each shape compiles for seconds
 
@@ -90,6 +92,7 @@ def test_samples_are_the_first_draws_that_a_camera_can_see():
     np.testing.assert_array_equal(np.moveaxis(np.asarray(samples), 0, 2)[:, : int(count)].swapaxes(0, 1), expected)
 
 
+@pytest.mark.slow
 def test_company_order_and_padding_change_no_bit():
     pairs = [pair(seed, count, share, capacity=128) for seed, (count, share) in enumerate(
         [(100, 0.1), (3, 1.0), (0, 1.0), (60, 0.9), (128, 0.3)])]  # fmt: skip
@@ -112,6 +115,7 @@ def test_a_plane_without_noise_is_found_to_a_pixels_thousandth():
     assert np.abs(ransac_oracle.mapped(found.matrix, matches.points1) - matches.points0).max() < 1e-2
 
 
+@pytest.mark.slow
 def test_least_squares_are_those_of_scipy():
     matches = pair(4, 200, 0.6)
     plain, refit = (estimate(Homography(8.0, refit=again), matches) for again in (False, True))
@@ -211,6 +215,7 @@ def test_a_plane_counts_however_little_its_matches_do():
     assert float(estimate(Homography(), matches).score) == 60 / 64
 
 
+@pytest.mark.slow
 def test_no_generator_of_jax_draws_otherwise_in_a_batch():
     pairs = [pair(seed, 60, 0.2, capacity=64) for seed in range(3)]
     expected = [float(estimate(Homography(8.0), matches).score) for matches in pairs]
@@ -227,6 +232,7 @@ def test_limits_that_are_none_score_nothing(limits):
     assert np.isnan(estimate(Homography(**limits), pair(9, 40, 0.5)).score)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("measure", ["inliers", "msac"])
 def test_matches_of_several_types_are_scored(measure):
     matches, scorer = pair(9, 40, 0.5), Homography(8.0, measure=measure)
@@ -236,6 +242,7 @@ def test_matches_of_several_types_are_scored(measure):
     np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_thresholds_and_iterations_are_swept_in_one_program():
     batch = stacked([pair(seed, 80, 0.3) for seed in range(3)])
     grid = np.asarray(score_grid(Homography(), batch, threshold=[4.0, 8.0, 24.0], max_iterations=[20, 300]))
@@ -246,6 +253,7 @@ def test_thresholds_and_iterations_are_swept_in_one_program():
     assert (grid[:, 1] >= grid[:, 0]).all()
 
 
+@pytest.mark.slow
 def test_nobody_gets_a_gradient_of_it():
     matches = pair(11, 20, 0.8)
     for wanted in (

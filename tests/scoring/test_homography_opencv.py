@@ -14,6 +14,8 @@ from mfvpr.types import Shortlist, per_match
 from tests.builders import make_matches
 from tests.scoring.test_homography import plane_points, stacked
 
+pytestmark = pytest.mark.optimized
+
 POINTS = [plane_points(seed, count, share) for seed, (count, share) in enumerate([(60, 0.5), (120, 0.2), (20, 0.8)])]
 BATCH = stacked([make_matches(points0, points1, capacity=128, index0=np.arange(len(points0)))
                  for points1, points0 in POINTS])  # fmt: skip

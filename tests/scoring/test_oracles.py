@@ -21,6 +21,8 @@ from mfvpr import (
 from tests import oracles
 from tests.builders import make_matches, random_matches, real
 
+pytestmark = pytest.mark.optimized
+
 WEIGHTS = {
     "fs": (FeatureScoreWeight(), lambda d, s0, s1, r: oracles.fs_weight(s0, s1)),
     "dmf": (DescriptorDistanceWeight(), lambda d, s0, s1, r: oracles.dmf_weight(d)),

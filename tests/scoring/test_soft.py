@@ -21,6 +21,8 @@ from mfvpr import (
 from tests import soft_oracles
 from tests.builders import SIZE, double, make_features, make_matches, random_matches, real
 
+pytestmark = pytest.mark.optimized
+
 HISTOGRAMS = [
     HistogramOfShifts(bin_size=24.0, max_bins=30),
     HistogramOfShifts(

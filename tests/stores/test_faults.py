@@ -267,6 +267,7 @@ def kill_rounds(root: str, kind: str, rounds: int) -> None:
     print(json.dumps(told))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "rounds"), [("features", 50), ("matches", 30)])
 def test_killed_processes_end_in_the_same_files(tmp_path, kind, rounds):
     told = json.loads(run_here(f"kill_rounds({str(tmp_path)!r}, {kind!r}, {rounds})"))

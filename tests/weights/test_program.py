@@ -329,6 +329,7 @@ def run(*arguments, **environment):
                           capture_output=True, timeout=120, env=os.environ | environment)  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not ALIKED.is_dir(), reason="no ../shared/weights: weights do not ship with the project")
 def test_real_weights_from_checkpoint_to_network(tmp_path):
     place = {"MFVPR_WEIGHTS": str(tmp_path)}
