@@ -5,7 +5,7 @@ import pytest
 
 from mfvpr import InputError, Shortlist
 from mfvpr.data.ground_truth import FrameTruth, RadiusTruth
-from mfvpr.evaluation import judge
+from mfvpr.evaluation import judge, middle
 
 QUERIES, TOLERANCES, SETTINGS = 20, (0, 1, 3), 4
 TRUTH = FrameTruth(tuple((row,) for row in range(QUERIES)), QUERIES)
@@ -67,6 +67,8 @@ def test_thresholds_ascend_and_the_middle_one_decides():
     found = judge(TRUTH, [3, 0, 1, 3])
     assert (found.thresholds, found.main, found.label(5, 1)) == ([0, 1, 3], 1, "R@5 ±1")
     np.testing.assert_array_equal(found.places.dense(), TRUTH.positives(3).dense())
+    for thresholds, main in (([1], 0), ([0, 1], 1), ([0, 1, 2, 3], 2)):  # of two in the middle the larger
+        assert (judge(TRUTH, thresholds).main, middle(thresholds)) == (main, thresholds[main])
     meters = judge(RadiusTruth(np.zeros((2, 2)), np.zeros((2, 2))), [25.0])
     assert meters.label(1, 25.0) == "R@1 25 m"
 

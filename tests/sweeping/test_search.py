@@ -133,6 +133,17 @@ def test_optuna_proposes_as_many_as_asked_after_the_scorers_own(data):
     np.testing.assert_array_equal(outcome.rows, rows)
 
 
+def test_optuna_learns_from_the_queries_that_choose(data, monkeypatch):
+    optuna = pytest.importorskip("optuna")
+    values = []
+    monkeypatch.setattr(optuna.Study, "tell", lambda study, trial, value: values.append(value))
+    axes = Axes(SUM, {"weight": ["fs", "unit"], "c": [0.5, 3.0]}, {"weight": "dmf", "c": 2})
+    outcome = sweeping.search_optuna(axes, judge(TRUTH, TOLERANCES, "both"), *data, trials=3, seed=1, ks=[1])
+    tuning = outcome.judge.tuning(outcome.rows)[:, 1:, outcome.judge.main].mean(axis=0)
+    np.testing.assert_array_equal(values, tuning)
+    assert (tuning != outcome.recall[1:, outcome.judge.main]).all()  # of all queries, reported ones among them
+
+
 def test_what_people_read_is_what_was_measured(outcome):
     table = sweeps.table(outcome)
     assert table.header == ["weight", "c", "R@1 ±0", "R@1 ±1", "R@1 ±2", "R@5 ±1"]
