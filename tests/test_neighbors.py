@@ -17,6 +17,9 @@ def make(rows, columns, kind):
     values = rng.normal(size=(rows, columns)).astype(np.float32)
     if kind == "ties":
         values = rng.integers(0, 3, (rows, columns)).astype(np.float32)
+    if kind == "peaks":  # one in every row, and many second ones that are equal
+        values = rng.integers(0, 2, (rows, columns)).astype(np.float32)
+        values[np.arange(rows), rng.integers(0, columns, rows)] = 2
     if kind == "holes":
         values[rng.random((rows, columns)) < 0.8] = -np.inf
     return values
@@ -44,7 +47,7 @@ def test_neighbors_are_those_of_a_stable_sort(rows, columns, kind):
         assert (np.asarray(index)[~some] == 0).all()
 
 
-@pytest.mark.parametrize("kind", ["random", "ties", "holes"])
+@pytest.mark.parametrize("kind", ["random", "ties", "peaks", "holes"])
 @pytest.mark.parametrize(("rows", "columns"), [(0, 5), (1, 1), (3, 2), (7, 31), (40, 64), (65, 97), (60, 8)])
 def test_the_two_nearest_are_the_first_of_a_stable_sort(rows, columns, kind):
     values = make(rows, columns, kind)

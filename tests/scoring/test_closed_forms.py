@@ -92,6 +92,8 @@ def test_scales_are_votes_of_zoomed_points_and_the_prior_is_a_factor():
     assert float(scorer(matches)) == pytest.approx(max(likely * by_scale), rel=1e-5)
     assert float(scorer.dominant_scale(matches)) == pytest.approx(SCALES[np.argmax(likely * by_scale)])
     np.testing.assert_allclose(scorer.histogram(matches).scores.max(), scorer(matches), rtol=1e-5)
+    smallest = HistogramOfShifts(scales=SCALES[:1], scale_deviation=0.3)
+    assert float(smallest(matches)) == pytest.approx(likely[0] * by_scale[0], rel=1e-5)
 
 
 def test_scales_of_exchanged_images_are_their_inverses():

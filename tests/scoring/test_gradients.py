@@ -160,6 +160,15 @@ def test_degenerate_pairs_have_finite_gradients(scorer):
         assert all((np.asarray(rows)[~matches.mask] == 0).all() for rows in found[1].values())
 
 
+def test_a_match_as_near_to_two_keypoints_has_no_gradient_of_its_ratio():
+    """Though that of a root is infinite there."""
+    matches = make_matches([[1, 1]] * 2, [[2, 2]] * 2, ratio=[1.0, 0.75])
+    weight = lambda exponent, ratio: jnp.sum(RatioWeight(exponent)(replace(matches, ratio=ratio)))  # noqa: E731
+    found = jax.grad(weight, argnums=(0, 1))(0.5, jnp.asarray(matches.ratio))
+    np.testing.assert_allclose(found[0], 0.5 * np.log(0.25), rtol=1e-6)
+    np.testing.assert_allclose(found[1], [0.0, -1.0], rtol=1e-6)
+
+
 def test_the_window_moves_in_whole_cells():
     matches = random_matches(np.random.default_rng(2), 20)
     scorer = AnchorPoints(6, 4.0, temperature=0.5)

@@ -185,6 +185,18 @@ def test_an_edge_of_cells_belongs_to_the_cell_above(cell_size):
     assert constant(matches) == 80
 
 
+@pytest.mark.parametrize("cell_size", [0.1, 1 / 3, 7.3])
+def test_what_lies_just_below_an_edge_belongs_to_the_cell_below(cell_size):
+    """Though a quotient may be rounded up to a whole number."""
+    size, number = np.float32(cell_size), np.delete(np.arange(-40, 41), 40).astype(np.float32)
+    below = np.nextafter(number * size, np.float32(-np.inf))
+    assert (below / size == number).any()
+    inside = np.concatenate([below, (number - np.float32(0.5)) * size])
+    matches = make_matches(np.zeros((160, 2)), np.stack([inside, np.zeros(160)], axis=1))
+    scorer = VisualPhrases(cell_size=cell_size, align="zero_edge")
+    assert scorer(matches) == score(scorer, matches) == 80
+
+
 def test_a_translation_by_cells_keeps_the_phrases():
     matches = random_matches(np.random.default_rng(3), 60)
     moved = replace(matches, points1=matches.points1 + np.float32([45, -30]))
