@@ -1,6 +1,7 @@
 """Whose a name is, for ever, and who waits for whom."""
 
 import hashlib
+from functools import partial
 
 import numpy as np
 import pytest
@@ -69,3 +70,14 @@ def test_what_waits_does_not_keep_the_rest():
         together(lambda: wait("a"), lambda: done.append(1), lambda: wait("b"), lambda: wait("a"))
     assert done == [1]
     assert together(lambda: 1, lambda: 2) == [1, 2]
+
+
+@pytest.mark.parametrize("complete", [(True, True), (True, False), (False, True), (False, False)])
+def test_a_shard_is_complete_if_all_that_waits_for_others_is(complete):
+    shards = [Shard(0, 2), Shard(1, 2)]
+    waits = [partial(shard.wait, lambda: [0, 1], ["a", "b"], "scores", is_complete=one)
+             for shard, one in zip(shards, complete, strict=True)]  # fmt: skip
+    with pytest.raises(NotYet) as error:
+        together(*waits)
+    assert error.value.is_complete == all(complete)
+    assert error.value.shards == {shard_of("a", 2), shard_of("b", 2)}
