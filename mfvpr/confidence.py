@@ -53,7 +53,7 @@ def confidence_inputs(
     spread = np.sqrt((count * variance + _PRIOR * prior) / (count + _PRIOR))
     spread = np.maximum(np.maximum(spread, _LEAST_SPREAD * np.abs(scores[:, 0])), np.finfo(np.float64).tiny)
     second = np.max(scores, axis=1, where=others, initial=-np.inf)
-    near = (filtered.rows >= 0) & (np.abs(filtered.rows - first) <= apart)
+    near = np.abs(filtered.rows - first) <= apart  # the answer is among them, before all that is no candidate
     above = {"margin": scores[:, 0] - second, "height": scores[:, 0] - mean}
     found = {name: np.where(others.any(axis=1), np.log1p(np.maximum(value, 0) / spread), np.inf)
              for name, value in above.items()}  # fmt: skip
