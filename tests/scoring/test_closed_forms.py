@@ -37,6 +37,20 @@ def test_number_of_bins_of_the_paper(size, bins):
     assert HistogramOfShifts().histogram(matches).scores.shape == (bins, bins)
 
 
+def test_a_match_votes_for_bins_as_far_as_the_limit():
+    matches = make_matches([[100, 100]], [[100 + CENTER, 100 + CENTER]], scores0=[0.5], scores1=[0.5])
+    scores = np.asarray(histogram(HistogramOfShifts(sigma=10.0, truncate=1.5, max_bins=63), matches).scores)
+    vote = np.exp(-0.5 * 1.5**2)
+    np.testing.assert_allclose(scores[23:26, 22:27], np.outer([vote, 1, vote], [0, vote, 1, vote, 0]), rtol=1e-6)
+
+
+def test_matches_agree_within_two_deviations_along_both_axes():
+    shifts = np.array([[0, 0], [45, 0], [45.1, 0], [0, -45], [0, -45.1], [44, 44]])
+    matches = make_matches(np.full((6, 2), 100.0), 100 + shifts)
+    found = HistogramOfShifts(sigma=22.5).agrees(matches, np.zeros(2, np.float32))
+    assert found.tolist() == [True, True, False, True, False, True]
+
+
 def test_translation_by_bins_moves_the_peak_and_keeps_the_score():
     matches = random_matches(np.random.default_rng(0), 80)
     matches = replace(matches, points0=matches.points0 / 4 + 100, points1=matches.points1 / 4 + 100)

@@ -143,6 +143,13 @@ def test_rapid_by_unknown_keypoints_is_refused():
     assert RapidSpatialScore(per_feature=True)(replace(pair, count0=np.int32(4))) == pytest.approx(SIZE**2 / 2)
 
 
+def test_a_single_match_may_count_nothing():
+    """However sure it is; two that are half sure are not single."""
+    points = np.full((3, 2), 9.0)
+    for confidence, count in (([0.25, 0, 0], 0), ([1, 0, 0], 0), ([0.5, 0.5, 0], 1), ([1, 1, 0.5], 2.5)):
+        assert MatchCount(single="zero")(make_matches(points, points, confidence=confidence)) == count
+
+
 def test_phrases_of_one_match_are_the_count():
     matches = random_matches(np.random.default_rng(1), 40, capacity=50)
     np.testing.assert_allclose(score(VisualPhrases(1), matches), score(MatchCount(), matches), rtol=1e-6)
