@@ -189,6 +189,15 @@ def test_padding_is_not_nearer_than_what_looks_the_opposite(mode):
     np.testing.assert_allclose(np.asarray(matches.ratio)[slots], ratio, atol=1e-6)
 
 
+def test_a_ratio_is_at_most_one_where_rounding_takes_the_further_for_the_nearest():
+    """Two that are as similar in single precision, the first of them twice as far away."""
+    query, candidate = (make_features(np.random.default_rng(14), 2, capacity=32) for _ in range(2))
+    query.descriptors[:2], candidate.descriptors[:2] = np.eye(16)[[0, 1]], np.eye(16)[0]
+    candidate.descriptors[:2, 2] = [2e-4, 1e-4]
+    matches = match_once(query, candidate, cross_check="none", with_ratio=True)
+    assert (matches.index1[0], matches.ratio[0]) == (0, 1)
+
+
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("counts", [(37, 41), (32, 127), (67, 30)])
 def test_numbers_that_do_not_come_out_even_in_blocks(mode, counts):

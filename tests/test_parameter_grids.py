@@ -17,6 +17,7 @@ from mfvpr import (
     MatchCount,
     UnitWeight,
     filter_matches,
+    parameter_grids,
     score_candidates,
     score_grid,
 )
@@ -49,6 +50,25 @@ def test_anchor_grid_equals_the_loop(matches):
         [score_candidates(AnchorPoints(window=w, tolerance=t), matches) for t in (1.0, 3.0, 4.5)] for w in (2, 10)
     ]
     np.testing.assert_allclose(got, expected, rtol=2e-6)
+
+
+def test_axes_come_in_the_order_in_which_they_are_given(matches):
+    """Though distances are varied within each setting of the scorer."""
+    axes = {"max_distance": [0.7, 1.5], "window": [2, 6, 10]}
+    got = score_grid(AnchorPoints(), matches, **axes)
+    turned = score_grid(AnchorPoints(), matches, **dict(reversed(axes.items())))
+    assert got.shape == (2, 3, 3)
+    np.testing.assert_array_equal(got, np.swapaxes(turned, 0, 1))
+
+
+@pytest.mark.parametrize("cores", [2, 3])
+def test_every_candidate_is_scored_once_by_parts_that_overlap(cores, monkeypatch):
+    monkeypatch.setattr(parameter_grids, "available_cpus", lambda: cores)
+    rng = np.random.default_rng(0)
+    pairs = [random_matches(rng, count, capacity=8) for count in rng.integers(0, 9, 13)]
+    pairs = jax.tree.map(lambda *leaves: np.stack(leaves), *pairs)
+    got = score_grid(MatchCount(), replace(pairs, confidence=None), max_distance=[0.7, 1.5])
+    np.testing.assert_array_equal(got, [(pairs.mask & (pairs.distance <= limit)).sum(1) for limit in (0.7, 1.5)])
 
 
 def test_kinds_of_weights_and_distances_are_axes_too(matches):

@@ -66,6 +66,12 @@ def test_capacities_are_few_and_hold_every_row(counts, step):
         assert capacities[-1] < counts.max() + step
 
 
+def test_a_capacity_is_worth_what_it_saves():
+    capacities, counts = np.array([8, 16]), np.array([8, 7, 0, 16, 5])
+    assert ragged.worthwhile(capacities, counts, 3 * 8).tolist() == [8, 16]
+    assert ragged.worthwhile(capacities, counts, 3 * 8 + 1).tolist() == [16]
+
+
 def test_empty_rows_make_no_capacity_smaller():
     counts = np.array([100, 100, 200])
     assert ragged.sizes(np.array([0] * 50 + [100, 100, 200]), (0.5, 1.0), 32).tolist() == [128, 224]

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mfvpr import balancing_c, combine, rank, rerank
-from mfvpr.reranking import fuse, fuse_scales
+from mfvpr import Shortlist, balancing_c, combine, rank, rerank
+from mfvpr.reranking import filter_scores, fuse, fuse_scales
 from tests import oracles
 
 pytestmark = pytest.mark.optimized
@@ -43,6 +43,11 @@ def test_combined_score_spans_plain_to_filter_order():
     np.testing.assert_array_equal(rank(combine(filter_scores, scores, c=0.0)), rank(scores))
     np.testing.assert_array_equal(rank(combine(filter_scores, scores)), rank(filter_scores))
     np.testing.assert_allclose(combine(filter_scores, scores, c=3.0), oracles.combine(filter_scores, scores, 3.0), 1e-6)
+
+
+def test_padding_is_no_similarity():
+    candidates = Shortlist(np.array([[3, -1]]), np.array([[0.5, 99.0]], np.float32), np.array([[True, False]]))
+    assert filter_scores(candidates, "negative_euclidean")[0, 0] == -1
 
 
 def test_balancing_c_equalizes_the_spread_of_real_candidates():
@@ -116,6 +121,8 @@ def test_a_scale_without_weight_takes_no_part_and_no_candidates_have_no_score():
         fuse_scales(scores, np.array([True, True, False]), np.array([0, 1], np.float32), normalize="none")
     )
     np.testing.assert_array_equal(fused, [1, 2, np.nan])
+    against = fuse_scales(scores, np.array([True, True, False]), np.array([0, -2], np.float32), normalize="none")
+    np.testing.assert_array_equal(against, [-2, -4, np.nan])
     assert fuse_scales(np.zeros((0, 2), np.float32), np.zeros(0, bool)).shape == (0,)
 
 

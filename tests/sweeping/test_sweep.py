@@ -211,6 +211,11 @@ def test_a_shape_is_compiled_where_that_costs_less_than_padding(pairs):
         assert settings * padding <= 4 * PROGRAM_SLOTS
 
 
+def test_the_largest_size_is_that_of_the_set_whatever_part_is_scored():
+    whole = MatchSet([], np.array([[300, 9], [9, 0]]), 320)
+    assert max(shapes(whole)) == max(shapes(replace(whole, counts=whole.counts[1:]))) == 320
+
+
 def test_slots_of_no_matches():
     assert (slots(MatchSet([], np.zeros((3, 2), int), 0)) == 32).all()
 
@@ -219,6 +224,9 @@ def test_memory_is_told_beforehand(data):
     match_set, _ = data
     assert sweeping.result_bytes(2, 10, 7, 3) == np.zeros((2, 10, 7, 3), np.int32).nbytes
     assert block_bytes(match_set, 10, 1) < block_bytes(match_set, 20, 1) < block_bytes(match_set, 20, 7)
+    uneven, largest = (MatchSet([], np.array(counts), 320) for counts in ([[0, 9], [300, 300], [9, 9]], [[300, 300]]))
+    many = 10**7  # settings, for which padding to one size would not pay
+    assert block_bytes(uneven, many, 1) == block_bytes(largest, many, 1)
 
 
 def other_matches(match_set, candidates):
