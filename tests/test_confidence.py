@@ -14,7 +14,7 @@ from scipy import special
 from mfvpr.confidence import confidence_inputs, fit_confidence, read_confidences, write_confidences
 from mfvpr.errors import InputError
 from mfvpr.evaluation import Positives
-from mfvpr.report.confidences import Assured
+from mfvpr.report.confidences import Assured, recall_by_share
 from mfvpr.results import Ranked
 
 NAMES = ("margin", "height", "filter", "score")
@@ -182,6 +182,15 @@ def test_other_files_are_refused_in_one_line(content, tmp_path):
     assert "\n" not in str(told.value)
     with pytest.raises(InputError, match="got nothing"):
         read_confidences(tmp_path / "none.json")
+
+
+def test_queries_without_an_answer_are_reranked_first():
+    """Then those that the filter is the least sure of."""
+    probabilities, right = np.linspace(0.99, 0.01, 20), {"filter": np.zeros(20, bool), "it": np.zeros(20, bool)}
+    probabilities[3] = np.nan
+    right["it"][3] = right["filter"][19] = True
+    assured: Any = SimpleNamespace(probabilities={"filter": probabilities}, right=right.__getitem__)
+    np.testing.assert_allclose(recall_by_share(assured, "it")[:4], [0.05, 0.1, 0.05, 0.05])
 
 
 def test_halves_of_drives_there_and_back_share_no_place():

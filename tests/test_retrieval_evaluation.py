@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 from mfvpr import frame_positives, radius_positives, recall_at_k, retrieve
 from mfvpr.errors import InputError
 from mfvpr.evaluation import Positives, Tally
-from mfvpr.retrieval import EXACT
+from mfvpr.retrieval import EXACT, ExactSearch
 from tests import oracles
 from tests.builders import unit
 
@@ -38,6 +38,13 @@ def test_a_descriptor_that_is_not_finite_never_appears():
     np.testing.assert_array_equal(shortlist.indices, [[2, 0, -1], [-1, -1, -1]])
     masked = retrieve(queries[:1], database, num_candidates=3, mask=np.array([True, True, False]))
     np.testing.assert_array_equal(masked.indices, [[0, -1, -1]])
+
+
+@pytest.mark.parametrize("memory", [None, 1e-9])
+def test_the_first_of_equal_rows_wins_whatever_is_searched_at_a_time(memory):
+    queries = np.eye(2, dtype=np.float32)
+    shortlist = ExactSearch(memory).shortlist(queries, queries[[0, 1, 0, 0, 1, 0]], 3)
+    np.testing.assert_array_equal(shortlist.indices, [[0, 2, 3], [1, 4, 0]])
 
 
 @given(st.lists(st.integers(-1, 9), min_size=1, max_size=8), st.integers(1, 10), st.integers(0, 5))

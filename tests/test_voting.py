@@ -43,7 +43,7 @@ def windows(seed, images, per_image=4, dimension=5):
 @pytest.mark.parametrize("num_candidates", [1, 3, 9, 12])
 def test_agrees_with_the_loop(num_candidates, memory):
     queries, database = windows(0, 7), windows(0, 9)
-    database[4], queries[2, 1, 0] = np.nan, np.inf
+    database[4, 1, 0], queries[2, 1, 0] = np.nan, np.inf
     got = voted(queries, database, num_candidates, search=ExactSearch(memory))
     assert_lists(got, by_loops(queries, database, num_candidates), num_candidates)
 

@@ -1,10 +1,13 @@
 """Principal components against a full singular value decomposition."""
 
+from dataclasses import astuple
+
 import numpy as np
 import pytest
 
 from mfvpr import whitening
 from mfvpr.errors import InputError
+from mfvpr.retrieval import WhitenedSearch
 from mfvpr.whitening import fit_bytes, fit_whitening
 
 
@@ -58,6 +61,13 @@ def test_a_component_without_variance_is_zero(shape):
 def test_too_few_vectors_are_refused(count, size, dimension, line):
     with pytest.raises(InputError, match=line):
         fit_whitening(np.random.default_rng(0).normal(size=(count, size)), dimension)
+
+
+def test_a_descriptor_that_is_not_finite_teaches_nothing():
+    sample = samples(40, 6, np.float32)
+    broken = np.insert(sample, [0, 20], [[np.nan, 1, 1, 1, 1, 1], [1, 1, 1, 1, 1, np.inf]], axis=0)
+    for got, expected in zip(*(astuple(WhitenedSearch(3).fit(one).whitening) for one in (broken, sample)), strict=True):
+        np.testing.assert_array_equal(got, expected)
 
 
 @pytest.mark.parametrize("value", [0.0, 0.1, 1e6])

@@ -47,6 +47,9 @@ def test_halves_of_a_map_where_most_queries_wait_at_its_end():
     first, second = halves_of_map(parts, "frames")
     assert len(first.report) == 2 * 40
     assert len(second.report) == 2 * 20
+    for end in (places, 59 - places):  # or at its start
+        parts = [Positives.from_matrix(frame_positives(end, np.arange(60), tolerance=1))] * 2
+        assert sorted(len(half.report) for half in halves_of_map(parts, "frames")) == [2 * 20, 2 * 40]
     nothing = halves_of_map([Positives.from_rows([[]] * 4, 3)] * 2, "m")
     assert [len(half.report) for half in nothing] == [4, 4]
 
@@ -76,6 +79,7 @@ def test_equals_are_told_apart_by_their_neighbors():
     assert best_setting(np.array([0.9, 0.1, 0.8, 0.9, 0.8]), axes) == 3
     assert best_setting(np.array([0.9, 0.1, 0.8, 0.9, 0.8])) == 0
     assert best_setting(np.array([0.2, 0.1, 0.8, 0.4, 0.7]), axes) == 2
+    assert best_setting(np.array([0.8, 0.9, 0.0, 0.7, 0.9, 0.7]), {"sigma": range(6)}) == 4  # on average
 
 
 def test_a_query_that_is_a_database_image_is_seen_where_it_is_reported():
