@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mfvpr import archive as archive_module
 from mfvpr import match, pipeline
 from mfvpr.archive import Archive
 from mfvpr.data.datasets import image_folder
@@ -143,6 +144,13 @@ def test_an_extractor_that_was_changed_is_another_one(folder, tmp_path, kept):
         extractor.number = number
         [features] = archive.local(folder, extractor)
         assert features.counts.tolist() == [number] * len(folder)
+
+
+def test_what_another_version_decodes_are_other_images(folder, monkeypatch):
+    known, recipe = archive_module.versions(), Archive().recipe(folder, SIFT)
+    for name in ("mfvpr", "opencv-python-headless", "pillow"):
+        monkeypatch.setattr(archive_module, "versions", lambda name=name: {**known, name: "0"})
+        assert Archive().recipe(folder, SIFT) != recipe
 
 
 @pytest.mark.parametrize("kept", [True, False])

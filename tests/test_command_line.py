@@ -10,6 +10,7 @@ import pytest
 from experiments import groups
 from experiments.benchmark.__main__ import main as benchmark
 from experiments.launch import version
+from experiments.quoting import as_typed
 from experiments.settings import CONF
 from tests.programs import ROOT, composed, run, typed
 
@@ -35,6 +36,14 @@ def test_help_has_every_setting_and_the_comments_of_conf(monkeypatch, capsys, pr
     assert "hydra:" not in stdout
     for group in ("system", "experiment"):
         assert (f"  {group}=null" in stdout) == (group in groups.groups(PROGRAMS[program]))
+
+
+@pytest.mark.parametrize(("argument", "alone", "in_multirun"), [
+    ("out=a,b", "out='a,b'", "out='a','b'"), ("dataset.queries=[a,b c]", *["dataset.queries=['a','b c']"] * 2),
+    ("candidates=5,10", "candidates=5,10", "candidates=5,10"),
+])  # fmt: skip
+def test_a_comma_is_part_of_a_path_unless_several_runs_are_asked_for(argument, alone, in_multirun):
+    assert (as_typed(argument), as_typed(argument, several=True)) == (alone, in_multirun)
 
 
 def test_help_is_of_the_groups_that_were_chosen(monkeypatch, capsys):

@@ -253,6 +253,7 @@ def test_what_is_excluded_is_not_right():
     np.testing.assert_array_equal(truth.positives(1).dense(), [[True] + [False] * 3, [False, True, False, False]])
     np.testing.assert_array_equal(truth.shows_place(1).dense(), [[True] * 3 + [False], [True, True, False, False]])
     assert not truth.positives(0).any()
+    np.testing.assert_array_equal(truth.shows_place(0).dense(), excluded)  # more than the tolerance alone
     assert (truth.place(0), truth.place(1), truth.unit) == (0, 1, "frames")
     everything = Positives.from_matrix(np.ones_like(excluded))
     assert AllowedTruth(truth, everything).place(0) is None

@@ -190,6 +190,19 @@ def test_values_that_cannot_be_used(path, change, message):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(("point", "is_inside"), [((645, 200), True), ((-6, 483), True), ((646, 200), False),
+                                                  ((-7, 200), False), ((300, 484), False)])  # fmt: skip
+def test_keypoints_may_lie_a_hundredth_of_the_image_outside(path, point, is_inside):
+    """640 x 480 pixels: as float16 rounds them, and as detectors extrapolate."""
+    append_hloc(path, "a.jpg", spoiled("keypoints", point)(hloc_parts(feature(1))))
+    source = open_features(path, ["a.jpg"])
+    if is_inside:
+        assert next(source.read())[1].keypoints[3].tolist() == list(point)
+    else:
+        with pytest.raises(InputError, match="expected keypoints"):
+            list(source.read())
+
+
 def test_lengths_of_descriptors(path):
     made = feature(0)
     lengths = np.linspace(0.5, 3, 30, dtype=np.float32)[:, None]

@@ -140,6 +140,7 @@ def test_unsure_answers_are_no_place(dataset, folder):
     assert refused.p_right < 1e-9
     assert (refused.reason, refused.shift, refused.shift_interval, refused.scale) == ("low confidence", *[None] * 3)
     assert refused.alternatives == sure.alternatives
+    assert asked(folder, confidence=SURE, threshold=sure.p_right).localize(image).place == sure.place
     with pytest.raises(InputError, match="expected a confidence as well"):
         asked(folder, threshold=0.5)
 
@@ -174,6 +175,17 @@ def test_a_file_has_one_name_under_every_spelling(dataset, tmp_path, monkeypatch
     for spelling in (root / name, f"{root.name}/./{name}", tmp_path / "link" / name):
         with pytest.raises(InputError, match="the map has an image of this name"):
             known.add(spelling, 0)
+
+
+def test_rows_are_seen_though_the_clock_of_the_folder_stands_still(dataset, tmp_path):
+    """As it does between two ticks, of seconds on some file systems."""
+    adding, other = (Map(tmp_path, Constant(), Constant(), candidates=3) for _ in range(2))
+    entries = tmp_path / "0000" / "entries"
+    for row, path in enumerate(dataset.database.paths[:3]):
+        adding.add(path, row)
+        os.utime(entries, ns=(0, 0))
+        other.refresh()
+        assert len(other) == row + 1
 
 
 def test_the_newest_rows_can_be_left_out(dataset, folder):

@@ -104,6 +104,16 @@ def test_layers_behind_a_sure_one_are_left_out(golden, sure):
         assert np.abs(found - golden["sure/None"]).max() > 0.1
 
 
+def test_less_is_sure_enough_behind_more_layers():
+    """A confidence of 0.85: below 0.9, the first layer's threshold, above 0.8 + 0.1 e^(-4 / 3), the second's."""
+    features = [padded(one, 40) for one in pair(SIZES[0], INPUTS, 0)]
+    weights, expected = (small(0, sure) for sure in (None, 1))
+    kernel, bias = (np.zeros_like(leaf) for leaf in weights.confidences)
+    even = weights._replace(confidences=type(weights.confidences)(kernel, bias + np.float32(np.log(0.85 / 0.15))))
+    found, stopped = (assigned(one, *features, depth_confidence=DEPTH) for one in (even, expected))
+    np.testing.assert_array_equal(found, stopped)
+
+
 def test_a_pair_depends_neither_on_its_padding_nor_on_its_batch():
     """One that stops early does not stop others."""
     pairs = [pair(counts, INPUTS, 5) for counts in ((20, 30), (30, 12), (7, 7))]

@@ -255,7 +255,8 @@ class TestInstall:
     def test_float64_is_rounded_and_that_is_noted(self, checkpoint):
         path, tensors = checkpoint
         third = tensors["net.conv.bias"].astype(np.float64) / 3
-        write_legacy(path, tensors | {"net.conv.bias": third})
+        unused = {"net.bn.num_batches_tracked": np.array(7.0)}  # float64 as well
+        write_legacy(path, tensors | {"net.conv.bias": third} | unused)
         install(path, "tiny")
         np.testing.assert_array_equal(load("tiny")["conv.bias"], third.astype(np.float32))
         assert read_manifest("tiny").rounded == 1
