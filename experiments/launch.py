@@ -18,7 +18,7 @@ def launch(program: Program, config: str = "config") -> None:
     """`program()(settings)` with the settings of conf/`config`.yaml and the command line, plain and checked."""
     with on_interrupt(leave), one_line():
         unwind_on_sigterm()
-        sys.unraisablehook = _keep_interrupt
+        sys.unraisablehook = keep_interrupt
         if isinstance(sys.stdout, io.TextIOWrapper):
             sys.stdout.reconfigure(errors="backslashreplace")  # names that the terminal cannot show cost no results
         if "--version" in sys.argv[1:]:
@@ -43,7 +43,7 @@ def version() -> str:
     return f"mfvpr {version('mfvpr')} (jax {version('jax')}, Python {sys.version.split()[0]})"
 
 
-def _keep_interrupt(lost: "sys.UnraisableHookArgs") -> None:
+def keep_interrupt(lost: "sys.UnraisableHookArgs") -> None:
     """Send Ctrl-C again where nobody could catch it, as in JAX's callback of the garbage collector."""
     if issubclass(lost.exc_type, KeyboardInterrupt):
         main = threading.main_thread().ident

@@ -43,7 +43,7 @@ def learn(settings: dict[str, Any]) -> None:
         if settings["report"]:
             others = len(data_sets.composed("report", settings["report"]))
             taught, reported = sets[:-others], sets[-others:]
-            _check_apart(taught, reported)
+            check_apart(taught, reported)
             whole = joined(*([one.part for one in some] for some in (taught, reported)))
         with watch("learning"):
             options = {"checkpoints": _checkpoints(settings, varied.scorer, whole, sets), "track": console.track}
@@ -96,7 +96,7 @@ def _prepared(settings: dict[str, Any], watch: Stopwatch) -> Prepared:
     return Prepared(part, images, recipe, truth.described(settings, images.dataset))
 
 
-def _check_apart(teach: list[Prepared], report: list[Prepared]) -> None:
+def check_apart(teach: list[Prepared], report: list[Prepared]) -> None:
     """Refuse to report on images that were learned on, and queries that would count twice."""
     for one, other in itertools.product(teach, report):
         sides = itertools.product(other.images.contents.values(), one.images.contents.values())

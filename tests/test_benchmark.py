@@ -183,13 +183,13 @@ def test_maps_are_matched_and_scored_as_in_torch(monkeypatch):
 
     for name, value in {"SELAVPR": (3, (9, 9), 16), "SPEED": (4, (6, 8), 32)}.items():
         monkeypatch.setattr(maps, name, value)
-    entries = [*maps._of_counts(maps.made_up(*maps.SELAVPR)), *maps._of_patches(maps.made_up(*maps.SPEED))]
+    entries = [*maps.count_entries(maps.made_up(*maps.SELAVPR)), *maps.patch_entries(maps.made_up(*maps.SPEED))]
     results = {(step, who): run() for step, who, run in entries}
     for step in (maps.COUNT, maps.RAPID):
         ours, theirs = (results[step, who] for who in (maps.MFVPR, "torch, candidate by candidate"))
         np.testing.assert_allclose(ours, theirs, rtol=1e-4)
         assert (np.diff(ours) > 0).all()  # those that show more
-    remarks = "\n".join(maps._remarks({key: [1.0, 2.0] for key in results}, results))
+    remarks = "\n".join(maps.list_remarks({key: [1.0, 2.0] for key in results}, results))
     for wanted in ("count: scores that differ: [0]", "and score: scores that differ: [0]", "1.00 x the matching"):
         assert wanted in remarks
 

@@ -140,12 +140,12 @@ def test_sets_of_one_map_are_not_independent(root, streets, tmp_path, capsys):
         settings = composed(*small(root), f"out={tmp_path}/out") | {"dataset": dataset | {"index_file": None}}
         _, images = learning.prepare.begun(settings, evaluation.Stopwatch())
         several.append(learning.Prepared(SimpleNamespace(name=name), images, {}, {}))
-    learning._check_apart([], several)
+    learning.check_apart([], several)
     assert capsys.readouterr().err.splitlines()[-1] == (
         "warning: there and back are of one map, but their queries are taken for independent, so that intervals are "
         "too narrow and p too low"
     )
-    learning._check_apart([], several[:1])
+    learning.check_apart([], several[:1])
     assert "of one map" not in capsys.readouterr().err
 
 

@@ -27,7 +27,7 @@ from mfvpr.errors import InputError
 from mfvpr.evaluation import Positives
 from mfvpr.evaluation.statistics import block_sign_flips, mcnemar
 from mfvpr.report import runs
-from mfvpr.report.evaluations import _Page
+from mfvpr.report.evaluations import Page
 from mfvpr.scoring import HistogramOfShifts
 from tests.programs import CANDIDATES, QUERIES, ROOT, composed, shared, small, typed
 
@@ -178,11 +178,11 @@ def test_a_wrong_figure_has_the_right_image_below(evaluated, outcome):
     names = outcome.images.dataset.database.names
     query = found[True]
     rank = int(np.argmax(right[query]))
-    [answer] = page._right_answer(query)
+    [answer] = page.correct_predictions(query)
     score = f"{ranked.scores[query, rank]:.5g}"
     assert answer.caption == f"right: {names[ranked.rows[query, rank]]}, rank {rank + 1}, score {score}"
     assert float(answer.explanation.score) == pytest.approx(float(score), rel=1e-3)
-    [answer] = page._right_answer(found[False])
+    [answer] = page.correct_predictions(found[False])
     place = outcome.images.dataset.truth.place(found[False])
     assert answer.caption == f"right: {names[place]}, not among the 3 candidates"
     assert answer.matches is None
@@ -193,7 +193,7 @@ def page_of(outcome, **changes):
     result = outcome.judged.result
     dataset = replace(result.dataset, sequences=(replace(result.dataset.only, **changes),))
     judged = replace(outcome.judged, result=replace(result, dataset=dataset))
-    return _Page(judged, 0, outcome.tools.extractor, HistogramOfShifts())
+    return Page(judged, 0, outcome.tools.extractor, HistogramOfShifts())
 
 
 def test_what_does_not_count_is_never_shown_as_right(outcome):
@@ -206,7 +206,7 @@ def test_what_does_not_count_is_never_shown_as_right(outcome):
 
     def answers(excluded):
         page = page_of(outcome, truth=AllowedTruth(truth, Positives.from_matrix(excluded)))
-        return [answer.caption for answer in page._right_answer(query)]
+        return [answer.caption for answer in page.correct_predictions(query)]
 
     other = int(np.argmax(outcome.judged.right[0].dense()[query] & ~excluded[query]))
     assert answers(excluded) == [f"right: {names[other]}, not among the 3 candidates"]

@@ -27,7 +27,7 @@ from mfvpr.models.ssm import SsmVgg
 from mfvpr.scoring import GridAnchors
 from mfvpr.sequence_matching import match_sequence, matches_recipe
 from mfvpr.sources import FeatureSet
-from mfvpr.stores.features import _pack, forecast_bytes
+from mfvpr.stores.features import forecast_bytes, pack_features
 from mfvpr.voting import SsmVoting
 from mfvpr.whitening import Whitening, fit_whitening
 from tests.builders import local
@@ -204,7 +204,7 @@ def test_stores_take_little_more_than_half_of_it(cells, dataset, tmp_path):
         dataset.database, fitted(replace(cells, whitening=WindowFitting(100)), dataset.database, archive)
     )
     [(_, one)] = found.read([0])
-    parts = _pack(one)
+    parts = pack_features(one)
     assert one.descriptors.nbytes == 12 * 100 * 4
     assert sum(part.nbytes for part in parts.values()) == 12 * (100 * 2 + 4 + 8 + 4) + 8
     assert forecast_bytes(1, 1600, 100) / (1600 * 100 * 4) == pytest.approx(0.55, abs=0.01)

@@ -376,5 +376,5 @@ def test_a_lost_ctrl_c_comes_again():
     """What is raised in a callback of the garbage collector, nobody can catch. It comes at once, even to who sleeps."""
     start = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
-        launch._keep_interrupt(SimpleNamespace(exc_type=KeyboardInterrupt)) or time.sleep(20)
+        launch.keep_interrupt(SimpleNamespace(exc_type=KeyboardInterrupt)) or time.sleep(20)
     assert time.monotonic() - start < 10

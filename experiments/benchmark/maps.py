@@ -29,14 +29,14 @@ def run(rounds: int | None, out: Path) -> None:
     lineup = Lineup(
         title=f"1 query x candidates: {shapes}",
         setting={"selavpr": SELAVPR, "patch_netvlad": SPEED},
-        entries=[*_of_counts(made_up(*SELAVPR)), *_of_patches(made_up(*SPEED))],
+        entries=[*count_entries(made_up(*SELAVPR)), *patch_entries(made_up(*SPEED))],
         rounds=7,
-        remarks=_remarks,
+        remarks=list_remarks,
     )
     compete(lineup, rounds, out)
 
 
-def _remarks(seconds: Seconds, results: Results) -> Iterator[str]:
+def list_remarks(seconds: Seconds, results: Results) -> Iterator[str]:
     for step in (COUNT, MATCHING):
         pairs = zip(seconds[step, MFVPR], seconds[step, PRODUCTS], strict=True)
         yield f"{step}: {np.median([whole / bare for whole, bare in pairs]):.2f} x {PRODUCTS}"
@@ -49,7 +49,7 @@ def _remarks(seconds: Seconds, results: Results) -> Iterator[str]:
         yield f"{step}: scores that differ: {[int((np.abs(ours - one) > 1e-3 * np.abs(one)).sum()) for one in others]}"
 
 
-def _of_counts(images: tuple[Features, Features]) -> list[Entry]:
+def count_entries(images: tuple[Features, Features]) -> list[Entry]:
     query, candidates = images
     return [
         (COUNT, MFVPR, _ranked(images, mfvpr.MatchCount(single="zero"))),
@@ -58,7 +58,7 @@ def _of_counts(images: tuple[Features, Features]) -> list[Entry]:
     ]
 
 
-def _of_patches(images: tuple[Features, Features]) -> list[Entry]:
+def patch_entries(images: tuple[Features, Features]) -> list[Entry]:
     (query, candidates), (_, (rows, columns), _) = images, SPEED
     places = np.asarray(query.keypoints) / 16
     largest = np.array([columns - 1, rows - 1])

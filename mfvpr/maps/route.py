@@ -23,7 +23,7 @@ from mfvpr.maps.answers import Answer
 from mfvpr.numerics import compiled
 from mfvpr.types import Array
 
-_FIRST = 1024  # rows; twice as many whenever they do not suffice, and a program for each
+FIRST_ROWS = 1024  # rows; twice as many whenever they do not suffice, and a program for each
 _REACH = 4  # standard deviations of the motion
 MOST = 10_000  # rows from one image to the next
 NEAR = 2  # rows beside a place that are taken for it
@@ -74,7 +74,7 @@ class Route:
 
     def __init__(self, drive: Drive) -> None:
         """It may be anywhere."""
-        self._drive, self._belief = drive, np.zeros(_FIRST, np.float32)
+        self._drive, self.belief = drive, np.zeros(FIRST_ROWS, np.float32)
         self._motion = motion(drive.advance, drive.spread)
 
     def __call__(self, answer: Answer | None, there: np.ndarray) -> Located | None:
@@ -90,19 +90,19 @@ class Route:
         if (last := max((one.row for one in found), default=-1)) >= len(there):
             raise InputError(f"there: expected the rows of the map that answered, up to {last} at least, got "
                              f"{len(there)}")  # fmt: skip
-        while len(there) > len(self._belief):
-            self._belief = np.concatenate([self._belief, np.zeros_like(self._belief)])
-        drive, allowed = self._drive, np.zeros(len(self._belief), bool)
+        while len(there) > len(self.belief):
+            self.belief = np.concatenate([self.belief, np.zeros_like(self.belief)])
+        drive, allowed = self._drive, np.zeros(len(self.belief), bool)
         allowed[: len(there)] = there
-        says = np.zeros(len(self._belief), np.float32)
+        says = np.zeros(len(self.belief), np.float32)
         if found:
             rows, scores = np.array([one.row for one in found]), np.array([one.score for one in found])
             says[rows] = shares(scores, drive.sharpness)
         p = drive.p_right if answer is None or answer.p_right is None else answer.p_right
-        belief = step(self._belief, allowed, self._motion, np.float32(drive.kidnapped), says, np.float32(p))
-        self._belief = np.asarray(belief)
-        row = int(np.argmax(self._belief))
-        return Located(row, min(1.0, float(self._belief[max(0, row - NEAR) : row + NEAR + 1].sum())))
+        belief = step(self.belief, allowed, self._motion, np.float32(drive.kidnapped), says, np.float32(p))
+        self.belief = np.asarray(belief)
+        row = int(np.argmax(self.belief))
+        return Located(row, min(1.0, float(self.belief[max(0, row - NEAR) : row + NEAR + 1].sum())))
 
 
 def motion(advance: float, spread: float) -> np.ndarray:

@@ -160,14 +160,14 @@ def figures(
     return [
         (f"{folders[sequence.name]}/{name}" if several else name, partial(page.draw, query=query, verdict=verdict))
         for place, sequence in enumerate(judged.sequences)
-        for page in [_Page(judged, place, extractor, histogram or HistogramOfShifts())]
+        for page in [Page(judged, place, extractor, histogram or HistogramOfShifts())]
         for query, verdict in page.shown(shown).items()
         for name in [f"{verdict}_{query:04d}.png"]
     ]
 
 
 @dataclass(frozen=True)
-class _Page:
+class Page:
     """One sequence, for its figures."""
 
     judged: Judged
@@ -205,7 +205,7 @@ class _Page:
     def draw(self, path: Path, query: int, verdict: str) -> None:
         """What was answered; where that is wrong, below it what is right."""
         names, truth = self.sequence.images.names, self.sequence.truth
-        answers = [self._answer(query, 0, verdict), *(self._right_answer(query) if verdict == "wrong" else [])]
+        answers = [self._answer(query, 0, verdict), *(self.correct_predictions(query) if verdict == "wrong" else [])]
         within = "" if truth is None else threshold_words(truth.unit, self.judged.threshold)
         answer = self.database.names[self.ranked.rows[query, 0]]
         about = dict(zip(ABOUT, (self.judged.headline, self.sequence.name, verdict, names[query], answer), strict=True))
@@ -224,7 +224,7 @@ class _Page:
         caption = f"{verdict}: {_short(self.database.names[row])}, rank {rank + 1}, score {score:.5g}"
         return Answer(self._image(self.database, row), caption, pair, explain(self.histogram, pair))
 
-    def _right_answer(self, query: int) -> list[Answer]:
+    def correct_predictions(self, query: int) -> list[Answer]:
         """The first right candidate; else the right image, which the filter missed; nothing where there is none."""
         ranked, right = self.judged.is_right(self.judged.headline, self.place), self.judged.right[self.place]
         truth = self.sequence.truth

@@ -52,7 +52,7 @@ def tallest_bins(shifts: Array, weights: Array, lattice: Lattice, capacity: int)
         return _all_bins(pairs, capacity, batch_size=max(1, PAIRS_AT_ONCE // num_weights))
 
     def one(pair: Any) -> Array:
-        found, done = _search(*pair, capacity=capacity)
+        found, done = search_blocks(*pair, capacity=capacity)
         return jax.lax.cond(done, lambda: found, lambda: of_all_bins(*pair, capacity=capacity))
 
     return jax.lax.map(one, pairs)
@@ -67,12 +67,12 @@ def _all_bins(pairs: Any, capacity: int, *, batch_size: int | None = None) -> Ar
     return jax.lax.map(lambda pair: of_all_bins(*pair, capacity=capacity), pairs, batch_size=batch_size)
 
 
-def _search(shifts: Array, weights: Array, lattice: Lattice, capacity: int) -> tuple[Array, Array]:
+def search_blocks(shifts: Array, weights: Array, lattice: Lattice, capacity: int) -> tuple[Array, Array]:
     """Of one pair the tallest bins `[W]`, and whether they are: no block that is left can hold a taller one."""
-    side = _side(capacity)
+    side = block_side(capacity)
     count = -(-capacity // side)
     usable = jnp.all(jnp.isfinite(weights), axis=1)
-    bounds = _bounds(shifts, jnp.where(usable[:, None], weights, 0.0), lattice, side, count)
+    bounds = block_bounds(shifts, jnp.where(usable[:, None], weights, 0.0), lattice, side, count)
 
     def promise(tallest: Array, left: Array) -> tuple[Array, Array]:
         """The blocks whose bounds exceed the tallest bins most, and by which factor, of those that are left."""
@@ -83,7 +83,7 @@ def _search(shifts: Array, weights: Array, lattice: Lattice, capacity: int) -> t
 
     def step(state: tuple) -> tuple:
         rounds, tallest, left, _, blocks = state
-        tallest = jnp.maximum(tallest, _evaluate(blocks, shifts, weights, lattice, side, count))
+        tallest = jnp.maximum(tallest, evaluate_blocks(blocks, shifts, weights, lattice, side, count))
         left = left.at[blocks].set(False)
         return rounds + 1, tallest, left, *promise(tallest, left)
 
@@ -95,12 +95,12 @@ def _search(shifts: Array, weights: Array, lattice: Lattice, capacity: int) -> t
     return jnp.where(usable, tallest, jnp.nan), factors[0] <= 1
 
 
-def _side(capacity: int) -> int:
+def block_side(capacity: int) -> int:
     """Bins along a side of a block."""
     return 2 if capacity <= 48 else 3 if capacity <= 96 else 4 if capacity <= 256 else 8
 
 
-def _bounds(shifts: Array, weights: Array, lattice: Lattice, side: int, count: int) -> Array:
+def block_bounds(shifts: Array, weights: Array, lattice: Lattice, side: int, count: int) -> Array:
     """`[count (y), W, count (x)]` what no bin of a block exceeds, 0 for blocks out of range."""
     width = side * lattice.bin_size
     narrow = width <= lattice.deviation
@@ -132,7 +132,7 @@ def _block_votes(shifts: Array, axis: int, start: Array, lattice: Lattice, side:
     return gaussian(distance, lattice.deviation, jnp.where(narrow, jnp.inf, truncate))
 
 
-def _evaluate(blocks: Array, shifts: Array, weights: Array, lattice: Lattice, side: int, count: int) -> Array:
+def evaluate_blocks(blocks: Array, shifts: Array, weights: Array, lattice: Lattice, side: int, count: int) -> Array:
     """`[W]` tallest bin in range of some blocks `[n]`."""
 
     inner = jnp.arange(side, dtype=shifts.dtype)[None]

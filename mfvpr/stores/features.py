@@ -42,7 +42,7 @@ def open_store(
     Raises:
         InputError: made from something else, or no store at all.
     """
-    return open_rows(folder, kind, recipe, {"num_images": num_images}, pack=_pack, unpack=_unpack, **options)
+    return open_rows(folder, kind, recipe, {"num_images": num_images}, pack=pack_features, unpack=_unpack, **options)
 
 
 def forecast_bytes(num_images: int, features_per_image: float, dimension: int) -> int:
@@ -52,10 +52,10 @@ def forecast_bytes(num_images: int, features_per_image: float, dimension: int) -
 
 def as_stored(features: Features) -> Features:
     """Features `[N, ...]` as they come back from a store: without padding, descriptors to 5e-4."""
-    return _unpack(_pack(features))
+    return _unpack(pack_features(features))
 
 
-def _pack(features: Features) -> dict[str, np.ndarray]:
+def pack_features(features: Features) -> dict[str, np.ndarray]:
     mask = np.asarray(features.mask)
     keypoints, descriptors, scores = (
         np.asarray(values, np.float32)[mask] for values in (features.keypoints, features.descriptors, features.scores)

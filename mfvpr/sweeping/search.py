@@ -90,7 +90,7 @@ def search_optuna(
     rows = [ranked(settings, track("own values"))]
     for start in range(0, trials, BATCH):
         asked = [study.ask() for _ in range(min(BATCH, trials - start))]
-        proposed = [_suggested(trial, axes) for trial in asked]
+        proposed = [suggest_setting(trial, axes) for trial in asked]
         rows.append(ranked(proposed, track(f"trials {start + 1} to {start + len(asked)}")))
         recall = judge.tuning(rows[-1])[..., judge.main].mean(axis=0)
         for trial, value in zip(asked, recall, strict=True):
@@ -119,7 +119,7 @@ def _ranker(
     )  # fmt: skip
 
 
-def _suggested(trial: "optuna.Trial", axes: Axes) -> dict[str, Any]:
+def suggest_setting(trial: "optuna.Trial", axes: Axes) -> dict[str, Any]:
     whole = {name for name, parameter in declared(axes.scorer).items() if parameter.whole}
     return {name: _drawn(trial, name, values, whole=name in whole) for name, values in axes.values.items()}
 

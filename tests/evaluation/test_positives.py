@@ -87,7 +87,6 @@ def test_more_rankings_than_are_looked_up_at_once():
     rows = rng.integers(-1, 1000, (2, 1500, 400)).astype(np.int32)
     found = Positives.from_matrix(matrix)
     np.testing.assert_array_equal(found.contains(rows), matrix[np.arange(1500)[:, None], rows] & (rows >= 0))
-    assert len(found._cuts(800)) > 2
 
 
 @pytest.mark.parametrize(

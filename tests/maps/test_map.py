@@ -356,7 +356,7 @@ def test_two_do_not_add_at_the_same_time(dataset, tmp_path):
     first, second = asked(tmp_path / "map"), asked(tmp_path / "map")
     first.learn(dataset.database)
     second.refresh()
-    with first._adding(), pytest.raises(InputError, match="in use by process"):
+    with map_store.hold_map(first.folder), pytest.raises(InputError, match="in use by process"):
         second.add(dataset.database.paths[0], 0)
     second.add(dataset.database.paths[0], 0)
     assert first.localize(dataset.database.paths[0]).place == 0

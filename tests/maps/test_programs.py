@@ -19,6 +19,7 @@ from mfvpr.confidence import Confidence, write_confidences
 from mfvpr.data.images import read_image
 from mfvpr.data.videos import frames
 from mfvpr.errors import InputError
+from mfvpr.stores.maps import hold_map
 from tests.programs import ROOT, composed, typed
 
 QUICK = ["features.max_keypoints=60", "features.image_size=[160,120]", "retrieval.num_words=8", "candidates=5"]
@@ -348,8 +349,7 @@ def test_a_file_that_vanishes_while_its_folder_is_listed_does_not_end_the_watch(
 
 
 def test_two_do_not_add_their_drives_at_the_same_time(twice, folder, monkeypatch, capsys):
-    other = maps.opened(folder)
-    with other._adding():
+    with hold_map(folder):
         code, stdout, stderr = called(monkeypatch, capsys, "localize", f"map={folder}", f"images={twice}", "add=true")
     assert (code, stdout) == (2, "")
     assert "in use by process" in stderr

@@ -58,7 +58,7 @@ def test_it_is_the_filter_that_its_first_lines_state():
         row, near = found(answer(scores, p), there)
         assert row == np.argmax(belief)
         assert near == pytest.approx(sum(belief[max(0, row - 2) : row + 3]), rel=1e-4)
-        np.testing.assert_allclose(found._belief[:40], belief, rtol=1e-3, atol=1e-7)
+        np.testing.assert_allclose(found.belief[:40], belief, rtol=1e-3, atol=1e-7)
 
 
 def test_without_motion_and_news_the_belief_stays():
@@ -83,8 +83,8 @@ def test_half_a_row_is_half_a_row():
     found(sharp(20), there)
     for _ in range(20):
         found(None, there)
-    np.testing.assert_allclose(found._belief[:100] @ np.arange(100), 30, atol=0.05)
-    np.testing.assert_allclose(found._belief[:100] @ (np.arange(100) - 30) ** 2, 20, rtol=0.05)  # variances add
+    np.testing.assert_allclose(found.belief[:100] @ np.arange(100), 30, atol=0.05)
+    np.testing.assert_allclose(found.belief[:100] @ (np.arange(100) - 30) ** 2, 20, rtol=0.05)  # variances add
 
 
 def test_it_finds_a_robot_that_was_carried_away():
@@ -106,11 +106,11 @@ def test_a_sum_of_one_and_never_nan():
     there, found = np.ones(30, bool), Route(Drive(1, 0.1, 0.0))
     for says in (sharp(3), sharp(20), None, answer({4: math.nan}, 1.0), answer({4: math.inf, 5: 1.0}, 1.0), sharp(0)):
         located = found(says, there)
-        assert found._belief.sum() == pytest.approx(1, abs=1e-5)
+        assert found.belief.sum() == pytest.approx(1, abs=1e-5)
         assert 0 <= located.p <= 1
     for _ in range(200):  # beyond the end of the map, where nothing is left
         located = found(None, there)
-        assert found._belief.sum() == pytest.approx(1, abs=1e-5)
+        assert found.belief.sum() == pytest.approx(1, abs=1e-5)
 
 
 def test_what_image_and_motion_exclude_is_left_to_the_motion():
@@ -138,7 +138,7 @@ def test_the_map_may_grow_and_costs_few_programs(compilations):
         assert found(sharp(rows - 1), np.ones(rows, bool)).row < rows
     assert compilations.count == 0
     assert found(sharp(1500), np.ones(1600, bool)).row == 1500
-    assert len(found._belief) == 2 * route._FIRST
+    assert len(found.belief) == 2 * route.FIRST_ROWS
 
 
 def test_rows_that_are_not_there_are_no_place():
@@ -146,7 +146,7 @@ def test_rows_that_are_not_there_are_no_place():
     there[11] = False
     found(sharp(10), there)
     assert found(None, there).row != 11
-    assert found._belief[11] == 0
+    assert found.belief[11] == 0
 
 
 @pytest.mark.parametrize(("scores", "expected"), [

@@ -29,7 +29,7 @@ SLOTS, WEIGHTINGS = 64, 8  # a search with every one of the capacities
 CAPACITIES = {20.0: 40, 10.0: 72, 5.0: 136, 3.0: 296}  # by bin size, with blocks of 2, 3, 4 and 8 bins
 pairs = jax.jit(tallest_bins, static_argnums=3)
 score = jax.jit(lambda scorer, matches: scorer(matches))
-bounds = jax.jit(tallest._bounds, static_argnums=(3, 4))
+bounds = jax.jit(tallest.block_bounds, static_argnums=(3, 4))
 
 
 def stack(trees):
@@ -104,7 +104,7 @@ def test_no_bin_is_taller(histogram):
 @given(histograms())
 def test_a_bound_exceeds_all_bins_of_its_block(histogram):
     shifts, weights, lattice, capacity = histogram
-    side = tallest._side(capacity)
+    side = tallest.block_side(capacity)
     count = -(-capacity // side)
     expected, _ = all_bins(shifts, weights, lattice, np.float64)
     padded = np.zeros((WEIGHTINGS, count * side, count * side))
@@ -127,14 +127,14 @@ def test_most_blocks_are_left_out(monkeypatch):
     shifts = (pair.points1 - pair.points0).T
     lattice = jax.tree.map(np.float32, Lattice(np.full(2, -336 + 2.5), np.full(2, 135), 5.0, 15.0, np.inf))
     evaluated = []
-    evaluate = tallest._evaluate
+    evaluate = tallest.evaluate_blocks
 
     def noted(blocks, *inputs):
         jax.debug.callback(lambda blocks: evaluated.extend(blocks.tolist()), blocks)
         return evaluate(blocks, *inputs)
 
-    monkeypatch.setattr(tallest, "_evaluate", noted)
-    jax.block_until_ready(jax.jit(partial(tallest._search, capacity=136))(shifts, pair.scores0[None], lattice))
+    monkeypatch.setattr(tallest, "evaluate_blocks", noted)
+    jax.block_until_ready(jax.jit(partial(tallest.search_blocks, capacity=136))(shifts, pair.scores0[None], lattice))
     jax.effects_barrier()
     assert len(evaluated) == len(set(evaluated))
     assert 0 < len(evaluated) <= 34**2 // 10

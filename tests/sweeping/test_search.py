@@ -111,7 +111,7 @@ def test_optuna_draws_within_the_axes():
     optuna = pytest.importorskip("optuna")
     values = {"num_bins": [4, 9], "tolerance": [1.5, 4.0], "weight": ["fs", "unit"], "window": [6]}
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=1))
-    drawn = [search._suggested(study.ask(), Axes(mfvpr.AnchorPoints(), values, {})) for _ in range(20)]
+    drawn = [search.suggest_setting(study.ask(), Axes(mfvpr.AnchorPoints(), values, {})) for _ in range(20)]
     for setting in drawn:
         assert type(setting["num_bins"]) is int
         assert 4 <= setting["num_bins"] <= 9
