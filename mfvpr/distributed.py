@@ -9,7 +9,8 @@ Every process calls the same, in the same order; each holds its part, and all ge
 `jax.distributed` the devices are those of this process.
 """
 
-from functools import partial
+from collections.abc import Callable
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -19,7 +20,7 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from mfvpr.errors import InputError
 from mfvpr.evaluation.positives import Positives
-from mfvpr.numerics import Device, masked, round_up
+from mfvpr.numerics import Device, compiled, held, masked, round_up
 from mfvpr.reranking import BIN_STEP, check_candidates
 from mfvpr.retrieval import retrieve
 from mfvpr.scoring import Scorer, check_host, on_host
@@ -131,14 +132,16 @@ def score_spread(scorer: Scorer, matches: Matches, *, mesh: Mesh) -> np.ndarray:
     spread = NamedSharding(mesh, PartitionSpec(AXIS))
     everywhere = jax.tree.map(lambda field: jax.make_array_from_process_local_data(spread, np.asarray(field)), matches)
     fitted = fit(scorer, np.asarray(matches.image_size0), np.asarray(matches.image_size1), multiple=BIN_STEP)
-    return np.asarray(_scored(fitted, everywhere, mesh=mesh))
+    return np.asarray(_score_all(mesh)(held(fitted), everywhere))
 
 
-@partial(jax.jit, static_argnames="mesh")
-def _scored(scorer: Scorer, matches: Matches, *, mesh: Mesh) -> Array:
+@cache
+def _score_all(mesh: Mesh) -> Callable[[Scorer, Matches], Array]:
+    """The program of a mesh; scores `[Q, C]`."""
+
     def own(scorer: Scorer, some: Matches) -> Array:
         scores = jax.lax.map(jax.vmap(scorer), some)  # query by query, all candidates of each
         return jax.lax.all_gather(scores, AXIS, axis=0, tiled=True)
 
     spread, whole = PartitionSpec(AXIS), PartitionSpec()
-    return jax.shard_map(own, mesh=mesh, in_specs=(whole, spread), out_specs=whole, check_vma=False)(scorer, matches)
+    return compiled(jax.shard_map(own, mesh=mesh, in_specs=(whole, spread), out_specs=whole, check_vma=False))

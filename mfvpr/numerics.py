@@ -114,22 +114,40 @@ def masked_std(values: Array, mask: Array) -> Array:
 def compiled(function: Function, **options: Any) -> Function:
     """`jax.jit` of what is plural, where it is defined; under a caller's `jit` it is inlined.
 
+    The classes of all nodes of the arguments choose the program as well, whoever registered them.
+
     With a plain function among the arguments, such as a user's scorer, or the weight of one, it runs op by op: a kept
     program would go on with what the function's closure held at the first call (as it does where a function stands in a
     static field). `held` is for many calls in a row.
     """
-    program = jax.jit(function, **options)
+    programs: dict[tuple[type, ...], Any] = {}
 
     @wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:
-        return (function if holds_function((arguments, named)) else program)(*arguments, **named)
+        leaves, classes = leaves_and_classes((arguments, named))
+        if any(map(callable, leaves)):
+            return function(*arguments, **named)
+        if classes not in programs:  # `jit` shares programs between equal functions, and a `partial` equals no other
+            programs.setdefault(classes, jax.jit(partial(function), **options))
+        return programs[classes](*arguments, **named)
 
     return call  # pyright: ignore[reportReturnType]
 
 
+def leaves_and_classes(tree: Any) -> tuple[list[Any], tuple[type, ...]]:
+    """The leaves of a pytree, and the classes of its nodes, parents first.
+
+    Up to jaxlib 0.10 tree structures are equal whatever the classes that `jax.tree_util.register_dataclass` registered.
+    """
+    seen: list[Any] = []
+    leaves = jax.tree.leaves(tree, is_leaf=seen.append)  # which is asked of every node, and gives None: not a leaf
+    of_leaves = set(map(type, leaves))
+    return leaves, tuple([cls for cls in map(type, seen) if cls not in of_leaves])
+
+
 def holds_function(tree: Any) -> bool:
     """Whether a leaf is a plain function, as a user's scorer may be, or the weight of one."""
-    return any(callable(leaf) for leaf in jax.tree.leaves(tree))
+    return any(map(callable, jax.tree.leaves(tree)))
 
 
 def held(tree: Tree) -> Tree:

@@ -29,7 +29,8 @@ def value(cls: Class) -> Class:
     Unflattening calls no `__init__`.
 
     `jax.tree_util.register_dataclass` registers the same, but up to jaxlib 0.10 at least its nodes are compared without
-    their class: `jit` takes one class's program for another's, by the luck of the hashes.
+    their class. The programs of this library tell the classes apart. A `jit` of your own may take the program of one
+    class for that of another, by the luck of the hashes.
     """
     made: Any = cls if is_dataclass(cls) and "__dataclass_fields__" in vars(cls) else dataclass(frozen=True)(cls)
     static = [f.name for f in fields(made) if f.metadata.get("static")]

@@ -1,6 +1,11 @@
 """`value`: dataclasses that jit tells apart, whatever they hold."""
 
-from dataclasses import FrozenInstanceError, dataclass, field, fields
+import os
+import subprocess
+import sys
+from dataclasses import FrozenInstanceError, dataclass, field, fields, make_dataclass
+from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +14,13 @@ import pytest
 from jax.extend.core import jaxpr_as_fun
 
 import mfvpr
+from mfvpr.distributed import _score_all, all_devices
+from mfvpr.match_sets import MatchSet
+from mfvpr.sweeping.settings import groups
+from mfvpr.sweeping.sweep import _program
 from mfvpr.types import per_match, per_pair
-from tests.builders import random_matches
+from tests.builders import of_query, random_matches
+from tests.programs import ROOT
 
 
 def one_number(factor):
@@ -42,10 +52,82 @@ def test_jit_never_takes_one_class_for_another():
 
 def test_nor_do_grids_and_candidates():
     matches = jax.tree.map(lambda leaf: leaf[None], random_matches(np.random.default_rng(0), 3))
-    for factor in range(60):
+    for factor in range(8):
         scorer = one_number(factor)()
         np.testing.assert_array_equal(mfvpr.score_grid(scorer, matches, number=[1.0, 2.0])[:, 0], [factor, 2 * factor])
         assert mfvpr.score_candidates(scorer, matches) == factor
+
+
+def registered(number, log):
+    """A class of scorers as users register it in JAX's own way; `log` gets the numbers of those that are called."""
+
+    def call(self, matches):
+        log.append(number)
+        return self.factor * jnp.any(matches.mask).astype(jnp.float32)
+
+    fields = [("factor", float, 1.0)]
+    return jax.tree_util.register_dataclass(
+        make_dataclass(f"Score{number}", fields, frozen=True, namespace={"__call__": call})
+    )
+
+
+ENTRIES = {
+    "score_candidates": lambda scorer, matches: mfvpr.score_candidates(scorer, matches),
+    "score_grid": lambda scorer, matches: mfvpr.score_grid(scorer, matches, factor=[1.0, 2.0]),
+    "score_spread": lambda scorer, matches: _score_all(all_devices())(scorer, jax.tree.map(lambda x: x[None], matches)),
+}
+
+
+def check_classes(entry, count=40):
+    """Whoever is called while a program is traced is whom it computes."""
+    matches, log = jax.tree.map(lambda leaf: leaf[None], random_matches(np.random.default_rng(0), 3)), []
+    for number in range(count):
+        scorer = registered(number, log)()
+        jax.eval_shape(lambda matches, scorer=scorer: ENTRIES[entry](scorer, matches), matches)
+        assert log[-1:] == [number]
+
+
+@pytest.mark.parametrize("entry", ENTRIES)
+def test_no_program_takes_a_class_that_jax_registered_for_another(entry):
+    check_classes(entry)
+
+
+@pytest.mark.slow
+def test_nor_with_other_hashes():
+    code = "from tests.test_types import check_classes; check_classes('score_candidates', 100)"
+    for seed in range(2):
+        environment = os.environ | {"PYTHONHASHSEED": str(seed)}
+        assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment).returncode == 0
+
+
+def test_the_program_of_a_sweep_is_that_of_its_class():
+    log = []
+    rows, counts = of_query([random_matches(np.random.default_rng(0), 3)])
+    match_set = MatchSet.of([rows], np.array([counts]))
+    work = SimpleNamespace(match_set=match_set, settings=1)
+    for number in range(60):
+        [group] = groups(registered(number, log)(), [{"factor": 1.0}], match_set.image_sizes)
+        _program(work, group)
+        assert log[-1:] == [number]
+
+
+PROGRAMS_OF_THEIR_OWN = {
+    "features/network.py",  # of a new function, which has one model
+    "learned_weight.py",  # of matches alone
+    "learning/teaching.py",  # of a new function, which has one model
+    "learning/training.py",  # of a new function, which has one kind of parameters
+    "lightglue.py",  # of networks of Flax, whose classes jit compares
+    "numerics.py",
+    "sweeping/sweep.py",  # of a new function
+    "testing.py",  # of new functions, each of which has one scorer
+    "distributed.py",  # of arrays alone
+}
+
+
+def test_all_other_programs_are_made_where_classes_are_compared():
+    package = Path(mfvpr.__file__).parent
+    modules = {str(path.relative_to(package)) for path in package.rglob("*.py") if "jax.jit" in path.read_text()}
+    assert modules == PROGRAMS_OF_THEIR_OWN
 
 
 def test_classes_without_leaves_are_told_apart_too():

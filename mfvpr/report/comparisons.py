@@ -14,6 +14,7 @@ from mfvpr.evaluation.statistics import SignFlips, block_sign_flips, estimate, m
 from mfvpr.learned_weight import LearnedWeight
 from mfvpr.learning.comparison import Comparison, Row
 from mfvpr.learning.training import Fit
+from mfvpr.numerics import compiled
 from mfvpr.report.learning_figures import curves_figure, weights_figure
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table, written
@@ -160,8 +161,8 @@ def _weights_figure(path: Path, comparison: Comparison, weights: Mapping[str, Le
     weights_figure(path, next(iter(weights.values())).names, np.concatenate(inputs), joined, np.concatenate(right))
 
 
-_weigh = jax.jit(jax.vmap(lambda weight, matches: weight(matches), in_axes=(None, 0)))
-_raw = jax.jit(
+_weigh = compiled(jax.vmap(lambda weight, matches: weight(matches), in_axes=(None, 0)))
+_raw = compiled(
     jax.vmap(
         lambda weight, matches: weight.center[None] + weight.scale[None] * weight.inputs(matches), in_axes=(None, 0)
     )

@@ -26,7 +26,8 @@ Scorer = Callable[[Matches], Array]
 for a pair without matches, and the same whatever the order of the matches, how much is padding, and what that holds.
 
 Any callable will do. A class decorated with `mfvpr.value` gets more than a plain function: its numbers may be swept,
-traced and learned, and its programs are kept. `mfvpr.testing.check_scorer` checks all of this.
+traced and learned, and its programs are kept. A class that `jax.tree_util.register_dataclass` registered gets the
+same; see `mfvpr.value` for its limits. `mfvpr.testing.check_scorer` checks all of this.
 
 What JAX cannot compute, such as another library's score, has a method `score_pairs(matches) -> [P]` as well, NumPy,
 of pairs `[P, K, ...]`, by which it is scored outside of `jit`; its class is a value.
