@@ -180,7 +180,10 @@ def rank(scores: Array, mask: Array | None = None, *, tie_break: Array | None = 
     present = jnp.ones(scores.shape, bool) if mask is None else mask
     number = present & ~jnp.isnan(scores)
     group = jnp.where(present, jnp.where(number, 0, 1), 2)
-    descending = -masked(jnp.asarray(scores), number, 0)  # whole numbers stay what they are
+    scores = jnp.asarray(scores)
+    # Whole numbers stay what they are. Of those, unsigned ones and the smallest have no negative.
+    descending = -scores if jnp.issubdtype(scores.dtype, jnp.floating) else ~scores
+    descending = masked(descending, number, jnp.zeros((), scores.dtype))
     keys = (descending, group) if tie_break is None else (tie_break, descending, group)
     return jnp.lexsort(keys, axis=-1).astype(jnp.int32)
 
