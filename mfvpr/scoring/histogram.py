@@ -137,9 +137,10 @@ class HistogramOfShifts:
         """`[2]` (x, y) px: where the query's points lie in the candidate; (0, 0) where nothing votes.
 
         The center of the tallest bin, the first in row-major order on a tie. With `refine` the peak between bin
-        centers: the maximum of the same sum of Gaussians over all shifts, reached from that bin by mean shift
-        (Comaniciu & Meer, PAMI 2002), within `shift_range`. With several scales z, the dominant one among them, a point
-        p of the query lies at c1 + z (p - c0) + sqrt(z) (shift - c1 + c0) in the candidate, of centers c0 and c1.
+        centers: the maximum of the same sum of Gaussians over all shifts that is uphill from that bin, to 1e-4 sigma,
+        within `shift_range`. Its derivatives do not depend on the bins. With several scales z, the dominant one among
+        them, a point p of the query lies at c1 + z (p - c0) + sqrt(z) (shift - c1 + c0) in the candidate, of centers c0
+        and c1.
         """
         return _dominant_shift(self._for(matches), matches, refine=refine)
 
