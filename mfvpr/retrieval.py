@@ -1,7 +1,7 @@
 """The filter: global descriptors -> Shortlist, by exact search in chunks, and what is fitted on the database before."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Protocol
 
@@ -12,10 +12,12 @@ import numpy as np
 from mfvpr.errors import InputError
 from mfvpr.evaluation.positives import Positives
 from mfvpr.numerics import at_least_single, compiled, device_of, free_bytes, masked
+from mfvpr.ragged import filled
 from mfvpr.types import Array, Shortlist
 from mfvpr.whitening import Whitening, fit_whitening
 
 SHARE = 1 / 16  # of the free memory, for the similarities that exist at the same time
+ROWS = 2**16  # of the database at a time, whatever the memory and the queries: their sums depend on it in the last bits
 
 
 class Search(Protocol):
@@ -37,7 +39,8 @@ class ExactSearch:
     """The largest dot products, as `retrieve` finds them, whatever the chunks.
 
     Attributes:
-        memory: GB of similarities that may exist at the same time; None = a sixteenth of what is free.
+        memory: GB of similarities that may exist at the same time, those of two queries with 65,536 rows at least; None
+            = a sixteenth of what is free. No bit depends on it.
         spread: finds the same in another way, as `mfvpr.distributed.retrieve_everywhere`; None = on one device.
     """
 
@@ -63,19 +66,19 @@ class ExactSearch:
                              f"got {len(excluded)} and {excluded.num_database}")  # fmt: skip
         if self.spread is not None:
             return self.spread(queries, database, num_candidates=num_candidates, excluded=excluded)
-        some, many = self._chunks(len(queries), len(database))
+        some = self._at_a_time(len(queries), min(len(database), ROWS))
         parts = []
         for part in _parts(len(queries), some):
-            allowed = None if excluded is None else ~excluded.dense(part)
-            parts.append(_shortlist(queries[part], database, num_candidates, many, allowed))
+            allowed = None if excluded is None else filled(~excluded.dense(part), some)
+            found = _shortlist(filled(queries[part], some), database, num_candidates, allowed)
+            parts.append(jax.tree.map(lambda field: field[: part.stop - part.start], found))  # noqa: B023
         return jax.tree.map(lambda *fields: np.concatenate(fields), *parts)
 
-    def _chunks(self, num_queries: int, num_database: int) -> tuple[int, int]:
-        """Queries and database rows at a time: all rows where a tenth of the queries fit with them."""
+    def _at_a_time(self, num_queries: int, num_rows: int) -> int:
+        """Queries whose similarities to so many rows fit, two at least; parts of as many queries are alike."""
         available = SHARE * free_bytes(device_of(())) if self.memory is None else 1e9 * self.memory
-        numbers = max(1, int(available) // 8)  # a similarity, and what becomes of it
-        many = min(num_database, max(1, numbers // max(1, num_queries // 10)))
-        return max(1, min(num_queries, numbers // many)), many
+        fitting = max(2, int(available) // 8 // num_rows)  # a similarity, and what becomes of it
+        return -(-num_queries // -(-num_queries // fitting))
 
 
 EXACT = ExactSearch()
@@ -146,22 +149,20 @@ class Whitened:
         return whitened / np.where(lengths > 0, lengths, 1)
 
 
-def _shortlist(
-    queries: np.ndarray, database: np.ndarray, num_candidates: int, many: int, allowed: np.ndarray | None
-) -> Shortlist:
-    """Of some queries, `many` rows of the database at a time; the first rows win ties, whatever the chunks."""
+def _shortlist(queries: np.ndarray, database: np.ndarray, num_candidates: int, allowed: np.ndarray | None) -> Shortlist:
+    """Of some queries, `ROWS` of the database at a time; the first rows win ties."""
     best: Shortlist | None = None
-    for part in _parts(len(database), many):
+    for part in _parts(len(database), ROWS):
         mask = None if allowed is None else allowed[:, part]
         here = retrieve(queries, database[part], num_candidates=num_candidates, mask=mask)
-        here = Shortlist(jnp.where(here.mask, here.indices + part.start, -1), here.scores, here.mask)
-        best = here if best is None else _best(best, here)
+        best = here if best is None else _best(best, here, part.start)
     return jax.tree.map(np.asarray, best)
 
 
 @compiled
-def _best(first: Shortlist, second: Shortlist) -> Shortlist:
-    """The best of two shortlists `[Q, C]`; the first one's win ties."""
+def _best(first: Shortlist, second: Shortlist, start: int) -> Shortlist:
+    """The best of two shortlists `[Q, C]`, the second of the rows from `start` on; the first one's win ties."""
+    second = replace(second, indices=jnp.where(second.mask, second.indices + start, -1))
     both = jax.tree.map(lambda *fields: jnp.concatenate(fields, axis=1), first, second)
     _, place = jax.lax.top_k(masked(both.scores, both.mask, -jnp.inf), first.mask.shape[1])
     return jax.tree.map(lambda field: jnp.take_along_axis(field, place, axis=1), both)
@@ -185,10 +186,12 @@ def retrieve(
 
     Returns:
         Shortlist `[Q, C]` by descending cosine similarity; the first row wins a tie. A database image whose
-        descriptor is not finite never appears; a query whose own is not finite gets an empty shortlist.
+        descriptor is not finite never appears; a query whose own is not finite gets an empty shortlist. On a CPU the
+        scores of a query do not depend on the other queries, in any bit.
     """
     queries, database = at_least_single(query_descriptors), at_least_single(database_descriptors)
-    similarity = jnp.matmul(queries, database.T, precision=jax.lax.Precision.HIGHEST)
+    similarity = jnp.matmul(_at_least_two(queries), _at_least_two(database).T, precision=jax.lax.Precision.HIGHEST)
+    similarity = similarity[: len(queries), : len(database)]
     usable = jnp.isfinite(similarity) if mask is None else jnp.isfinite(similarity) & jnp.atleast_2d(mask)
     depth = min(num_candidates, database_descriptors.shape[0])
     scores, indices = jax.lax.top_k(masked(similarity, usable, -jnp.inf), depth)
@@ -200,3 +203,8 @@ def retrieve(
         scores=masked(scores, found),
         mask=found,
     )
+
+
+def _at_least_two(rows: Array) -> Array:
+    """Rows `[n, D]`, a single one with zeros: its products would be summed in another order than those of several."""
+    return jnp.pad(rows, ((0, max(0, 2 - len(rows))), (0, 0)))

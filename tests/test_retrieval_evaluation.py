@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from mfvpr import frame_positives, radius_positives, recall_at_k, retrieve
+from mfvpr import frame_positives, radius_positives, recall_at_k, retrieval, retrieve
 from mfvpr.errors import InputError
 from mfvpr.evaluation import Positives, Tally
 from mfvpr.retrieval import EXACT, ExactSearch
@@ -40,11 +40,24 @@ def test_a_descriptor_that_is_not_finite_never_appears():
     np.testing.assert_array_equal(masked.indices, [[0, -1, -1]])
 
 
-@pytest.mark.parametrize("memory", [None, 1e-9])
-def test_the_first_of_equal_rows_wins_whatever_is_searched_at_a_time(memory):
+@pytest.mark.parametrize("rows", [2, 9])
+def test_the_first_of_equal_rows_wins_whatever_is_searched_at_a_time(rows, monkeypatch):
+    monkeypatch.setattr(retrieval, "ROWS", rows)
     queries = np.eye(2, dtype=np.float32)
-    shortlist = ExactSearch(memory).shortlist(queries, queries[[0, 1, 0, 0, 1, 0]], 3)
+    shortlist = ExactSearch().shortlist(queries, queries[[0, 1, 0, 0, 1, 0]], 3)
     np.testing.assert_array_equal(shortlist.indices, [[0, 2, 3], [1, 4, 0]])
+
+
+@pytest.mark.parametrize("num_database", [1, 100])
+def test_a_query_has_the_same_bits_alone_and_in_company_whatever_the_memory(num_database):
+    rng = np.random.default_rng(0)
+    queries, database = unit(rng.normal(size=(5, 130))), unit(rng.normal(size=(num_database, 130)))
+    together = retrieve(queries, database, num_candidates=9)
+    np.testing.assert_array_equal(retrieve(queries[4:], database, num_candidates=9).scores, together.scores[4:])
+    for memory in (None, 1e-9, 1e-9 * 8 * 4 * num_database):  # parts of 5; of 2, 2 and 1; of 3 and 2
+        found = ExactSearch(memory).shortlist(queries, database, 9)
+        np.testing.assert_array_equal(found.indices, together.indices)
+        np.testing.assert_array_equal(found.scores, together.scores)
 
 
 @given(st.lists(st.integers(-1, 9), min_size=1, max_size=8), st.integers(1, 10), st.integers(0, 5))

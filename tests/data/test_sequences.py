@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mfvpr import InputError
+from mfvpr import InputError, retrieval
 from mfvpr.data.contents import contents
 from mfvpr.data.datasets import folder_dataset
 from mfvpr.data.sequences import own_rows, without_neighbors
@@ -65,9 +65,10 @@ def test_two_sequences_have_no_neighbors(sequence, tmp_path):
         without_neighbors(dataset.only, 6, own, 2)
 
 
-@pytest.mark.parametrize("memory", [None, 1e-6, 1e-9])
-def test_the_shortlist_leaves_out_what_is_not_allowed(memory):
-    """Whatever is searched at a time: all, some dozens of numbers, one."""
+@pytest.mark.parametrize("memory, rows", [(None, 6), (1e-9, 6), (1e-9, 4), (None, 1)])
+def test_the_shortlist_leaves_out_what_is_not_allowed(memory, rows, monkeypatch):
+    """Whatever is searched at a time: all, two queries, some rows of the database, one."""
+    monkeypatch.setattr(retrieval, "ROWS", rows)
     rng, search = np.random.default_rng(0), ExactSearch(memory)
     descriptors = unit(rng.normal(size=(6, 8)))
     everything = search.shortlist(descriptors, descriptors, 6)
