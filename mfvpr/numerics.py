@@ -140,7 +140,7 @@ def leaves_and_classes(tree: Any) -> tuple[list[Any], tuple[type, ...]]:
     Up to jaxlib 0.10 tree structures are equal whatever the classes that `jax.tree_util.register_dataclass` registered.
     """
     seen: list[Any] = []
-    leaves = jax.tree.leaves(tree, is_leaf=seen.append)  # which is asked of every node, and gives None: not a leaf
+    leaves = jax.tree.leaves(tree, is_leaf=lambda node: bool(seen.append(node)))  # asked of every node; never a leaf
     of_leaves = set(map(type, leaves))
     return leaves, tuple([cls for cls in map(type, seen) if cls not in of_leaves])
 
