@@ -221,7 +221,7 @@ def test_bad_images_fail_by_default_with_the_mend(tmp_path):
     (tmp_path / "a.png").write_bytes(b"")
     with pytest.raises(InputError, match=r"a\.png.*0 bytes.*, or skip bad images"):
         Archive().local(image_folder(tmp_path), SIFT)
-    with pytest.raises(InputError, match=r"none of 1 images can be used; the first: .*a\.png"):
+    with pytest.raises(InputError, match=r"none of 1 images .*a\.png"):
         Archive(skip_bad=True).local(image_folder(tmp_path), SIFT)
 
 

@@ -412,5 +412,5 @@ def test_lightglue_matches_what_candidates_have_in_common(monkeypatch):
             common = rows[rows[:, 0] < 30]
             assert len(common) > 20
             assert (common[:, 0] == common[:, 1]).all()
-    with pytest.raises(InputError, match=r"nowhere: expected a clone of https://github.com/cvg/LightGlue$"):
+    with pytest.raises(InputError, match=r"nowhere: .*https://github.com/cvg/LightGlue"):
         list(lightglue.entries(lightglue.made_up(), arrays, Path("nowhere")))

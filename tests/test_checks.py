@@ -85,51 +85,51 @@ def evaluated(dataset, extractor=SIFT, chosen=None, scorers=HISTOGRAM, **options
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"candidates": 0}, "candidates=0: expected a whole number from 1, or 'all'"),
+        ({"candidates": 0}, r"candidates=0: expected .*'all'"),
         ({"candidates": "some"}, "candidates='some': expected"),
         ({"candidates": 2.5}, "candidates=2.5: expected"),
         ({"ties": "indx"}, "ties='indx': expected one of filter, index"),
         ({"memory": -1}, "memory=-1: expected GB above 0, or None"),
         ({"memory": np.nan}, "memory=nan: expected GB"),
-        ({"fused": {"nope": Fusion()}}, r"fused: expected names of scorers \(histogram\), got nope"),
-        ({"correlated": {"filter": FRAMES}}, r"correlated: expected names of scorers \(histogram\), got filter"),
+        ({"fused": {"nope": Fusion()}}, r"fused: .*\(histogram\), got nope"),
+        ({"correlated": {"filter": FRAMES}}, r"correlated: .*\(histogram\), got filter"),
         ({"scorers": HISTOGRAM | {"histogram + frames": mfvpr.MatchCount()}, "correlated": {"histogram": FRAMES}},
-         r"histogram \+ frames is the name of another system"),
-        ({"scorers": {"filter": mfvpr.MatchCount()}}, "filter is the name of another system"),
+         r"histogram \+ frames .*system"),
+        ({"scorers": {"filter": mfvpr.MatchCount()}}, r"filter .*system"),
         ({"scorers": HISTOGRAM | {"histogram + filter": mfvpr.MatchCount()}, "fused": {"histogram": Fusion()}},
-         r"histogram \+ filter is the name of another system"),
-        ({"scorers": {"h": mfvpr.MatchCount}}, r"expected h to map Matches .*, got the class MatchCount; write MatchC"),
-        ({"scorers": {"h": 5}}, "scorers: expected h to map Matches to a score, got 5"),
+         r"histogram \+ filter .*system"),
+        ({"scorers": {"h": mfvpr.MatchCount}}, r"h .*the class MatchCount"),
+        ({"scorers": {"h": 5}}, r"scorers: .*h .*got 5"),
         ({"scorers": {"h": mfvpr.HistogramOfShifts(sigma=-1.0)}}, "sigma=-1.0: expected numbers from"),
         ({"scorers": {"v": lambda matches: matches.points0[:, 0]}}, "v: expected a number for each pair"),
         ({"scorers": {"v": lambda matches: matches.points0[0, 0].astype(complex)}}, "scorer: expected real number"),
         ({"matching": Matching(cross_check="x")}, "cross_check='x': expected one of"),
         ({"fused": {"histogram": Fusion(1.0, "euclidean")}}, "filter_score='euclidean': expected one of"),
         ({"fused": {"histogram": Fusion(1.0, "negative_euclidean")}, "chosen": Fixed((0, 1, 2), 3.0)},
-         "expected cosine similarities up to 1, got 3"),
+         r"cosine .*1, got 3"),
         ({"fused": {"histogram": Fusion("auto")}}, "c='auto': expected a number from 0 to .*, 'zscore', or None"),
         ({"fused": {"histogram": Fusion(np.nan)}}, "c=nan: expected a number from 0"),
         ({"fused": {"histogram": Fusion(-1.0)}}, "c=-1.0: expected a number from 0"),
-        ({"fused": {"histogram": Fusion(weights={"filter": 2.0})}}, "weights: expected c='zscore' as well, got c=None"),
+        ({"fused": {"histogram": Fusion(weights={"filter": 2.0})}}, r"weights: .*c='zscore'.* got c=None"),
         ({"fused": {"histogram": Fusion("zscore", weights={"anchor": 1})}},
-         r"weights: expected filter or names of scorers \(histogram\), got anchor; score by it as well"),
+         r"weights: .*filter .*\(histogram\), got anchor"),
         *(({"fused": {"histogram": Fusion("zscore", weights={"filter": wrong})}},
-           rf"weights: expected numbers from 1e-06 to 1e\+12, got filter={wrong!r}")
+           rf"weights: .*1e-06 .*1e\+12, got filter={wrong!r}")
           for wrong in (0, -1.0, np.nan, np.inf, "1", None)),
         ({"fused": {"histogram": Fusion("zscore")}, "scorers": HISTOGRAM | {"histogram + filter": mfvpr.MatchCount()}},
-         r"histogram \+ filter is the name of another system"),
+         r"histogram \+ filter .*system"),
         ({"fused": {"histogram": Fusion("zscore", weights={"count": 1})}, "correlated": {"histogram + filter": FRAMES},
           "scorers": HISTOGRAM | {"count": mfvpr.MatchCount()}}, "correlated: expected .* got histogram [+] filter"),
-        ({"chosen": Fixed((0, 1, 99))}, "Fixed: expected rows of the database from 0 to 9, got 0 to 99"),
-        ({"chosen": Fixed((0, 1, 1))}, "Fixed: expected every row of the database once, got 1 twice for query 0"),
-        ({"chosen": Fixed((0, 1))}, r"Fixed: expected indices \(whole\), scores and mask \(bool\) of \[10, 3\] each"),
+        ({"chosen": Fixed((0, 1, 99))}, r"Fixed: .*0 to 9, got 0 to 99"),
+        ({"chosen": Fixed((0, 1, 1))}, r"Fixed: .*got 1 twice .*query 0"),
+        ({"chosen": Fixed((0, 1))}, r"Fixed: .*indices .*scores .*mask .*\[10, 3\]"),
         ({"chosen": Fixed((0, 1, 2), np.nan)}, "Fixed: expected finite scores"),
-        ({"chosen": Retrieval(SIFT)}, "Sift: gives no global descriptor; expected one that does, or Aggregated"),
-        ({"extractor": Own("fewer")}, "Own: expected a Description of each of 3 images, got 2"),
+        ({"chosen": Retrieval(SIFT)}, r"Sift: .*global descriptor.*Aggregated"),
+        ({"extractor": Own("fewer")}, r"Own: .*Description .*3 images, got 2"),
         ({"extractor": Own("features")}, "Own: expected a Description, got Features"),
-        ({"extractor": Own("dimension")}, r"Own: expected local features of \[128\] dimensions, .* got \[5\]"),
+        ({"extractor": Own("dimension")}, r"Own: .*\[128\] .*got \[5\]"),
         ({"extractor": Own("shape")}, r"Own: features: expected keypoints \[N, 2\]"),
-        ({"extractor": Own("vector")}, "Own: vector_size=0, but a description with 2 numbers"),
+        ({"extractor": Own("vector")}, r"Own: vector_size=0.* 2 numbers"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_used_is_told(dataset, options, words):
@@ -182,11 +182,11 @@ def test_scores_that_are_nan_are_told(dataset):
 
     scorers = {"n": scorer}
     evaluated(dataset, scorers=scorers, archive=Archive(tell=lines.append))
-    assert any("of n are NaN, and rank last" in line for line in lines)
+    assert any("of n are NaN" in line for line in lines)
     lines.clear()  # of a single candidate every z-score is 0
     options = {"chosen": Fixed((4,)), "candidates": 1, "fused": {"n": Fusion("zscore")}}
     evaluated(dataset, scorers=scorers, archive=Archive(tell=lines.append), **options)
-    assert any("of n + filter are NaN, and rank last" in line for line in lines)
+    assert any("of n + filter are NaN" in line for line in lines)
 
 
 @pytest.mark.parametrize(
@@ -198,14 +198,14 @@ def test_scores_that_are_nan_are_told(dataset):
     ],
 )
 def test_a_scorer_of_nothing_but_nan_is_refused(dataset, scorer):
-    with pytest.raises(InputError, match="n: every score of a pair that has matches is NaN or infinite; check"):
+    with pytest.raises(InputError, match=r"^n: .*NaN"):
         evaluated(dataset, scorers={"n": scorer})
 
 
 def test_a_ground_truth_of_other_images_is_told(dataset):
     other = replace(dataset.only, truth=FrameTruth(tuple((row,) for row in range(9)), 10))
     result = evaluated(replace(dataset, sequences=(other,)))
-    with pytest.raises(InputError, match="expected a ground truth of 10 queries and 10 database images, got one of 9"):
+    with pytest.raises(InputError, match=r"10 queries.*10 .*got .*9"):
         result.recall([0])
     with pytest.raises(InputError, match=r"ks=\[0\]: expected depths from 1"):
         result.recall([0], [0])
@@ -216,7 +216,7 @@ def test_a_ground_truth_of_other_images_is_told(dataset):
 def test_dimensions_of_both_sides_must_be_the_same():
     rng = np.random.default_rng(0)
     vectors = [rng.normal(size=(4, size)).astype(np.float32) for size in (3, 5)]
-    with pytest.raises(InputError, match="expected as many numbers on both sides, got 3 for queries and 5"):
+    with pytest.raises(InputError, match=r"got 3 .*5"):
         EXACT.shortlist(*vectors, 2)
     with pytest.raises(InputError, match="dimension=0: expected at least 1"):
         WhitenedSearch(0)

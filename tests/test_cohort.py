@@ -106,7 +106,7 @@ def test_each_score_is_divided_by_that_of_its_image():
 def test_scores_below_0_are_refused():
     rows = np.array([[0, 1]])
     candidates, scores = Shortlist(rows, rows * 0.0, rows >= 0), np.array([[3, -0.5]], np.float32)
-    words = "cohort: expected scores from 0, which can be divided, got -0.5 of grid; choose"
+    words = r"cohort: .*from 0, .*got -0.5 of grid"
     for refused in (
         lambda: hubness(candidates, scores, 2, who="grid"),
         lambda: by_hubness(candidates, scores, np.ones(2), who="grid"),
@@ -130,7 +130,7 @@ def test_no_image_is_scored_with_its_own_place(tmp_path):
 
 @pytest.mark.parametrize("neighbors", [-1, 2.0, True, "5", 3, 100])
 def test_neighbors_that_leave_nothing_or_mean_nothing_are_refused(tmp_path, neighbors):
-    with pytest.raises(InputError, match=r"^cohort='?(-1|2\.0|True|5|3|100)'?: expected (frames|less than half of 6)"):
+    with pytest.raises(InputError, match=r"^cohort='?(-1|2\.0|True|5|3|100)'?: .*(frames|half of 6)"):
         cohort_sequence(contents(tmp_path, *"abcdef"), neighbors)
     assert len(cohort_sequence(contents(tmp_path, *"abcdef"), 2).images) == 6
 
@@ -199,10 +199,10 @@ def test_sequences_share_a_cohort_that_is_told_and_kept(dataset, kept, result):
 
 def test_names_of_systems_with_a_cohort_are_known_only_with_one(dataset):
     for options in ({"fused": {"count + cohort": Fusion()}}, {"correlated": {"count + cohort": FrameCorrelation()}}):
-        with pytest.raises(InputError, match=r"expected names of scorers \(histogram, count\)|got count \+ cohort"):
+        with pytest.raises(InputError, match=r"\(histogram, count\)|got count \+ cohort"):
             mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, **options)
     taken = {"count": mfvpr.MatchCount(), "count + cohort": mfvpr.MatchCount()}
-    with pytest.raises(InputError, match=r"count \+ cohort is the name of another system"):
+    with pytest.raises(InputError, match=r"count \+ cohort .*system"):
         mfvpr.evaluate(dataset, SIFT, VLAD, taken, cohort=2)
 
 
@@ -238,17 +238,17 @@ def test_a_list_of_pairs_must_be_of_database_images_as_well(small_street, tmp_pa
     code, _, stderr = typed(monkeypatch, capsys, "evaluate", *folder(small_street), "retrieval=pairs", "cohort=2",
                             "retrieval.queries=pairs.txt", "store=null", f"out={tmp_path}/out")  # fmt: skip
     assert code == 2
-    known = f"one of: {small_street}/queries; choose another retrieval, or no cohort\n"
-    assert stderr.endswith(f"{small_street}/database: expected a folder that a file was given of, {known}")
+    assert f"{small_street}/database: expected" in stderr
+    assert f"one of: {small_street}/queries;" in stderr
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["cohort=-1"], "cohort=-1: expected a whole number not below 0 (at most 1000000), or null"),
-        (["cohort=2.5"], "cohort=2.5: expected a whole number not below 0 (at most 1000000), or null"),
-        (["cohort=all"], "cohort=all: expected a whole number not below 0 (at most 1000000), or null"),
-        ([f"cohort={QUERIES // 2}"], f"cohort={QUERIES // 2}: expected less than half of {QUERIES} database images"),
+        (["cohort=-1"], "cohort=-1: expected a whole number"),
+        (["cohort=2.5"], "cohort=2.5: expected a whole number"),
+        (["cohort=all"], "cohort=all: expected a whole number"),
+        ([f"cohort={QUERIES // 2}"], f"cohort={QUERIES // 2}: expected less than half of {QUERIES}"),
     ],
 )
 def test_mistakes_are_one_line_and_exit_code_2(root, tmp_path, monkeypatch, capsys, arguments, words):

@@ -175,9 +175,7 @@ def broken(**changes):
 def test_other_files_are_refused_in_one_line(content, tmp_path):
     path = tmp_path / "confidence.json"
     path.write_text(content)
-    with pytest.raises(
-        InputError, match=r"confidence.json: expected the confidence.json that .* wrote \(.*\); "
-    ) as told:
+    with pytest.raises(InputError, match=r"confidence.json: expected .*\(.*\); ") as told:
         read_confidences(path)
     assert "\n" not in str(told.value)
     with pytest.raises(InputError, match="got nothing"):

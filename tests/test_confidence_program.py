@@ -91,7 +91,7 @@ def test_below_the_threshold_the_answer_is_no_place(evaluate):
     given = (f"confidence={first}/confidence.json", "threshold=0.4")
     out, code, stdout, stderr = evaluate("second", *given)
     assert code == 0, stderr
-    assert "was fitted on these very images, so that it flatters" in stderr
+    assert "was fitted on these very images" in stderr
     assert "other settings" not in stderr
     header = stdout[stdout.index("AP by score") :].splitlines()[0]
     assert header.endswith("right  wrong  refused  of these right")
@@ -154,9 +154,9 @@ def test_no_place_is_right_where_the_database_does_not_show_it(evaluate, root, t
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        (["threshold=0.5"], "threshold=0.5: expected confidence=FILE as well"),
+        (["threshold=0.5"], "threshold=0.5: expected confidence=FILE"),
         (["threshold=2"], "threshold=2: expected a number from 0 to 1"),
-        (["confidence=/none.json"], "/none.json: expected the confidence.json that an evaluation wrote, got nothing"),
+        (["confidence=/none.json"], "/none.json: expected the confidence.json"),
     ],
 )
 def test_what_cannot_say_how_sure_answers_are_is_refused(evaluate, settings, words):
@@ -173,7 +173,7 @@ def test_confidence_of_other_systems_is_refused(evaluate, tmp_path):
     (tmp_path / "other.json").write_text(json.dumps(found))
     _, code, _, stderr = evaluate("out", f"confidence={tmp_path}/other.json")
     assert code == 2
-    words = "expected one of the system that decides, histogram, got filter, histogram + filter; make it with"
+    words = "got filter, histogram + filter; "
     assert words in stderr.splitlines()[-1]
 
 
@@ -183,13 +183,13 @@ def test_confidence_of_other_settings_is_said(evaluate):
     given = (f"confidence={first}/confidence.json", "figures=0")
     _, code, _, stderr = evaluate("second", *given, "scorer.weight=ratio", "fusion.c=2")
     assert code == 0, stderr
-    assert "confidence.json was fitted with other settings of scorer, fusion: p may mean nothing here" in stderr
+    assert "other settings of scorer, fusion:" in stderr
     fused = ("scorer=ratio", "fusion.c=zscore", "fusion.weights={anchor: 1}", "final=combined", "figures=0")
     other, *_ = evaluate("fused", *fused)
     for changed, told in (("scorer.anchor.window=6", True), ("scorer.anchor.window=10", False)):
         _, code, _, stderr = evaluate(changed, f"confidence={other}/confidence.json", *fused, changed)
         assert code == 0, stderr
-        assert ("was fitted with other settings of scorer: p" in stderr) == told
+        assert ("other settings of scorer:" in stderr) == told
     _, code, _, stderr = evaluate("third", *given, "scorer=paper")
     assert code == 0, stderr
     assert "other settings" not in stderr  # the histogram is the same beside others
@@ -198,14 +198,14 @@ def test_confidence_of_other_settings_is_said(evaluate):
 def test_confidence_of_what_counted_otherwise_is_said(evaluate):
     first, *_ = evaluate("first", "figures=0", "scorer=paper")
     given = (f"confidence={first}/confidence.json", "figures=0", "scorer=paper")
-    for changed, words in (("recall.tolerances=[0]", "recall (what counts as right)"),
-                           ("candidates=5", "candidates (as many as there were)")):  # fmt: skip
+    for changed, words in (("recall.tolerances=[0]", "recall ("),
+                           ("candidates=5", "candidates (")):  # fmt: skip
         _, code, _, stderr = evaluate(changed, *given, changed)
         assert code == 0, stderr
-        assert f"confidence.json was fitted with other settings of {words}: p may mean nothing here" in stderr
+        assert f"other settings of {words}" in stderr
     out, code, _, stderr = evaluate("sum", *given, "scorer.sum.weight=fs")
     assert code == 0, stderr
-    assert "nothing is said of sum, which had other settings there" in stderr
+    assert "nothing is said of sum" in stderr
     assert "other settings of" not in stderr
     assert "sum" not in {line["system"] for line in rows(out / "confidence.csv")}
 
@@ -233,7 +233,7 @@ def test_a_single_candidate_leaves_nothing_to_say(evaluate):
     assert {line[name] for name in line if " by p" in name or "ECE" in name or name == "by chance"} == {""}
     _, code, _, stderr = evaluate("second", "figures=0", "candidates=1", f"confidence={first}/confidence.json")
     assert code == 2
-    assert "expected p of systems, got none: the run that left it could fit none" in stderr.splitlines()[-1]
+    assert "expected p of systems, got none" in stderr.splitlines()[-1]
 
 
 @pytest.mark.parametrize("made", [
@@ -246,7 +246,7 @@ def test_what_another_program_says_of_how_it_was_made_stops_nothing(evaluate, tm
     (tmp_path / "other.json").write_text(json.dumps(found | {"made": made}))
     _, code, _, stderr = evaluate("out", f"confidence={tmp_path}/other.json", "figures=0")
     assert code == 0, stderr
-    assert "was fitted with other settings of features" in stderr
+    assert "other settings of features" in stderr
 
 
 def test_a_weight_is_known_by_what_it_holds(evaluate, tmp_path):
@@ -258,7 +258,7 @@ def test_a_weight_is_known_by_what_it_holds(evaluate, tmp_path):
     assert code == 0, stderr
     assert "other settings" not in stderr
     _, code, _, stderr = evaluate("third", "figures=0", given, "scorer.weight=ratio")
-    assert "fitted with other settings of scorer" in stderr
+    assert "other settings of scorer" in stderr
 
 
 def test_a_confidence_that_is_the_same_for_all_is_told(evaluate, tmp_path):
@@ -268,4 +268,4 @@ def test_a_confidence_that_is_the_same_for_all_is_told(evaluate, tmp_path):
     (tmp_path / "flat.json").write_text(json.dumps(found))
     _, code, _, stderr = evaluate("out", f"confidence={tmp_path}/flat.json", "figures=0")
     assert code == 0, stderr
-    assert "flat.json cannot tell right answers from wrong ones: p is the same for all" in stderr
+    assert "flat.json cannot tell right answers from wrong ones" in stderr

@@ -78,12 +78,12 @@ def test_an_image_that_finds_itself_is_told_and_left_out(small_street, tmp_path,
 def test_nothing_right_is_told_beforehand(small_street, run):
     settings = ("dataset.ground_truth=order", "dataset.exclude_neighbors=5", "recall.tolerances=[0,5]")
     rows, printed, _ = run(*same(small_street, *settings))
-    assert "warning: the ground truth gives no query a right answer; every recall will be 0" in printed.err
+    assert "warning: the ground truth gives no query" in printed.err
     assert set(recall(rows).values()) == {0.0}
 
 
 def test_two_sequences_cannot_exclude_neighbors(small_street, run):
-    with pytest.raises(InputError, match="exclude_neighbors=0: expected queries that are among the database images"):
+    with pytest.raises(InputError, match=r"exclude_neighbors=0: expected .*database images"):
         run(*folder(small_street, "dataset.exclude_neighbors=0"))
 
 
@@ -150,7 +150,7 @@ def test_turned_and_16_bit_copies_give_the_same_and_it_is_said(small_street, tmp
         "query": {"orient": True, "turned": 0, "bits": 16, "scaled_16bit": 10,
                   "largest_16bit": other[0][0]["reading"]["query"]["largest_16bit"]},
     }  # fmt: skip
-    assert "note: 10 database images are turned as their EXIF orientation says" in other[1].err
+    assert "note: 10 database images are turned" in other[1].err
     assert "note: 10 16-bit query images are scaled to 8 bits" in other[1].err
     assert "warning: the largest value" not in other[1].err
 

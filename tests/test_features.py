@@ -110,12 +110,10 @@ def test_identical_features_and_single_ones_have_words():
 
 
 def test_fewer_features_than_words_is_the_users_to_mend():
-    with pytest.raises(
-        InputError, match="10 local features in 1 database images: expected at least one for each of the 64 words"
-    ):
+    with pytest.raises(InputError, match=r"10 local features .*1 database images.*64 words"):
         VladFitting().fit(FeatureSet.of([make_features(np.random.default_rng(2), 10)]))
 
 
 def test_fewer_samples_than_words_are_the_users_to_mend():
-    with pytest.raises(InputError, match=r"^max_samples=10: expected at least one for each of num_words=64 words$"):
+    with pytest.raises(InputError, match=r"^max_samples=10: .*num_words=64\b"):
         VladFitting(max_samples=10).fit(FeatureSet.of([make_features(np.random.default_rng(2), 100)]))

@@ -28,7 +28,7 @@ def test_other_numbers_make_another_recipe():
     others += [recipe_of(VladFitting(seed=1)), recipe_of(Vlad(np.ones((2, 3), np.float32)))]
     others += [recipe_of(Vlad(np.ones((3, 2), np.float32))), recipe_of(Vlad(np.zeros((2, 3), np.float32)))]
     assert len({json.dumps(one, sort_keys=True) for one in (*keys, *others)}) == 7
-    with pytest.raises(TypeError, match="expected a dataclass, arrays, or a property `recipe`"):
+    with pytest.raises(TypeError, match=r"dataclass, arrays, .*`recipe`"):
         recipe_of(lambda images: images)
 
 

@@ -25,9 +25,7 @@ def folder(root, count=3):
     ],
 )
 def test_a_folder_without_a_file_is_refused_with_those_that_have_one(tmp_path, read):
-    with pytest.raises(
-        InputError, match=r"/other: expected a folder that a file was given of, one of: .*/known; give one of this"
-    ):
+    with pytest.raises(InputError, match=r"/other: .*one of: .*/known; "):
         read({tmp_path / "known": File(tmp_path / "a.npz")}, folder(tmp_path / "other"))
 
 
@@ -46,5 +44,5 @@ def test_two_files_of_one_folder_are_refused(tmp_path, change, refused):
         if not refused:
             assert made(settings, data).files == {tmp_path: File(build.expanded("a.h5"))}
             continue
-        with pytest.raises(SettingsError, match=rf"^{group}\.queries={refused}: expected the file and the prefix of"):
+        with pytest.raises(SettingsError, match=rf"^{group}\.queries={refused}: .*file .*prefix"):
             made(settings, data)

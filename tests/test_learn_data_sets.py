@@ -92,14 +92,14 @@ def test_several_sets_as_they_are_typed(streets):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["also=streets"], "also=streets: expected report=DATASET,... as well"),
+        (["also=streets"], "also=streets: expected report="),
         (["report=streets", "split=first_half"], "split=first_half: expected none with report="),
         (
             ["report=street"],
-            "report=street: expected data sets such as streets:seed=1,corridor:root=DIR, of berlin_a100, ",
+            "report=street: expected data sets",
         ),
-        (["report=corridor"], "report=corridor: corridor has no default of root; write corridor:root=VALUE"),
-        (["report=streets:sed=1"], "report=streets:sed=1: streets has no setting sed; it has cache, name, seed"),
+        (["report=corridor"], "report=corridor: corridor has no default of root"),
+        (["report=streets:sed=1"], "report=streets:sed=1: streets has no setting sed"),
         (["report=streets", "retrieval.name=pairs"], "retrieval=pairs: expected none with report="),
         (["report=streets:seed=-1"], "dataset.seed=-1: expected a whole number not below 0"),
     ],
@@ -118,17 +118,17 @@ def test_the_images_that_were_learned_on_are_not_reported_on(root, streets, tmp_
     code, stdout, stderr = typed(monkeypatch, capsys, "learn", *small(root), *SHORT, same, f"out={tmp_path}/out")
     assert (code, stdout) == (2, "")
     last = stderr.splitlines()[-1]
-    assert last == (f"error: report=street0: expected other images than those of folder, which is learned on; "
-                    f"{2 * QUERIES} are the same")  # fmt: skip
+    assert last.startswith("error: report=street0: expected")
+    assert f"; {2 * QUERIES} " in last.partition(" folder")[2]
 
 
 def test_the_same_queries_do_not_count_twice(root, streets, tmp_path, monkeypatch, capsys):
     twice = f"report={streets[1]},{streets[1].replace('name=street1', 'name=again')}"
     code, stdout, stderr = typed(monkeypatch, capsys, "learn", *small(root), *SHORT, twice, f"out={tmp_path}/out")
     assert (code, stdout) == (2, "")
-    assert stderr.splitlines()[-1] == (
-        f"error: again: expected other queries than those of street1; {QUERIES} are the same, and would count twice"
-    )
+    last = stderr.splitlines()[-1]
+    assert last.startswith("error: again: expected")
+    assert f"; {QUERIES} " in last.partition(" street1")[2]
 
 
 def test_sets_of_one_map_are_not_independent(root, streets, tmp_path, capsys):
@@ -141,17 +141,14 @@ def test_sets_of_one_map_are_not_independent(root, streets, tmp_path, capsys):
         _, images = learning.prepare.begun(settings, evaluation.Stopwatch())
         several.append(learning.Prepared(SimpleNamespace(name=name), images, {}, {}))
     learning.check_apart([], several)
-    assert capsys.readouterr().err.splitlines()[-1] == (
-        "warning: there and back are of one map, but their queries are taken for independent, so that intervals are "
-        "too narrow and p too low"
-    )
+    assert capsys.readouterr().err.splitlines()[-1].startswith("warning: there and back ")
     learning.check_apart([], several[:1])
-    assert "of one map" not in capsys.readouterr().err
+    assert "there and back" not in capsys.readouterr().err
 
 
 def test_a_learned_weight_knows_what_it_was_learned_on(root, streets, learned, tmp_path, monkeypatch, capsys):
     weight = learned[0] / "out" / "weights" / "other_sets_match_labels.json"
-    on_these = "was learned on images of folder, so that it flatters here"
+    on_these = "was learned on images of folder"
     own = (*small(root), f"scorer.weight={weight}", "figures=0")
     for number, (more, told) in enumerate([
         (["scorer=sum"], [on_these]), (["scorer=histogram"], [on_these]),

@@ -162,9 +162,9 @@ def test_relative_inputs_are_those_of_other_units():
 def test_inputs_by_name():
     assert {*RELATIVE, *ABSOLUTE} == {*INPUTS}
     for names in ((), ("ratio", "ratio"), "ratio"):
-        with pytest.raises(InputError, match="LearnedWeight: expected different names of inputs, got"):
+        with pytest.raises(InputError, match=r"LearnedWeight: .*names .*got"):
             LearnedWeight.create(KEY, pairs(), names=names)
-    with pytest.raises(InputError, match="LearnedWeight: unknown input depth; expected some of ratio, "):
+    with pytest.raises(InputError, match=r"LearnedWeight: .*depth; .*ratio, "):
         LearnedWeight.create(KEY, pairs(), names=("ratio", "depth"))
 
 

@@ -184,13 +184,11 @@ def test_features_of_another_kind_are_one_line():
         check_matching(50, extractor, Matching())
     check_matching(50, Extractor(16), matcher())
     check_matching(50, Extractor(0), matcher())  # not known before they are read
-    with pytest.raises(InputError, match=r"^LightGlue: expected descriptors of 16 dimensions, got 8; take"):
+    with pytest.raises(InputError, match=r"^LightGlue: .*16 dimensions, got 8\b"):
         matched(matcher(), *pair(COUNTS, 8, 0))
-    with pytest.raises(InputError, match=r"^depth_confidence=95: expected a number from 0 to 1$"):
+    with pytest.raises(InputError, match=r"^depth_confidence=95: .*0 to 1$"):
         check_matching(50, Extractor(16), matcher(depth_confidence=95))
-    with pytest.raises(
-        InputError, match=r"^matching: expected what maps .* got the class Matching; see mfvpr.Matcher$"
-    ):
+    with pytest.raises(InputError, match=r"^matching: .*the class Matching; .*mfvpr.Matcher"):
         check_matching(50, Extractor(16), Matching)
 
 

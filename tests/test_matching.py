@@ -344,7 +344,7 @@ def test_a_chunk_is_what_fits_where_the_data_are(monkeypatch):
         monkeypatch.setattr(matching, "device_bytes", lambda tree: memory)  # noqa: B023
         assert matching.pairs_at_once(None, make_features(rng, 20), batch) == expected
         assert matching.pairs_at_once(7, make_features(rng, 20), batch) == 7
-    with pytest.raises(ValueError, match="chunk_size=0: expected a whole number above 0"):
+    with pytest.raises(ValueError, match=r"chunk_size=0: .*above 0"):
         match_candidates(make_features(rng, 20), batch, chunk_size=0)
 
 
@@ -354,5 +354,5 @@ def test_all_fields_of_half_precision_are_matched_in_single():
     half = [jax.tree.map(lambda leaf: leaf if leaf.dtype == bool else leaf.astype(np.float16), one) for one in pair]
     for name in ("points0", "points1", "distance", "scores0", "scores1", "image_size0"):
         assert getattr(match_once(*half), name).dtype == jnp.float32
-    with pytest.raises(ValueError, match=r"expected one query \[N0\] and candidates \[C, N1\]"):
+    with pytest.raises(ValueError, match=r"query \[N0\] .*candidates \[C, N1\]"):
         match_candidates(*pair)

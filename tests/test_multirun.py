@@ -29,9 +29,9 @@ def test_a_multirun_makes_one_run_folder_per_job(root, tmp_path, monkeypatch, ca
     folders = sorted((tmp_path / "runs" / "folder").iterdir())
     assert [f"results: {path.relative_to(tmp_path)}" in stdout for path in folders] == [True, True]
     assert {results(path)["scorer"]["method"] for path in folders} == {"sum", "histogram"}
-    line = "error: candidates=0: expected a whole number above 0 (at most 1000000), or all"
-    assert stderr.splitlines().count(line) == 3
-    assert stderr.splitlines()[-1] == line
+    line = "error: candidates=0: expected "
+    assert [one.startswith(line) for one in stderr.splitlines()].count(True) == 3
+    assert stderr.splitlines()[-1].startswith(line)
     assert "Traceback" not in stderr
     assert [number for number in range(4) if f"job {number}: " in stderr] == [0, 1, 2, 3]
 
@@ -75,12 +75,13 @@ def test_a_job_waits_for_the_matches_of_another_and_a_single_run_does_not(root, 
     assert taken.wait(timeout=60)
     code, _, stderr = typed(monkeypatch, capsys, "sweep", *overrides, f"out={tmp_path}/single")
     assert (code, told.is_set()) == (2, False)
-    assert stderr == f"error: {path}: in use by process {os.getpid()}; wait until it ends, or stop it\n"
+    assert stderr.startswith(f"error: {path}: in use by process {os.getpid()}; ")
+    assert stderr.count("\n") == 1
     monkeypatch.chdir(tmp_path)
     code, _, stderr = typed(monkeypatch, capsys, "sweep", "-m", *overrides, f"out={tmp_path}/job")
     other.join(timeout=60)
     assert code == 0, stderr
-    assert f"{path}: in use by process {os.getpid()}; waiting until it is free\n" in stderr
+    assert f"{path}: in use by process {os.getpid()}; waiting" in stderr
     assert {place.name for place in tmp_path.iterdir()} == {"runs", "first", "second", "job"}
 
 
@@ -113,5 +114,5 @@ def test_who_waits_for_a_store_says_so_and_gets_it(tmp_path):
             time.sleep(0.01)
         assert not got
     other.join(timeout=30)
-    assert told == [f"{tmp_path}/s: in use by process {os.getpid()}; waiting until it is free"]
+    assert told == [f"{tmp_path}/s: in use by process {os.getpid()}; waiting"]
     assert got == [[False]]

@@ -75,7 +75,7 @@ def test_a_file_that_changed_is_read_again(file, weight):
 
 
 def test_another_file_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"none\.json: expected a match weight that experiments.learn wrote"):
+    with pytest.raises(InputError, match=r"none\.json: .*experiments.learn"):
         NAMED_WEIGHTS[str(tmp_path / "none.json")]
 
 
@@ -111,15 +111,15 @@ def test_a_changed_file_is_another_setting_of_a_confidence(
         given = [f"confidence={tmp_path}/0/confidence.json"] if number else []
         code, _, stderr = typed(monkeypatch, capsys, "evaluate", *run, *given, f"out={tmp_path}/{number}")
         assert code == 0, stderr
-        found.append("was fitted with other settings of scorer: p may mean nothing here" in stderr)
+        found.append("other settings of scorer" in stderr)
     assert found == [False, False, True]
 
 
 @pytest.mark.parametrize(
     ("value", "words"),
     [
-        ("FOLDER/none.json", "none.json: expected a match weight that experiments.learn wrote, got nothing"),
-        ("FOLDER/text.json", "text.json: expected a match weight that experiments.learn wrote"),
+        ("FOLDER/none.json", "none.json: expected a match weight"),
+        ("FOLDER/text.json", "text.json: expected a match weight"),
         ("FOLDER/mine.txt", "expected one of fs, dmf, ratio, unit"),
         ("7", "expected one of fs, dmf, ratio, unit"),
     ],
@@ -143,5 +143,5 @@ def test_how_a_weight_of_another_program_was_made_stops_nothing(
     options = ("scorer=histogram", f"scorer.weight={tmp_path}/theirs.json", "figures=0", f"out={tmp_path}/out")
     code, _, stderr = typed(monkeypatch, capsys, "evaluate", *small(shared(tmp_path_factory)), *options)
     assert code == 0, stderr
-    assert "theirs.json was learned with other features (unknown instead of sift" in stderr
-    assert "theirs.json was learned with other matching (unknown instead of neighbors" in stderr
+    assert "other features (unknown instead of sift" in stderr
+    assert "other matching (unknown instead of neighbors" in stderr

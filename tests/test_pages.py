@@ -268,7 +268,7 @@ def test_what_is_no_run_is_refused_in_one_line(run, tmp_path, monkeypatch, capsy
         assert words in stderr
     code, _, stderr = program(monkeypatch, capsys, run, run)
     assert code == 2
-    assert stderr.endswith("one: expected different run folders, got this one twice\n")
+    assert "one: expected different run folders" in stderr
     with pytest.raises(InputError, match="expected different"):
         write_comparison([run, run.parent / "." / "one"], tmp_path / "page.html")
 

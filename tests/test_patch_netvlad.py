@@ -75,19 +75,19 @@ def test_one_pass_gives_what_the_network_gives(model):
 
 
 @pytest.mark.parametrize(("options", "words"), [
-    ({"patch_sizes": ()}, r"patch_sizes=\[\]: expected sizes from 1 to 8, as a map of 10 x 8 positions has room for"),
+    ({"patch_sizes": ()}, r"patch_sizes=\[\]: .*from 1 to 8, .*10 x 8"),
     ({"patch_sizes": (9,)}, "expected sizes from 1 to 8"), ({"patch_sizes": (0, 2)}, "expected sizes from 1 to 8"),
-    ({"patch_sizes": (2, 2)}, r"patch_sizes=\[2, 2\]: expected each size once"),
-    ({"scale_weights": (1.0, 2.0)}, r"scale_weights=\[1.0, 2.0\]: expected one for each of patch_sizes=\[5\], or None"),
+    ({"patch_sizes": (2, 2)}, r"patch_sizes=\[2, 2\]: .*once"),
+    ({"scale_weights": (1.0, 2.0)}, r"scale_weights=\[1.0, 2.0\]: .*patch_sizes=\[5\], or None"),
 ])  # fmt: skip
 def test_what_cannot_be_is_refused(model, options, words):
     with pytest.raises(InputError, match=words):
         PatchNetVladFeatures(model, SIZE, **options)
-    with pytest.raises(InputError, match="Patch-NetVLAD: expected a VggNetVlad as model, got Vgg16; `"):
+    with pytest.raises(InputError, match=r"Patch-NetVLAD: .*VggNetVlad .*got Vgg16"):
         PatchNetVladFeatures(model.vgg, SIZE)
-    with pytest.raises(ValueError, match="expected features of one scale, got 2; see `local`"):
+    with pytest.raises(ValueError, match=r"one scale, got 2; .*`local`"):
         _ = PatchNetVladFeatures(model, SIZE, patch_sizes=(2, 3))(image(SIZE))[0].features
-    with pytest.raises(InputError, match="expected images of 160 x 128 px, got 128 x 160"):
+    with pytest.raises(InputError, match=r"160 x 128 px, got 128 x 160"):
         PatchNetVladFeatures(model, SIZE)(np.zeros((1, 160, 128, 3), np.uint8))
 
 
@@ -192,7 +192,7 @@ def test_its_configurations_run_by_name(program, system, scorer):
     if reach:  # at another size of images, that of the configuration is another score
         _, code, _, stderr = program("evaluate", f"system={system}")
         assert code == 2
-        assert "scorer.size=[560, 400]: expected [80, 48], the largest place of these patches, or null" in stderr
+        assert "scorer.size=[560, 400]: expected [80, 48]" in stderr
     out, code, _, stderr = program("evaluate", f"system={system}", "figures=2", *reach)
     assert code == 0, stderr
     rows = json.loads((out / "results.json").read_text())
@@ -218,9 +218,9 @@ def test_a_sweep_fuses_the_scales_as_an_evaluation_does(program):
 
 
 @pytest.mark.parametrize(("options", "words"), [
-    (("scorer=all", "scorer.rapid.size=[560,400]"), "scorer.rapid.size=[560, 400]: expected [80, 48], the largest"),
+    (("scorer=all", "scorer.rapid.size=[560,400]"), "scorer.rapid.size=[560, 400]: expected [80, 48]"),
     (("scorer=rapid", "scorer.size=[560,400]", "features.patch_sizes=[9]"), "[9]: expected sizes from 1 to 8"),
-    (("features.image_size=null",), "features.image_size=null: expected width and height for features=patch_netvlad"),
+    (("features.image_size=null",), "features.image_size=null: expected width and height"),
 ])  # fmt: skip
 def test_settings_of_other_sizes_are_refused(program, options, words):
     _, code, _, stderr = program("evaluate", "features=patch_netvlad", "retrieval=same", last=options)
@@ -232,7 +232,7 @@ def test_what_it_cannot_be_used_for_is_one_line(program, monkeypatch):
     scales = ("features=patch_netvlad", "features.patch_sizes=[2,4]")
     _, code, _, stderr = program("learn", *scales, "retrieval=same", "scorer=sum", "steps=1", "recall.tolerances=[0]")
     assert code == 2
-    words = "features.patch_sizes=[2, 4]: expected one size, since learning knows one scale"
+    words = "features.patch_sizes=[2, 4]: expected one size"
     assert words in stderr.splitlines()[-1]
     monkeypatch.setattr(prepare, "dataset_of", None)  # told before
     _, code, _, stderr = program("evaluate", *scales, "retrieval=same", "features.scale_weights=[1]")
@@ -245,4 +245,4 @@ def test_other_features_have_no_global_descriptor(small_street, tmp_path, monkey
     code, _, stderr = typed(monkeypatch, capsys, "evaluate", "dataset=folder", *folders, "dataset.ground_truth=order",
                             "retrieval=same", f"out={tmp_path}/out")  # fmt: skip
     assert code == 2
-    assert "retrieval=same: expected features with a global descriptor, patch_netvlad or selavpr" in stderr
+    assert "retrieval=same: expected features with a global descriptor" in stderr

@@ -181,7 +181,7 @@ def test_an_interrupted_matching_goes_on_where_it_was(features, candidates, open
         pipeline.match(features[1], features[0], candidates, store=store, track=killed_after(9))
     with opened() as store:
         assert store.done.tolist() == [True] * pipeline.STORE_BATCH + [False] * 2
-        with pytest.raises(InputError, match=r"store: expected the matches of all 10 queries, got 8; finish"):
+        with pytest.raises(InputError, match=r"store: .*10 queries, got 8"):
             pipeline.stored_matches(store)
         resumed = pipeline.match(features[1], features[0], candidates, store=store)
     with opened(name="uninterrupted") as store:
@@ -192,7 +192,7 @@ def test_matches_of_another_shortlist_are_told(features, candidates, opened):
     with opened() as store:
         pipeline.match(features[1], features[0], candidates, store=store)
         other = replace(candidates, indices=candidates.indices[:, ::-1])
-        with pytest.raises(InputError, match=r"store: expected matches of these candidates, .* delete this folder"):
+        with pytest.raises(InputError, match=r"store: .*candidates.*delete"):
             pipeline.match(features[1], features[0], other, store=store)
 
 

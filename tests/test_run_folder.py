@@ -218,7 +218,7 @@ def test_figures_of_chosen_queries(outcome):
     assert asked([5, "0002.png", 5], dataset) == [5, 2]
     assert asked(7, dataset) == 7
     for wrong in (24, -1, "nope.png"):
-        with pytest.raises(SettingsError, match=r"expected rows of queries from 0 to 23, or names such as 0000"):
+        with pytest.raises(SettingsError, match=r"rows .*0 to 23, .*0000"):
             asked([0, wrong], dataset)
     assert list(page_of(outcome).shown([5, 2])) == [5, 2]
 
@@ -231,7 +231,7 @@ def test_a_folder_in_use_is_refused_at_the_start(root, tmp_path, monkeypatch, ca
     with runs.claimed(tmp_path / "out"):
         code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *small(root), f"out={tmp_path}/out")
     assert (code, stdout) == (2, "")
-    expected = "another run is using this folder; wait until it ends, or name another with out=DIR"
+    expected = "another run is using this folder"
     assert stderr == f"error: {tmp_path}/out: {expected}\n"
     assert list(tmp_path.iterdir()) == []
 
@@ -355,7 +355,7 @@ def test_ctrl_c_while_figures_are_drawn_keeps_the_tables(root, evaluated, tmp_pa
     code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *small(root), *LINES, f"out={tmp_path}/out")
     assert code == 130
     assert "\nhistogram + filter " in stdout
-    assert stderr.endswith("\ninterrupted; nothing half-written was left, and what was finished is kept\n")
+    assert stderr.splitlines()[-1].startswith("interrupted")
     names = {path.name for path in evaluated.iterdir()} - {"figures", "report.html"}
     assert {path.name for path in (tmp_path / "out").iterdir()} == names
 

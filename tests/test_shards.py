@@ -202,7 +202,7 @@ def test_scores_are_known_by_their_scorers_and_candidates(dataset, split, small_
         write_arrays(path, kept | {"indices": np.roll(kept["indices"], 1, axis=0)}, path.parent.name)
     for path in tmp_path.glob("matches-*/shards/*/*.npz"):
         path.unlink()
-    with pytest.raises(InputError, match="expected scores of these candidates, got those of another shortlist"):
+    with pytest.raises(InputError, match=r"scores .*candidates.*shortlist"):
         mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, archive=one)
 
 

@@ -59,12 +59,13 @@ def tables(place):
 
 
 def test_tasks_in_any_order_leave_the_results_of_one(task, asked, plain, tmp_path):
-    assert asked("missing") == (2, "", f"error: {tmp_path}/out/shards/run.json: expected a file of a run with "
-                                       "shard=i/n and out=DIR, got none, or something else\n")  # fmt: skip
+    code, out, error = asked("missing")
+    assert (code, out, error.count("\n")) == (2, "", 1)
+    assert error.startswith(f"error: {tmp_path}/out/shards/run.json: expected ")
     code, out, _ = task("2/3")
     assert code == 0
     assert "shard 2/3 has done what it can: database features: " in out
-    assert "missing, of shards 0-1; start it again when they are there" in out
+    assert "missing, of shards 0-1;" in out
     assert asked("missing")[1] == "0-2\n"
     code, out, _ = asked("status")
     assert code == 0
@@ -93,7 +94,7 @@ def test_tasks_must_agree(task, asked, tmp_path, root, settings):
     assert task("0/2")[0] == 0
     code, _, error = task("0/4")
     assert code == 2
-    assert "shard=0/4: shards=4, expected 2 by the task that came first (" in error
+    assert "shard=0/4: shards=4, expected 2 " in error
     code, _, error = task("1/2", "scorer.histogram.sigma=7")
     assert code == 2
     assert "sigma=7" in error
@@ -107,11 +108,11 @@ def test_tasks_must_agree(task, asked, tmp_path, root, settings):
     assert "images.database" in error
     code, _, error = task("1/2", f"store={tmp_path}/local")  # of the same path on another machine, as it were
     assert code == 2
-    assert "shard=1/2: expected the store= of the task that came first, got another folder" in error
+    assert "shard=1/2: expected the store=" in error
     (tmp_path / "out" / "shards" / "run.json").write_text("{")
     code, _, error = task("1/2")
     assert code == 2
-    assert "run.json: expected a file of a run with shard=i/n" in error
+    assert "run.json: expected a file of a run" in error
 
 
 @pytest.mark.parametrize(
@@ -138,13 +139,13 @@ def test_a_folder_of_another_run_is_refused(task, tmp_path, asked, plain):
     shutil.copytree(plain, tmp_path / "out")
     code, _, error = task("0/1")
     assert code == 2
-    assert f"out={tmp_path}/out: expected a new or empty folder, or that of other shards of this run" in error
+    assert f"out={tmp_path}/out: expected a new or empty folder" in error
     (tmp_path / "out" / "shards").mkdir()
     for wrong in ('{"format": "mfvpr shards 1", "shards": -2}', '{"format": "mfvpr shards 1", "shards": "x"}', "[]"):
         (tmp_path / "out" / "shards" / "run.json").write_text(wrong)
         code, _, error = asked("missing")
         assert code == 2
-        assert error.startswith(f"error: {tmp_path}/out/shards/run.json: expected a file of a run with shard=i/n")
+        assert error.startswith(f"error: {tmp_path}/out/shards/run.json: expected ")
 
 
 def command(settings, place, shard):

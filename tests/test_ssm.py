@@ -124,14 +124,14 @@ def test_images_that_cannot_be_read_have_no_windows():
 def test_more_windows_than_memory_has_room_for_are_refused(monkeypatch):
     monkeypatch.setattr(windows, "free_host_bytes", lambda: 3 * 10**9)
     rows = [*range(250)]
-    with pytest.raises(InputError, match=r"9000 windows of 41472 numbers: takes 3\.3 GB .* lower max_images"):
+    with pytest.raises(InputError, match=r"9000 windows .*41472 .*3\.3 GB .*max_images"):
         WindowFitting(125).fit([], Windows((14, 14, 512), 9), rows)
 
 
 def test_fewer_windows_than_dimensions_are_refused(cells, dataset):
     one = ImageFolder(dataset.database.root, dataset.database.names[:1])
     few = replace(cells, whitening=WindowFitting(12))
-    with pytest.raises(InputError, match="expected more than 12 descriptors of as many numbers, got 12 of 4608"):
+    with pytest.raises(InputError, match=r"12 descriptors .*got 12 .*4608"):
         fitted(few, one, Archive())
     assert np.isfinite(fitted(replace(cells, whitening=WindowFitting(11)), one, Archive()).whitening.components).all()
 
@@ -171,13 +171,13 @@ def test_the_filter_has_36_windows_of_125_numbers(model):
 
 
 def test_what_has_no_cells_or_has_not_seen_the_database_is_refused(model, cells):
-    with pytest.raises(InputError, match="windows of 3 x 3: expected a map of as many positions, got 2 x 6"):
+    with pytest.raises(InputError, match=r"3 x 3: .*got 2 x 6"):
         SsmCells(model, (48, 16))
     with pytest.raises(InputError, match="stride=0"):
         SsmCells(model, stride=0)
     with pytest.raises(InputError, match="SsmCells: has not seen the database; take"):
         cells(np.zeros((1, 40, 48, 3), np.uint8))
-    with pytest.raises(InputError, match="SsmCells: expected a whitening of 4608 numbers, got one of 41472"):
+    with pytest.raises(InputError, match=r"SsmCells: .*whitening .*4608 .*got .*41472"):
         replace(cells, whitening=nothing(41472, 3))(np.zeros((1, 40, 48, 3), np.uint8))
 
 
@@ -267,7 +267,7 @@ def test_it_is_refused_by_other_networks_images_and_windows(cells, dataset, tmp_
         {"model": network(1)}, {"preprocessing": "caffe"}, {"interpolation": "cv2_area"}, {"stride": 2},
         {"image_size": (40, 48)},
     ):  # fmt: skip
-        with pytest.raises(InputError, match="SsmCells: expected a whitening of its own network, images and windows"):
+        with pytest.raises(InputError, match=r"SsmCells: .*whitening .*network, images and windows"):
             replace(learned, **change)(image)
     assert len(replace(learned, batch_size=1)(image)) == 1
     assert fitted(cells, dataset.database, Archive()).whitening.origin == learned.whitening.origin != ""
@@ -291,7 +291,7 @@ def test_images_that_cannot_be_read_are_left_out_only_where_they_may_be(cells, d
         shutil.copy(dataset.database.root / name, tmp_path)
     (tmp_path / dataset.database.names[1]).write_bytes(b"no image")
     folder = ImageFolder(tmp_path, dataset.database.names[:3])
-    with pytest.raises(InputError, match=r"0001\.png: cannot be read as an image .*, or skip bad images"):
+    with pytest.raises(InputError, match=r"0001\.png: .*read as an image .*skip"):
         fitted(cells, folder, Archive(tmp_path / "strict"))
     assert not kept(tmp_path / "strict")
     learned = fitted(cells, folder, Archive(tmp_path / "s", skip_bad=True))
@@ -333,7 +333,7 @@ def test_the_database_is_looked_at_once_for_all_sequences(cells, small_street, d
     assert (first.matches[0].counts == 12).all()
     np.testing.assert_array_equal(found.systems["count"][1].scores, np.full((10, 3), 12))
     assert second.matches[0].counts.shape == (10, 3)
-    with pytest.raises(InputError, match="grid: every score of a pair that has matches is NaN"):  # of 4 x 3 cells
+    with pytest.raises(InputError, match=r"^grid: .*NaN"):  # of 4 x 3 cells
         mfvpr.evaluate(several, cells, FILTER, {"grid": GridAnchors(3)}, **options)
 
 

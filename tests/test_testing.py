@@ -67,7 +67,7 @@ BROKEN = {
     "expected a scalar of float32, got shape": lambda m: m.mask.astype(jnp.float32),
     "of int32": lambda m: jnp.sum(m.mask.astype(jnp.int32)),
     "the score of 0 matches is nan.*mfvpr.masked": lambda m: jnp.sum(m.distance),
-    "a pair without matches scores 1.0, expected exactly 0": lambda m: 1.0 + real(m),
+    r"without matches .*1.0, expected .*0": lambda m: 1.0 + real(m),
     "padding that holds inf changes the score": lambda m: (
         jnp.sum(jnp.isinf(m.distance).astype(jnp.float32)) * jnp.any(m.mask).astype(jnp.float32)
     ),
@@ -89,9 +89,7 @@ def asks(matches):
 
 def test_what_jit_cannot_do_is_told_with_its_mend():
     for scorer in (Baked(), numpy_only, asks):
-        with pytest.raises(
-            AssertionError, match=r"asks Python for a number that jit has not computed yet .* jnp.where"
-        ):
+        with pytest.raises(AssertionError, match=r"number .*jit .*jnp.where"):
             check_scorer(scorer)
 
 
@@ -133,5 +131,5 @@ def test_a_trace_for_every_number_is_named():
         return (scorer.number,), None if isinstance(scorer.number, jax.core.Tracer) else float(scorer.number)
 
     jax.tree_util.register_pytree_node(Static, flatten, unflatten)
-    with pytest.raises(AssertionError, match="3 traces for three sets of numbers, expected one"):
+    with pytest.raises(AssertionError, match=r"3 traces .*expected one"):
         check_scorer(Static(2.0))

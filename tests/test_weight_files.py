@@ -53,7 +53,7 @@ def test_another_file_is_refused(tmp_path, weight, change):
     path = tmp_path / "weight.json"
     write_weight(path, weight, MADE)
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
-    with pytest.raises(InputError, match=r"weight\.json: expected a match weight that experiments.learn wrote"):
+    with pytest.raises(InputError, match=r"weight\.json: .*experiments.learn"):
         read_weight(path)
 
 
@@ -61,5 +61,5 @@ def test_no_file_and_no_json_are_refused(tmp_path):
     (tmp_path / "text.json").write_text("[]")
     (tmp_path / "deep.json").write_text("[" * 100_000)
     for name, reason in (("none.json", "got nothing"), ("text.json", ""), ("deep.json", "Recursion")):
-        with pytest.raises(InputError, match=f"{name}: expected a match weight that experiments.learn wrote.*{reason}"):
+        with pytest.raises(InputError, match=f"{name}: .*experiments.learn.*{reason}"):
             read_weight(tmp_path / name)

@@ -54,8 +54,8 @@ def test_a_component_without_variance_is_zero(shape):
 
 @pytest.mark.parametrize(
     ("count", "size", "dimension", "line"),
-    [(8, 20, 8, "more than 8 descriptors of as many numbers, got 8 of 20"),
-     (20, 7, 8, "more than 8 descriptors of as many numbers, got 20 of 7"),
+    [(8, 20, 8, r"8 descriptors .*got 8 .*20"),
+     (20, 7, 8, r"8 descriptors .*got 20 .*7"),
      (1, 7, 1, "got 1 of 7"), (9, 7, 0, "more than 0")],
 )  # fmt: skip
 def test_too_few_vectors_are_refused(count, size, dimension, line):

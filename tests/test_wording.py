@@ -50,20 +50,19 @@ ORDER = "dataset.ground_truth=order"
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["dataset.ground_truth=index"], "error: dataset.ground_truth=index: expected a file; give "
-                                         "dataset.index_file=FILE as well"),
-        (["dataset.ground_truth=label"], "give dataset.database_labels=FILE as well"),
-        ([ORDER, "dataset.index_file=a.csv"], "given as dataset.index_file, but dataset.ground_truth=order; set it"),
-        ([ORDER, "dataset.exclude_neighbors=1"], "error: dataset.exclude_neighbors=1: expected queries that"),
+        (["dataset.ground_truth=index"], "dataset.index_file=FILE"),
+        (["dataset.ground_truth=label"], "dataset.database_labels=FILE"),
+        ([ORDER, "dataset.index_file=a.csv"], "dataset.index_file, but dataset.ground_truth=order"),
+        ([ORDER, "dataset.exclude_neighbors=1"], "error: dataset.exclude_neighbors=1: expected"),
         ([ORDER, "retrieval.num_words=99"], "or lower retrieval.num_words"),
         ([ORDER, "dataset.queries=ROOT/broken"], "or set on_bad_image=skip"),
         ([ORDER, "dataset=sequences", "dataset.queries=[ROOT/queries,ROOT/mean]"], "error: dataset.queries: expected"),
-        ([ORDER, *files("features", "both.h5")], "with features.database_prefix=... and features.query_prefix=..."),
-        ([ORDER, *files("retrieval", "both_vectors.h5")], "with retrieval.database_prefix=... and retrieval.qu"),
-        ([ORDER, *files("features", "some.npz")], "behind features.database_prefix and features.query_prefix)"),
-        ([ORDER, *files("features", "sizeless.npz")], "give it as features.image_size=[W,H]"),
-        ([ORDER, *files("features", "long_features.npz")], "features.lengths=normalize gives them unit length, fea"),
-        ([ORDER, *files("retrieval", "long.npz")], "retrieval.lengths=normalize gives them unit length, ret"),
+        ([ORDER, *files("features", "both.h5")], "features.database_prefix=... and features.query_prefix=..."),
+        ([ORDER, *files("retrieval", "both_vectors.h5")], "retrieval.database_prefix=... and retrieval.qu"),
+        ([ORDER, *files("features", "some.npz")], "features.database_prefix and features.query_prefix"),
+        ([ORDER, *files("features", "sizeless.npz")], "features.image_size=[W,H]"),
+        ([ORDER, *files("features", "long_features.npz")], "features.lengths=normalize"),
+        ([ORDER, *files("retrieval", "long.npz")], "retrieval.lengths=normalize"),
     ],
 )  # fmt: skip
 def test_what_is_refused_says_which_setting_mends_it(images, tmp_path, monkeypatch, capsys, arguments, words):
@@ -85,4 +84,4 @@ def test_a_sweep_says_how_one_sequence_is_chosen(images, tmp_path, monkeypatch, 
                f"dataset.queries=[{images}/queries,{images}/database]", "scorer=sum", "grid.clamp=[true]")  # fmt: skip
     code, _, stderr = typed(monkeypatch, capsys, "sweep", *several, "store=null")
     assert code == 2
-    assert "expected one query sequence, got 2; give one folder as dataset.queries=[DIR], of queries, d" in stderr
+    assert "got 2; give one folder as dataset.queries=[DIR]" in stderr

@@ -36,7 +36,7 @@ def test_missing_and_empty_folders(tmp_path):
     ):
         with pytest.raises(InputError, match=words):
             image_folder(path)
-    with pytest.raises(InputError, match="ground_truth=index: expected a file; give index_file as well"):
+    with pytest.raises(InputError, match=r"ground_truth=index: .*file; .*index_file"):
         folder_dataset(fill(tmp_path / "a", ["0.png"]), tmp_path / "a", ground_truth="index")
 
 
@@ -65,7 +65,7 @@ def test_links_in_circles_or_to_nothing_are_refused(tmp_path):
             ("sub/back", "..", "back: a link back to "),
             ("sub/up", "../..", "a link back to "),
             ("self", "self", "cannot be listed"),
-            ("gone", "nowhere", "gone: a link to nothing, which may have been a folder; mend or remove it"),
+            ("gone", "nowhere", "gone: a link to nothing"),
         )
     ):
         root = fill(tmp_path / str(number) / "root", ["sub/0.png"])
@@ -104,7 +104,7 @@ def test_unreadable_folders_and_files_are_errors(closed):
         fill(place / "root", ["0.png", "sub/1.png"])
         (place / closed).chmod(0)
         try:
-            with as_nobody(), pytest.raises(InputError, match=f"{closed}: cannot be listed .Permission denied."):
+            with as_nobody(), pytest.raises(InputError, match=f"{closed}: .*Permission denied"):
                 image_folder(place / "root")
         finally:
             (place / closed).chmod(0o755)

@@ -257,7 +257,7 @@ def test_netpbm_files_state_their_range(tmp_path):
 def test_32_bits_have_no_range(tmp_path, dtype):
     path = tmp_path / "a.tif"
     Image.fromarray(np.array([[0, 300]], dtype)).save(path)
-    with pytest.raises(InputError, match=r"a\.tif: expected 8 or 16 bits a channel, got 32.*; convert it"):
+    with pytest.raises(InputError, match=r"a\.tif: .*8 or 16 bits .*got 32"):
         read_image(path)
     np.testing.assert_array_equal(read_image(path, bits=None)[0, :, 0], [0, 255])
 

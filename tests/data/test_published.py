@@ -71,12 +71,12 @@ def test_a_gap_is_refused_since_the_table_counts_numbers(ssm, side, number):
 
 def test_ssm_vprs_lack_something(ssm, tmp_path):
     (ssm / "GroundTruth.csv").write_text("Reference,Live\n0,0\n12,1\n4,2\n")
-    refused("gardens_point", ssm, "pair 2: expected the name of a database image or a number from 0 to 11, got '12'")
+    refused("gardens_point", ssm, "from 0 to 11, got '12'")
     (ssm / "GroundTruth.csv").write_text("Reference,Live\n0,0\n4,2\n")
     refused("gardens_point", ssm, "expected ground truth for all 3 queries")
     (ssm / "GroundTruth.csv").unlink()
-    refused("gardens_point", ssm, "GroundTruth.csv: expected a ground truth file, got nothing")
-    refused("gardens_point", tmp_path / "no", "no: expected the folder of gardens_point, got nothing; it is to be had")
+    refused("gardens_point", ssm, "GroundTruth.csv: expected")
+    refused("gardens_point", tmp_path / "no", "no: expected the folder of gardens_point")
 
 
 # RobotCar
@@ -150,7 +150,7 @@ def test_robotcar_knows_one_pose_of_each_image(tmp_path):
     assert published_dataset("robotcar_seasons", tmp_path).database.names == (f"{REFERENCE}/rear/1.jpg",)
     line = text.splitlines()[0].split()
     poses.write_text(text + " ".join([*line[:4], "3.0", *line[5:]]) + "\n")
-    refused("robotcar_seasons", tmp_path, f"expected one pose of {REFERENCE}/rear/1.jpg, got another")
+    refused("robotcar_seasons", tmp_path, f"pose of {REFERENCE}/rear/1.jpg")
 
 
 def test_robotcar_lacks_something(tmp_path):
@@ -163,7 +163,7 @@ def test_robotcar_lacks_something(tmp_path):
     refused("robotcar_seasons", tmp_path, "expected poses of night-rain/rear, got none")
     for line in ("dawn/rear/1.jpg 1 2 3", "dawn/rear/1.jpg " + "nan " * 16, "dawn/rear/1.jpg " + "x " * 16):
         (tmp_path / "robotcar_v2_train.txt").write_text(f"\n{line}\n")
-        refused("robotcar_seasons", tmp_path, "line 1: expected a name and the 16 numbers of a pose")
+        refused("robotcar_seasons", tmp_path, "line 1: expected a name and the 16 numbers")
     identity = np.eye(4)
     identity[:3, 3] = 7
     for numbers in (identity.T, 10 * identity):  # transposed, and in other units
@@ -171,11 +171,11 @@ def test_robotcar_lacks_something(tmp_path):
         refused(
             "robotcar_seasons",
             tmp_path,
-            "line 1: expected a name and the 16 numbers of a pose by rows, the last 0 0 0 1",
+            "the last 0 0 0 1",
         )
     digits = " ".join(map(str, identity.ravel())).replace("7.0", "7_0")
     (tmp_path / "robotcar_v2_train.txt").write_text(f"dawn/rear/1.jpg {digits}\n")
-    refused("robotcar_seasons", tmp_path, "line 1: expected a name and the 16 numbers of a pose")
+    refused("robotcar_seasons", tmp_path, "line 1: expected a name and the 16 numbers")
     (tmp_path / "robotcar_v2_train.txt").write_text(f"{REFERENCE}/rear/../../../x.jpg {'0 ' * 15}1\n")
     refused("robotcar_seasons", tmp_path, "expected names below")
 
@@ -195,7 +195,7 @@ def test_nordland_pairs_frames_of_one_number(tmp_path):
     assert turned.queries.root.name == "fall"
     refused("nordland_27592", tmp_path, "expected two of fall, spring", seasons=("may", "fall"))
     (tmp_path / "winter/images-00008.png").rename(tmp_path / "winter/images-00009.png")
-    refused("nordland_27592", tmp_path, "got images-00009.png where that has images-00008.png")
+    refused("nordland_27592", tmp_path, "got images-00009.png")
     (tmp_path / "winter/images-00009.png").unlink()
     refused("nordland_27592", tmp_path, "expected as many frames as in")
 
@@ -208,7 +208,7 @@ def test_nordland_takes_the_frames_of_patch_netvlads_lists(tmp_path):
     dataset = published_dataset("nordland_27592", tmp_path)
     assert dataset.database.names == dataset.queries.names == tuple(f"images-{i:05d}.png" for i in (2, 3, 6))
     (tmp_path / "winter/images-00003.png").unlink()
-    refused("nordland_27592", tmp_path, "1 of the 3 images of nordland_imageNames_query.txt are missing, the first is")
+    refused("nordland_27592", tmp_path, "1 of the 3 images of nordland_imageNames_query.txt")
 
 
 def test_nordlands_test_part_is_two_sections(tmp_path):
@@ -226,7 +226,7 @@ def test_vpr_bench_asks_every_tenth_frame(tmp_path):
     put(tmp_path, *(f"ref/{i:07d}.jpg" for i in range(22)), *(f"query/{i:07d}.jpg" for i in range(3)))
     assert rows(published_dataset("nordland_vprbench", tmp_path), 1) == [[0, 1], [9, 10, 11], [19, 20, 21]]
     put(tmp_path, "query/0000003.jpg")
-    refused("nordland_vprbench", tmp_path, "expected 10 database images per query, got 22 for 4")
+    refused("nordland_vprbench", tmp_path, "got 22 for 4")
 
 
 # Pittsburgh
@@ -276,7 +276,7 @@ def test_pittsburgh_is_right_within_25_m(pittsburgh, folder):
     assert dataset.database.names == tuple(DATABASE)
     assert dataset.queries.names == tuple(f"queries_real/{name}" for name in QUERIES)
     assert rows(dataset, 25) == [[1], [0, 1]]
-    refused("pitts30k_test", pittsburgh, "expected datasets/pitts30k_test.mat, or pitts30k_test_dbImages.npy")
+    refused("pitts30k_test", pittsburgh, "datasets/pitts30k_test.mat")
 
 
 def test_pittsburghs_names_pack_well(pittsburgh):
@@ -347,7 +347,7 @@ def test_damaged_lists(pittsburgh):
 def test_structures_that_are_not_pittsburghs(pittsburgh):
     path = pittsburgh / "datasets/pitts30k_val.mat"
     write_structure(path, places=PLACES[:2])
-    refused("pitts30k_val", pittsburgh, "expected a position for each of 3 images, got [2, 2]")
+    refused("pitts30k_val", pittsburgh, "3 images, got [2, 2]")
     write_structure(path, places=np.full((3, 2), np.nan))
     refused("pitts30k_val", pittsburgh, "expected a position for each")
     write_structure(path, qImageFns=cells(["../x.jpg", "y.jpg"]))
@@ -424,7 +424,7 @@ def test_msls_of_lists(tmp_path):
     write_msls(tmp_path)
     names = [f"train_val/{city}/database/images/d{row}.jpg" for city in ("cph", "sf") for row in (0, 2)]
     np.save(tmp_path / "msls_val_dbImages.npy", np.array(names))
-    refused("msls_val", tmp_path, "expected beside the other lists, found nothing; get all four")
+    refused("msls_val", tmp_path, "beside the other lists")
     asked = [f"train_val/cph/query/images/q{row}.jpg" for row in range(3)]
     np.save(tmp_path / "msls_val_qImages.npy", np.array(asked))
     np.save(tmp_path / "msls_val_qIdx.npy", np.array([0, 2]))
@@ -440,18 +440,16 @@ def test_msls_of_lists(tmp_path):
 
 
 def test_msls_lacks_something(tmp_path):
-    refused("msls_val", tmp_path, "raw.csv: expected a table of the data set, got nothing")
+    refused("msls_val", tmp_path, "raw.csv: expected a table")
     write_msls(tmp_path)
     table = tmp_path / "train_val/sf/query/postprocessed.csv"
     text = table.read_text()
     table.write_text("".join(text.splitlines(keepends=True)[:-1]))
-    refused(
-        "msls_val", tmp_path, "expected the same keys in raw.csv, postprocessed.csv, subtask_index.csv, got 4, 3 and 4"
-    )
+    refused("msls_val", tmp_path, "raw.csv, postprocessed.csv, subtask_index.csv, got 4, 3 and 4")
     table.write_text(text.replace("q3", "q4"))
     refused("msls_val", tmp_path, "expected the same keys")
     table.write_text(text.replace("q3", "q2"))
-    refused("msls_val", tmp_path, "postprocessed.csv: expected a different key in every line, got 3 in 4 lines")
+    refused("msls_val", tmp_path, "got 3 in 4 lines")
     for change in (text.replace("easting", "east"), *(text.replace("5000000.0", word) for word in ("nan", "x", "5_0"))):
         table.write_text(change)
         refused("msls_val", tmp_path, "key 'q0': expected pano in raw.csv")
@@ -471,7 +469,7 @@ def test_pipes_are_not_waited_for(tmp_path, pipe):
         with pytest.raises(InputError):
             published_dataset(name, tmp_path)
     for read in (read_lines, read_names, lambda path: read_rows(path, 1)):
-        with pytest.raises(InputError, match=r"expected a list, got a pipe or device"):
+        with pytest.raises(InputError, match=r"expected a list, got a pipe"):
             read(path)
 
 

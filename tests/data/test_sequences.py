@@ -61,7 +61,7 @@ def test_two_sequences_have_no_neighbors(sequence, tmp_path):
     (tmp_path / "other").mkdir()
     Image.new("RGB", (4, 4), (99, 0, 0)).save(tmp_path / "other" / "0.png")
     dataset, own = owned(sequence, tmp_path / "other")
-    with pytest.raises(InputError, match="exclude_neighbors=2: expected queries that are among the database images"):
+    with pytest.raises(InputError, match=r"exclude_neighbors=2: expected .*database images"):
         without_neighbors(dataset.only, 6, own, 2)
 
 

@@ -77,8 +77,8 @@ def test_thresholds_ascend_and_the_middle_one_decides():
     ("thresholds", "split", "words"),
     [
         ([], None, "thresholds: expected at least one"),
-        ([1], "half", "split=half: expected one of None, first_half, second_half, both"),
-        ([1, QUERIES], "both", "split=both: no query of one half has a place far enough from the other half"),
+        ([1], "half", r"split=half: .*None, first_half, second_half, both"),
+        ([1, QUERIES], "both", r"split=both: no query .*half"),
     ],
 )
 def test_what_cannot_be_judged_is_said_before_anything_is_ranked(thresholds, split, words):

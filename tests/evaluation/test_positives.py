@@ -92,9 +92,9 @@ def test_more_rankings_than_are_looked_up_at_once():
 @pytest.mark.parametrize(
     ("rows", "words"),
     [
-        (np.zeros((3, 1), int), r"rows: expected shape \[..., 2 queries, k\], got \[3, 1\]"),
+        (np.zeros((3, 1), int), r"rows: .*\[..., 2 queries, k\], got \[3, 1\]"),
         (np.zeros(2, int), r"got \[2\]"),
-        (np.array([[0], [4]]), "rows: expected whole numbers below 4, got int64 up to 4"),
+        (np.array([[0], [4]]), r"rows: .*below 4, got int64 .*4"),
         (np.zeros((2, 1)), "got float64"),
     ],
 )
@@ -105,11 +105,11 @@ def test_rankings_of_others_are_refused(rows, words):
 
 
 @pytest.mark.parametrize(("rows", "offsets", "words"), [
-    ([2, 0], [0, 2, 2], "rows that ascend for each query; from_rows takes them in any order"),
+    ([2, 0], [0, 2, 2], r"rows that ascend .*from_rows"),
     ([1, 1], [0, 0, 2], "rows that ascend"),
-    ([0, 4], [0, 1, 2], "rows from 0 to 3, and offsets that grow from 0 to 2"),
+    ([0, 4], [0, 1, 2], r"rows from 0 to 3.*offsets .*0 to 2"),
     ([-1, 1], [0, 1, 2], "rows from 0 to 3"),
-    ([0, 1], [0, 1, 1], "offsets that grow from 0 to 2"),
+    ([0, 1], [0, 1, 1], r"offsets .*0 to 2"),
     ([0, 1], [1, 1, 2], "offsets that grow"),
     ([0, 1], [0, 3, 2], "offsets that grow"),
 ])  # fmt: skip
@@ -121,12 +121,12 @@ def test_made_by_hand_they_are_as_described(rows, offsets, words):
 def test_what_does_not_fit_is_refused():
     found = Positives.from_rows([[0], [0, 1]], 4)
     for rows in ([[4]], [[0], [-1]], [[2**32]]):
-        with pytest.raises(InputError, match="positives: expected rows of a database of 4 images, got"):
+        with pytest.raises(InputError, match=r"positives: .*4 images, got"):
             Positives.from_rows(rows, 4)
     for rows in ([[0.5]], np.eye(2, dtype=bool)):
-        with pytest.raises(InputError, match=r"expected rows as whole numbers, got .* from_matrix takes matrices"):
+        with pytest.raises(InputError, match=r"whole numbers, got .*from_matrix"):
             Positives.from_rows(rows, 4)
-    with pytest.raises(InputError, match=r"expected two of one size .*, got \(2, 4\) and \(2, 5\)"):
+    with pytest.raises(InputError, match=r"size.* got \(2, 4\) and \(2, 5\)"):
         found | Positives.from_rows([[0], [0]], 5)
     with pytest.raises(InputError, match="allowed: expected shape"):
         found.among(np.ones(5, bool))

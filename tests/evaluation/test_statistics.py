@@ -130,7 +130,7 @@ def test_no_queries_tell_nothing():
 
 
 def test_hits_of_several_systems_are_told():
-    with pytest.raises(InputError, match=r"hits: expected \[Q\], one of every query, got \[2, 5\]"):
+    with pytest.raises(InputError, match=r"hits: expected \[Q\].* got \[2, 5\]"):
         recall_interval(np.ones((2, 5), bool))
 
 

@@ -72,7 +72,7 @@ def test_every_order_comes_back(tmp_path_factory, names):
 def test_lengths(tmp_path, descriptors):
     path = tmp_path / "g.npy"
     np.save(path, descriptors * 3)
-    with pytest.raises(InputError, match=r"g\.npy: expected descriptors of unit length, got length 3 at"):
+    with pytest.raises(InputError, match=r"g\.npy: .*unit length, got length 3 "):
         read_global_descriptors(path, NAMES)
     np.testing.assert_allclose(
         read_global_descriptors(path, NAMES, lengths="normalize"), descriptors[[1, 0, 2]], atol=1e-6
@@ -82,19 +82,19 @@ def test_lengths(tmp_path, descriptors):
 @pytest.mark.parametrize(
     "file, arrays, message",
     [
-        ("g.npy", np.ones((2, 8)), r"expected descriptors \[3, D\] of the images, got \[2, 8\]"),
-        ("g.npy", np.ones(3), r"expected descriptors \[3, D\] of the images, got \[3\]"),
-        ("g.npy", np.ones((3, 0)), r"expected descriptors \[3, D\] of the images, got \[3, 0\]"),
-        ("g.npy", np.ones((3, 8), int), "expected floating-point numbers, got int64"),
-        ("g.npy", np.full((3, 8), np.nan), r"expected finite float32, got nan at \[0, 0\]"),
-        ("g.npy", np.array([[{}]], object), "got objects or records; they are never loaded"),
+        ("g.npy", np.ones((2, 8)), r"descriptors \[3, D\].* got \[2, 8\]"),
+        ("g.npy", np.ones(3), r"descriptors \[3, D\].* got \[3\]"),
+        ("g.npy", np.ones((3, 0)), r"descriptors \[3, D\].* got \[3, 0\]"),
+        ("g.npy", np.ones((3, 8), int), "floating-point .*got int64"),
+        ("g.npy", np.full((3, 8), np.nan), r"finite .*nan at \[0, 0\]"),
+        ("g.npy", np.array([[{}]], object), "got objects"),
         ("g.npz", {"names": NAMES}, "got no descriptors"),
         ("g.npz", {"descriptors": np.ones((3, 8)), "names": NAMES[:2]}, r"expected names as text \[M\]"),
         ("g.npz", {"descriptors": np.ones((3, 8)), "names": np.arange(3)}, r"got int64\[3\] and \[3, 8\]"),
         ("g.npz", {"descriptors": np.ones((3, 8)), "names": ["a", "a", "b"]}, "expected different names, got 1 again"),
         ("g.npz", {"descriptors": np.ones((3, 8)), "names": [*NAMES[:2], "x"]}, r"first without is sub/image 1\.jpg"),
         ("g.npz", {"descriptors": np.ones(3), "names": NAMES}, r"expected descriptors \[3, D\] .* got \[3\]"),
-        ("g.npz", {"descriptors": np.array([{}, 1, 2], object)}, "got objects or records"),
+        ("g.npz", {"descriptors": np.array([{}, 1, 2], object)}, "got objects"),
         ("g.csv", None, r"expected a file named \.npy, \.npz, \.h5, \.hdf5, got \.csv"),
     ],
 )  # fmt: skip
@@ -114,14 +114,14 @@ def test_what_is_refused(tmp_path, file, arrays, message):
 
 def test_what_is_refused_of_hloc(tmp_path, descriptors):
     path = hloc(tmp_path / "g.h5", NAMES, descriptors)
-    with pytest.raises(InputError, match=r"expected descriptors of all 4 images, got 3; the first without is x\.jpg"):
+    with pytest.raises(InputError, match=r"all 4 images, got 3; .*x\.jpg"):
         read_global_descriptors(path, [*NAMES, "x.jpg"])
     with h5py.File(path, "a") as file:
         file.create_group("x.jpg")["global_descriptor"] = np.ones(9, np.float16)
         file.create_group("y.jpg")["keypoints"] = np.ones((9, 2), np.float16)
-    with pytest.raises(InputError, match=r"x\.jpg: expected global_descriptor \[D\], the same D for all, got \[9\]"):
+    with pytest.raises(InputError, match=r"x\.jpg: .*global_descriptor \[D\].* got \[9\]"):
         read_global_descriptors(path, [*NAMES, "x.jpg"])
-    with pytest.raises(InputError, match=r"y\.jpg: expected global_descriptor \[D\], .* got none"):
+    with pytest.raises(InputError, match=r"y\.jpg: .*global_descriptor \[D\].* got none"):
         read_global_descriptors(path, [*NAMES, "y.jpg"])
 
 
@@ -135,10 +135,10 @@ def test_truncated(tmp_path, descriptors):
 
 
 def test_what_cannot_be_written(tmp_path, descriptors):
-    with pytest.raises(InputError, match=r"expected descriptors \[2, D\] to write, got \[3, 8\]"):
+    with pytest.raises(InputError, match=r"\[2, D\] .*got \[3, 8\]"):
         write_global_descriptors(tmp_path / "g.npy", NAMES[:2], descriptors)
     with pytest.raises(InputError, match="expected values that float16 holds"):
         write_global_descriptors(tmp_path / "g.npy", NAMES, descriptors * 1e6, half=True)
-    with pytest.raises(InputError, match=r"a name that ends with \.npy, \.npz, \.h5 or \.hdf5"):
+    with pytest.raises(InputError, match=r"name .*\.npy, \.npz, \.h5 or \.hdf5"):
         write_global_descriptors(tmp_path / "g", NAMES, descriptors)
     assert not list(tmp_path.iterdir())

@@ -97,7 +97,7 @@ def test_a_failure_leaves_what_was_there(tmp_path, file):
 def test_what_cannot_be_written(tmp_path):
     made = feature(0)
     loud = type(made)(**(vars(made) | {"scores": made.scores * 1e6}))
-    with pytest.raises(InputError, match=r"a\.jpg: scores: expected values that float16 holds"):
+    with pytest.raises(InputError, match=r"a\.jpg: scores: .*float16"):
         write_features(tmp_path / "f.h5", ["a.jpg"], [(0, loud)], half=True)
     for name in ("../a.jpg", "/a.jpg", ""):
         with pytest.raises(InputError, match="expected a path below the folder of images"):

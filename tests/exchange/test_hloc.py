@@ -92,34 +92,34 @@ def test_scores_by_another_name_or_missing(path):
     source = open_features(path, ["b.jpg"])
     assert not source.scored
     np.testing.assert_array_equal(next(source.read())[1].scores, np.ones(30))
-    with pytest.raises(InputError, match=r"expected scores of all images or of none, got none of b\.jpg"):
+    with pytest.raises(InputError, match=r"scores .*got none .*b\.jpg"):
         open_features(path, ["a.jpg", "b.jpg"])
 
 
 def test_image_size_that_the_file_lacks_is_given(path):
     write_hloc(path, NAMES, features_of(3), change=lambda _, parts: parts | {"image_size": parts.pop("image_size")})
     write_hloc(path, ["x.jpg"], features_of(1), change=lambda _, parts: {k: parts[k] for k in list(parts)[:3]})
-    with pytest.raises(InputError, match=r"x\.jpg: expected image_size .* got none; give it as image_size="):
+    with pytest.raises(InputError, match=r"x\.jpg: .*image_size .*got none; .*image_size="):
         open_features(path, ["x.jpg"])
     for size in ((640, 480), [[640, 480]]):
         [(_, found)] = open_features(path, ["x.jpg"], image_size=size).read()
         assert found.image_size.tolist() == [640, 480]
-    with pytest.raises(InputError, match=r"a/image 1\.jpg: expected the image_size that was given, \[320"):
+    with pytest.raises(InputError, match=r"a/image 1\.jpg: .*image_size .*\[320"):
         next(open_features(path, NAMES, image_size=(320, 240)).read())
     for size in ((0, 3), (np.nan, 1), (1, 2, 3), [[1, 2]]):
-        with pytest.raises(InputError, match=r"image_size: expected .width, height. in pixels"):
+        with pytest.raises(InputError, match=r"image_size: .*width, height"):
             open_features(path, NAMES, image_size=size)
 
 
 def test_missing_images(path):
     write_hloc(path, NAMES[:2], features_of(2))
-    with pytest.raises(InputError, match=r"feats-d2net-ss\.h5: expected features of all 3 .* is image10\.png"):
+    with pytest.raises(InputError, match=r"feats-d2net-ss\.h5: .*all 3 .*image10\.png"):
         open_features(path, NAMES)
     source = open_features(path, NAMES, partial=True)
     assert source.counts.tolist() == [30, 30, -1]
     assert [row for row, _ in source.read()] == [0, 1]
     for row in (2, 3, -1):
-        with pytest.raises(InputError, match=f"expected features of image {row}, got none"):
+        with pytest.raises(InputError, match=f"image {row}, got none"):
             next(source.read([row]))
     with pytest.raises(InputError, match="got 0; the first without"):
         open_features(path, ["other.jpg"], partial=True)
@@ -138,7 +138,7 @@ def test_missing_images(path):
         (lambda p: p | {"descriptors": p["descriptors"][:8]}, "expected 16 numbers each, got 8"),
         (
             lambda p: p | {"descriptors": p["descriptors"].T},
-            r"one layout, got \[D, N\] for a\.jpg and \[N, D\] for b\.",
+            r"got \[D, N\] .*a\.jpg .*\[N, D\] .*b\.",
         ),
     ],
 )
@@ -164,18 +164,18 @@ def spoiled(part, value, row=3):
 @pytest.mark.parametrize(
     "change, message",
     [
-        (spoiled("keypoints", np.nan), r"keypoints: expected finite float32, got nan at \[3, 0\]"),
-        (spoiled("descriptors", np.inf), r"descriptors: expected finite float32, got inf at \[3, 0\]"),
-        (spoiled("scores", np.nan), r"scores: expected finite float32, got nan at \[3\]"),
-        (lambda p: p | {"scores": np.full(30, 1e300)}, "scores: expected finite float32, got 1e.300"),
-        (lambda p: p | {"descriptors": p["descriptors"] * 2}, r"unit length, got length 2.* lengths='normalize'"),
-        (lambda p: p | {"descriptors": np.zeros((16, 30), np.uint8)}, "expected floating-point numbers, got uint8"),
-        (lambda p: p | {"keypoints": np.zeros((30, 2), np.complex64)}, "keypoints: expected numbers, got complex64"),
+        (spoiled("keypoints", np.nan), r"keypoints: .*finite .*nan at \[3, 0\]"),
+        (spoiled("descriptors", np.inf), r"descriptors: .*finite .*inf at \[3, 0\]"),
+        (spoiled("scores", np.nan), r"scores: .*finite .*nan at \[3\]"),
+        (lambda p: p | {"scores": np.full(30, 1e300)}, "scores: .*finite .*1e.300"),
+        (lambda p: p | {"descriptors": p["descriptors"] * 2}, r"got length 2.* lengths='normalize'"),
+        (lambda p: p | {"descriptors": np.zeros((16, 30), np.uint8)}, "floating-point .*got uint8"),
+        (lambda p: p | {"keypoints": np.zeros((30, 2), np.complex64)}, "keypoints: .*numbers, got complex64"),
         (lambda p: p | {"scores": p["scores"][1:]}, r"expected 30 keypoints with scores .* got 30, 29 and \[30, 16\]"),
-        (lambda p: p | {"scores": np.zeros(30, bool)}, "scores: expected floating-point numbers, got bool"),
+        (lambda p: p | {"scores": np.zeros(30, bool)}, "scores: .*floating-point .*got bool"),
         (lambda p: p | {"image_size": np.array([640, 0])}, r"image_size: expected .* got \[640, 0\]"),
         (lambda p: p | {"image_size": np.array([640, 480, 3])}, r"image_size: expected .* got \[640, 480, 3\]"),
-        (spoiled("keypoints", 700), r"expected keypoints .x, y. in an image of 640 x 480 pixels, got \(700, 700\)"),
+        (spoiled("keypoints", 700), r"keypoints .*640 x 480 .*got \(700, 700\)"),
         (spoiled("keypoints", -20), r"got \(-20, -20\)"),
         (lambda p: p | {"keypoints": np.full((30, 2), (100, 600))}, r"got \(100, 600\)"),
     ],
@@ -213,11 +213,9 @@ def test_lengths_of_descriptors(path):
     [(_, unit)] = open_features(path, ["a.jpg"], lengths="normalize").read()
     np.testing.assert_allclose(unit.descriptors, made.descriptors, atol=1e-6)
     append_hloc(path, "zero.jpg", spoiled("descriptors", 0, row=slice(None))(parts))
-    with pytest.raises(
-        InputError, match=r"zero\.jpg: descriptors: expected descriptors with a direction, got zeros at 0"
-    ):
+    with pytest.raises(InputError, match=r"zero\.jpg: descriptors: .*got zeros at 0"):
         list(open_features(path, ["zero.jpg"], lengths="normalize").read())
-    with pytest.raises(InputError, match="lengths=l2: expected one of unit, normalize, keep"):
+    with pytest.raises(InputError, match=r"lengths=l2: .*unit, normalize, keep"):
         open_features(path, ["a.jpg"], lengths="l2")  # type: ignore[arg-type]
 
 
@@ -226,7 +224,7 @@ def test_a_file_that_changes_after_it_was_opened(path):
     source = open_features(path, ["a.jpg"])
     path.unlink()
     write_hloc(path, ["a.jpg"], [feature(0, count=31)])
-    with pytest.raises(InputError, match=r"a\.jpg: expected 30 keypoints .* changed since it was opened"):
+    with pytest.raises(InputError, match=r"a\.jpg: .*30 keypoints .*changed"):
         list(source.read())
     path.unlink()
     write_hloc(
@@ -263,7 +261,7 @@ def test_opening_and_reading_take_the_memory_of_what_is_read(path):
     assert len(read) == 5
     assert (source.counts == 50).all()
     assert peak < 6e6  # of 400 MB; what is read takes 1 MB, headers 2 MB
-    with pytest.raises(InputError, match=r"db/0/00005\.jpg/keypoints: .* not written; extract this image again"):
+    with pytest.raises(InputError, match=r"db/0/00005\.jpg/keypoints: .*not written"):
         list(source.read([5]))
 
 
@@ -271,5 +269,5 @@ def test_without_h5py(path, monkeypatch):
     path.write_bytes(b"")
     assert not hasattr(mfvpr.exchange.h5, "h5py")  # it is imported where it is needed
     monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(InputError, match=r"HDF5 needs the package h5py; pip install 'mfvpr\[hloc\]'"):
+    with pytest.raises(InputError, match=r"h5py; pip install 'mfvpr\[hloc\]'"):
         open_features(path, NAMES)

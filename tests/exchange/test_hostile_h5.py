@@ -30,7 +30,7 @@ def secret(tmp_path):
 def test_external_link_to_an_image(path, secret):
     with h5py.File(path, "w") as file:
         file["a.jpg"] = h5py.ExternalLink(str(secret), "/a.jpg")
-    refused(path, r"a\.jpg: expected data, got a link, which is not followed")
+    refused(path, r"a\.jpg: .*got a link")
 
 
 def test_external_link_to_an_array(path, secret):
@@ -56,7 +56,7 @@ def test_storage_in_another_file(path, tmp_path):
     with h5py.File(path, "a") as file:
         stored = [(str(tmp_path / "secret"), 0, scores.nbytes)]
         file["a.jpg"].create_dataset("scores", shape=scores.shape, dtype=scores.dtype, external=stored)
-    refused(path, r"a\.jpg/scores: expected data in this file, got storage in others")
+    refused(path, r"a\.jpg/scores: .*storage in others")
 
 
 def test_virtual_dataset(path, secret):
@@ -67,14 +67,14 @@ def test_virtual_dataset(path, secret):
     layout[:] = h5py.VirtualSource(str(secret), "a.jpg/scores", shape=scores.shape)
     with h5py.File(path, "a", libver="latest") as file:
         file["a.jpg"].create_virtual_dataset("scores", layout)
-    refused(path, r"a\.jpg/scores: expected data in this file, got storage in others")
+    refused(path, r"a\.jpg/scores: .*storage in others")
 
 
 def test_a_group_that_holds_itself(path):
     with h5py.File(path, "w") as file:
         group = file.create_group("a")
         group["b"] = group
-    refused(path, "a/b: expected a group with one name, got one with several")
+    refused(path, "a/b: .*one name.* several")
 
 
 def test_objects_and_records(path):
@@ -82,7 +82,7 @@ def test_objects_and_records(path):
         append_hloc(path, name, {k: v for k, v in hloc_parts(feature(0)).items() if k != "scores"})
         with h5py.File(path, "a") as file:
             file[name].create_dataset("scores", shape=(30,), dtype=dtype)
-        refused(path, "scores: expected an array of numbers or text, got objects or records", [name])
+        refused(path, "scores: .*array of numbers .*got objects", [name])
 
 
 def test_a_group_where_an_array_should_be(path):
@@ -90,7 +90,7 @@ def test_a_group_where_an_array_should_be(path):
     with h5py.File(path, "a") as file:
         del file["a.jpg/keypoints"]
         file.create_group("a.jpg/keypoints")
-    refused(path, r"a\.jpg/keypoints: expected a dataset, got a group")
+    refused(path, r"a\.jpg/keypoints: .*got a group")
 
 
 def test_a_space_without_values(path):
@@ -98,7 +98,7 @@ def test_a_space_without_values(path):
     with h5py.File(path, "a") as file:
         del file["a.jpg/scores"]
         file["a.jpg"].create_dataset("scores", data=h5py.Empty("f"))
-    refused(path, r"a\.jpg/scores: expected values, got a dataset without any")
+    refused(path, r"a\.jpg/scores: .*values, got .*without")
 
 
 def test_values_that_were_not_all_written(path):
@@ -114,13 +114,13 @@ def test_values_that_were_not_all_written(path):
         file["b.jpg"].create_dataset("scores", shape=(30,), dtype="f2", chunks=(10,))[:20] = 1
     [_, (_, found)] = open_features(path, ["a.jpg", "c.jpg"]).read()
     np.testing.assert_array_equal(found.scores, parts["scores"])
-    refused(path, r"b\.jpg/scores: expected data, got a dataset that was not written", ["b.jpg"])
+    refused(path, r"b\.jpg/scores: .*not written", ["b.jpg"])
 
 
 def test_no_images(path):
     with h5py.File(path, "w") as file:
         file.create_group("a.jpg")
-    refused(path, "expected a group for every image, as hloc writes them, got no datasets")
+    refused(path, "group .*image.* got no datasets")
 
 
 def test_truncated_at_any_place(tmp_path, path):
@@ -134,7 +134,7 @@ def test_not_a_file(tmp_path):
     for name, message in (("x.h5", "got nothing"), ("x.txt", "got nothing"), ("x", "got nothing")):
         refused(tmp_path / name, message)
     (tmp_path / "x.txt").write_text("")
-    refused(tmp_path / "x.txt", r"a folder or a file named \.h5, \.hdf5, \.npz, got \.txt")
+    refused(tmp_path / "x.txt", r"\.h5, \.hdf5, \.npz, got \.txt")
     (tmp_path / "y.h5").write_text("text")
     with pytest.raises(InputError, match="cannot be read"):
         read_global_descriptors(tmp_path / "y.h5", ["a.jpg"])

@@ -52,15 +52,15 @@ def test_matches(names, foreign, expected):
     "names, foreign, several",
     [
         (["1.jpg"], ["db/1.jpg", "query/1.jpg"], r"1\.jpg: expected .* got db/1\.jpg and query/1\.jpg"),
-        (["a/1.jpg", "b/1.jpg"], ["1.jpg"], r"a/1\.jpg: expected .* got 1\.jpg, which may mean other images"),
-        (["1.jpg", "1.png"], ["1"], r"1\.jpg: expected .* got 1, which may mean other images"),
+        (["a/1.jpg", "b/1.jpg"], ["1.jpg"], r"a/1\.jpg: expected .* got 1\.jpg"),
+        (["1.jpg", "1.png"], ["1"], r"1\.jpg: expected .* got 1,"),
         (["1.jpg"], ["1.png", "1"], r"1\.jpg: expected .* got 1 and 1\.png"),
         (
             ["0.jpg", "1.jpg", "2.jpg"],
             ["db/0.jpg", "db/1.jpg", "query/2.jpg"],
-            r"one prefix for all .* got db/0\.jpg for 0\.jpg but query/2\.jpg for 2\.jpg",
+            r"one prefix .*db/0\.jpg .*query/2\.jpg",
         ),
-        (["a/1.jpg", "b/2.jpg"], ["1.jpg", "2.jpg"], r"one prefix .* got 1\.jpg for a/1\.jpg but 2\.jpg for b/2\.jpg"),
+        (["a/1.jpg", "b/2.jpg"], ["1.jpg", "2.jpg"], r"one prefix .* got 1\.jpg .*a/1\.jpg .*b/2\.jpg"),
     ],
 )
 def test_nothing_is_guessed(names, foreign, several):
@@ -83,13 +83,13 @@ def test_a_name_twice(tmp_path, names):
         lambda: write_global_descriptors(tmp_path / "a.h5", names, np.eye(len(names))),
         lambda: write_shortlist(tmp_path / "a.txt", shortlist, names, ["d.jpg"]),
     ):
-        with pytest.raises(InputError, match=r"expected images with different names, got (a|\\udcff)\.jpg twice"):
+        with pytest.raises(InputError, match=r"names, got (a|\\udcff)\.jpg twice"):
             use()
     assert not list(tmp_path.iterdir())
 
 
 def test_missing_images_are_counted():
-    with pytest.raises(InputError, match=r"expected features of all 3 images, got 1; the first without is b\.jpg"):
+    with pytest.raises(InputError, match=r"all 3 images, got 1; .*b\.jpg"):
         require_all(FILE, ["a.jpg", "b.jpg", "c.jpg"], ["a.jpg", None, None], "features")
 
 

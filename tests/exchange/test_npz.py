@@ -85,7 +85,7 @@ def test_only_what_is_asked_for_is_read(tmp_path):
     source = open_features(path, ["a.jpg", "b.jpg"])
     [(_, found)] = source.read([0])
     assert_equal(found, made["a.jpg"])
-    with pytest.raises(InputError, match=r"all\.npz: cannot be read \(Bad CRC-32 for file 'b\.jpg/descriptors\.npy'\)"):
+    with pytest.raises(InputError, match=r"all\.npz: .*CRC-32 .*'b\.jpg/descriptors\.npy'"):
         list(source.read([1]))
 
 
@@ -94,7 +94,7 @@ def test_pipes_are_not_waited_for(tmp_path):
     np.savez(tmp_path / "1.jpg.npz", **parts_of(made))
     os.mkfifo(tmp_path / "2.jpg.npz")
     for path, wanted in ((tmp_path, names), (tmp_path / "2.jpg.npz", names)):
-        with pytest.raises(InputError, match=r"2\.jpg\.npz: expected a file, got a pipe or device"):
+        with pytest.raises(InputError, match=r"2\.jpg\.npz: .*a pipe"):
             open_features(path, wanted)
     [(_, found)] = open_features(tmp_path, names[:1]).read()
     assert_equal(found, made)
@@ -103,11 +103,11 @@ def test_pipes_are_not_waited_for(tmp_path):
     source = open_features(tmp_path, names)
     (tmp_path / "2.jpg.npz").unlink()
     os.mkfifo(tmp_path / "2.jpg.npz")
-    with pytest.raises(InputError, match=r"2\.jpg\.npz: expected a file, got a pipe or device"):
+    with pytest.raises(InputError, match=r"2\.jpg\.npz: .*a pipe"):
         list(source.read([1]))
     for name in ("a.h5", "a.npy"):
         os.mkfifo(tmp_path / name)
-        with pytest.raises(InputError, match="got a pipe or device"):
+        with pytest.raises(InputError, match="got a pipe"):
             read_global_descriptors(tmp_path / name, names)
 
 
@@ -125,7 +125,7 @@ def test_an_array_twice(tmp_path):
         lambda: list(source.read()),
         lambda: list(whole.read()),
     ):
-        with pytest.raises(InputError, match=r"npz: expected every array once, got .*scores\.npy again"):
+        with pytest.raises(InputError, match=r"npz: .*once, got .*scores\.npy"):
             use()
 
 
@@ -138,12 +138,12 @@ def test_pickles_are_never_loaded(tmp_path):
     np.savez(tmp_path / "1.jpg.npz", **(parts | {"scores": np.array([Trap()], object)}))
     np.savez(tmp_path / "all.npz", **{"1.jpg/keypoints": np.array([Trap()], object)})
     for path in (tmp_path / "all.npz", tmp_path):
-        with pytest.raises(InputError, match=r"npz: .*expected an array of numbers or text, got objects or records"):
+        with pytest.raises(InputError, match=r"npz: .*array of numbers .*got objects"):
             list(open_features(path, ["1.jpg"]).read())
     records = np.zeros(30, np.dtype([("x", "f4")]))
     np.savez(tmp_path / "1.jpg.npz", **(parts | {"scores": records}))
     (tmp_path / "all.npz").unlink()
-    with pytest.raises(InputError, match="got objects or records"):
+    with pytest.raises(InputError, match="got objects"):
         list(open_features(tmp_path, ["1.jpg"]).read())
 
 
@@ -196,21 +196,21 @@ def test_more_keypoints_than_can_be_counted(tmp_path):
     with zipfile.ZipFile(tmp_path / "1.jpg.npz", "w") as archive:
         for part in ("keypoints", "descriptors"):
             archive.writestr(f"{part}.npy", npy(header))
-    with pytest.raises(InputError, match=r"1\.jpg: keypoints: expected \[N, 2\].* got \[1000000000000, 2\]"):
+    with pytest.raises(InputError, match=r"1\.jpg: keypoints: .*\[N, 2\].* got \[1000000000000, 2\]"):
         open_features(tmp_path, ["1.jpg"], image_size=SIZE)
 
 
 def test_what_is_no_store_of_features(tmp_path):
     path = tmp_path / "1.jpg.npz"
     np.savez(path, **parts_of(feature(0)))
-    with pytest.raises(InputError, match=r"got keypoints, descriptors, scores, image_size; .* give their folder"):
+    with pytest.raises(InputError, match=r"got keypoints, descriptors, scores, image_size; .*folder"):
         open_features(path, ["1.jpg"])
     np.savez(path)
     with pytest.raises(InputError, match=r"expected arrays named by images .* got none"):
         open_features(path, ["1.jpg"])
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match=r"empty: expected files named \.npz or \.d2-net, got none"):
+    with pytest.raises(InputError, match=r"empty: .*\.npz .*\.d2-net, got none"):
         open_features(tmp_path / "empty", ["1.jpg"])
     d2net(tmp_path / "1.jpg", feature(0))
-    with pytest.raises(InputError, match=r"1\.jpg\.npz: 1\.jpg\.d2-net beside it is of the same image"):
+    with pytest.raises(InputError, match=r"1\.jpg\.npz: 1\.jpg\.d2-net .*same image"):
         open_features(tmp_path, ["1.jpg"])

@@ -81,25 +81,25 @@ def test_a_candidate_twice_counts_where_it_comes_first(tmp_path):
 @pytest.mark.parametrize(
     "text, message",
     [
-        ("q/1.jpg d/9.jpg", r"line 1: expected the names of a query and a database image, got names of none in 'q/1"),
+        ("q/1.jpg d/9.jpg", r"line 1: .*names .*'q/1"),
         (
             "q/1.jpg d/1.jpg\nd/1.jpg q/1.jpg",
-            r"expected the relative path of a query image, got 'd/1\.jpg', which none",
+            r"query image, got 'd/1\.jpg'",
         ),
         ("q/1.jpg", "line 1: expected the names"),
         ("q/1.jpg d/1.jpg 0.5", "line 1: expected the names"),
         ("q/1.jpg, d/1.jpg, high", "line 1: expected the names"),
         ("q/1.jpg, d/1.jpg, 1_0", "line 1: expected the names"),
         ("q/1.jpg, d/1.jpg, 0.5\nq/2.jpg, d/2.jpg", "expected scores of all pairs or of none"),
-        ("q/1.jpg, d/1.jpg, 0.5\nq/1.jpg, d/2.jpg, 0.6", r"q/1\.jpg: expected scores, .* descend .* negate distances"),
+        ("q/1.jpg, d/1.jpg, 0.5\nq/1.jpg, d/2.jpg, 0.6", r"q/1\.jpg: .*scores.* descend .*distances"),
         ("q/1.jpg, d/1.jpg, nan", r"q/1\.jpg: expected finite scores"),
         ("q/1.jpg, d/1.jpg, 1e99", r"q/1\.jpg: expected finite scores"),
         (
             "other/1.jpg d/1.jpg",
-            r"expected the relative path of a query image, got 'other/1\.jpg', which none of the 3",
+            r"query image, got 'other/1\.jpg'.* 3",
         ),
-        ("1.jpg d/1.jpg\nq/1.jpg d/2.jpg", r"got '1\.jpg', which none of the 3 has, or one has by its full path"),
-        ("# nothing but a comment", "expected candidates of 3 queries, got none at all"),
+        ("1.jpg d/1.jpg\nq/1.jpg d/2.jpg", r"got '1\.jpg'.* 3 .*full path"),
+        ("# nothing but a comment", "3 queries, got none"),
         ("", "got none at all"),
         ("x" * 500, r"got names of none in 'x{40}\.\.\. \(500 characters\)'"),
     ],
@@ -114,20 +114,20 @@ def test_lines_that_are_no_pairs(tmp_path, text, message):
 @pytest.mark.parametrize(
     "arrays, message",
     [
-        ({}, r"expected predictions \[2, K\], whole numbers, got none"),
+        ({}, r"predictions \[2, K\].* got none"),
         ({"predictions": np.zeros((2, 2))}, r"got float64\[2, 2\]"),
         ({"predictions": np.zeros(2, int)}, r"got int64\[2\]"),
-        ({"predictions": np.zeros((3, 2), int)}, "expected predictions of 2 queries, got 3"),
-        ({"predictions": [[0, 1], [4, 0]]}, "query 1: expected database rows from 0 to 3, or -1 for none, got 4"),
+        ({"predictions": np.zeros((3, 2), int)}, "predictions .*2 queries, got 3"),
+        ({"predictions": [[0, 1], [4, 0]]}, "query 1: .*0 to 3, .*-1 .*got 4"),
         ({"predictions": [[0, -2], [0, 0]]}, "query 0: expected .* got -2"),
         ({"predictions": np.array([[2**63], [0]], np.uint64)}, "query 0: expected .* got 9223372036854775808"),
         ({"predictions": [[0], [1]], "scores": [[1.0, 2], [1, 2]]}, r"expected scores \[2, 1\] .* got float64\[2, 2\]"),
-        ({"predictions": [[0], [1]], "scores": [["a"], ["b"]]}, r"expected scores \[2, 1\] of numbers, got <U1"),
+        ({"predictions": [[0], [1]], "scores": [["a"], ["b"]]}, r"scores \[2, 1\] .*got <U1"),
         ({"predictions": [[0, 1], [1, 0]], "scores": [[1.0, 2], [1, 2]]}, r"q/1\.jpg: expected scores, .* descend"),
         ({"predictions": [[0, 1], [1, 0]], "scores": [[1.0, np.nan], [1, 2]]}, "expected finite scores"),
         ({"predictions": np.full((2, 3), -1)}, "got none at all"),
         ({"predictions": np.zeros((2, 0), int)}, "got none at all"),
-        ({"predictions": np.array([[{}], [1]], object)}, "got objects or records; they are never loaded"),
+        ({"predictions": np.array([[{}], [1]], object)}, "got objects"),
     ],
 )
 def test_predictions_that_cannot_be_used(tmp_path, arrays, message):
@@ -207,18 +207,18 @@ def test_what_cannot_be_written(tmp_path):
     shortlist = Shortlist(indices=np.array([[3]]), scores=np.ones((1, 1)), mask=np.ones((1, 1), bool))
     path = tmp_path / "p.txt"
     for names, message in (
-        ((QUERIES, DATABASE), "expected the names of 1 queries, got 3"),
-        ((QUERIES[:1], DATABASE[:3]), "expected database rows below 3, got 3"),
-        ((["a\nb"], DATABASE), r"expected names of one line without spaces around, got 'a\\nb'; write \.npz"),
+        ((QUERIES, DATABASE), "1 queries, got 3"),
+        ((QUERIES[:1], DATABASE[:3]), "rows below 3, got 3"),
+        ((["a\nb"], DATABASE), r"names .*got 'a\\nb'; .*\.npz"),
         ((["a "], DATABASE), "without spaces around"),
     ):
         with pytest.raises(InputError, match=message):
             write_shortlist(path, shortlist, *names)
-    with pytest.raises(InputError, match="layout=csv: expected hloc or kapture"):
+    with pytest.raises(InputError, match=r"layout=csv: .*hloc .*kapture"):
         write_shortlist(path, shortlist, QUERIES[:1], DATABASE, layout="csv")  # type: ignore[arg-type]
     wrong = Shortlist(indices=np.array([[0, 1]]), scores=np.array([[0.5, np.nan]]), mask=np.ones((1, 2), bool))
     ascending = Shortlist(indices=np.array([[0, 1]]), scores=np.array([[0.5, 0.7]]), mask=np.ones((1, 2), bool))
-    for shortlist, message in ((wrong, "finite scores"), (ascending, "scores, larger = better, that descend")):
+    for shortlist, message in ((wrong, "finite scores"), (ascending, "scores, .*descend")):
         for file, layout in (("p.txt", "kapture"), ("p.npz", "hloc")):
             with pytest.raises(InputError, match=rf"q/1\.jpg: expected {message}"):
                 write_shortlist(tmp_path / file, shortlist, QUERIES[:1], DATABASE, layout=layout)

@@ -63,15 +63,14 @@ def test_another_training_is_refused_and_nothing_changes(trained, changes, diffe
     before = contents(trained)
     with pytest.raises(InputError) as told:
         train(trained, **changes)
-    assert str(told.value) == (
-        f"{trained}: this checkpoint is of {difference}; choose another folder, or delete this one"
-    )
+    assert str(told.value).startswith(f"{trained}: ")
+    assert f"{difference}; " in str(told.value)
     assert contents(trained) == before
 
 
 def test_fewer_steps_than_were_made_are_refused(trained):
     before = contents(trained)
-    with pytest.raises(InputError, match="this checkpoint is of step 10, expected at most 5; ask for more steps, or"):
+    with pytest.raises(InputError, match=r"step 10, .*5; "):
         train(trained, steps=5)
     assert contents(trained) == before
 
@@ -96,9 +95,9 @@ def test_folders_of_something_else_are_refused(tmp_path):
         manager.save(3, args=ocp.args.StandardSave({"x": np.ones(3)}))
     before = contents(tmp_path)
     for name, message in (
-        ("file", r"file: expected a folder of checkpoints, got a file; choose another folder"),
-        ("photos", r"photos: expected a folder of checkpoints, got one that holds summer; choose another folder"),
-        ("foreign", r"foreign/3: expected a checkpoint of mfvpr, got another; choose another folder"),
+        ("file", r"file: .*got a file"),
+        ("photos", r"photos: .*got .*summer"),
+        ("foreign", r"foreign/3: .*checkpoint of mfvpr"),
     ):
         with pytest.raises(InputError, match=message):
             train(tmp_path / name)
@@ -122,7 +121,7 @@ def test_damage_is_told_and_the_one_before_still_serves(tmp_path, item, damage):
     files = [path for path in (tmp_path / "2" / item).rglob("*") if path.is_file() and path.suffix != ".txt"]
     largest = max(files, key=lambda path: path.stat().st_size)
     largest.write_bytes(damage(largest.read_bytes()))
-    with pytest.raises(InputError, match=r"/2: damaged \(.+\); delete it to go on from the checkpoint before$") as told:
+    with pytest.raises(InputError, match=r"/2: damaged \(.+\); delete") as told:
         checkpoints.restore(tmp_path, {}, state)
     assert "\n" not in str(told.value)
     shutil.rmtree(tmp_path / "2")
@@ -136,17 +135,15 @@ def test_changed_progress_is_damage(tmp_path):
     path = tmp_path / "1" / "record" / "metadata"
     record = json.loads(path.read_text())
     path.write_text(json.dumps({**record, "progress": [[1, 0.75]]}))
-    with pytest.raises(
-        InputError, match=r"/1: damaged \(another checksum\); delete it to go on from the checkpoint before"
-    ):
+    with pytest.raises(InputError, match=r"/1: damaged \(.*checksum\); delete"):
         checkpoints.restore(tmp_path, {}, STATE)
 
 
 def test_a_place_that_cannot_be_written_is_told(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match=r"file/sub: no checkpoint can be kept here \(.*check the path"):
+    with pytest.raises(InputError, match=r"file/sub: .*checkpoint .*path"):
         train(tmp_path / "file" / "sub")
-    with pytest.raises(InputError, match=r"file/sub: the checkpoint of step 5 cannot be written \(.*check the path"):
+    with pytest.raises(InputError, match=r"file/sub: .*step 5 .*path"):
         checkpoints.save(tmp_path / "file" / "sub", 5, RECIPE, STATE, [])
 
 

@@ -119,10 +119,10 @@ def test_queries_without_a_wrong_candidate_teach_nothing_and_judge_nothing():
 def test_what_cannot_be_compared_is_refused():
     at = split()
     data = at.match_set, at.candidates
-    with pytest.raises(InputError, match="MatchCount: expected a scorer with numbers to learn"):
+    with pytest.raises(InputError, match=r"MatchCount: .*numbers to learn"):
         comparison.compare(Axes(MatchCount(), {}, {}), at.judge, *data)
     whole = replace(at.judge, halves=(), split=None)
-    with pytest.raises(InputError, match="split=None: expected first_half, second_half or both"):
+    with pytest.raises(InputError, match=r"split=None: .*first_half, second_half .*both"):
         comparison.compare(Axes(AggregatedScore(), {}, {}), whole, *data)
-    with pytest.raises(InputError, match="split=first_half: expected queries to learn on and to validate with, got 0"):
+    with pytest.raises(InputError, match=r"split=first_half: .*queries .*got 0"):
         split(only_right=range(QUERIES))

@@ -107,11 +107,11 @@ def test_databases_stand_side_by_side():
 
 def test_sets_that_do_not_go_together_are_refused(parts):
     a, b, c = parts
-    with pytest.raises(InputError, match="expected data sets to learn on and to report on, got 3 and 0"):
+    with pytest.raises(InputError, match=r"learn on .*report on, got 3 and 0"):
         joined(parts, [])
-    with pytest.raises(InputError, match="expected data sets of different names, got a, b, a"):
+    with pytest.raises(InputError, match=r"names, got a, b, a"):
         joined([a, b], [replace(c, name="a")])
-    with pytest.raises(InputError, match="c: expected the unit of a, frames, got m;"):
+    with pytest.raises(InputError, match=r"c: .*unit of a, frames, got m;"):
         joined([a], [replace(c, judge=replace(c.judge, unit="m"))])
-    with pytest.raises(InputError, match=r"c: expected the thresholds of a, \(0, 1, 2\), got \(0, 1, 3\);"):
+    with pytest.raises(InputError, match=r"c: .*thresholds of a, \(0, 1, 2\), got \(0, 1, 3\);"):
         joined([a], [replace(c, judge=replace(c.judge, thresholds=(0, 1, 3)))])

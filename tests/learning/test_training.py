@@ -170,7 +170,7 @@ def test_the_best_between_two_validations_is_of_the_shorter_training_alone(tmp_p
 def test_a_second_training_in_one_folder_is_refused(tmp_path):
     def second(step):
         if step == 8:
-            with pytest.raises(InputError, match="another process trains here; wait until it ends, or choose another"):
+            with pytest.raises(InputError, match="another process"):
                 train(tmp_path)
         return batches(step)
 
@@ -233,9 +233,7 @@ def test_what_is_not_finite_is_told_and_leaves_the_checkpoint(tmp_path, whole, b
 
 
 def test_a_step_to_infinity_and_a_validation_of_nan_are_told():
-    with pytest.raises(
-        TrainingError, match=r"step 0: updated\..* of batch 0 is not finite.*there is no checkpoint yet"
-    ):
+    with pytest.raises(TrainingError, match=r"step 0: updated\..*batch 0 .*not finite.*no checkpoint"):
         train(objective=lambda parameters, batch: 10 * objective(parameters, batch), optimizer=optax.sgd(1e38))
     with pytest.raises(TrainingError, match=r"step 5: validation is not finite"):
         train(validate=lambda parameters: np.nan if parameters["slope"] != 1 else 0.0)
@@ -243,7 +241,7 @@ def test_a_step_to_infinity_and_a_validation_of_nan_are_told():
 
 @pytest.mark.parametrize("wrong", [{"every": 0}, {"steps": -1}, {"patience": 0}, {"patience": 1, "validate": None}])
 def test_impossible_settings_are_refused(wrong):
-    with pytest.raises(ValueError, match="expected counts, and a patience only with validate"):
+    with pytest.raises(ValueError, match=r"patience .*validate"):
         train(**wrong)
 
 

@@ -238,7 +238,7 @@ def test_a_vocabulary_that_is_damaged_or_gone_is_to_be_put_back(dataset, folder,
     content = path.read_bytes()
     for damage in (lambda: path.write_bytes(content[:-50]), path.unlink):
         damage()
-        with pytest.raises(InputError, match=r"vocabulary\.npz: expected the vocabulary .* [pP]ut .* back") as error:
+        with pytest.raises(InputError, match=r"vocabulary\.npz: expected the vocabulary .*back") as error:
             asked(tmp_path / "map")
         assert "delete" not in str(error.value)
     path.write_bytes(content)
@@ -374,7 +374,7 @@ class Tensor:
     None, Tensor(), b"0.png", [[[0, 0, 0]], []],
 ])  # fmt: skip
 def test_arrays_are_images(folder, image):
-    with pytest.raises(InputError, match=r"^image: expected a file or \[H, W, 3\] uint8 RGB, got [^\n]+$"):
+    with pytest.raises(InputError, match=r"^image: .*\[H, W, 3\] uint8 .*got [^\n]+$"):
         asked(folder).localize(image)
 
 

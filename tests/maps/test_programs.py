@@ -82,7 +82,7 @@ def test_images_are_added(folder, small_street, monkeypatch, capsys):
     assert lines(stdout)[0]["place"] != "the last"
     code, _, stderr = called(monkeypatch, capsys, "map", "add", folder, folder.parent / "new.png")
     assert code == 2
-    assert "new.png: the map has an image of this name" in stderr
+    assert "new.png: the map has an image" in stderr
 
 
 @pytest.fixture
@@ -130,16 +130,16 @@ def test_an_image_that_cannot_be_read_stops_no_other(folder, small_street, tmp_p
 @pytest.mark.parametrize(("arguments", "words"), [
     (["map=/no/such", "images=/no"], "map=/no/such: expected a folder with a map, got none"),
     (["images=/no"], "map: this setting has no default"),
-    (["map=MAP", "images=/no"], "images=/no: expected an image, a folder or a video, got nothing"),
+    (["map=MAP", "images=/no"], "images=/no: expected an image"),
     (["map=MAP", "images=MAP/settings.json", "watch=true"], "watch=true: expected images=DIR, one folder"),
     (["map=MAP", "images=MAP", "threshold=0.5"], "expected confidence=FILE as well"),
     (["map=MAP", "images=MAP", "confidence=/no"], "/no: expected the confidence.json"),
     (["map=MAP", "images=MAP", "every=0"], "every=0: expected"),
-    (["map=MAP", "images=MAP", "figures=3"], "figures=3: expected out=DIR as well, where they are drawn"),
+    (["map=MAP", "images=MAP", "figures=3"], "figures=3: expected out=DIR"),
     (["map=MAP", "images=MAP", "figures=[a.png]"], "expected out=DIR as well"),
     (["map=MAP", "images=MAP", "figures=1", "out=MAP/figures", "root=/no"], "root=/no: expected the folder of the map"),
     (["map=MAP", "images=MAP", "figures=[]"], "figures=[]: expected how many"),
-    (["map=MAP", "images=MAP", "route=fast"], "route=fast: expected a number from -1000 to 1000, or null"),
+    (["map=MAP", "images=MAP", "route=fast"], "route=fast: expected a number from -1000 to 1000"),
     (["map=MAP", "images=MAP", "add=1"], "add=1: expected one of true, false"),
 ])  # fmt: skip
 def test_mistakes_are_one_line(folder, monkeypatch, capsys, arguments, words):
@@ -151,11 +151,11 @@ def test_mistakes_are_one_line(folder, monkeypatch, capsys, arguments, words):
 
 
 @pytest.mark.parametrize(("more", "words"), [
-    (["candidates=4"], "was made with other candidates; name another folder"),
+    (["candidates=4"], "was made with other candidates"),
     (["features.max_keypoints=50"], "was made with other features"),
-    (["candidates=all"], "candidates=all: a map matches so many"),
-    (["retrieval.whiten=4"], "expected vlad, same or a network, without whiten"),
-    (["scorer=paper"], "expected one score, as scorer=histogram, got several"),
+    (["candidates=all"], "candidates=all: "),
+    (["retrieval.whiten=4"], "expected vlad, same or a network"),
+    (["scorer=paper"], "scorer=histogram, got several"),
     (["map=STREET"], "expected a new or empty folder, or a map"),
 ])  # fmt: skip
 def test_other_settings_are_refused(folder, small_street, monkeypatch, capsys, more, words):
@@ -232,7 +232,7 @@ def test_a_map_shows_nothing_outside_of_its_folder(small_street, tmp_path, monke
     warning, error = stderr.splitlines()
     assert warning.startswith(f"warning: {tmp_path}/out/0000_0004.png: not drawn ('..")
     assert "one that leads elsewhere" in warning
-    assert error == "error: 1 of the figures could not be drawn; warnings say why"
+    assert error.startswith("error: 1 of the figures ")
     assert not (tmp_path / "out").exists()
 
 
@@ -241,7 +241,7 @@ def test_figures_of_what_was_not_asked(folder, small_street, tmp_path, monkeypat
                                   f"images={small_street}/database", f"out={tmp_path}/out")  # fmt: skip
     assert code == 2
     assert len(lines(stdout)) == 10
-    assert stderr.startswith("error: figures=[10,no.png]: expected rows of images that were answered")
+    assert stderr.startswith("error: figures=[10,no.png]: expected rows")
     assert len([*(tmp_path / "out").iterdir()]) == 1
 
 
@@ -370,7 +370,7 @@ def test_confidences_of_other_settings_are_told(folder, small_street, tmp_path, 
         )  # fmt: skip
         assert code == 0
         assert 0 <= json.loads(stdout)["p_right"] <= 1
-        told = "was fitted with other settings of candidates: p may mean nothing here" in stderr
+        told = "other settings of candidates" in stderr
         assert told == (candidates != own["candidates"])
 
 

@@ -85,7 +85,7 @@ def test_the_networks_have_the_published_sizes(variant, parameters):
 
 
 def test_another_variant_is_refused():
-    with pytest.raises(InputError, match=r"ALIKED: expected one of aliked-t16, .*, got aliked-n64"):
+    with pytest.raises(InputError, match=r"ALIKED: .*aliked-t16, .*got aliked-n64"):
         Aliked("aliked-n64", rngs=nnx.Rngs(0))
 
 
@@ -276,9 +276,9 @@ def test_no_images_and_dark_images_have_no_features(unlimited):
 
 
 def test_images_too_small_or_of_another_size_are_refused(drawn):
-    with pytest.raises(InputError, match=r"ALIKED: expected images of 5 x 5 px or more, got 60 x 4$"):
+    with pytest.raises(InputError, match=r"ALIKED: .*5 x 5 px .*got 60 x 4$"):
         AlikedFeatures(drawn, (60, 4))
-    with pytest.raises(InputError, match=r"ALIKED: expected images of 40 x 60 px, got 60 x 40$"):
+    with pytest.raises(InputError, match=r"ALIKED: .*40 x 60 px, got 60 x 40$"):
         AlikedFeatures(Direct(), (40, 60))(crowded())
 
 

@@ -284,9 +284,7 @@ def test_no_images_give_no_features(small, images):
     "size, multiscale, smallest", [((11, 64), False, 12), ((64, 23), True, 24), ((0, 0), False, 12)]
 )
 def test_images_too_small_are_refused(size, multiscale, smallest):
-    with pytest.raises(
-        InputError, match=f"expected images of {smallest} x {smallest} px or more, got {size[0]} x {size[1]}"
-    ):
+    with pytest.raises(InputError, match=f"{smallest} x {smallest} px .*got {size[0]} x {size[1]}"):
         D2NetFeatures(Tiny(), image_size=size, multiscale=multiscale)
 
 

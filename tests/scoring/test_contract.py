@@ -153,7 +153,7 @@ def test_images_of_other_sizes_are_never_scored_with_too_few_bins():
     assert (expected > 0).all()
     for scorer in (HistogramOfShifts(), Wrapped()):
         for traced in (_score_all, jax.jit(jax.vmap(scorer))):
-            with pytest.raises(ValueError, match=r"before image sizes or bin_size are traced; set max_bins="):
+            with pytest.raises(ValueError, match=r"bin_size .*traced; .*max_bins="):
                 traced(scorer, matches) if traced is _score_all else traced(matches)
     roomy = HistogramOfShifts().with_capacity(matches.image_size0, matches.image_size1)
     np.testing.assert_allclose(_score_all(roomy, matches), expected, rtol=2e-6)
@@ -169,9 +169,7 @@ def test_a_capacity_that_is_too_small_is_told_where_it_can_be():
     matches = stack([random_matches(np.random.default_rng(13), 30)])
     with pytest.raises(InputError, match="max_bins=44: expected at least 45"):
         score_candidates(HistogramOfShifts(max_bins=44), matches)
-    with pytest.raises(
-        InputError, match=r"bin_size=0.5: expected at most 1024 bins per axis, .* need 1344; use larger"
-    ):
+    with pytest.raises(InputError, match=r"bin_size=0.5: .*1024.*1344"):
         score_candidates(HistogramOfShifts(bin_size=0.5), matches)
     assert np.isnan(_score_all(HistogramOfShifts(max_bins=44), matches)).all()
 
@@ -248,7 +246,7 @@ def test_what_would_be_ambiguous_or_too_large_is_refused():
 
     batch = stack([random_matches(np.random.default_rng(18), 20)])
     np.testing.assert_allclose(score_candidates(Near(), batch), 20.0)
-    with pytest.raises(ValueError, match=r"Near.max_distance: a grid means something else by max_distance; rename"):
+    with pytest.raises(ValueError, match=r"Near.max_distance: .*grid .*rename"):
         score_grid(Near(), batch, max_distance=[1.0])
     with pytest.raises(ValueError, match="num_bins=216"):
         AnchorPoints(num_bins=216)

@@ -260,13 +260,13 @@ def test_nobody_gets_a_gradient_of_it():
         lambda: jax.grad(lambda threshold: Homography(threshold)(matches))(8.0),
         lambda: jax.grad(lambda points: Homography()(replace(matches, points0=points)))(matches.points0),
     ):
-        with pytest.raises(NoGradientError, match="homography: the number of inliers has no gradient; take a score"):
+        with pytest.raises(NoGradientError, match=r"homography: .*gradient"):
             wanted()
     beside = jax.grad(lambda scores: Homography()(matches) + jnp.sum(masked(scores, matches.mask)))(matches.scores0)
     assert (np.asarray(beside) == 1).all()
 
 
 def test_a_word_that_is_none():
-    with pytest.raises(ValueError, match=r"Homography\(measure='most'\): expected one of inliers, msac"):
+    with pytest.raises(ValueError, match=r"Homography\(measure='most'\): .*inliers, msac"):
         Homography(measure="most")
     assert mfvpr.Homography is Homography

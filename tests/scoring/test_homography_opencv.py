@@ -70,7 +70,7 @@ def test_grids_data_sets_and_sweeps_score_alike():
 def test_jax_cannot_look_into_it(trace):
     matches = BATCH if trace is jax.vmap else jax.tree.map(lambda leaf: leaf[0], BATCH)
     points = matches.points0
-    with pytest.raises(InputError, match="homography_opencv: expected matches that neither jit nor vmap nor grad"):
+    with pytest.raises(InputError, match=r"homography_opencv: .*jit .*vmap .*grad"):
         trace(lambda points, matches: OpenCvHomography()(replace(matches, points0=points)))(points, matches)
 
 
@@ -78,7 +78,7 @@ def test_jax_cannot_look_into_it(trace):
     "wrong", [{"threshold": 0.0}, {"threshold": np.nan}, {"confidence": 1.0}, {"max_iterations": 0.0}]
 )
 def test_numbers_that_opencv_would_replace_are_refused(wrong):
-    with pytest.raises(InputError, match=f"{next(iter(wrong))}=.*: expected numbers from"):
+    with pytest.raises(InputError, match=f"{next(iter(wrong))}=.*: expected numbers"):
         score_candidates(OpenCvHomography(**wrong), BATCH)
 
 

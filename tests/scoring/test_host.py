@@ -49,7 +49,7 @@ def answer(masks):
 @pytest.mark.parametrize("wrong", [lambda _: 1.0, lambda _: np.ones(1), lambda masks: masks[:, :1]])
 def test_a_number_for_each_pair_is_expected(monkeypatch, way, wrong):
     monkeypatch.setitem(globals(), "answer", wrong)
-    with pytest.raises(InputError, match=r"Host\.score_pairs: expected a number for each of \d+ pairs, got an array"):
+    with pytest.raises(InputError, match=r"Host\.score_pairs: .*\d+ pairs, got an array"):
         WAYS[way](Host())
 
 
@@ -57,7 +57,7 @@ def test_a_number_for_each_pair_is_expected(monkeypatch, way, wrong):
 @pytest.mark.parametrize("wrong", [lambda masks: masks.sum(axis=1) * 1j, lambda masks: ["x"] * len(masks)])
 def test_real_numbers_are_expected(monkeypatch, way, wrong):
     monkeypatch.setitem(globals(), "answer", wrong)
-    with pytest.raises(InputError, match=r"Host\.score_pairs: expected real numbers as scores, got (complex|<U)"):
+    with pytest.raises(InputError, match=r"Host\.score_pairs: .*real numbers.* got (complex|<U)"):
         WAYS[way](Host())
 
 
@@ -66,7 +66,7 @@ def test_a_class_that_is_no_value_is_refused(way):
     class Plain(OpenCvHomography):
         pass
 
-    with pytest.raises(InputError, match="Plain: expected a class with score_pairs that is a value; decorate it"):
+    with pytest.raises(InputError, match=r"Plain: .*score_pairs.*decorate"):
         WAYS[way](Plain())
 
 

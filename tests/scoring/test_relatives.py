@@ -138,7 +138,7 @@ def test_the_largest_of_shifts_below_zero_is_the_least():
 
 def test_rapid_by_unknown_keypoints_is_refused():
     pair = make_matches([[1, 1]], [[2, 2]])
-    with pytest.raises(InputError, match=r"per_feature=True: expected matches that know .* \(count0\), got None"):
+    with pytest.raises(InputError, match=r"per_feature=True: .*\(count0\), got None"):
         RapidSpatialScore(per_feature=True)(pair)
     assert RapidSpatialScore(per_feature=True)(replace(pair, count0=np.int32(4))) == pytest.approx(SIZE**2 / 2)
 
@@ -216,7 +216,7 @@ def test_cells_without_a_width_and_phrases_without_a_length_are_no_score():
         assert np.isnan(score(VisualPhrases(cell_size=size), matches))
         assert score(VisualPhrases(cell_size=size), empty) == 0
     for length in (0, 9):
-        with pytest.raises(ValueError, match=rf"VisualPhrases\(length={length}\): expected from 1 to 8 matches"):
+        with pytest.raises(ValueError, match=rf"VisualPhrases\(length={length}\): .*1 to 8"):
             VisualPhrases(length)
 
 

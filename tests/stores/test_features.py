@@ -180,7 +180,7 @@ def test_a_global_descriptor_takes_the_space_of_one(tmp_path):
 
 def test_space_is_checked_before_a_run(tmp_path):
     require_space(tmp_path / "not" / "there", 1000)
-    with pytest.raises(InputError, match=r"not/there: expected about 1000000000\.0 MB of free disk space, got .* MB; "):
+    with pytest.raises(InputError, match=r"not/there: .*1000000000\.0 MB .*got .* MB; "):
         require_space(tmp_path / "not" / "there", 10**15)
 
 
@@ -215,9 +215,7 @@ def _changed(**extractor):
 def test_features_made_from_something_else_are_refused(tmp_path, recipe, num_images, difference):
     fill(tmp_path / "s")
     with (
-        pytest.raises(
-            InputError, match=rf"s/manifest\.json: these features were made with {difference}; .*delete"
-        ) as told,
+        pytest.raises(InputError, match=rf"s/manifest\.json: .*{difference}; .*delete") as told,
         open_store(tmp_path / "s", recipe, num_images=num_images),
     ):
         pass
@@ -297,10 +295,10 @@ def _no_json(folder):
         (_file, "expected a folder of features, got a file"),
         (_foreign, 'without manifest.json that holds "holiday.jpg"'),
         (_below_a_file, r"\(Not a directory\)"),
-        (_other_json, "expected the manifest of a feature store, got something else"),
-        (_list, "expected the manifest of a feature store, got something else"),
-        (_old, "expected 'mfvpr feature store 3', got the format of an earlier version"),
-        (_no_json, "expected the manifest of a feature store, got something else"),
+        (_other_json, "manifest of a feature store"),
+        (_list, "manifest of a feature store"),
+        (_old, "expected 'mfvpr feature store 3', got"),
+        (_no_json, "manifest of a feature store"),
     ],
 )
 def test_what_is_no_store_is_refused_and_left_alone(tmp_path, spoil, message):

@@ -92,9 +92,7 @@ def test_matches_that_tell_other_things_are_told_apart(tmp_path, stored, other, 
             if not store.done[0]:
                 store.write({0: stored})
             before = digests(folder)
-            with pytest.raises(
-                InputError, match=rf"s: row 1: {message} as in the other queries; choose .*delete"
-            ) as told:
+            with pytest.raises(InputError, match=rf"s: row 1: {message} .*delete") as told:
                 store.write({1: other})
             assert "\n" not in str(told.value)
             assert digests(folder) == before
@@ -164,9 +162,7 @@ def test_a_match_store_has_a_path_of_its_own(tmp_path):
 def test_matches_made_from_something_else_are_refused(tmp_path, recipe, num_queries, num_candidates, difference):
     fill(tmp_path / "s", subject=MATCHES)
     with (
-        pytest.raises(
-            InputError, match=rf"s/manifest\.json: these matches were made with {difference}; .*delete"
-        ) as told,
+        pytest.raises(InputError, match=rf"s/manifest\.json: .*{difference}; .*delete") as told,
         open_match_store(tmp_path / "s", recipe, num_queries=num_queries, num_candidates=num_candidates),
     ):
         pass

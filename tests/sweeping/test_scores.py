@@ -139,9 +139,9 @@ def test_blocks_of_other_weights_or_scales_are_not_taken(two_scales, tmp_path):
 
 def test_scales_that_do_not_belong_together_are_refused(data):
     match_set, _ = data
-    with pytest.raises(mfvpr.InputError, match=r"expected match sets of the same queries and candidates, got \[\(2, 5"):
+    with pytest.raises(mfvpr.InputError, match=r"queries and candidates, got \[\(2, 5"):
         Scales([match_set, match_set.take(range(2))])
-    with pytest.raises(mfvpr.InputError, match="expected a weight for each of 2 scales, got 1"):
+    with pytest.raises(mfvpr.InputError, match=r"weight .*2 scales, got 1"):
         Scales([match_set] * 2, [1.0])
     with pytest.raises(mfvpr.InputError, match="expected match sets"):
         Scales([])

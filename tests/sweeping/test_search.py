@@ -59,10 +59,10 @@ def test_bins_that_do_not_fit_are_refused_before_any_work(data):
 
 def test_what_is_no_word_or_has_no_own_value_is_refused(data):
     words = Axes(SUM, {"weight": [mfvpr.UnitWeight()]}, {"weight": "fs"})
-    with pytest.raises(InputError, match=r"weight=UnitWeight\(\): expected one of fs, dmf, ratio, unit"):
+    with pytest.raises(InputError, match=r"weight=UnitWeight\(\): .*fs, dmf, ratio, unit"):
         sweeping.search_grid(words, judge(TRUTH, TOLERANCES), *data)
     without = Axes(SUM, {"weight": ["fs"], "c": [0]}, {"weight": "fs"})
-    with pytest.raises(InputError, match="own: expected a value of each of weight, c, got weight"):
+    with pytest.raises(InputError, match=r"own: .*weight, c, got weight"):
         sweeping.search_grid(without, judge(TRUTH, TOLERANCES), *data)
 
 

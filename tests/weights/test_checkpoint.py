@@ -140,11 +140,11 @@ def test_other_tensors_of_torch_are_refused(torch, path, zipped):
         (plain.half(), "expected tensors of float32 or float64, got Half"),
         (plain.bfloat16(), "got BFloat16"),
         (plain.cfloat(), "got ComplexFloat"),
-        (plain.to(torch.float8_e4m3fn), "it asks for torch._utils._rebuild_tensor_v3, where plain dense tensors are"),
-        (torch.empty(2, device="meta"), "it asks for torch._utils._rebuild_meta_tensor_no_storage, where plain dense"),
-        (torch.eye(3).to_sparse(), "it asks for torch.serialization._get_layout, where plain dense tensors are expec"),
-        (torch.nn.Linear(2, 2), "it asks for torch.nn.modules.linear.Linear, where"),
-        (torch.zeros(1).expand(9), "expected no more values than the file stores at a"),
+        (plain.to(torch.float8_e4m3fn), "torch._utils._rebuild_tensor_v3"),
+        (torch.empty(2, device="meta"), "torch._utils._rebuild_meta_tensor_no_storage"),
+        (torch.eye(3).to_sparse(), "torch.serialization._get_layout"),
+        (torch.nn.Linear(2, 2), "torch.nn.modules.linear.Linear"),
+        (torch.zeros(1).expand(9), "than the file stores at a"),
     ):
         torch.save({"a": tensor}, path, _use_new_zipfile_serialization=zipped)
         assert words in refused(path)
@@ -175,7 +175,7 @@ def test_notes_are_known_without_torch(path, arrays, write):
 
 def test_types_are_refused_by_key(path):
     for dtype in (np.float16, np.complex64):
-        assert f"got {'Half' if dtype is np.float16 else 'ComplexFloat'} at net.a; use the official file" in refused(
+        assert f"got {'Half' if dtype is np.float16 else 'ComplexFloat'} at net.a" in refused(
             write_zip(path, {"net.a": np.zeros(3, dtype)})
         )
     assert "got Q" in refused(write_zip(path, {"a": View(np.zeros(3), kind="QInt8Storage")}))
@@ -193,9 +193,7 @@ def test_code_is_refused_and_not_executed(path, tmp_path):
         {"a": View(np.zeros(3), module="os")},
     ):
         assert "asks for" in (message := refused_content(path, content)) or "damaged" in message
-    assert "it asks for os.mkdir, where plain dense tensors are expected; nothing was executed" in refused(
-        write_zip(path, Call(Global("os", "mkdir"), (str(made),)))
-    )
+    assert "it asks for os.mkdir" in refused(write_zip(path, Call(Global("os", "mkdir"), (str(made),))))
     assert not made.exists()
 
 
@@ -292,7 +290,7 @@ def test_nothing_grows_beyond_the_file(path, monkeypatch):
 @WRITERS
 def test_views_that_are_no_part_of_their_storage_are_refused(path, write, view):
     message = refused(write(path, {"a": View(np.zeros(6, np.float32), **view)}))
-    assert "damaged" in message or "expected no more values than the file stores at a" in message
+    assert "damaged" in message or "than the file stores at a" in message
 
 
 def flipped(content, place):
@@ -309,7 +307,7 @@ def test_a_flipped_bit_is_refused(path, arrays):
         whole.index(b"little"),
     ):
         path.write_bytes(flipped(whole, place))
-        assert "this checkpoint is damaged, by the checksum of file/" in refused(path)
+        assert "the checksum of file/" in refused(path)
 
 
 def test_damage_is_refused_wherever_it_is(path):
@@ -354,7 +352,7 @@ def test_damaged_old_files(path, arrays):
 
 
 def test_zip_files_of_other_making(path, arrays, tmp_path):
-    once = "expected each entry of the zip file once and uncompressed"
+    once = "once and uncompressed"
     assert once in refused(write_zip(path, arrays, compression=zipfile.ZIP_DEFLATED))
     write_zip(path, arrays)
     with pytest.warns(UserWarning, match="Duplicate"), zipfile.ZipFile(path, "a") as archive:
@@ -394,7 +392,7 @@ def test_what_is_no_checkpoint(path, tmp_path):
     path.write_bytes(b"")
     assert "got an empty file" in refused(path)
     path.write_text("<!DOCTYPE html><title>Virus scan warning</title>")
-    assert "got a text file, perhaps a web page" in refused(path)
+    assert "got a text file" in refused(path)
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(100))
     assert "got another kind of file" in refused(path)
     os.mkfifo(tmp_path / "pipe")

@@ -132,8 +132,8 @@ def test_float64_is_rounded_and_scalars_stay():
     ("change", "expected"),
     [
         (lambda key: key, None),
-        (lambda key: f"module.{key}", "its keys begin with module., which the official file's do not"),
-        (lambda key: f"state.model.{key}", "its keys begin with state.model., which the official file's do not"),
+        (lambda key: f"module.{key}", "its keys begin with module."),
+        (lambda key: f"state.model.{key}", "its keys begin with state.model."),
         (lambda key: f"{key}.renamed", None),
     ],
 )
@@ -212,7 +212,7 @@ def test_biases_of_places365_may_have_more_axes():
               for (key, value), shape in zip(vacant(shapes).items(), shapes.values(), strict=True)}  # fmt: skip
     np.testing.assert_array_equal(places365(source)["vgg.conv1_1.bias"], np.arange(64))
     source["conv1_1.bias"] = np.zeros((8, 8))
-    with pytest.raises(InputError, match=r"1 of another shape \(conv1_1.bias: expected \(64,\), got \(8, 8\)\)"):
+    with pytest.raises(InputError, match=r"1 .*\(conv1_1.bias: expected \(64,\), got \(8, 8\)\)"):
         places365(source)
 
 
