@@ -25,6 +25,8 @@ from mfvpr.types import Features
 from tests.builders import make_features
 from tests.stores.made_up import assert_same
 
+pytestmark = pytest.mark.thorough
+
 SIFT = Sift(max_keypoints=60, batch_size=3)
 
 

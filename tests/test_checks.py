@@ -24,6 +24,8 @@ from mfvpr.rankings import Fusion
 from mfvpr.retrieval import EXACT, WhitenedSearch
 from mfvpr.types import Shortlist
 
+pytestmark = pytest.mark.thorough
+
 SIFT = Sift(max_keypoints=20, image_size=(160, 120))
 FRAMES = FrameCorrelation()
 HISTOGRAM = {"histogram": mfvpr.HistogramOfShifts()}

@@ -23,6 +23,8 @@ from mfvpr.sequence_matching import match_cohort
 from mfvpr.types import Shortlist
 from tests.programs import QUERIES, composed, folder, shared, small, typed
 
+pytestmark = pytest.mark.thorough
+
 SIFT = Sift(max_keypoints=60, image_size=(160, 120))
 VLAD = Retrieval(Aggregated(SIFT, VladFitting(num_words=8)))
 SCORERS = {"histogram": mfvpr.HistogramOfShifts(), "count": mfvpr.MatchCount()}

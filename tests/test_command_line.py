@@ -14,6 +14,8 @@ from experiments.quoting import as_typed
 from experiments.settings import CONF
 from tests.programs import ROOT, composed, run, typed
 
+pytestmark = pytest.mark.thorough
+
 OWN = ("dataset=folder", "dataset.database=a", "dataset.queries=b")
 PROGRAMS = {program: config for config, program in groups.PROGRAMS.items()}
 

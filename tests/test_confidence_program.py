@@ -14,6 +14,8 @@ from mfvpr.confidence import read_confidences
 from mfvpr.evaluation.precision import precision_recall, reliability
 from tests.programs import QUERIES, shared, small, typed
 
+pytestmark = pytest.mark.thorough
+
 SYSTEMS = ("filter", "histogram", "histogram + filter")
 LINES = ("scorer=histogram", "figures=1")
 LEARNED = Path(mfvpr.__file__).parent / "learned" / "learned_aliked.json"

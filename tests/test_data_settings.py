@@ -18,6 +18,8 @@ from mfvpr import InputError
 from mfvpr.data.images import read_image
 from tests.programs import composed, folder, matches_path
 
+pytestmark = pytest.mark.thorough
+
 QUICK = ("figures=0", "features.max_keypoints=60", "features.image_size=[160,120]", "retrieval.num_words=8",
          "scorer=sum", "candidates=4")  # fmt: skip
 

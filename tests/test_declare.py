@@ -20,6 +20,8 @@ from mfvpr.types import Array, Matches
 from mfvpr.weighting import UnitWeight, Weight, match_weights
 from tests.programs import ROOT, results, shared, small, typed
 
+pytestmark = pytest.mark.thorough
+
 
 @value
 class Nearness:

@@ -37,6 +37,8 @@ from mfvpr.retrieval import WhitenedSearch
 from mfvpr.sequence_matching import match_sequence
 from tests.programs import typed
 
+pytestmark = pytest.mark.thorough
+
 SIFT = Sift(max_keypoints=60, image_size=(160, 120))
 VLAD = Retrieval(Aggregated(SIFT, VladFitting(num_words=8)))
 SCORERS = {"histogram": mfvpr.HistogramOfShifts(), "count": mfvpr.MatchCount()}

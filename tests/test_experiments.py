@@ -17,6 +17,8 @@ from mfvpr import AnchorPoints, HistogramOfShifts, RatioWeight
 from mfvpr.scoring import ALONE, PAPER, SCORERS, Homography, OpenCvHomography
 from tests.programs import QUICK, ROOT, composed, folder, run, typed
 
+pytestmark = pytest.mark.thorough
+
 CHOICES = [
     (group.name, choice.stem)
     for group in sorted(CONF.iterdir())

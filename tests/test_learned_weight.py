@@ -15,6 +15,8 @@ from mfvpr.learned_weight import ABSOLUTE, INPUTS, RELATIVE, LearnedWeight
 from mfvpr.weighting import match_weights
 from tests.builders import make_matches, per_match, random_matches
 
+pytestmark = pytest.mark.thorough
+
 SIZES = ((320, 240), (400, 300))
 KEY = jax.random.key(0)
 

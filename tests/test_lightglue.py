@@ -23,7 +23,7 @@ from mfvpr.weights.networks import planned
 from mfvpr.weights.tables import LIGHTGLUE
 from tests.golden.make_lightglue import SIZES, SMALL, checkpoint, pair
 
-pytestmark = pytest.mark.optimized
+pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
 
 INPUTS = SMALL["inputs"]
 COUNTS = SIZES[0]

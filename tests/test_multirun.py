@@ -12,6 +12,8 @@ from experiments import console
 from mfvpr.stores import matches as match_store
 from tests.programs import CANDIDATES, QUERIES, ROOT, composed, matches_path, results, shared, small, typed
 
+pytestmark = pytest.mark.thorough
+
 SIGMA = "grid.sigma=[10]"
 
 

@@ -20,6 +20,8 @@ from mfvpr.weighting import WEIGHTS
 from tests.builders import random_matches
 from tests.programs import results, shared, small, typed
 
+pytestmark = pytest.mark.thorough
+
 MATCHES = random_matches(np.random.default_rng(0), 30)
 LEARNED = [name for name in NAMED_WEIGHTS if name not in WEIGHTS]
 

@@ -6,7 +6,7 @@ import pytest
 
 from mfvpr.neighbors import nearest, nearest_two
 
-pytestmark = pytest.mark.optimized
+pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
 
 nearest_of = jax.jit(nearest, static_argnames="axis")
 two_of = jax.jit(nearest_two)

@@ -22,6 +22,8 @@ from mfvpr.report.runs import write_json
 from tests.programs import typed
 from tests.run_folders import HEADLINE, HOSTILE, RANKS, SYSTEMS, TOLERANCES, change_json, write_run
 
+pytestmark = pytest.mark.thorough
+
 TWO = ("</style><b onclick=alert(3)>", "{{7*7}}")
 
 

@@ -25,7 +25,7 @@ from mfvpr.types import Shortlist, per_match, per_pair
 from tests.builders import make_features
 from tests.test_sources import Counting
 
-pytestmark = pytest.mark.optimized
+pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
 
 ROOT = Path(__file__).parent.parent
 COUNTS0 = [20, 30, 20, 0] * 5

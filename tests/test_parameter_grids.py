@@ -26,6 +26,8 @@ from mfvpr.weighting import ChosenWeight
 from tests.builders import random_matches
 from tests.scorers import FOREIGN, Strongest, Wrapped, plain, title
 
+pytestmark = pytest.mark.thorough
+
 
 @pytest.fixture
 def matches():

@@ -26,7 +26,7 @@ from tests.golden import make_patch_scores as patch_scores
 from tests.golden.make_netvlad import GOLDEN, POSITIONS, image, name
 from tests.programs import results, typed
 
-pytestmark = pytest.mark.optimized
+pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
 
 SIZE = (160, 128)
 

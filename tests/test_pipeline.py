@@ -28,6 +28,8 @@ from tests import oracles
 from tests.builders import of_query, random_matches, real
 from tests.scorers import FOREIGN, OWN, one_of_each_class, plain, title
 
+pytestmark = pytest.mark.thorough
+
 SIFT = Sift(max_keypoints=400)
 
 

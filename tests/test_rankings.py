@@ -21,6 +21,8 @@ from mfvpr.sequence_matching import match_sequence
 from mfvpr.types import Shortlist
 from tests import oracles
 
+pytestmark = pytest.mark.thorough
+
 SIFT = Sift(max_keypoints=60, image_size=(160, 120))
 VLAD = Retrieval(Aggregated(SIFT, VladFitting(num_words=8)))
 SCORERS = {"histogram": mfvpr.HistogramOfShifts(), "count": mfvpr.MatchCount()}

@@ -21,6 +21,8 @@ from tests import checkpoints
 from tests.builders import make_matches
 from tests.programs import QUICK, ROOT, composed, typed
 
+pytestmark = pytest.mark.thorough
+
 README = (ROOT / "README.md").read_text()
 BESIDE = [(ROOT / place).read_text() for place in ("experiments/results.md", "conf/README.md")]
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", README, flags=re.DOTALL)

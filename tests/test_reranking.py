@@ -11,7 +11,7 @@ from mfvpr import Shortlist, balancing_c, combine, rank, rerank
 from mfvpr.reranking import filter_scores, fuse, fuse_scales
 from tests import oracles
 
-pytestmark = pytest.mark.optimized
+pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
 
 
 @given(st.lists(st.sampled_from([0.0, 1.0, 2.5, -1.0, np.nan, np.inf, -np.inf]), min_size=1, max_size=12), st.data())

@@ -31,6 +31,8 @@ from mfvpr.report.evaluations import Page
 from mfvpr.scoring import HistogramOfShifts
 from tests.programs import CANDIDATES, QUERIES, ROOT, composed, shared, small, typed
 
+pytestmark = pytest.mark.thorough
+
 LINES = ("scorer=histogram", "figures=4")
 SYSTEMS = ("filter", "histogram", "histogram + filter")
 

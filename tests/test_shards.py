@@ -28,6 +28,8 @@ from mfvpr.shards import NotYet, Shard, shard_of
 from mfvpr.stores.vectors import open_vector_store
 from mfvpr.types import Shortlist
 
+pytestmark = pytest.mark.thorough
+
 SIFT = Sift(max_keypoints=60, image_size=(160, 120))
 VLAD = Retrieval(Aggregated(SIFT, VladFitting(num_words=8)))
 SCORERS = {"histogram": mfvpr.HistogramOfShifts(), "count": mfvpr.MatchCount()}

@@ -16,6 +16,8 @@ from mfvpr.report.shifts import HEADER
 from tests.builders import make_matches, of_query
 from tests.programs import composed, shared, small
 
+pytestmark = pytest.mark.thorough
+
 STEERING = ("scorer=histogram", "scorer.bin_size=5", "scorer.sigma=10", "scorer.weight=ratio", "figures=0")
 
 

@@ -14,6 +14,8 @@ from mfvpr import match, match_candidates, soft_match
 from tests import soft_oracles
 from tests.builders import double, make_features
 
+pytestmark = pytest.mark.thorough
+
 soft = jax.jit(soft_match)
 with_ratio = jax.jit(partial(match, with_ratio=True), static_argnames="cross_check")
 

@@ -32,6 +32,8 @@ from mfvpr.voting import SsmVoting
 from mfvpr.whitening import Whitening, fit_whitening
 from tests.builders import local
 
+pytestmark = pytest.mark.thorough
+
 SMALL = (48, 40)  # px: 4 x 3 cells
 FILTER = Retrieval(Aggregated(Sift(max_keypoints=60, image_size=(160, 120)), VladFitting(num_words=8)))
 CANDIDATE = Matching(cross_check="candidate")

@@ -29,7 +29,7 @@ from tests.golden.make_ssm import (
     picture,
 )
 
-pytestmark = pytest.mark.optimized
+pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
 
 FITTINGS = WindowFitting(DIMENSIONS[0]), WindowFitting(DIMENSIONS[1], zero_row=True, dtype="float64")
 SIZES = 9, 3

@@ -18,6 +18,8 @@ from mfvpr.archive import Archive
 from mfvpr.stores import matches as match_store
 from tests.programs import CANDIDATES, QUERIES, ROOT, composed, matches_path, results, shared, small, snapshot, typed
 
+pytestmark = pytest.mark.thorough
+
 SWEEP = sys.modules["mfvpr.sweeping.sweep"]
 
 

@@ -10,6 +10,8 @@ from mfvpr import testing
 from mfvpr.testing import check_scorer
 from tests.scorers import FOREIGN, OWN, one_of_each_class, title
 
+pytestmark = pytest.mark.thorough
+
 
 @pytest.mark.parametrize("scorer", one_of_each_class([*OWN, *FOREIGN]), ids=title)
 def test_what_keeps_the_contract_passes(scorer, monkeypatch):

@@ -22,6 +22,8 @@ from mfvpr.types import per_match, per_pair
 from tests.builders import of_query, random_matches
 from tests.programs import ROOT
 
+pytestmark = pytest.mark.thorough
+
 
 def one_number(factor):
     """A scorer class of its own, as users write them by the dozen: one number, `factor` times which is its score."""

@@ -20,6 +20,8 @@ from mfvpr.features.sift import Sift
 from mfvpr.threads import ordered_map
 from tests.golden import make_resize
 
+pytestmark = pytest.mark.thorough
+
 
 @pytest.fixture
 def photo():

@@ -13,6 +13,8 @@ from mfvpr.data.streets.exposure import fall_rain
 from mfvpr.data.streets.seasons import CONDITIONS, TRUTH
 from tests.data.test_streets import contents
 
+pytestmark = pytest.mark.thorough
+
 FRAMES, SIZE = 3, (96, 72)
 
 

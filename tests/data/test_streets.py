@@ -16,6 +16,8 @@ from mfvpr.data.streets.ground_truth import Facade, image_shift, visible_points
 from mfvpr.data.streets.sheets import Sheet, texture
 from mfvpr.data.streets.weather import WEATHERS, Exposure
 
+pytestmark = pytest.mark.thorough
+
 FRAMES = 4
 SIZE = (96, 72)
 CAMERA = Camera(x=0.0, z=0.0, heading=0.0, pitch=0.0, image_size=(448, 336))

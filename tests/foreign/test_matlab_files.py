@@ -15,6 +15,8 @@ from mfvpr.weights.registry import entry_of
 from mfvpr.weights.tables import NETVLAD_MATLAB
 from tests.checkpoints import matlab_netvlad, matlab_shapes, random_checkpoint, write_matlab
 
+pytestmark = pytest.mark.thorough
+
 
 def cell(*parts):
     content = np.empty((1, len(parts)), object)

@@ -15,6 +15,8 @@ from mfvpr import InputError
 from mfvpr.learning import checkpoints
 from tests.learning.toys import RECIPE, ROOT, START, contents, program, same, train
 
+pytestmark = pytest.mark.thorough
+
 STATE = {"a": np.float32([1.5, -2.0]), "b": {"c": np.int32(3), "d": np.arange(600, dtype=np.float32).reshape(20, 30)}}
 
 

@@ -17,6 +17,8 @@ from mfvpr.sweeping.search import untracked_stages
 from tests.builders import random_matches
 from tests.learning.paths import QUERIES, SIZES, TOLERANCES, split
 
+pytestmark = pytest.mark.thorough
+
 OPTIONS = Options(batch=4, hidden=5, inputs=ABSOLUTE)
 
 

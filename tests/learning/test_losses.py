@@ -14,6 +14,8 @@ from jax.test_util import check_grads
 from mfvpr import rank, recall_at_k
 from mfvpr.learning.losses import cross_entropy, mean_loss, smooth_average_precision, smooth_recall_at_1
 
+pytestmark = pytest.mark.thorough
+
 CANDIDATES = 6
 LOSSES = {
     "cross_entropy": cross_entropy,

@@ -17,6 +17,8 @@ from mfvpr.learning.projection import Projection
 from mfvpr.learning.training import fit
 from tests.builders import make_features, unit
 
+pytestmark = pytest.mark.thorough
+
 
 def random_descriptors(seed, count=200, dimension=12):
     """Correlated and far from centered, as real ones."""

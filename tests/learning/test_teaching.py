@@ -17,6 +17,8 @@ from mfvpr.learning.training import fit
 from tests.builders import make_matches
 from tests.learning.paths import SIZES, split
 
+pytestmark = pytest.mark.thorough
+
 SHIFT = (30, -20)
 TEACHER = HistogramOfShifts(bin_size=5.0, sigma=10.0, weight=RatioWeight(), max_bins=160)
 

@@ -16,6 +16,8 @@ from mfvpr.learning.training import TrainingError, fit
 from tests.builders import make_matches
 from tests.learning.toys import START, batches, contents, objective, program, same, train, validate
 
+pytestmark = pytest.mark.thorough
+
 
 @pytest.fixture(scope="module")
 def whole():

@@ -34,6 +34,8 @@ from mfvpr.types import Features
 from tests import scorers
 from tests.programs import ROOT
 
+pytestmark = pytest.mark.thorough
+
 SIFT, VLAD = Sift(max_keypoints=60, image_size=(160, 120)), VladFitting(num_words=8)
 SURE = Confidence(("margin", "height"), 1, (0.0, 0.0), (1.0, 1.0), (1.0, 1.0), 0.0)
 

@@ -22,6 +22,8 @@ from mfvpr.errors import InputError
 from mfvpr.stores.maps import hold_map
 from tests.programs import ROOT, composed, typed
 
+pytestmark = pytest.mark.thorough
+
 QUICK = ["features.max_keypoints=60", "features.image_size=[160,120]", "retrieval.num_words=8", "candidates=5"]
 
 

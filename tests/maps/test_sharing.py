@@ -19,6 +19,8 @@ from mfvpr.stores.rows import open_rows
 from tests.maps.test_map import Constant
 from tests.stores.made_up import file_of
 
+pytestmark = pytest.mark.thorough
+
 
 @pytest.fixture(scope="module")
 def images(small_street):

@@ -23,7 +23,7 @@ from tests.builders import local
 from tests.golden.make_aliked import DRAWN, GOLDEN, REAL, checkpoint, picture, projections, samples, texture
 from tests.models import aliked_oracle as oracle
 
-pytestmark = pytest.mark.optimized
+pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
 
 SLOTS = 1500
 IMAGES = checkpoints.ALIKED.parent.parent / "data" / "grief_season"

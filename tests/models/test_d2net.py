@@ -21,7 +21,7 @@ from tests.checkpoints import d2net_shapes, random_checkpoint
 from tests.golden.make_d2net import CASES, GOLDEN, PLAIN, projections, samples, texture
 from tests.models import d2net_oracle as oracle
 
-pytestmark = pytest.mark.optimized
+pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
 
 
 @pytest.fixture(scope="module")

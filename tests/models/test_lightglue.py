@@ -22,7 +22,7 @@ from tests import checkpoints
 from tests.golden import make_lightglue_real
 from tests.golden.make_lightglue import DEPTH, GOLDEN, REAL, SEEDS, SIZES, SMALL, SURE, checkpoint, pair
 
-pytestmark = pytest.mark.optimized
+pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
 
 INPUTS = SMALL["inputs"]
 assigned = jax.jit(assignment)

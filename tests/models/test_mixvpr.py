@@ -19,7 +19,7 @@ from mfvpr.weights.tables import MIXVPR
 from tests.checkpoints import mixvpr_shapes, random_checkpoint
 from tests.golden.make_mixvpr import GOLDEN, SIZES, faint_maps, images, samples
 
-pytestmark = pytest.mark.optimized
+pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
 
 RELATIVE = 1e-5
 PARAMETERS = {4096: 10_880_900, 512: 10_092_898, 128: 9_896_098}

@@ -19,7 +19,7 @@ from mfvpr.weights.tables import NETVLAD, NETVLAD_MATLAB
 from tests.checkpoints import gem_checkpoint, matlab_netvlad, netvlad_checkpoint, write_matlab
 from tests.golden.make_netvlad import CASES, GEM, GOLDEN, MATLAB, PATCHES, image, name, samples
 
-pytestmark = pytest.mark.optimized
+pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
 
 RELATIVE = 1e-5  # of the largest value
 

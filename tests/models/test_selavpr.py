@@ -24,7 +24,7 @@ from tests.golden.make_netvlad import image, name, samples
 from tests.golden.make_selavpr import BACKBONES, GOLDEN, MATCHES, NETWORKS, SIZE, WIDTH, maps
 from tests.models.test_netvlad import assert_close, filled
 
-pytestmark = pytest.mark.optimized
+pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
 
 
 @pytest.fixture(scope="module")

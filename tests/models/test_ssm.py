@@ -17,7 +17,7 @@ from mfvpr.weights.tables import SSM
 from tests.golden.make_d2net import samples
 from tests.golden.make_ssm_maps import CASES, GOLDEN, checkpoint
 
-pytestmark = pytest.mark.optimized
+pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
 
 RELATIVE = 1e-5  # of the map's largest value
 

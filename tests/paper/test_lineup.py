@@ -15,6 +15,8 @@ from experiments.truth import fingerprint
 from mfvpr.data.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.data.ground_truth import FrameTruth
 
+pytestmark = pytest.mark.thorough
+
 SETTINGS = {"out": "out", "store": None, "memory": None, "devices": 1}
 RUNS = list(dict.fromkeys(row.run for row in ROWS))
 

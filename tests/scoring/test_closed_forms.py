@@ -10,6 +10,8 @@ from mfvpr import AggregatedScore, AnchorPoints, DescriptorDistanceWeight, Histo
 from mfvpr.errors import InputError
 from tests.builders import SIZE, make_matches, random_matches
 
+pytestmark = pytest.mark.thorough
+
 histogram = jax.jit(HistogramOfShifts.histogram)
 score = jax.jit(lambda scorer, matches: scorer(matches))
 dominant_shift = jax.jit(HistogramOfShifts.dominant_shift, static_argnames="refine")

@@ -27,6 +27,8 @@ from mfvpr.scoring.parameters import fit
 from tests.builders import SIZE, per_match, random_matches
 from tests.scorers import FOREIGN, OWN, Wrapped, one_of_each_class, plain, title
 
+pytestmark = pytest.mark.thorough
+
 everyone = pytest.mark.parametrize("scorer", one_of_each_class([*OWN, *FOREIGN]), ids=title)
 own = pytest.mark.parametrize("scorer", one_of_each_class(OWN), ids=title)
 _score = jax.jit(lambda scorer, matches: scorer(matches))  # compiled once per shape: hence 60 slots, 5 pairs

@@ -21,6 +21,8 @@ from mfvpr import (
 )
 from tests.builders import SIZE, double, make_features, make_matches, random_matches
 
+pytestmark = pytest.mark.thorough
+
 HARD = [
     HistogramOfShifts(bin_size=20.0, max_bins=36),
     HistogramOfShifts(bin_size=17.0, sigma=300.0, sigma_is_variance=True, shift_range=(100.0, 50.0), max_bins=14),

@@ -13,6 +13,8 @@ from mfvpr.testing import check_scorer
 from tests import oracles
 from tests.builders import make_matches, per_match
 
+pytestmark = pytest.mark.thorough
+
 _score = jax.jit(lambda scorer, matches: scorer(matches))
 OUTSIDE = {"unequal": -1000, "zero": 0}
 

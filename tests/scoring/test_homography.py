@@ -18,7 +18,7 @@ from mfvpr.types import per_match
 from tests import ransac_oracle
 from tests.builders import SIZE, make_matches
 
-pytestmark = pytest.mark.optimized
+pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
 
 PLANE = np.array([[1.05, 0.05, 8.0], [-0.03, 0.97, -5.0], [1e-4, -5e-5, 1.0]])  # candidate -> query
 estimate = jax.jit(lambda scorer, matches: scorer.estimate(matches))  # each shape compiles for seconds

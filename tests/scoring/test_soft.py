@@ -21,7 +21,7 @@ from mfvpr import (
 from tests import soft_oracles
 from tests.builders import SIZE, double, make_features, make_matches, random_matches, real
 
-pytestmark = pytest.mark.optimized
+pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
 
 HISTOGRAMS = [
     HistogramOfShifts(bin_size=24.0, max_bins=30),

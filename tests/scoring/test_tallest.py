@@ -25,6 +25,8 @@ from mfvpr.scoring.lattice import Lattice
 from mfvpr.scoring.tallest import tallest_bins
 from tests.builders import per_match, random_matches
 
+pytestmark = pytest.mark.thorough
+
 SLOTS, WEIGHTINGS = 64, 8  # a search with every one of the capacities
 CAPACITIES = {20.0: 40, 10.0: 72, 5.0: 136, 3.0: 296}  # by bin size, with blocks of 2, 3, 4 and 8 bins
 pairs = jax.jit(tallest_bins, static_argnums=3)

@@ -32,6 +32,8 @@ from tests.stores.made_up import (
     run_here,
 )
 
+pytestmark = pytest.mark.thorough
+
 # Two processes
 
 

@@ -16,6 +16,8 @@ from tests.programs import ROOT
 from tests.scorers import plain
 from tests.sweeping.test_sweep import CANDIDATES, QUERIES, make_set
 
+pytestmark = pytest.mark.thorough
+
 SCORERS = {"sum": mfvpr.AggregatedScore(), "histogram": mfvpr.HistogramOfShifts(bin_size=40.0)}
 WEIGHTS = (0.7, 0.3)
 

@@ -18,6 +18,8 @@ from mfvpr.types import Shortlist
 from tests.builders import of_query, random_matches
 from tests.scorers import FOREIGN, Sampled, Strongest, Wrapped, title
 
+pytestmark = pytest.mark.thorough
+
 FS, DMF = mfvpr.FeatureScoreWeight(), mfvpr.DescriptorDistanceWeight()
 QUERIES, CANDIDATES, DATABASE = 7, 5, 9
 

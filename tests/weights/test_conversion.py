@@ -26,6 +26,8 @@ from tests.checkpoints import (
 )
 from tests.weights.conftest import PARAMETERS, SHAPES, SOURCE_SHAPES, TABLE, tiny_entry
 
+pytestmark = pytest.mark.thorough
+
 _NETVLAD = (
     (16, 4096, "mapillary_4096"),
     (16, 512, "mapillary_512"),
