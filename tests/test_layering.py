@@ -33,7 +33,7 @@ ALLOWED = {
     "pair_matching": {"match_sets", "matchers", "numerics", "ragged", "sources", "threads", "types"},
     "scoring": {"declaration", "errors", "named_weights", "numerics", "types", "weighting", "scoring"},
     "whitening": {"errors"},
-    "retrieval": {"errors", "evaluation", "numerics", "types", "whitening"},
+    "retrieval": {"errors", "evaluation", "numerics", "ragged", "types", "whitening"},
     "reranking": {"errors", "numerics", "types", "scoring"},
     "parameter_grids": {"matching", "numerics", "types", "scoring", "weighting", "reranking"},
     "sweeping": {
@@ -132,6 +132,7 @@ ALLOWED = {
     },
     "distributed": {"errors", "evaluation", "numerics", "reranking", "retrieval", "scoring", "types"},
     "report": {
+        "numerics",
         "archive",
         "confidence",
         "results",
