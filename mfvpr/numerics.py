@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.core import Tracer
 from jax.tree_util import Partial
@@ -33,6 +34,16 @@ def masked(values: Array, mask: Array, fill: ArrayLike = 0.0) -> Array:
     """
     extra = values.ndim - mask.ndim
     return jnp.where(mask.reshape(mask.shape + (1,) * extra), values, fill)
+
+
+def or_nan(values: Array, mask: Array) -> Array:
+    """`values` where `mask`, NaN elsewhere: there is no value.
+
+    Where nothing is traced the host makes the NaN, as `jax_debug_nans` stops at those that a program makes.
+    """
+    if is_concrete((values, mask)):
+        return jax.device_put(np.where(mask, values, np.nan))
+    return jnp.where(mask, values, jnp.nan)
 
 
 def as_float(values: ArrayLike) -> Array:

@@ -194,23 +194,33 @@ def dominant_shifts(
     for start in range(0, len(queries), SHIFTS_AT_ONCE):
         some = slice(start, start + SHIFTS_AT_ONCE)
         pairs = match_set.pairs(queries[some], places[some], match_set.capacity, total=SHIFTS_AT_ONCE)
-        found = jax.tree.map(np.asarray, pair_shifts(fitted, pairs))
-        parts.append(tuple(values[: len(queries[some])] for values in found))
+        parts.append(tuple(values[: len(queries[some])] for values in pair_shifts(fitted, pairs)))
     shifts, intervals, scales = (np.concatenate(same) for same in zip(*parts, strict=True))
     return shifts, intervals, scales
 
 
-@compiled
-def pair_shifts(scorer: HistogramOfShifts, matches: Matches) -> tuple[Array, Array, Array]:
+def pair_shifts(scorer: HistogramOfShifts, matches: Matches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """`dominant_shifts` of matches `[P, K, ...]`, by a scorer that is fitted to their images."""
+    votes, shifts, intervals, scales = jax.tree.map(np.asarray, _pair_shifts(scorer, matches))
+    none = ~votes  # the host makes the NaN: `jax_debug_nans` stops at those of programs
+    return (
+        np.where(none[:, None], np.nan, shifts),
+        np.where(none[:, None, None], np.nan, intervals),
+        np.where(none, np.nan, scales),
+    )
 
-    def of_pair(one: Matches) -> tuple[Array, Array, Array]:
+
+@compiled
+def _pair_shifts(scorer: HistogramOfShifts, matches: Matches) -> tuple[Array, Array, Array, Array]:
+    """Whether anything votes `[P]`, and `pair_shifts`, 0 where nothing does."""
+
+    def of_pair(one: Matches) -> tuple[Array, Array, Array, Array]:
         scale, votes = scorer.dominant_scale(one), scorer(one) > 0
         found = jnp.concatenate([scorer.dominant_shift(one, refine=True)[None], scorer.shift_interval(one)])
         if scorer.direction == "query_minus_candidate":
             found = -found[jnp.array([0, 2, 1])]
         apart = (at_least_single(one.image_size1) - at_least_single(one.image_size0))[None] / 2  # of the centers
-        found = jnp.where(votes, apart + jnp.sqrt(scale) * (found - apart), jnp.nan)
-        return found[0], found[1:], jnp.where(votes, scale, jnp.nan)
+        found = jnp.where(votes, apart + jnp.sqrt(scale) * (found - apart), 0.0)
+        return votes, found[0], found[1:], jnp.where(votes, scale, 0.0)
 
     return jax.vmap(of_pair)(matches)

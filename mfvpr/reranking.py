@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mfvpr.errors import InputError, require_word
-from mfvpr.numerics import as_float, compiled, is_concrete, masked, masked_mean, masked_std
+from mfvpr.numerics import as_float, compiled, is_concrete, masked, masked_mean, masked_std, or_nan
 from mfvpr.scoring import Scorer, check_host, on_host, score_pairs
 from mfvpr.scoring.parameters import fit
 from mfvpr.types import Array, Matches, Ranking, Shortlist
@@ -112,7 +112,6 @@ def filter_scores(candidates: Shortlist, kind: FilterScore = "cosine") -> np.nda
     return -np.sqrt(np.maximum(2 - 2 * cosine, 0))
 
 
-@partial(compiled, static_argnames="normalize")
 def fuse_scales(
     scores: Array, mask: Array, weights: Array | None = None, *, normalize: Literal["zscore", "none"] = "zscore"
 ) -> Array:
@@ -126,6 +125,12 @@ def fuse_scales(
             all score the same, 0. A score that is not finite takes no part in that, and what it makes of the sum is its
             candidate's alone. "none" leaves the scores as they are, as for a pair by itself.
     """
+    return or_nan(_fuse_scales(scores, mask, weights, normalize=normalize), mask)
+
+
+@partial(compiled, static_argnames="normalize")
+def _fuse_scales(scores: Array, mask: Array, weights: Array | None, *, normalize: str) -> Array:
+    """`fuse_scales`, 0 without a candidate."""
     scores = as_float(scores)
     weights = jnp.ones(scores.shape[-1]) if weights is None else jnp.asarray(weights)
     mask = jnp.broadcast_to(mask, scores.shape[:-1])
@@ -135,8 +140,7 @@ def fuse_scales(
         scores = jnp.moveaxis(standardized(by_scale, mask[..., None, :]), -2, -1)
     counts = jnp.expand_dims(weights != 0, tuple(range(scores.ndim - 1)))
     scores = jnp.where(mask[..., None] & counts, scores, 0.0)  # infinity times 0 would be no number
-    fused = jnp.matmul(scores, weights.astype(scores.dtype), precision=jax.lax.Precision.HIGHEST)
-    return masked(fused, mask, jnp.nan)
+    return jnp.matmul(scores, weights.astype(scores.dtype), precision=jax.lax.Precision.HIGHEST)
 
 
 def _standardized(scores: Array, mask: Array) -> Array:

@@ -123,6 +123,12 @@ def test_a_candidate_that_is_not_there_or_no_number_matters_to_itself_alone():
     assert np.isnan(fused[[1, 3]]).all()
 
 
+def test_no_score_is_no_fault_of_a_program():
+    scores, mask = np.ones((3, 2), np.float32), np.array([True, True, False])
+    with jax.debug_nans(True):
+        np.testing.assert_array_equal(fuse_scales(scores, mask), [0, 0, np.nan])
+
+
 def test_a_scale_without_weight_takes_no_part_and_no_candidates_have_no_score():
     scores = np.array([[np.inf, 1], [1, 2], [3, np.nan]], np.float32)
     fused = np.asarray(

@@ -72,7 +72,8 @@ def test_a_zoomed_candidate_shows_the_middle_of_the_query_where_it_does(zoom, di
     matches, counts = of_query([pair, silent])
     match_set = MatchSet([matches], np.array([counts]), 40)
     scorer = HistogramOfShifts(bin_size=4.0, sigma=5.0, scales=(0.5, 1.0, 2.0), direction=direction)
-    shifts, intervals, scales = dominant_shifts(scorer, match_set, np.array([0, 0]), np.array([0, 1]))
+    with jax.debug_nans(True):  # which takes no NaN for a fault that says there is nothing
+        shifts, intervals, scales = dominant_shifts(scorer, match_set, np.array([0, 0]), np.array([0, 1]))
     expected = size1 / 2 - size0 / 2 + [17, -9]
     np.testing.assert_allclose(shifts[0], expected, atol=0.01)
     assert (intervals[0, 0] < expected).all()
