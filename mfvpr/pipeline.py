@@ -194,7 +194,9 @@ def dominant_shifts(
     for start in range(0, len(queries), SHIFTS_AT_ONCE):
         some = slice(start, start + SHIFTS_AT_ONCE)
         pairs = match_set.pairs(queries[some], places[some], match_set.capacity, total=SHIFTS_AT_ONCE)
-        parts.append(tuple(values[: len(queries[some])] for values in pair_shifts(fitted, pairs)))
+        number = len(queries[some])
+        shifts, intervals, scales = pair_shifts(fitted, pairs)
+        parts.append((shifts[:number], intervals[:number], scales[:number]))
     shifts, intervals, scales = (np.concatenate(same) for same in zip(*parts, strict=True))
     return shifts, intervals, scales
 
