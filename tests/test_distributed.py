@@ -142,7 +142,7 @@ def test_a_task_that_dies_ends_the_others_and_all_go_on(tmp_path):
     assert first.returncode == 75
     line = error.strip().splitlines()[-1]
     assert line.startswith("error: shard=0/2: another task has ended")
-    assert line.endswith("start all tasks again")
+    assert "start all tasks again" in line
     assert "Terminating process" in Path(line.partition("(see ")[2].partition(")")[0]).read_text()
     second.communicate()
     again = tasks()
