@@ -150,7 +150,7 @@ class Whitened:
 
 
 def _shortlist(queries: np.ndarray, database: np.ndarray, num_candidates: int, allowed: np.ndarray | None) -> Shortlist:
-    """Of some queries, `ROWS` of the database at a time; the first rows win ties."""
+    """Search for a part of the queries, `ROWS` of the database at a time; the first row wins a tie."""
     best: Shortlist | None = None
     for part in _parts(len(database), ROWS):
         mask = None if allowed is None else allowed[:, part]

@@ -43,7 +43,7 @@ def paper(settings: dict[str, Any]) -> None:
 
 
 def _plan(rows: Sequence[Row], found: Sequence[Place], settings: Mapping[str, Any]) -> str:
-    """What will be done, in one line."""
+    """Announce evaluations, data sets and what is finished, in one line."""
     names = list(dict.fromkeys(row.run for row in rows))
     done = sum(runs.is_finished(runs.folder_of(run, place, settings)) for place in found for run in names)
     return (
@@ -192,16 +192,16 @@ def _finished(rows: Sequence[Row], here: Sequence[Place], settings: Mapping[str,
 
 def _write_tables(out: Path, found: Found) -> dict[str, tuple[str, Table]]:
     shutil.rmtree(out / "tables", ignore_errors=True)  # of other rows and data sets, perhaps
-    made = {name: (heading, table) for name, heading, table in tables(found)}
-    for name, (heading, table) in made.items():
+    table_of = {name: (heading, table) for name, heading, table in tables(found)}
+    for name, (heading, table) in table_of.items():
         run_folders.write_table(out / "tables", table, heading, name=name)
-    return made
+    return table_of
 
 
 def _write(out: Path, found: Found, finished: Mapping[tuple[str, str], Path], left_out: Sequence[str]) -> None:
     for name in ("figures", "comparisons"):  # likewise
         shutil.rmtree(out / name, ignore_errors=True)
-    made = _write_tables(out, found)
+    table_of = _write_tables(out, found)
     best = [row for name in _BEST for row in found.rows if row.name == name]
     growth = _growth(best, found, finished, out)
     shown = {}
@@ -211,7 +211,7 @@ def _write(out: Path, found: Found, finished: Mapping[tuple[str, str], Path], le
             shown[name] = folder
     for name, draw in figures.figures(found, shown, growth):
         draw(out / "figures" / name)
-    pages.write(out, found, made, growth, finished, left_out)
+    pages.write(out, found, table_of, growth, finished, left_out)
     print(f"\ntables and figures: {out}\nreport: {out / PAGE}")
 
 

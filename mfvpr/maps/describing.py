@@ -41,7 +41,7 @@ class Describing:
         return {"extractor": recipe_of(self.extractor), "describer": recipe_of(self.describer)}
 
     def image(self, image: Image) -> Described:
-        """Of one image: a file, or `[H, W, 3]` uint8 RGB, in whatever `np.asarray` converts.
+        """Describe one image: a file, or `[H, W, 3]` uint8 RGB in any form that `np.asarray` converts.
 
         Raises:
             InputError: it cannot be read, is something else, or something is not finite.

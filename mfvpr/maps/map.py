@@ -274,7 +274,7 @@ class Map:
         without candidates, or with p(right) below the threshold.
 
         Args:
-            image: a file, or `[H, W, 3]` uint8 RGB, in whatever `np.asarray` converts.
+            image: a file, or `[H, W, 3]` uint8 RGB in any form that `np.asarray` converts.
             recent: so many of the newest rows are left out: of a drive that is being added, the same place.
             before: rows from this on are left out as well, as if the map ended there; None = none.
 
@@ -384,7 +384,7 @@ def _aggregated(
 
 
 class _Made(NamedTuple):
-    """What needs a describer: how images are described, the rows on disk, those on the device, and their strength."""
+    """Parts of a map that need a describer: the description, rows on disk, rows on the device, and their strength."""
 
     describing: Describing
     rows: MapRows
