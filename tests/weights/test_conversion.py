@@ -131,17 +131,17 @@ def test_float64_is_rounded_and_scalars_stay():
 
 
 @pytest.mark.parametrize(
-    ("change", "expected"),
+    ("change", "prefix"),
     [
         (lambda key: key, None),
-        (lambda key: f"module.{key}", "its keys begin with module."),
-        (lambda key: f"state.model.{key}", "its keys begin with state.model."),
+        (lambda key: f"module.{key}", " module."),
+        (lambda key: f"state.model.{key}", " state.model."),
         (lambda key: f"{key}.renamed", None),
     ],
 )
-def test_a_prefix_is_recognized(change, expected):
-    keys = [change(key) for key in d2net_shapes()]
-    assert resemblance(keys, NETWORKS["d2_tf"]) == expected
+def test_a_prefix_is_recognized(change, prefix):
+    message = resemblance([change(key) for key in d2net_shapes()], NETWORKS["d2_tf"])
+    assert message is None if prefix is None else prefix in message
 
 
 def test_other_networks_are_recognized():
