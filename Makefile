@@ -5,6 +5,9 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
+# Half the compilation, for tests of logic. Tests of bits and of parity with other code are marked `optimized`.
+QUICK := JAX_DISABLE_MOST_OPTIMIZATIONS=1 \
+  XLA_FLAGS='--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1'
 
 .PHONY: demo test test-fast test-all setup check conf benchmark clean
 
@@ -12,10 +15,11 @@ demo: setup
 	$(BIN)/python -m experiments.evaluate scorer=demo
 
 test-fast: .venv/.test
-	$(PYTEST) --quick-compile -m 'not slow and not thorough'
+	$(QUICK) $(PYTEST) -m 'not (slow or thorough or optimized)'
 
 test: .venv/.test
-	$(PYTEST) --quick-compile -m 'not slow'
+	$(QUICK) $(PYTEST) -m 'not (slow or optimized)'
+	$(PYTEST) -m 'optimized and not slow'
 
 test-all: .venv/.test
 	$(PYTEST)

@@ -1,5 +1,6 @@
 """Strict arithmetic for every test: no silent rank promotion, warnings are errors (pyproject.toml)."""
 
+import gc
 import os
 import shutil
 import signal
@@ -17,6 +18,7 @@ from mfvpr.weights.networks import blueprint, network_of
 from mfvpr.weights.registry import entry_of
 from tests import checkpoints
 
+gc.set_threshold(50_000, 20, 100)  # tracing makes many objects: collecting them as often as usual takes 4 % of the time
 # A shell ignores Ctrl-C for what it runs in the background; the tests of Ctrl-C need it there too.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -70,14 +72,6 @@ def compilations() -> Compilations:
     return _compilations
 
 
-def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption(
-        "--quick-compile",
-        action="store_true",
-        help="compile without most optimizations, but for tests marked optimized",
-    )
-
-
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark all cases but the first of a test that is marked `first_case` as slow."""
@@ -90,13 +84,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def compiler(request: pytest.FixtureRequest) -> None:
-    """Choose how the programs of a module are compiled, and drop compiled programs where they are too many."""
-    quick = request.config.getoption("--quick-compile") and not request.node.get_closest_marker("optimized")
-    changes = quick != jax.config.read("jax_disable_most_optimizations")
-    if changes or count_memory_maps() > MOST_MEMORY_MAPS:
+def bounded_memory_maps() -> None:
+    """Drop compiled programs where they are too many."""
+    if count_memory_maps() > MOST_MEMORY_MAPS:
         jax.clear_caches()
-    configure_jax("jax_disable_most_optimizations", quick)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -23,7 +23,7 @@ from mfvpr.weights.networks import planned
 from mfvpr.weights.tables import LIGHTGLUE
 from tests.golden.make_lightglue import SIZES, SMALL, checkpoint, pair
 
-pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 
 INPUTS = SMALL["inputs"]
 COUNTS = SIZES[0]
@@ -93,6 +93,7 @@ def test_matches_are_the_largest_of_their_row_and_column_and_above_the_threshold
     assert 0 < len(fewer["index0"]) < len(expected)
 
 
+@pytest.mark.optimized
 @pytest.mark.slow
 @pytest.mark.parametrize("chunk_size", [None, 3])
 def test_a_pair_depends_neither_on_its_batch_nor_on_its_padding(chunk_size):

@@ -15,7 +15,7 @@ from mfvpr.types import per_match, per_pair
 from tests import oracles
 from tests.builders import make_features, random_matches, unit
 
-pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 
 MODES = ["mutual", "opencv_legacy", "none", "candidate"]
 # Compiled as a whole, not operation by operation: seconds, where every test has its own shapes.
@@ -90,6 +90,7 @@ def test_every_chunk_size_gives_the_loop(chunk_size):
         np.testing.assert_array_equal(got.points1[row][alone.mask], np.asarray(alone.points1)[alone.mask])
 
 
+@pytest.mark.optimized
 def test_similarities_of_all_candidates_never_exist_at_once_on_a_cpu():
     """The compiled program's temporary memory is one similarity matrix or two, not fifty."""
     num, candidates = 256, 50
@@ -245,6 +246,7 @@ def test_options_without_meaning_are_refused():
         match_candidates(features, jax.tree.map(lambda leaf: leaf[None], features), chunk_size=0)
 
 
+@pytest.mark.optimized
 def test_real_size_agrees_with_a_vectorised_check():
     """700 x 700 x 512 non-negative descriptors, as D2-Net's, against float32 argmax."""
     rng = np.random.default_rng(5)
@@ -259,6 +261,7 @@ def test_real_size_agrees_with_a_vectorised_check():
     np.testing.assert_array_equal(np.asarray(matches.points1)[agree], two.keypoints[similarity.argmax(1)][agree])
 
 
+@pytest.mark.optimized
 def test_half_precision_gives_what_single_precision_of_the_same_values_gives():
     rng = np.random.default_rng(4)
     pair = [make_features(rng, 60, dimension=64) for _ in range(2)]
@@ -298,6 +301,7 @@ def test_whoever_calls_it_matching_compiles_once(compilations):
     assert compilations.count == 0
 
 
+@pytest.mark.optimized
 @pytest.mark.parametrize("chunk_size", [None, 1, 2, 3, 9])
 def test_pairs_are_matched_as_each_of_them(chunk_size):
     """Whatever their number, and the number of those that are done at a time; pairs beyond the count have none."""

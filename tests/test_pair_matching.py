@@ -25,7 +25,7 @@ from mfvpr.types import Shortlist, per_match, per_pair
 from tests.builders import make_features
 from tests.test_sources import Counting
 
-pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 
 ROOT = Path(__file__).parent.parent
 COUNTS0 = [20, 30, 20, 0] * 5
@@ -108,6 +108,7 @@ def assert_same(one, other):
 # Every pair
 
 
+@pytest.mark.optimized
 @pytest.mark.first_case
 @pytest.mark.parametrize(
     "options",
@@ -139,6 +140,7 @@ def test_descriptors_need_not_be_of_unit_length():
     assert_as_alone(found, queries, database, candidates, expected_of(queries, database, candidates))
 
 
+@pytest.mark.optimized
 def test_stored_features_are_matched_as_those_in_memory(tmp_path):
     """And rows that are there are not read again."""
     candidates, stored, kept = shortlist_of(), [], []
@@ -329,6 +331,7 @@ def test_image_sizes_are_all_combinations():
     assert len(sizes0) == 4
 
 
+@pytest.mark.optimized
 def test_some_queries_are_matched_as_all_of_them():
     """To the bit: where the others have more keypoints, so that shapes would be other ones without them."""
     rng = np.random.default_rng(3)

@@ -26,7 +26,7 @@ from tests.golden import make_patch_scores as patch_scores
 from tests.golden.make_netvlad import GOLDEN, POSITIONS, image, name
 from tests.programs import results, typed
 
-pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 
 SIZE = (160, 128)
 
@@ -51,6 +51,7 @@ def dataset(small_street):
     return folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
 
 
+@pytest.mark.optimized
 @pytest.mark.first_case
 @pytest.mark.parametrize("position", POSITIONS, ids=map(str, POSITIONS))
 def test_patches_are_where_the_public_code_has_them(model, position):
@@ -137,11 +138,12 @@ def test_databases_are_of_the_published_size(images, size, patch_sizes, outputs,
     assert stored / 2**20 == pytest.approx(printed / 2, rel=0.03)
 
 
+@pytest.mark.optimized
 @pytest.mark.first_case
 @pytest.mark.parametrize(("matcher", "scorer", "unit"), [
-    ("RANSAC", lambda patch: mfvpr.Homography(24.0, few="zero", per_feature=True), 1),
     ("spatialApproximator", lambda patch: mfvpr.RapidSpatialScore(
         size=tuple(16.0 * (side - patch) for side in reversed(patch_scores.MAP)), per_feature=True), 256),
+    ("RANSAC", lambda patch: mfvpr.Homography(24.0, few="zero", per_feature=True), 1),
 ])  # fmt: skip
 def test_scores_and_rankings_are_the_public_codes(model, matcher, scorer, unit):
     """Of every size, for pairs and over candidates; the public scores are the smaller, the better, and in patches.

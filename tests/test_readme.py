@@ -124,6 +124,7 @@ def test_library_example(small_street, tmp_path, monkeypatch, capsys):
         assert name in printed
 
 
+@pytest.mark.slow
 def test_the_whole_way_in_one_call(small_street, tmp_path, monkeypatch, capsys):
     for side in ("database", "queries"):
         shutil.copytree(small_street / side, tmp_path / side)

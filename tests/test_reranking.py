@@ -11,7 +11,7 @@ from mfvpr import Shortlist, balancing_c, combine, rank, rerank
 from mfvpr.reranking import filter_scores, fuse, fuse_scales
 from tests import oracles
 
-pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 
 
 @given(st.lists(st.sampled_from([0.0, 1.0, 2.5, -1.0, np.nan, np.inf, -np.inf]), min_size=1, max_size=12), st.data())
@@ -140,6 +140,7 @@ def test_a_scale_without_weight_takes_no_part_and_no_candidates_have_no_score():
     assert fuse_scales(np.zeros((0, 2), np.float32), np.zeros(0, bool)).shape == (0,)
 
 
+@pytest.mark.optimized
 def test_scales_of_equal_scores_say_nothing():
     """Whatever rounding makes of the mean of equal scores."""
     rng = np.random.default_rng(0)

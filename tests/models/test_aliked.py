@@ -23,7 +23,7 @@ from tests.builders import local
 from tests.golden.make_aliked import DRAWN, GOLDEN, REAL, checkpoint, picture, projections, samples, texture
 from tests.models import aliked_oracle as oracle
 
-pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 
 SLOTS = 1500
 IMAGES = checkpoints.ALIKED.parent.parent / "data" / "grief_season"
@@ -89,6 +89,7 @@ def test_another_variant_is_refused():
         Aliked("aliked-n64", rngs=nnx.Rngs(0))
 
 
+@pytest.mark.optimized
 @pytest.mark.first_case
 @pytest.mark.skipif(
     not checkpoints.ALIKED.is_dir(), reason="no ../shared/weights: weights do not ship with the project"
@@ -101,6 +102,7 @@ def test_with_real_weights_everything_is_as_in_the_public_code(case):
     assert_golden(case, *jax.tree.map(lambda field: field[0], results))
 
 
+@pytest.mark.optimized
 def test_with_random_weights_too_and_images_of_a_batch_do_not_mix(drawn):
     image = picture(DRAWN, IMAGES)
     results = []
@@ -112,6 +114,7 @@ def test_with_random_weights_too_and_images_of_a_batch_do_not_mix(drawn):
     jax.tree.map(np.testing.assert_array_equal, *results)
 
 
+@pytest.mark.optimized
 def test_the_extractor_does_as_the_public_code_and_compiles_once(drawn, compilations):
     extractor = AlikedFeatures(drawn, (DRAWN.width, DRAWN.height), threshold=DRAWN.threshold)
     image = picture(DRAWN, IMAGES)[None]

@@ -21,7 +21,7 @@ from tests.checkpoints import d2net_shapes, random_checkpoint
 from tests.golden.make_d2net import CASES, GOLDEN, PLAIN, projections, samples, texture
 from tests.models import d2net_oracle as oracle
 
-pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +88,7 @@ def test_the_network_has_the_published_size():
         assert jax.eval_shape(model, image).shape == (1, side, side, 512)
 
 
+@pytest.mark.optimized
 @pytest.mark.first_case
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_maps_and_features_are_those_of_the_public_code(model, case):
@@ -126,6 +127,7 @@ def plain(model) -> D2NetFeatures:
     return D2NetFeatures(model, (PLAIN[0].width, PLAIN[0].height))
 
 
+@pytest.mark.optimized
 @pytest.mark.first_case
 @pytest.mark.parametrize("case", PLAIN, ids=str)
 def test_plain_areas_have_the_keypoints_of_the_public_code_and_no_more(plain, case):
@@ -139,6 +141,7 @@ def test_plain_areas_have_the_keypoints_of_the_public_code_and_no_more(plain, ca
     np.testing.assert_allclose(projections(features.descriptors), golden["projections"], atol=1e-4)
 
 
+@pytest.mark.optimized
 def test_neighbors_that_see_the_same_pixels_have_the_same_bits(model):
     """A position sees 92 x 92 px; elsewhere the fast convolutions are at work."""
     image = texture(160, 128)
@@ -239,6 +242,7 @@ def test_crowded_images_are_extracted_again(small, images, monkeypatch):
         jax.tree.map(lambda ours, theirs: np.testing.assert_allclose(ours, theirs, rtol=1e-5), ours, expected)
 
 
+@pytest.mark.optimized
 @pytest.mark.slow
 def test_images_of_a_batch_do_not_mix(model, images):
     extracted = compiled(model, extract)

@@ -5,9 +5,8 @@ import pytest
 
 from mfvpr.models.imagenet import preprocess
 
-pytestmark = pytest.mark.optimized
 
-
+@pytest.mark.optimized
 def test_bytes_are_preprocessed_to_the_last_bit():
     image = np.arange(256, dtype=np.uint8)[None, :, None, None].repeat(3, axis=3)
     mean = np.array([103.939, 116.779, 123.68])

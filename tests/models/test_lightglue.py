@@ -22,7 +22,7 @@ from tests import checkpoints
 from tests.golden import make_lightglue_real
 from tests.golden.make_lightglue import DEPTH, GOLDEN, REAL, SEEDS, SIZES, SMALL, SURE, checkpoint, pair
 
-pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 
 INPUTS = SMALL["inputs"]
 assigned = jax.jit(assignment)
@@ -76,6 +76,7 @@ def assert_same(found, expected, atol=1e-5):
     np.testing.assert_allclose(np.exp(found), np.exp(expected), rtol=0, atol=atol)
 
 
+@pytest.mark.optimized
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("counts", SIZES, ids=str)
 def test_assignments_are_the_public_codes(golden, counts, seed):
@@ -87,6 +88,7 @@ def test_assignments_are_the_public_codes(golden, counts, seed):
     assert (found[:, counts[1] :] == -np.inf).all()
 
 
+@pytest.mark.optimized
 @pytest.mark.slow
 def test_in_double_precision_nothing_but_rounding_is_left(golden):
     with jax.enable_x64(True):
@@ -114,6 +116,7 @@ def test_less_is_sure_enough_behind_more_layers():
     np.testing.assert_array_equal(found, stopped)
 
 
+@pytest.mark.optimized
 def test_a_pair_depends_neither_on_its_padding_nor_on_its_batch():
     """One that stops early does not stop others."""
     pairs = [pair(counts, INPUTS, 5) for counts in ((20, 30), (30, 12), (7, 7))]
@@ -142,6 +145,7 @@ def test_what_is_not_finite_is_no_keypoint_and_of_none_nothing_is_said():
     assert (np.asarray(assigned(small(), nobody, features1)) == -np.inf).all()
 
 
+@pytest.mark.optimized
 @pytest.mark.skipif(not checkpoints.LIGHTGLUE.is_file(), reason="no ../shared/weights: weights do not ship")
 def test_published_weights_assign_as_the_public_code(golden):
     entry = entry_of("aliked_lightglue")
@@ -172,6 +176,7 @@ def test_older_names_of_the_published_tensors_are_known():
         )
 
 
+@pytest.mark.optimized
 @pytest.mark.skipif(not checkpoints.LIGHTGLUE.is_file(), reason="no ../shared/weights: LightGlue's are not shipped")
 @pytest.mark.parametrize("name", make_lightglue_real.PAIRS)
 def test_photographs_are_matched_as_by_the_public_code(real_golden, matcher, name):

@@ -19,7 +19,7 @@ from mfvpr.weights.tables import MIXVPR
 from tests.checkpoints import mixvpr_shapes, random_checkpoint
 from tests.golden.make_mixvpr import GOLDEN, SIZES, faint_maps, images, samples
 
-pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 
 RELATIVE = 1e-5
 PARAMETERS = {4096: 10_880_900, 512: 10_092_898, 128: 9_896_098}
@@ -67,17 +67,20 @@ def assert_same_descriptors(actual, expected):
     assert np.linalg.norm(actual - expected, axis=1).max() < RELATIVE
 
 
+@pytest.mark.optimized
 def test_backbone_is_the_public_codes(computed, golden):
     assert computed.maps.shape == (2, 20, 20, 1024)
     assert_close(samples(np.asarray(computed.maps)), golden["backbone"])
     assert_close(computed.maps.mean((1, 2)), golden["backbone/means"])
 
 
+@pytest.mark.optimized
 def test_each_mixer_is_the_public_codes(computed, golden):
     for place, mixed in enumerate(computed.mixers):
         assert_close(samples(np.asarray(mixed)), golden[f"mixer{place}"])
 
 
+@pytest.mark.optimized
 @pytest.mark.first_case
 @pytest.mark.parametrize("channels, rows", SIZES)
 def test_descriptors_are_the_public_codes(computed, golden, channels, rows):
@@ -99,6 +102,7 @@ def vectors(descriptions):
     return np.array([description.vector for description in descriptions])
 
 
+@pytest.mark.optimized
 def test_extractor_gives_the_public_codes_descriptors_and_compiles_once(model, golden, compilations):
     extractor = MixVprDescriptor(model, batch_size=2)
     assert (extractor.image_size, extractor.vector_size, extractor.interpolation) == ((320, 320), 4096, "pil_bicubic")
@@ -113,6 +117,7 @@ def test_extractor_gives_the_public_codes_descriptors_and_compiles_once(model, g
     assert_same_descriptors(floats, one)
 
 
+@pytest.mark.optimized
 def test_images_of_a_batch_do_not_see_each_other(model, computed):
     alone = jax.jit(MixVPR.aggregate)(model, computed.maps[1:])
     assert_same_descriptors(alone, computed.descriptors[1:])

@@ -19,7 +19,7 @@ from mfvpr.weights.tables import NETVLAD, NETVLAD_MATLAB
 from tests.checkpoints import gem_checkpoint, matlab_netvlad, netvlad_checkpoint, write_matlab
 from tests.golden.make_netvlad import CASES, GEM, GOLDEN, MATLAB, PATCHES, image, name, samples
 
-pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 
 RELATIVE = 1e-5  # of the largest value
 
@@ -38,6 +38,7 @@ def assert_close(actual, expected):
     np.testing.assert_allclose(actual, expected, rtol=0, atol=RELATIVE * np.abs(expected).max())
 
 
+@pytest.mark.optimized
 @pytest.mark.first_case
 @pytest.mark.parametrize("case", CASES, ids=map(str, CASES))
 def test_descriptors_and_patches_are_the_public_codes(golden, case):
@@ -54,6 +55,7 @@ def test_descriptors_and_patches_are_the_public_codes(golden, case):
         assert_close(np.asarray(found[0], np.float64).mean(axis=0), golden[f"{key}/{patch}/means"])
 
 
+@pytest.mark.optimized
 @pytest.mark.slow
 def test_the_originals_file_gives_the_descriptors_of_hlocs_code(golden, tmp_path):
     clusters, outputs, size, seed = MATLAB
@@ -65,6 +67,7 @@ def test_the_originals_file_gives_the_descriptors_of_hlocs_code(golden, tmp_path
     np.testing.assert_allclose(floats, found, atol=1e-7)
 
 
+@pytest.mark.optimized
 @pytest.mark.first_case
 @pytest.mark.parametrize("case", GEM, ids=map(str, GEM))
 def test_generalized_means_are_cosplaces(golden, case):
@@ -137,6 +140,7 @@ def test_fewer_components_are_the_first_of_all(small):
     np.testing.assert_allclose(part, whole[:3] / np.linalg.norm(whole[:3]), atol=1e-6)
 
 
+@pytest.mark.optimized
 def test_images_of_a_batch_do_not_see_each_other_and_one_program_is_compiled(small, compilations):
     extractor = GlobalDescriptor(small, (64, 48))
     images = np.concatenate([image((64, 48)), image((64, 48))[:, ::-1]])

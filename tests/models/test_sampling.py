@@ -8,8 +8,6 @@ import pytest
 from mfvpr.models.sampling import neighbors, sample, upsample
 from tests.models import aliked_oracle as oracle
 
-pytestmark = pytest.mark.optimized
-
 
 @pytest.fixture(scope="module")
 def dense() -> np.ndarray:

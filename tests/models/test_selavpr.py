@@ -24,7 +24,7 @@ from tests.golden.make_netvlad import image, name, samples
 from tests.golden.make_selavpr import BACKBONES, GOLDEN, MATCHES, NETWORKS, SIZE, WIDTH, maps
 from tests.models.test_netvlad import assert_close, filled
 
-pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +37,7 @@ def network(depth=1, registers=0, seed=0, width=1024, prefix=""):
     return filled(build, SELAVPR, transformer_checkpoint(selavpr_shapes(width, depth, registers, prefix), seed))
 
 
+@pytest.mark.optimized
 @pytest.mark.first_case
 @pytest.mark.parametrize("case", NETWORKS, ids=map(str, NETWORKS))
 def test_descriptors_are_the_public_codes(golden, case):
@@ -49,6 +50,7 @@ def test_descriptors_are_the_public_codes(golden, case):
     assert_close(local.descriptors.astype(np.float64).mean(axis=0), golden[f"{key}/means"])
 
 
+@pytest.mark.optimized
 @pytest.mark.parametrize("case", BACKBONES, ids=map(str, BACKBONES))
 def test_tokens_are_the_public_codes(golden, case):
     """Of any size: positions are resized but for those that were trained; images need not be square."""
@@ -70,6 +72,7 @@ def test_tokens_are_the_public_codes(golden, case):
     assert_close(samples(np.asarray(found)), golden[f"{key}/maps"])
 
 
+@pytest.mark.optimized
 @pytest.mark.parametrize("case", MATCHES, ids=map(str, MATCHES))
 def test_scores_are_the_public_codes(golden, case):
     """Numbers of mutual matches, equal as integers; a single match counts nothing there."""
@@ -186,6 +189,7 @@ def test_tokens_are_descriptors_of_images():
     assert len(recipes) == 3  # stores of one are not read for another
 
 
+@pytest.mark.optimized
 def test_tokens_of_a_batch_do_not_see_each_other_and_one_program_is_compiled(compilations):
     size = (28, 28)
     extractor = SelaVprFeatures(network(width=64), size)

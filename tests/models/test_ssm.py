@@ -17,7 +17,7 @@ from mfvpr.weights.tables import SSM
 from tests.golden.make_d2net import samples
 from tests.golden.make_ssm_maps import CASES, GOLDEN, checkpoint
 
-pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 
 RELATIVE = 1e-5  # of the map's largest value
 
@@ -55,6 +55,7 @@ def assert_same_map(dense, name, golden):
     np.testing.assert_allclose(samples(np.asarray(dense)), golden[name], rtol=0, atol=tolerance)
 
 
+@pytest.mark.optimized
 @pytest.mark.parametrize("case", [case for case in CASES if case.width == 224], ids=str)
 def test_one_pass_gives_both_maps_of_the_public_code(case, golden):
     (first,), (second,) = both(published(case.seed), case.image[None])
@@ -62,6 +63,7 @@ def test_one_pass_gives_both_maps_of_the_public_code(case, golden):
     assert_same_map(second, f"{case}/stage2", golden)
 
 
+@pytest.mark.optimized
 @pytest.mark.first_case
 @pytest.mark.parametrize("case", [case for case in CASES if case.width != 224], ids=str)
 def test_each_map_alone_is_the_public_codes(case, golden):
@@ -81,6 +83,7 @@ def test_sizes_of_the_maps(width, height):
         assert dense.shape == (2, -(-height // stride), -(-width // stride), 512)
 
 
+@pytest.mark.optimized
 def test_pixels_are_torchs_unless_caffes_are_asked_for():
     image = np.random.default_rng(0).integers(0, 256, (1, 4, 4, 3), np.uint8)
     np.testing.assert_array_equal(SsmVgg.preprocess(image), imagenet.preprocess(image, "torch"))

@@ -9,7 +9,7 @@ from flax import nnx
 from mfvpr.models.convolution import Conv3x3, winograd
 from mfvpr.models.vgg import Vgg16
 
-pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 
 
 def convolved(x, kernel, dilation):

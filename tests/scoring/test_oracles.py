@@ -21,7 +21,7 @@ from mfvpr import (
 from tests import oracles
 from tests.builders import make_matches, random_matches, real
 
-pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 
 WEIGHTS = {
     "fs": (FeatureScoreWeight(), lambda d, s0, s1, r: oracles.fs_weight(s0, s1)),

@@ -25,7 +25,7 @@ from tests.builders import SIZE, make_matches, random_matches, real
 from tests.golden import make_relatives as public
 from tests.scoring.test_oracles import certainty, pairs
 
-pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 
 score = jax.jit(lambda scorer, matches: scorer(matches))
 matched = jax.jit(match)

@@ -21,7 +21,7 @@ from mfvpr import (
 from tests import soft_oracles
 from tests.builders import SIZE, double, make_features, make_matches, random_matches, real
 
-pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 
 HISTOGRAMS = [
     HistogramOfShifts(bin_size=24.0, max_bins=30),
@@ -87,6 +87,7 @@ def test_points_outside_of_an_image_are_at_its_border():
     assert score(scorer, outside) == score(scorer, border) != score(scorer, matches)
 
 
+@pytest.mark.optimized
 @draws(HISTOGRAMS, [0.01, 0.3, 10.0])
 def test_histogram_agrees_with_the_loop(matches, scorer, temperature):
     points0, points1, weights, _ = oracle_inputs(scorer, matches)

@@ -166,7 +166,9 @@ def test_a_blueprint_can_be_filled_twice(folder, arrays):
     assert first.bn.use_running_average
 
 
-@pytest.mark.parametrize("name", PUBLIC)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name.startswith("selavpr") else []) for name in PUBLIC]
+)
 def test_published_layouts_fit_the_networks(name):
     """By names and shapes alone: each parameter of the network comes from one key of the checkpoint."""
     plan = blueprint(entry_of(name))
