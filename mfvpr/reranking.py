@@ -174,13 +174,19 @@ def rank_shortlist(candidates: Shortlist, scores: np.ndarray, *, ties: Ties = "f
     return np.asarray(rank(scores, candidates.mask, tie_break=tie_break))
 
 
-@compiled
 def rank(scores: Array, mask: Array | None = None, *, tie_break: Array | None = None) -> Array:
     """Positions `[..., C]` int32 in descending order of `scores` `[..., C]`.
 
     Stable: ties keep the given order, which is the filter's, or go by ascending `tie_break` `[..., C]`, such as the
     database index. NaN comes after every number, masked last.
     """
+    if isinstance(scores, np.ndarray) and scores.dtype in (np.int64, np.uint64):  # JAX cuts them to 32 bits
+        scores = np.unique(scores, return_inverse=True)[1].reshape(scores.shape)
+    return _rank(scores, mask, tie_break)
+
+
+@compiled
+def _rank(scores: Array, mask: Array | None, tie_break: Array | None) -> Array:
     present = jnp.ones(scores.shape, bool) if mask is None else mask
     number = present & ~jnp.isnan(scores)
     group = jnp.where(present, jnp.where(number, 0, 1), 2)

@@ -144,9 +144,17 @@ class Whitened:
         return self.search.shortlist(queries, database, num_candidates, excluded=excluded)
 
     def _whitened(self, descriptors: np.ndarray) -> np.ndarray:
-        whitened = self.whitening(descriptors)
-        lengths = np.linalg.norm(whitened, axis=1, keepdims=True)
-        return whitened / np.where(lengths > 0, lengths, 1)
+        mean, components = self.whitening.mean, self.whitening.components
+        return np.concatenate([_whiten(descriptors[part], mean, components) for part in _parts(len(descriptors), ROWS)])
+
+
+@compiled
+def _whiten(descriptors: Array, mean: Array, components: Array) -> Array:
+    """Principal components `[n, D']` of unit length. As in `retrieve`, those of a row do not depend on other rows."""
+    rows = _at_least_two(at_least_single(descriptors))
+    whitened = jnp.matmul(rows - mean[None], components.T, precision=jax.lax.Precision.HIGHEST)[: len(descriptors)]
+    lengths = jnp.linalg.norm(whitened, axis=1, keepdims=True)
+    return whitened / jnp.where(lengths > 0, lengths, 1)
 
 
 def _shortlist(queries: np.ndarray, database: np.ndarray, num_candidates: int, allowed: np.ndarray | None) -> Shortlist:

@@ -89,7 +89,7 @@ def test_whole_numbers_are_ranked_as_they_are():
     np.testing.assert_array_equal(rank(jnp.array([2**24, 2**24 + 1, 7])), [1, 0, 2])
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.int8, np.uint32, np.int32, np.bool_])
+@pytest.mark.parametrize("dtype", [np.uint8, np.int8, np.uint32, np.int32, np.uint64, np.int64, np.bool_])
 def test_the_ends_of_whole_numbers_are_ranked_as_they_are(dtype):
     low, high = (False, True) if dtype is np.bool_ else (np.iinfo(dtype).min, np.iinfo(dtype).max)
     scores, mask = np.array([low, high, 1, low, high], dtype), np.array([True, True, True, True, False])

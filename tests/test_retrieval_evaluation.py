@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 from mfvpr import frame_positives, radius_positives, recall_at_k, retrieval, retrieve
 from mfvpr.errors import InputError
 from mfvpr.evaluation import Positives, Tally
-from mfvpr.retrieval import EXACT, ExactSearch
+from mfvpr.retrieval import EXACT, ExactSearch, WhitenedSearch
 from tests import oracles
 from tests.builders import unit
 
@@ -48,6 +48,7 @@ def test_the_first_of_equal_rows_wins_whatever_is_searched_at_a_time(rows, monke
     np.testing.assert_array_equal(shortlist.indices, [[0, 2, 3], [1, 4, 0]])
 
 
+@pytest.mark.optimized
 @pytest.mark.parametrize("num_database", [1, 100])
 def test_a_query_has_the_same_bits_alone_and_in_company_whatever_the_memory(num_database):
     rng = np.random.default_rng(0)
@@ -58,6 +59,17 @@ def test_a_query_has_the_same_bits_alone_and_in_company_whatever_the_memory(num_
         found = ExactSearch(memory).shortlist(queries, database, 9)
         np.testing.assert_array_equal(found.indices, together.indices)
         np.testing.assert_array_equal(found.scores, together.scores)
+
+
+@pytest.mark.optimized
+def test_a_whitened_query_has_the_same_bits_alone_and_in_company():
+    rng = np.random.default_rng(1)
+    queries, database = unit(rng.normal(size=(5, 130))), unit(rng.normal(size=(100, 130)))
+    search = WhitenedSearch(20).fit(database)
+    together = search.shortlist(queries, database, 9)
+    for row in range(5):
+        alone = search.shortlist(queries[row : row + 1], database, 9)
+        np.testing.assert_array_equal(alone.scores[0], together.scores[row])
 
 
 @given(st.lists(st.integers(-1, 9), min_size=1, max_size=8), st.integers(1, 10), st.integers(0, 5))
