@@ -45,7 +45,13 @@ def axes(settings: dict[str, Any]) -> Axes:
     if not values:
         raise SettingsError("grid: expected at least one axis, such as 'grid.sigma=[10,22.5]', or an experiment=; see "
                             "--help")  # fmt: skip
-    own = settings["scorer"] | {"max_distance": settings["matching"].get("max_distance")}
+    limit = settings["matching"].get("max_distance")
+    if limit is not None and any(value is None or value > limit for value in values.get("max_distance", [])):
+        raise SettingsError(
+            f"grid.max_distance={values['max_distance']}: expected values up to {limit}, as "
+            f"matching.max_distance={limit} leaves no other matches; set matching.max_distance=null"
+        )
+    own = settings["scorer"] | {"max_distance": limit}
     own |= {"c": _plain_c(settings) if settings["final"] == "combined" else 0} if "c" in values else {}
     return Axes(scorer, values, {name: own.get(name) for name in values})
 

@@ -83,13 +83,14 @@ def fuse(filter_scores: Array, scores: Array, mask: Array, c: float | Array | No
     """Combined scores `[Q, C]` of several queries; `c` None balances the spread of both scores per query."""
     if c is None:
         c = jax.vmap(balancing_c)(filter_scores, scores, mask)[:, None]
+    filter_scores, scores = masked(filter_scores, mask), masked(scores, mask)
     return combine(filter_scores, scores, c=c)
 
 
 def fuse_shortlist(
     candidates: Shortlist, scores: np.ndarray, c: float | None, *, filter_score: FilterScore = "cosine"
 ) -> np.ndarray:
-    """Combined scores `[Q, C]` of filter and re-ranking, NumPy.
+    """Combined scores `[Q, C]` of filter and re-ranking, NumPy; NaN without a candidate.
 
     Args:
         candidates: the filter's, with their cosine similarities.
@@ -97,7 +98,8 @@ def fuse_shortlist(
         c: weight of the filter; None balances the spread of both per query.
         filter_score: the filter's score, see `filter_scores`.
     """
-    return np.asarray(fuse(filter_scores(candidates, filter_score), scores, candidates.mask, c))
+    fused = fuse(filter_scores(candidates, filter_score), scores, candidates.mask, c)
+    return np.asarray(or_nan(fused, candidates.mask))
 
 
 def filter_scores(candidates: Shortlist, kind: FilterScore = "cosine") -> np.ndarray:
@@ -180,9 +182,14 @@ def rank(scores: Array, mask: Array | None = None, *, tie_break: Array | None = 
     Stable: ties keep the given order, which is the filter's, or go by ascending `tie_break` `[..., C]`, such as the
     database index. NaN comes after every number, masked last.
     """
-    if isinstance(scores, np.ndarray) and scores.dtype in (np.int64, np.uint64):  # JAX cuts them to 32 bits
-        scores = np.unique(scores, return_inverse=True)[1].reshape(scores.shape)
-    return _rank(scores, mask, tie_break)
+    return _rank(_in_32_bits(scores), mask, _in_32_bits(tie_break))
+
+
+def _in_32_bits(keys: Array | None) -> Array | None:
+    """Smaller whole numbers in the same order, where JAX would cut those of 64 bits."""
+    if isinstance(keys, np.ndarray) and keys.dtype in (np.int64, np.uint64):
+        return np.unique(keys, return_inverse=True)[1].reshape(keys.shape)
+    return keys
 
 
 @compiled

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import Shortlist, balancing_c, combine, rank, rerank
-from mfvpr.reranking import filter_scores, fuse, fuse_scales
+from mfvpr.reranking import filter_scores, fuse, fuse_scales, fuse_shortlist
 from tests import oracles
 
 pytestmark = pytest.mark.thorough
@@ -35,6 +35,8 @@ def test_ties_may_go_by_index_instead():
     index = jnp.array([[7, 9, 3, 1, 5]])
     np.testing.assert_array_equal(rank(scores), [[1, 2, 0, 4, 3]])
     np.testing.assert_array_equal(rank(scores, tie_break=index), [[2, 1, 4, 0, 3]])
+    large = np.array([[7, 9, 3, 1, 5]]) + 2**32 * np.array([[0, 0, 1, 0, 0]])
+    np.testing.assert_array_equal(rank(scores, tie_break=large), [[1, 2, 4, 0, 3]])
 
 
 def test_combined_score_spans_plain_to_filter_order():
@@ -127,6 +129,9 @@ def test_no_score_is_no_fault_of_a_program():
     scores, mask = np.ones((3, 2), np.float32), np.array([True, True, False])
     with jax.debug_nans(True):
         np.testing.assert_array_equal(fuse_scales(scores, mask), [0, 0, np.nan])
+        candidates = Shortlist(np.array([[0, -1]]), np.array([[0.5, np.nan]], np.float32), np.array([[True, False]]))
+        fused = fuse_shortlist(candidates, np.array([[2, np.nan]], np.float32), 4.0)
+        np.testing.assert_array_equal(fused, [[4, np.nan]])
 
 
 def test_a_scale_without_weight_takes_no_part_and_no_candidates_have_no_score():

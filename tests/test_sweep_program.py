@@ -261,6 +261,8 @@ SIGMA = "grid.sigma=[10]"
         (["grid.c=[automatic]"], "grid.c=['automatic']: expected"),
         (["scorer=anchor", "grid.num_bins=[33]"], "each a whole number from 1 to 32"),
         (["grid.sigma=[10,10]"], "grid.sigma=[10, 10]: expected different values"),
+        (["grid.max_distance=[0.3,0.9]", "matching.max_distance=0.4"], "grid.max_distance=[0.3, 0.9]: expected"),
+        (["grid.max_distance=[null]", "matching.max_distance=0.4"], "grid.max_distance=[None]: expected"),
         (["scorer=all", SIGMA], "scorer: a sweep takes one scorer at a time"),
         (["scorer=count", SIGMA], "it has single, max_distance, c"),
         ([SIGMA, "dataset.ground_truth=none", "dataset.index_file=null"], "choosing settings needs a ground truth"),
