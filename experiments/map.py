@@ -68,13 +68,13 @@ def info(folder: Path) -> None:
 
 
 def add(folder: Path, images: list[Path], place: str | None) -> None:
-    """Add files under their names."""
+    """Add files under their absolute paths."""
     from experiments import maps
     from mfvpr.data.files import printable
 
     known = maps.opened(folder)
     for path in images:
-        known.add(path, path.name if place is None else place, name=path.name)
+        known.add(path, path.name if place is None else place)
         print(printable(f"{path}: added, {len(known)} images"), flush=True)
 
 

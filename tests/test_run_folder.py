@@ -225,6 +225,12 @@ def test_figures_of_chosen_queries(outcome):
     assert list(page_of(outcome).shown([5, 2])) == [5, 2]
 
 
+def test_the_figure_of_a_refused_answer_says_that_there_is_no_place(outcome):
+    page = replace(page_of(outcome), refused=np.arange(24) == 5)
+    assert "no place" in page.title(5, "right")
+    assert "no place" not in page.title(2, "right")
+
+
 # --- the claim ---------------------------------------------------------------------------------------------------
 
 

@@ -147,6 +147,7 @@ def figures(
     extractor: Extractor | Source,
     shown: int | Sequence[int],
     histogram: HistogramOfShifts | None = None,
+    refused: Sequence[np.ndarray] | None = None,
 ) -> list[Figure]:
     """The paper's figure for a few queries, right and wrong ones, spread over each sequence.
 
@@ -155,12 +156,14 @@ def figures(
         extractor: whose images are shown.
         shown: how many, or rows of queries.
         histogram: which; None = the paper's.
+        refused: `[Q]` bool of each sequence, queries whose confidence is below the threshold; None = no query.
     """
     several, folders = len(judged.sequences) > 1, file_names([sequence.name for sequence in judged.sequences])
     return [
         (f"{folders[sequence.name]}/{name}" if several else name, partial(page.draw, query=query, verdict=verdict))
         for place, sequence in enumerate(judged.sequences)
-        for page in [Page(judged, place, extractor, histogram or HistogramOfShifts())]
+        for doubts in [None if refused is None else refused[place]]
+        for page in [Page(judged, place, extractor, histogram or HistogramOfShifts(), doubts)]
         for query, verdict in page.shown(shown).items()
         for name in [f"{verdict}_{query:04d}.png"]
     ]
@@ -174,6 +177,7 @@ class Page:
     place: int
     extractor: Extractor | Source
     histogram: HistogramOfShifts
+    refused: np.ndarray | None = None
 
     @property
     def sequence(self) -> QuerySequence:
@@ -202,19 +206,26 @@ class Page:
         return {query: verdict for verdict, number in numbers.items()
                 for query in _spread(np.flatnonzero(some & (verdicts == verdict)), number)}  # fmt: skip
 
+    def title(self, query: int, verdict: str) -> str:
+        """The score, whether the prediction is correct within the threshold, and both names."""
+        truth, refused = self.sequence.truth, self.refused is not None and self.refused[query]
+        within = "" if truth is None else " at" + threshold_words(truth.unit, self.judged.threshold)
+        names = f"{_short(self.sequence.images.names[query])} -> {_short(self._prediction(query))}"
+        note = " (no place: confidence below the threshold)" if refused else ""
+        return f"{self.judged.headline}, {verdict}{within}: {names}{note}"
+
     def draw(self, path: Path, query: int, verdict: str) -> None:
         """What was answered; where that is wrong, below it what is right."""
-        names, truth = self.sequence.images.names, self.sequence.truth
         answers = [self._answer(query, 0, verdict), *(self.correct_predictions(query) if verdict == "wrong" else [])]
-        within = "" if truth is None else threshold_words(truth.unit, self.judged.threshold)
-        answer = self.database.names[self.ranked.rows[query, 0]]
-        about = dict(zip(ABOUT, (self.judged.headline, self.sequence.name, verdict, names[query], answer), strict=True))
-        verdict += " at" * bool(within) + within
-        title = f"{self.judged.headline}, {verdict}: {_short(names[query])} -> {_short(answer)}"
+        values = self.judged.headline, self.sequence.name, verdict, self.sequence.images.names[query]
+        about = dict(zip(ABOUT, (*values, self._prediction(query)), strict=True))
         original = self.sequence.images.read(query)
         image = self._resized(original)
         aspect = aspect_of_resized(original, image)
-        histogram_figure(path, image, answers, title=title, pixel_aspect=aspect, about=about)
+        histogram_figure(path, image, answers, title=self.title(query, verdict), pixel_aspect=aspect, about=about)
+
+    def _prediction(self, query: int) -> str:
+        return self.database.names[self.ranked.rows[query, 0]]
 
     def _answer(self, query: int, rank: int, verdict: str) -> Answer:
         """The candidate at a rank from 0."""

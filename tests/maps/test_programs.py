@@ -85,6 +85,7 @@ def test_images_are_added(folder, small_street, monkeypatch, capsys):
     code, _, stderr = called(monkeypatch, capsys, "map", "add", folder, folder.parent / "new.png")
     assert code == 2
     assert "new.png: the map has an image" in stderr
+    assert called(monkeypatch, capsys, "map", "add", folder, image)[0] == 0  # another image of the name 0009.png
 
 
 @pytest.fixture
