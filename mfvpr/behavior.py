@@ -2,6 +2,7 @@
 
 It is what runs that counts (instructions, constants, names, defaults, and what a function closes over), and the text
 of the class where there is one: a file may have been edited since it was read. What methods call is not looked at.
+Class attributes count as well. Private attributes count if they hold values and no name says `cache`.
 """
 
 import functools
@@ -14,6 +15,7 @@ import jax
 import numpy as np
 
 _PLAIN = (bool, int, float, complex, str, bytes)
+_CONSTANTS = (*_PLAIN, np.ndarray, np.generic, jax.Array, tuple, list, dict, set, frozenset, type)
 
 
 def behavior_of(kind: type, recipe_of: Callable[[Any], Any]) -> list[Any]:
@@ -35,8 +37,11 @@ def _text(kind: type) -> str:
 
 
 def _counts(name: str, part: Any) -> bool:
-    """Not what Python notes of a class, nor what a class keeps for itself while it works."""
-    return bool(_functions(part)) or isinstance(part, functools.partial) or not name.startswith("_")
+    """Functions and attributes, except Python's notes (`__doc__`), and private caches and objects."""
+    if _functions(part) or isinstance(part, functools.partial) or not name.startswith("_"):
+        return True
+    is_note = name.startswith("__") and name.endswith("__")
+    return isinstance(part, _CONSTANTS) and not is_note and "cache" not in name.lower()
 
 
 def _functions(part: Any) -> list[Any]:

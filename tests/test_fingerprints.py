@@ -86,6 +86,25 @@ def test_text_counts_where_code_does_not_say_all(tmp_path, monkeypatch):
     assert recipes[0] != recipes[1]
 
 
+def privately(value):
+    """A class of the same text whatever its private attribute holds."""
+
+    class Mine(Sift):
+        _gain = value
+
+        def __call__(self, images):
+            return super().__call__([image * self._gain for image in images])
+
+    return Mine
+
+
+def test_private_constants_are_part_of_the_recipe():
+    values = [1, 3, 1.0, "1", (1, 2), {"a": 1}, [1], np.ones(2), np.zeros(2), np.float32]
+    recipes = [fingerprint(recipe_of(privately(value)())) for value in values]
+    assert len({*recipes}) == len(values)
+    assert recipes[0] == fingerprint(recipe_of(privately(1)()))
+
+
 def test_what_a_class_keeps_while_it_works_is_no_part_of_the_recipe():
     used = made_by(1)()
     before = recipe_of(used)
