@@ -14,8 +14,11 @@ from mfvpr.archive import Archive
 from mfvpr.data.datasets import ImageFolder, QuerySequence
 from mfvpr.data.images import Interpolation
 from mfvpr.errors import InputError
-from mfvpr.exchange import ImportedFeatures, open_features, read_global_descriptors, read_shortlist
+from mfvpr.exchange import ImportedFeatures, open_features
 from mfvpr.exchange.checks import Lengths
+from mfvpr.exchange.descriptors import read_with_entries as read_descriptors
+from mfvpr.exchange.names import Images, require_one_image
+from mfvpr.exchange.shortlists import read_with_entries as read_shortlist
 from mfvpr.features import Scale
 from mfvpr.filters import Filtered
 from mfvpr.retrieval import EXACT, Search
@@ -54,17 +57,21 @@ class FeatureFiles:
     image_size: tuple[int, int] | None = None
     interpolation: Interpolation = field(default="pil_bilinear", metadata={"recipe": False})
     scales: tuple[Scale, ...] = field(default=(Scale(0, TYPICAL),), metadata={"recipe": False})
+    _images: Images = field(default_factory=dict, init=False, repr=False, compare=False, metadata={"recipe": False})
 
     def opened(self, folder: ImageFolder, *, partial: bool) -> ImportedFeatures:
         """The features of a folder's images; `partial`: some may be missing.
 
         Raises:
-            InputError: there is no file of the folder, or see `open_features`.
+            InputError: there is no file of the folder, an entry stands for an image of another folder as well, or see
+                `open_features`.
         """
         file = _file_of(self.files, folder)
-        return open_features(
+        features = open_features(
             file.path, file.names(folder), image_size=self.image_size, lengths=self.lengths, partial=partial
         )
+        require_one_image(file.path, folder.paths, features.entries, self._images)
+        return features
 
 
 @dataclass(frozen=True)
@@ -80,6 +87,7 @@ class DescriptorFiles:
     files: Mapping[Path, File]
     lengths: Lengths = "unit"
     search: Search = EXACT
+    _images: Images = field(default_factory=dict, init=False, repr=False, compare=False, metadata={"recipe": False})
 
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, archive: Archive
@@ -93,7 +101,9 @@ class DescriptorFiles:
 
     def _read(self, folder: ImageFolder) -> np.ndarray:
         file = _file_of(self.files, folder)
-        return read_global_descriptors(file.path, file.names(folder), lengths=self.lengths)
+        vectors, entries = read_descriptors(file.path, file.names(folder), lengths=self.lengths)
+        require_one_image(file.path, folder.paths, entries, self._images)
+        return vectors
 
 
 @dataclass(frozen=True)
@@ -114,7 +124,10 @@ class ShortlistFiles:
         """See `mfvpr.filters.Filter`; what the sequence excludes is left out, and the others move up."""
         file = _file_of(self.files, sequence.images)
         names = [self.database_prefix + name for name in database.names]
-        shortlist = read_shortlist(file.path, file.names(sequence.images), names)
+        shortlist, query_entries, database_entries = read_shortlist(file.path, file.names(sequence.images), names)
+        known: Images = {}
+        require_one_image(file.path, database.paths, database_entries, known)
+        require_one_image(file.path, sequence.images.paths, query_entries, known)
         if sequence.excluded is not None:
             shortlist = _without(shortlist, sequence.excluded.contains(shortlist.indices))
         return Filtered(_cut(shortlist, num_candidates), {}, {})

@@ -17,6 +17,18 @@ class Contents(NamedTuple):
     shapes: Mapping[str, tuple[int, ...]]
 
 
+class Entry(NamedTuple):
+    """Place of an image's arrays.
+
+    Attributes:
+        file: that holds the arrays.
+        name: of the image in the file; "" = the file holds one image.
+    """
+
+    file: Path
+    name: str
+
+
 class Container(Protocol):
     """Arrays of several images; only what is asked for is read.
 
@@ -38,8 +50,8 @@ class Container(Protocol):
         """For each image, those of its `parts` that are there."""
         ...
 
-    def files(self, images: Iterable[str]) -> tuple[Path, ...]:
-        """The files that hold these images."""
+    def entry(self, image: str) -> Entry:
+        """Place of an image's arrays."""
         ...
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from mfvpr.data.files import printable, replacing, require_file
 from mfvpr.errors import InputError
 from mfvpr.exchange.checks import Lengths, as_float32, require_lengths, with_length
-from mfvpr.exchange.containers import reading, shortened
+from mfvpr.exchange.containers import Entry, reading, shortened
 from mfvpr.exchange.feature_files import as_written
 from mfvpr.exchange.h5 import H5File, write_h5
 from mfvpr.exchange.names import match_names, require_all, require_different
@@ -34,16 +34,24 @@ def read_global_descriptors(path: Path | str, names: Sequence[str], *, lengths: 
         InputError: no such file, damaged, images that are missing or could be several, values that are not finite, or
             not of unit length.
     """
+    return read_with_entries(path, names, lengths=lengths)[0]
+
+
+def read_with_entries(
+    path: Path | str, names: Sequence[str], *, lengths: Lengths = "unit"
+) -> tuple[np.ndarray, list[Entry]]:
+    """Descriptors as `read_global_descriptors` returns them, and `[M]` the entry of each image."""
     path = Path(path)
     require_lengths(lengths)
     readers = {".npy": _from_npy, ".npz": _from_npz, ".h5": _from_h5, ".hdf5": _from_h5}
     require_file(path)
     if path.suffix.lower() not in readers:
         raise InputError(f"{path}: expected a file named {', '.join(readers)}, got {path.suffix or 'no suffix'}")
-    found = readers[path.suffix.lower()](path, names)
-    if found.ndim != 2 or len(found) != len(names) or not found.shape[1]:
-        raise InputError(f"{path}: expected descriptors [{len(names)}, D] of the images, got {list(found.shape)}")
-    return with_length(str(path), as_float32(str(path), found), lengths)
+    entries, values = readers[path.suffix.lower()](path, names)
+    if values.ndim != 2 or len(values) != len(names) or not values.shape[1]:
+        raise InputError(f"{path}: expected descriptors [{len(names)}, D] of the images, got {list(values.shape)}")
+    values = with_length(str(path), as_float32(str(path), values), lengths)
+    return values, [Entry(path, entry) for entry in entries]
 
 
 def write_global_descriptors(
@@ -74,12 +82,15 @@ def write_global_descriptors(
         raise InputError(f"{path}: expected a name that ends with .npy, .npz, .h5 or .hdf5")
 
 
-def _from_npy(path: Path, names: Sequence[str]) -> np.ndarray:
+Rows = tuple[list[str], np.ndarray]  # the entry of each image, and its descriptor
+
+
+def _from_npy(path: Path, names: Sequence[str]) -> Rows:
     with reading(path):
         return _from_sorted(path, names, parse_npy(str(path), path.read_bytes()))
 
 
-def _from_npz(path: Path, names: Sequence[str]) -> np.ndarray:
+def _from_npz(path: Path, names: Sequence[str]) -> Rows:
     arrays = read_npz(path, ("descriptors", "names"))
     if "descriptors" not in arrays:
         raise InputError(f"{path}: expected an array descriptors [M, D], and names [M]; got no descriptors")
@@ -96,10 +107,11 @@ def _from_npz(path: Path, names: Sequence[str]) -> np.ndarray:
         raise InputError(f"{path}: expected different names, got {len(foreign) - len(rows)} again; keep one of each")
     matched = match_names(path, names, rows)
     require_all(path, names, matched, "descriptors")
-    return descriptors[[rows[name] for name in matched if name is not None]]
+    images = [image for image in matched if image is not None]
+    return images, descriptors[[rows[image] for image in images]]
 
 
-def _from_h5(path: Path, names: Sequence[str]) -> np.ndarray:
+def _from_h5(path: Path, names: Sequence[str]) -> Rows:
     file = H5File(path)
     matched = match_names(path, names, file.images)
     require_all(path, names, matched, "descriptors")
@@ -110,15 +122,14 @@ def _from_h5(path: Path, names: Sequence[str]) -> np.ndarray:
             got = list(parts[PART].shape) if PART in parts else "none"
             raise InputError(f"{path}: {shortened(image)}: expected {PART} [D], the same D for all, got {got}")
         rows.append(parts[PART])
-    return np.stack(rows) if rows else np.zeros((0, 0), np.float32)
+    return images, np.stack(rows) if rows else np.zeros((0, 0), np.float32)
 
 
-def _from_sorted(path: Path, names: Sequence[str], descriptors: np.ndarray) -> np.ndarray:
+def _from_sorted(path: Path, names: Sequence[str], descriptors: np.ndarray) -> Rows:
     if descriptors.ndim != 2 or len(descriptors) != len(names):
         raise InputError(f"{path}: expected descriptors [{len(names)}, D] of the images, got {list(descriptors.shape)}")
-    rows = np.empty_like(descriptors)
-    rows[_sorted_rows(names)] = descriptors
-    return rows
+    places = np.argsort(_sorted_rows(names))
+    return [f"row {place}" for place in places.tolist()], descriptors[places]
 
 
 def _sorted_rows(names: Sequence[str]) -> np.ndarray:

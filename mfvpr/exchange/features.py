@@ -24,7 +24,7 @@ import numpy as np
 from mfvpr.data.files import require_file
 from mfvpr.errors import InputError
 from mfvpr.exchange.checks import Lengths, as_float32, require_lengths, with_length
-from mfvpr.exchange.containers import Container, Contents, shortened
+from mfvpr.exchange.containers import Container, Contents, Entry, shortened
 from mfvpr.exchange.h5 import H5File
 from mfvpr.exchange.names import match_names, require_all
 from mfvpr.exchange.npz import NpzFile, NpzFolder
@@ -59,6 +59,11 @@ class ImportedFeatures:
 
     def __len__(self) -> int:
         return len(self.counts)
+
+    @property
+    def entries(self) -> list[Entry | None]:
+        """`[M]` place of each image's arrays; None = not there."""
+        return [None if image is None else self._container.entry(image) for image in self._images]
 
     def read(self, rows: Iterable[int] | None = None) -> Iterator[tuple[int, Features]]:
         """Row and features, unpadded NumPy float32 with a full mask, in the order of `rows`; nothing else is read.
@@ -149,7 +154,7 @@ def open_features(
     transposed, dimension = _layout(path, contents, container.transposed)
     return ImportedFeatures(
         path=path,
-        paths=container.files(matched),
+        paths=tuple(dict.fromkeys(container.entry(image).file for image in matched)),
         counts=counts,
         dimension=dimension,
         scored=_scored(path, contents),

@@ -1,5 +1,6 @@
 """Which image of a file of another program is which image of the data set."""
 
+import os
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path, PurePosixPath
@@ -7,9 +8,11 @@ from pathlib import Path, PurePosixPath
 from mfvpr.data.files import printable
 from mfvpr.data.images import SUFFIXES
 from mfvpr.errors import InputError
-from mfvpr.exchange.containers import shortened
+from mfvpr.exchange.containers import Entry, shortened
 
 Prefix = tuple[tuple[str, ...], tuple[str, ...]]  # folders that only the file's names have, only the images' names
+Images = dict[tuple[int, int, str], Path]  # image of an entry, by the device, inode and name of the entry
+_NO_PREFIX: Prefix = ((), ())
 
 
 def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> list[str | None]:
@@ -63,6 +66,37 @@ def require_all(path: Path, names: Sequence[str], matched: Sequence[str | None],
 Variants = Callable[[str], list[str]]
 
 
+def require_one_image(path: Path, images: Sequence[Path], entries: Sequence[Entry | None], known: Images) -> None:
+    """Refuse an entry that stands for images of two folders.
+
+    Args:
+        path: file or folder, for messages.
+        images: `[M]` paths of a folder's images.
+        entries: `[M]` their entries; None = the file lacks the image.
+        known: images of entries so far. The images of this folder are added.
+
+    Raises:
+        InputError: an entry has another image in `known`, unless both paths lead to one file.
+    """
+    for image, entry in zip(images, entries, strict=True):
+        if entry is None:
+            continue
+        status = entry.file.stat()  # one file may have several paths
+        other = known.setdefault((status.st_dev, status.st_ino, entry.name), image)
+        if other != image and os.path.realpath(other) != os.path.realpath(image):
+            name = shortened(entry.name or entry.file.name)
+            first, second = (shortened(str(file), 300) for file in (other, image))
+            raise InputError(
+                f"{path}: expected one image for each entry, got {name} for {first} and for {second}; "
+                "give names with their folders as the file has them, or a file for each folder"
+            )
+
+
+def adds_folders(name: str, match: str) -> bool:
+    """Whether a matched name has folders before the part that it shares with the image's name."""
+    return bool(_prefix(name, match)[0])
+
+
 class _Ends:
     """Foreign names by what they are, and by every end of them."""
 
@@ -84,13 +118,17 @@ class _Ends:
 
 
 def _match_ends(path: Path, names: Sequence[str], rows: list[int], ends: _Ends, matched: list[str | None]) -> None:
-    """Fill `matched` where one foreign name and one image mean each other alone, with the prefix of earlier matches."""
+    """Fill `matched` where one foreign name and one image mean each other alone, with the prefix of earlier matches.
+
+    A name at the image's own path contradicts another prefix of earlier matches: it is not ignored.
+    """
     examples: dict[Prefix, tuple[str, str]] = {}  # an image and its name in the file
     for name, match in zip(names, matched, strict=True):
         if match is not None:
             examples.setdefault(_prefix(name, match), (name, match))
+    prefixes = {*examples, _NO_PREFIX}
     candidates = {
-        row: {match for match in ends.candidates(names[row]) if not examples or _prefix(names[row], match) in examples}
+        row: {match for match in ends.candidates(names[row]) if not examples or _prefix(names[row], match) in prefixes}
         for row in rows
     }
     claims = Counter(name for possible in candidates.values() for name in possible)

@@ -8,8 +8,8 @@ import numpy as np
 
 from mfvpr.data.files import require_file, write_text
 from mfvpr.errors import InputError
-from mfvpr.exchange.containers import shortened
-from mfvpr.exchange.names import match_names, require_different
+from mfvpr.exchange.containers import Entry, shortened
+from mfvpr.exchange.names import adds_folders, match_names, require_different
 from mfvpr.exchange.npz import read_npz, write_npz
 from mfvpr.exchange.pairs import Pair, read_pairs, require_lines
 from mfvpr.types import Ranking, Shortlist
@@ -40,18 +40,32 @@ def read_shortlist(
         InputError: no such file, damaged, unknown or ambiguous names, rows out of range, scores of some pairs only, not
             finite, or ascending.
     """
+    return read_with_entries(path, query_names, database_names, num_candidates=num_candidates)[0]
+
+
+def read_with_entries(
+    path: Path | str, query_names: Sequence[str], database_names: Sequence[str], *, num_candidates: int | None = None
+) -> tuple[Shortlist, list[Entry | None], list[Entry | None]]:
+    """Shortlist as `read_shortlist` returns it, and the entries of queries `[Q]` and database images `[N]`.
+
+    Only names with additional folders are entries. A file name alone may mean an image on either side.
+    """
     path = Path(path)
     require_file(path)
     if num_candidates is not None and num_candidates < 1:
         raise InputError(f"num_candidates={num_candidates}: expected at least 1")
+    queries, database = {}, {}
     if path.suffix.lower() == ".npz":
         candidates = _from_npz(path, len(query_names), len(database_names))
     else:
         pairs = read_pairs(path, query_names, database_names)
-        candidates = _from_pairs(path, pairs, query_names, database_names)
+        queries = _rows(path, query_names, dict.fromkeys(pair.query for pair in pairs), "query")
+        database = _rows(path, database_names, dict.fromkeys(pair.database for pair in pairs), "database")
+        candidates = _from_pairs(pairs, queries, database, len(query_names))
     if not any(candidates):
         raise InputError(f"{path}: expected candidates of {len(query_names)} queries, got none at all")
-    return _shortlist(path, [_first_of_each(own) for own in candidates], query_names, num_candidates)
+    shortlist = _shortlist(path, [_first_of_each(own) for own in candidates], query_names, num_candidates)
+    return shortlist, _entries(path, query_names, queries), _entries(path, database_names, database)
 
 
 def write_shortlist(
@@ -136,11 +150,9 @@ def _from_npz(path: Path, num_queries: int, num_database: int) -> list[Candidate
 
 
 def _from_pairs(
-    path: Path, pairs: Sequence[Pair], query_names: Sequence[str], database_names: Sequence[str]
+    pairs: Sequence[Pair], queries: dict[str, int], database: dict[str, int], num_queries: int
 ) -> list[Candidates]:
-    queries = _rows(path, query_names, dict.fromkeys(pair.query for pair in pairs), "query")
-    database = _rows(path, database_names, dict.fromkeys(pair.database for pair in pairs), "database")
-    candidates: list[Candidates] = [[] for _ in query_names]
+    candidates: list[Candidates] = [[] for _ in range(num_queries)]
     for pair in pairs:
         candidates[queries[pair.query]].append((database[pair.database], pair.score))
     return candidates
@@ -156,6 +168,14 @@ def _rows(path: Path, names: Sequence[str], foreign: dict[str, None], side: str)
                 f"{len(names)} has, or one has by its full path; give names with their folders as the file has them"
             )
     return rows
+
+
+def _entries(path: Path, names: Sequence[str], rows: dict[str, int]) -> list[Entry | None]:
+    entries: list[Entry | None] = [None] * len(names)
+    for match, row in rows.items():
+        if adds_folders(names[row], match):
+            entries[row] = Entry(path, match)
+    return entries
 
 
 def _first_of_each(candidates: Candidates) -> Candidates:

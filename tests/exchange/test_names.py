@@ -40,7 +40,6 @@ FILE = Path("feats.h5")
         ([r"a\udce9.jpg"], ["a\udce9.jpg", r"a\udce9.jpg"], [r"a\udce9.jpg"]),
         (["1.jpg", "2.jpg"], ["1.jpg", "query/2.jpg"], ["1.jpg", None]),  # one prefix for all images
         (["1.jpg", "2.jpg"], ["db/1.jpg", "db/2", "query/2"], ["db/1.jpg", "db/2"]),
-        (["a/1.jpg", "a/2.jpg"], ["1.jpg", "a/2.png"], ["1.jpg", None]),
         ([], ["a.jpg"], []),
     ],
 )
@@ -60,6 +59,8 @@ def test_matches(names, foreign, expected):
             ["db/0.jpg", "db/1.jpg", "query/2.jpg"],
             r"one prefix .*db/0\.jpg .*query/2\.jpg",
         ),
+        (["1.jpg", "2.jpg"], ["1", "query/2.jpg"], r"one prefix .*query/2\.jpg for 2\.jpg .*1 for 1\.jpg"),
+        (["a/1.jpg", "a/2.jpg"], ["1.jpg", "a/2.png"], r"one prefix .*1\.jpg for a/1\.jpg .*a/2\.png for a/2\.jpg"),
         (["a/1.jpg", "b/2.jpg"], ["1.jpg", "2.jpg"], r"one prefix .* got 1\.jpg .*a/1\.jpg .*b/2\.jpg"),
     ],
 )
