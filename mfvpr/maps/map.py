@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import operator
 import shutil
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -17,7 +18,7 @@ import numpy as np
 from mfvpr.confidence import Confidence
 from mfvpr.data.arrays import read_arrays, write_arrays
 from mfvpr.data.datasets import ImageFolder
-from mfvpr.data.files import canonical_name
+from mfvpr.data.files import canonical_name, clipped
 from mfvpr.errors import InputError
 from mfvpr.features import Aggregation, Extractor
 from mfvpr.features.vlad import Vlad, VladFitting
@@ -36,7 +37,17 @@ from mfvpr.scoring import HistogramOfShifts, Scorer
 from mfvpr.sources import FeatureSet, stacked
 from mfvpr.stores.disk import told
 from mfvpr.stores.features import FeatureStore, open_store
-from mfvpr.stores.maps import MAP, Entry, MapRows, check_place, has_rows, hold_map, is_map_settled, settle_map
+from mfvpr.stores.maps import (
+    MAP,
+    Entry,
+    MapRows,
+    check_name,
+    check_place,
+    has_rows,
+    hold_map,
+    is_map_settled,
+    settle_map,
+)
 from mfvpr.types import Features, Matches
 
 _VOCABULARY = "vocabulary.npz"
@@ -102,8 +113,7 @@ class Map:
         if len(extractor.scales) != 1:
             raise InputError(f"{type(extractor).__name__}: a map takes local features of one scale, "
                              f"got {len(extractor.scales)}")  # fmt: skip
-        if candidates < 1:
-            raise InputError(f"candidates={candidates}: expected at least 1")
+        candidates = _whole_number("candidates", candidates, least=1)
         if threshold is not None and confidence is None:
             raise InputError(f"threshold={threshold}: expected a confidence as well, which gives p(right)")
         self.folder, self.extractor, self.matcher, self.candidates = Path(folder), extractor, matcher, candidates
@@ -206,6 +216,7 @@ class Map:
         if len(places) != len(images):
             raise InputError(f"expected a place of each of {len(images)} images, got {len(places)}")
         for name, place in zip(images.names, places, strict=True):
+            check_name(name)
             check_place(name, place)
         with hold_map(self.folder), self._learning(images, track) as features, self._adding() as made:
             missing = [row for row, name in enumerate(images.names) if name not in self._rows]
@@ -228,7 +239,7 @@ class Map:
         Args:
             image: as of `ask`.
             place: where it was taken, any JSON value.
-            name: None = the file's absolute path, see `canonical_name`; an array needs one.
+            name: text; None = the file's absolute path, see `canonical_name`; an array needs one.
 
         Raises:
             InputError: as `build`; a name that is there; or a map whose vocabulary is not learned.
@@ -252,10 +263,16 @@ class Map:
         """
         if len(entries) != len(features):
             raise InputError(f"expected features of each of {len(entries)} images, got {len(features)}")
+        for name, place, _ in entries:
+            check_name(name)
+            check_place(name, place)
         with hold_map(self.folder), self._adding() as made:
-            new: set[str] = set()
-            for name, place, _ in entries:
-                check_place(name, place)
+            new, length = set[str](), self._vectors.length
+            for name, _, vector in entries:
+                length = np.size(vector) if length is None else length
+                if np.shape(vector) != (length,):
+                    raise InputError(f"{name}: expected a descriptor [{length}], got {list(np.shape(vector))}. Take it "
+                                     "from `describing` of this map.")  # fmt: skip
                 if name in self._rows or name in new:
                     raise InputError(f"{name}: the map has an image of this name; choose another")
                 new.add(name)
@@ -279,8 +296,10 @@ class Map:
             before: rows from this on are left out as well, as if the map ended there; None = none.
 
         Raises:
-            InputError: the map is empty, or the image cannot be read.
+            InputError: the map is empty, the image cannot be read, or `recent` or `before` is no number of rows.
         """
+        recent = _whole_number("recent", recent)
+        before = None if before is None else _whole_number("before", before)
         self.refresh()
         if not len(self) or self._made is None:
             raise InputError(f"{self.folder}: expected a map with images, got an empty one; add some")
@@ -372,6 +391,17 @@ class Map:
     def _vocabulary_of(self) -> str:
         """What the vocabulary is of: another's is refused."""
         return fingerprint({"extractor": self._settings["extractor"], "vocabulary": self._settings["describer"]})
+
+
+def _whole_number(name: str, value: Any, least: int = 0) -> int:
+    """An argument, which may be one of NumPy's numbers."""
+    try:
+        if (number := operator.index(value)) >= least:
+            return number
+    except TypeError:
+        pass
+    got = clipped(" ".join(repr(value).split()), 80)
+    raise InputError(f"{name}: expected a whole number from {least}, got {got}. Use an `int`.")
 
 
 def _aggregated(

@@ -23,6 +23,11 @@ class Vectors:
         self._there = np.zeros(0, bool)
         self.total = 0
 
+    @property
+    def length(self) -> int | None:
+        """D, None = there is no descriptor yet."""
+        return self._values.shape[1] if self._values.size else None
+
     def put(self, row: int, vector: np.ndarray) -> None:
         """The descriptor `[D]` of a row."""
         if not self._values.size:

@@ -55,6 +55,12 @@ class Entry(NamedTuple):
     vector: np.ndarray
 
 
+def check_name(name: Any) -> None:
+    """Refuse a name that is no text: JSON would give back another one, or none."""
+    if not isinstance(name, str):
+        raise InputError(f"name: expected text, got {clipped(repr(name), 80)}. Use `str(name)`.")
+
+
 def check_place(name: str, place: Any) -> None:
     """Refuse a place that is None, or that JSON would not give back as it is: a tuple comes back as a list."""
     try:

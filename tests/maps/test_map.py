@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -362,6 +363,32 @@ def test_two_do_not_add_at_the_same_time(dataset, tmp_path):
         second.add(dataset.database.paths[0], 0)
     second.add(dataset.database.paths[0], 0)
     assert first.localize(dataset.database.paths[0]).place == 0
+
+
+@pytest.mark.parametrize("name", [("drive1", 9), ["l"], 5, b"b", Path("x"), float("nan")], ids=repr)
+def test_names_are_text(dataset, tmp_path, name):
+    known, one = Map(tmp_path / "map", Constant(), Constant()), replace(dataset.database, names=(name,))
+    for add in (lambda: known.add(dataset.database.paths[0], 0, name=name), lambda: known.build(one, [0])):
+        with pytest.raises(InputError, match=r"^name: expected text, got [^\n]+$"):
+            add()
+    assert not (tmp_path / "map").exists()
+
+
+@pytest.mark.parametrize("number", [-1, 1.5, "2", np.arange(4).reshape(2, 2), np.int64(-3)], ids=repr)
+def test_numbers_of_rows_are_whole_and_not_negative(dataset, folder, number):
+    known, image = asked(folder), dataset.database.paths[7]
+    for ask in (lambda: known.ask(image, recent=number), lambda: known.ask(image, before=number),
+                lambda: known.localize(image, recent=number), lambda: asked(folder, candidates=number)):  # fmt: skip
+        with pytest.raises(InputError, match=r"^(recent|before|candidates): expected a whole number [^\n]+$"):
+            ask()
+    with pytest.raises(InputError, match=r"^recent: .*got None"):
+        known.localize(image, recent=None)
+
+
+def test_numbers_of_rows_may_be_those_of_numpy(dataset, folder):
+    known, image = asked(folder), dataset.database.paths[7]
+    numbers = {"recent": np.int64(2), "before": np.uint8(6)}
+    assert known.ask(image, **numbers).answer == known.ask(image, recent=2, before=6).answer
 
 
 class Tensor:
