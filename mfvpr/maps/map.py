@@ -43,6 +43,7 @@ from mfvpr.stores.maps import (
     MapRows,
     check_name,
     check_place,
+    file_stamp,
     has_rows,
     hold_map,
     is_map_settled,
@@ -116,13 +117,15 @@ class Map:
         candidates = _whole_number("candidates", candidates, least=1)
         if threshold is not None and confidence is None:
             raise InputError(f"threshold={threshold}: expected a confidence as well, which gives p(right)")
-        self.folder, self.extractor, self.matcher, self.candidates = Path(folder), extractor, matcher, candidates
+        self.folder = Path(folder).absolute()  # the working directory may change
+        self.extractor, self.matcher, self.candidates = extractor, matcher, candidates
         self.scorer: Scorer = HistogramOfShifts() if scorer is None else scorer
         self.confidence, self.threshold = confidence, threshold
         self._fitting = describer if isinstance(describer, VladFitting) else None
         self._vectors, self._entries, self._rows, self._made = Vectors(), {}, {}, None
         self._resident_options = {"candidates": candidates, "memory": memory}
         self._settings = {"extractor": recipe_of(extractor), "describer": recipe_of(describer)}
+        self._vocabulary_stamp = None  # of the file that was read
         self._is_settled = False  # whether they are known to be those of the folder
         self._lock = threading.RLock()
         if not isinstance(describer, VladFitting):
@@ -171,7 +174,7 @@ class Map:
         """Look for what others have added; how many there are.
 
         Raises:
-            InputError: it was made with something else, or is damaged.
+            InputError: it was made with something else, is damaged, or was replaced since it was opened.
         """
         before = len(self)
         self._is_settled = self._is_settled or is_map_settled(self.folder, self._settings)
@@ -182,6 +185,9 @@ class Map:
             elif expects_vocabulary:
                 raise InputError(f"{self.folder / _VOCABULARY}: expected the vocabulary of the rows, got none. Put it "
                                  "back.")  # fmt: skip
+        elif self._fitting is not None and file_stamp(self.folder / _VOCABULARY) != self._vocabulary_stamp:
+            raise InputError(f"{self.folder / _VOCABULARY}: expected the file that the map was opened with, got one "
+                             "that replaced it, or none. Open the map again.")  # fmt: skip
         for row, entry in self._made.rows.new() if self._made else ():
             self._vectors.put(row, entry.vector)
             self._entries[row] = entry._replace(vector=None)
@@ -364,6 +370,7 @@ class Map:
         made = self._made
         if made is None:
             raise InputError(_NO_VOCABULARY.format(self.folder))
+        self.refresh()  # first: nothing of this map goes into one that replaced it
         settle_map(self.folder, self._settings)
         with made.rows.adding():
             self.refresh()
@@ -378,6 +385,7 @@ class Map:
 
     def _vocabulary(self) -> Vlad:
         path = self.folder / _VOCABULARY
+        self._vocabulary_stamp = file_stamp(path)  # first: a file that replaces this one is noticed
         try:
             arrays = read_arrays(path, self._vocabulary_of())
         except InputError:

@@ -18,7 +18,7 @@ class Rows(Protocol):
     """What a map keeps on disk."""
 
     def counts(self, rows: Sequence[int]) -> np.ndarray:
-        """`[n]` keypoints."""
+        """`[n]` keypoints, -1 = a row is not there."""
         ...
 
     def features(self, rows: Sequence[int]) -> Iterator[tuple[int, Features]]:

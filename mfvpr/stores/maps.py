@@ -14,6 +14,9 @@ which the files of both stores know as well. So features and entries that were n
 A row is there when its token is, which is written last: nobody sees half of one, and a file that is removed later is
 missed. A process that is killed leaves out some numbers.
 
+The file of tokens grows before the files of a row are written: a row beyond its end shows that the file was cut. Until
+the tokens are written it lacks one byte: its size changes with every new row, even where the clock stands still.
+
 A map of format 1 has no tokens, and no manifest beside its segments. It can be read, but not added to.
 """
 
@@ -142,14 +145,14 @@ class _Segment:
         features: local ones.
         entries: all else.
         tokens: `[SEGMENT]` of the rows that are there; 0 = there is none.
-        size: of the file of tokens, bytes; None = there was none.
+        stamp: `file_stamp` of the file of tokens.
         is_held: rows may be added.
     """
 
     features: FeatureStore
     entries: RowStore[Entry]
     tokens: np.ndarray
-    size: int | None
+    stamp: tuple[int, ...] | None
     is_held: bool = False
 
     @property
@@ -168,9 +171,8 @@ class _Segment:
 
     @property
     def is_current(self) -> bool:
-        """Whether nothing was added since: the file of tokens would have grown."""
-        path = self.folder / _TOKENS
-        return self.is_held or self.size == (path.stat().st_size if path.exists() else None)
+        """Whether nothing was added or replaced since: the file of tokens would have grown, or be another."""
+        return self.is_held or self.stamp == file_stamp(self.folder / _TOKENS)
 
     def add(self, first: int, items: Sequence[tuple[Features, Entry]]) -> range:
         """Rows of images that are now on disk, from the first on."""
@@ -178,9 +180,13 @@ class _Segment:
         new = np.random.default_rng().integers(1, 2**64 - 1, len(items), np.uint64)
         self.tokens[first : rows.stop] = new
         try:
-            self.features.write({row: features for row, (features, _) in zip(rows, items, strict=True)})
-            self.entries.write({row: entry for row, (_, entry) in zip(rows, items, strict=True)})
+            features = self.features.pack({row: features for row, (features, _) in zip(rows, items, strict=True)})
+            entries = self.entries.pack({row: entry for row, (_, entry) in zip(rows, items, strict=True)})
             with told(self.folder, MAP.content), (self.folder / _TOKENS).open("r+b") as file:
+                file.truncate(rows.stop * _TOKEN.itemsize - 1)
+                os.fsync(file.fileno())  # a row must not be on disk before
+                self.features.write_packed(features)
+                self.entries.write_packed(entries)
                 file.seek(first * _TOKEN.itemsize)
                 file.write(new.astype(_TOKEN).tobytes())
                 file.flush()
@@ -188,17 +194,23 @@ class _Segment:
         except BaseException:
             self.tokens[first : rows.stop] = 0
             raise
-        self.size = rows.stop * _TOKEN.itemsize
+        self.stamp = file_stamp(self.folder / _TOKENS)
         return rows
 
     def check(self) -> None:
         """Compare the files that are there with the tokens.
 
         Raises:
-            InputError: one of the two files of a row is gone, or that of the tokens.
+            InputError: one of the two files of a row is gone, or that of the tokens is gone or was cut.
         """
-        if self.entries.done.any() and not (self.folder / _TOKENS).exists():
-            raise InputError(f"{self.folder / _TOKENS}: expected a file, got none. Put it back.")
+        stamp, path = file_stamp(self.folder / _TOKENS), self.folder / _TOKENS  # after the names of files
+        if self.entries.done.any() and stamp is None:
+            raise InputError(f"{path}: expected a file, got none. Put it back.")
+        whole = np.flatnonzero(self.features.done & self.entries.done)
+        if stamp and len(lost := whole[(whole + 1) * _TOKEN.itemsize - 1 > stamp[0]]):
+            raise InputError(f"{path}: expected tokens of rows up to {lost[-1]}, got a file that was cut to {stamp[0]} "
+                             f"bytes. Put it back, or delete the files of {len(lost)} rows from {lost[0]} on in "
+                             f"{self.features.folder} and {self.entries.folder}, which leaves them out.")  # fmt: skip
         halves = np.flatnonzero((self.tokens > 0) & (self.features.done != self.entries.done))
         if len(halves):
             row = halves[0]
@@ -226,12 +238,17 @@ class MapRows:
     _known: list[np.ndarray] = field(default_factory=list, repr=False)  # by segment, the rows that `new` gave
     _held: ExitStack | None = field(default=None, repr=False)
 
+    def __post_init__(self) -> None:
+        self.folder = self.folder.absolute()  # the working directory may change
+
     def new(self) -> Iterator[tuple[int, Entry]]:
         """(row, entry) of all rows that were not given before, in their order.
 
         Raises:
-            InputError: they were made with something else, or are damaged.
+            InputError: they were made with something else, or are damaged, or rows that were given are others now.
         """
+        if self._segments:
+            self._open(0)  # full or not: all maps have this one, so it tells whether the map was replaced
         number = next((number for number, known in enumerate(self._known) if not known.all()), len(self._known))
         while self._open(number):
             segment, known = self._segments[number], self._known[number]
@@ -243,9 +260,13 @@ class MapRows:
             number += 1
 
     def counts(self, rows: Iterable[int]) -> np.ndarray:
-        """`[n]` keypoints of rows that are there."""
-        places = (divmod(row, SEGMENT) for row in rows)
-        return np.array([self._segments[segment].features.counts[row] for segment, row in places], int)
+        """`[n]` keypoints of rows, -1 = a row is not there."""
+        row_numbers = np.fromiter(rows, int)
+        counts = np.full(len(row_numbers), -1)
+        for number in np.unique(row_numbers // SEGMENT):
+            segment, is_here = self._segments[number], row_numbers // SEGMENT == number
+            counts[is_here] = np.where(segment.done, segment.features.counts, -1)[row_numbers[is_here] % SEGMENT]
+        return counts
 
     def features(self, rows: Sequence[int]) -> Iterator[tuple[int, Features]]:
         """(row, features) of rows that are there, in no order.
@@ -257,7 +278,7 @@ class MapRows:
         for row in rows:
             segments.setdefault(row // SEGMENT, []).append(row % SEGMENT)
         for number, own in segments.items():
-            if gone := [row for row in own if self._segments[number].features.counts[row] < 0]:
+            if gone := [row for row in own if not self._segments[number].done[row]]:
                 raise InputError(f"{self.folder}: expected features of row {number * SEGMENT + gone[0]}, got none. "
                                  "Open the map again, without rows that were deleted.")  # fmt: skip
             for row, features in self._segments[number].features.read(own):
@@ -311,10 +332,11 @@ class MapRows:
             number += 1
 
     def _open(self, number: int) -> bool:
-        """Have a segment as it is on disk; False where there is none."""
-        if number < len(self._segments) and self._segments[number].is_current:
+        """Have a segment as it is on disk; False where there never was one."""
+        is_open = number < len(self._segments)
+        if is_open and self._segments[number].is_current:
             return True
-        there = _segment_folder(self.folder, number).is_dir()
+        there = is_open or _segment_folder(self.folder, number).is_dir()
         if there:
             self._opened(number)
         return there
@@ -325,16 +347,19 @@ class MapRows:
         if before is not None and before.is_held:
             return before
         folder, is_old = _segment_folder(self.folder, number), _is_old(self.folder)
-        tokens, size = _read_tokens(folder / _TOKENS)  # before the names of files, which come first on disk
+        tokens, stamp = _read_tokens(folder / _TOKENS)  # before the names of files, which come first on disk
         options: dict[str, Any] = {"tokens": None if is_old else tokens}
         entries = open_rows(folder / "entries", _MAP_1 if is_old else MAP, self.recipe, {"num_images": SEGMENT},
                             pack=_pack, unpack=_unpack, **options)  # fmt: skip
         features = open_store(folder / "features", self.recipe, num_images=SEGMENT, kind=_FEATURES, **options)
-        segment = _Segment(features, entries, tokens, size)
+        segment = _Segment(features, entries, tokens, stamp)
         if is_old:
             tokens[entries.done] = 1
         else:
             segment.check()
+        if before is not None and (before.tokens != tokens)[self._known[number]].any():
+            raise InputError(f"{self.folder}: expected the map that was opened, got another one that replaced it, or "
+                             "none. Open the map again.")  # fmt: skip
         if before is None:
             self._segments.append(segment)
             self._known.append(np.zeros(SEGMENT, bool))
@@ -343,14 +368,24 @@ class MapRows:
         return segment
 
 
-def _read_tokens(path: Path) -> tuple[np.ndarray, int | None]:
-    """`[SEGMENT]`, 0 beyond the end of the file, and its size in bytes; None = there is no file."""
-    tokens = np.zeros(SEGMENT, _TOKEN)
+def file_stamp(path: Path) -> tuple[int, ...] | None:
+    """Size of a file in bytes, and what else differs where another file replaces it; None = there is no file."""
     with told(path.parent, MAP.content):
-        content = path.read_bytes() if path.exists() else None
-    stored = np.frombuffer(content or b"", _TOKEN, len(content or b"") // _TOKEN.itemsize)
+        try:
+            status = path.stat()
+        except FileNotFoundError:
+            return None
+    return status.st_size, status.st_ino, status.st_mtime_ns
+
+
+def _read_tokens(path: Path) -> tuple[np.ndarray, tuple[int, ...] | None]:
+    """`[SEGMENT]`, 0 beyond the end of the file, and the `file_stamp` of the file."""
+    tokens, stamp = np.zeros(SEGMENT, _TOKEN), file_stamp(path)  # first the stamp: what comes later is noticed
+    with told(path.parent, MAP.content):
+        content = path.read_bytes() if stamp else b""
+    stored = np.frombuffer(content, _TOKEN, len(content) // _TOKEN.itemsize)
     tokens[: len(stored)] = stored
-    return tokens, None if content is None else len(content)
+    return tokens, stamp
 
 
 def _pack(entry: Entry) -> dict[str, np.ndarray]:

@@ -135,14 +135,21 @@ class RowStore(Generic[Item]):
                 than those before it.
             ValueError: a row that is done or does not exist, what cannot be stored, or a store that is not held.
         """
-        if not items:
-            return
+        if items:
+            self.write_packed(self.pack(items))
+
+    def pack(self, items: Mapping[int, Item]) -> dict[int, Parts]:
+        """Check a batch of rows and pack it for `write_packed`, without a write; raises as `write`."""
         if refused := [row for row in items if not 0 <= row < len(self.counts) or self.counts[row] >= 0]:
             raise ValueError(f"{self.folder}: row {refused[0]} is done or does not exist")
         if not self._is_writable:
             raise ValueError(f"{self.folder}: is read only, or was complete; write `with store:`")
         rows = {row: self._packed(row, item) for row, item in items.items()}
         self._check_layouts(rows)
+        return rows
+
+    def write_packed(self, rows: Mapping[int, Parts]) -> None:
+        """Store what `pack` gave, as `write` does."""
         sizes = {row: row_bytes(sum(part.nbytes for part in parts.values()), len(parts)) for row, parts in rows.items()}
         missing = partial(self._missing_bytes, sizes)
         with told(self.folder, self.kind.content, missing):

@@ -1,5 +1,6 @@
 """One map used by several threads or builders, and files of several maps: nobody gets what is another's."""
 
+import os
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -15,7 +16,7 @@ from mfvpr.maps import Map
 from mfvpr.maps.describing import Describing
 from mfvpr.stores import maps as map_store
 from mfvpr.stores.features import open_store
-from mfvpr.stores.rows import open_rows
+from mfvpr.stores.rows import RowStore, open_rows
 from tests.maps.test_map import Constant
 from tests.stores.made_up import file_of
 
@@ -136,6 +137,129 @@ def test_tokens_that_were_removed_are_missed(folder):
     (folder / "0000/tokens").unlink()
     with pytest.raises(InputError, match="0000/tokens: expected a file, got none"):
         opened(folder)
+
+
+class Killed(BaseException):
+    """Ends an add as a signal does."""
+
+
+def add_killed(monkeypatch, part, folder, images):
+    """Add an image, and end where one of the two stores of the segment is written."""
+    write = RowStore.write_packed
+
+    def end(store, rows):
+        if store.folder.name == part:
+            raise Killed
+        write(store, rows)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RowStore, "write_packed", end)
+        with pytest.raises(Killed):
+            opened(folder).add(images.paths[6], "lost", name="lost")
+
+
+@pytest.mark.parametrize("part", ["features", "entries"])
+def test_a_row_without_its_token_is_no_row(images, folder, monkeypatch, part):
+    add_killed(monkeypatch, part, folder, images)
+    known = opened(folder)
+    known.add(images.paths[7], "next", name="next")
+    for maps in (known, opened(folder)):
+        assert maps.localize(images.paths[7]).place == "next"
+        assert maps.row("lost") is None
+
+
+def test_nothing_is_written_of_rows_that_cannot_be_stored(images, folder):
+    known = opened(folder)
+    features, vector = known.describing.image(images.paths[6])
+    files = sorted(folder.rglob("*"))
+    for bad, words in ((vector[:5], r"^bad: .*\[36\], got \[5\]"), (vector.astype(str) + "x", r"row 7: could not")):
+        entries = [map_store.Entry("good", 0, vector), map_store.Entry("bad", 1, bad)]
+        with pytest.raises(ValueError, match=words):
+            known.add_described(entries, [features] * 2)
+        assert sorted(folder.rglob("*")) == files
+    assert opened(folder).names == list(images.names[:6])
+
+
+@pytest.mark.parametrize("segment", [3, 4096])
+def test_a_map_that_replaced_the_one_that_is_open_is_refused(images, tmp_path, monkeypatch, segment):
+    """Also one of the same size, or of full segments."""
+    monkeypatch.setattr(map_store, "SEGMENT", segment)
+    folder = tmp_path / "map"
+    opened(folder).build(first(images, 6))
+    stays, grows = opened(folder), opened(folder)
+    shutil.rmtree(folder)
+    with pytest.raises(InputError, match=f"^{folder}: .*replaced.* Open the map again"):
+        stays.add(images.paths[7], 7)
+    opened(folder).build(replace(images, names=images.names[5::-1]))
+    for known in (stays, grows):
+        for use in (lambda known=known: known.localize(images.paths[0]), lambda known=known: known.build(images)):
+            with pytest.raises(InputError, match=f"^{folder}: .*replaced.* Open the map again"):
+                use()
+    assert opened(folder).localize(images.paths[0]).place == images.names[0]
+    assert len(opened(folder)) == 6
+
+
+def test_a_vocabulary_that_replaced_the_one_that_is_open_is_refused(images, tmp_path):
+    maps = [opened(tmp_path / "map", describer=VladFitting(num_words=2)) for _ in range(2)]
+    for known in maps:
+        known.learn(first(images, 4))
+    shutil.rmtree(tmp_path / "map")
+    opened(tmp_path / "map", describer=VladFitting(num_words=2)).build(images)
+    for use in (lambda known: known.localize(images.paths[0]), lambda known: known.add(images.paths[0], 0, name="0")):
+        with pytest.raises(InputError, match=r"vocabulary\.npz: .*replaced.* Open the map again"):
+            use(maps.pop())
+
+
+def test_a_map_stays_where_it_is_when_the_working_directory_changes(images, folder, monkeypatch):
+    monkeypatch.chdir(folder.parent)
+    known = opened(folder.name)
+    monkeypatch.chdir("/")
+    opened(folder).add(images.paths[6], "new", name="new")
+    assert known.localize(images.paths[6]).place == "new"
+    known.add(images.paths[7], "newer", name="newer")
+    assert opened(folder).names == known.names
+
+
+@pytest.mark.parametrize("size", [0, 5, 16, 40])
+def test_tokens_that_were_cut_are_missed(images, folder, size):
+    known, path = opened(folder), folder / "0000/tokens"
+    content = path.read_bytes()
+    path.write_bytes(content[:size])
+    for use in (lambda: opened(folder), lambda: known.localize(images.paths[0]), lambda: known.build(images)):
+        with pytest.raises(InputError, match=f"^{path}: expected tokens of rows up to 5, got .* {size} bytes[^\n]+$"):
+            use()
+    path.write_bytes(content)
+    assert opened(folder).localize(images.paths[5]).place == images.names[5]
+
+
+def test_a_map_can_be_opened_whenever_another_process_is_adding(images, folder, monkeypatch):
+    """Between any two of its steps; and after it was killed there."""
+    lengths, write, sync = [], RowStore.write_packed, os.fsync
+
+    def look(call):
+        def step(*arguments):
+            result = call(*arguments)
+            lengths.append(len(opened(folder)))
+            return result
+
+        return step
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RowStore, "write_packed", look(write))
+        patch.setattr(os, "fsync", look(sync))
+        opened(folder).build(first(images, 8))
+    assert set(lengths) == {6, 8}
+    assert lengths == sorted(lengths)
+
+
+def test_rows_are_seen_after_a_killed_add_of_the_same_number(images, folder, monkeypatch):
+    """Though the clock of the file of tokens stands still."""
+    add_killed(monkeypatch, "features", folder, images)
+    path, known = folder / "0000/tokens", opened(folder)
+    for row in (6, 7):
+        opened(folder).add(images.paths[row], row, name=str(row))
+        os.utime(path, ns=(0, 0))
+        assert known.localize(images.paths[row]).place == row
 
 
 def test_a_map_of_format_1_is_read_but_not_added_to(images, tmp_path):
