@@ -150,6 +150,7 @@ def test_all_scores_contain_it(near):
     assert found["near"].weight is NAMED_WEIGHTS["unit"]
 
 
+@pytest.mark.slow
 def test_its_parameters_are_swept(near, tmp_path_factory, tmp_path, monkeypatch, capsys):
     axes = ("scorer=near", "grid.radius=[0.001,20]", "grid.weight=[unit,dmf]", "grid.norm=[sum,largest]")
     run = (*small(shared(tmp_path_factory)), f"out={tmp_path}/out")

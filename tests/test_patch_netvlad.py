@@ -219,6 +219,7 @@ def test_a_sweep_fuses_the_scales_as_an_evaluation_does(program):
         assert [row["1"] for row in setting["recall_at"].values()] == pytest.approx(expected, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("options", "words"), [
     (("scorer=all", "scorer.rapid.size=[560,400]"), "scorer.rapid.size=[560, 400]: expected [80, 48]"),
     (("scorer=rapid", "scorer.size=[560,400]", "features.patch_sizes=[9]"), "[9]: expected sizes from 1 to 8"),

@@ -39,6 +39,7 @@ def test_make_targets_exist(target):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "command",
     [
