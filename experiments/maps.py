@@ -29,7 +29,7 @@ def made(settings: Mapping[str, Any]) -> Map:
         _compare(folder, own)
     elif is_foreign:
         raise SettingsError(f"map={folder}: expected a new or empty folder, or a map; name another")
-    opened = _map(folder, own)  # before the settings, which then are of a map that can be
+    opened = map_of(folder, own)  # before the settings, which then are of a map that can be
     written_once(folder / SETTINGS, json.dumps({"format": _FORMAT} | own, indent=1, ensure_ascii=False) + "\n")
     _compare(folder, own)  # another process may have begun a map here
     return opened
@@ -37,7 +37,7 @@ def made(settings: Mapping[str, Any]) -> Map:
 
 def opened(folder: Path, **options: Any) -> Map:
     """A map that is there; options as of `Map`."""
-    return _map(folder, read(folder), **options)
+    return map_of(folder, read(folder), **options)
 
 
 def read(folder: Path) -> dict[str, Any]:
@@ -79,7 +79,7 @@ def _check(settings: Mapping[str, Any]) -> None:
         raise SettingsError(f"retrieval={retrieval}: expected vlad, same or a network, without whiten")
 
 
-def _map(folder: Path, settings: Mapping[str, Any], **options: Any) -> Map:
+def map_of(folder: Path, settings: Mapping[str, Any], **options: Any) -> Map:
     extractor: Any = build.extractor(settings["features"], None)  # not of files
     filter: Any = build.filter(settings["retrieval"], extractor, None)  # with a describer, as all that are left
     describer: Any = filter.describer

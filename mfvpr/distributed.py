@@ -132,11 +132,11 @@ def score_spread(scorer: Scorer, matches: Matches, *, mesh: Mesh) -> np.ndarray:
     spread = NamedSharding(mesh, PartitionSpec(AXIS))
     everywhere = jax.tree.map(lambda field: jax.make_array_from_process_local_data(spread, np.asarray(field)), matches)
     fitted = fit(scorer, np.asarray(matches.image_size0), np.asarray(matches.image_size1), multiple=BIN_STEP)
-    return np.asarray(_score_all(mesh)(held(fitted), everywhere))
+    return np.asarray(score_program(mesh)(held(fitted), everywhere))
 
 
 @cache
-def _score_all(mesh: Mesh) -> Callable[[Scorer, Matches], Array]:
+def score_program(mesh: Mesh) -> Callable[[Scorer, Matches], Array]:
     """The program of a mesh; scores `[Q, C]`."""
 
     def own(scorer: Scorer, some: Matches) -> Array:

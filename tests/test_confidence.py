@@ -199,7 +199,7 @@ def test_halves_of_drives_there_and_back_share_no_place():
                  for one in shown]  # fmt: skip
     judged: Any = SimpleNamespace(thresholds=[1], sequences=sequences)
     reported = []
-    for half in Assured(judged)._halves():
+    for half in Assured(judged).path_halves():
         places = [{place for row in part for place in rows[row]} for part in (half.tune, half.report)]
         assert not places[0] & places[1]
         assert min(map(len, places)) >= 9

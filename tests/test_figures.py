@@ -52,7 +52,7 @@ def test_titles_of_panels_are_not_cut_off(tmp_path):
 def test_systems_have_the_same_colors_in_figures_and_pages(tmp_path, monkeypatch):
     curve = precision_recall(P, RIGHT, np.ones(20, bool))
     saved = []
-    monkeypatch.setattr(confidence_figures, "_save", lambda figure, path: saved.append(figure))
+    monkeypatch.setattr(confidence_figures, "save_figure", lambda figure, path: saved.append(figure))
     confidence_figures.precision_recall_figure(tmp_path / "a.png", {name: {"score": curve} for name in SYSTEMS})
     confidence_figures.shares_figure(tmp_path / "b.png", [0, 1], {name: np.zeros(2) for name in SYSTEMS[1:]})
     chart = lines("name", "title", {name: [(0, 0), (1, 1)] for name in SYSTEMS}, axes=("x", "y"))

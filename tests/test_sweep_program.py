@@ -368,8 +368,8 @@ def test_ctrl_c_keeps_what_is_finished_and_the_next_run_does_the_rest(root, swee
     done, computed = list(kept.glob("folder_sweep-*/[!.]*.npz")), []
     assert 5 <= len(done) < 6 * QUERIES
     sweep(tmp_path / "other", SIGMA)  # takes nothing of another sweep away
-    scores = SWEEP._scores
-    monkeypatch.setattr(SWEEP, "_scores", lambda *block: computed.append(1) or scores(*block))
+    scores = SWEEP.block_scores
+    monkeypatch.setattr(SWEEP, "block_scores", lambda *block: computed.append(1) or scores(*block))
     resumed = sweep(tmp_path / "out", *grid)
     assert len(computed) == 6 * QUERIES - len(done)
     assert not list(kept.glob("folder_sweep-*"))

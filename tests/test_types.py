@@ -14,10 +14,10 @@ import pytest
 from jax.extend.core import jaxpr_as_fun
 
 import mfvpr
-from mfvpr.distributed import _score_all, all_devices
+from mfvpr.distributed import all_devices, score_program
 from mfvpr.match_sets import MatchSet
 from mfvpr.sweeping.settings import groups
-from mfvpr.sweeping.sweep import _program
+from mfvpr.sweeping.sweep import group_program
 from mfvpr.types import per_match, per_pair
 from tests.builders import of_query, random_matches
 from tests.programs import ROOT
@@ -76,7 +76,7 @@ def registered(number, log):
 ENTRIES = {
     "score_candidates": lambda scorer, matches: mfvpr.score_candidates(scorer, matches),
     "score_grid": lambda scorer, matches: mfvpr.score_grid(scorer, matches, factor=[1.0, 2.0]),
-    "score_spread": lambda scorer, matches: _score_all(all_devices())(scorer, jax.tree.map(lambda x: x[None], matches)),
+    "score_spread": lambda scorer, pair: score_program(all_devices())(scorer, jax.tree.map(lambda x: x[None], pair)),
 }
 
 
@@ -109,7 +109,7 @@ def test_the_program_of_a_sweep_is_that_of_its_class():
     work = SimpleNamespace(match_set=match_set, settings=1)
     for number in range(60):
         [group] = groups(registered(number, log)(), [{"factor": 1.0}], match_set.image_sizes)
-        _program(work, group)
+        group_program(work, group)
         assert log[-1:] == [number]
 
 

@@ -56,7 +56,7 @@ def _plan(rows: Sequence[Row], found: Sequence[Place], settings: Mapping[str, An
 def _make(
     rows: Sequence[Row], found: Sequence[Place], settings: Mapping[str, Any], out: Path, left_out: Sequence[str]
 ) -> None:
-    datasets, failed = _evaluate_all(rows, found, settings)
+    datasets, failed = evaluate_all(rows, found, settings)
     here = [place for place in found if place.name in datasets]
     if not here:
         raise SettingsError(f"nothing was evaluated: {failed[0]}")
@@ -68,7 +68,7 @@ def _make(
     for name, (heading, table) in _write_tables(out, whole).items():  # before the seconds, which take a while
         if name in ("recall", "averages"):
             print(f"\n{heading}\n\n{table.text()}", end="", flush=True)
-    times = _timed(rows, timed_on, datasets[timed_on.name], settings, out)
+    times = measure_times(rows, timed_on, datasets[timed_on.name], settings, out)
     seconds = {row.name: times[row.run] for row in rows if row.run in times and row.leads}
     _write(out, replace(whole, seconds=seconds), finished, [*left_out, *failed])
     if failed:
@@ -87,7 +87,7 @@ def _with_weights(
     return [row for row in rows if row.run not in lines], list(lines.values())
 
 
-def _evaluate_all(
+def evaluate_all(
     rows: Sequence[Row], found: Sequence[Place], settings: Mapping[str, Any]
 ) -> tuple[dict[str, Dataset], list[str]]:
     """The data sets that could be read, and a line for each evaluation that could not be made."""
@@ -139,7 +139,7 @@ def _collected(rows: Sequence[Row], finished: Mapping[tuple[str, str], Path]) ->
     return collected
 
 
-def _timed(
+def measure_times(
     rows: Sequence[Row], place: Place, dataset: Dataset, settings: Mapping[str, Any], out: Path
 ) -> dict[str, dict[str, Any]]:
     """Seconds by evaluation that is finished on a data set; measured once of the same settings, data and device."""

@@ -92,7 +92,7 @@ def contents(folder: ImageFolder, cache: Path | str | None = None) -> Contents:
     states = dict(zip(folder.names, map(state_of, folder.paths), strict=True))
     trusted = {name for name, state in states.items() if state and name in known and known[name][:4] == state}
     changed = [name for name in folder.names if name not in trusted]
-    read = ordered_map(_content, [folder.root / name for name in changed], workers=2)
+    read = ordered_map(read_content, [folder.root / name for name in changed], workers=2)
     files = {name: Content(*known[name][4:]) for name in trusted} | dict(zip(changed, read, strict=True))
     if record is not None and changed:  # other files of this folder, which another data set asks for, stay known
         settled = {name: state for name, state in states.items() if state and max(state[1:3]) < begun - SETTLED}
@@ -119,7 +119,7 @@ def state_of(path: Path | str) -> list[int] | None:
     return [status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino]
 
 
-def _content(path: Path) -> Content:
+def read_content(path: Path) -> Content:
     try:
         if not path.is_file():  # a pipe would keep us waiting
             return Content()

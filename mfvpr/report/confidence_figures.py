@@ -40,7 +40,7 @@ def precision_recall_figure(path: Path, curves: Mapping[str, Mapping[str, Precis
         panel.set_title(f"by {kind}", fontsize=9)
         _label(panel, "recall of the queries that have an answer", "precision of the answers")
         panel.legend(fontsize=7, loc="lower left")
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def reliability_figure(path: Path, reliabilities: Mapping[str, Reliability]) -> None:
@@ -57,7 +57,7 @@ def reliability_figure(path: Path, reliabilities: Mapping[str, Reliability]) -> 
         panel.scatter(found.probability, found.right, s=sizes, alpha=0.8, color=color_and_dash(place)[0])
         panel.set_title(f"{_short(name)}\nECE {100 * found.calibration_error:.1f} %", fontsize=8, parse_math=False)
         _label(panel, "p(right)", "right")
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def shares_figure(path: Path, shares: Sequence[float], recall: Mapping[str, np.ndarray]) -> None:
@@ -73,7 +73,7 @@ def shares_figure(path: Path, shares: Sequence[float], recall: Mapping[str, np.n
         panel.plot(shares, values, label=_short(name), **_line(place))
     _label(panel, "share of queries re-ranked", "recall at 1")
     panel.legend(fontsize=7)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _line(place: int) -> dict[str, Any]:
@@ -103,6 +103,6 @@ def _label(panel: Axes, x: str, y: str) -> None:
     panel.grid(alpha=0.3)
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save_figure(figure: Figure, path: Path) -> None:
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=110, bbox_inches="tight")  # titles may be wider than their panel

@@ -115,14 +115,14 @@ class Assured:
         """p of each half of the path by the other, without what shows places of both."""
         inputs, right = self._inputs(system), self.right(system)
         found = np.full(len(right), np.nan)
-        for half in self._halves():
+        for half in self.path_halves():
             if np.isfinite(inputs[half.tune]).all(axis=1).any():
                 found[half.report] = fit_confidence(inputs[half.tune], right[half.tune]).probability(
                     inputs[half.report]
                 )
         return found
 
-    def _halves(self) -> tuple[Half, Half]:
+    def path_halves(self) -> tuple[Half, Half]:
         """Of the path; of several sequences, which pass the same places in whatever order, of the database's."""
         truths = [sequence.truth for sequence in self.judged.sequences if sequence.truth is not None]
         shown = [truth.shows_place(self.judged.thresholds[-1]) for truth in truths]

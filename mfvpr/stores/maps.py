@@ -350,7 +350,7 @@ class MapRows:
         tokens, stamp = _read_tokens(folder / _TOKENS)  # before the names of files, which come first on disk
         options: dict[str, Any] = {"tokens": None if is_old else tokens}
         entries = open_rows(folder / "entries", _MAP_1 if is_old else MAP, self.recipe, {"num_images": SEGMENT},
-                            pack=_pack, unpack=_unpack, **options)  # fmt: skip
+                            pack=pack_entry, unpack=unpack_entry, **options)  # fmt: skip
         features = open_store(folder / "features", self.recipe, num_images=SEGMENT, kind=_FEATURES, **options)
         segment = _Segment(features, entries, tokens, stamp)
         if is_old:
@@ -388,11 +388,11 @@ def _read_tokens(path: Path) -> tuple[np.ndarray, tuple[int, ...] | None]:
     return tokens, stamp
 
 
-def _pack(entry: Entry) -> dict[str, np.ndarray]:
+def pack_entry(entry: Entry) -> dict[str, np.ndarray]:
     text = json.dumps([entry.name, entry.place], allow_nan=False)
     return {"vector": np.asarray(entry.vector, np.float32), "text": np.frombuffer(text.encode("ascii"), np.uint8)}
 
 
-def _unpack(parts: Mapping[str, np.ndarray]) -> Entry:
+def unpack_entry(parts: Mapping[str, np.ndarray]) -> Entry:
     name, place = json.loads(parts["text"].tobytes().decode("ascii"))
     return Entry(name, place, parts["vector"])

@@ -119,7 +119,7 @@ def sweep(
     per_program = len(scored_once) / len(found_groups)
     work = Work(match_set, range(num_queries), per_program, candidates, views, depth, ties, filter_score)
     if folder is not None:
-        found_groups = [replace(group, program=_program(work, group)) for group in found_groups]
+        found_groups = [replace(group, program=group_program(work, group)) for group in found_groups]
     blocks = [block for group in found_groups for block in group.blocks(per_block)]
     found = np.full((len(views), len(settings), num_queries, depth), -1, np.int32)
     steps = ((part, block) for part in work.parts(queries) for block in blocks)
@@ -149,7 +149,7 @@ def _rows(
     if not held:
         held.extend(all_batches(part.match_set, part.queries, settings=part.settings))
     shape = len(scales(part.match_set)), *part.candidates.mask.shape
-    scores = _scores(block, held, shape, devices)
+    scores = block_scores(block, held, shape, devices)
     _, first = np.unique(block.rows, return_index=True)
     scores = scores.reshape(shape[0], -1, *shape[1:])[:, np.sort(first)]
 
@@ -159,7 +159,7 @@ def _rows(
     return np.stack([first_rows(view) for view in part.views])
 
 
-def _scores(
+def block_scores(
     block: Group, held: Sequence[PaddedBatch], shape: tuple[int, int, int], devices: Sequence[Device] | None
 ) -> np.ndarray:
     """`[S, G, W, q, C]` of every scale; a pair without matches scores 0."""
@@ -237,7 +237,7 @@ def _fingerprint(part: Work, block: Group, cs: Sequence[Any]) -> str:
     return content_hash(repr(options), block.program, part.digest, numbers)
 
 
-def _program(work: Work, group: Group) -> str:
+def group_program(work: Work, group: Group) -> str:
     """What the scorer computes of batches of these shapes: a user's code may change while its class keeps its name."""
     if on_host(group.scorer):
         return "callback"

@@ -97,7 +97,7 @@ def test_parts_of_a_folder_do_not_forget_each_other(folder, cache, monkeypatch):
     parts = [replace(whole, names=names) for names in (whole.names[:1], whole.names[1:], whole.names)]
     settle()
     found = [contents(part, cache) for part in parts]
-    monkeypatch.setattr(module, "_content", lambda path: pytest.fail(f"{path} read again"))
+    monkeypatch.setattr(module, "read_content", lambda path: pytest.fail(f"{path} read again"))
     assert [contents(part, cache) for part in parts] == found
 
 

@@ -170,14 +170,14 @@ def test_other_settings_are_refused(folder, small_street, monkeypatch, capsys, m
 
 def test_settings_that_another_build_wrote_meanwhile_stay(tmp_path, monkeypatch):
     settings = [composed(f"map={tmp_path}/map", *QUICK[:-1], f"candidates={number}", config="map") for number in (5, 6)]
-    open_map = maps._map
+    open_map = maps.map_of
 
     def build_other_first(*arguments):
         monkeypatch.undo()
         maps.made(settings[1])
         return open_map(*arguments)
 
-    monkeypatch.setattr(maps, "_map", build_other_first)
+    monkeypatch.setattr(maps, "map_of", build_other_first)
     with pytest.raises(SettingsError, match="was made with other candidates"):
         maps.made(settings[0])
     assert maps.read(tmp_path / "map")["candidates"] == 6

@@ -266,7 +266,7 @@ def test_a_map_of_format_1_is_read_but_not_added_to(images, tmp_path):
     extractor = Constant()
     recipe, sizes = {"extractor": recipe_of(extractor), "describer": recipe_of(extractor)}, {"num_images": 4096}
     kind, folder = replace(map_store.MAP, version=1), tmp_path / "map/0000"
-    options = {"pack": map_store._pack, "unpack": map_store._unpack}
+    options = {"pack": map_store.pack_entry, "unpack": map_store.unpack_entry}
     with open_store(folder / "features", recipe, **sizes) as features, \
             open_rows(folder / "entries", kind, recipe, sizes, **options) as entries:  # fmt: skip
         for row, path in enumerate(images.paths[:4]):

@@ -141,13 +141,13 @@ def test_the_plan_comes_first_and_tables_before_the_seconds(tmp_path, monkeypatc
     """An interrupted timing costs no table."""
     place = lineup.Place("streets_seasons", ("dataset=streets_seasons",))
     monkeypatch.setattr(program.lineup, "places", lambda *_: ([place], ["corridor: needs a folder"]))
-    monkeypatch.setattr(program, "_evaluate_all", lambda *_: ({place.name: None}, []))
+    monkeypatch.setattr(program, "evaluate_all", lambda *_: ({place.name: None}, []))
     monkeypatch.setattr(program, "tables", lambda found: [("recall", "heading", Table(["system"], [["SIFT"]]))])
 
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(program, "_timed", interrupted)
+    monkeypatch.setattr(program, "measure_times", interrupted)
     with pytest.raises(KeyboardInterrupt):
         program.paper(composed("systems=[sift_hist_10]", f"out={tmp_path}/out", config="paper"))
     assert (tmp_path / "out" / "tables" / "recall.csv").read_text() == "system\nSIFT\n"
