@@ -163,8 +163,8 @@ def test_finished_blocks_are_read_and_damaged_ones_computed_again(data, tmp_path
     kept[2].write_bytes(turned)
     computed = []
     module = sweeping.sweep.__globals__
-    scores = module["_scores"]
-    monkeypatch.setitem(module, "_scores", lambda *inputs: computed.append(1) or scores(*inputs))
+    scores = module["block_scores"]
+    monkeypatch.setitem(module, "block_scores", lambda *inputs: computed.append(1) or scores(*inputs))
     np.testing.assert_array_equal(sweeping.sweep(scorer, settings, *data, **chunks), expected)
     assert len(computed) == 9 - 4 + 3
     np.testing.assert_array_equal(sweeping.sweep(scorer, settings, *data, **chunks), expected)
@@ -372,8 +372,8 @@ def test_pairs_score_the_same_in_a_smaller_set(data, scorer, monkeypatch):
     few = replace(match_set, matches=match_set.matches[:2], counts=match_set.counts[:2])
     assert shapes(few) == shapes(match_set)
     found, module = [], sweeping.sweep.__globals__
-    scores = module["_scores"]
-    monkeypatch.setitem(module, "_scores", lambda *inputs: found.append(scores(*inputs)) or found[-1])
+    scores = module["block_scores"]
+    monkeypatch.setitem(module, "block_scores", lambda *inputs: found.append(scores(*inputs)) or found[-1])
     for one in (match_set, few):
         listed = jax.tree.map(lambda rows: rows[: len(one.matches)], candidates)  # noqa: B023
         sweeping.sweep(scorer, [{"max_distance": 2.0}], one, listed)
