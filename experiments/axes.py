@@ -51,9 +51,9 @@ def axes(settings: dict[str, Any]) -> Axes:
             f"grid.max_distance={values['max_distance']}: expected values up to {limit}, as "
             f"matching.max_distance={limit} leaves no other matches; set matching.max_distance=null"
         )
-    own = settings["scorer"] | {"max_distance": limit}
-    own |= {"c": _plain_c(settings) if settings["final"] == "combined" else 0} if "c" in values else {}
-    return Axes(scorer, values, {name: own.get(name) for name in values})
+    defaults = settings["scorer"] | {"max_distance": limit}
+    defaults |= {"c": _plain_c(settings) if settings["final"] == "combined" else 0} if "c" in values else {}
+    return Axes(scorer, values, {name: defaults.get(name) for name in values})
 
 
 def searchable(settings: dict[str, Any]) -> Axes:

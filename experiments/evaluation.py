@@ -110,8 +110,7 @@ def evaluated(settings: dict[str, Any]) -> Outcome:
     judged = Judged(result, thresholds, sorted(set(settings["recall"]["ks"])), headline)
     histogram = histogram if isinstance(histogram, HistogramOfShifts) else None
     assured = Assured(judged, confidence and confidence.systems, settings["threshold"])
-    refused = None if settings["threshold"] is None else assured.refused_of_headline
-    drawn = figures(judged, tools.extractor, shown, histogram, refused)
+    drawn = figures(judged, tools.extractor, shown, assured.refused_of_headline, histogram)
     drawn += confidence_figures(assured) if shown else []
     deciding = histogram if main == "histogram" else None
     return Outcome(settings, images, tools, judged, assured, parameters, deciding, drawn)

@@ -17,7 +17,7 @@ from mfvpr.errors import InputError
 from mfvpr.exchange import ImportedFeatures, open_features
 from mfvpr.exchange.checks import Lengths
 from mfvpr.exchange.descriptors import read_with_entries as read_descriptors
-from mfvpr.exchange.names import Images, require_one_image
+from mfvpr.exchange.names import ImageOfEntry, require_one_image
 from mfvpr.exchange.shortlists import read_with_entries as read_shortlist
 from mfvpr.features import Scale
 from mfvpr.filters import Filtered
@@ -57,7 +57,9 @@ class FeatureFiles:
     image_size: tuple[int, int] | None = None
     interpolation: Interpolation = field(default="pil_bilinear", metadata={"recipe": False})
     scales: tuple[Scale, ...] = field(default=(Scale(0, TYPICAL),), metadata={"recipe": False})
-    _images: Images = field(default_factory=dict, init=False, repr=False, compare=False, metadata={"recipe": False})
+    _images: ImageOfEntry = field(
+        default_factory=dict, init=False, repr=False, compare=False, metadata={"recipe": False}
+    )
 
     def opened(self, folder: ImageFolder, *, partial: bool) -> ImportedFeatures:
         """The features of a folder's images; `partial`: some may be missing.
@@ -87,7 +89,9 @@ class DescriptorFiles:
     files: Mapping[Path, File]
     lengths: Lengths = "unit"
     search: Search = EXACT
-    _images: Images = field(default_factory=dict, init=False, repr=False, compare=False, metadata={"recipe": False})
+    _images: ImageOfEntry = field(
+        default_factory=dict, init=False, repr=False, compare=False, metadata={"recipe": False}
+    )
 
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, archive: Archive
@@ -125,7 +129,7 @@ class ShortlistFiles:
         file = _file_of(self.files, sequence.images)
         names = [self.database_prefix + name for name in database.names]
         shortlist, query_entries, database_entries = read_shortlist(file.path, file.names(sequence.images), names)
-        known: Images = {}
+        known: ImageOfEntry = {}
         require_one_image(file.path, database.paths, database_entries, known)
         require_one_image(file.path, sequence.images.paths, query_entries, known)
         if sequence.excluded is not None:

@@ -17,7 +17,7 @@ _BLOCK = 2**25  # numbers in double precision at a time
 
 @dataclass(frozen=True)
 class Whitening:
-    """Vectors -> their principal components, divided by the standard deviations.
+    """Principal components divided by the standard deviations: `(vectors - mean) @ components.T`.
 
     Attributes:
         mean: `[D]`.
@@ -33,10 +33,6 @@ class Whitening:
     def dimension(self) -> int:
         """D'."""
         return len(self.components)
-
-    def __call__(self, vectors: np.ndarray) -> np.ndarray:
-        """`[..., D]` -> `[..., D']`."""
-        return (vectors - self.mean) @ self.components.T
 
 
 def fit_whitening(sample: np.ndarray, dimension: int) -> Whitening:

@@ -18,7 +18,7 @@ from mfvpr.weights.networks import blueprint, network_of
 from mfvpr.weights.registry import entry_of
 from tests import checkpoints
 
-gc.set_threshold(50_000, 20, 100)  # tracing makes many objects: collecting them as often as usual takes 4 % of the time
+gc.set_threshold(50_000, 20, 100)  # tracing makes many objects, and the usual thresholds collect too often
 # A shell ignores Ctrl-C for what it runs in the background; the tests of Ctrl-C need it there too.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -195,7 +195,7 @@ def page_of(outcome, **changes):
     result = outcome.judged.result
     dataset = replace(result.dataset, sequences=(replace(result.dataset.only, **changes),))
     judged = replace(outcome.judged, result=replace(result, dataset=dataset))
-    return Page(judged, 0, outcome.tools.extractor, HistogramOfShifts())
+    return Page(judged, 0, outcome.tools.extractor, HistogramOfShifts(), np.zeros(24, bool))
 
 
 def test_what_does_not_count_is_never_shown_as_right(outcome):

@@ -17,7 +17,7 @@ class Contents(NamedTuple):
     shapes: Mapping[str, tuple[int, ...]]
 
 
-class Entry(NamedTuple):
+class FileEntry(NamedTuple):
     """Place of an image's arrays.
 
     Attributes:
@@ -50,7 +50,7 @@ class Container(Protocol):
         """For each image, those of its `parts` that are there."""
         ...
 
-    def entry(self, image: str) -> Entry:
+    def entry(self, image: str) -> FileEntry:
         """Place of an image's arrays."""
         ...
 

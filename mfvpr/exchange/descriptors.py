@@ -8,7 +8,7 @@ import numpy as np
 from mfvpr.data.files import printable, replacing, require_file
 from mfvpr.errors import InputError
 from mfvpr.exchange.checks import Lengths, as_float32, require_lengths, with_length
-from mfvpr.exchange.containers import Entry, reading, shortened
+from mfvpr.exchange.containers import FileEntry, reading, shortened
 from mfvpr.exchange.feature_files import as_written
 from mfvpr.exchange.h5 import H5File, write_h5
 from mfvpr.exchange.names import match_names, require_all, require_different
@@ -39,7 +39,7 @@ def read_global_descriptors(path: Path | str, names: Sequence[str], *, lengths: 
 
 def read_with_entries(
     path: Path | str, names: Sequence[str], *, lengths: Lengths = "unit"
-) -> tuple[np.ndarray, list[Entry]]:
+) -> tuple[np.ndarray, list[FileEntry]]:
     """Descriptors as `read_global_descriptors` returns them, and `[M]` the entry of each image."""
     path = Path(path)
     require_lengths(lengths)
@@ -51,7 +51,7 @@ def read_with_entries(
     if values.ndim != 2 or len(values) != len(names) or not values.shape[1]:
         raise InputError(f"{path}: expected descriptors [{len(names)}, D] of the images, got {list(values.shape)}")
     values = with_length(str(path), as_float32(str(path), values), lengths)
-    return values, [Entry(path, entry) for entry in entries]
+    return values, [FileEntry(path, entry) for entry in entries]
 
 
 def write_global_descriptors(

@@ -24,7 +24,7 @@ import numpy as np
 from mfvpr.data.files import require_file
 from mfvpr.errors import InputError
 from mfvpr.exchange.checks import Lengths, as_float32, require_lengths, with_length
-from mfvpr.exchange.containers import Container, Contents, Entry, shortened
+from mfvpr.exchange.containers import Container, Contents, FileEntry, shortened
 from mfvpr.exchange.h5 import H5File
 from mfvpr.exchange.names import match_names, require_all
 from mfvpr.exchange.npz import NpzFile, NpzFolder
@@ -61,7 +61,7 @@ class ImportedFeatures:
         return len(self.counts)
 
     @property
-    def entries(self) -> list[Entry | None]:
+    def entries(self) -> list[FileEntry | None]:
         """`[M]` place of each image's arrays; None = not there."""
         return [None if image is None else self._container.entry(image) for image in self._images]
 

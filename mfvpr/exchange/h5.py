@@ -12,7 +12,7 @@ import numpy as np
 
 from mfvpr.data.files import printable, replacing, require_file
 from mfvpr.errors import InputError
-from mfvpr.exchange.containers import Contents, Entry, reading, require_plain, shortened
+from mfvpr.exchange.containers import Contents, FileEntry, reading, require_plain, shortened
 
 
 class H5File:
@@ -46,8 +46,8 @@ class H5File:
                 there = (part for part in parts if _encoded(part) in group)
                 yield {part: _read(self.path, image, group, part) for part in there}
 
-    def entry(self, image: str) -> Entry:
-        return Entry(self.path, image)
+    def entry(self, image: str) -> FileEntry:
+        return FileEntry(self.path, image)
 
 
 def write_h5(path: Path, groups: Iterable[tuple[str, Mapping[str, np.ndarray]]]) -> None:

@@ -8,10 +8,10 @@ from pathlib import Path, PurePosixPath
 from mfvpr.data.files import printable
 from mfvpr.data.images import SUFFIXES
 from mfvpr.errors import InputError
-from mfvpr.exchange.containers import Entry, shortened
+from mfvpr.exchange.containers import FileEntry, shortened
 
 Prefix = tuple[tuple[str, ...], tuple[str, ...]]  # folders that only the file's names have, only the images' names
-Images = dict[tuple[int, int, str], Path]  # image of an entry, by the device, inode and name of the entry
+ImageOfEntry = dict[tuple[int, int, str], Path]  # image of an entry, by the device, inode and name of the entry
 _NO_PREFIX: Prefix = ((), ())
 
 
@@ -66,7 +66,9 @@ def require_all(path: Path, names: Sequence[str], matched: Sequence[str | None],
 Variants = Callable[[str], list[str]]
 
 
-def require_one_image(path: Path, images: Sequence[Path], entries: Sequence[Entry | None], known: Images) -> None:
+def require_one_image(
+    path: Path, images: Sequence[Path], entries: Sequence[FileEntry | None], known: ImageOfEntry
+) -> None:
     """Refuse an entry that stands for images of two folders.
 
     Args:

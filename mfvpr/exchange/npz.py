@@ -14,7 +14,7 @@ import numpy as np
 
 from mfvpr.data.files import printable, replacing, require_file
 from mfvpr.errors import InputError
-from mfvpr.exchange.containers import Contents, Entry, reading, require_plain, shortened
+from mfvpr.exchange.containers import Contents, FileEntry, reading, require_plain, shortened
 
 SUFFIXES = (".npz", ".d2-net")  # of the files of images; D2-Net names its own so
 
@@ -54,8 +54,8 @@ class NpzFile:
             for image in images:
                 yield {part: _array(archive, name) for part, name in _members(members, f"{image}/", parts)}
 
-    def entry(self, image: str) -> Entry:
-        return Entry(self.path, image)
+    def entry(self, image: str) -> FileEntry:
+        return FileEntry(self.path, image)
 
 
 class NpzFolder:
@@ -86,8 +86,8 @@ class NpzFolder:
         for image in images:
             yield read_npz(self._paths[image], parts)
 
-    def entry(self, image: str) -> Entry:
-        return Entry(self._paths[image], "")
+    def entry(self, image: str) -> FileEntry:
+        return FileEntry(self._paths[image], "")
 
 
 def read_npz(path: Path, parts: Sequence[str]) -> dict[str, np.ndarray]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from mfvpr.data.files import require_file, write_text
 from mfvpr.errors import InputError
-from mfvpr.exchange.containers import Entry, shortened
+from mfvpr.exchange.containers import FileEntry, shortened
 from mfvpr.exchange.names import adds_folders, match_names, require_different
 from mfvpr.exchange.npz import read_npz, write_npz
 from mfvpr.exchange.pairs import Pair, read_pairs, require_lines
@@ -45,7 +45,7 @@ def read_shortlist(
 
 def read_with_entries(
     path: Path | str, query_names: Sequence[str], database_names: Sequence[str], *, num_candidates: int | None = None
-) -> tuple[Shortlist, list[Entry | None], list[Entry | None]]:
+) -> tuple[Shortlist, list[FileEntry | None], list[FileEntry | None]]:
     """Shortlist as `read_shortlist` returns it, and the entries of queries `[Q]` and database images `[N]`.
 
     Only names with additional folders are entries. A file name alone may mean an image on either side.
@@ -170,11 +170,11 @@ def _rows(path: Path, names: Sequence[str], foreign: dict[str, None], side: str)
     return rows
 
 
-def _entries(path: Path, names: Sequence[str], rows: dict[str, int]) -> list[Entry | None]:
-    entries: list[Entry | None] = [None] * len(names)
+def _entries(path: Path, names: Sequence[str], rows: dict[str, int]) -> list[FileEntry | None]:
+    entries: list[FileEntry | None] = [None] * len(names)
     for match, row in rows.items():
         if adds_folders(names[row], match):
-            entries[row] = Entry(path, match)
+            entries[row] = FileEntry(path, match)
     return entries
 
 

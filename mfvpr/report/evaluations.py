@@ -146,8 +146,8 @@ def figures(
     judged: Judged,
     extractor: Extractor | Source,
     shown: int | Sequence[int],
+    refused: Sequence[np.ndarray],
     histogram: HistogramOfShifts | None = None,
-    refused: Sequence[np.ndarray] | None = None,
 ) -> list[Figure]:
     """The paper's figure for a few queries, right and wrong ones, spread over each sequence.
 
@@ -155,15 +155,14 @@ def figures(
         judged: the evaluation.
         extractor: whose images are shown.
         shown: how many, or rows of queries.
+        refused: `[Q]` bool of each sequence, queries whose confidence is below the threshold.
         histogram: which; None = the paper's.
-        refused: `[Q]` bool of each sequence, queries whose confidence is below the threshold; None = no query.
     """
     several, folders = len(judged.sequences) > 1, file_names([sequence.name for sequence in judged.sequences])
     return [
         (f"{folders[sequence.name]}/{name}" if several else name, partial(page.draw, query=query, verdict=verdict))
         for place, sequence in enumerate(judged.sequences)
-        for doubts in [None if refused is None else refused[place]]
-        for page in [Page(judged, place, extractor, histogram or HistogramOfShifts(), doubts)]
+        for page in [Page(judged, place, extractor, histogram or HistogramOfShifts(), refused[place])]
         for query, verdict in page.shown(shown).items()
         for name in [f"{verdict}_{query:04d}.png"]
     ]
@@ -177,7 +176,7 @@ class Page:
     place: int
     extractor: Extractor | Source
     histogram: HistogramOfShifts
-    refused: np.ndarray | None = None
+    refused: np.ndarray
 
     @property
     def sequence(self) -> QuerySequence:
@@ -208,10 +207,10 @@ class Page:
 
     def title(self, query: int, verdict: str) -> str:
         """The score, whether the prediction is correct within the threshold, and both names."""
-        truth, refused = self.sequence.truth, self.refused is not None and self.refused[query]
+        truth = self.sequence.truth
         within = "" if truth is None else " at" + threshold_words(truth.unit, self.judged.threshold)
         names = f"{_short(self.sequence.images.names[query])} -> {_short(self._prediction(query))}"
-        note = " (no place: confidence below the threshold)" if refused else ""
+        note = " (no place: confidence below the threshold)" if self.refused[query] else ""
         return f"{self.judged.headline}, {verdict}{within}: {names}{note}"
 
     def draw(self, path: Path, query: int, verdict: str) -> None:

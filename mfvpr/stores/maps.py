@@ -203,7 +203,8 @@ class _Segment:
         Raises:
             InputError: one of the two files of a row is gone, or that of the tokens is gone or was cut.
         """
-        stamp, path = file_stamp(self.folder / _TOKENS), self.folder / _TOKENS  # after the names of files
+        path = self.folder / _TOKENS
+        stamp = file_stamp(path)  # the rows were listed earlier, and an add grows this file before it writes rows
         if self.entries.done.any() and stamp is None:
             raise InputError(f"{path}: expected a file, got none. Put it back.")
         whole = np.flatnonzero(self.features.done & self.entries.done)

@@ -181,10 +181,10 @@ LINE = np.stack([np.linspace(0, 300, 20), np.linspace(10, 200, 20)], axis=1)
     [(LINE, LINE), (LINE, LINE[::-1]), (np.full((20, 2), 7.0), LINE), (np.full((20, 2), 7.0), np.full((20, 2), 9.0))],
 )
 def test_no_homography_explains_a_line_or_a_point(points1, points0):
-    found = estimate(Homography(), make_matches(points0, points1, capacity=CAPACITY))
-    assert (float(found.score), int(found.samples)) == (0, 0)
-    assert np.isnan(found.matrix).all()
-    assert not np.asarray(found.inliers).any()
+    estimated = estimate(Homography(), make_matches(points0, points1, capacity=CAPACITY))
+    assert (float(estimated.score), int(estimated.samples)) == (0, 0)
+    assert np.isnan(estimated.matrix).all()
+    assert not np.asarray(estimated.inliers).any()
 
 
 @pytest.mark.parametrize("threshold", [0.0, 1e-6, 1e12, np.inf])
