@@ -9,8 +9,8 @@ from experiments.prepare import Images, num_candidates
 from experiments.settings import SettingsError
 from mfvpr.confidence import Confidence, read_confidences
 from mfvpr.evaluation import middle
-from mfvpr.report import runs
 from mfvpr.report.evaluations import Judged
+from mfvpr.versions import versions
 
 _NAMES = ("features", "retrieval", "scorer", "matching", "candidates", "fusion", "previous_queries", "cohort")
 
@@ -117,5 +117,5 @@ def made(settings: Mapping[str, Any], images: Images, judged: Judged) -> dict[st
         "ground_truth": truth.described(settings, images.dataset),
         "settings": {name: settings[name] for name in _NAMES} | {"scorer": build.described(settings["scorer"])},
         "command": settings.get("command"),
-        "versions": runs.versions(),
+        "versions": versions(),
     }

@@ -13,15 +13,16 @@ from mfvpr.data.published import differences
 from mfvpr.evaluation import Unit
 from mfvpr.features import Source
 from mfvpr.progress import Stopwatch
+from mfvpr.ranked import COHORT, FILTER, FRAMES
 from mfvpr.report import runs
 from mfvpr.report.confidences import Assured, confidence_figures, confidence_table, write_confidence
 from mfvpr.report.differences import write_gains
 from mfvpr.report.evaluations import Figure, Judged, figures, recall_table, write_rankings, write_skipped
 from mfvpr.report.shifts import write_shifts
-from mfvpr.results import COHORT, FILTER, FRAMES
 from mfvpr.scoring import HistogramOfShifts
 from mfvpr.shards import NotYet
 from mfvpr.sinks import open_sinks
+from mfvpr.versions import versions
 
 _THRESHOLDS: dict[Unit, str] = {"frames": "tolerance", "m": "radius"}  # their names in results
 
@@ -183,7 +184,7 @@ def result_rows(outcome: Outcome) -> list[dict[str, Any]]:
         "reading": outcome.images.reading,
         "bytes_per_image": _bytes_per_image(outcome),
         "seconds": judged.result.seconds,
-        "versions": runs.versions(),
+        "versions": versions(),
     }
     rows = []
     for name, parameters in outcome.parameters.items():

@@ -21,6 +21,7 @@ from mfvpr.match_sets import Scales
 from mfvpr.progress import Stopwatch
 from mfvpr.report import comparisons, runs
 from mfvpr.scoring import Scorer
+from mfvpr.versions import versions
 
 _INPUTS = {"relative": RELATIVE, "absolute": ABSOLUTE}
 
@@ -57,7 +58,7 @@ def learn(settings: dict[str, Any]) -> None:
         results = {
             **several, **comparisons.results(comparison),
             "settings": {name: value for name, value in settings.items() if name not in left_out},
-            "seconds": watch.seconds, "versions": runs.versions(),
+            "seconds": watch.seconds, "versions": versions(),
         }  # fmt: skip
 
         def write(new: Path) -> None:
@@ -139,7 +140,7 @@ def _checkpoints(settings: dict[str, Any], scorer: Scorer, whole: Part, sets: li
         "tolerances": settings["recall"], **{name: settings[name] for name in names},
         "filter_score": settings["fusion"]["filter_score"], "positives": whole.judge.fingerprint,
         "reported": dict(whole.judge.reported_sets),
-        "versions": {name: runs.versions()[name] for name in ("mfvpr", "jax", "numpy")},
+        "versions": {name: versions()[name] for name in ("mfvpr", "jax", "numpy")},
     }  # fmt: skip
     own = "" if settings["checkpoints"] else f"{settings['dataset']['name']}_learning-{fingerprint(recipe)}"
     return Checkpoints(build.expanded(root) / own, recipe)

@@ -11,6 +11,7 @@ from mfvpr.errors import InputError
 from mfvpr.report import runs
 from mfvpr.report.pages import one_run
 from mfvpr.report.runs import Figure
+from mfvpr.versions import versions
 
 _OF_THE_START = ("multirun", "command")  # what `command_line` adds to the settings
 
@@ -101,5 +102,5 @@ def _about(settings: Mapping[str, Any], ground_truth: Mapping[str, Any]) -> dict
         "settings": {name: value for name, value in settings.items() if name not in _OF_THE_START},
         "ground_truth": ground_truth,
         "commit": runs.commit(Path()),
-        "versions": runs.versions(),
+        "versions": versions(),
     }

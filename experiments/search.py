@@ -13,6 +13,7 @@ from mfvpr.progress import Stopwatch
 from mfvpr.report import runs, sweeps
 from mfvpr.sweeping import Outcome
 from mfvpr.types import Shortlist
+from mfvpr.versions import versions
 
 
 def sweep(settings: dict[str, Any]) -> None:
@@ -64,8 +65,8 @@ def _kept(settings: dict[str, Any], tools: prepare.Tools, images: prepare.Images
     recipe = prepare.recipe(tools, images, candidates.mask.shape[1])
     names = ("scorer", "grid", "search", "trials", "seed", "split", "recall", "ties", "fusion")
     own = {name: settings[name] for name in names}  # or another sweep that ends would take away what this one needs
-    versions = {name: runs.versions()[name] for name in ("mfvpr", "jax", "numpy")}
-    name = fingerprint({"matches": recipe, "sweep": own, "versions": versions})
+    software = {name: versions()[name] for name in ("mfvpr", "jax", "numpy")}
+    name = fingerprint({"matches": recipe, "sweep": own, "versions": software})
     return build.expanded(settings["store"]) / f"{settings['dataset']['name']}_sweep-{name}"
 
 
@@ -88,5 +89,5 @@ def _results(
         "scorer": settings["scorer"], "features": settings["features"], "filter": settings["retrieval"],
         "matching": settings["matching"], "candidates": settings["candidates"], "fusion": settings["fusion"],
         "final": settings["final"], "ground_truth": truth.described(settings, images.dataset),
-        **sweeps.results(outcome), "seconds": seconds, "versions": runs.versions(),
+        **sweeps.results(outcome), "seconds": seconds, "versions": versions(),
     }  # fmt: skip

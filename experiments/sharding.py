@@ -25,6 +25,7 @@ from mfvpr.fingerprints import difference
 from mfvpr.report import runs
 from mfvpr.shards import NotYet, Shard
 from mfvpr.stores.disk import locked
+from mfvpr.versions import versions
 
 SHARDS = "shards"
 COMPLETE = "complete"
@@ -102,7 +103,7 @@ def check_data(settings: Mapping[str, Any], images: Images) -> None:
         return
     known = images.dataset.sequences[0].truth
     right = truth.fingerprint(images.dataset, truth.thresholds(settings, known))
-    about = {"images": images.fingerprints, "ground truth": right, "versions": runs.versions()}
+    about = {"images": images.fingerprints, "ground truth": right, "versions": versions()}
     folder = _folder(build.expanded(settings["out"]))
     _agreed(folder / "data.json", about, f"shard={settings['shard']}")
 

@@ -10,7 +10,8 @@ what a scorer of your own is written with; `mfvpr.testing.check_scorer` says whe
 from typing import TYPE_CHECKING, Any
 
 from mfvpr.errors import InputError
-from mfvpr.evaluation import frame_positives, radius_positives, recall_at_k
+from mfvpr.evaluation.positives import frame_positives, radius_positives
+from mfvpr.evaluation.recall import recall_at_k
 from mfvpr.lightglue import LightGlueMatching
 from mfvpr.matchers import Matcher, Matching, match_pairs
 from mfvpr.matching import compact, filter_matches, match, match_candidates
@@ -18,22 +19,18 @@ from mfvpr.numerics import masked, masked_mean, masked_median, safe_sqrt
 from mfvpr.parameter_grids import score_grid
 from mfvpr.reranking import balancing_c, combine, rank, rerank, score_candidates
 from mfvpr.retrieval import retrieve
-from mfvpr.scoring import (
-    AggregatedScore,
-    AnchorPoints,
-    GridAnchors,
-    HistogramOfShifts,
-    Homography,
-    LostScore,
-    MatchCount,
-    OpenCvHomography,
-    RapidSpatialScore,
-    Scorer,
-    ShiftHistogram,
-    VisualPhrases,
-    image_sizes,
-    match_shifts,
-)
+from mfvpr.scoring.aggregate import AggregatedScore
+from mfvpr.scoring.anchor import AnchorPoints
+from mfvpr.scoring.counting import MatchCount
+from mfvpr.scoring.grid import GridAnchors
+from mfvpr.scoring.histogram import HistogramOfShifts, ShiftHistogram
+from mfvpr.scoring.homography import Homography
+from mfvpr.scoring.homography_opencv import OpenCvHomography
+from mfvpr.scoring.lost import LostScore
+from mfvpr.scoring.phrases import VisualPhrases
+from mfvpr.scoring.rapid import RapidSpatialScore
+from mfvpr.scoring.scorer import Scorer
+from mfvpr.scoring.shifts import image_sizes, match_shifts
 from mfvpr.soft_matching import soft_match
 from mfvpr.types import Features, Matches, Ranking, Shortlist, value
 from mfvpr.weighting import (
@@ -47,7 +44,7 @@ from mfvpr.weighting import (
 
 if TYPE_CHECKING:
     from mfvpr.evaluations import evaluate
-    from mfvpr.maps import Map
+    from mfvpr.maps.map import Map
 
 __version__ = "0.2.0"
 
@@ -111,6 +108,6 @@ def __getattr__(name: str) -> Any:
     if name not in ("evaluate", "Map"):
         raise AttributeError(f"module 'mfvpr' has no attribute {name!r}")
     from mfvpr.evaluations import evaluate
-    from mfvpr.maps import Map
+    from mfvpr.maps.map import Map
 
     return evaluate if name == "evaluate" else Map

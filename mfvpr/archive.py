@@ -20,16 +20,16 @@ from mfvpr.data.contents import Contents, contents, files_of, state_of
 from mfvpr.data.datasets import ImageFolder
 from mfvpr.errors import InputError
 from mfvpr.extraction import described
-from mfvpr.features import Aggregated, Aggregation, Extractor, Source
+from mfvpr.features.extractor import Aggregated, Aggregation, Extractor, Source
 from mfvpr.fingerprints import fingerprint, recipe_of
 from mfvpr.progress import Stopwatch, Track, untracked
-from mfvpr.report.runs import versions
 from mfvpr.shards import Shard
 from mfvpr.sinks import Sink, Taken, account, open_sinks
 from mfvpr.sources import FeatureSet, FeatureSource, InMemory
 from mfvpr.stores import matches as match_stores
 from mfvpr.stores.manifest import MATCHES, store_path
 from mfvpr.stores.rows import require_space
+from mfvpr.versions import versions
 
 DECODERS = ("mfvpr", "opencv-python-headless", "pillow")  # whose versions decide what an image becomes
 AGGREGATED = 16  # images at a time

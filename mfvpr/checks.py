@@ -9,16 +9,16 @@ import numpy as np
 from mfvpr.data.datasets import ImageFolder
 from mfvpr.declaration import check_bounds
 from mfvpr.errors import InputError, require_word
-from mfvpr.features import Extractor, Source
+from mfvpr.features.extractor import Extractor, Source
 from mfvpr.features.sift import Sift
 from mfvpr.filters import Filtered
 from mfvpr.lightglue import LightGlueMatching
 from mfvpr.matchers import Matcher, Matching
 from mfvpr.matching import CrossCheck
+from mfvpr.ranked import COHORT, FILTER, FRAMES, Matched, Ranked
 from mfvpr.rankings import Fusion
 from mfvpr.reranking import Ties
-from mfvpr.results import COHORT, FILTER, FRAMES, Matched, Ranked
-from mfvpr.scoring import SCORERS
+from mfvpr.scoring.registry import SCORERS
 from mfvpr.sources import FeatureSet
 from mfvpr.types import Shortlist
 

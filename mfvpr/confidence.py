@@ -15,7 +15,7 @@ from scipy import optimize, special
 
 from mfvpr.data.files import require_file, write_text
 from mfvpr.errors import InputError
-from mfvpr.results import Ranked
+from mfvpr.ranked import Ranked
 
 Input = Literal["margin", "height", "filter", "score"]
 INPUTS: tuple[Input, ...] = ("margin", "height")  # by default

@@ -23,8 +23,8 @@ from mfvpr.evaluation.positives import Positives
 from mfvpr.numerics import Device, compiled, held, masked, round_up
 from mfvpr.reranking import BIN_STEP, check_candidates
 from mfvpr.retrieval import retrieve
-from mfvpr.scoring import Scorer, check_host, on_host
 from mfvpr.scoring.parameters import fit
+from mfvpr.scoring.scorer import Scorer, check_host, on_host
 from mfvpr.types import Array, Matches, Shortlist
 
 AXIS = "devices"  # the only one of a mesh

@@ -21,16 +21,17 @@ from mfvpr.checks import check_request, nan_scores
 from mfvpr.cohort import cohort_sequence, hubness
 from mfvpr.data.datasets import Dataset, QuerySequence
 from mfvpr.errors import InputError
-from mfvpr.features import Extractor, Source
+from mfvpr.features.extractor import Extractor, Source
 from mfvpr.filters import Filter
 from mfvpr.frame_correlation import FrameCorrelation
 from mfvpr.matchers import NEIGHBORS, Matcher
 from mfvpr.numerics import Device
 from mfvpr.progress import Stopwatch
+from mfvpr.ranked import COHORT, Matched
 from mfvpr.rankings import Fusion, rank_sequence
 from mfvpr.reranking import Ties
-from mfvpr.results import COHORT, Matched, Result
-from mfvpr.scoring import Scorer
+from mfvpr.results import Result
+from mfvpr.scoring.scorer import Scorer
 from mfvpr.sequence_matching import match_sequence, matches_recipe
 from mfvpr.shards import together
 from mfvpr.stores.manifest import SCORES, store_path

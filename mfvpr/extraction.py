@@ -11,7 +11,7 @@ import numpy as np
 from mfvpr.data.datasets import ImageFolder
 from mfvpr.data.images import Interpolation, resize
 from mfvpr.errors import InputError
-from mfvpr.features import Description, Extractor
+from mfvpr.features.extractor import Description, Extractor
 from mfvpr.numerics import available_cpus
 from mfvpr.progress import Track, untracked
 from mfvpr.sources import check_features, without_padding

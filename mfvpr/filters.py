@@ -9,7 +9,7 @@ import numpy as np
 
 from mfvpr.archive import Archive
 from mfvpr.data.datasets import ImageFolder, QuerySequence
-from mfvpr.features import Aggregated, Extractor
+from mfvpr.features.extractor import Aggregated, Extractor
 from mfvpr.retrieval import EXACT, Search
 from mfvpr.shards import together
 from mfvpr.types import Shortlist

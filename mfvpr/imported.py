@@ -14,12 +14,12 @@ from mfvpr.archive import Archive
 from mfvpr.data.datasets import ImageFolder, QuerySequence
 from mfvpr.data.images import Interpolation
 from mfvpr.errors import InputError
-from mfvpr.exchange import ImportedFeatures, open_features
 from mfvpr.exchange.checks import Lengths
 from mfvpr.exchange.descriptors import read_with_entries as read_descriptors
+from mfvpr.exchange.features import ImportedFeatures, open_features
 from mfvpr.exchange.names import ImageOfEntry, require_one_image
 from mfvpr.exchange.shortlists import read_with_entries as read_shortlist
-from mfvpr.features import Scale
+from mfvpr.features.extractor import Scale
 from mfvpr.filters import Filtered
 from mfvpr.retrieval import EXACT, Search
 from mfvpr.types import Shortlist

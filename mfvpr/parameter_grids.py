@@ -17,8 +17,9 @@ import numpy as np
 from mfvpr.matching import filter_matches
 from mfvpr.numerics import available_cpus, compiled, held, holds_function, is_concrete, knows_own_context, platform
 from mfvpr.reranking import BIN_STEP, check_candidates, matched_sizes
-from mfvpr.scoring import HistogramOfShifts, check_host, on_host, require_real, score_pairs
+from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.scoring.parameters import fit, numbers, whole_numbers, with_parameters
+from mfvpr.scoring.scorer import check_host, on_host, require_real, score_pairs
 from mfvpr.types import Array, Matches
 from mfvpr.weighting import ChosenWeight, Weight, match_weights
 

@@ -21,7 +21,7 @@ from mfvpr.matchers import NEIGHBORS, Matcher
 from mfvpr.numerics import Device, at_least_single, compiled, device_of
 from mfvpr.progress import Track, untracked
 from mfvpr.reranking import BIN_STEP
-from mfvpr.scoring import HistogramOfShifts, ShiftHistogram
+from mfvpr.scoring.histogram import HistogramOfShifts, ShiftHistogram
 from mfvpr.scoring.parameters import fit
 from mfvpr.sources import FeatureSet, memory_budget
 from mfvpr.stores.matches import MatchStore, StoredMatches

@@ -10,8 +10,8 @@ from mfvpr.cohort import by_hubness
 from mfvpr.declaration import POSITIVE
 from mfvpr.errors import InputError, require_word
 from mfvpr.frame_correlation import FrameCorrelation
+from mfvpr.ranked import COHORT, FILTER, FRAMES, Matched, Ranked
 from mfvpr.reranking import FilterScore, Ties, filter_scores, fuse_scales, fuse_shortlist, rank_shortlist
-from mfvpr.results import COHORT, FILTER, FRAMES, Matched, Ranked
 from mfvpr.types import Shortlist
 
 

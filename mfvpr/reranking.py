@@ -12,8 +12,8 @@ import numpy as np
 
 from mfvpr.errors import InputError, require_word
 from mfvpr.numerics import as_float, compiled, is_concrete, masked, masked_mean, masked_std, or_nan
-from mfvpr.scoring import Scorer, check_host, on_host, score_pairs
 from mfvpr.scoring.parameters import fit
+from mfvpr.scoring.scorer import Scorer, check_host, on_host, score_pairs
 from mfvpr.types import Array, Matches, Ranking, Shortlist
 
 Ties = Literal["filter", "index"]

@@ -18,13 +18,13 @@ from mfvpr.data.arrays import read_arrays, write_arrays
 from mfvpr.data.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.data.files import placing, write_text
 from mfvpr.errors import InputError
-from mfvpr.features import Extractor, Source
+from mfvpr.features.extractor import Extractor, Source
 from mfvpr.filters import Filter, Filtered
 from mfvpr.fingerprints import recipe_of
 from mfvpr.fitting import fitted
 from mfvpr.matchers import NEIGHBORS, Matcher
 from mfvpr.progress import Stopwatch
-from mfvpr.results import Matched
+from mfvpr.ranked import Matched
 from mfvpr.shards import together
 from mfvpr.sources import FeatureSet
 from mfvpr.stores.matches import MatchStore

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mfvpr.features import Extractor, Scale
+from mfvpr.features.extractor import Extractor, Scale
 from mfvpr.stores import features, vectors
 from mfvpr.stores.bad import known_bad, leave_bad
 from mfvpr.stores.manifest import VECTORS, store_path

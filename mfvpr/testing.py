@@ -15,8 +15,8 @@ import numpy as np
 from mfvpr.errors import NoGradientError
 from mfvpr.numerics import holds_function
 from mfvpr.reranking import score_candidates
-from mfvpr.scoring import Scorer, on_host
 from mfvpr.scoring.parameters import fit
+from mfvpr.scoring.scorer import Scorer, on_host
 from mfvpr.types import Array, Matches, per_match
 
 SLOTS = 48

@@ -6,7 +6,7 @@ import numpy as np
 
 from mfvpr.archive import Archive
 from mfvpr.data.datasets import ImageFolder, QuerySequence
-from mfvpr.evaluation import Positives
+from mfvpr.evaluation.positives import Positives
 from mfvpr.features.ssm import SsmWindows
 from mfvpr.filters import Filtered
 from mfvpr.fitting import fitted

@@ -14,8 +14,8 @@ from scipy import special
 from mfvpr.confidence import confidence_inputs, fit_confidence, read_confidences, write_confidences
 from mfvpr.errors import InputError
 from mfvpr.evaluation import Positives
+from mfvpr.ranked import Ranked
 from mfvpr.report.confidences import Assured, recall_by_share
-from mfvpr.results import Ranked
 
 NAMES = ("margin", "height", "filter", "score")
 

@@ -11,10 +11,10 @@ from experiments.benchmark.real import answered, extractors, matched_sets
 from experiments.console import track
 from mfvpr import Homography, OpenCvHomography, pipeline
 from mfvpr.data.files import write_text
-from mfvpr.report.runs import versions
+from mfvpr.ranked import Matched
 from mfvpr.report.tables import Table
-from mfvpr.results import Matched
 from mfvpr.scoring import Scorer
+from mfvpr.versions import versions
 
 CANDIDATES = 50
 TOLERANCE = 2  # frames

@@ -20,7 +20,6 @@ from mfvpr.data.files import write_text
 from mfvpr.evaluation.positives import Positives
 from mfvpr.evaluation.recall import recall_at_k
 from mfvpr.numerics import available_cpus
-from mfvpr.report.runs import versions
 from mfvpr.report.tables import Table
 from mfvpr.reranking import rank
 from mfvpr.retrieval import EXACT
@@ -28,6 +27,7 @@ from mfvpr.sources import FeatureSet
 from mfvpr.stores.features import FeatureStore, forecast_bytes, open_store, require_space
 from mfvpr.stores.manifest import store_path
 from mfvpr.types import Shortlist
+from mfvpr.versions import versions
 
 DATA = MadeUp(100_000, 200, 700, 128, views=1, likeness=0.18)  # so the filter often fails
 ROUNDS = 3

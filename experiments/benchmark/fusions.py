@@ -11,12 +11,12 @@ import numpy as np
 from experiments.benchmark.real import answered, extractors, matched_sets
 from mfvpr import AnchorPoints, HistogramOfShifts, pipeline
 from mfvpr.data.files import write_text
+from mfvpr.ranked import FILTER, Matched
 from mfvpr.rankings import Fusion
-from mfvpr.report.runs import versions
 from mfvpr.report.tables import Table
 from mfvpr.reranking import rank_shortlist
-from mfvpr.results import FILTER, Matched
 from mfvpr.types import Shortlist
+from mfvpr.versions import versions
 from mfvpr.weighting import WEIGHTS
 
 CANDIDATES = 50

@@ -19,11 +19,11 @@ from mfvpr.evaluation.statistics import block_sign_flips, mcnemar
 from mfvpr.features import Aggregated, Extractor
 from mfvpr.features.vlad import VladFitting
 from mfvpr.filters import Retrieval
-from mfvpr.report.runs import versions
+from mfvpr.ranked import Matched
 from mfvpr.report.tables import Table
-from mfvpr.results import Matched
 from mfvpr.sequence_matching import match_cohort, match_sequence
 from mfvpr.types import Shortlist
+from mfvpr.versions import versions
 from mfvpr.weighting import FeatureScoreWeight, RatioWeight
 
 STREETS = (0, 1, 2)  # seeds

@@ -24,8 +24,8 @@ from experiments.console import bar
 from experiments.settings import SettingsError
 from mfvpr.data.files import write_text
 from mfvpr.data.streets import streets_folder
-from mfvpr.report.runs import versions
 from mfvpr.report.tables import Table
+from mfvpr.versions import versions
 
 KILLS, SHARDS = 200, 2
 FRAMES, IMAGE_SIZE = 40, (160, 120)

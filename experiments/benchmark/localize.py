@@ -20,10 +20,10 @@ from mfvpr.data.streets import streets_folder
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
 from mfvpr.maps import Map
-from mfvpr.report.runs import versions
 from mfvpr.report.tables import Table
 from mfvpr.stores.maps import Entry
 from mfvpr.types import Features
+from mfvpr.versions import versions
 from mfvpr.weights.files import load_model
 
 SIZES, CANDIDATES, ROUNDS = (1000, 10_000), 50, 3

@@ -35,11 +35,11 @@ from mfvpr.filters import Retrieval
 from mfvpr.matchers import Matcher
 from mfvpr.named_weights import NAMED_WEIGHTS
 from mfvpr.numerics import available_cpus
-from mfvpr.report.runs import versions
 from mfvpr.report.tables import Table
 from mfvpr.sequence_matching import match_sequence
 from mfvpr.sources import FeatureSet
 from mfvpr.types import Shortlist
+from mfvpr.versions import versions
 from mfvpr.weights.files import load_model
 
 CANDIDATES, KEYPOINTS = 50, 512

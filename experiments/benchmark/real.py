@@ -30,12 +30,12 @@ from mfvpr.features.vlad import VladFitting
 from mfvpr.filters import Retrieval
 from mfvpr.matchers import NEIGHBORS, Matcher
 from mfvpr.numerics import available_cpus
-from mfvpr.report.runs import versions
+from mfvpr.ranked import FILTER, Matched
 from mfvpr.report.tables import Table
 from mfvpr.reranking import rank_shortlist
-from mfvpr.results import FILTER, Matched
 from mfvpr.scoring import Scorer
 from mfvpr.sequence_matching import match_sequence
+from mfvpr.versions import versions
 from mfvpr.weights.files import load_model
 
 FOLDERS = {"grief_season": ("database", "queries"), "corridor": ("ref", "query")}

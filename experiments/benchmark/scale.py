@@ -22,12 +22,12 @@ from experiments.console import bar
 from mfvpr import HistogramOfShifts, pipeline
 from mfvpr.data.files import write_text
 from mfvpr.numerics import available_cpus
-from mfvpr.report.runs import versions
 from mfvpr.report.tables import Table
 from mfvpr.reranking import rank_shortlist
 from mfvpr.retrieval import EXACT
 from mfvpr.sources import FeatureSet, FeatureSource, InMemory
 from mfvpr.types import Features, Shortlist
+from mfvpr.versions import versions
 
 QUERIES, KEYPOINTS = 100, 700
 SETS = tuple(

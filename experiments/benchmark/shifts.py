@@ -20,8 +20,8 @@ from mfvpr.data.files import write_text
 from mfvpr.data.streets import streets_folder
 from mfvpr.features import Extractor
 from mfvpr.features.sift import Sift
-from mfvpr.report.runs import versions
 from mfvpr.report.tables import Table
+from mfvpr.versions import versions
 
 LEVELS = (0.68, 0.95)
 GROSS = 45.0  # px off along an axis: two standard deviations of the paper's votes

@@ -12,10 +12,10 @@ from experiments.benchmark.real import answered, extractors, matched_sets
 from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, pipeline
 from mfvpr.data.files import write_text
 from mfvpr.evaluation.statistics import block_sign_flips, mcnemar
-from mfvpr.report.runs import versions
+from mfvpr.ranked import Matched
 from mfvpr.report.tables import Table
 from mfvpr.reranking import fuse_shortlist
-from mfvpr.results import Matched
+from mfvpr.versions import versions
 from mfvpr.weighting import WEIGHTS
 
 SIZE = (320, 320)

@@ -11,9 +11,9 @@ import numpy as np
 from experiments.benchmark.real import answered, extractors, matched_sets
 from mfvpr import HistogramOfShifts, pipeline
 from mfvpr.data.files import write_text
-from mfvpr.report.runs import versions
+from mfvpr.ranked import Matched
 from mfvpr.report.tables import Table
-from mfvpr.results import Matched
+from mfvpr.versions import versions
 from mfvpr.weighting import WEIGHTS
 
 SCALES = (0.7, 0.84, 0.92, 1.0, 1.09, 1.19, 1.41)

@@ -11,7 +11,7 @@ from experiments.build import expanded
 from experiments.quoting import as_typed
 from experiments.settings import RULES, SettingsError
 from mfvpr.data.published import PUBLISHED
-from mfvpr.results import FILTER
+from mfvpr.ranked import FILTER
 from mfvpr.weights.files import is_installed
 from mfvpr.weights.registry import REGISTRY, Entry
 

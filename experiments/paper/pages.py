@@ -15,8 +15,8 @@ from mfvpr.report.pages.pictures import MOST_PICTURES, Picture, pictures
 from mfvpr.report.pages.rendering import write_page
 from mfvpr.report.pages.sections import Gallery, Section, Sheet, flat
 from mfvpr.report.pages.several_runs import write_comparison
-from mfvpr.report.runs import versions
 from mfvpr.report.tables import Table
+from mfvpr.versions import versions
 
 Tables = Mapping[str, tuple[str, Table]]  # heading and table by name
 _COSTS, _ABOUT = ("sizes", "seconds"), ("data_sets", "settings")

@@ -18,10 +18,10 @@ from experiments.settings import SettingsError
 from mfvpr.data.datasets import Dataset
 from mfvpr.data.published import differences
 from mfvpr.errors import InputError
+from mfvpr.ranked import FILTER
 from mfvpr.report import runs as run_folders
 from mfvpr.report.pages.one_run import PAGE
 from mfvpr.report.tables import Table
-from mfvpr.results import FILTER
 
 _BEST = ("mix_hist_50", "aliked_hist_50", "sift_hist_50")  # whose failures are shown: the first that is here
 

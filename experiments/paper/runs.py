@@ -21,6 +21,7 @@ from mfvpr.data.files import remove_leftovers
 from mfvpr.fingerprints import fingerprint
 from mfvpr.report import runs
 from mfvpr.report.pages.one_run import PAGE
+from mfvpr.versions import versions
 from mfvpr.weights import files
 from mfvpr.weights.registry import REGISTRY
 
@@ -81,7 +82,7 @@ def made_of(settings: Mapping[str, Any], images: Mapping[str, str], truth: str |
     return {
         "settings": fingerprint(free), "images": fingerprint(dict(images)),
         "ground truth": truth or "none", "weights": fingerprint(weights),
-        "version": runs.versions()["mfvpr"],
+        "version": versions()["mfvpr"],
     }  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from mfvpr.data.datasets import Dataset, ImageFolder
 from mfvpr.maps.vectors import Vectors
 from mfvpr.numerics import available_cpus
 from mfvpr.progress import Stopwatch
-from mfvpr.report import runs
+from mfvpr.versions import versions
 
 QUERIES, DATABASE = 10, 60  # images; as many of the database as there are candidates, at least
 STEPS = ("filter", "features", "matching", "scores")
@@ -58,7 +58,7 @@ def measured(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, float]:
 
 def device() -> dict[str, Any]:
     """What the seconds were measured on."""
-    return {"device": jax.devices()[0].device_kind, "cores": available_cpus(), "versions": runs.versions()}
+    return {"device": jax.devices()[0].device_kind, "cores": available_cpus(), "versions": versions()}
 
 
 def _renamed(images: ImageFolder, number: int, folder: Path) -> ImageFolder:

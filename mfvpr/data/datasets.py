@@ -12,7 +12,8 @@ from mfvpr.data.ground_truth import CHOICES, KINDS, truth_by_order, truth_from_n
 from mfvpr.data.images import SUFFIXES, read_image
 from mfvpr.data.truth_files import truth_from_file, truth_from_labels
 from mfvpr.errors import InputError
-from mfvpr.evaluation import Positives, Truth
+from mfvpr.evaluation.positives import Positives
+from mfvpr.evaluation.truth import Truth
 
 MEANS = ("mean", "pooled")  # what results call the means over sequences, and over all of their queries
 

@@ -14,7 +14,8 @@ import numpy as np
 
 from mfvpr.data.numbers import parse_number
 from mfvpr.errors import InputError
-from mfvpr.evaluation import Positives, Truth, Unit, rows_within
+from mfvpr.evaluation.positives import Positives, rows_within
+from mfvpr.evaluation.truth import Truth, Unit
 
 KINDS = {
     "order": "query i shows database image i",

@@ -11,7 +11,7 @@ import numpy as np
 from mfvpr.data.files import require_file
 from mfvpr.data.ground_truth import FARTHEST, FrameTruth, LabelTruth, RadiusTruth
 from mfvpr.errors import InputError
-from mfvpr.evaluation import Truth
+from mfvpr.evaluation.truth import Truth
 
 MAX_DIGITS = 20  # of a row number
 

@@ -12,7 +12,7 @@ from jax import Array
 
 from mfvpr.data.images import Interpolation
 from mfvpr.errors import InputError
-from mfvpr.features import Description, Scale
+from mfvpr.features.extractor import Description, Scale
 from mfvpr.features.network import compiled, in_batches, require_size
 from mfvpr.models.aliked import Aliked
 from mfvpr.models.aliked_detection import RADIUS, Detections

@@ -9,7 +9,7 @@ import numpy as np
 
 from mfvpr.data.images import Interpolation
 from mfvpr.errors import InputError
-from mfvpr.features import Description, Scale
+from mfvpr.features.extractor import Description, Scale
 from mfvpr.features.network import compiled, in_batches, require_size
 from mfvpr.models.d2net import SCALES, STRIDE, D2Net, Detections, extract, map_size
 from mfvpr.models.imagenet import Preprocessing

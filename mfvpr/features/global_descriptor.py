@@ -10,7 +10,7 @@ import numpy as np
 
 from mfvpr.data.images import Interpolation
 from mfvpr.errors import InputError
-from mfvpr.features import Description, Scale
+from mfvpr.features.extractor import Description, Scale
 from mfvpr.features.network import compiled, in_batches, require_size
 from mfvpr.models.lengths import of_unit_length
 

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from mfvpr.data.images import Interpolation
-from mfvpr.features import Description, Scale
+from mfvpr.features.extractor import Description, Scale
 from mfvpr.features.network import compiled, in_batches, require_size
 from mfvpr.models.mixvpr import IMAGE_SIZE, MixVPR, preprocess
 

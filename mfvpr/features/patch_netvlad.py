@@ -10,7 +10,7 @@ import numpy as np
 
 from mfvpr.data.images import Interpolation
 from mfvpr.errors import InputError
-from mfvpr.features import Description, Scale
+from mfvpr.features.extractor import Description, Scale
 from mfvpr.features.network import at_places, compiled, in_batches, require_network, require_size
 from mfvpr.models.netvlad import VggNetVlad
 from mfvpr.models.vgg import STRIDE

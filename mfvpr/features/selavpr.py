@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from mfvpr.data.images import Interpolation
-from mfvpr.features import Description, Scale
+from mfvpr.features.extractor import Description, Scale
 from mfvpr.features.network import at_places, compiled, in_batches, require_network, require_size
 from mfvpr.models.selavpr import LOCAL, SelaVpr
 from mfvpr.models.vit import PATCH, require_patches

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from mfvpr.data.images import Interpolation
-from mfvpr.features import Description, Scale
+from mfvpr.features.extractor import Description, Scale
 from mfvpr.types import Features
 
 

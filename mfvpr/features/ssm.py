@@ -10,7 +10,7 @@ import numpy as np
 
 from mfvpr.data.images import Interpolation
 from mfvpr.errors import InputError
-from mfvpr.features import Description, Scale
+from mfvpr.features.extractor import Description, Scale
 from mfvpr.features.network import at_places, compiled, in_batches
 from mfvpr.features.windows import WindowFitting, Windows, kernels, known, normalized, whitened
 from mfvpr.models.imagenet import Preprocessing

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mfvpr.errors import InputError
-from mfvpr.features import Extractor
+from mfvpr.features.extractor import Extractor
 from mfvpr.fingerprints import fingerprint, recipe_of
 from mfvpr.numerics import free_host_bytes
 from mfvpr.types import Array

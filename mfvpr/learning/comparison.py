@@ -8,7 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mfvpr.errors import InputError
-from mfvpr.evaluation import Judge, best_setting, hits
+from mfvpr.evaluation.choosing import best_setting
+from mfvpr.evaluation.judging import Judge
+from mfvpr.evaluation.recall import hits
 from mfvpr.learning.models import Model
 from mfvpr.learning.parameters import can_learn
 from mfvpr.learning.splits import TrainingSplit, training_splits
@@ -16,10 +18,11 @@ from mfvpr.learning.teaching import Options, of_matches, start, train
 from mfvpr.learning.training import Fit
 from mfvpr.match_sets import MatchSet
 from mfvpr.progress import untracked
-from mfvpr.scoring import Scorer
-from mfvpr.sweeping import Axes, Setting, sweep
+from mfvpr.scoring.scorer import Scorer
+from mfvpr.sweeping.axes import Axes
 from mfvpr.sweeping.search import Stages, untracked_stages
-from mfvpr.sweeping.settings import FUSION
+from mfvpr.sweeping.settings import FUSION, Setting
+from mfvpr.sweeping.sweep import sweep
 from mfvpr.types import Shortlist
 from mfvpr.weighting import DescriptorDistanceWeight, FeatureScoreWeight, RatioWeight, UnitWeight
 

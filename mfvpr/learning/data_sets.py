@@ -7,7 +7,8 @@ from typing import Any, overload
 import numpy as np
 
 from mfvpr.errors import InputError
-from mfvpr.evaluation import Half, Judge
+from mfvpr.evaluation.choosing import Half
+from mfvpr.evaluation.judging import Judge
 from mfvpr.evaluation.positives import side_by_side
 from mfvpr.match_sets import MatchSet
 from mfvpr.types import Matches, Shortlist, per_pair

@@ -15,7 +15,7 @@ from mfvpr.learning.parameters import from_logarithms, starts, to_logarithms
 from mfvpr.learning.splits import Batch
 from mfvpr.numerics import masked_mean
 from mfvpr.reranking import combine, score_candidates
-from mfvpr.scoring import HistogramOfShifts
+from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.types import Array, Matches
 
 Parameters = dict[str, Any]  # `numbers` by name and `c` as logarithms, `sharpness`, `weight`

@@ -8,11 +8,13 @@ import numpy as np
 
 from mfvpr import ragged
 from mfvpr.errors import InputError
-from mfvpr.evaluation import Half, Judge, Positives, separated
+from mfvpr.evaluation.choosing import Half, separated
+from mfvpr.evaluation.judging import Judge
+from mfvpr.evaluation.positives import Positives
 from mfvpr.match_sets import MatchSet
 from mfvpr.numerics import round_up
 from mfvpr.reranking import FilterScore, filter_scores
-from mfvpr.scoring import Scorer
+from mfvpr.scoring.scorer import Scorer
 from mfvpr.sweeping.scores import score
 from mfvpr.types import Matches, Shortlist, value
 

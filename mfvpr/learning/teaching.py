@@ -13,7 +13,8 @@ from mfvpr.learning.models import Model, Parameters
 from mfvpr.learning.splits import Batch, TrainingSplit
 from mfvpr.learning.training import Fit, fit
 from mfvpr.reranking import FilterScore, Ties
-from mfvpr.scoring import HistogramOfShifts, parameters
+from mfvpr.scoring import parameters
+from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.weighting import RatioWeight, UnitWeight
 
 TEACHER_SIGMA = 0.03  # of the teacher of single matches, in units of the largest side of an image

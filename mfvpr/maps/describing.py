@@ -13,7 +13,7 @@ from mfvpr.data.datasets import ImageFolder
 from mfvpr.data.images import read_image, resize
 from mfvpr.errors import InputError
 from mfvpr.extraction import described, described_images
-from mfvpr.features import Aggregation, Description, Extractor
+from mfvpr.features.extractor import Aggregation, Description, Extractor
 from mfvpr.fingerprints import recipe_of
 from mfvpr.progress import Track, untracked
 from mfvpr.stores.features import as_stored

@@ -20,7 +20,7 @@ from mfvpr.data.arrays import read_arrays, write_arrays
 from mfvpr.data.datasets import ImageFolder
 from mfvpr.data.files import canonical_name, clipped
 from mfvpr.errors import InputError
-from mfvpr.features import Aggregation, Extractor
+from mfvpr.features.extractor import Aggregation, Extractor
 from mfvpr.features.vlad import Vlad, VladFitting
 from mfvpr.fingerprints import fingerprint, recipe_of
 from mfvpr.maps.answers import Alternative, Answer, Asked, refusal
@@ -32,8 +32,9 @@ from mfvpr.maps.shifts import shift_of
 from mfvpr.maps.vectors import Vectors
 from mfvpr.matchers import NEIGHBORS, Matcher
 from mfvpr.progress import Track, untracked
-from mfvpr.results import Ranked
-from mfvpr.scoring import HistogramOfShifts, Scorer
+from mfvpr.ranked import Ranked
+from mfvpr.scoring.histogram import HistogramOfShifts
+from mfvpr.scoring.scorer import Scorer
 from mfvpr.sources import FeatureSet, stacked
 from mfvpr.stores.disk import told
 from mfvpr.stores.features import FeatureStore, open_store

@@ -8,7 +8,7 @@ import numpy as np
 from mfvpr.matchers import Matcher, match_pairs
 from mfvpr.numerics import available_cpus, device_bytes, knows_own_context, round_up
 from mfvpr.reranking import score_candidates
-from mfvpr.scoring import Scorer
+from mfvpr.scoring.scorer import Scorer
 from mfvpr.threads import ordered_map
 from mfvpr.types import Features, Matches
 

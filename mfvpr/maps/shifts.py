@@ -6,8 +6,9 @@ import numpy as np
 
 from mfvpr.pipeline import pair_shifts
 from mfvpr.reranking import BIN_STEP
-from mfvpr.scoring import HistogramOfShifts, Scorer
+from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.scoring.parameters import fit
+from mfvpr.scoring.scorer import Scorer
 from mfvpr.types import Matches
 
 Point = tuple[float, float]

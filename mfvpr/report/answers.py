@@ -7,11 +7,12 @@ import numpy as np
 from mfvpr.data.files import below, clipped
 from mfvpr.data.images import read_image, resize
 from mfvpr.errors import InputError
-from mfvpr.features import Extractor
-from mfvpr.maps import Asked, Map
+from mfvpr.features.extractor import Extractor
+from mfvpr.maps.answers import Asked
+from mfvpr.maps.map import Map
 from mfvpr.pipeline import explain
 from mfvpr.report.figures import Answer, aspect_of_resized, histogram_figure
-from mfvpr.scoring import HistogramOfShifts
+from mfvpr.scoring.histogram import HistogramOfShifts
 
 _GRAY, _MOST = 150, 80  # of an image that is not at hand; characters of a name or a place
 

@@ -9,8 +9,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from mfvpr.evaluation import Judge, threshold_words
+from mfvpr.evaluation.judging import Judge
 from mfvpr.evaluation.statistics import SignFlips, block_sign_flips, estimate, mcnemar, recall_interval
+from mfvpr.evaluation.truth import threshold_words
 from mfvpr.learned_weight import LearnedWeight
 from mfvpr.learning.comparison import Comparison, Row
 from mfvpr.learning.training import Fit

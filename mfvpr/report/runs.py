@@ -3,7 +3,6 @@
 import fcntl
 import json
 import os
-import platform
 import re
 import shutil
 import subprocess
@@ -11,8 +10,6 @@ import tempfile
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
-from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -137,16 +134,6 @@ def commit(place: Path) -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return found.stdout.strip() or None
-
-
-@cache
-def versions() -> dict[str, str]:
-    """Versions of what computed the results."""
-    return {
-        "mfvpr": version("mfvpr"),
-        "python": platform.python_version(),
-        **{package: version(package) for package in PACKAGES},
-    }
 
 
 def write_json(path: Path, value: Any) -> None:

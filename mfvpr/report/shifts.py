@@ -8,7 +8,7 @@ import numpy as np
 from mfvpr.pipeline import Scales, dominant_shifts
 from mfvpr.report.evaluations import Judged
 from mfvpr.report.rankings import number, write_csv
-from mfvpr.scoring import HistogramOfShifts
+from mfvpr.scoring.histogram import HistogramOfShifts
 
 HEADER = ("query", "answer", "shift_x", "shift_y", "low_x", "high_x", "low_y", "high_y", "scale")
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from mfvpr.declaration import declared
 from mfvpr.errors import InputError
-from mfvpr.scoring import Scorer
 from mfvpr.scoring.parameters import fit, with_parameters
+from mfvpr.scoring.scorer import Scorer
 from mfvpr.sweeping.settings import FUSION, Setting, grid
 
 MAX_DISTANCE = "max_distance"

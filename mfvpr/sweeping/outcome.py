@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mfvpr import evaluation
-from mfvpr.evaluation import Judge
+from mfvpr.evaluation.judging import Judge
 from mfvpr.evaluation.statistics import Estimate, McNemar, SignFlips, block_sign_flips, estimate, mcnemar
 from mfvpr.sweeping.axes import Axes
 

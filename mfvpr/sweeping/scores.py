@@ -15,8 +15,8 @@ from mfvpr.numerics import Device, available_cpus, compiled, held, knows_own_con
 from mfvpr.parameter_grids import score_settings
 from mfvpr.progress import Track, untracked
 from mfvpr.reranking import BIN_STEP, fuse_scales
-from mfvpr.scoring import Scorer, check_host, on_host, score_pairs
 from mfvpr.scoring.parameters import fit
+from mfvpr.scoring.scorer import Scorer, check_host, on_host, score_pairs
 from mfvpr.threads import ordered_map
 from mfvpr.types import Array, Matches, Shortlist
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from mfvpr.declaration import declared
 from mfvpr.errors import InputError
-from mfvpr.evaluation import Judge
+from mfvpr.evaluation.judging import Judge
 from mfvpr.match_sets import MatchSet, Scales
 from mfvpr.progress import Track, untracked
 from mfvpr.sweeping.axes import Axes

@@ -24,7 +24,7 @@ from mfvpr.match_sets import MatchSet, Scales, queries_that_fit, scales, shapes
 from mfvpr.numerics import Device, compiled
 from mfvpr.progress import Track, untracked
 from mfvpr.reranking import FilterScore, Ties, filter_scores, indexed
-from mfvpr.scoring import check_host, on_host
+from mfvpr.scoring.scorer import check_host, on_host
 from mfvpr.sweeping.scores import PaddedBatch, all_batches, fuse_all, scored
 from mfvpr.sweeping.settings import FUSION, Group, Setting, distinct, groups
 from mfvpr.types import Array, Matches, Shortlist, per_match, per_pair

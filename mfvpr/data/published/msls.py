@@ -12,7 +12,7 @@ from mfvpr.data.ground_truth import FARTHEST, FrameTruth, RadiusTruth
 from mfvpr.data.numbers import parse_number
 from mfvpr.data.published.lists import listed_images, read_names, read_rows
 from mfvpr.errors import InputError
-from mfvpr.evaluation import rows_within
+from mfvpr.evaluation.positives import rows_within
 
 CITIES = ("cph", "sf")
 REACH = 25.0  # meters, within which a query has to have an answer to be asked

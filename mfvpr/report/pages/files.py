@@ -17,7 +17,7 @@ import numpy as np
 
 from mfvpr.data.datasets import MEANS
 from mfvpr.errors import InputError, require_word
-from mfvpr.evaluation import Unit, middle, threshold_words
+from mfvpr.evaluation.truth import Unit, middle, threshold_words
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.file_names import file_names
 from mfvpr.report.tables import Table

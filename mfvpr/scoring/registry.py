@@ -1,0 +1,32 @@
+"""Scorers by name."""
+
+from mfvpr.scoring.aggregate import AggregatedScore
+from mfvpr.scoring.anchor import AnchorPoints
+from mfvpr.scoring.counting import MatchCount
+from mfvpr.scoring.grid import GridAnchors
+from mfvpr.scoring.histogram import HistogramOfShifts
+from mfvpr.scoring.homography import Homography
+from mfvpr.scoring.homography_opencv import OpenCvHomography
+from mfvpr.scoring.lost import LostScore
+from mfvpr.scoring.phrases import VisualPhrases
+from mfvpr.scoring.rapid import RapidSpatialScore
+
+SCORERS: dict[str, type] = {
+    "count": MatchCount,
+    "rapid": RapidSpatialScore,
+    "phrases": VisualPhrases,
+    "lost": LostScore,
+    "sum": AggregatedScore,
+    "anchor": AnchorPoints,
+    "histogram": HistogramOfShifts,
+    "grid": GridAnchors,
+    "homography": Homography,
+    "homography_opencv": OpenCvHomography,
+}
+"""The scores that programs know, by name. Their settings follow from their fields (`mfvpr.declaration`)."""
+
+PAPER = ("count", "sum", "anchor", "histogram")
+"""Those that are compared where nobody chooses."""
+
+ALONE = ("homography_opencv", "grid")
+"""Those that are not among all: OpenCV takes a second for a query, and not all features are cells of a grid."""

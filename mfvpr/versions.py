@@ -1,0 +1,17 @@
+"""Versions of the software that computes results."""
+
+import platform
+from functools import cache
+from importlib.metadata import version
+
+PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "opencv-python-headless", "pillow")
+
+
+@cache
+def versions() -> dict[str, str]:
+    """Versions of what computed the results."""
+    return {
+        "mfvpr": version("mfvpr"),
+        "python": platform.python_version(),
+        **{package: version(package) for package in PACKAGES},
+    }
