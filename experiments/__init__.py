@@ -1,1 +1,1 @@
-"""The programs: settings -> plain values -> mfvpr.pipeline."""
+"""The programs: settings -> plain values -> mfvpr.evaluation.stages."""

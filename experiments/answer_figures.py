@@ -9,7 +9,7 @@ import numpy as np
 from experiments import build
 from experiments.console import tell
 from experiments.settings import SettingsError
-from mfvpr.maps import Asked, Map
+from mfvpr.localization import Asked, Map
 from mfvpr.report.answers import answer_figure
 from mfvpr.report.file_names import file_names
 

@@ -4,16 +4,16 @@ from typing import Any
 
 from experiments import build
 from experiments.settings import SettingsError
-from mfvpr import sweeping
-from mfvpr.declaration import declared
-from mfvpr.errors import InputError
-from mfvpr.learning.parameters import can_learn
-from mfvpr.match_sets import MatchSet, Scales, block_bytes, scales
-from mfvpr.numerics import free_host_bytes
+from mfvpr.matching.match_set import MatchSet, Scales, block_bytes, scales
 from mfvpr.scoring import SCORERS
-from mfvpr.sweeping import Axes
-from mfvpr.sweeping.search import require_optuna
-from mfvpr.sweeping.sweep import SETTINGS_PER_BLOCK
+from mfvpr.scoring.fields import declared
+from mfvpr.tuning import sweeps
+from mfvpr.tuning.learning.parameters import can_learn
+from mfvpr.tuning.sweeps import Axes
+from mfvpr.tuning.sweeps.search import require_optuna
+from mfvpr.tuning.sweeps.sweep import SETTINGS_PER_BLOCK
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.numerics import free_host_bytes
 
 OF_MATCHES = ("max_distance", "c")  # what is no parameter of a scorer
 BYTES_PER_SETTING = 2000  # of Python's own, about
@@ -106,7 +106,7 @@ def require_memory(settings: dict[str, Any], varied: Axes, views: int, matches: 
     num_settings = varied.size + (dict(varied.own) not in varied.grid())
     _require(
         f"grid: rankings of {queries:,} queries by {num_settings:,} settings",
-        sweeping.result_bytes(views, num_settings, queries, max(settings["recall"]["ks"])),
+        sweeps.result_bytes(views, num_settings, queries, max(settings["recall"]["ks"])),
         "use fewer values, smaller recall.ks, or search=optuna",
     )
     chunk = settings["chunk"]

@@ -8,28 +8,28 @@ from typing import Any
 
 from experiments import console
 from experiments.settings import SettingsError
-from mfvpr.archive import Archive
-from mfvpr.data.datasets import Dataset, folder_dataset, sequences_dataset
-from mfvpr.data.ground_truth import CHOICES
-from mfvpr.data.published import published_dataset
-from mfvpr.data.streets import seasons_folder, streets_folder
-from mfvpr.data.streets.seasons import CONDITIONS, TRUTH
-from mfvpr.declaration import made
+from mfvpr.datasets.datasets import Dataset, folder_dataset, sequences_dataset
+from mfvpr.datasets.ground_truth import CHOICES
+from mfvpr.datasets.published import published_dataset
+from mfvpr.datasets.streets import seasons_folder, streets_folder
+from mfvpr.datasets.streets.seasons import CONDITIONS, TRUTH
 from mfvpr.features import Aggregated, Extractor
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
-from mfvpr.filters import Filter, Retrieval
-from mfvpr.fingerprints import fingerprint, recipe_of
-from mfvpr.frame_correlation import FrameCorrelation
-from mfvpr.imported import DescriptorFiles, FeatureFiles, File, ShortlistFiles
-from mfvpr.lightglue import LightGlueMatching
-from mfvpr.matchers import Matcher, Matching
-from mfvpr.named_weights import NAMED_WEIGHTS
-from mfvpr.rankings import Fusion
-from mfvpr.retrieval import ExactSearch, WhitenedSearch
+from mfvpr.matching.lightglue import LightGlueMatching
+from mfvpr.matching.matcher import Matcher, Matching
+from mfvpr.reranking.frame_correlation import FrameCorrelation
+from mfvpr.reranking.fusion import Fusion
+from mfvpr.retrieval.precomputed import DescriptorFiles, FeatureFiles, File, ShortlistFiles
+from mfvpr.retrieval.retriever import Filter, Retrieval
+from mfvpr.retrieval.search import ExactSearch, WhitenedSearch
 from mfvpr.scoring import SCORERS, Scorer
-from mfvpr.shards import Shard
-from mfvpr.weighting import WEIGHTS
+from mfvpr.scoring.fields import made
+from mfvpr.scoring.weight_registry import NAMED_WEIGHTS
+from mfvpr.scoring.weights import WEIGHTS
+from mfvpr.storage.feature_cache import Archive
+from mfvpr.storage.shards import Shard
+from mfvpr.utils.fingerprints import fingerprint, recipe_of
 
 
 def expanded(path: str) -> Path:
@@ -138,7 +138,7 @@ def _described(name: str, options: dict[str, Any]) -> Extractor:
     networks = ("netvlad", "patch_netvlad") if name == "netvlad" else (name,)
     model, size = _network("retrieval", networks, options.pop("weights")), tuple(options.pop("image_size"))
     if name == "dinov2":
-        from mfvpr.models.vit import TokenDescriptor
+        from mfvpr.networks.vit import TokenDescriptor
 
         model = TokenDescriptor(model, options.pop("pooling"), options.pop("power"))
     return GlobalDescriptor(model, size, **_only(options, GlobalDescriptor, f"retrieval={name}"))
@@ -156,7 +156,7 @@ def matching(settings: dict[str, Any]) -> Matcher:
 
 def _voting(options: dict[str, Any]) -> Filter:
     from mfvpr.features.ssm import STAGE1_FITTING, STAGE1_SIZE, SsmWindows
-    from mfvpr.voting import SsmVoting
+    from mfvpr.retrieval.ssm_voting import SsmVoting
 
     size, weights, whitening = options.pop("image_size"), options.pop("weights"), _fitting(options, STAGE1_FITTING)
     if tuple(size) != STAGE1_SIZE:
@@ -228,8 +228,8 @@ def frames(settings: dict[str, Any]) -> FrameCorrelation | None:
 
 def _network(group: str, names: str | tuple[str, ...], weights: str | None) -> Any:
     """The network, one of these, with its weights, converted before."""
-    from mfvpr.weights.files import load_model
-    from mfvpr.weights.registry import REGISTRY
+    from mfvpr.checkpoints.files import load_model
+    from mfvpr.checkpoints.registry import REGISTRY
 
     names = (names,) if isinstance(names, str) else names
     known = [entry.name for entry in REGISTRY.values() if entry.network in names]

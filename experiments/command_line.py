@@ -17,7 +17,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from experiments import meeting
+from experiments import distributed_launch
 from experiments.console import tell
 from experiments.data_sets import first_of
 from experiments.errors import on_interrupt, one_line
@@ -45,7 +45,7 @@ def run(program: Program, config: str) -> None:
             check(settings)
             own = [one for one in job.overrides.task if not one.startswith("launcher=")] if many else typed
             command = shlex.join(own)
-            with meeting.met(settings, PROGRAMS[config], own):
+            with distributed_launch.met(settings, PROGRAMS[config], own):
                 work = program()
                 _require_device()
                 about = {"multirun": many, "command": f"python -m experiments.{PROGRAMS[config]} {command}"}

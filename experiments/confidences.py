@@ -5,12 +5,12 @@ from typing import Any, NamedTuple
 
 from experiments import build, truth
 from experiments.console import tell
-from experiments.prepare import Images, num_candidates
 from experiments.settings import SettingsError
-from mfvpr.confidence import Confidence, read_confidences
-from mfvpr.evaluation import middle
+from experiments.stages import Images, num_candidates
+from mfvpr.datasets.truth import middle
+from mfvpr.evaluation.calibration import Confidence, read_confidences
 from mfvpr.report.evaluations import Judged
-from mfvpr.versions import versions
+from mfvpr.utils.versions import versions
 
 _NAMES = ("features", "retrieval", "scorer", "matching", "candidates", "fusion", "previous_queries", "cohort")
 

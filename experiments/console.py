@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from tqdm import tqdm
 
 if TYPE_CHECKING:  # or the command line would wait for JAX
-    from mfvpr.progress import Track
+    from mfvpr.utils.progress import Track
 
 
 def tell(text: str) -> None:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from experiments.errors import Parser, refuse, run_command
 
 if TYPE_CHECKING:
-    from mfvpr.data.contents import Contents
-    from mfvpr.data.datasets import Dataset, ImageFolder, QuerySequence
+    from mfvpr.datasets.contents import Contents
+    from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
 
 # Functions import what they need: --help and wrong usage need not wait for JAX.
 DATA = "python -m experiments.data"
@@ -44,9 +44,9 @@ def _parser() -> Parser:
 
 def list_data(names: list[str]) -> None:
     """Print a table, or what is known of some."""
-    from mfvpr.data.published import PUBLISHED
-    from mfvpr.errors import InputError
+    from mfvpr.datasets.published import PUBLISHED
     from mfvpr.report.tables import Table
+    from mfvpr.utils.errors import InputError
 
     for name in names:
         if name not in PUBLISHED and name not in _OTHERS:
@@ -70,11 +70,11 @@ def list_data(names: list[str]) -> None:
 def check(name: str, settings: list[str], sheet: Path | None) -> None:
     """Print counts beside the published ones and what is odd about the ground truth; draw pairs."""
     from experiments import data_sets
-    from experiments.prepare import dataset_of
-    from mfvpr.archive import Archive
-    from mfvpr.data.published import differences
+    from experiments.stages import dataset_of
+    from mfvpr.datasets.published import differences
     from mfvpr.report.contact_sheets import contact_sheet
     from mfvpr.report.tables import Table
+    from mfvpr.storage.feature_cache import Archive
 
     [chosen] = data_sets.composed("check", ":".join([name, *settings]))
     dataset = dataset_of(chosen)
@@ -98,7 +98,7 @@ def check(name: str, settings: list[str], sheet: Path | None) -> None:
 
 def _counts(dataset: "Dataset") -> Iterator[list[str]]:
     """Side, images, and how many are published."""
-    from mfvpr.data.published import PUBLISHED
+    from mfvpr.datasets.published import PUBLISHED
 
     entry = PUBLISHED.get(dataset.name)
     published = "-" if entry is None else f"{entry.database:,}"
@@ -112,9 +112,9 @@ def _counts(dataset: "Dataset") -> Iterator[list[str]]:
 def _unreadable(dataset: "Dataset") -> Iterator[list[str]]:
     """Why images of each side cannot be read, those that cannot."""
     from experiments import console
-    from mfvpr.errors import InputError
-    from mfvpr.numerics import available_cpus
-    from mfvpr.threads import ordered_map
+    from mfvpr.utils.errors import InputError
+    from mfvpr.utils.numerics import available_cpus
+    from mfvpr.utils.threads import ordered_map
 
     for side, folder in [("database", dataset.database), *((one.name, one.images) for one in dataset.sequences)]:
 
@@ -134,8 +134,8 @@ def _truth(sequence: "QuerySequence", queries: "Contents", database: "Contents")
     """What the ground truth of a sequence says, and how many of its queries are database images."""
     import numpy as np
 
-    from mfvpr.data.sequences import own_rows
-    from mfvpr.evaluation import threshold_words
+    from mfvpr.datasets.sequences import own_rows
+    from mfvpr.datasets.truth import threshold_words
 
     if sequence.truth is None:
         yield "no ground truth"

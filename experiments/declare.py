@@ -10,9 +10,9 @@ from typing import Any
 import yaml
 
 from experiments.settings import CONF
-from mfvpr.data.files import write_text
-from mfvpr.declaration import declared, summary
 from mfvpr.scoring import ALONE, PAPER, SCORERS
+from mfvpr.scoring.fields import declared, summary
+from mfvpr.utils.files import write_text
 
 _FIRST = "# Made by `make conf` from mfvpr/scoring: change it there.\n"
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NoReturn
 from experiments.settings import SettingsError
 
 if TYPE_CHECKING:  # it brings JAX along
-    from mfvpr.weights.registry import Entry
+    from mfvpr.checkpoints.registry import Entry
 
 WEIGHTS = "python -m experiments.weights"
 _INTERRUPTED = "\ninterrupted; nothing half-written was left, and what was finished is kept\n"
@@ -52,7 +52,7 @@ def one_line() -> Iterator[None]:
     except OSError as error:
         refuse(f"{error.filename or 'input or output'}: {error.strerror or error}")
     except ValueError as error:
-        from mfvpr.errors import InputError  # here, since it brings JAX along
+        from mfvpr.utils.errors import InputError  # here, since it brings JAX along
 
         if not isinstance(error, InputError):
             raise
@@ -61,7 +61,7 @@ def one_line() -> Iterator[None]:
 
 def with_command(error: Exception) -> str:
     """The message, and where weights are to be installed, how."""
-    from mfvpr.weights.files import WeightsError
+    from mfvpr.checkpoints.files import WeightsError
 
     return f"{error}: {how_to_install(error.entry)}" if isinstance(error, WeightsError) else str(error)
 

@@ -4,25 +4,25 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments import build, confidences, meeting, prepare, run_folder, sharding, truth
-from experiments.prepare import Images, Tools
+from experiments import build, confidences, distributed_launch, run_folder, sharding, stages, truth
 from experiments.settings import SettingsError
-from mfvpr import evaluations
-from mfvpr.data.datasets import Dataset
-from mfvpr.data.published import differences
-from mfvpr.evaluation import Unit
+from experiments.stages import Images, Tools
+from mfvpr.datasets.datasets import Dataset
+from mfvpr.datasets.published import differences
+from mfvpr.datasets.truth import Unit
+from mfvpr.evaluation import evaluation
 from mfvpr.features import Source
-from mfvpr.progress import Stopwatch
-from mfvpr.ranked import COHORT, FILTER, FRAMES
 from mfvpr.report import runs
 from mfvpr.report.confidences import Assured, confidence_figures, confidence_table, write_confidence
 from mfvpr.report.differences import write_gains
 from mfvpr.report.evaluations import Figure, Judged, figures, recall_table, write_rankings, write_skipped
 from mfvpr.report.shifts import write_shifts
+from mfvpr.reranking.results import COHORT, FILTER, FRAMES
 from mfvpr.scoring import HistogramOfShifts
-from mfvpr.shards import NotYet
-from mfvpr.sinks import open_sinks
-from mfvpr.versions import versions
+from mfvpr.storage.feature_writers import open_sinks
+from mfvpr.storage.shards import NotYet
+from mfvpr.utils.progress import Stopwatch
+from mfvpr.utils.versions import versions
 
 _THRESHOLDS: dict[Unit, str] = {"frames": "tolerance", "m": "radius"}  # their names in results
 
@@ -57,7 +57,7 @@ def evaluate(settings: dict[str, Any]) -> None:
                 done, then = ("its part", "the last shard leaves the results")
             print(f"shard {settings['shard']} has done {done}: {needs}; {then}")
             return
-        meeting.part()
+        distributed_launch.part()
         with sharding.last(settings) as is_last:
             if is_last:
                 with run_folder.claimed(settings, own=True, beside=[sharding.SHARDS]) as folder:
@@ -80,7 +80,7 @@ def evaluated(settings: dict[str, Any]) -> Outcome:
     scorers, watch, confidence = build.scorers(settings["scorer"]), Stopwatch(), confidences.read(settings)
     fusion, main = build.fusion(settings), "histogram" if "histogram" in scorers else next(iter(scorers))
     fusion.check(main, scorers)
-    tools, images = prepare.begun(settings, watch)
+    tools, images = stages.begun(settings, watch)
     sharding.check_data(settings, images)
     shown = asked_figures(settings["figures"], images.dataset)
     combined, histogram = fusion.system(main), scorers.get("histogram")
@@ -90,7 +90,7 @@ def evaluated(settings: dict[str, Any]) -> Outcome:
         alone.append(f"{main} + {COHORT}")
     fusions = {name: fusion.renamed(main, name) for name in alone}
     confidence = confidences.check(confidence, headline, settings, images)
-    result = evaluations.evaluate(
+    result = evaluation.evaluate(
         images.dataset, tools.extractor, tools.filter, scorers, candidates=settings["candidates"],
         matching=tools.matching, fused=fusions, cohort=cohort,
         correlated={headline: frames} if frames else {}, ties=settings["ties"], archive=tools.archive, watch=watch,

@@ -5,23 +5,23 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments import build, console, data_sets, prepare, run_folder, truth
+from experiments import build, console, data_sets, run_folder, stages, truth
 from experiments.axes import learnable, own_c
-from experiments.prepare import Images
 from experiments.settings import SettingsError
-from mfvpr.data.files import write_text
-from mfvpr.data.sequences import own_rows
-from mfvpr.fingerprints import fingerprint, recipe_of
-from mfvpr.learned_weight import ABSOLUTE, RELATIVE
-from mfvpr.learning.comparison import Checkpoints, compare
-from mfvpr.learning.data_sets import Part, joined
-from mfvpr.learning.losses import LOSSES
-from mfvpr.learning.teaching import Options
-from mfvpr.match_sets import Scales
-from mfvpr.progress import Stopwatch
+from experiments.stages import Images
+from mfvpr.datasets.sequences import own_rows
+from mfvpr.matching.match_set import Scales
 from mfvpr.report import comparisons, runs
 from mfvpr.scoring import Scorer
-from mfvpr.versions import versions
+from mfvpr.scoring.learned_weight import ABSOLUTE, RELATIVE
+from mfvpr.tuning.learning.comparison import Checkpoints, compare
+from mfvpr.tuning.learning.data_sets import Part, joined
+from mfvpr.tuning.learning.losses import LOSSES
+from mfvpr.tuning.learning.teaching import Options
+from mfvpr.utils.files import write_text
+from mfvpr.utils.fingerprints import fingerprint, recipe_of
+from mfvpr.utils.progress import Stopwatch
+from mfvpr.utils.versions import versions
 
 _INPUTS = {"relative": RELATIVE, "absolute": ABSOLUTE}
 
@@ -87,12 +87,12 @@ def _each(settings: dict[str, Any]) -> Iterator[dict[str, Any]]:
 def _prepared(settings: dict[str, Any], watch: Stopwatch) -> Prepared:
     if len(sizes := settings["features"].get("patch_sizes", [])) > 1:
         raise SettingsError(f"features.patch_sizes={sizes}: expected one size, since learning knows one scale")
-    tools, images = prepare.begun(settings, watch)
+    tools, images = stages.begun(settings, watch)
     judge = truth.judge(settings, images.dataset)
-    matches, candidates = prepare.matched(settings, tools, images, watch)
+    matches, candidates = stages.matched(settings, tools, images, watch)
     if isinstance(matches, Scales):
         raise ValueError("expected features of one scale, since learning knows one")
-    recipe = prepare.recipe(tools, images, candidates.mask.shape[1])
+    recipe = stages.recipe(tools, images, candidates.mask.shape[1])
     part = Part(data_sets.label(settings["dataset"]), judge, matches, candidates)
     return Prepared(part, images, recipe, truth.described(settings, images.dataset))
 

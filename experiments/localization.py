@@ -9,15 +9,15 @@ import numpy as np
 
 from experiments import build, confidences, maps
 from experiments.answer_figures import AnswerFigures
-from experiments.asked_images import images
 from experiments.console import tell
+from experiments.query_images import images
 from experiments.settings import SettingsError
-from mfvpr.confidence import Confidence, read_confidences
-from mfvpr.data.files import printable
-from mfvpr.data.images import read_image
-from mfvpr.errors import InputError
-from mfvpr.maps import Answer, Asked, Drive, Map, Route
-from mfvpr.stores.maps import Entry
+from mfvpr.datasets.images import read_image
+from mfvpr.evaluation.calibration import Confidence, read_confidences
+from mfvpr.localization import Answer, Asked, Drive, Map, Route
+from mfvpr.storage.maps import Entry
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import printable
 
 
 def localize(settings: dict[str, Any]) -> None:

@@ -27,7 +27,7 @@ def build() -> Callable[[dict[str, Any]], None]:
     def job(settings: dict[str, Any]) -> None:
         from experiments import maps
         from experiments.console import track
-        from experiments.prepare import dataset_of
+        from experiments.stages import dataset_of
 
         known = maps.made(settings)
         added = known.build(dataset_of(settings["dataset"]).database, track=track("images"))
@@ -60,7 +60,7 @@ def info(folder: Path) -> None:
     import json
 
     from experiments import maps
-    from mfvpr.stores.disk import used_bytes
+    from mfvpr.storage.disk import used_bytes
 
     settings, known = maps.read(folder), maps.opened(folder)
     print(f"{folder}: {len(known)} images, {used_bytes(folder) / 1e6:.1f} MB")
@@ -70,7 +70,7 @@ def info(folder: Path) -> None:
 def add(folder: Path, images: list[Path], place: str | None) -> None:
     """Add files under their absolute paths."""
     from experiments import maps
-    from mfvpr.data.files import printable
+    from mfvpr.utils.files import printable
 
     known = maps.opened(folder)
     for path in images:

@@ -7,9 +7,9 @@ from typing import Any
 
 from experiments import build
 from experiments.settings import SettingsError, check
-from mfvpr.data.files import written_once
 from mfvpr.features import Aggregated
-from mfvpr.maps import Map
+from mfvpr.localization import Map
+from mfvpr.utils.files import written_once
 
 SETTINGS = "settings.json"
 _FORMAT = "mfvpr map 1"

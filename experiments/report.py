@@ -31,9 +31,9 @@ def _parser() -> Parser:
 
 def write(folders: list[Path], out: Path | None) -> None:
     """The page of one run, or of several; says where it is."""
-    from mfvpr.data.files import printable
     from mfvpr.report.pages.one_run import write_report
     from mfvpr.report.pages.several_runs import write_comparison
+    from mfvpr.utils.files import printable
 
     if len(folders) == 1:
         path = write_report(folders[0], out)

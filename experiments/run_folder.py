@@ -7,11 +7,11 @@ from typing import Any
 
 from experiments import build, console
 from experiments.settings import SettingsError
-from mfvpr.errors import InputError
 from mfvpr.report import runs
 from mfvpr.report.pages import one_run
 from mfvpr.report.runs import Figure
-from mfvpr.versions import versions
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.versions import versions
 
 _OF_THE_START = ("multirun", "command")  # what `command_line` adds to the settings
 

@@ -4,16 +4,16 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from experiments import build, console, prepare, run_folder, truth
+from experiments import build, console, run_folder, stages, truth
 from experiments.axes import as_final, require_memory, searchable
-from mfvpr import sweeping
-from mfvpr.data.files import write_text
-from mfvpr.fingerprints import fingerprint
-from mfvpr.progress import Stopwatch
 from mfvpr.report import runs, sweeps
-from mfvpr.sweeping import Outcome
+from mfvpr.tuning import sweeps as sweeping
+from mfvpr.tuning.sweeps import Outcome
 from mfvpr.types import Shortlist
-from mfvpr.versions import versions
+from mfvpr.utils.files import write_text
+from mfvpr.utils.fingerprints import fingerprint
+from mfvpr.utils.progress import Stopwatch
+from mfvpr.utils.versions import versions
 
 
 def sweep(settings: dict[str, Any]) -> None:
@@ -22,9 +22,9 @@ def sweep(settings: dict[str, Any]) -> None:
     with run_folder.claimed(settings) as folder:
         varied = searchable(settings)
         watch = Stopwatch()
-        tools, images = prepare.begun(settings, watch)
+        tools, images = stages.begun(settings, watch)
         judge = truth.judge(settings, images.dataset)
-        matches, candidates = prepare.matched(settings, tools, images, watch)
+        matches, candidates = stages.matched(settings, tools, images, watch)
         kept = _kept(settings, tools, images, candidates)
         options = {
             "ks": settings["recall"]["ks"], "ties": settings["ties"],
@@ -58,11 +58,11 @@ def sweep(settings: dict[str, Any]) -> None:
         shutil.rmtree(kept, ignore_errors=True)
 
 
-def _kept(settings: dict[str, Any], tools: prepare.Tools, images: prepare.Images, candidates: Shortlist) -> Path | None:
+def _kept(settings: dict[str, Any], tools: stages.Tools, images: stages.Images, candidates: Shortlist) -> Path | None:
     """Where an interrupted sweep goes on: its finished blocks on these matches, by this version."""
     if settings["store"] is None:
         return None
-    recipe = prepare.recipe(tools, images, candidates.mask.shape[1])
+    recipe = stages.recipe(tools, images, candidates.mask.shape[1])
     names = ("scorer", "grid", "search", "trials", "seed", "split", "recall", "ties", "fusion")
     own = {name: settings[name] for name in names}  # or another sweep that ends would take away what this one needs
     software = {name: versions()[name] for name in ("mfvpr", "jax", "numpy")}
@@ -70,7 +70,7 @@ def _kept(settings: dict[str, Any], tools: prepare.Tools, images: prepare.Images
     return build.expanded(settings["store"]) / f"{settings['dataset']['name']}_sweep-{name}"
 
 
-def _heading(settings: dict[str, Any], images: prepare.Images, outcome: Outcome) -> str:
+def _heading(settings: dict[str, Any], images: stages.Images, outcome: Outcome) -> str:
     dataset, features = images.dataset, settings["features"]
     right = truth.in_words(truth.described(settings, dataset))
     size = " at {} x {} px".format(*features["image_size"]) if features["image_size"] else ""  # files may have others
@@ -82,7 +82,7 @@ def _heading(settings: dict[str, Any], images: prepare.Images, outcome: Outcome)
 
 
 def _results(
-    settings: dict[str, Any], images: prepare.Images, outcome: Outcome, seconds: dict[str, float]
+    settings: dict[str, Any], images: stages.Images, outcome: Outcome, seconds: dict[str, float]
 ) -> dict[str, Any]:
     return {
         "dataset": images.dataset.name, "data_fingerprint": images.fingerprints, "reading": images.reading,

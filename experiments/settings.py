@@ -245,7 +245,7 @@ def scorer_rules(file: Path) -> dict[str, dict[str, Rule]]:
 
 
 def _within(*, length: int = 0, optional: bool = False, file: str = "", **limits: list[Any]) -> Rule:
-    """The rule of `mfvpr.declaration.Parameter.limits`."""
+    """The rule of `mfvpr.scoring.fields.Parameter.limits`."""
     [(kind, values)] = limits.items()
     rule = {"choices": one_of, "whole": between, "number": number}[kind](*values)
     rule = or_file(rule, file) if file else rule

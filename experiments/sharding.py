@@ -18,14 +18,14 @@ from pathlib import Path
 from typing import Any
 
 from experiments import build, truth
-from experiments.prepare import Images
 from experiments.settings import SettingsError
-from mfvpr.data.files import write_text, written_once
-from mfvpr.fingerprints import difference
+from experiments.stages import Images
 from mfvpr.report import runs
-from mfvpr.shards import NotYet, Shard
-from mfvpr.stores.disk import locked
-from mfvpr.versions import versions
+from mfvpr.storage.disk import locked
+from mfvpr.storage.shards import NotYet, Shard
+from mfvpr.utils.files import write_text, written_once
+from mfvpr.utils.fingerprints import difference
+from mfvpr.utils.versions import versions
 
 SHARDS = "shards"
 COMPLETE = "complete"

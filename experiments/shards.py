@@ -41,7 +41,7 @@ def status(folder: Path) -> None:
 def missing(folder: Path) -> None:
     """Print the expression."""
     from experiments import sharding
-    from mfvpr.shards import indices
+    from mfvpr.storage.shards import indices
 
     if left := indices(sharding.missing(folder)):
         print(left)

@@ -4,9 +4,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from experiments.settings import SettingsError
-from mfvpr import evaluation, fingerprints
-from mfvpr.data.datasets import Dataset
-from mfvpr.evaluation import Judge, Truth
+from mfvpr import evaluation
+from mfvpr.datasets.datasets import Dataset
+from mfvpr.datasets.truth import Truth
+from mfvpr.evaluation import Judge
+from mfvpr.utils import fingerprints
 
 _FILES = ("index_file", "query_labels", "database_labels")
 _WORDS = {"order": "file order", "utm": "positions in the names", "drawn": "drawn with the images",

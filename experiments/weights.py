@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from experiments.errors import WEIGHTS, Parser, how_to_install, refuse, run_command, with_command
 
 if TYPE_CHECKING:
-    from mfvpr.weights.registry import Entry
+    from mfvpr.checkpoints.registry import Entry
 
 # Functions import what they need: --help and wrong usage need not wait for JAX.
 _CHUNK = 1 << 18
@@ -46,9 +46,9 @@ def _parser() -> Parser:
 
 def list_weights() -> None:
     """Print a table of the registry."""
+    from mfvpr.checkpoints.files import is_installed
+    from mfvpr.checkpoints.registry import REGISTRY
     from mfvpr.report.tables import Table
-    from mfvpr.weights.files import is_installed
-    from mfvpr.weights.registry import REGISTRY
 
     header = ["name", "network", "official file", "license of code", "of weights", "installed", "MB"]
     rows = []
@@ -62,7 +62,7 @@ def list_weights() -> None:
 
 def convert(file: Path, name: str | None) -> None:
     """Install an official checkpoint."""
-    from mfvpr.weights.files import install, read_manifest
+    from mfvpr.checkpoints.files import install, read_manifest
 
     entry = _recognized(file, name)
     if file.is_file() and (megabytes := file.stat().st_size >> 20) > _LARGE:
@@ -75,9 +75,9 @@ def convert(file: Path, name: str | None) -> None:
 
 def verify(names: Iterable[str]) -> None:
     """Check runtime files against their manifests, and downloaded checkpoints against the published hashes."""
-    from mfvpr.errors import InputError
-    from mfvpr.weights.files import weights_folder
-    from mfvpr.weights.registry import REGISTRY, entry_of
+    from mfvpr.checkpoints.files import weights_folder
+    from mfvpr.checkpoints.registry import REGISTRY, entry_of
+    from mfvpr.utils.errors import InputError
 
     there = [entry for entry in REGISTRY.values() if _runtime_present(entry) or _original_present(entry)]
     entries = [entry_of(name) for name in names] or there
@@ -96,9 +96,9 @@ def verify(names: Iterable[str]) -> None:
 
 def download(name: str) -> None:
     """Fetch an official checkpoint into the weights folder; it gets its name once its hash is right."""
-    from mfvpr.errors import InputError
-    from mfvpr.weights.files import file_sha256, weights_folder
-    from mfvpr.weights.registry import entry_of
+    from mfvpr.checkpoints.files import file_sha256, weights_folder
+    from mfvpr.checkpoints.registry import entry_of
+    from mfvpr.utils.errors import InputError
 
     entry = entry_of(name)
     if entry.sha256 is None:
@@ -122,9 +122,9 @@ def _fetch(entry: "Entry", target: Path) -> None:
 
     from tqdm import tqdm
 
-    from mfvpr.data.files import replacing
-    from mfvpr.errors import InputError
-    from mfvpr.weights.files import check_sha256
+    from mfvpr.checkpoints.files import check_sha256
+    from mfvpr.utils.errors import InputError
+    from mfvpr.utils.files import replacing
 
     digest = hashlib.sha256()
     try:
@@ -147,8 +147,8 @@ def _fetch(entry: "Entry", target: Path) -> None:
 
 
 def _recognized(file: Path, name: str | None) -> "Entry":
-    from mfvpr.errors import InputError
-    from mfvpr.weights.registry import REGISTRY, entry_of
+    from mfvpr.checkpoints.registry import REGISTRY, entry_of
+    from mfvpr.utils.errors import InputError
 
     if name is not None:
         return entry_of(name)
@@ -161,13 +161,13 @@ def _recognized(file: Path, name: str | None) -> "Entry":
 
 
 def _runtime_present(entry: "Entry") -> bool:
-    from mfvpr.weights.files import weights_folder
+    from mfvpr.checkpoints.files import weights_folder
 
     return any((weights_folder() / f"{entry.name}{suffix}").exists() for suffix in (".safetensors", ".json"))
 
 
 def _original_present(entry: "Entry") -> bool:
-    from mfvpr.weights.files import weights_folder
+    from mfvpr.checkpoints.files import weights_folder
 
     return entry.sha256 is not None and (weights_folder() / entry.file).exists()
 
@@ -178,8 +178,8 @@ def _verified(entry: "Entry") -> str:
     Raises:
         InputError: what is not.
     """
-    from mfvpr.errors import InputError
-    from mfvpr.weights.files import check_published, load_model, read_manifest, weights_folder
+    from mfvpr.checkpoints.files import check_published, load_model, read_manifest, weights_folder
+    from mfvpr.utils.errors import InputError
 
     good = []
     original = weights_folder() / entry.file

@@ -2,23 +2,22 @@
 
 Images become features; features become a shortlist and matches; matches become scores; scores become a ranking;
 rankings become recall. `evaluate` goes the whole way over a data set, a `Map` is asked with one image at a time; the
-other names below are the core of that sentence, on arrays. `mfvpr.data`, `mfvpr.features`, `mfvpr.filters`,
-`mfvpr.archive` and `mfvpr.report` put it to work on images and files. `value`, `Scorer` and what follows from them is
-what a scorer of your own is written with; `mfvpr.testing.check_scorer` says whether it keeps the contract.
+other names below are the core of that sentence, on arrays. The packages put it to work on images and files. `value`,
+`Scorer` and what follows from them is what a scorer of your own is written with; `mfvpr.testing.check_scorer` says
+whether it keeps the contract.
 """
 
 from typing import TYPE_CHECKING, Any
 
-from mfvpr.errors import InputError
-from mfvpr.evaluation.positives import frame_positives, radius_positives
+from mfvpr.datasets.positives import frame_positives, radius_positives
 from mfvpr.evaluation.recall import recall_at_k
-from mfvpr.lightglue import LightGlueMatching
-from mfvpr.matchers import Matcher, Matching, match_pairs
-from mfvpr.matching import compact, filter_matches, match, match_candidates
-from mfvpr.numerics import masked, masked_mean, masked_median, safe_sqrt
-from mfvpr.parameter_grids import score_grid
-from mfvpr.reranking import balancing_c, combine, rank, rerank, score_candidates
-from mfvpr.retrieval import retrieve
+from mfvpr.matching.lightglue import LightGlueMatching
+from mfvpr.matching.matcher import Matcher, Matching, match_pairs
+from mfvpr.matching.nearest_neighbors import compact, filter_matches, match, match_candidates
+from mfvpr.matching.soft import soft_match
+from mfvpr.reranking.grids import score_grid
+from mfvpr.reranking.ranking import balancing_c, combine, rank, rerank, score_candidates
+from mfvpr.retrieval.search import retrieve
 from mfvpr.scoring.aggregate import AggregatedScore
 from mfvpr.scoring.anchor import AnchorPoints
 from mfvpr.scoring.counting import MatchCount
@@ -31,9 +30,7 @@ from mfvpr.scoring.phrases import VisualPhrases
 from mfvpr.scoring.rapid import RapidSpatialScore
 from mfvpr.scoring.scorer import Scorer
 from mfvpr.scoring.shifts import image_sizes, match_shifts
-from mfvpr.soft_matching import soft_match
-from mfvpr.types import Features, Matches, Ranking, Shortlist, value
-from mfvpr.weighting import (
+from mfvpr.scoring.weights import (
     DescriptorDistanceWeight,
     FeatureScoreWeight,
     RatioWeight,
@@ -41,10 +38,13 @@ from mfvpr.weighting import (
     Weight,
     match_weights,
 )
+from mfvpr.types import Features, Matches, Ranking, Shortlist, value
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.numerics import masked, masked_mean, masked_median, safe_sqrt
 
 if TYPE_CHECKING:
-    from mfvpr.evaluations import evaluate
-    from mfvpr.maps.map import Map
+    from mfvpr.evaluation.evaluation import evaluate
+    from mfvpr.localization.map import Map
 
 __version__ = "0.2.0"
 
@@ -107,7 +107,7 @@ def __getattr__(name: str) -> Any:
     """`evaluate` and `Map`, once they are asked for: images take longer to import than arrays."""
     if name not in ("evaluate", "Map"):
         raise AttributeError(f"module 'mfvpr' has no attribute {name!r}")
-    from mfvpr.evaluations import evaluate
-    from mfvpr.maps.map import Map
+    from mfvpr.evaluation.evaluation import evaluate
+    from mfvpr.localization.map import Map
 
     return evaluate if name == "evaluate" else Map

@@ -12,12 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mfvpr.errors import NoGradientError
-from mfvpr.numerics import holds_function
-from mfvpr.reranking import score_candidates
+from mfvpr.reranking.ranking import score_candidates
 from mfvpr.scoring.parameters import fit
 from mfvpr.scoring.scorer import Scorer, on_host
 from mfvpr.types import Array, Matches, per_match
+from mfvpr.utils.errors import NoGradientError
+from mfvpr.utils.numerics import holds_function
 
 SLOTS = 48
 COUNTS = (0, 1, 2, 17, 40)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mfvpr.weights.checkpoint import read_checkpoint
+from mfvpr.checkpoints.checkpoint import read_checkpoint
 
 SHARED = Path(__file__).parent.parent.parent / "shared" / "weights"
 ALIKED, LIGHTGLUE = SHARED / "aliked", SHARED / "lightglue" / "aliked_lightglue.pth"

@@ -11,11 +11,11 @@ import jax
 import pytest
 from hypothesis import settings
 
-from mfvpr.data.streets import streets_folder
-from mfvpr.weights.conversion import convert
-from mfvpr.weights.files import save
-from mfvpr.weights.networks import blueprint, network_of
-from mfvpr.weights.registry import entry_of
+from mfvpr.checkpoints.conversion import convert
+from mfvpr.checkpoints.files import save
+from mfvpr.checkpoints.networks import blueprint, network_of
+from mfvpr.checkpoints.registry import entry_of
+from mfvpr.datasets.streets import streets_folder
 from tests import checkpoints
 
 gc.set_threshold(50_000, 20, 100)  # tracing makes many objects, and the usual thresholds collect too often

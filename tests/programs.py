@@ -14,11 +14,11 @@ from pathlib import Path
 import hydra
 from omegaconf import OmegaConf
 
-from experiments import prepare
+from experiments import stages
 from experiments.launch import launch
 from experiments.settings import CONF
-from mfvpr.data.streets import streets_folder
-from mfvpr.stores.manifest import MATCHES, store_path
+from mfvpr.datasets.streets import streets_folder
+from mfvpr.storage.manifest import MATCHES, store_path
 
 ROOT = Path(__file__).parent.parent
 QUICK = ("figures=0", "features.max_keypoints=100", "retrieval.num_words=8")
@@ -67,8 +67,8 @@ def small(root, *more):
 
 def matches_path(settings):
     """Where a program keeps the matches of its data set, and their recipe."""
-    tools, images = prepare.begun(settings, prepare.Stopwatch())
-    recipe = prepare.recipe(tools, images, settings["candidates"])
+    tools, images = stages.begun(settings, stages.Stopwatch())
+    recipe = stages.recipe(tools, images, settings["candidates"])
     return store_path(tools.archive.root, "matches", recipe, MATCHES), recipe
 
 

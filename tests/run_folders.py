@@ -6,12 +6,12 @@ import numpy as np
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from mfvpr.data.files import printable
 from mfvpr.report.evaluations import ABOUT, sequence_folder
 from mfvpr.report.file_names import file_names
 from mfvpr.report.rankings import Rankings, write_csv, write_failures, write_predictions
 from mfvpr.report.runs import write_json
 from mfvpr.report.tables import Table
+from mfvpr.utils.files import printable
 
 HOSTILE = (
     "<img src=x onerror=alert(1)>.png",

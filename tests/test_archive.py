@@ -9,19 +9,20 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mfvpr import archive as archive_module
-from mfvpr import match, pipeline
-from mfvpr.archive import Archive
-from mfvpr.data.datasets import image_folder
-from mfvpr.errors import InputError
+from mfvpr import match
+from mfvpr.datasets.datasets import image_folder
+from mfvpr.evaluation import stages
 from mfvpr.features import Aggregated, Description, Scale
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
-from mfvpr.fingerprints import recipe_of
-from mfvpr.retrieval import EXACT
-from mfvpr.stores import vectors
-from mfvpr.stores.features import forecast_bytes, open_store
+from mfvpr.retrieval.search import EXACT
+from mfvpr.storage import feature_cache as archive_module
+from mfvpr.storage import vectors
+from mfvpr.storage.feature_cache import Archive
+from mfvpr.storage.features import forecast_bytes, open_store
 from mfvpr.types import Features
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.fingerprints import recipe_of
 from tests.builders import make_features
 from tests.stores.made_up import assert_same
 
@@ -324,11 +325,11 @@ def test_features_of_ones_own_are_matched_as_they_are():
     rng = np.random.default_rng(0)
     images = [make_features(rng, count, capacity=40) for count in (7, 0, 40, 33)]
     images[2] = replace(images[2], descriptors=images[2].descriptors.astype(np.float16).astype(np.float32))
-    found = pipeline.FeatureSet.of(images)
+    found = stages.FeatureSet.of(images)
     assert len(found) == 4
     assert found.counts.tolist() == [7, 0, 40, 33]
     candidates = EXACT.shortlist(np.eye(4, dtype=np.float32), np.ones((4, 4), np.float32) / 2, 4)
-    matches = pipeline.match(found, found, candidates)
+    matches = stages.match(found, found, candidates)
     for query, row in ((0, 2), (2, 3), (3, 0), (1, 2)):
         alone = match(images[query], images[row])
         place = candidates.indices[query].tolist().index(row)
@@ -346,13 +347,13 @@ def test_features_of_ones_own_are_matched_as_they_are():
 def test_features_of_ones_own_that_do_not_fit_are_told(change, words):
     image = replace(make_features(np.random.default_rng(0), 5), **change)
     with pytest.raises(InputError, match=words):
-        pipeline.FeatureSet.of([image])
+        stages.FeatureSet.of([image])
     with pytest.raises(InputError, match="at least one image"):
-        pipeline.FeatureSet.of([])
+        stages.FeatureSet.of([])
 
 
 def test_descriptors_are_of_unit_length_only_where_that_is_asked():
     image = make_features(np.random.default_rng(0), 5)
     longer = replace(image, descriptors=3 * image.descriptors)
-    found = pipeline.FeatureSet.of([longer], unit_length=False)
+    found = stages.FeatureSet.of([longer], unit_length=False)
     np.testing.assert_array_equal(found[0].descriptors, longer.descriptors)

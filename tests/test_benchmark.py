@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 
 from experiments.benchmark.__main__ import BENCHMARKS
-from mfvpr.data.datasets import folder_dataset
-from mfvpr.errors import InputError
-from mfvpr.evaluations import evaluate
+from mfvpr.checkpoints.networks import NETWORKS, Network, blueprint, network_of
+from mfvpr.checkpoints.registry import entry_of
+from mfvpr.checkpoints.tables import SELAVPR
+from mfvpr.datasets.datasets import folder_dataset
+from mfvpr.evaluation.evaluation import evaluate
 from mfvpr.features import Aggregated, Description
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
-from mfvpr.filters import Retrieval
-from mfvpr.models.selavpr import SelaVpr
+from mfvpr.networks.selavpr import SelaVpr
+from mfvpr.retrieval.retriever import Retrieval
 from mfvpr.scoring import MatchCount
 from mfvpr.types import Shortlist
-from mfvpr.weights.networks import NETWORKS, Network, blueprint, network_of
-from mfvpr.weights.registry import entry_of
-from mfvpr.weights.tables import SELAVPR
+from mfvpr.utils.errors import InputError
 from tests import checkpoints
 
 pytestmark = pytest.mark.slow
@@ -396,8 +396,8 @@ def test_shifts_of_a_drawn_street_are_near_the_true_ones(tmp_path, monkeypatch, 
 def test_lightglue_matches_what_candidates_have_in_common(monkeypatch):
     """Early stop or not; of the keypoints that are moved all alike, most."""
     from experiments.benchmark import lightglue
-    from mfvpr.weights.checkpoint import read_checkpoint
-    from mfvpr.weights.conversion import convert
+    from mfvpr.checkpoints.checkpoint import read_checkpoint
+    from mfvpr.checkpoints.conversion import convert
 
     if not checkpoints.LIGHTGLUE.is_file():
         pytest.skip("no ../shared/weights: weights do not ship with the project")

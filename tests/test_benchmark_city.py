@@ -8,8 +8,8 @@ import pytest
 from experiments.benchmark import city
 from experiments.benchmark.made_up import MadeUp
 from experiments.benchmark.projection import Rates, projected
-from mfvpr.stores.features import open_store
-from mfvpr.stores.manifest import store_path
+from mfvpr.storage.features import open_store
+from mfvpr.storage.manifest import store_path
 
 pytestmark = pytest.mark.slow
 

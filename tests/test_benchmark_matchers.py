@@ -6,13 +6,13 @@ import pytest
 
 from experiments.benchmark import matchers
 from mfvpr import MatchCount, Matching
-from mfvpr.data.datasets import folder_dataset
-from mfvpr.evaluations import evaluate
+from mfvpr.checkpoints.files import load_model
+from mfvpr.datasets.datasets import folder_dataset
+from mfvpr.evaluation.evaluation import evaluate
 from mfvpr.features import Aggregated
 from mfvpr.features.aliked import AlikedFeatures
 from mfvpr.features.vlad import VladFitting
-from mfvpr.filters import Retrieval
-from mfvpr.weights.files import load_model
+from mfvpr.retrieval.retriever import Retrieval
 from tests import checkpoints
 
 pytestmark = pytest.mark.slow

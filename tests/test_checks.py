@@ -9,20 +9,20 @@ import pytest
 from PIL import Image
 
 import mfvpr
-from mfvpr import pipeline
-from mfvpr.archive import Archive
-from mfvpr.data.datasets import folder_dataset, image_folder
-from mfvpr.data.ground_truth import FrameTruth
-from mfvpr.errors import InputError
+from mfvpr.datasets.datasets import folder_dataset, image_folder
+from mfvpr.datasets.ground_truth import FrameTruth
+from mfvpr.evaluation import stages
 from mfvpr.features import Aggregated, Description
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
-from mfvpr.filters import Filtered, Retrieval
-from mfvpr.frame_correlation import FrameCorrelation
-from mfvpr.matchers import Matching
-from mfvpr.rankings import Fusion
-from mfvpr.retrieval import EXACT, WhitenedSearch
+from mfvpr.matching.matcher import Matching
+from mfvpr.reranking.frame_correlation import FrameCorrelation
+from mfvpr.reranking.fusion import Fusion
+from mfvpr.retrieval.retriever import Filtered, Retrieval
+from mfvpr.retrieval.search import EXACT, WhitenedSearch
+from mfvpr.storage.feature_cache import Archive
 from mfvpr.types import Shortlist
+from mfvpr.utils.errors import InputError
 
 pytestmark = pytest.mark.thorough
 
@@ -168,7 +168,7 @@ class Negative(mfvpr.HistogramOfShifts):
 def test_a_scorer_on_top_of_ours_scores_as_it_says(dataset):
     scorers = HISTOGRAM | {"negative": Negative(), "flat": mfvpr.HistogramOfShifts(shift_range=(100.0, 0.0))}
     [matched] = evaluated(dataset, scorers=scorers).matched
-    scores = pipeline.score(scorers, matched.by_scale, matched.candidates)
+    scores = stages.score(scorers, matched.by_scale, matched.candidates)
     np.testing.assert_allclose(scores["negative"], -scores["histogram"], rtol=1e-6)
     assert (scores["histogram"] > 0).any()
 

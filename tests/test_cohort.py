@@ -7,20 +7,20 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr import pipeline
-from mfvpr.archive import Archive
-from mfvpr.cohort import PRIOR, by_hubness, cohort_sequence, hubness
-from mfvpr.data.contents import Content, Contents
-from mfvpr.data.datasets import ImageFolder, folder_dataset
-from mfvpr.errors import InputError
+from mfvpr.datasets.contents import Content, Contents
+from mfvpr.datasets.datasets import ImageFolder, folder_dataset
+from mfvpr.evaluation import stages
+from mfvpr.evaluation.sequence_matching import match_cohort
 from mfvpr.features import Aggregated
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
-from mfvpr.filters import Retrieval
-from mfvpr.frame_correlation import FrameCorrelation
-from mfvpr.rankings import Fusion
-from mfvpr.sequence_matching import match_cohort
+from mfvpr.reranking.cohort_normalization import PRIOR, by_hubness, cohort_sequence, hubness
+from mfvpr.reranking.frame_correlation import FrameCorrelation
+from mfvpr.reranking.fusion import Fusion
+from mfvpr.retrieval.retriever import Retrieval
+from mfvpr.storage.feature_cache import Archive
 from mfvpr.types import Shortlist
+from mfvpr.utils.errors import InputError
 from tests.programs import QUERIES, composed, folder, shared, small, typed
 
 pytestmark = pytest.mark.thorough
@@ -176,7 +176,7 @@ def test_every_scorer_is_ranked_with_the_cohort_as_well(dataset, kept, result):
     others = match_cohort(dataset, 2, SIFT, VLAD, 5, archive=Archive(kept))
     candidates = others.candidates
     assert (np.abs(candidates.indices - np.arange(10)[:, None])[candidates.mask] > 2).all()
-    for name, scores in pipeline.score(SCORERS, others.by_scale, candidates).items():
+    for name, scores in stages.score(SCORERS, others.by_scale, candidates).items():
         strength = np.array(by_loops(candidates, scores, 10))
         np.testing.assert_allclose(hubness(candidates, scores, 10), strength, rtol=1e-12)
         assert strength.max() > 1.02

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from scipy import special
 
-from mfvpr.confidence import confidence_inputs, fit_confidence, read_confidences, write_confidences
-from mfvpr.errors import InputError
-from mfvpr.evaluation import Positives
-from mfvpr.ranked import Ranked
+from mfvpr.datasets.positives import Positives
+from mfvpr.evaluation.calibration import confidence_inputs, fit_confidence, read_confidences, write_confidences
 from mfvpr.report.confidences import Assured, recall_by_share
+from mfvpr.reranking.results import Ranked
+from mfvpr.utils.errors import InputError
 
 NAMES = ("margin", "height", "filter", "score")
 

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 import mfvpr
-from mfvpr.confidence import read_confidences
+from mfvpr.evaluation.calibration import read_confidences
 from mfvpr.evaluation.precision import precision_recall, reliability
 from tests.programs import QUERIES, shared, small, typed
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.thorough
 
 SYSTEMS = ("filter", "histogram", "histogram + filter")
 LINES = ("scorer=histogram", "figures=1")
-LEARNED = Path(mfvpr.__file__).parent / "learned" / "learned_aliked.json"
+LEARNED = Path(mfvpr.__file__).parent / "scoring" / "learned" / "learned_aliked.json"
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 from PIL import Image
 
-from mfvpr.data.published import PUBLISHED
+from mfvpr.datasets.published import PUBLISHED
 from tests.data.test_published import put
 from tests.programs import typed
 

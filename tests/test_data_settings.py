@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments import prepare
+from experiments import stages
 from experiments.evaluation import evaluate
 from experiments.launch import launch
 from mfvpr import InputError
-from mfvpr.data.images import read_image
+from mfvpr.datasets.images import read_image
 from tests.programs import composed, folder, matches_path
 
 pytestmark = pytest.mark.thorough
@@ -165,7 +165,7 @@ def test_turned_and_16_bit_copies_give_the_same_and_it_is_said(small_street, tmp
 
 def test_a_second_run_is_told_the_same_of_its_images(small_street, tmp_path, monkeypatch):
     settings = composed(*folder(small_street, f"store={tmp_path}/store"))
-    first, second = (prepare.begun(settings, prepare.Stopwatch())[1] for _ in range(2))
+    first, second = (stages.begun(settings, stages.Stopwatch())[1] for _ in range(2))
     assert first.fingerprints == second.fingerprints
     assert first.reading == second.reading
     assert len(list((tmp_path / "store" / "contents").iterdir())) == 2

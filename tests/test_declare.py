@@ -12,12 +12,12 @@ import pytest
 from experiments import build, command_line, declare, groups, help_text, settings
 from experiments.settings import CONF
 from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, value
-from mfvpr.declaration import check_choices, choice, declared, flag, made, named, number, numbers, whole
-from mfvpr.learning.parameters import can_learn, starts
-from mfvpr.named_weights import NAMED_WEIGHTS, SUFFIX
 from mfvpr.scoring import ALONE, SCORERS, match_shifts
+from mfvpr.scoring.fields import check_choices, choice, declared, flag, made, named, number, numbers, whole
+from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, SUFFIX
+from mfvpr.scoring.weights import UnitWeight, Weight, match_weights
+from mfvpr.tuning.learning.parameters import can_learn, starts
 from mfvpr.types import Array, Matches
-from mfvpr.weighting import UnitWeight, Weight, match_weights
 from tests.programs import ROOT, results, shared, small, typed
 
 pytestmark = pytest.mark.thorough

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr.distributed import all_devices, retrieve_spread, score_spread
-from mfvpr.errors import InputError
-from mfvpr.evaluation import Positives
+from mfvpr.datasets.positives import Positives
+from mfvpr.evaluation.distributed import all_devices, retrieve_spread, score_spread
+from mfvpr.utils.errors import InputError
 from tests.builders import make_matches, unit
 from tests.programs import ROOT, run, small
 from tests.test_shards_program import tables

@@ -12,29 +12,31 @@ import pytest
 from PIL import Image
 
 import mfvpr
-from mfvpr import archive, pipeline, progress
-from mfvpr.archive import Archive
-from mfvpr.confidence import confidence_inputs, fit_confidence
-from mfvpr.data.datasets import folder_dataset, sequences_dataset
-from mfvpr.errors import InputError
-from mfvpr.evaluation import Positives, halves
+from mfvpr.datasets.datasets import folder_dataset, sequences_dataset
+from mfvpr.datasets.positives import Positives
+from mfvpr.evaluation import halves, stages
+from mfvpr.evaluation.calibration import confidence_inputs, fit_confidence
+from mfvpr.evaluation.sequence_matching import match_sequence
 from mfvpr.evaluation.statistics import block_sign_flips
-from mfvpr.exchange import write_features, write_global_descriptors, write_shortlist
-from mfvpr.extraction import described
 from mfvpr.features import Aggregated
+from mfvpr.features.extraction import described
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
-from mfvpr.filters import Retrieval
-from mfvpr.fingerprints import fingerprint
-from mfvpr.frame_correlation import FrameCorrelation
-from mfvpr.imported import DescriptorFiles, FeatureFiles, File, ShortlistFiles
-from mfvpr.progress import untracked
-from mfvpr.rankings import Fusion, rank_sequence
+from mfvpr.io import write_features, write_global_descriptors, write_shortlist
 from mfvpr.report.confidences import Assured
 from mfvpr.report.differences import differences, write_gains
 from mfvpr.report.evaluations import Judged, recall_table, write_rankings
-from mfvpr.retrieval import WhitenedSearch
-from mfvpr.sequence_matching import match_sequence
+from mfvpr.reranking.frame_correlation import FrameCorrelation
+from mfvpr.reranking.fusion import Fusion, rank_sequence
+from mfvpr.retrieval.precomputed import DescriptorFiles, FeatureFiles, File, ShortlistFiles
+from mfvpr.retrieval.retriever import Retrieval
+from mfvpr.retrieval.search import WhitenedSearch
+from mfvpr.storage import feature_cache
+from mfvpr.storage.feature_cache import Archive
+from mfvpr.utils import progress
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.fingerprints import fingerprint
+from mfvpr.utils.progress import untracked
 from tests.programs import typed
 
 pytestmark = pytest.mark.thorough
@@ -74,7 +76,7 @@ def test_frame_correlation_is_a_ranking_more(result):
     """Of a scorer, or of one that is fused; all others are what they are without it."""
     [matched] = result.matched
     correlated = {"histogram": FrameCorrelation(1), "histogram + filter": FrameCorrelation()}
-    scores = pipeline.score(SCORERS, matched.by_scale, matched.candidates)
+    scores = stages.score(SCORERS, matched.by_scale, matched.candidates)
     systems = rank_sequence(matched, scores, {"histogram": Fusion(c=10.0)}, correlated, "filter")
     assert [*systems] == [*result.systems, "histogram + frames", "histogram + filter + frames"]
     for name, [ranked] in result.systems.items():
@@ -167,9 +169,9 @@ class Vectors:
 
 def test_only_candidates_are_extracted(dataset, tmp_path):
     few = replace(dataset.only, images=replace(dataset.queries, names=dataset.queries.names[:2]), truth=None)
-    archive, lines = Archive(tmp_path), []
-    archive.tell = lines.append
-    matched = match_sequence(dataset, few, SIFT, Retrieval(Vectors()), 3, archive=archive)
+    feature_cache, lines = Archive(tmp_path), []
+    feature_cache.tell = lines.append
+    matched = match_sequence(dataset, few, SIFT, Retrieval(Vectors()), 3, archive=feature_cache)
     wanted = np.unique(matched.candidates.indices)
     assert len(wanted) < 7
     [features] = Archive(tmp_path).local(dataset.database, SIFT, [])
@@ -214,14 +216,14 @@ def test_whitening_is_fitted_on_the_database():
 @pytest.fixture(scope="module")
 def files(dataset, tmp_path_factory):
     """What another program would have left of the data set, exactly."""
-    root, archive = tmp_path_factory.mktemp("files"), Archive()
+    root, feature_cache = tmp_path_factory.mktemp("files"), Archive()
     for side, folder in (("database", dataset.database), ("queries", dataset.queries)):
         names = [f"{side}/{name}" for name in folder.names]
-        [features] = archive.local(folder, SIFT)
+        [features] = feature_cache.local(folder, SIFT)
         write_features(root / f"{side}.npz", names, features.read(range(len(folder))))
-        vectors = archive.vectors(folder, VLAD.describer, dataset.database).values
+        vectors = feature_cache.vectors(folder, VLAD.describer, dataset.database).values
         write_global_descriptors(root / f"{side}_vectors.npz", names, vectors)
-    candidates = VLAD.shortlist(dataset.only, dataset.database, 5, archive).candidates
+    candidates = VLAD.shortlist(dataset.only, dataset.database, 5, feature_cache).candidates
     write_shortlist(root / "pairs.npz", candidates, dataset.queries.names, dataset.database.names)
     return root
 
@@ -273,18 +275,18 @@ def test_queries_without_candidates_are_told(dataset, tmp_path):
 
 
 def test_files_are_known_by_content(dataset, files, tmp_path):
-    archive, before = Archive(tmp_path / "s"), FeatureFiles(at(dataset, files, ".npz"))
-    recipe = archive.recipe(dataset.database, before)
+    feature_cache, before = Archive(tmp_path / "s"), FeatureFiles(at(dataset, files, ".npz"))
+    recipe = feature_cache.recipe(dataset.database, before)
     moved = tmp_path / "elsewhere"
     shutil.copytree(files, moved)
-    assert archive.recipe(dataset.database, FeatureFiles(at(dataset, moved, ".npz"))) == recipe
+    assert feature_cache.recipe(dataset.database, FeatureFiles(at(dataset, moved, ".npz"))) == recipe
     shutil.copy(files / "queries.npz", moved / "database.npz")
     assert Archive(tmp_path / "s").recipe(dataset.database, FeatureFiles(at(dataset, moved, ".npz"))) != recipe
 
 
 def test_what_is_read_of_files_is_part_of_the_recipe(dataset, files, tmp_path):
     """Which file belongs to which folder, and the prefixes; also within an aggregation."""
-    archive, sides = Archive(tmp_path), at(dataset, files, ".npz")
+    feature_cache, sides = Archive(tmp_path), at(dataset, files, ".npz")
     (one, first), (other, second) = sides.items()
     changed = [sides, {one: second, other: first}, sides | {one: replace(first, prefix="other/")}]
     for wrap in (
@@ -292,9 +294,9 @@ def test_what_is_read_of_files_is_part_of_the_recipe(dataset, files, tmp_path):
         DescriptorFiles,
         lambda found: Retrieval(Aggregated(FeatureFiles(found), VladFitting())),
     ):
-        assert len({fingerprint(archive.recipe_of(wrap(found))) for found in changed}) == len(changed)
+        assert len({fingerprint(feature_cache.recipe_of(wrap(found))) for found in changed}) == len(changed)
     pairs = [ShortlistFiles({one: first}, prefix) for prefix in ("", "database/")]
-    assert len({fingerprint(archive.recipe_of(found)) for found in pairs}) == 2
+    assert len({fingerprint(feature_cache.recipe_of(found)) for found in pairs}) == 2
 
 
 def test_what_is_fitted_on_the_database_is_fitted_once_for_all_sequences(split, small_street, monkeypatch):
@@ -314,8 +316,8 @@ def test_bad_images_of_the_database_are_told_once(split, small_street, tmp_path)
     several, lines = sequences_dataset(tmp_path / "database", split, ground_truth="none"), []
     for root in (None, tmp_path / "s", tmp_path / "s"):  # the last reads matches alone
         lines.clear()
-        archive = Archive(root, skip_bad=True, tell=lines.append)
-        found = mfvpr.evaluate(several, SIFT, VLAD, SCORERS, candidates="all", archive=archive)
+        feature_cache = Archive(root, skip_bad=True, tell=lines.append)
+        found = mfvpr.evaluate(several, SIFT, VLAD, SCORERS, candidates="all", archive=feature_cache)
         assert all(list(one.bad_database) == [4] for one in found.matched)
         warned = [line for line in lines if line.startswith("warning: ")]
         assert len(warned) == 2
@@ -364,7 +366,7 @@ def test_extraction_counts_as_features_whoever_asks_for_them(dataset, monkeypatc
         clock[0] += 10
         yield from described(*arguments, **options)
 
-    monkeypatch.setattr(archive, "described", slow)
+    monkeypatch.setattr(feature_cache, "described", slow)
     seconds = mfvpr.evaluate(dataset, SIFT, VLAD, {}, candidates=2, cohort=1).seconds
     assert seconds.pop("features") >= 20
     assert {*seconds.values()} == {0}

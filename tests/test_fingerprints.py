@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from mfvpr.checkpoints.networks import blueprint
+from mfvpr.checkpoints.registry import entry_of
 from mfvpr.features.aliked import AlikedFeatures
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import Vlad, VladFitting
-from mfvpr.fingerprints import fingerprint, recipe_of
-from mfvpr.weights.networks import blueprint
-from mfvpr.weights.registry import entry_of
+from mfvpr.utils.fingerprints import fingerprint, recipe_of
 
 
 def test_other_numbers_make_another_recipe():

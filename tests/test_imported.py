@@ -7,11 +7,11 @@ import pytest
 
 from experiments import build
 from experiments.settings import SettingsError
-from mfvpr.archive import Archive
-from mfvpr.data.datasets import Dataset, ImageFolder, QuerySequence
-from mfvpr.errors import InputError
-from mfvpr.exchange import write_features, write_global_descriptors
-from mfvpr.imported import DescriptorFiles, FeatureFiles, File, ShortlistFiles
+from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
+from mfvpr.io import write_features, write_global_descriptors
+from mfvpr.retrieval.precomputed import DescriptorFiles, FeatureFiles, File, ShortlistFiles
+from mfvpr.storage.feature_cache import Archive
+from mfvpr.utils.errors import InputError
 from tests.exchange.foreign import feature
 
 

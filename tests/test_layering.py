@@ -1,198 +1,92 @@
-"""Imports run downwards only, and each foreign library stays in its room (the ground plan of the README)."""
+"""Packages import only packages above them, and each library of others stays where it belongs."""
 
 import ast
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
-# What each room may import of mfvpr. Rooms not named stand on everything.
-ALLOWED = {
-    "errors": set(),
-    "declaration": {"errors"},
-    "numerics": {"errors"},
+ROOT = Path(__file__).parent.parent / "mfvpr"
+# Packages and modules at the root, each with all that it imports of those above it.
+PERMISSIONS = {
     "types": set(),
-    "weighting": {"errors", "numerics", "types"},
-    "learned_weight": {"errors", "numerics", "types", "weighting"},
-    "weight_files": {"data", "errors", "learned_weight"},
-    "named_weights": {"weight_files", "weighting"},
-    "neighbors": {"types"},
-    "ragged": set(),
-    "progress": set(),
-    "threads": set(),
-    "matching": {"errors", "neighbors", "numerics", "ragged", "types"},
-    "matchers": {"matching", "numerics", "types"},
-    "lightglue": {"errors", "fingerprints", "matching", "models", "neighbors", "types"},
-    "soft_matching": {"matching", "numerics", "types"},
-    "match_sets": {"errors", "numerics", "ragged", "threads", "types"},
-    "sources": {"errors", "numerics", "ragged", "types"},
-    "behavior": set(),
-    "fingerprints": {"behavior"},
-    "shards": {"errors"},
-    "stores": {"data", "errors", "fingerprints", "match_sets", "shards", "stores", "threads", "types"},
-    "pair_matching": {"match_sets", "matchers", "numerics", "ragged", "sources", "threads", "types"},
-    "scoring": {"declaration", "errors", "named_weights", "numerics", "types", "weighting", "scoring"},
-    "whitening": {"errors"},
-    "retrieval": {"errors", "evaluation", "numerics", "ragged", "types", "whitening"},
-    "reranking": {"errors", "numerics", "types", "scoring"},
-    "parameter_grids": {"matching", "numerics", "types", "scoring", "weighting", "reranking"},
-    "sweeping": {
-        "data",
-        "declaration",
-        "errors",
-        "evaluation",
-        "fingerprints",
-        "match_sets",
-        "numerics",
-        "parameter_grids",
-        "progress",
-        "reranking",
-        "scoring",
-        "sweeping",
-        "threads",
-        "types",
-        "weighting",
+    "utils": set(),
+    "io": {"types", "utils"},
+    "networks": {"types", "utils"},
+    "scoring": {"types", "utils"},
+    "checkpoints": {"io", "networks", "utils"},
+    "datasets": {"io", "utils"},
+    "features": {"datasets", "networks", "types", "utils"},
+    "matching": {"features", "networks", "types", "utils"},
+    "storage": {"datasets", "features", "matching", "types", "utils"},
+    "retrieval": {"datasets", "features", "io", "storage", "types", "utils"},
+    "reranking": {"datasets", "matching", "scoring", "types", "utils"},
+    "evaluation": {
+        "datasets", "features", "matching", "reranking", "retrieval", "scoring", "storage", "types", "utils",
     },
-    "learning": {
-        "data",
-        "declaration",
-        "errors",
-        "evaluation",
-        "fingerprints",
-        "learned_weight",
-        "learning",
-        "match_sets",
-        "matching",
-        "numerics",
-        "ragged",
-        "reranking",
-        "scoring",
-        "sweeping",
-        "types",
-        "weighting",
-        "progress",
+    "testing": {"reranking", "scoring", "types", "utils"},
+    "localization": {
+        "datasets", "evaluation", "features", "matching", "reranking", "scoring", "storage", "types", "utils",
     },
-    "evaluation": {"errors", "fingerprints", "types", "evaluation"},
-    "foreign": {"errors", "foreign"},
-    "data": {"errors", "evaluation", "foreign", "numerics", "threads", "types", "data"},
-    "models": {"errors", "numerics", "types", "models"},
-    "weights": {"errors", "data", "foreign", "models", "weights"},
-    "features": {
-        "errors",
-        "types",
-        "numerics",
-        "data",
-        "models",
-        "ragged",
-        "sources",
-        "whitening",
-        "features",
-        "fingerprints",
-    },
-    "extraction": {"errors", "types", "numerics", "data", "features", "progress", "sources", "threads"},
-    "exchange": {"errors", "types", "data", "exchange"},
-    "cohort": {"data", "errors", "numerics", "pipeline", "progress", "ranked", "scoring", "types"},
-    "checks": {
-        "data",
-        "declaration",
-        "errors",
-        "features",
-        "filters",
-        "lightglue",
-        "matchers",
-        "matching",
-        "rankings",
-        "reranking",
-        "ranked",
-        "results",
-        "scoring",
-        "sources",
-        "types",
-    },
-    "testing": {"errors", "numerics", "reranking", "scoring", "types"},
-    "confidence": {"data", "errors", "ranked", "results"},
-    "maps": {
-        "confidence",
-        "data",
-        "errors",
-        "extraction",
-        "features",
-        "fingerprints",
-        "maps",
-        "matchers",
-        "numerics",
-        "pipeline",
-        "progress",
-        "reranking",
-        "ranked",
-        "results",
-        "scoring",
-        "sources",
-        "stores",
-        "threads",
-        "types",
-    },
-    "distributed": {"errors", "evaluation", "numerics", "reranking", "retrieval", "scoring", "types"},
+    "tuning": {"datasets", "evaluation", "matching", "reranking", "scoring", "types", "utils"},
     "report": {
-        "numerics",
-        "archive",
-        "confidence",
-        "ranked",
-        "results",
-        "data",
-        "errors",
-        "evaluation",
-        "evaluations",
-        "features",
-        "fingerprints",
-        "learned_weight",
-        "learning",
-        "maps",
-        "pipeline",
-        "report",
-        "scoring",
-        "sweeping",
-        "types",
-        "weight_files",
+        "datasets", "evaluation", "features", "localization", "reranking", "scoring", "tuning", "types", "utils",
     },
-}
-HOMES = {
-    "cv2": {"data", "features", "scoring"},
-    "PIL": {"data", "report"},
+}  # fmt: skip
+LIBRARIES = {
+    "cv2": {"datasets", "features", "scoring"},
+    "PIL": {"datasets", "report"},
+    "flax": {"networks", "checkpoints", "features"},
+    "safetensors": {"checkpoints"},
+    "optax": {"tuning"},
+    "orbax": {"tuning"},
+    "h5py": {"io"},
     "matplotlib": {"report"},
     "plotly": {"report"},
     "jinja2": {"report"},
     "markupsafe": {"report"},
-    "hydra": set(),
-    "omegaconf": set(),
-    "torch": set(),
-    "flax": {"models", "weights", "features"},
-    "safetensors": {"weights"},
-    "tqdm": set(),
-    "optax": {"learning"},
-    "orbax": {"learning"},
-    "h5py": {"exchange"},
 }
-MODULES = sorted((ROOT / "mfvpr").rglob("*.py"))
+NOWHERE = {"hydra", "omegaconf", "torch", "tqdm"}
 
 
-def imports(path):
+def imported_modules(path):
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module == "mfvpr":
+            yield from (f"mfvpr.{alias.name}" for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            yield from ([f"mfvpr.{alias.name}" for alias in node.names] if node.module == "mfvpr" else [node.module])
+            yield node.module
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: path.relative_to(ROOT).as_posix())
-def test_imports_run_downwards(path):
-    room = path.relative_to(ROOT / "mfvpr").parts[0].removesuffix(".py")
-    for name in imports(path):
-        top, _, rest = name.partition(".")
-        assert room in HOMES.get(top, {room}), f"{name} does not belong in {room}"
-        if top == "mfvpr" and room in ALLOWED:
-            assert rest.partition(".")[0] in ALLOWED[room], f"{room} must not import {name}"
+def imports_of(package):
+    """All modules that a package, or a module at the root, imports from elsewhere."""
+    paths = (ROOT / package).rglob("*.py") if (ROOT / package).is_dir() else [ROOT / f"{package}.py"]
+    return {name for path in paths for name in imported_modules(path)}
 
 
-def test_there_is_something_to_check():
-    assert len(MODULES) > 40
+def test_the_root_holds_the_packages_alone():
+    entries = {path.stem for path in ROOT.iterdir() if path.name not in ("__init__.py", "__pycache__", "py.typed")}
+    assert entries == set(PERMISSIONS)
+
+
+@pytest.mark.parametrize("package", PERMISSIONS)
+def test_a_package_imports_what_is_permitted_and_all_of_it(package):
+    modules = {name.split(".")[1] for name in imports_of(package) if name.startswith("mfvpr.")}
+    assert modules - {package} == PERMISSIONS[package]
+
+
+def test_packages_import_only_packages_above_them():
+    packages = list(PERMISSIONS)
+    for place, package in enumerate(packages):
+        assert PERMISSIONS[package] <= set(packages[:place]), package
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_a_library_is_used_where_it_belongs_and_in_all_these_places(library):
+    places = {package for package in PERMISSIONS if library in {name.split(".")[0] for name in imports_of(package)}}
+    assert places == LIBRARIES[library]
+
+
+def test_libraries_of_programs_are_used_nowhere():
+    used = {name.split(".")[0] for package in PERMISSIONS for name in imports_of(package)}
+    assert not used & NOWHERE

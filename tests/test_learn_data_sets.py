@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from experiments import data_sets, evaluation, learning
-from mfvpr.data.streets import streets_folder
+from mfvpr.datasets.streets import streets_folder
 from tests.programs import QUERIES, composed, results, shared, small, typed
 
 pytestmark = pytest.mark.slow

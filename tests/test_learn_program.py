@@ -9,10 +9,10 @@ import pytest
 from PIL import Image
 
 from experiments import evaluation, learning, search
-from mfvpr.learning import checkpoints, teaching
-from mfvpr.learning.splits import TrainingSplit
-from mfvpr.learning.training import Fit, Record
-from mfvpr.weight_files import read_weight
+from mfvpr.scoring.weight_files import read_weight
+from mfvpr.tuning.learning import checkpoints, teaching
+from mfvpr.tuning.learning.splits import TrainingSplit
+from mfvpr.tuning.learning.training import Fit, Record
 from tests.programs import QUERIES, composed, results, shared, small, snapshot, typed
 
 pytestmark = pytest.mark.slow

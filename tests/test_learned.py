@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from mfvpr.data.datasets import image_folder
-from mfvpr.data.images import resize
+from mfvpr.checkpoints.files import load_model
+from mfvpr.datasets.datasets import image_folder
+from mfvpr.datasets.images import resize
 from mfvpr.features.global_descriptor import GlobalDescriptor
-from mfvpr.weights.files import load_model
 from tests import checkpoints
 from tests.programs import ROOT, typed
 

@@ -11,8 +11,8 @@ import pytest
 from jax.test_util import check_grads
 
 from mfvpr import AggregatedScore, HistogramOfShifts, InputError, Matches, UnitWeight, score_candidates
-from mfvpr.learned_weight import ABSOLUTE, INPUTS, RELATIVE, LearnedWeight
-from mfvpr.weighting import match_weights
+from mfvpr.scoring.learned_weight import ABSOLUTE, INPUTS, RELATIVE, LearnedWeight
+from mfvpr.scoring.weights import match_weights
 from tests.builders import make_matches, per_match, random_matches
 
 pytestmark = pytest.mark.thorough

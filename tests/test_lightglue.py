@@ -8,19 +8,21 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr import InputError, LightGlueMatching, Matching, Shortlist, pipeline, ragged
-from mfvpr.checks import check_matching
+from mfvpr import InputError, LightGlueMatching, Matching, Shortlist
+from mfvpr.checkpoints.conversion import convert
+from mfvpr.checkpoints.networks import planned
+from mfvpr.checkpoints.tables import LIGHTGLUE
+from mfvpr.evaluation import stages
+from mfvpr.evaluation.validation import check_matching
 from mfvpr.features import Scale
+from mfvpr.features.feature_set import FeatureSet, stacked
 from mfvpr.features.sift import Sift
-from mfvpr.fingerprints import recipe_of
-from mfvpr.models.lightglue import LightGlue
-from mfvpr.models.lightglue_assignment import assignment
-from mfvpr.sources import FeatureSet, stacked
-from mfvpr.stores.matches import open_match_store
+from mfvpr.networks.lightglue import LightGlue
+from mfvpr.networks.lightglue_assignment import assignment
+from mfvpr.storage.matches import open_match_store
 from mfvpr.types import per_keypoint, per_match
-from mfvpr.weights.conversion import convert
-from mfvpr.weights.networks import planned
-from mfvpr.weights.tables import LIGHTGLUE
+from mfvpr.utils import ragged
+from mfvpr.utils.fingerprints import recipe_of
 from tests.golden.make_lightglue import SIZES, SMALL, checkpoint, pair
 
 pytestmark = pytest.mark.thorough
@@ -139,9 +141,9 @@ def shortlist():
 @pytest.mark.slow
 def test_stores_keep_the_confidence_for_the_scorers(tmp_path):
     queries, database = sets()
-    in_memory = pipeline.match(queries, database, shortlist(), matcher())
+    in_memory = stages.match(queries, database, shortlist(), matcher())
     with open_match_store(tmp_path / "m", {"of": "any"}, num_queries=4, num_candidates=2) as store:
-        kept = pipeline.match(queries, database, shortlist(), matcher(), store=store)
+        kept = stages.match(queries, database, shortlist(), matcher(), store=store)
     for match_set in (in_memory, kept):
         assert match_set.counts[:2].all()
         assert not match_set.counts[2:].any()
@@ -152,7 +154,7 @@ def test_stores_keep_the_confidence_for_the_scorers(tmp_path):
             assert_same_rows(found, alone)
         sure = replace(match_set, matches=[replace(one, confidence=None) for one in match_set.matches])
         scorers = {"histogram": mfvpr.HistogramOfShifts()}
-        found, more = (pipeline.score(scorers, one, shortlist())["histogram"] for one in (match_set, sure))
+        found, more = (stages.score(scorers, one, shortlist())["histogram"] for one in (match_set, sure))
         assert (found[:2] < more[:2]).all()
 
 
@@ -214,9 +216,9 @@ class InOrder:
 
 def test_a_matcher_of_ones_own_matches_whole_shortlists():
     queries, database = sets()
-    found = pipeline.match(queries, database, shortlist(), InOrder(4.0))
+    found = stages.match(queries, database, shortlist(), InOrder(4.0))
     np.testing.assert_array_equal(found.counts, [[4, 4], [4, 4], [0, 0], [0, 0]])
     assert all(one.confidence is None and one.ratio is None and one.index0 is None for one in found.matches)
     np.testing.assert_array_equal(found.matches[1].points1[:4], database[1].keypoints[:4])
-    scores = pipeline.score({"count": mfvpr.MatchCount()}, found, shortlist())["count"]
+    scores = stages.score({"count": mfvpr.MatchCount()}, found, shortlist())["count"]
     np.testing.assert_array_equal(scores[shortlist().mask], found.counts[shortlist().mask])

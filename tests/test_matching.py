@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mfvpr import Features, compact, filter_matches, match, match_candidates, matching, retrieve
-from mfvpr.matchers import Matching, match_pairs
+from mfvpr import Features, compact, filter_matches, match, match_candidates, retrieve
+from mfvpr.matching import nearest_neighbors
+from mfvpr.matching.matcher import Matching, match_pairs
 from mfvpr.types import per_match, per_pair
 from tests import oracles
 from tests.builders import make_features, random_matches, unit
@@ -345,9 +346,9 @@ def test_a_chunk_is_what_fits_where_the_data_are(monkeypatch):
     rng = np.random.default_rng(8)
     batch = jax.tree.map(lambda leaf: leaf[None], make_features(rng, 30))
     for memory, expected in ((None, 1), (80 * 2**30, 80 * 2**30 // 256 // (4 * 20 * 30 + 1)), (10**5, 1)):
-        monkeypatch.setattr(matching, "device_bytes", lambda tree: memory)  # noqa: B023
-        assert matching.pairs_at_once(None, make_features(rng, 20), batch) == expected
-        assert matching.pairs_at_once(7, make_features(rng, 20), batch) == 7
+        monkeypatch.setattr(nearest_neighbors, "device_bytes", lambda tree: memory)  # noqa: B023
+        assert nearest_neighbors.pairs_at_once(None, make_features(rng, 20), batch) == expected
+        assert nearest_neighbors.pairs_at_once(7, make_features(rng, 20), batch) == 7
     with pytest.raises(ValueError, match=r"chunk_size=0: .*above 0"):
         match_candidates(make_features(rng, 20), batch, chunk_size=0)
 

@@ -9,7 +9,7 @@ import time
 import pytest
 
 from experiments import console
-from mfvpr.stores import matches as match_store
+from mfvpr.storage import matches as match_store
 from tests.programs import CANDIDATES, QUERIES, ROOT, composed, matches_path, results, shared, small, typed
 
 pytestmark = pytest.mark.thorough

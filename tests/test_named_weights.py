@@ -12,11 +12,11 @@ import pytest
 
 import mfvpr
 from mfvpr import HistogramOfShifts, InputError
-from mfvpr.declaration import made
-from mfvpr.learned_weight import RELATIVE, LearnedWeight
-from mfvpr.named_weights import NAMED_WEIGHTS
-from mfvpr.weight_files import read_weight, write_weight
-from mfvpr.weighting import WEIGHTS
+from mfvpr.scoring.fields import made
+from mfvpr.scoring.learned_weight import RELATIVE, LearnedWeight
+from mfvpr.scoring.weight_files import read_weight, write_weight
+from mfvpr.scoring.weight_registry import NAMED_WEIGHTS
+from mfvpr.scoring.weights import WEIGHTS
 from tests.builders import random_matches
 from tests.programs import results, shared, small, typed
 
@@ -54,7 +54,7 @@ def test_what_ships_says_how_it_was_made_and_weighs(name):
     weights = np.asarray(weight(MATCHES))[np.asarray(MATCHES.mask)]
     assert (weights > 0).all()
     assert weights.std() > 0.01
-    path = Path(mfvpr.__file__).parent / "learned" / f"{name}.json"
+    path = Path(mfvpr.__file__).parent / "scoring" / "learned" / f"{name}.json"
     _, how = read_weight(path)
     assert how["command"].startswith("python -m experiments.learn dataset=streets:seed=")
     assert not re.search(r"/(home|root|work|tmp|Users)/", path.read_text())

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from mfvpr.neighbors import nearest, nearest_two
+from mfvpr.matching.similarity import nearest, nearest_two
 
 pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
 

@@ -10,7 +10,7 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
-from mfvpr.data.streets import streets_folder
+from mfvpr.datasets.streets import streets_folder
 from tests.test_layering import imports
 
 FOLDER = Path(__file__).parent.parent / "notebooks"

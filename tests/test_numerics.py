@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from mfvpr.numerics import free_host_bytes
+from mfvpr.utils.numerics import free_host_bytes
 
 
 def test_free_memory_is_told_by_any_system(monkeypatch):

@@ -13,15 +13,18 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr import Matches, pair_matching, pipeline, ragged
-from mfvpr.match_sets import MatchSet, batches, compacted, shapes, slots
-from mfvpr.matchers import Matching
-from mfvpr.matching import filter_matches
-from mfvpr.pair_matching import QUERIES
-from mfvpr.reranking import rank_shortlist
-from mfvpr.sources import FeatureSet, InMemory
-from mfvpr.stores.features import open_store
+from mfvpr import Matches
+from mfvpr.evaluation import stages
+from mfvpr.features.feature_set import FeatureSet, InMemory
+from mfvpr.matching import batched
+from mfvpr.matching.batched import QUERIES
+from mfvpr.matching.match_set import MatchSet, batches, compacted, shapes, slots
+from mfvpr.matching.matcher import Matching
+from mfvpr.matching.nearest_neighbors import filter_matches
+from mfvpr.reranking.ranking import rank_shortlist
+from mfvpr.storage.features import open_store
 from mfvpr.types import Shortlist, per_match, per_pair
+from mfvpr.utils import ragged
 from tests.builders import make_features
 from tests.test_sources import Counting
 
@@ -125,7 +128,7 @@ def assert_same(one, other):
 def test_every_pair_is_matched_as_alone(options, memory):
     queries, database = sets()
     candidates = shortlist_of()
-    found = pipeline.match(queries, database, candidates, Matching(**options), memory=memory)
+    found = stages.match(queries, database, candidates, Matching(**options), memory=memory)
     options = {name: value for name, value in options.items() if name != "chunk_size"}
     expected = expected_of(queries, database, candidates, **options)
     assert found.counts.sum() > 300
@@ -135,7 +138,7 @@ def test_every_pair_is_matched_as_alone(options, memory):
 def test_descriptors_need_not_be_of_unit_length():
     queries, database = sets(3.0)
     candidates = shortlist_of(1)
-    found = pipeline.match(queries, database, candidates, memory=SMALL)
+    found = stages.match(queries, database, candidates, memory=SMALL)
     assert max(one.distance.max(initial=0) for one in found.matches) > 2
     assert_as_alone(found, queries, database, candidates, expected_of(queries, database, candidates))
 
@@ -150,8 +153,8 @@ def test_stored_features_are_matched_as_those_in_memory(tmp_path):
             store.write({row: image for row, image in images.items() if row % 10 != 4})
         stored.append(FeatureSet(Counting(store), {4: "bad"}))
         kept.append(FeatureSet(InMemory(dict(store.read()), len(some)), {4: "bad"}))
-    found = pipeline.match(*stored, candidates, memory=1)
-    assert_same(found, pipeline.match(*kept, candidates))
+    found = stages.match(*stored, candidates, memory=1)
+    assert_same(found, stages.match(*kept, candidates))
     assert_as_alone(found, *kept, candidates, expected_of(*kept, candidates))
     # Each side looks at its first image once more, for the size of a keypoint.
     pairs = candidates.mask & (stored[0].counts > 0)[:, None] & (stored[1].counts[candidates.indices] > 0)
@@ -163,14 +166,14 @@ def test_stored_features_are_matched_as_those_in_memory(tmp_path):
         assert sum(reads.values()) == len(some) + 1
     for side in stored:
         side.source.reads.clear()
-    assert_same(pipeline.match(*stored, candidates, memory=SMALL), found)
+    assert_same(stages.match(*stored, candidates, memory=SMALL), found)
     assert max(stored[1].source.reads.values()) > 1
 
 
 def test_queries_may_be_of_several_capacities():
     database, queries = sets()
     candidates = shortlist_of(2, len(queries), len(database))
-    found = pipeline.match(queries, database, candidates, memory=SMALL)
+    found = stages.match(queries, database, candidates, memory=SMALL)
     assert_as_alone(found, queries, database, candidates, expected_of(queries, database, candidates))
 
 
@@ -181,10 +184,10 @@ def test_any_number_of_queries(number):
     some = FeatureSet(InMemory({row: queries[row] for row in range(number)}, number), {})
     few = jax.tree.map(lambda leaf: leaf[:number], candidates)
     if number:
-        found = pipeline.match(some, database, few)
-        assert_same(found, pipeline.match(queries, database, candidates).take(range(number)))
+        found = stages.match(some, database, few)
+        assert_same(found, stages.match(queries, database, candidates).take(range(number)))
     else:
-        assert list(pipeline.match(some, database, few).matches) == []
+        assert list(stages.match(some, database, few).matches) == []
 
 
 def test_nothing_to_match():
@@ -194,7 +197,7 @@ def test_nothing_to_match():
     for one, other, indices in ((empty, database, [[0, 1]] * 2), (queries, empty, [[1, 0]] * len(queries)),
                                 (empty, empty, [[-1, -1]] * 2)):  # fmt: skip
         indices = np.array(indices, np.int32)
-        found = pipeline.match(one, other, Shortlist(indices, np.zeros(indices.shape, np.float32), indices >= 0))
+        found = stages.match(one, other, Shortlist(indices, np.zeros(indices.shape, np.float32), indices >= 0))
         assert found.counts.shape == indices.shape
         assert not found.counts.any()
         assert found[0].mask.shape == (2, 64)
@@ -204,7 +207,7 @@ def test_a_candidate_that_comes_twice_is_matched_twice():
     queries, database = sets()
     indices = np.array([[3, 3, 1]] * len(queries), np.int32)
     twice = Shortlist(indices, np.zeros(indices.shape, np.float32), indices >= 0)
-    found = pipeline.match(queries, database, twice)
+    found = stages.match(queries, database, twice)
     assert (found.counts[:, 0] == found.counts[:, 1]).all()
     assert_as_alone(found, queries, database, twice, expected_of(queries, database, twice))
 
@@ -213,7 +216,7 @@ def test_another_data_set_of_the_same_capacities_compiles_nothing(compilations):
     def matched(seed, change):
         counts0, counts1 = ([max(0, count - change) for count in counts] for counts in (COUNTS0, COUNTS1))
         some = (FeatureSet.of(images_of(counts, seed)) for counts in (counts0, counts1))
-        return pipeline.match(*some, shortlist_of(seed), Matching(max_distance=1.0 - change / 10))
+        return stages.match(*some, shortlist_of(seed), Matching(max_distance=1.0 - change / 10))
 
     matched(0, 0)
     compilations.reset()
@@ -235,8 +238,8 @@ def on_devices(out):
     queries, database, candidates = for_devices()
     results = []
     for devices, memory in ((jax.devices(), SMALL), (jax.devices()[-1:], SMALL), (None, None)):
-        found = pipeline.match(queries, database, candidates, devices=devices, memory=memory)
-        scores = pipeline.score({"histogram": mfvpr.HistogramOfShifts()}, found, candidates)["histogram"]
+        found = stages.match(queries, database, candidates, devices=devices, memory=memory)
+        scores = stages.score({"histogram": mfvpr.HistogramOfShifts()}, found, candidates)["histogram"]
         content = [np.asarray(leaf).tobytes().hex() for leaf in jax.tree.leaves(list(found.matches))]
         results.append({"ranking": rank_shortlist(candidates, scores).tolist(), "matches": content})
     Path(out).write_text(json.dumps({"devices": jax.device_count(), "results": results}))
@@ -256,7 +259,7 @@ def test_eight_devices_give_what_one_gives(tmp_path):
     first, *others = content["results"]
     assert len(others) == 2
     assert all(other == first for other in others)
-    here = pipeline.match(*for_devices())
+    here = stages.match(*for_devices())
     leaves = jax.tree.leaves(list(here.matches))
     assert first["matches"] == [np.asarray(leaf).tobytes().hex() for leaf in leaves]
 
@@ -266,7 +269,7 @@ def test_eight_devices_give_what_one_gives(tmp_path):
 
 @pytest.fixture(scope="module")
 def match_set():
-    return pipeline.match(*sets(), shortlist_of())
+    return stages.match(*sets(), shortlist_of())
 
 
 def test_a_querys_matches_are_padded_to_the_capacity(match_set):
@@ -340,17 +343,17 @@ def test_some_queries_are_matched_as_all_of_them():
     indices = np.array([[0, 1], [2, 3], [3, 2]], np.int32)
     listed = Shortlist(indices, np.zeros(indices.shape, np.float32), indices >= 0)
     options = {"matcher": Matching(), "memory": None, "devices": jax.local_devices()[:1]}
-    sizes, call = [], pair_matching.match_pairs
+    sizes, call = [], batched.match_pairs
 
     def counted(first, second, *rest, **more):
         sizes.append((first.mask.shape[1], second.mask.shape[1]))
         return call(first, second, *rest, **more)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pair_matching, "match_pairs", counted)
-        whole = dict(pair_matching.matched(queries, database, listed, [0, 1, 2], **options))
+        patch.setattr(batched, "match_pairs", counted)
+        whole = dict(batched.matched(queries, database, listed, [0, 1, 2], **options))
         of_all, sizes[:] = {*sizes}, []
-        alone = dict(pair_matching.matched(queries, database, listed, [0], **options))
+        alone = dict(batched.matched(queries, database, listed, [0], **options))
     assert {*sizes} < of_all
     for one, other in zip(jax.tree.leaves(whole[0].matches), jax.tree.leaves(alone[0].matches), strict=True):
         np.testing.assert_array_equal(one, other)

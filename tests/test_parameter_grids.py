@@ -17,12 +17,12 @@ from mfvpr import (
     MatchCount,
     UnitWeight,
     filter_matches,
-    parameter_grids,
     score_candidates,
     score_grid,
 )
-from mfvpr.parameter_grids import by_capacity
-from mfvpr.weighting import ChosenWeight
+from mfvpr.reranking import grids
+from mfvpr.reranking.grids import by_capacity
+from mfvpr.scoring.weights import ChosenWeight
 from tests.builders import random_matches
 from tests.scorers import FOREIGN, Strongest, Wrapped, plain, title
 
@@ -65,7 +65,7 @@ def test_axes_come_in_the_order_in_which_they_are_given(matches):
 
 @pytest.mark.parametrize("cores", [2, 3])
 def test_every_candidate_is_scored_once_by_parts_that_overlap(cores, monkeypatch):
-    monkeypatch.setattr(parameter_grids, "available_cpus", lambda: cores)
+    monkeypatch.setattr(grids, "available_cpus", lambda: cores)
     rng = np.random.default_rng(0)
     pairs = [random_matches(rng, count, capacity=8) for count in rng.integers(0, 9, 13)]
     pairs = jax.tree.map(lambda *leaves: np.stack(leaves), *pairs)

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 import mfvpr
-from experiments import prepare
-from mfvpr.archive import Archive
-from mfvpr.data.datasets import folder_dataset
-from mfvpr.errors import InputError
+from experiments import stages
+from mfvpr.checkpoints.conversion import convert
+from mfvpr.checkpoints.networks import planned
+from mfvpr.checkpoints.tables import NETVLAD
+from mfvpr.datasets.datasets import folder_dataset
 from mfvpr.features.patch_netvlad import PatchNetVladFeatures
-from mfvpr.filters import Retrieval
-from mfvpr.models.netvlad import VggNetVlad
-from mfvpr.reranking import fuse_scales
-from mfvpr.stores import features, vectors
-from mfvpr.weights.conversion import convert
-from mfvpr.weights.networks import planned
-from mfvpr.weights.tables import NETVLAD
+from mfvpr.networks.netvlad import VggNetVlad
+from mfvpr.reranking.ranking import fuse_scales
+from mfvpr.retrieval.retriever import Retrieval
+from mfvpr.storage import features, vectors
+from mfvpr.storage.feature_cache import Archive
+from mfvpr.utils.errors import InputError
 from tests.checkpoints import netvlad_checkpoint
 from tests.golden import make_patch_scores as patch_scores
 from tests.golden.make_netvlad import GOLDEN, POSITIONS, image, name
@@ -237,7 +237,7 @@ def test_what_it_cannot_be_used_for_is_one_line(program, monkeypatch):
     assert code == 2
     words = "features.patch_sizes=[2, 4]: expected one size"
     assert words in stderr.splitlines()[-1]
-    monkeypatch.setattr(prepare, "dataset_of", None)  # told before
+    monkeypatch.setattr(stages, "dataset_of", None)  # told before
     _, code, _, stderr = program("evaluate", *scales, "retrieval=same", "features.scale_weights=[1]")
     assert code == 2
     assert "scale_weights=[1]: expected one for each of patch_sizes=[2, 4]" in stderr

@@ -7,20 +7,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mfvpr import InputError, Shortlist, confidence, exchange, weight_files
-from mfvpr.confidence import Confidence, read_confidences, write_confidences
-from mfvpr.data import datasets, truth_files, videos
-from mfvpr.data.datasets import ImageFolder, folder_dataset, sequences_dataset
-from mfvpr.data.published import published_dataset
-from mfvpr.data.streets import draw_streets, streets_folder
-from mfvpr.imported import DescriptorFiles, FeatureFiles, File
-from mfvpr.weight_files import read_weight
+from mfvpr import InputError, Shortlist, io
+from mfvpr.datasets import datasets, truth_files, videos
+from mfvpr.datasets.datasets import ImageFolder, folder_dataset, sequences_dataset
+from mfvpr.datasets.published import published_dataset
+from mfvpr.datasets.streets import draw_streets, streets_folder
+from mfvpr.evaluation import calibration
+from mfvpr.evaluation.calibration import Confidence, read_confidences, write_confidences
+from mfvpr.retrieval.precomputed import DescriptorFiles, FeatureFiles, File
+from mfvpr.scoring import weight_files
+from mfvpr.scoring.weight_files import read_weight
 from tests.builders import fill
 from tests.exchange.foreign import feature
 
 
 def public_functions():
-    modules = (confidence, datasets, exchange, truth_files, videos, weight_files)
+    modules = (calibration, datasets, io, truth_files, videos, weight_files)
     functions = [value for module in modules for name, value in vars(module).items() if not name.startswith("_")]
     return {function for function in (*functions, draw_streets, published_dataset, streets_folder)
             if inspect.isfunction(function) and function.__module__.startswith("mfvpr.")}  # fmt: skip
@@ -38,22 +40,20 @@ def test_signatures_say_so():
 
 def test_files_of_other_programs(tmp_path):
     names, path = ["1.jpg", "2.jpg"], str(tmp_path / "all.npz")
-    exchange.write_features(path, names, [(row, feature(row, count=4)) for row in range(2)])
-    assert exchange.open_features(path, names).counts.tolist() == [4, 4]
+    io.write_features(path, names, [(row, feature(row, count=4)) for row in range(2)])
+    assert io.open_features(path, names).counts.tolist() == [4, 4]
     folder = ImageFolder(str(tmp_path), tuple(names))  # type: ignore[arg-type]
     files = FeatureFiles({str(tmp_path): File(path)})  # type: ignore[dict-item]
     assert files.opened(folder, partial=False).counts.tolist() == [4, 4]
     assert File(path) == File(Path(path))  # type: ignore[arg-type]
     assert folder.paths == [tmp_path / name for name in names]
     path = str(tmp_path / "g.npy")
-    exchange.write_global_descriptors(path, names, np.eye(2))
-    np.testing.assert_array_equal(exchange.read_global_descriptors(path, names), np.eye(2))
+    io.write_global_descriptors(path, names, np.eye(2))
+    np.testing.assert_array_equal(io.read_global_descriptors(path, names), np.eye(2))
     np.testing.assert_array_equal(DescriptorFiles({str(tmp_path): File(path)})._read(folder), np.eye(2))  # type: ignore
     path = str(tmp_path / "pairs.txt")
-    exchange.write_shortlist(
-        path, Shortlist(np.zeros((2, 1), int), np.ones((2, 1)), np.ones((2, 1), bool)), names, names
-    )
-    assert exchange.read_shortlist(path, names, names).indices.tolist() == [[0], [0]]
+    io.write_shortlist(path, Shortlist(np.zeros((2, 1), int), np.ones((2, 1)), np.ones((2, 1), bool)), names, names)
+    assert io.read_shortlist(path, names, names).indices.tolist() == [[0], [0]]
 
 
 def test_data_sets(tmp_path):

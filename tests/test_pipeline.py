@@ -10,20 +10,22 @@ import pytest
 from PIL import Image
 
 import mfvpr
-from mfvpr import match_sets, pipeline, reranking
-from mfvpr.archive import Archive
-from mfvpr.data.datasets import folder_dataset, image_folder
-from mfvpr.errors import InputError
+from mfvpr.datasets.datasets import folder_dataset, image_folder
+from mfvpr.evaluation import stages
 from mfvpr.features import Aggregated
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
-from mfvpr.filters import Retrieval
-from mfvpr.match_sets import MatchSet
-from mfvpr.matchers import Matching
-from mfvpr.retrieval import EXACT
-from mfvpr.stores.matches import StoredMatches, open_match_store
-from mfvpr.sweeping import sweep
+from mfvpr.matching import match_set as match_sets
+from mfvpr.matching.match_set import MatchSet
+from mfvpr.matching.matcher import Matching
+from mfvpr.reranking import ranking
+from mfvpr.retrieval.retriever import Retrieval
+from mfvpr.retrieval.search import EXACT
+from mfvpr.storage.feature_cache import Archive
+from mfvpr.storage.matches import StoredMatches, open_match_store
+from mfvpr.tuning.sweeps import sweep
 from mfvpr.types import Shortlist
+from mfvpr.utils.errors import InputError
 from tests import oracles
 from tests.builders import of_query, random_matches, real
 from tests.scorers import FOREIGN, OWN, one_of_each_class, plain, title
@@ -53,7 +55,7 @@ def candidates(street):
 
 @pytest.fixture(scope="module")
 def matches(features, candidates):
-    return pipeline.match(features[1], features[0], candidates)
+    return stages.match(features[1], features[0], candidates)
 
 
 def test_matches_are_those_of_every_pair(features, candidates, matches):
@@ -70,7 +72,7 @@ def test_matches_are_those_of_every_pair(features, candidates, matches):
 
 def test_scores_are_those_of_the_oracle(candidates, matches):
     scorers = {"histogram": mfvpr.HistogramOfShifts(), "anchor": mfvpr.AnchorPoints(), "sum": mfvpr.AggregatedScore()}
-    scores = pipeline.score(scorers, matches, candidates)
+    scores = stages.score(scorers, matches, candidates)
     for place in range(6):
         points0, points1, distance, s0, s1 = real(jax.tree.map(lambda field, p=place: field[p], matches[3]))
         size, weights = (336, 336), s0 + s1
@@ -84,31 +86,31 @@ def test_scores_are_those_of_the_oracle(candidates, matches):
 
 
 def test_the_street_is_recognized(street, candidates, matches):
-    scores = pipeline.score({"h": mfvpr.HistogramOfShifts()}, matches, candidates)["h"]
-    rows = np.take_along_axis(candidates.indices, reranking.rank_shortlist(candidates, scores), axis=1)
+    scores = stages.score({"h": mfvpr.HistogramOfShifts()}, matches, candidates)["h"]
+    rows = np.take_along_axis(candidates.indices, ranking.rank_shortlist(candidates, scores), axis=1)
     assert mfvpr.recall_at_k(rows, street.truth.positives(1), [1])[0] >= 0.8
 
 
 def test_fusion_with_a_constant_and_balanced(candidates, matches):
-    scores = pipeline.score({"count": mfvpr.MatchCount()}, matches, candidates)["count"]
+    scores = stages.score({"count": mfvpr.MatchCount()}, matches, candidates)["count"]
     np.testing.assert_allclose(
-        reranking.fuse_shortlist(candidates, scores, 10.0), 10 * candidates.scores + scores, rtol=1e-5
+        ranking.fuse_shortlist(candidates, scores, 10.0), 10 * candidates.scores + scores, rtol=1e-5
     )
     distance = np.sqrt(2 - 2 * candidates.scores)
-    euclidean = reranking.fuse_shortlist(candidates, scores, 10.0, filter_score="negative_euclidean")
+    euclidean = ranking.fuse_shortlist(candidates, scores, 10.0, filter_score="negative_euclidean")
     np.testing.assert_allclose(euclidean, scores - 10 * distance, rtol=1e-5)
     by_index = np.take_along_axis(
-        candidates.indices, reranking.rank_shortlist(candidates, 0 * scores, ties="index"), axis=1
+        candidates.indices, ranking.rank_shortlist(candidates, 0 * scores, ties="index"), axis=1
     )
     np.testing.assert_array_equal(by_index, np.sort(candidates.indices, axis=1))
-    added = reranking.fuse_shortlist(candidates, scores, None) - scores
+    added = ranking.fuse_shortlist(candidates, scores, None) - scores
     np.testing.assert_allclose(added.std(axis=1), scores.std(axis=1), rtol=1e-3)
 
 
 def test_capacity_of_matches_is_the_largest_pair(features, candidates, matches):
     assert matches.capacity % 64 == 0
     assert matches.counts.max() <= matches.capacity < matches.counts.max() + 64
-    few = pipeline.match(features[1], features[0], candidates, Matching(max_matches=10, max_distance=0.9))
+    few = stages.match(features[1], features[0], candidates, Matching(max_matches=10, max_distance=0.9))
     assert few.counts.max() <= 10
     assert few.capacity == 64
 
@@ -152,11 +154,11 @@ def assert_same_matches(got, expected, names=PER_MATCH):
 
 def test_a_store_gives_what_was_matched_and_is_read_ever_after(features, candidates, matches, opened, monkeypatch):
     with opened() as store:
-        first = pipeline.match(features[1], features[0], candidates, store=store)
+        first = stages.match(features[1], features[0], candidates, store=store)
     with opened() as store:
-        again = pipeline.match(features[1], features[0], candidates, store=store, track=nothing_done)
-        alone, stored = pipeline.stored_matches(store)
-        read_again, _ = pipeline.stored_matches(store, memory=1e-5)
+        again = stages.match(features[1], features[0], candidates, store=store, track=nothing_done)
+        alone, stored = stages.stored_matches(store)
+        read_again, _ = stages.stored_matches(store, memory=1e-5)
     assert isinstance(read_again.matches, StoredMatches)
     assert len(read_again.matches) == len(first)
     assert_same_matches(first, matches)
@@ -167,11 +169,11 @@ def test_a_store_gives_what_was_matched_and_is_read_ever_after(features, candida
     for name in ("indices", "scores", "mask"):
         np.testing.assert_array_equal(getattr(stored, name), getattr(candidates, name))
     scorers = {"h": mfvpr.HistogramOfShifts(), "a": mfvpr.AnchorPoints(), "s": mfvpr.AggregatedScore()}
-    fresh, *others = (pipeline.score(scorers, one, candidates) for one in (matches, alone, read_again))
+    fresh, *others = (stages.score(scorers, one, candidates) for one in (matches, alone, read_again))
     for name, other in itertools.product(scorers, others):
         np.testing.assert_array_equal(fresh[name], other[name])
     monkeypatch.setattr(match_sets, "BLOCK_BYTES", 1)  # a query at a time
-    one_by_one = pipeline.score(scorers, read_again, candidates)
+    one_by_one = stages.score(scorers, read_again, candidates)
     for name in scorers:
         np.testing.assert_array_equal(fresh[name], one_by_one[name])
     rows = [sweep(scorers["h"], [{"sigma": 9.0}], one, candidates) for one in (matches, read_again)]
@@ -180,22 +182,22 @@ def test_a_store_gives_what_was_matched_and_is_read_ever_after(features, candida
 
 def test_an_interrupted_matching_goes_on_where_it_was(features, candidates, opened):
     with opened() as store, pytest.raises(KeyboardInterrupt):
-        pipeline.match(features[1], features[0], candidates, store=store, track=killed_after(9))
+        stages.match(features[1], features[0], candidates, store=store, track=killed_after(9))
     with opened() as store:
-        assert store.done.tolist() == [True] * pipeline.STORE_BATCH + [False] * 2
+        assert store.done.tolist() == [True] * stages.STORE_BATCH + [False] * 2
         with pytest.raises(InputError, match=r"store: .*10 queries, got 8"):
-            pipeline.stored_matches(store)
-        resumed = pipeline.match(features[1], features[0], candidates, store=store)
+            stages.stored_matches(store)
+        resumed = stages.match(features[1], features[0], candidates, store=store)
     with opened(name="uninterrupted") as store:
-        assert_same_matches(resumed, pipeline.match(features[1], features[0], candidates, store=store))
+        assert_same_matches(resumed, stages.match(features[1], features[0], candidates, store=store))
 
 
 def test_matches_of_another_shortlist_are_told(features, candidates, opened):
     with opened() as store:
-        pipeline.match(features[1], features[0], candidates, store=store)
+        stages.match(features[1], features[0], candidates, store=store)
         other = replace(candidates, indices=candidates.indices[:, ::-1])
         with pytest.raises(InputError, match=r"store: .*candidates.*delete"):
-            pipeline.match(features[1], features[0], other, store=store)
+            stages.match(features[1], features[0], other, store=store)
 
 
 @pytest.fixture
@@ -220,16 +222,16 @@ def test_skipped_images_are_listed_and_never_shortlisted(mixed, opened):
     candidates = EXACT.shortlist(descriptors, descriptors, 5)
     np.testing.assert_array_equal(candidates.indices[0], [0, 4, 3, -1, -1])
     np.testing.assert_array_equal(candidates.indices[1], [-1] * 5)
-    matches = pipeline.match(found, found, candidates)
+    matches = stages.match(found, found, candidates)
     with opened(5, 5) as store:
-        assert_same_matches(pipeline.match(found, found, candidates, store=store), matches)
-        np.testing.assert_array_equal(pipeline.stored_matches(store)[1].mask, candidates.mask)
-    scores = pipeline.score({"h": mfvpr.HistogramOfShifts(), "a": mfvpr.AnchorPoints()}, matches, candidates)
+        assert_same_matches(stages.match(found, found, candidates, store=store), matches)
+        np.testing.assert_array_equal(stages.stored_matches(store)[1].mask, candidates.mask)
+    scores = stages.score({"h": mfvpr.HistogramOfShifts(), "a": mfvpr.AnchorPoints()}, matches, candidates)
     for values in scores.values():
         assert values[0, 0] == values[0, 1] > 0
         assert values[0, 2] == 0.0  # no keypoints, no matches
         assert np.isnan(values[0, 3:]).all()
-        np.testing.assert_array_equal(reranking.rank_shortlist(candidates, values)[0], range(5))
+        np.testing.assert_array_equal(ranking.rank_shortlist(candidates, values)[0], range(5))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -261,7 +263,7 @@ def test_numbers_cost_no_compilation_within_a_capacity(features, candidates, mat
             "histogram": mfvpr.HistogramOfShifts(sigma=sigma, bin_size=bin_size),
             "anchor": mfvpr.AnchorPoints(window=window, tolerance=tolerance),
         }
-        return pipeline.score(scorers, matches, candidates)
+        return stages.score(scorers, matches, candidates)
 
     first = scores(22.5, 15.0, 10, 3.0)  # 672 px in 45 bins: a capacity of 48
     compilations.reset()
@@ -293,7 +295,7 @@ def mixed_sizes():
 @pytest.mark.parametrize("scorer", one_of_each_class([*OWN, *FOREIGN]), ids=title)
 def test_every_scorer_on_images_of_two_sizes_with_a_confidence(mixed_sizes, scorer):
     match_set, listed = mixed_sizes
-    got = pipeline.score({"it": scorer}, match_set, listed)["it"]
+    got = stages.score({"it": scorer}, match_set, listed)["it"]
     for query in range(len(got)):
         np.testing.assert_allclose(got[query], mfvpr.score_candidates(scorer, match_set[query]), rtol=2e-6)
     assert np.isfinite(got).all()
@@ -303,12 +305,12 @@ def test_every_scorer_on_images_of_two_sizes_with_a_confidence(mixed_sizes, scor
 def test_what_a_function_holds_may_change_between_calls(mixed_sizes):
     factor = [1.0]
     scorer = lambda matches: factor[0] * plain(matches)  # noqa: E731
-    first = pipeline.score({"it": scorer}, *mixed_sizes)["it"]
+    first = stages.score({"it": scorer}, *mixed_sizes)["it"]
     factor[0] = 2.0
-    np.testing.assert_allclose(pipeline.score({"it": scorer}, *mixed_sizes)["it"], 2 * first, rtol=2e-6)
+    np.testing.assert_allclose(stages.score({"it": scorer}, *mixed_sizes)["it"], 2 * first, rtol=2e-6)
 
 
 def test_too_many_bins_for_one_of_the_sizes_are_refused(mixed_sizes):
     scorer = mfvpr.HistogramOfShifts(max_bins=50)  # enough for the first query, which is the smaller one
     with pytest.raises(InputError, match="max_bins=50: expected at least 86"):
-        pipeline.score({"it": scorer}, *mixed_sizes)
+        stages.score({"it": scorer}, *mixed_sizes)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mfvpr import ragged
+from mfvpr.utils import ragged
 
 
 def rows_of(counts, seed=0):

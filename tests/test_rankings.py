@@ -8,16 +8,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import mfvpr
-from mfvpr import pipeline
-from mfvpr.data.datasets import folder_dataset, sequences_dataset
+from mfvpr.datasets.datasets import folder_dataset, sequences_dataset
+from mfvpr.evaluation import stages
+from mfvpr.evaluation.sequence_matching import match_sequence
 from mfvpr.features import Aggregated
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
-from mfvpr.filters import Retrieval
-from mfvpr.frame_correlation import FrameCorrelation
-from mfvpr.rankings import Fusion, rank_sequence
-from mfvpr.reranking import rank_shortlist
-from mfvpr.sequence_matching import match_sequence
+from mfvpr.reranking.frame_correlation import FrameCorrelation
+from mfvpr.reranking.fusion import Fusion, rank_sequence
+from mfvpr.reranking.ranking import rank_shortlist
+from mfvpr.retrieval.retriever import Retrieval
 from mfvpr.types import Shortlist
 from tests import oracles
 
@@ -134,7 +134,7 @@ def matched(dataset):
 
 
 def ranked(matched, *how):
-    return rank_sequence(matched, pipeline.score(SCORERS, matched.by_scale, matched.candidates), *how)
+    return rank_sequence(matched, stages.score(SCORERS, matched.by_scale, matched.candidates), *how)
 
 
 def test_systems_of_several_scores_are_ranked_beside_the_others(matched):

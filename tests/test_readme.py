@@ -13,10 +13,10 @@ import pytest
 from experiments import data_sets
 from experiments.quoting import as_typed
 from experiments.settings import CONF, RULES, check, scorer_rules
-from mfvpr.archive import Archive
-from mfvpr.data.datasets import image_folder
-from mfvpr.exchange import write_features
+from mfvpr.datasets.datasets import image_folder
 from mfvpr.features.sift import Sift
+from mfvpr.io import write_features
+from mfvpr.storage.feature_cache import Archive
 from tests import checkpoints
 from tests.builders import make_matches
 from tests.programs import QUICK, ROOT, composed, typed

@@ -20,15 +20,15 @@ import pytest
 
 from experiments import console, evaluation, run_folder
 from experiments.settings import SettingsError
-from mfvpr.data.ground_truth import AllowedTruth
-from mfvpr.data.images import read_image
-from mfvpr.data.streets import streets_folder
-from mfvpr.errors import InputError
-from mfvpr.evaluation import Positives
+from mfvpr.datasets.ground_truth import AllowedTruth
+from mfvpr.datasets.images import read_image
+from mfvpr.datasets.positives import Positives
+from mfvpr.datasets.streets import streets_folder
 from mfvpr.evaluation.statistics import block_sign_flips, mcnemar
 from mfvpr.report import runs
 from mfvpr.report.evaluations import Page
 from mfvpr.scoring import HistogramOfShifts
+from mfvpr.utils.errors import InputError
 from tests.programs import CANDIDATES, QUERIES, ROOT, composed, shared, small, typed
 
 pytestmark = pytest.mark.thorough

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from experiments import weights
-from mfvpr.models.selavpr import SelaVpr
-from mfvpr.models.vit import VisionTransformer
-from mfvpr.weights import networks
-from mfvpr.weights.tables import DINOV2, SELAVPR
+from mfvpr.checkpoints import networks
+from mfvpr.checkpoints.tables import DINOV2, SELAVPR
+from mfvpr.networks.selavpr import SelaVpr
+from mfvpr.networks.vit import VisionTransformer
 from tests.checkpoints import dinov2_shapes, selavpr_shapes, transformer_checkpoint, write_zip
 from tests.programs import typed
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mfvpr.errors import InputError
-from mfvpr.shards import NotYet, Shard, indices, shard_of, together
+from mfvpr.storage.shards import NotYet, Shard, indices, shard_of, together
+from mfvpr.utils.errors import InputError
 
 
 def test_patience():

@@ -12,21 +12,21 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr.archive import Archive
-from mfvpr.data.arrays import read_arrays, write_arrays
-from mfvpr.data.datasets import folder_dataset, sequences_dataset
-from mfvpr.errors import InputError
+from mfvpr.datasets.datasets import folder_dataset, sequences_dataset
+from mfvpr.evaluation.sequence_matching import match_sequence
 from mfvpr.features import Aggregated, Description, Scale
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
-from mfvpr.filters import Filtered, Retrieval
-from mfvpr.fingerprints import recipe_of
-from mfvpr.frame_correlation import FrameCorrelation
-from mfvpr.rankings import Fusion
-from mfvpr.sequence_matching import match_sequence
-from mfvpr.shards import NotYet, Shard, shard_of
-from mfvpr.stores.vectors import open_vector_store
+from mfvpr.reranking.frame_correlation import FrameCorrelation
+from mfvpr.reranking.fusion import Fusion
+from mfvpr.retrieval.retriever import Filtered, Retrieval
+from mfvpr.storage.feature_cache import Archive
+from mfvpr.storage.shards import NotYet, Shard, shard_of
+from mfvpr.storage.vectors import open_vector_store
 from mfvpr.types import Shortlist
+from mfvpr.utils.arrays import read_arrays, write_arrays
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.fingerprints import recipe_of
 
 pytestmark = pytest.mark.thorough
 

@@ -7,12 +7,12 @@ import jax
 import numpy as np
 import pytest
 
-from experiments import evaluation, prepare
+from experiments import evaluation, stages
 from mfvpr import HistogramOfShifts
-from mfvpr.match_sets import MatchSet
-from mfvpr.pipeline import dominant_shifts
-from mfvpr.progress import Stopwatch
+from mfvpr.evaluation.stages import dominant_shifts
+from mfvpr.matching.match_set import MatchSet
 from mfvpr.report.shifts import HEADER
+from mfvpr.utils.progress import Stopwatch
 from tests.builders import make_matches, of_query
 from tests.programs import composed, shared, small
 
@@ -43,8 +43,8 @@ def test_every_first_answer_has_the_shift_that_the_library_says(root, tmp_path, 
     assert [(line["query"], line["answer"]) for line in lines] == [
         (line["query"], line["database"]) for line in reversed(first.values())
     ]
-    tools, images = prepare.begun(settings, Stopwatch())
-    matches, candidates = prepare.matched(settings, tools, images, Stopwatch())
+    tools, images = stages.begun(settings, Stopwatch())
+    matches, candidates = stages.matched(settings, tools, images, Stopwatch())
     scorer = HistogramOfShifts(
         bin_size=5.0, sigma=10.0, weight=evaluation.build.scorers(settings["scorer"])["histogram"].weight
     )

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import Features, InputError
-from mfvpr.sources import KEPT, WRITTEN, FeatureSet, InMemory, Recent, Slots, memory_budget, stacked
-from mfvpr.stores.features import open_store
+from mfvpr.features.feature_set import KEPT, WRITTEN, FeatureSet, InMemory, Recent, Slots, memory_budget, stacked
+from mfvpr.storage.features import open_store
 from tests.builders import make_features
 
 DEVICE = jax.devices()[0]

@@ -10,26 +10,27 @@ import pytest
 from flax import nnx
 
 import mfvpr
-from mfvpr import Features, Shortlist, pipeline
-from mfvpr.archive import Archive
-from mfvpr.data.datasets import ImageFolder, folder_dataset, sequences_dataset
-from mfvpr.errors import InputError
+from mfvpr import Features, Shortlist
+from mfvpr.datasets.datasets import ImageFolder, folder_dataset, sequences_dataset
+from mfvpr.evaluation import stages
+from mfvpr.evaluation.sequence_matching import match_sequence, matches_recipe
 from mfvpr.features import Aggregated, windows
+from mfvpr.features.feature_set import FeatureSet
 from mfvpr.features.sift import Sift
 from mfvpr.features.ssm import SsmCells, SsmMaps, SsmWindows
 from mfvpr.features.vlad import VladFitting
 from mfvpr.features.windows import WindowFitting, Windows, kernels, normalized, whitened
-from mfvpr.filters import Retrieval
-from mfvpr.fingerprints import difference, fingerprint
-from mfvpr.fitting import fitted, whitening_recipe
-from mfvpr.matchers import Matching
-from mfvpr.models.ssm import SsmVgg
+from mfvpr.matching.matcher import Matching
+from mfvpr.networks.ssm import SsmVgg
+from mfvpr.retrieval.fitting import fitted, whitening_recipe
+from mfvpr.retrieval.retriever import Retrieval
+from mfvpr.retrieval.ssm_voting import SsmVoting
 from mfvpr.scoring import GridAnchors
-from mfvpr.sequence_matching import match_sequence, matches_recipe
-from mfvpr.sources import FeatureSet
-from mfvpr.stores.features import forecast_bytes, pack_features
-from mfvpr.voting import SsmVoting
-from mfvpr.whitening import Whitening, fit_whitening
+from mfvpr.storage.feature_cache import Archive
+from mfvpr.storage.features import forecast_bytes, pack_features
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.fingerprints import difference, fingerprint
+from mfvpr.utils.whitening import Whitening, fit_whitening
 from tests.builders import local
 
 pytestmark = pytest.mark.thorough
@@ -311,8 +312,8 @@ def test_candidates_without_cells_score_zero():
     queries, database = (FeatureSet.of(images, unit_length=False) for images in ([image, empty], [empty, image]))
     indices = np.array([[0, 1]] * 2, np.int32)
     candidates = Shortlist(indices, np.zeros((2, 2), np.float32), indices >= 0)
-    matches = pipeline.match(queries, database, candidates, CANDIDATE)
-    scores = pipeline.score({"grid": GridAnchors(4, 3)}, matches, candidates)["grid"]
+    matches = stages.match(queries, database, candidates, CANDIDATE)
+    scores = stages.score({"grid": GridAnchors(4, 3)}, matches, candidates)["grid"]
     np.testing.assert_array_equal(scores, [[0, 100], [0, 0]])
 
 

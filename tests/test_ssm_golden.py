@@ -6,15 +6,15 @@ import pytest
 
 import mfvpr
 from mfvpr import Features, GridAnchors, Shortlist
-from mfvpr.data.images import resize
+from mfvpr.checkpoints.conversion import convert
+from mfvpr.checkpoints.networks import blueprint
+from mfvpr.checkpoints.registry import entry_of
+from mfvpr.checkpoints.tables import SSM
+from mfvpr.datasets.images import resize
 from mfvpr.features.ssm import SsmMaps
 from mfvpr.features.windows import WindowFitting, Windows, kernels, normalized, whitened
-from mfvpr.frame_correlation import FrameCorrelation
-from mfvpr.voting import voted
-from mfvpr.weights.conversion import convert
-from mfvpr.weights.networks import blueprint
-from mfvpr.weights.registry import entry_of
-from mfvpr.weights.tables import SSM
+from mfvpr.reranking.frame_correlation import FrameCorrelation
+from mfvpr.retrieval.ssm_voting import voted
 from tests.builders import make_matches
 from tests.checkpoints import places365_shapes, random_checkpoint
 from tests.golden.make_ssm import (

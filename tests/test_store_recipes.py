@@ -6,9 +6,10 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from mfvpr import InputError, Shortlist, pipeline
-from mfvpr.sources import FeatureSet
-from mfvpr.stores.matches import open_match_store
+from mfvpr import InputError, Shortlist
+from mfvpr.evaluation import stages
+from mfvpr.features.feature_set import FeatureSet
+from mfvpr.storage.matches import open_match_store
 from mfvpr.types import Matches
 from tests.programs import composed, matches_path
 from tests.stores.made_up import digests, features_of
@@ -58,9 +59,9 @@ def _interrupting(after):
 
 
 def test_another_shortlist_is_refused_before_anything_is_written(drawn, candidates, opened, monkeypatch):
-    monkeypatch.setattr(pipeline, "STORE_BATCH", 2)
+    monkeypatch.setattr(stages, "STORE_BATCH", 2)
     with opened() as store, pytest.raises(Interrupted):
-        pipeline.match(drawn, drawn, candidates, store=store, track=_interrupting(5))
+        stages.match(drawn, drawn, candidates, store=store, track=_interrupting(5))
     others = [
         replace(candidates, indices=candidates.indices[:, ::-1]),
         replace(candidates, indices=np.where(np.arange(QUERIES)[:, None] == 3, 0, candidates.indices)),
@@ -72,23 +73,23 @@ def test_another_shortlist_is_refused_before_anything_is_written(drawn, candidat
             assert store.done.tolist() == [True] * 4 + [False] * 2
             before = digests(store.folder)
             with pytest.raises(InputError, match=r"s: .*candidates.*shortlist"):
-                pipeline.match(drawn, drawn, other, store=store)
+                stages.match(drawn, drawn, other, store=store)
             assert digests(store.folder) == before
     with opened() as store:
         assert_same(
-            pipeline.match(drawn, drawn, candidates, store=store),
-            pipeline.match(drawn, drawn, candidates),
+            stages.match(drawn, drawn, candidates, store=store),
+            stages.match(drawn, drawn, candidates),
         )
-        np.testing.assert_array_equal(pipeline.stored_matches(store)[1].indices, candidates.indices)
+        np.testing.assert_array_equal(stages.stored_matches(store)[1].indices, candidates.indices)
 
 
 def test_matching_without_a_store_is_the_same(drawn, candidates, opened):
     """To the last bit, the ratio too."""
-    plain = pipeline.match(drawn, drawn, candidates)
+    plain = stages.match(drawn, drawn, candidates)
     assert plain.matches[0].ratio is not None
     for _ in range(2):
         with opened() as store:
-            kept = pipeline.match(drawn, drawn, candidates, store=store)
+            kept = stages.match(drawn, drawn, candidates, store=store)
         assert_same(kept, plain)
 
 

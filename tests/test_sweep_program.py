@@ -14,13 +14,13 @@ import pytest
 from PIL import Image
 
 from experiments import axes, evaluation, launch, search
-from mfvpr.archive import Archive
-from mfvpr.stores import matches as match_store
+from mfvpr.storage import matches as match_store
+from mfvpr.storage.feature_cache import Archive
 from tests.programs import CANDIDATES, QUERIES, ROOT, composed, matches_path, results, shared, small, snapshot, typed
 
 pytestmark = pytest.mark.thorough
 
-SWEEP = sys.modules["mfvpr.sweeping.sweep"]
+SWEEP = sys.modules["mfvpr.tuning.sweeps.sweep"]
 
 
 @pytest.fixture(scope="session")

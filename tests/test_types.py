@@ -14,10 +14,10 @@ import pytest
 from jax.extend.core import jaxpr_as_fun
 
 import mfvpr
-from mfvpr.distributed import all_devices, score_program
-from mfvpr.match_sets import MatchSet
-from mfvpr.sweeping.settings import groups
-from mfvpr.sweeping.sweep import group_program
+from mfvpr.evaluation.distributed import all_devices, score_program
+from mfvpr.matching.match_set import MatchSet
+from mfvpr.tuning.sweeps.settings import groups
+from mfvpr.tuning.sweeps.sweep import group_program
 from mfvpr.types import per_match, per_pair
 from tests.builders import of_query, random_matches
 from tests.programs import ROOT
@@ -115,14 +115,14 @@ def test_the_program_of_a_sweep_is_that_of_its_class():
 
 PROGRAMS_OF_THEIR_OWN = {
     "features/network.py",  # of a new function, which has one model
-    "learned_weight.py",  # of matches alone
-    "learning/teaching.py",  # of a new function, which has one model
-    "learning/training.py",  # of a new function, which has one kind of parameters
-    "lightglue.py",  # of networks of Flax, whose classes jit compares
-    "numerics.py",
-    "sweeping/sweep.py",  # of a new function
+    "scoring/learned_weight.py",  # of matches alone
+    "tuning/learning/teaching.py",  # of a new function, which has one model
+    "tuning/learning/training.py",  # of a new function, which has one kind of parameters
+    "matching/lightglue.py",  # of networks of Flax, whose classes jit compares
+    "utils/numerics.py",
+    "tuning/sweeps/sweep.py",  # of a new function
     "testing.py",  # of new functions, each of which has one scorer
-    "distributed.py",  # of arrays alone
+    "evaluation/distributed.py",  # of arrays alone
 }
 
 

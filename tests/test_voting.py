@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from mfvpr.evaluation import Positives
-from mfvpr.retrieval import ExactSearch
-from mfvpr.voting import voted
+from mfvpr.datasets.positives import Positives
+from mfvpr.retrieval.search import ExactSearch
+from mfvpr.retrieval.ssm_voting import voted
 
 
 def by_loops(queries, database, num_candidates, excluded=()):

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mfvpr import InputError
-from mfvpr.learned_weight import ABSOLUTE, RELATIVE, LearnedWeight
-from mfvpr.weight_files import read_weight, write_weight
+from mfvpr.scoring.learned_weight import ABSOLUTE, RELATIVE, LearnedWeight
+from mfvpr.scoring.weight_files import read_weight, write_weight
 from tests.builders import random_matches
 
 MADE = {"command": "by hand", "seeds": [1, 2]}

@@ -5,10 +5,10 @@ from dataclasses import astuple
 import numpy as np
 import pytest
 
-from mfvpr import whitening
-from mfvpr.errors import InputError
-from mfvpr.retrieval import WhitenedSearch
-from mfvpr.whitening import fit_bytes, fit_whitening
+from mfvpr.retrieval.search import WhitenedSearch
+from mfvpr.utils import whitening
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.whitening import fit_bytes, fit_whitening
 
 
 def samples(count, size, dtype=np.float64, rank=None):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mfvpr.exchange import write_features, write_global_descriptors
+from mfvpr.io import write_features, write_global_descriptors
 from tests.builders import make_features, unit
 from tests.programs import typed
 

@@ -9,12 +9,13 @@ import numpy as np
 
 from experiments.benchmark.real import answered, extractors, matched_sets
 from experiments.console import track
-from mfvpr import Homography, OpenCvHomography, pipeline
-from mfvpr.data.files import write_text
-from mfvpr.ranked import Matched
+from mfvpr import Homography, OpenCvHomography
+from mfvpr.evaluation import stages
 from mfvpr.report.tables import Table
+from mfvpr.reranking.results import Matched
 from mfvpr.scoring import Scorer
-from mfvpr.versions import versions
+from mfvpr.utils.files import write_text
+from mfvpr.utils.versions import versions
 
 CANDIDATES = 50
 TOLERANCE = 2  # frames
@@ -67,7 +68,7 @@ def pooled(rows: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
 
 
 def _scores(matched: Matched, label: str, scorer: Scorer) -> np.ndarray:
-    [scores] = pipeline.score({label: scorer}, matched.by_scale, matched.candidates, track=track(label)).values()
+    [scores] = stages.score({label: scorer}, matched.by_scale, matched.candidates, track=track(label)).values()
     return scores
 
 

@@ -16,18 +16,18 @@ from experiments.benchmark.made_up import BATCH, GLOBAL, MadeUp
 from experiments.benchmark.projection import ASSUMED, Plan, Rates, projected
 from experiments.benchmark.scale import CANDIDATES, MEMORY, Answer, Counted, peak_bytes, reranked
 from experiments.console import bar
-from mfvpr.data.files import write_text
-from mfvpr.evaluation.positives import Positives
+from mfvpr.datasets.positives import Positives
 from mfvpr.evaluation.recall import recall_at_k
-from mfvpr.numerics import available_cpus
+from mfvpr.features.feature_set import FeatureSet
 from mfvpr.report.tables import Table
-from mfvpr.reranking import rank
-from mfvpr.retrieval import EXACT
-from mfvpr.sources import FeatureSet
-from mfvpr.stores.features import FeatureStore, forecast_bytes, open_store, require_space
-from mfvpr.stores.manifest import store_path
+from mfvpr.reranking.ranking import rank
+from mfvpr.retrieval.search import EXACT
+from mfvpr.storage.features import FeatureStore, forecast_bytes, open_store, require_space
+from mfvpr.storage.manifest import store_path
 from mfvpr.types import Shortlist
-from mfvpr.versions import versions
+from mfvpr.utils.files import write_text
+from mfvpr.utils.numerics import available_cpus
+from mfvpr.utils.versions import versions
 
 DATA = MadeUp(100_000, 200, 700, 128, views=1, likeness=0.18)  # so the filter often fails
 ROUNDS = 3

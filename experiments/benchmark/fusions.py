@@ -9,15 +9,16 @@ from typing import Any
 import numpy as np
 
 from experiments.benchmark.real import answered, extractors, matched_sets
-from mfvpr import AnchorPoints, HistogramOfShifts, pipeline
-from mfvpr.data.files import write_text
-from mfvpr.ranked import FILTER, Matched
-from mfvpr.rankings import Fusion
+from mfvpr import AnchorPoints, HistogramOfShifts
+from mfvpr.evaluation import stages
 from mfvpr.report.tables import Table
-from mfvpr.reranking import rank_shortlist
+from mfvpr.reranking.fusion import Fusion
+from mfvpr.reranking.ranking import rank_shortlist
+from mfvpr.reranking.results import FILTER, Matched
+from mfvpr.scoring.weights import WEIGHTS
 from mfvpr.types import Shortlist
-from mfvpr.versions import versions
-from mfvpr.weighting import WEIGHTS
+from mfvpr.utils.files import write_text
+from mfvpr.utils.versions import versions
 
 CANDIDATES = 50
 TOLERANCE = 2  # frames
@@ -45,7 +46,7 @@ def run(rounds: int | None, out: Path, data: Path | None = None) -> None:
 
 def recall_by_system(matched: Matched) -> dict[System, float]:
     """R@1 of the filter, of every score alone, and of the fusions."""
-    scores = pipeline.score(SCORERS, matched.by_scale, matched.candidates)
+    scores = stages.score(SCORERS, matched.by_scale, matched.candidates)
     return {
         system: float(np.mean(answered(matched, values, TOLERANCE)))
         for system, values in fused(matched.candidates, scores)

@@ -12,10 +12,10 @@ import jax
 import numpy as np
 
 from experiments.console import bar
-from mfvpr.data.files import write_text
-from mfvpr.numerics import available_cpus
 from mfvpr.report.tables import Table
-from mfvpr.versions import versions
+from mfvpr.utils.files import write_text
+from mfvpr.utils.numerics import available_cpus
+from mfvpr.utils.versions import versions
 
 Entry = tuple[str, str, Callable[[], Any]]  # step, who, what is timed
 Seconds = Mapping[tuple[str, str], list[float]]  # of every call, by (step, who)

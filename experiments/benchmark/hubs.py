@@ -11,20 +11,21 @@ from typing import Any
 import numpy as np
 
 from experiments.benchmark.real import answered, datasets, extractors, kept, street
-from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, pipeline
-from mfvpr.cohort import by_hubness, hubness
-from mfvpr.data.datasets import Dataset
-from mfvpr.data.files import write_text
+from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts
+from mfvpr.datasets.datasets import Dataset
+from mfvpr.evaluation import stages
+from mfvpr.evaluation.sequence_matching import match_cohort, match_sequence
 from mfvpr.evaluation.statistics import block_sign_flips, mcnemar
 from mfvpr.features import Aggregated, Extractor
 from mfvpr.features.vlad import VladFitting
-from mfvpr.filters import Retrieval
-from mfvpr.ranked import Matched
 from mfvpr.report.tables import Table
-from mfvpr.sequence_matching import match_cohort, match_sequence
+from mfvpr.reranking.cohort_normalization import by_hubness, hubness
+from mfvpr.reranking.results import Matched
+from mfvpr.retrieval.retriever import Retrieval
+from mfvpr.scoring.weights import FeatureScoreWeight, RatioWeight
 from mfvpr.types import Shortlist
-from mfvpr.versions import versions
-from mfvpr.weighting import FeatureScoreWeight, RatioWeight
+from mfvpr.utils.files import write_text
+from mfvpr.utils.versions import versions
 
 STREETS = (0, 1, 2)  # seeds
 TOLERANCE = 2  # frames
@@ -72,7 +73,7 @@ def scored(dataset: Dataset, extractor: Extractor) -> Scored:
     filter, archive = Retrieval(Aggregated(extractor, VladFitting())), kept()
     queries = match_sequence(dataset, dataset.only, extractor, filter, "all", archive=archive)
     database = match_cohort(dataset, 0, extractor, filter, "all", archive=archive)
-    scores = (pipeline.score(SCORERS, matched.by_scale, matched.candidates) for matched in (queries, database))
+    scores = (stages.score(SCORERS, matched.by_scale, matched.candidates) for matched in (queries, database))
     return Scored(queries, database.candidates, *scores)
 
 

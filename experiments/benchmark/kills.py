@@ -22,10 +22,10 @@ from pathlib import Path
 from experiments import sharding
 from experiments.console import bar
 from experiments.settings import SettingsError
-from mfvpr.data.files import write_text
-from mfvpr.data.streets import streets_folder
+from mfvpr.datasets.streets import streets_folder
 from mfvpr.report.tables import Table
-from mfvpr.versions import versions
+from mfvpr.utils.files import write_text
+from mfvpr.utils.versions import versions
 
 KILLS, SHARDS = 200, 2
 FRAMES, IMAGE_SIZE = 40, (160, 120)

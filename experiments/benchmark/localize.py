@@ -13,18 +13,18 @@ import jax
 import numpy as np
 
 from experiments.console import bar
-from mfvpr.data.datasets import ImageFolder, image_folder
-from mfvpr.data.files import write_text
-from mfvpr.data.images import read_image, resize
-from mfvpr.data.streets import streets_folder
+from mfvpr.checkpoints.files import load_model
+from mfvpr.datasets.datasets import ImageFolder, image_folder
+from mfvpr.datasets.images import read_image, resize
+from mfvpr.datasets.streets import streets_folder
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
-from mfvpr.maps import Map
+from mfvpr.localization import Map
 from mfvpr.report.tables import Table
-from mfvpr.stores.maps import Entry
+from mfvpr.storage.maps import Entry
 from mfvpr.types import Features
-from mfvpr.versions import versions
-from mfvpr.weights.files import load_model
+from mfvpr.utils.files import write_text
+from mfvpr.utils.versions import versions
 
 SIZES, CANDIDATES, ROUNDS = (1000, 10_000), 50, 3
 FRAMES = 100  # of the drawn street, of which each image of a map is one, with noise of its own
@@ -48,9 +48,9 @@ def run(rounds: int | None, out: Path) -> None:
 
 def _extractors() -> Iterator[tuple[str, Any]]:
     yield "SIFT", Sift()
+    from mfvpr.checkpoints.files import is_installed
+    from mfvpr.checkpoints.registry import REGISTRY
     from mfvpr.features.aliked import AlikedFeatures
-    from mfvpr.weights.files import is_installed
-    from mfvpr.weights.registry import REGISTRY
 
     if is_installed(REGISTRY["aliked-n16"]):
         model: Any = load_model("aliked-n16")

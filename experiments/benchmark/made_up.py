@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from experiments.console import bar
-from mfvpr.stores.features import FeatureStore, forecast_bytes, open_store, require_space
-from mfvpr.stores.manifest import store_path
-from mfvpr.threads import ordered_map
+from mfvpr.storage.features import FeatureStore, forecast_bytes, open_store, require_space
+from mfvpr.storage.manifest import store_path
 from mfvpr.types import Features
+from mfvpr.utils.threads import ordered_map
 
 SIZE = 336  # px
 COMMON = 2 / 7  # of the keypoints they share with it

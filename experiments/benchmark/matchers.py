@@ -22,25 +22,25 @@ from mfvpr import (
     RatioWeight,
     Scorer,
     UnitWeight,
-    pipeline,
     value,
 )
-from mfvpr.archive import Archive
-from mfvpr.data.datasets import Dataset
-from mfvpr.data.files import write_text
+from mfvpr.checkpoints.files import load_model
+from mfvpr.datasets.datasets import Dataset
+from mfvpr.evaluation import stages
+from mfvpr.evaluation.sequence_matching import match_sequence
 from mfvpr.features import Aggregated, Extractor
 from mfvpr.features.aliked import AlikedFeatures
+from mfvpr.features.feature_set import FeatureSet
 from mfvpr.features.vlad import VladFitting
-from mfvpr.filters import Retrieval
-from mfvpr.matchers import Matcher
-from mfvpr.named_weights import NAMED_WEIGHTS
-from mfvpr.numerics import available_cpus
+from mfvpr.matching.matcher import Matcher
 from mfvpr.report.tables import Table
-from mfvpr.sequence_matching import match_sequence
-from mfvpr.sources import FeatureSet
+from mfvpr.retrieval.retriever import Retrieval
+from mfvpr.scoring.weight_registry import NAMED_WEIGHTS
+from mfvpr.storage.feature_cache import Archive
 from mfvpr.types import Shortlist
-from mfvpr.versions import versions
-from mfvpr.weights.files import load_model
+from mfvpr.utils.files import write_text
+from mfvpr.utils.numerics import available_cpus
+from mfvpr.utils.versions import versions
 
 CANDIDATES, KEYPOINTS = 50, 512
 NETWORK, LIGHTGLUE = "aliked-n16", "aliked_lightglue"
@@ -107,7 +107,7 @@ def _matching_time(
         one, listed = FeatureSet.of([queries[row]]), jax.tree.map(itemgetter(slice(row, row + 1)), candidates)
         for _ in range(2):  # the first compiles for this query's number of keypoints
             start = time.perf_counter()
-            pipeline.match(one, database, listed, matching)
+            stages.match(one, database, listed, matching)
             seconds = time.perf_counter() - start
         taken.append(seconds)
     return 1e3 * float(np.median(taken))

@@ -13,8 +13,11 @@ import jax
 import numpy as np
 
 from experiments.benchmark.harness import Entry, Lineup, Results, Seconds, compete
-from mfvpr.data.images import read_image, resize
-from mfvpr.data.streets import draw_streets
+from mfvpr.checkpoints.files import is_installed, load
+from mfvpr.checkpoints.networks import blueprint, network_of
+from mfvpr.checkpoints.registry import entry_of
+from mfvpr.datasets.images import read_image, resize
+from mfvpr.datasets.streets import draw_streets
 from mfvpr.features import Description
 from mfvpr.features.aliked import AlikedFeatures
 from mfvpr.features.d2net import D2NetFeatures
@@ -23,11 +26,8 @@ from mfvpr.features.mixvpr import MixVprDescriptor
 from mfvpr.features.network import compiled
 from mfvpr.features.patch_netvlad import PatchNetVladFeatures
 from mfvpr.features.selavpr import SelaVprFeatures
-from mfvpr.models.d2net import extract
-from mfvpr.models.imagenet import preprocess
-from mfvpr.weights.files import is_installed, load
-from mfvpr.weights.networks import blueprint, network_of
-from mfvpr.weights.registry import entry_of
+from mfvpr.networks.d2net import extract
+from mfvpr.networks.imagenet import preprocess
 
 BATCHES = (1, 8)
 D2NET_SIZE, MIXVPR_SIZE, ALIKED_SIZE = 336, 320, 320  # px

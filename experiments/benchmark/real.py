@@ -12,31 +12,31 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 
-from experiments import build, prepare
+from experiments import build
+from experiments import stages as program_stages
 from experiments.console import tell, track
 from experiments.groups import defaults
 from experiments.settings import CONF
-from mfvpr import pipeline
-from mfvpr.archive import Archive
-from mfvpr.data.datasets import Dataset, folder_dataset
-from mfvpr.data.files import write_text
-from mfvpr.errors import InputError
-from mfvpr.evaluation import hits
+from mfvpr.checkpoints.files import load_model
+from mfvpr.datasets.datasets import Dataset, folder_dataset
+from mfvpr.evaluation import hits, stages
+from mfvpr.evaluation.sequence_matching import match_sequence
 from mfvpr.evaluation.statistics import estimate
 from mfvpr.features import Aggregated, Extractor
 from mfvpr.features.aliked import AlikedFeatures
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
-from mfvpr.filters import Retrieval
-from mfvpr.matchers import NEIGHBORS, Matcher
-from mfvpr.numerics import available_cpus
-from mfvpr.ranked import FILTER, Matched
+from mfvpr.matching.matcher import NEIGHBORS, Matcher
 from mfvpr.report.tables import Table
-from mfvpr.reranking import rank_shortlist
+from mfvpr.reranking.ranking import rank_shortlist
+from mfvpr.reranking.results import FILTER, Matched
+from mfvpr.retrieval.retriever import Retrieval
 from mfvpr.scoring import Scorer
-from mfvpr.sequence_matching import match_sequence
-from mfvpr.versions import versions
-from mfvpr.weights.files import load_model
+from mfvpr.storage.feature_cache import Archive
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import write_text
+from mfvpr.utils.numerics import available_cpus
+from mfvpr.utils.versions import versions
 
 FOLDERS = {"grief_season": ("database", "queries"), "corridor": ("ref", "query")}
 SIZE = (336, 336)
@@ -83,7 +83,7 @@ def datasets(data: Path | None, *, streets: bool = False) -> list[Dataset]:
 
 def street(seed: int) -> Dataset:
     """A drawn one, which is drawn once."""
-    return prepare.dataset_of({"name": "streets", "cache": str(_cache()), "seed": seed})
+    return program_stages.dataset_of({"name": "streets", "cache": str(_cache()), "seed": seed})
 
 
 def kept() -> Archive:
@@ -116,7 +116,7 @@ def judged(matched: Matched, scorers: Mapping[str, Scorer], rounds: int) -> Iter
         scores, taken = candidates.scores, []
         for _ in range(1 + rounds if name in scorers else 0):
             start = time.perf_counter()
-            [scores] = pipeline.score({name: scorers[name]}, matched.by_scale, candidates).values()
+            [scores] = stages.score({name: scorers[name]}, matched.by_scale, candidates).values()
             taken.append((time.perf_counter() - start) / len(scores))
         found = {tolerance: estimate(answered(matched, scores, tolerance)) for tolerance in TOLERANCES}
         yield {

@@ -19,15 +19,16 @@ import numpy as np
 
 from experiments.benchmark.made_up import MadeUp
 from experiments.console import bar
-from mfvpr import HistogramOfShifts, pipeline
-from mfvpr.data.files import write_text
-from mfvpr.numerics import available_cpus
+from mfvpr import HistogramOfShifts
+from mfvpr.evaluation import stages
+from mfvpr.features.feature_set import FeatureSet, FeatureSource, InMemory
 from mfvpr.report.tables import Table
-from mfvpr.reranking import rank_shortlist
-from mfvpr.retrieval import EXACT
-from mfvpr.sources import FeatureSet, FeatureSource, InMemory
+from mfvpr.reranking.ranking import rank_shortlist
+from mfvpr.retrieval.search import EXACT
 from mfvpr.types import Features, Shortlist
-from mfvpr.versions import versions
+from mfvpr.utils.files import write_text
+from mfvpr.utils.numerics import available_cpus
+from mfvpr.utils.versions import versions
 
 QUERIES, KEYPOINTS = 100, 700
 SETS = tuple(
@@ -206,9 +207,9 @@ def reranked(
 ) -> Answer:
     """All steps after the filter."""
     times = [time.perf_counter()]
-    matches = pipeline.match(queries, database, candidates, memory=memory)
+    matches = stages.match(queries, database, candidates, memory=memory)
     times.append(time.perf_counter())
-    scores = pipeline.score({"histogram": HistogramOfShifts()}, matches, candidates)["histogram"]
+    scores = stages.score({"histogram": HistogramOfShifts()}, matches, candidates)["histogram"]
     times.append(time.perf_counter())
     order = rank_shortlist(candidates, scores)
     times.append(time.perf_counter())

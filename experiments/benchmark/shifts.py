@@ -13,15 +13,16 @@ import numpy as np
 
 from experiments import build
 from experiments.console import tell
-from mfvpr import HistogramOfShifts, Matches, RatioWeight, Shortlist, pipeline
-from mfvpr.archive import Archive
-from mfvpr.data.datasets import folder_dataset
-from mfvpr.data.files import write_text
-from mfvpr.data.streets import streets_folder
+from mfvpr import HistogramOfShifts, Matches, RatioWeight, Shortlist
+from mfvpr.datasets.datasets import folder_dataset
+from mfvpr.datasets.streets import streets_folder
+from mfvpr.evaluation import stages
 from mfvpr.features import Extractor
 from mfvpr.features.sift import Sift
 from mfvpr.report.tables import Table
-from mfvpr.versions import versions
+from mfvpr.storage.feature_cache import Archive
+from mfvpr.utils.files import write_text
+from mfvpr.utils.versions import versions
 
 LEVELS = (0.68, 0.95)
 GROSS = 45.0  # px off along an axis: two standard deviations of the paper's votes
@@ -55,7 +56,7 @@ def matched(folder: Path, extractor: Extractor, archive: Archive) -> tuple[Match
     dataset = folder_dataset(folder / "database", folder / "queries", ground_truth="order")
     [queries], [database] = (archive.local(one, extractor, label="") for one in (dataset.queries, dataset.database))
     own = np.arange(len(queries))
-    found = pipeline.match(
+    found = stages.match(
         queries,
         database,
         Shortlist(indices=own[:, None], scores=np.ones((len(own), 1)), mask=np.ones((len(own), 1), bool)),

@@ -18,9 +18,9 @@ import mfvpr
 from experiments.benchmark import scores
 from experiments.benchmark.harness import Entry, Lineup, Results, Seconds, compete
 from experiments.benchmark.scores import CANDIDATES, SIZE
-from mfvpr.numerics import available_cpus
+from mfvpr.scoring.weights import match_weights
 from mfvpr.types import Matches
-from mfvpr.weighting import match_weights
+from mfvpr.utils.numerics import available_cpus
 
 SIGMAS, BIN_SIZES = (5.0, 10.0, 15.0, 22.5, 30.0, 45.0), (5.0, 10.0, 15.0, 20.0)  # px
 WEIGHTS = (mfvpr.FeatureScoreWeight(), mfvpr.DescriptorDistanceWeight(), mfvpr.UnitWeight())

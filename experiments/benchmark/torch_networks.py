@@ -13,8 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from mfvpr.models.imagenet import DEVIATION, MEAN
-from mfvpr.weights.conversion import Table
+from mfvpr.checkpoints.conversion import Table
+from mfvpr.networks.imagenet import DEVIATION, MEAN
 
 Weights = Callable[[str], Tensor]  # by published keys
 

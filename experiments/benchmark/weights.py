@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 
 from experiments.benchmark.real import answered, extractors, matched_sets
-from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, pipeline
-from mfvpr.data.files import write_text
+from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts
+from mfvpr.evaluation import stages
 from mfvpr.evaluation.statistics import block_sign_flips, mcnemar
-from mfvpr.ranked import Matched
 from mfvpr.report.tables import Table
-from mfvpr.reranking import fuse_shortlist
-from mfvpr.versions import versions
-from mfvpr.weighting import WEIGHTS
+from mfvpr.reranking.ranking import fuse_shortlist
+from mfvpr.reranking.results import Matched
+from mfvpr.scoring.weights import WEIGHTS
+from mfvpr.utils.files import write_text
+from mfvpr.utils.versions import versions
 
 SIZE = (320, 320)
 VARIANTS = ("n16", "n32")
@@ -44,7 +45,7 @@ def all_answered(matched: Matched) -> Hits:
     scorers = {
         f"{name} {weight}": replace(SCORERS[name], weight=WEIGHTS[weight]) for name in SCORERS for weight in WEIGHTS
     }
-    scores = pipeline.score(scorers, matched.by_scale, candidates)
+    scores = stages.score(scorers, matched.by_scale, candidates)
     found: Hits = {}
     for (name, _, weight), alone in ((key.partition(" "), values) for key, values in scores.items()):
         for system, values in {name: alone, f"{name} + filter": fuse_shortlist(candidates, alone, None)}.items():

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from experiments.benchmark.real import answered, extractors, matched_sets
-from mfvpr import HistogramOfShifts, pipeline
-from mfvpr.data.files import write_text
-from mfvpr.ranked import Matched
+from mfvpr import HistogramOfShifts
+from mfvpr.evaluation import stages
 from mfvpr.report.tables import Table
-from mfvpr.versions import versions
-from mfvpr.weighting import WEIGHTS
+from mfvpr.reranking.results import Matched
+from mfvpr.scoring.weights import WEIGHTS
+from mfvpr.utils.files import write_text
+from mfvpr.utils.versions import versions
 
 SCALES = (0.7, 0.84, 0.92, 1.0, 1.09, 1.19, 1.41)
 THINNED = {1: 2, 4: 2, 8: 4}  # every so manieth image of the database, and the tolerance, frames
@@ -45,7 +46,7 @@ def judged(matched: Matched, rounds: int) -> Iterator[dict[str, Any]]:
         taken = []
         for _ in range(1 + rounds):  # the first compiles
             start = time.perf_counter()
-            [scores] = pipeline.score({name: scorer}, matched.by_scale, matched.candidates).values()
+            [scores] = stages.score({name: scorer}, matched.by_scale, matched.candidates).values()
             taken.append(1e3 * (time.perf_counter() - start) / len(scores))
         recall = [recall_of(matched, scores, every, tolerance) for every, tolerance in THINNED.items()]
         yield {"scorer": name, "recall": recall, "ms_per_query": float(np.median(taken[1:]))}

@@ -11,14 +11,14 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from experiments.paper.lineup import Row
 from experiments.paper.printed import average, printed
+from experiments.paper.systems import Row
 from experiments.paper.tables import TOLERANCES, Found, listed
-from mfvpr.data.datasets import Dataset, ImageFolder, QuerySequence
-from mfvpr.data.files import clipped, printable, replacing
-from mfvpr.data.images import resize
+from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
+from mfvpr.datasets.images import resize
 from mfvpr.report import runs
 from mfvpr.report.evaluations import sequence_folder
+from mfvpr.utils.files import clipped, printable, replacing
 
 _MIDDLE = 1  # of the tolerances: the paper's figure
 _OURS, _THEIRS = "#2f6fb0", "#c9a227"

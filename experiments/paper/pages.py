@@ -8,7 +8,7 @@ from urllib.parse import quote
 from experiments.paper.figures import mean_bars
 from experiments.paper.tables import Found, listed, thresholds_of
 from experiments.paper.timing import STEPS
-from mfvpr.evaluation import middle, threshold_words
+from mfvpr.datasets.truth import middle, threshold_words
 from mfvpr.report.pages.charts import Bar, Chart, amounts, bars, lines
 from mfvpr.report.pages.one_run import PAGE
 from mfvpr.report.pages.pictures import MOST_PICTURES, Picture, pictures
@@ -16,7 +16,7 @@ from mfvpr.report.pages.rendering import write_page
 from mfvpr.report.pages.sections import Gallery, Section, Sheet, flat
 from mfvpr.report.pages.several_runs import write_comparison
 from mfvpr.report.tables import Table
-from mfvpr.versions import versions
+from mfvpr.utils.versions import versions
 
 Tables = Mapping[str, tuple[str, Table]]  # heading and table by name
 _COSTS, _ABOUT = ("sizes", "seconds"), ("data_sets", "settings")

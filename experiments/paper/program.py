@@ -10,26 +10,26 @@ from typing import Any
 from experiments import build, truth
 from experiments.console import tell
 from experiments.errors import how_to_install
-from experiments.paper import figures, lineup, pages, runs, timing
-from experiments.paper.lineup import Place, Row
+from experiments.paper import figures, pages, runs, systems, timing
+from experiments.paper.systems import Place, Row
 from experiments.paper.tables import Evaluated, Found, evaluated, tables
-from experiments.prepare import dataset_of
 from experiments.settings import SettingsError
-from mfvpr.data.datasets import Dataset
-from mfvpr.data.published import differences
-from mfvpr.errors import InputError
-from mfvpr.ranked import FILTER
+from experiments.stages import dataset_of
+from mfvpr.datasets.datasets import Dataset
+from mfvpr.datasets.published import differences
 from mfvpr.report import runs as run_folders
 from mfvpr.report.pages.one_run import PAGE
 from mfvpr.report.tables import Table
+from mfvpr.reranking.results import FILTER
+from mfvpr.utils.errors import InputError
 
 _BEST = ("mix_hist_50", "aliked_hist_50", "sift_hist_50")  # whose failures are shown: the first that is here
 
 
 def paper(settings: dict[str, Any]) -> None:
     """Evaluate what is not evaluated yet, then write tables and figures, and print the recalls."""
-    rows = lineup.chosen_rows(settings["systems"])
-    found, missing = lineup.places(settings["data"], settings["datasets"])
+    rows = systems.chosen_rows(settings["systems"])
+    found, missing = systems.places(settings["data"], settings["datasets"])
     rows, lacking = _with_weights(rows, found, settings)
     out = Path(settings["out"]).expanduser()
     if found and rows:
@@ -81,7 +81,7 @@ def _with_weights(
     """Rows whose networks are installed, and a line for each evaluation whose are not."""
     lines: dict[str, str] = {}
     for run in dict.fromkeys(row.run for row in rows) if found else ():
-        if entries := lineup.missing_weights(runs.settings_of(run, found[0], settings)):
+        if entries := systems.missing_weights(runs.settings_of(run, found[0], settings)):
             needs = "; ".join(f"{entry.name} ({entry.file}): {how_to_install(entry)}" for entry in entries)
             lines[run] = f"{run}: needs {needs}"
     return [row for row in rows if row.run not in lines], list(lines.values())

@@ -14,16 +14,16 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from experiments import evaluation, run_folder
-from experiments.paper.lineup import Place, overrides
 from experiments.paper.sizes import bytes_of_an_image
+from experiments.paper.systems import Place, overrides
 from experiments.settings import CONF, SettingsError, check
-from mfvpr.data.files import remove_leftovers
-from mfvpr.fingerprints import fingerprint
+from mfvpr.checkpoints import files
+from mfvpr.checkpoints.registry import REGISTRY
 from mfvpr.report import runs
 from mfvpr.report.pages.one_run import PAGE
-from mfvpr.versions import versions
-from mfvpr.weights import files
-from mfvpr.weights.registry import REGISTRY
+from mfvpr.utils.files import remove_leftovers
+from mfvpr.utils.fingerprints import fingerprint
+from mfvpr.utils.versions import versions
 
 FIGURES = 2  # queries that each run draws
 _MADE_OF, _SIZES = "made_of.json", "sizes.json"

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from experiments.paper.lineup import Row
 from experiments.paper.printed import BERLIN, OTHERS, average, printed, printed_recall, printed_settings
-from mfvpr.data.datasets import MEANS, Dataset
-from mfvpr.data.published import differences
-from mfvpr.evaluation import middle
+from experiments.paper.systems import Row
+from mfvpr.datasets.datasets import MEANS, Dataset
+from mfvpr.datasets.published import differences
+from mfvpr.datasets.truth import middle
 from mfvpr.report.tables import Table
 
 INCOMPLETE = " (incomplete)"

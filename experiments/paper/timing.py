@@ -11,13 +11,13 @@ import jax
 import numpy as np
 
 from experiments import build
-from mfvpr import evaluations
-from mfvpr.archive import Archive
-from mfvpr.data.datasets import Dataset, ImageFolder
-from mfvpr.maps.vectors import Vectors
-from mfvpr.numerics import available_cpus
-from mfvpr.progress import Stopwatch
-from mfvpr.versions import versions
+from mfvpr.datasets.datasets import Dataset, ImageFolder
+from mfvpr.evaluation import evaluation
+from mfvpr.localization.vectors import Vectors
+from mfvpr.storage.feature_cache import Archive
+from mfvpr.utils.numerics import available_cpus
+from mfvpr.utils.progress import Stopwatch
+from mfvpr.utils.versions import versions
 
 QUERIES, DATABASE = 10, 60  # images; as many of the database as there are candidates, at least
 STEPS = ("filter", "features", "matching", "scores")
@@ -49,7 +49,7 @@ def measured(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, float]:
             part = replace(
                 sequence, images=_renamed(sequence.images, number, Path(folder) / turn), truth=None, excluded=None
             )
-            evaluations.evaluate(
+            evaluation.evaluate(
                 Dataset(dataset.name, database, (part,)), extractor, filter, {main: scorers[main]},
                 candidates=candidates, matching=matching, archive=archive, watch=watch,
             )  # fmt: skip

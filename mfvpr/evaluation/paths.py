@@ -4,8 +4,8 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
-from mfvpr.evaluation.positives import Positives
-from mfvpr.evaluation.truth import Unit
+from mfvpr.datasets.positives import Positives
+from mfvpr.datasets.truth import Unit
 
 
 def places_along_path(shown: Positives, unit: Unit) -> np.ndarray:

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mfvpr.errors import InputError
+from mfvpr.utils.errors import InputError
 
 BINS = 10
 _DRAWS = 400

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mfvpr.evaluation.positives import Positives
+from mfvpr.datasets.positives import Positives
 
 
 @dataclass(frozen=True)

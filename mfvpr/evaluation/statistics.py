@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special, stats
 
-from mfvpr.errors import InputError
+from mfvpr.utils.errors import InputError
 
 _PSEUDO_EVENTS = 1.0  # of a default autocorrelation: a path with hits only, or misses only, does not show its own
 

@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mfvpr.data.images import Interpolation
-from mfvpr.errors import InputError
+from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale
 from mfvpr.features.network import compiled, in_batches, require_size
-from mfvpr.models.aliked import Aliked
-from mfvpr.models.aliked_detection import RADIUS, Detections
+from mfvpr.networks.aliked import Aliked
+from mfvpr.networks.aliked_detection import RADIUS, Detections
 from mfvpr.types import Features
+from mfvpr.utils.errors import InputError
 
 _SMALLEST = 2 * RADIUS + 1  # px: one pixel within the border, which has no keypoints
 _PIXELS_PER_SLOT = 40  # photographs have a keypoint in 65 px at most
@@ -29,7 +29,7 @@ class AlikedFeatures:
     Attributes:
         model: the network with its weights.
         image_size: (width, height) px.
-        interpolation: see `mfvpr.data.images.resize`.
+        interpolation: see `mfvpr.datasets.images.resize`.
         threshold: of the detection score, in (0, 1). 0.1 is that of Pivonka & Preucil (IEEE T-IV 2024); its authors'
             default is 0.2. Where no score of an image is above it, those above the image's mean are taken.
         max_keypoints: those of the highest scores are kept; None = all.

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from mfvpr.data.images import Interpolation
-from mfvpr.errors import InputError
+from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale
 from mfvpr.features.network import compiled, in_batches, require_size
-from mfvpr.models.d2net import SCALES, STRIDE, D2Net, Detections, extract, map_size
-from mfvpr.models.imagenet import Preprocessing
+from mfvpr.networks.d2net import SCALES, STRIDE, D2Net, Detections, extract, map_size
+from mfvpr.networks.imagenet import Preprocessing
 from mfvpr.types import Features
+from mfvpr.utils.errors import InputError
 
 _SHARE = 0.3  # keypoint slots per position of a map; photographs take about a tenth
 _SMALLEST_MAP = 2
@@ -26,7 +26,7 @@ class D2NetFeatures:
     Attributes:
         model: the network with its weights.
         image_size: (width, height) px.
-        interpolation: see `mfvpr.data.images.resize`.
+        interpolation: see `mfvpr.datasets.images.resize`.
         preprocessing: "caffe" as published, or "torch".
         multiscale: detect at half, full and double size as well, in this order.
         max_keypoints: those of the highest scores are kept, in the same order; None = all.

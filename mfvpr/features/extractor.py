@@ -6,9 +6,9 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from mfvpr.data.datasets import ImageFolder
-from mfvpr.data.images import Interpolation
-from mfvpr.sources import FeatureSet, FeatureSource
+from mfvpr.datasets.datasets import ImageFolder
+from mfvpr.datasets.images import Interpolation
+from mfvpr.features.feature_set import FeatureSet, FeatureSource
 from mfvpr.types import Features
 
 
@@ -51,7 +51,7 @@ class Description(NamedTuple):
 class Extractor(Protocol):
     """Images `[B, H, W, 3]` uint8 RGB -> a Description of each.
 
-    With a store its recipe is needed, see `mfvpr.fingerprints.recipe_of`: a frozen dataclass has one.
+    With a store its recipe is needed, see `mfvpr.utils.fingerprints.recipe_of`: a frozen dataclass has one.
     """
 
     @property

@@ -8,11 +8,11 @@ from typing import Any, Protocol
 import jax
 import numpy as np
 
-from mfvpr.data.images import Interpolation
-from mfvpr.errors import InputError
+from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale
 from mfvpr.features.network import compiled, in_batches, require_size
-from mfvpr.models.lengths import of_unit_length
+from mfvpr.networks.lengths import of_unit_length
+from mfvpr.utils.errors import InputError
 
 
 class DescriptorNetwork(Protocol):
@@ -44,7 +44,7 @@ class GlobalDescriptor:
     Attributes:
         model: the network with its weights.
         image_size: (width, height) px; 640 x 480 is Patch-NetVLAD's.
-        interpolation: see `mfvpr.data.images.resize`.
+        interpolation: see `mfvpr.datasets.images.resize`.
         components: how many of the first principal components are kept, scaled to unit length again; None = all.
         batch_size: images per call.
 

@@ -8,10 +8,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from mfvpr.data.images import Interpolation
+from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale
 from mfvpr.features.network import compiled, in_batches, require_size
-from mfvpr.models.mixvpr import IMAGE_SIZE, MixVPR, preprocess
+from mfvpr.networks.mixvpr import IMAGE_SIZE, MixVPR, preprocess
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class MixVprDescriptor:
 
     Attributes:
         model: the network with its weights.
-        interpolation: see `mfvpr.data.images.resize`. "pil_bicubic" is that of the authors' demonstration and of
+        interpolation: see `mfvpr.datasets.images.resize`. "pil_bicubic" is that of the authors' demonstration and of
             OpenVPRLab, "pil_bilinear" their training's, "torch_bilinear" VPR-methods-evaluation's.
         batch_size: images per call.
     """

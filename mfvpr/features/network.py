@@ -7,10 +7,10 @@ import jax
 import numpy as np
 from flax import nnx
 
-from mfvpr import ragged
-from mfvpr.errors import InputError
-from mfvpr.numerics import device_bytes
 from mfvpr.types import Features
+from mfvpr.utils import ragged
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.numerics import device_bytes
 
 
 def compiled(model: nnx.Module, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -25,7 +25,7 @@ def require_network(name: str, model: Any, expected: type[nnx.Module]) -> None:
     """Raise an InputError unless the model is such a network."""
     if not isinstance(model, expected):
         raise InputError(f"{name}: expected a {expected.__name__} as model, got {type(model).__name__}; "
-                         "`mfvpr.weights.files.load_model` gives a network by its name")  # fmt: skip
+                         "`mfvpr.checkpoints.files.load_model` gives a network by its name")  # fmt: skip
 
 
 def require_size(name: str, images: np.ndarray, size: tuple[int, int]) -> None:

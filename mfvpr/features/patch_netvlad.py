@@ -8,13 +8,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from mfvpr.data.images import Interpolation
-from mfvpr.errors import InputError
+from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale
 from mfvpr.features.network import at_places, compiled, in_batches, require_network, require_size
-from mfvpr.models.netvlad import VggNetVlad
-from mfvpr.models.vgg import STRIDE
+from mfvpr.networks.netvlad import VggNetVlad
+from mfvpr.networks.vgg import STRIDE
 from mfvpr.types import Features
+from mfvpr.utils.errors import InputError
 
 _MIDDLE = (STRIDE - 1) // 2  # px from a position's first pixel, as published: a half is dropped
 
@@ -28,7 +28,7 @@ class PatchNetVladFeatures:
     Attributes:
         model: the network with its weights.
         image_size: (width, height) px.
-        interpolation: see `mfvpr.data.images.resize`.
+        interpolation: see `mfvpr.datasets.images.resize`.
         patch_sizes: sides of the squares, in positions of the map; each size is a scale.
         scale_weights: how much the score of each scale counts, see `mfvpr.fuse_scales`; None = all alike.
         batch_size: images per call.

@@ -8,11 +8,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from mfvpr.data.images import Interpolation
+from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale
 from mfvpr.features.network import at_places, compiled, in_batches, require_network, require_size
-from mfvpr.models.selavpr import LOCAL, SelaVpr
-from mfvpr.models.vit import PATCH, require_patches
+from mfvpr.networks.selavpr import LOCAL, SelaVpr
+from mfvpr.networks.vit import PATCH, require_patches
 from mfvpr.types import Features
 
 _STEP = PATCH / 4  # px between positions of the local map, which was upsampled twice
@@ -29,7 +29,7 @@ class SelaVprFeatures:
     Attributes:
         model: the network with its weights.
         image_size: (width, height) px, multiples of 14; 224 x 224 is published.
-        interpolation: see `mfvpr.data.images.resize`; as published, colors between pixels, without antialiasing.
+        interpolation: see `mfvpr.datasets.images.resize`; as published, colors between pixels, without antialiasing.
         batch_size: images per call.
 
     Raises:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from mfvpr.data.images import Interpolation
+from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale
 from mfvpr.types import Features
 
@@ -16,7 +16,7 @@ class Sift:
 
     Attributes:
         image_size: (width, height) px.
-        interpolation: see `mfvpr.data.images.resize`.
+        interpolation: see `mfvpr.datasets.images.resize`.
         max_keypoints: the strongest are kept; None = all.
         contrast_threshold: OpenCV's; low, so that dark images reach `max_keypoints` as well.
         clahe_clip: clip limit of local histogram equalization before detection; 0 turns it off.

@@ -8,15 +8,15 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from mfvpr.data.images import Interpolation
-from mfvpr.errors import InputError
+from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale
 from mfvpr.features.network import at_places, compiled, in_batches
 from mfvpr.features.windows import WindowFitting, Windows, kernels, known, normalized, whitened
-from mfvpr.models.imagenet import Preprocessing
-from mfvpr.models.ssm import STAGE1_STRIDE, STAGE2_STRIDE, SsmVgg
+from mfvpr.networks.imagenet import Preprocessing
+from mfvpr.networks.ssm import STAGE1_STRIDE, STAGE2_STRIDE, SsmVgg
 from mfvpr.types import Features
-from mfvpr.whitening import Whitening
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.whitening import Whitening
 
 CHANNELS = 512
 STAGE1_SIZE = (224, 224)
@@ -33,7 +33,7 @@ class SsmMaps:
         model: the network with its weights.
         stage: 1 or 2.
         image_size: (width, height) px.
-        interpolation: see `mfvpr.data.images.resize`.
+        interpolation: see `mfvpr.datasets.images.resize`.
         preprocessing: "torch" as the public code, or "caffe", which the weights are for.
         batch_size: images per call.
     """

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import softmax
 
-from mfvpr.errors import InputError
-from mfvpr.sources import FeatureSet
+from mfvpr.features.feature_set import FeatureSet
 from mfvpr.types import Features
+from mfvpr.utils.errors import InputError
 
 # Chosen so that R@1 hardly depends on the input's last bits, with SIFT and with ALIKED, summer against snow.
 _VARIANCE = 0.015  # of a word's Gaussian, in squared lengths of descriptors

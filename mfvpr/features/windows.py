@@ -1,7 +1,7 @@
 """Windows of a network's maps, whitened: how both stages of SSM-VPR describe images (Camara & Preucil, RAS 2020).
 
-The whitening is learned from windows of the database's images; see `mfvpr.fitting`. It is linear, so that a window's
-descriptor is a convolution of the map, and no windows are formed once it is known.
+The whitening is learned from windows of the database's images; see `mfvpr.retrieval.fitting`. It is linear, so that a
+window's descriptor is a convolution of the map, and no windows are formed once it is known.
 """
 
 from collections.abc import Iterable, Mapping
@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mfvpr.errors import InputError
 from mfvpr.features.extractor import Extractor
-from mfvpr.fingerprints import fingerprint, recipe_of
-from mfvpr.numerics import free_host_bytes
 from mfvpr.types import Array
-from mfvpr.whitening import Whitening, fit_bytes, fit_whitening
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.fingerprints import fingerprint, recipe_of
+from mfvpr.utils.numerics import free_host_bytes
+from mfvpr.utils.whitening import Whitening, fit_bytes, fit_whitening
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ def known(extractor: WindowExtractor) -> Whitening:
     """
     who, whitening, expected = type(extractor).__name__, extractor.whitening, extractor.windows.dimension
     if not isinstance(whitening, Whitening):
-        raise InputError(f"{who}: has not seen the database; take mfvpr.fitting.fitted(...) of it")
+        raise InputError(f"{who}: has not seen the database; take mfvpr.retrieval.fitting.fitted(...) of it")
     if len(whitening.mean) != expected:
         raise InputError(f"{who}: expected a whitening of {expected} numbers, got one of {len(whitening.mean)}; learn "
                          "it from windows of these maps")  # fmt: skip

@@ -4,15 +4,15 @@ from pathlib import Path
 
 import numpy as np
 
-from mfvpr.data.files import below, clipped
-from mfvpr.data.images import read_image, resize
-from mfvpr.errors import InputError
+from mfvpr.datasets.images import read_image, resize
+from mfvpr.evaluation.stages import explain
 from mfvpr.features.extractor import Extractor
-from mfvpr.maps.answers import Asked
-from mfvpr.maps.map import Map
-from mfvpr.pipeline import explain
+from mfvpr.localization.answers import Asked
+from mfvpr.localization.map import Map
 from mfvpr.report.figures import Answer, aspect_of_resized, histogram_figure
 from mfvpr.scoring.histogram import HistogramOfShifts
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import below, clipped
 
 _GRAY, _MOST = 150, 80  # of an image that is not at hand; characters of a name or a place
 

@@ -9,17 +9,17 @@ from typing import Any
 import jax
 import numpy as np
 
-from mfvpr.evaluation.judging import Judge
+from mfvpr.datasets.truth import threshold_words
+from mfvpr.evaluation.protocol import Judge
 from mfvpr.evaluation.statistics import SignFlips, block_sign_flips, estimate, mcnemar, recall_interval
-from mfvpr.evaluation.truth import threshold_words
-from mfvpr.learned_weight import LearnedWeight
-from mfvpr.learning.comparison import Comparison, Row
-from mfvpr.learning.training import Fit
-from mfvpr.numerics import compiled
 from mfvpr.report.learning_figures import curves_figure, weights_figure
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table, written
-from mfvpr.weight_files import write_weight
+from mfvpr.scoring.learned_weight import LearnedWeight
+from mfvpr.scoring.weight_files import write_weight
+from mfvpr.tuning.learning.comparison import Comparison, Row
+from mfvpr.tuning.learning.training import Fit
+from mfvpr.utils.numerics import compiled
 
 SHOWN_QUERIES = 20  # whose matches the figure of the weights counts
 
@@ -99,7 +99,7 @@ def results(comparison: Comparison) -> dict[str, Any]:
 
 
 def write_weights(folder: Path, comparison: Comparison, made: Mapping[str, Any]) -> None:
-    """Every learned match weight by name, with how all of them were made; see `mfvpr.weight_files`."""
+    """Every learned match weight by name, with how all of them were made; see `mfvpr.scoring.weight_files`."""
     for name, weight in _weights(comparison).items():
         write_weight(folder / f"{re.sub(r'[^a-z]+', '_', name)}.json", weight, {**made, "training": name})
 

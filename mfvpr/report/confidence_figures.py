@@ -9,9 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from mfvpr.data.files import clipped, printable, replacing
 from mfvpr.evaluation.precision import PrecisionRecall, Reliability
 from mfvpr.report.colors import color_and_dash
+from mfvpr.utils.files import clipped, printable, replacing
 
 _LINE_STYLES = {
     "solid": "solid",

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mfvpr.confidence import Confidence, confidence_inputs, fit_confidence, write_confidences
-from mfvpr.evaluation.choosing import Half, halves, halves_of_map
+from mfvpr.evaluation.calibration import Confidence, confidence_inputs, fit_confidence, write_confidences
 from mfvpr.evaluation.precision import (
     PrecisionRecall,
     Reliability,
@@ -17,13 +16,14 @@ from mfvpr.evaluation.precision import (
     precision_recall,
     reliability,
 )
-from mfvpr.ranked import FILTER
+from mfvpr.evaluation.results import Reason
+from mfvpr.evaluation.selection import Half, halves, halves_of_map
 from mfvpr.report.confidence_figures import precision_recall_figure, reliability_figure, shares_figure
 from mfvpr.report.evaluations import Judged
 from mfvpr.report.rankings import NO_PLACE, number, write_csv
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table
-from mfvpr.results import Reason
+from mfvpr.reranking.results import FILTER
 
 _COUNTS = ("right", "wrong", "refused", "of these right")
 SHARES = tuple(share / 20 for share in range(21))

@@ -10,10 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from mfvpr.data.datasets import Dataset, QuerySequence
-from mfvpr.data.files import clipped, printable, replacing
-from mfvpr.data.images import resize
-from mfvpr.errors import InputError
+from mfvpr.datasets.datasets import Dataset, QuerySequence
+from mfvpr.datasets.images import resize
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import clipped, printable, replacing
 
 SIDE = 320  # px of an image's longer side on the sheet
 _COLUMNS = 2  # of pairs

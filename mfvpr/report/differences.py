@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mfvpr.data.files import write_text
+from mfvpr.datasets.positives import stacked
 from mfvpr.evaluation.paths import places_along_path
-from mfvpr.evaluation.positives import stacked
 from mfvpr.evaluation.statistics import McNemar, SignFlips, block_sign_flips, mcnemar
 from mfvpr.report.evaluations import Judged
 from mfvpr.report.rankings import number, write_csv
 from mfvpr.report.tables import Table
+from mfvpr.utils.files import write_text
 
 
 class Difference(NamedTuple):

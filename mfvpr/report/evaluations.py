@@ -8,21 +8,21 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from mfvpr.data.datasets import MEANS, ImageFolder, QuerySequence
-from mfvpr.data.files import clipped, printable, write_text
-from mfvpr.data.images import resize
-from mfvpr.evaluation.positives import Positives
-from mfvpr.evaluation.truth import middle, threshold_words
+from mfvpr.datasets.datasets import MEANS, ImageFolder, QuerySequence
+from mfvpr.datasets.images import resize
+from mfvpr.datasets.positives import Positives
+from mfvpr.datasets.truth import middle, threshold_words
+from mfvpr.evaluation.results import Recall, Result
+from mfvpr.evaluation.stages import explain
 from mfvpr.features.extractor import Extractor, Source
-from mfvpr.pipeline import explain
-from mfvpr.ranked import Matched, Ranked
 from mfvpr.report.figures import Answer, aspect_of_resized, histogram_figure
 from mfvpr.report.file_names import file_names
 from mfvpr.report.rankings import Rankings, write_failures, write_predictions
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table
-from mfvpr.results import Recall, Result
+from mfvpr.reranking.results import Matched, Ranked
 from mfvpr.scoring.histogram import HistogramOfShifts
+from mfvpr.utils.files import clipped, printable, write_text
 
 ABOUT: tuple[str, ...] = ("system", "sequence", "outcome", "query", "answer")  # what the file of a figure tells
 _MOST_OF_A_NAME = 40  # characters in the title of a figure

@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
 
-from mfvpr.data.files import clipped, printable, replacing
-from mfvpr.pipeline import Explanation
+from mfvpr.evaluation.stages import Explanation
 from mfvpr.types import Matches
+from mfvpr.utils.files import clipped, printable, replacing
 
 _AGREES, _DIFFERS = "#2fa8ff", "#ff9a1f"  # told apart by color-blind people as well
 _GAP = 12  # px between the two images
@@ -30,7 +30,7 @@ class Answer:
         image: `[H, W, 3]` uint8, at the size that the points refer to.
         caption: above it.
         matches: of this pair, `[K, ...]`, NumPy; None where it was not matched.
-        explanation: of these matches, see `mfvpr.pipeline.explain`.
+        explanation: of these matches, see `mfvpr.evaluation.stages.explain`.
     """
 
     image: np.ndarray

@@ -5,8 +5,8 @@ import unicodedata
 from collections import Counter
 from collections.abc import Sequence
 
-from mfvpr.errors import InputError
-from mfvpr.fingerprints import fingerprint
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.fingerprints import fingerprint
 
 _MOST_BYTES = 200  # a file system takes 255, and `replacing` adds some
 _PLAIN = re.compile(r'(?!\.)[^\x00-\x1f\x7f/\\:*?"<>|\ud800-\udfff]*[^\x00-\x1f\x7f/\\:*?"<>|\ud800-\udfff. ]')

@@ -8,7 +8,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from mfvpr.data.files import replacing
+from mfvpr.utils.files import replacing
 
 _MARK = "#e8482c"
 _FLAT = 9  # letters of a column's value that fit beside the next one's

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from mfvpr.data.files import replacing
+from mfvpr.utils.files import replacing
 
 BINS = 12
 

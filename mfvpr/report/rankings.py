@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mfvpr.data.files import replacing
+from mfvpr.utils.files import replacing
 
 NO_PLACE = "no place"  # the answer to a query whose place the database is thought not to show
 

@@ -13,9 +13,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from mfvpr.data.files import write_text
-from mfvpr.errors import InputError
 from mfvpr.report.tables import Table
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import write_text
 
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "opencv-python-headless", "pillow")
 _UNFINISHED = ".unfinished"

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mfvpr.pipeline import Scales, dominant_shifts
+from mfvpr.evaluation.stages import Scales, dominant_shifts
 from mfvpr.report.evaluations import Judged
 from mfvpr.report.rankings import number, write_csv
 from mfvpr.scoring.histogram import HistogramOfShifts

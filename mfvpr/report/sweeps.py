@@ -14,7 +14,7 @@ from mfvpr.report.file_names import file_names
 from mfvpr.report.heat_maps import heat_map_figure
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table, written
-from mfvpr.sweeping.outcome import Outcome
+from mfvpr.tuning.sweeps.outcome import Outcome
 
 TOP = 10
 MAX_HEAT_MAPS = 6

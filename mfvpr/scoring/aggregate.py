@@ -3,12 +3,12 @@
 import jax
 import jax.numpy as jnp
 
-from mfvpr.declaration import check_choices, choice, flag, named, number
-from mfvpr.named_weights import NAMED_WEIGHTS, SUFFIX
-from mfvpr.numerics import masked, masked_mean, masked_median, positive, safe_sqrt, where_finite
+from mfvpr.scoring.fields import check_choices, choice, flag, named, number
 from mfvpr.scoring.shifts import image_sizes, match_shifts
+from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, SUFFIX
+from mfvpr.scoring.weights import Weight, match_confidence, match_weights
 from mfvpr.types import Array, Matches, value
-from mfvpr.weighting import Weight, match_confidence, match_weights
+from mfvpr.utils.numerics import masked, masked_mean, masked_median, positive, safe_sqrt, where_finite
 
 
 @value

@@ -8,12 +8,12 @@ paper's ||((i, j) - (k, l)) - (m_ij - m_kl)|| is the distance of two displacemen
 import jax
 import jax.numpy as jnp
 
-from mfvpr.declaration import check_choices, choice, flag, named, number, whole
-from mfvpr.named_weights import NAMED_WEIGHTS, SUFFIX
-from mfvpr.numerics import at_least_single, masked, positive, safe_sqrt, where_finite
+from mfvpr.scoring.fields import check_choices, choice, flag, named, number, whole
 from mfvpr.scoring.shifts import image_sizes
+from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, SUFFIX
+from mfvpr.scoring.weights import Weight, match_confidence, match_weights
 from mfvpr.types import Array, Matches, value
-from mfvpr.weighting import Weight, match_confidence, match_weights
+from mfvpr.utils.numerics import at_least_single, masked, positive, safe_sqrt, where_finite
 
 MAX_BINS = 215  # per side: pairs of cells are then still numbers of 32 bits
 _LEAST_SHARE = 1e-12  # of the winner's votes, below which a target has none: keeps the logarithm's gradient finite

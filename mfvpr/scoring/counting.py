@@ -2,9 +2,9 @@
 
 import jax.numpy as jnp
 
-from mfvpr.declaration import check_choices, choice
+from mfvpr.scoring.fields import check_choices, choice
+from mfvpr.scoring.weights import match_confidence
 from mfvpr.types import Array, Matches, value
-from mfvpr.weighting import match_confidence
 
 
 @value

@@ -8,11 +8,11 @@ patch of n x n cells is as it should be where index[anchor + offset] = index[anc
 import jax
 import jax.numpy as jnp
 
-from mfvpr.declaration import check_choices, choice, flag, whole
-from mfvpr.errors import InputError
-from mfvpr.numerics import masked
+from mfvpr.scoring.fields import check_choices, choice, flag, whole
+from mfvpr.scoring.weights import match_confidence
 from mfvpr.types import Array, Matches, value
-from mfvpr.weighting import match_confidence
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.numerics import masked
 
 LARGEST = 2**24  # whole numbers up to it are exact in float32
 _OUTSIDE = {"unequal": -1000, "zero": 0}

@@ -13,16 +13,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mfvpr.declaration import SCORE, check_choices, choice, flag, named, number, numbers, several, whole
-from mfvpr.errors import InputError
-from mfvpr.named_weights import NAMED_WEIGHTS, SUFFIX
-from mfvpr.numerics import compiled, is_concrete, positive, round_up
+from mfvpr.scoring.fields import SCORE, check_choices, choice, flag, named, number, numbers, several, whole
 from mfvpr.scoring.intervals import mass_interval
 from mfvpr.scoring.lattice import Lattice, bins, climb, mapped, of_all_bins, smooth_tallest, tallest, votes
 from mfvpr.scoring.shifts import are_numbers, image_sizes, match_shifts, where_usable, zoomed
 from mfvpr.scoring.tallest import tallest_bins
+from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, SUFFIX
+from mfvpr.scoring.weights import Weight, match_weights
 from mfvpr.types import Array, Matches, value
-from mfvpr.weighting import Weight, match_weights
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.numerics import compiled, is_concrete, positive, round_up
 
 MAX_BINS = 1024  # per axis, where nobody asks for more: the histograms of 50 pairs then take 200 MB
 

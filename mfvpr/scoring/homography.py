@@ -10,12 +10,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mfvpr.declaration import check_choices, choice, flag, number, whole
-from mfvpr.numerics import at_least_single, masked, where_finite, without_gradient
 from mfvpr.scoring import planes, quads
+from mfvpr.scoring.fields import check_choices, choice, flag, number, whole
 from mfvpr.scoring.shifts import query_features
+from mfvpr.scoring.weights import match_confidence
 from mfvpr.types import Array, Matches, value
-from mfvpr.weighting import match_confidence
+from mfvpr.utils.numerics import at_least_single, masked, where_finite, without_gradient
 
 _TOGETHER = 16  # matches that all models of a round are compared with in one step
 _ROUNDS = 8  # as many as the samples need, before degenerate draws end the search

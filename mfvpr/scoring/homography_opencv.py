@@ -5,10 +5,10 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import numpy as np
 
-from mfvpr.declaration import check_bounds, check_choices, choice, number
-from mfvpr.errors import InputError
-from mfvpr.numerics import available_cpus, is_concrete
+from mfvpr.scoring.fields import check_bounds, check_choices, choice, number
 from mfvpr.types import Array, Matches, value
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.numerics import available_cpus, is_concrete
 
 
 @value

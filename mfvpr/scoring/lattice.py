@@ -6,8 +6,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mfvpr.numerics import masked, safe_sqrt
 from mfvpr.types import Array
+from mfvpr.utils.numerics import masked, safe_sqrt
 
 _MOST_STEPS = 100  # of which hardly any pair takes 10
 _TOLERANCE = 1e-4  # standard deviations

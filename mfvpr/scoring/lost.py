@@ -2,11 +2,11 @@
 
 import jax.numpy as jnp
 
-from mfvpr.declaration import check_choices, choice, flag
-from mfvpr.numerics import at_least_single, masked, masked_mean, safe_sqrt, where_finite
+from mfvpr.scoring.fields import check_choices, choice, flag
 from mfvpr.scoring.shifts import image_sizes
+from mfvpr.scoring.weights import match_confidence
 from mfvpr.types import Array, Matches, value
-from mfvpr.weighting import match_confidence
+from mfvpr.utils.numerics import at_least_single, masked, masked_mean, safe_sqrt, where_finite
 
 _SMALLEST = 1e-12  # what float32 resolves of a cosine distance, and less than any distance of descriptors but 0
 

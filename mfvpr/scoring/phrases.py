@@ -3,11 +3,11 @@
 import jax
 import jax.numpy as jnp
 
-from mfvpr.declaration import check_choices, choice, number, whole
-from mfvpr.numerics import masked, positive, where_finite
+from mfvpr.scoring.fields import check_choices, choice, number, whole
 from mfvpr.scoring.shifts import match_shifts
+from mfvpr.scoring.weights import match_confidence
 from mfvpr.types import Array, Matches, value
-from mfvpr.weighting import match_confidence
+from mfvpr.utils.numerics import masked, positive, where_finite
 
 MAX_LENGTH = 8  # the phrases of 100,000 matches are still a number of float32
 

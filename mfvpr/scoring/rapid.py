@@ -2,11 +2,11 @@
 
 import jax.numpy as jnp
 
-from mfvpr.declaration import check_choices, choice, flag, numbers
-from mfvpr.numerics import at_least_single, masked, masked_mean, where_finite
+from mfvpr.scoring.fields import check_choices, choice, flag, numbers
 from mfvpr.scoring.shifts import image_sizes, match_shifts, query_features
+from mfvpr.scoring.weights import match_confidence
 from mfvpr.types import Array, Matches, value
-from mfvpr.weighting import match_confidence
+from mfvpr.utils.numerics import at_least_single, masked, masked_mean, where_finite
 
 
 @value

@@ -23,7 +23,7 @@ SCORERS: dict[str, type] = {
     "homography": Homography,
     "homography_opencv": OpenCvHomography,
 }
-"""The scores that programs know, by name. Their settings follow from their fields (`mfvpr.declaration`)."""
+"""The scores that programs know, by name. Their settings follow from their fields (`mfvpr.scoring.fields`)."""
 
 PAPER = ("count", "sum", "anchor", "histogram")
 """Those that are compared where nobody chooses."""

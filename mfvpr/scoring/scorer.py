@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mfvpr.errors import InputError
 from mfvpr.types import Array, Matches
+from mfvpr.utils.errors import InputError
 
 Scorer = Callable[[Matches], Array]
 """Maps the Matches of ONE pair, slots `[K]`, to a score `[]` float32: larger = more likely the same place, exactly 0

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 
-from mfvpr.errors import InputError
-from mfvpr.numerics import at_least_single, masked
 from mfvpr.types import Array, Matches
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.numerics import at_least_single, masked
 
 
 def match_shifts(matches: Matches) -> Array:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mfvpr import InputError
-from mfvpr.data.arrays import read_arrays, write_arrays
-from mfvpr.numerics import available_cpus
+from mfvpr.utils.arrays import read_arrays, write_arrays
+from mfvpr.utils.numerics import available_cpus
 
 ARRAYS = {
     "scores": np.random.default_rng(0).normal(size=(3, 4)).astype(np.float32),

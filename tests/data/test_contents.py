@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mfvpr.data import contents as module
-from mfvpr.data.contents import Content, contents
-from mfvpr.data.datasets import image_folder
+from mfvpr.datasets import contents as module
+from mfvpr.datasets.contents import Content, contents
+from mfvpr.datasets.datasets import image_folder
 
 SETTLED = 30_000_000  # ns; the real one would keep every test waiting for seconds
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from mfvpr import InputError
-from mfvpr.data.datasets import folder_dataset, image_folder
-from mfvpr.data.files import printable, replacing, write_text
+from mfvpr.datasets.datasets import folder_dataset, image_folder
+from mfvpr.utils.files import printable, replacing, write_text
 from tests.builders import fill
 
 

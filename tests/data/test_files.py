@@ -2,8 +2,8 @@
 
 import pytest
 
-from mfvpr.data.files import below
-from mfvpr.errors import InputError
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import below
 
 
 @pytest.fixture

@@ -12,16 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import InputError, frame_positives
-from mfvpr.data.datasets import folder_dataset
-from mfvpr.data.files import write_text
-from mfvpr.data.ground_truth import (
-    AllowedTruth,
-    FrameTruth,
-    LabelTruth,
-    RadiusTruth,
-)
-from mfvpr.data.truth_files import truth_from_labels
-from mfvpr.evaluation import Positives, judge, threshold_words
+from mfvpr.datasets.datasets import folder_dataset
+from mfvpr.datasets.ground_truth import AllowedTruth, FrameTruth, LabelTruth, RadiusTruth
+from mfvpr.datasets.positives import Positives
+from mfvpr.datasets.truth import threshold_words
+from mfvpr.datasets.truth_files import truth_from_labels
+from mfvpr.evaluation import judge
+from mfvpr.utils.files import write_text
 from tests import oracles
 from tests.builders import fill
 

@@ -13,11 +13,11 @@ import pytest
 from PIL import Image
 
 from mfvpr import InputError
-from mfvpr.data.contents import contents
-from mfvpr.data.datasets import image_folder
-from mfvpr.data.images import MAX_PIXELS, Header, read_header, read_image, resize
+from mfvpr.datasets.contents import contents
+from mfvpr.datasets.datasets import image_folder
+from mfvpr.datasets.images import MAX_PIXELS, Header, read_header, read_image, resize
 from mfvpr.features.sift import Sift
-from mfvpr.threads import ordered_map
+from mfvpr.utils.threads import ordered_map
 from tests.golden import make_resize
 
 pytestmark = pytest.mark.thorough

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from mfvpr.data.published import PUBLISHED, differences, published_dataset
-from mfvpr.data.published.lists import read_lines, read_names, read_rows
-from mfvpr.data.published.robotcar import CONDITIONS, REFERENCE, nearest_places
-from mfvpr.errors import InputError
+from mfvpr.datasets.published import PUBLISHED, differences, published_dataset
+from mfvpr.datasets.published.lists import read_lines, read_names, read_rows
+from mfvpr.datasets.published.robotcar import CONDITIONS, REFERENCE, nearest_places
+from mfvpr.utils.errors import InputError
 from tests.checkpoints import write_matlab
 
 IMAGE = cv2.imencode(".png", np.zeros((4, 6, 3), np.uint8))[1].tobytes()

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from mfvpr.data.streets import draw_seasons, seasons_folder
-from mfvpr.data.streets.drives import LANE, SPACING, plan_drives, plan_return
-from mfvpr.data.streets.exposure import fall_rain
-from mfvpr.data.streets.seasons import CONDITIONS, TRUTH
+from mfvpr.datasets.streets import draw_seasons, seasons_folder
+from mfvpr.datasets.streets.drives import LANE, SPACING, plan_drives, plan_return
+from mfvpr.datasets.streets.exposure import fall_rain
+from mfvpr.datasets.streets.seasons import CONDITIONS, TRUTH
 from tests.data.test_streets import contents
 
 pytestmark = pytest.mark.thorough

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mfvpr import InputError, retrieval
-from mfvpr.data.contents import contents
-from mfvpr.data.datasets import folder_dataset
-from mfvpr.data.sequences import own_rows, without_neighbors
-from mfvpr.evaluation import Positives
-from mfvpr.retrieval import ExactSearch
+from mfvpr import InputError
+from mfvpr.datasets.contents import contents
+from mfvpr.datasets.datasets import folder_dataset
+from mfvpr.datasets.positives import Positives
+from mfvpr.datasets.sequences import own_rows, without_neighbors
+from mfvpr.retrieval import search as retrieval
+from mfvpr.retrieval.search import ExactSearch
 from tests.builders import unit
 
 

@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from mfvpr.data.streets import draw_streets, streets_folder
-from mfvpr.data.streets.camera import Camera
-from mfvpr.data.streets.drives import plan_drives
-from mfvpr.data.streets.exposure import expose
-from mfvpr.data.streets.ground_truth import Facade, image_shift, visible_points
-from mfvpr.data.streets.sheets import Sheet, texture
-from mfvpr.data.streets.weather import WEATHERS, Exposure
+from mfvpr.datasets.streets import draw_streets, streets_folder
+from mfvpr.datasets.streets.camera import Camera
+from mfvpr.datasets.streets.drives import plan_drives
+from mfvpr.datasets.streets.exposure import expose
+from mfvpr.datasets.streets.ground_truth import Facade, image_shift, visible_points
+from mfvpr.datasets.streets.sheets import Sheet, texture
+from mfvpr.datasets.streets.weather import WEATHERS, Exposure
 
 pytestmark = pytest.mark.thorough
 

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from mfvpr import frame_positives
-from mfvpr.data.ground_truth import AllowedTruth, FrameTruth, LabelTruth
-from mfvpr.evaluation import Positives, best_setting, halves, hits, neighbors
-from mfvpr.evaluation.choosing import halves_of_map
+from mfvpr.datasets.ground_truth import AllowedTruth, FrameTruth, LabelTruth
+from mfvpr.datasets.positives import Positives
+from mfvpr.evaluation import best_setting, halves, hits, neighbors
+from mfvpr.evaluation.selection import halves_of_map
 
 
 @pytest.mark.parametrize("tolerance", [0, 1, 3])

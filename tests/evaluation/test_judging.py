@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from mfvpr import InputError, Shortlist
-from mfvpr.data.ground_truth import FrameTruth, RadiusTruth
-from mfvpr.evaluation import judge, middle
+from mfvpr.datasets.ground_truth import FrameTruth, RadiusTruth
+from mfvpr.datasets.truth import middle
+from mfvpr.evaluation import judge
 
 QUERIES, TOLERANCES, SETTINGS = 20, (0, 1, 3), 4
 TRUTH = FrameTruth(tuple((row,) for row in range(QUERIES)), QUERIES)

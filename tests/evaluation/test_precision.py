@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from mfvpr.errors import InputError
 from mfvpr.evaluation.precision import chance_calibration_error, precision_recall, reliability
+from mfvpr.utils.errors import InputError
 
 
 def made_up(seed=0, queries=40):

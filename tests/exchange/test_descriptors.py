@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import InputError
-from mfvpr.exchange import read_global_descriptors, write_global_descriptors
+from mfvpr.io import read_global_descriptors, write_global_descriptors
 from tests.builders import unit
 
 NAMES = ["image2.jpg", "image10.jpg", "sub/image 1.jpg"]  # in natural order; Python sorts 10 before 2

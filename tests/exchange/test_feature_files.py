@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mfvpr import InputError
-from mfvpr.exchange import open_features, write_features
+from mfvpr.io import open_features, write_features
 from tests.builders import make_features
 from tests.exchange.foreign import NAMES, assert_equal, feature, features_of
 

@@ -7,9 +7,9 @@ import h5py
 import numpy as np
 import pytest
 
-import mfvpr.exchange.h5
+import mfvpr.io.h5
 from mfvpr import InputError
-from mfvpr.exchange import open_features
+from mfvpr.io import open_features
 from tests.exchange.foreign import NAMES, SIZE, append_hloc, assert_equal, feature, features_of, hloc_parts, write_hloc
 
 
@@ -267,7 +267,7 @@ def test_opening_and_reading_take_the_memory_of_what_is_read(path):
 
 def test_without_h5py(path, monkeypatch):
     path.write_bytes(b"")
-    assert not hasattr(mfvpr.exchange.h5, "h5py")  # it is imported where it is needed
+    assert not hasattr(mfvpr.io.h5, "h5py")  # it is imported where it is needed
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(InputError, match=r"h5py; pip install 'mfvpr\[hloc\]'"):
         open_features(path, NAMES)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from mfvpr import InputError
-from mfvpr.exchange import open_features, read_global_descriptors
+from mfvpr.io import open_features, read_global_descriptors
 from tests.exchange.foreign import append_hloc, feature, features_of, hloc_parts, write_hloc
 
 

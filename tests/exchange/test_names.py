@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import InputError, Shortlist
-from mfvpr.exchange import write_features, write_global_descriptors, write_shortlist
-from mfvpr.exchange.names import match_names, require_all
+from mfvpr.io import write_features, write_global_descriptors, write_shortlist
+from mfvpr.io.names import match_names, require_all
 from tests.exchange.foreign import feature
 
 FILE = Path("feats.h5")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mfvpr import InputError
-from mfvpr.exchange import open_features, read_global_descriptors
+from mfvpr.io import open_features, read_global_descriptors
 from tests.exchange.foreign import SIZE, assert_equal, feature
 
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import InputError, Ranking, Shortlist
-from mfvpr.exchange import read_shortlist, reranked, write_shortlist
+from mfvpr.io import read_shortlist, reranked, write_shortlist
 
 QUERIES = ["q/1.jpg", "q/2.jpg", "q/my query.jpg"]
 DATABASE = ["d/1.jpg", "d/2.jpg", "d/my place.jpg", "d/x, y.jpg"]

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mfvpr.data.images import read_image, resize
-from mfvpr.weights.checkpoint import read_checkpoint
+from mfvpr.checkpoints.checkpoint import read_checkpoint
+from mfvpr.datasets.images import read_image, resize
 from tests.checkpoints import random_checkpoint
 from tests.golden.make_d2net import projections, samples, texture
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.types import Features
-from mfvpr.weights.checkpoint import read_checkpoint
 from tests.builders import make_features
 from tests.checkpoints import lightglue_shapes, random_checkpoint
 

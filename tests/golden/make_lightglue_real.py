@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from experiments.benchmark.real import FOLDERS, SIZE
-from mfvpr.data.images import read_image, resize
+from mfvpr.checkpoints.checkpoint import read_checkpoint
+from mfvpr.checkpoints.files import load_model
+from mfvpr.datasets.images import read_image, resize
 from mfvpr.features.aliked import AlikedFeatures
 from mfvpr.types import Features
-from mfvpr.weights.checkpoint import read_checkpoint
-from mfvpr.weights.files import load_model
 from tests.golden.make_lightglue import as_tensors, public
 
 GOLDEN = Path(__file__).parent / "lightglue_real.npz"

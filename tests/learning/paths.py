@@ -3,9 +3,10 @@
 import numpy as np
 
 from mfvpr import Shortlist
-from mfvpr.evaluation import Judge, Positives, halves
-from mfvpr.learning.splits import training_splits
-from mfvpr.match_sets import MatchSet
+from mfvpr.datasets.positives import Positives
+from mfvpr.evaluation import Judge, halves
+from mfvpr.matching.match_set import MatchSet
+from mfvpr.tuning.learning.splits import training_splits
 from tests.builders import of_query, random_matches
 
 QUERIES = 32

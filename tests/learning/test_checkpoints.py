@@ -12,7 +12,7 @@ import orbax.checkpoint as ocp
 import pytest
 
 from mfvpr import InputError
-from mfvpr.learning import checkpoints
+from mfvpr.tuning.learning import checkpoints
 from tests.learning.toys import RECIPE, ROOT, START, contents, program, same, train
 
 pytestmark = pytest.mark.thorough

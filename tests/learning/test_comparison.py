@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, InputError, MatchCount, score_candidates
-from mfvpr.learned_weight import ABSOLUTE
-from mfvpr.learning import comparison
-from mfvpr.learning.comparison import Options, start
-from mfvpr.learning.losses import LOSSES, cross_entropy, mean_loss
-from mfvpr.learning.models import Model
-from mfvpr.sweeping import Axes
-from mfvpr.sweeping.search import untracked_stages
+from mfvpr.scoring.learned_weight import ABSOLUTE
+from mfvpr.tuning.learning import comparison
+from mfvpr.tuning.learning.comparison import Options, start
+from mfvpr.tuning.learning.losses import LOSSES, cross_entropy, mean_loss
+from mfvpr.tuning.learning.models import Model
+from mfvpr.tuning.sweeps import Axes
+from mfvpr.tuning.sweeps.search import untracked_stages
 from tests.builders import random_matches
 from tests.learning.paths import QUERIES, SIZES, TOLERANCES, split
 

@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 
 from mfvpr import HistogramOfShifts, InputError
-from mfvpr.evaluation import Positives
-from mfvpr.evaluation.positives import side_by_side
-from mfvpr.learning import comparison
-from mfvpr.learning.data_sets import Part, joined
-from mfvpr.learning.splits import VALIDATION, training_splits
-from mfvpr.learning.teaching import Options
-from mfvpr.sweeping import Axes
-from mfvpr.sweeping.search import untracked_stages
+from mfvpr.datasets.positives import Positives, side_by_side
+from mfvpr.tuning.learning import comparison
+from mfvpr.tuning.learning.data_sets import Part, joined
+from mfvpr.tuning.learning.splits import VALIDATION, training_splits
+from mfvpr.tuning.learning.teaching import Options
+from mfvpr.tuning.sweeps import Axes
+from mfvpr.tuning.sweeps.search import untracked_stages
 from mfvpr.types import per_match
 from tests.learning.paths import QUERIES, TOLERANCES, path
 

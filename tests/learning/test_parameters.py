@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from mfvpr import InputError
-from mfvpr.learning.parameters import from_logarithms, to_logarithms
+from mfvpr.tuning.learning.parameters import from_logarithms, to_logarithms
 
 
 def test_there_and_back_and_always_above_0():

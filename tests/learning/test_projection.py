@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from jax.test_util import check_grads
 
 from mfvpr import MatchCount, match, soft_match
-from mfvpr.learning.losses import cross_entropy, mean_loss
-from mfvpr.learning.projection import Projection
-from mfvpr.learning.training import fit
+from mfvpr.tuning.learning.losses import cross_entropy, mean_loss
+from mfvpr.tuning.learning.projection import Projection
+from mfvpr.tuning.learning.training import fit
 from tests.builders import make_features, unit
 
 pytestmark = pytest.mark.thorough

@@ -9,11 +9,11 @@ import optax
 import pytest
 
 from mfvpr import AggregatedScore, HistogramOfShifts, RatioWeight
-from mfvpr.learned_weight import RELATIVE, LearnedWeight
-from mfvpr.learning.models import Model
-from mfvpr.learning.splits import Batch
-from mfvpr.learning.teaching import TEACHER_SIGMA, Options, of_matches
-from mfvpr.learning.training import fit
+from mfvpr.scoring.learned_weight import RELATIVE, LearnedWeight
+from mfvpr.tuning.learning.models import Model
+from mfvpr.tuning.learning.splits import Batch
+from mfvpr.tuning.learning.teaching import TEACHER_SIGMA, Options, of_matches
+from mfvpr.tuning.learning.training import fit
 from tests.builders import make_matches
 from tests.learning.paths import SIZES, split
 

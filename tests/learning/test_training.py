@@ -9,10 +9,10 @@ import optax
 import pytest
 
 from mfvpr import HistogramOfShifts, InputError, score_candidates
-from mfvpr.learned_weight import ABSOLUTE, LearnedWeight
-from mfvpr.learning.losses import cross_entropy, mean_loss
-from mfvpr.learning.parameters import from_logarithms, to_logarithms
-from mfvpr.learning.training import TrainingError, fit
+from mfvpr.scoring.learned_weight import ABSOLUTE, LearnedWeight
+from mfvpr.tuning.learning.losses import cross_entropy, mean_loss
+from mfvpr.tuning.learning.parameters import from_logarithms, to_logarithms
+from mfvpr.tuning.learning.training import TrainingError, fit
 from tests.builders import make_matches
 from tests.learning.toys import START, batches, contents, objective, program, same, train, validate
 

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from mfvpr.learning import checkpoints
-from mfvpr.learning.training import Fit, fit
+from mfvpr.tuning.learning import checkpoints
+from mfvpr.tuning.learning.training import Fit, fit
 
 ROOT = Path(__file__).parents[2]
 RECIPE = {"model": {"scorer": "line", "sizes": (1, 3)}, "data": {"name": "drawn", "images": 100}, "seed": None}

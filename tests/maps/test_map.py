@@ -17,21 +17,21 @@ import pytest
 from PIL import Image
 
 import mfvpr
-from mfvpr.archive import Archive
-from mfvpr.confidence import Confidence
-from mfvpr.data.datasets import folder_dataset
-from mfvpr.errors import InputError
+from mfvpr.datasets.datasets import folder_dataset
+from mfvpr.evaluation.calibration import Confidence
+from mfvpr.evaluation.stages import explain
 from mfvpr.features import Aggregated, Description, Scale
 from mfvpr.features.sift import Sift
 from mfvpr.features.vlad import VladFitting
-from mfvpr.filters import Retrieval
-from mfvpr.maps import Map
-from mfvpr.maps import matching as map_matching
-from mfvpr.maps.evidence import LEAST_MATCHES, MapStrength
-from mfvpr.maps.resident import Resident
-from mfvpr.pipeline import explain
-from mfvpr.stores import maps as map_store
+from mfvpr.localization import Map
+from mfvpr.localization import matching as map_matching
+from mfvpr.localization.evidence import LEAST_MATCHES, MapStrength
+from mfvpr.localization.resident import Resident
+from mfvpr.retrieval.retriever import Retrieval
+from mfvpr.storage import maps as map_store
+from mfvpr.storage.feature_cache import Archive
 from mfvpr.types import Features
+from mfvpr.utils.errors import InputError
 from tests import scorers
 from tests.programs import ROOT
 
@@ -487,8 +487,8 @@ def test_descriptors_may_be_the_extractors_own_or_anothers(dataset, tmp_path):
 def test_killed_while_adding_it_has_whole_rows(small_street, tmp_path):
     """Rows appear one by one; whatever is there can be read, and the next goes on behind it."""
     program = (
-        "import sys; from pathlib import Path; from mfvpr.data.datasets import folder_dataset\n"
-        "from mfvpr.maps import Map; from tests.maps.test_map import SIFT, VLAD\n"
+        "import sys; from pathlib import Path; from mfvpr.datasets.datasets import folder_dataset\n"
+        "from mfvpr.localization import Map; from tests.maps.test_map import SIFT, VLAD\n"
         "root = Path(sys.argv[1]); data = folder_dataset(root / 'database', root / 'queries', ground_truth='order')\n"
         "known = Map(sys.argv[2], SIFT, VLAD); known.learn(data.database); print('ready', flush=True)\n"
         "for turn in range(int(sys.argv[3]), 10**6):\n"

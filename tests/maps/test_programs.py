@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments import asked_images, build, maps
+from experiments import build, maps, query_images
 from experiments.settings import SettingsError
-from mfvpr.confidence import Confidence, write_confidences
-from mfvpr.data.images import read_image
-from mfvpr.data.videos import frames
-from mfvpr.errors import InputError
-from mfvpr.stores.maps import hold_map
+from mfvpr.datasets.images import read_image
+from mfvpr.datasets.videos import frames
+from mfvpr.evaluation.calibration import Confidence, write_confidences
+from mfvpr.storage.maps import hold_map
+from mfvpr.utils.errors import InputError
 from tests.programs import ROOT, composed, typed
 
 pytestmark = pytest.mark.thorough
@@ -324,10 +324,10 @@ def test_names_do_not_depend_on_the_spelling_of_a_path(small_street, video, tmp_
     monkeypatch.chdir(small_street)
     expected = [str(small_street / f"queries/{row:04d}.png") for row in range(10)]
     for folder in ("queries", small_street / "queries", "./database/../queries/", tmp_path / "link/queries"):
-        found = asked_images.images({"images": str(folder), "watch": False})
+        found = query_images.images({"images": str(folder), "watch": False})
         assert [name for name, _ in found] == expected
     monkeypatch.chdir(tmp_path)
-    name, _ = next(asked_images.images({"images": video.name, "watch": False, "every": 1}))
+    name, _ = next(query_images.images({"images": video.name, "watch": False, "every": 1}))
     assert name == f"{video}:0"
 
 
@@ -346,8 +346,8 @@ def test_a_file_that_vanishes_while_its_folder_is_listed_does_not_end_the_watch(
     (tmp_path / "b.png").write_bytes(b"image")
     (tmp_path / "c.png").mkdir()
     monkeypatch.setattr(Path, "is_file", lambda _: True)  # as it was when it was asked
-    monkeypatch.setattr(asked_images, "POLL", 0)
-    name, path = next(asked_images.images({"images": str(tmp_path), "watch": True}))
+    monkeypatch.setattr(query_images, "POLL", 0)
+    name, path = next(query_images.images({"images": str(tmp_path), "watch": True}))
     assert (name, path) == (str(tmp_path / "b.png"), tmp_path / "b.png")
 
 

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from mfvpr.errors import InputError
-from mfvpr.maps import Alternative, Answer, route
-from mfvpr.maps.route import Drive, Route, motion, shares, step
+from mfvpr.localization import Alternative, Answer, route
+from mfvpr.localization.route import Drive, Route, motion, shares, step
+from mfvpr.utils.errors import InputError
 
 
 def answer(scores, p=None):

@@ -8,15 +8,15 @@ from dataclasses import dataclass, field, replace
 import pytest
 
 import mfvpr
-from mfvpr.data.datasets import image_folder
-from mfvpr.errors import InputError
+from mfvpr.datasets.datasets import image_folder
 from mfvpr.features.vlad import VladFitting
-from mfvpr.fingerprints import recipe_of
-from mfvpr.maps import Map
-from mfvpr.maps.describing import Describing
-from mfvpr.stores import maps as map_store
-from mfvpr.stores.features import open_store
-from mfvpr.stores.rows import RowStore, open_rows
+from mfvpr.localization import Map
+from mfvpr.localization.describing import Describing
+from mfvpr.storage import maps as map_store
+from mfvpr.storage.features import open_store
+from mfvpr.storage.rows import RowStore, open_rows
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.fingerprints import recipe_of
 from tests.maps.test_map import Constant
 from tests.stores.made_up import file_of
 

@@ -9,15 +9,15 @@ import pytest
 from flax import nnx
 
 from mfvpr import InputError
+from mfvpr.checkpoints.conversion import convert
+from mfvpr.checkpoints.networks import blueprint
+from mfvpr.checkpoints.registry import entry_of
+from mfvpr.checkpoints.tables import ALIKED
 from mfvpr.features.aliked import AlikedFeatures
-from mfvpr.models.aliked import Aliked, DeformableConv
-from mfvpr.models.aliked_description import DescriptorHead, field
-from mfvpr.models.aliked_detection import detect
-from mfvpr.models.sampling import sample, upsample
-from mfvpr.weights.conversion import convert
-from mfvpr.weights.networks import blueprint
-from mfvpr.weights.registry import entry_of
-from mfvpr.weights.tables import ALIKED
+from mfvpr.networks.aliked import Aliked, DeformableConv
+from mfvpr.networks.aliked_description import DescriptorHead, field
+from mfvpr.networks.aliked_detection import detect
+from mfvpr.networks.sampling import sample, upsample
 from tests import checkpoints
 from tests.builders import local
 from tests.golden.make_aliked import DRAWN, GOLDEN, REAL, checkpoint, picture, projections, samples, texture

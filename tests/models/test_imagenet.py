@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mfvpr.models.imagenet import preprocess
+from mfvpr.networks.imagenet import preprocess
 
 
 @pytest.mark.optimized

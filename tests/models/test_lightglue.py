@@ -8,16 +8,16 @@ import jax
 import numpy as np
 import pytest
 
-from mfvpr.errors import InputError
-from mfvpr.lightglue import LightGlueMatching
-from mfvpr.models.lightglue import LightGlue
-from mfvpr.models.lightglue_assignment import assignment
+from mfvpr.checkpoints.checkpoint import read_checkpoint
+from mfvpr.checkpoints.conversion import convert
+from mfvpr.checkpoints.networks import blueprint, planned
+from mfvpr.checkpoints.registry import entry_of
+from mfvpr.checkpoints.tables import LIGHTGLUE
+from mfvpr.matching.lightglue import LightGlueMatching
+from mfvpr.networks.lightglue import LightGlue
+from mfvpr.networks.lightglue_assignment import assignment
 from mfvpr.types import per_keypoint
-from mfvpr.weights.checkpoint import read_checkpoint
-from mfvpr.weights.conversion import convert
-from mfvpr.weights.networks import blueprint, planned
-from mfvpr.weights.registry import entry_of
-from mfvpr.weights.tables import LIGHTGLUE
+from mfvpr.utils.errors import InputError
 from tests import checkpoints
 from tests.golden import make_lightglue_real
 from tests.golden.make_lightglue import DEPTH, GOLDEN, REAL, SEEDS, SIZES, SMALL, SURE, checkpoint, pair

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from mfvpr.errors import InputError
+from mfvpr.checkpoints.conversion import convert
+from mfvpr.checkpoints.networks import blueprint
+from mfvpr.checkpoints.registry import entry_of
+from mfvpr.checkpoints.tables import MIXVPR
 from mfvpr.features.mixvpr import MixVprDescriptor
-from mfvpr.models.mixvpr import MixVPR, preprocess
-from mfvpr.models.resnet import ResNet50
-from mfvpr.weights.conversion import convert
-from mfvpr.weights.networks import blueprint
-from mfvpr.weights.registry import entry_of
-from mfvpr.weights.tables import MIXVPR
+from mfvpr.networks.mixvpr import MixVPR, preprocess
+from mfvpr.networks.resnet import ResNet50
+from mfvpr.utils.errors import InputError
 from tests.checkpoints import mixvpr_shapes, random_checkpoint
 from tests.golden.make_mixvpr import GOLDEN, SIZES, faint_maps, images, samples
 

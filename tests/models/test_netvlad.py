@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from mfvpr.errors import InputError
+from mfvpr.checkpoints.checkpoint import read_checkpoint
+from mfvpr.checkpoints.conversion import convert
+from mfvpr.checkpoints.networks import network_of, planned
+from mfvpr.checkpoints.registry import entry_of
+from mfvpr.checkpoints.tables import NETVLAD, NETVLAD_MATLAB
 from mfvpr.features.global_descriptor import GlobalDescriptor
-from mfvpr.models.gem import GeneralizedMean
-from mfvpr.models.netvlad import CHANNELS, NetVlad, VggNetVlad
-from mfvpr.weights.checkpoint import read_checkpoint
-from mfvpr.weights.conversion import convert
-from mfvpr.weights.networks import network_of, planned
-from mfvpr.weights.registry import entry_of
-from mfvpr.weights.tables import NETVLAD, NETVLAD_MATLAB
+from mfvpr.networks.gem import GeneralizedMean
+from mfvpr.networks.netvlad import CHANNELS, NetVlad, VggNetVlad
+from mfvpr.utils.errors import InputError
 from tests.checkpoints import gem_checkpoint, matlab_netvlad, netvlad_checkpoint, write_matlab
 from tests.golden.make_netvlad import CASES, GEM, GOLDEN, MATLAB, PATCHES, image, name, samples
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mfvpr.models.sampling import neighbors, sample, upsample
+from mfvpr.networks.sampling import neighbors, sample, upsample
 from tests.models import aliked_oracle as oracle
 
 

@@ -10,14 +10,14 @@ import pytest
 from flax import nnx
 
 import mfvpr
-from mfvpr.errors import InputError
+from mfvpr.checkpoints.tables import DINOV2, SELAVPR
 from mfvpr.features.global_descriptor import GlobalDescriptor
 from mfvpr.features.selavpr import SelaVprFeatures
-from mfvpr.fingerprints import fingerprint, recipe_of
-from mfvpr.models.selavpr import AdaptedBlock, SelaVpr, Upsampling
-from mfvpr.models.vit import Block, TokenDescriptor, VisionTransformer
-from mfvpr.stores import features, vectors
-from mfvpr.weights.tables import DINOV2, SELAVPR
+from mfvpr.networks.selavpr import AdaptedBlock, SelaVpr, Upsampling
+from mfvpr.networks.vit import Block, TokenDescriptor, VisionTransformer
+from mfvpr.storage import features, vectors
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.fingerprints import fingerprint, recipe_of
 from tests.builders import make_matches
 from tests.checkpoints import dinov2_shapes, selavpr_shapes, transformer_checkpoint
 from tests.golden.make_netvlad import image, name, samples

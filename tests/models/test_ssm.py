@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from mfvpr.models import imagenet
-from mfvpr.models.ssm import STAGE1_STRIDE, STAGE2_STRIDE, SsmVgg
-from mfvpr.weights.conversion import convert
-from mfvpr.weights.networks import blueprint
-from mfvpr.weights.registry import entry_of
-from mfvpr.weights.tables import SSM
+from mfvpr.checkpoints.conversion import convert
+from mfvpr.checkpoints.networks import blueprint
+from mfvpr.checkpoints.registry import entry_of
+from mfvpr.checkpoints.tables import SSM
+from mfvpr.networks import imagenet
+from mfvpr.networks.ssm import STAGE1_STRIDE, STAGE2_STRIDE, SsmVgg
 from tests.golden.make_d2net import samples
 from tests.golden.make_ssm_maps import CASES, GOLDEN, checkpoint
 

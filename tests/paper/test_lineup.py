@@ -4,16 +4,16 @@ from pathlib import Path
 
 import pytest
 
-from experiments.paper import lineup
+from experiments.paper import systems
 from experiments.paper.figures import mean_bars
-from experiments.paper.lineup import DRAWN, ROWS, Place, chosen_rows, missing_weights, overrides, places
 from experiments.paper.printed import printed
 from experiments.paper.runs import made_of, settings_of
+from experiments.paper.systems import DRAWN, ROWS, Place, chosen_rows, missing_weights, overrides, places
 from experiments.paper.tables import OVERALL, Evaluated, Found, beside, evaluated, tables
 from experiments.settings import SettingsError
 from experiments.truth import fingerprint
-from mfvpr.data.datasets import Dataset, ImageFolder, QuerySequence
-from mfvpr.data.ground_truth import FrameTruth
+from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
+from mfvpr.datasets.ground_truth import FrameTruth
 
 pytestmark = pytest.mark.thorough
 
@@ -97,7 +97,7 @@ def test_rows_are_chosen_by_name():
 
 
 def test_weights_that_are_missing_are_named(monkeypatch):
-    monkeypatch.setattr(lineup, "is_installed", lambda entry: False)
+    monkeypatch.setattr(systems, "is_installed", lambda entry: False)
     assert [entry.name for entry in missing_weights(made("mix_hist_50"))] == ["d2_tf", "mixvpr_4096"]
     assert [entry.name for entry in missing_weights(made("ssm_vpr"))] == ["vgg16_places365"]
     assert missing_weights(made("sift_50")) == []

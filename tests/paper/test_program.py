@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.paper import lineup, program
+from experiments.paper import program, systems
 from experiments.paper.runs import held
 from mfvpr.report.tables import Table
 from tests.programs import ROOT, composed, typed
@@ -28,7 +28,7 @@ QUERIES = 8
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     """A folder with one data set: frames of the drawn street under the names of another."""
-    from mfvpr.data.streets import draw_streets
+    from mfvpr.datasets.streets import draw_streets
 
     folder = tmp_path_factory.mktemp("data") / "grief_season"
     draw_streets(folder, num_frames=QUERIES, image_size=(160, 120))
@@ -139,7 +139,7 @@ def test_damaged_runs_are_told(finished, data, tmp_path, monkeypatch, capsys, na
 
 def test_the_plan_comes_first_and_tables_before_the_seconds(tmp_path, monkeypatch, capsys):
     """An interrupted timing costs no table."""
-    place = lineup.Place("streets_seasons", ("dataset=streets_seasons",))
+    place = systems.Place("streets_seasons", ("dataset=streets_seasons",))
     monkeypatch.setattr(program.lineup, "places", lambda *_: ([place], ["corridor: needs a folder"]))
     monkeypatch.setattr(program, "evaluate_all", lambda *_: ({place.name: None}, []))
     monkeypatch.setattr(program, "tables", lambda found: [("recall", "heading", Table(["system"], [["SIFT"]]))])

@@ -21,9 +21,9 @@ from mfvpr import (
     score_candidates,
     score_grid,
 )
-from mfvpr.errors import InputError
-from mfvpr.numerics import held
 from mfvpr.scoring.parameters import fit
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.numerics import held
 from tests.builders import SIZE, per_match, random_matches
 from tests.scorers import FOREIGN, OWN, Wrapped, one_of_each_class, plain, title
 

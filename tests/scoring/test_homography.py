@@ -11,10 +11,10 @@ from scipy.optimize import least_squares
 
 import mfvpr
 from mfvpr import Homography, score_candidates, score_grid
-from mfvpr.errors import NoGradientError
-from mfvpr.numerics import masked
 from mfvpr.scoring import quads
 from mfvpr.types import per_match
+from mfvpr.utils.errors import NoGradientError
+from mfvpr.utils.numerics import masked
 from tests import ransac_oracle
 from tests.builders import SIZE, make_matches
 

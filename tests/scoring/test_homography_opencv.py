@@ -7,10 +7,12 @@ import jax
 import numpy as np
 import pytest
 
-from mfvpr import OpenCvHomography, pipeline, score_candidates, score_grid, sweeping
-from mfvpr.errors import InputError
-from mfvpr.match_sets import MatchSet
+from mfvpr import OpenCvHomography, score_candidates, score_grid
+from mfvpr.evaluation import stages
+from mfvpr.matching.match_set import MatchSet
+from mfvpr.tuning import sweeps
 from mfvpr.types import Shortlist, per_match
+from mfvpr.utils.errors import InputError
 from tests.builders import make_matches
 from tests.scoring.test_homography import plane_points, stacked
 
@@ -57,11 +59,11 @@ def test_grids_data_sets_and_sweeps_score_alike():
     match_set = MatchSet.of([row], np.array([[60, 120, 20]]))
     candidates = Shortlist(np.arange(3)[None], np.array([[0.3, 0.2, 0.1]], np.float32), np.ones((1, 3), bool))
     scorers = {"opencv": OpenCvHomography(8.0), "magsac": OpenCvHomography(8.0, estimator="magsac")}
-    scores = pipeline.score(scorers, match_set, candidates)
+    scores = stages.score(scorers, match_set, candidates)
     assert scores["opencv"].tolist() == [expected(cv2.RANSAC)]
     assert scores["magsac"].tolist() == [expected(cv2.USAC_MAGSAC)]
     settings = [{"threshold": 8.0, "max_distance": distance} for distance in (0.4, 0.6)]  # all are 0.5 apart
-    rows = sweeping.sweep(scorers["opencv"], settings, match_set, candidates)
+    rows = sweeps.sweep(scorers["opencv"], settings, match_set, candidates)
     assert rows[0, 0, 0].tolist()[:3] == [0, 1, 2]  # nothing matches: the filter's order
     assert rows[0, 1, 0].tolist()[:3] == np.argsort(expected(cv2.RANSAC))[::-1].tolist()
 

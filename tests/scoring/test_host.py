@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr import OpenCvHomography, pipeline, score_candidates, score_grid, sweeping
-from mfvpr.errors import InputError
-from mfvpr.match_sets import MatchSet
+from mfvpr import OpenCvHomography, score_candidates, score_grid
+from mfvpr.evaluation import stages
+from mfvpr.matching.match_set import MatchSet
+from mfvpr.tuning import sweeps
 from mfvpr.types import Shortlist, per_match
+from mfvpr.utils.errors import InputError
 from tests.builders import make_matches
 from tests.scoring.test_homography import plane_points, stacked
 
@@ -23,8 +25,8 @@ SETTINGS = [{"max_distance": 9.0}]
 WAYS = {
     "candidates": lambda scorer: score_candidates(scorer, BATCH),
     "grid": lambda scorer: score_grid(scorer, BATCH, max_distance=[9.0]),
-    "pipeline": lambda scorer: pipeline.score({"own": scorer}, MATCHES, CANDIDATES),
-    "sweep": lambda scorer: sweeping.sweep(scorer, SETTINGS, MATCHES, CANDIDATES),
+    "pipeline": lambda scorer: stages.score({"own": scorer}, MATCHES, CANDIDATES),
+    "sweep": lambda scorer: sweeps.sweep(scorer, SETTINGS, MATCHES, CANDIDATES),
 }
 
 
@@ -72,7 +74,7 @@ def test_a_class_that_is_no_value_is_refused(way):
 
 def test_no_sweep_keeps_what_nobody_sees(monkeypatch, tmp_path):
     def first():
-        return sweeping.sweep(Host(), SETTINGS, MATCHES, CANDIDATES, folder=tmp_path)[0, 0, 0, :3].tolist()
+        return sweeps.sweep(Host(), SETTINGS, MATCHES, CANDIDATES, folder=tmp_path)[0, 0, 0, :3].tolist()
 
     assert first() == [1, 0, 2]
     monkeypatch.setitem(globals(), "answer", lambda masks: -masks.sum(axis=1))

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from mfvpr import Features, Matches
-from mfvpr.stores import manifest as store_manifest
-from mfvpr.stores.features import open_store
-from mfvpr.stores.matches import QueryMatches, open_match_store
+from mfvpr.storage import manifest as store_manifest
+from mfvpr.storage.features import open_store
+from mfvpr.storage.matches import QueryMatches, open_match_store
 from tests.builders import make_features
 
 ROOT = Path(__file__).parents[2]

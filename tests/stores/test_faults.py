@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from mfvpr import InputError
-from mfvpr.stores.features import forecast_bytes, open_store
+from mfvpr.storage.features import forecast_bytes, open_store
 from tests.small_disks import UNSHARE, mount, need_small_disks
 from tests.stores.made_up import (
     DAMAGE,

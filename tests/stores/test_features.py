@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from mfvpr import Features, InputError
-from mfvpr.stores import rows
-from mfvpr.stores.features import forecast_bytes, open_store, require_space
-from mfvpr.stores.manifest import recipe_fingerprint, store_path
+from mfvpr.storage import rows
+from mfvpr.storage.features import forecast_bytes, open_store, require_space
+from mfvpr.storage.manifest import recipe_fingerprint, store_path
 from tests.builders import make_features
 from tests.stores.made_up import RECIPE, assert_same, digests, features_of, fill, read_all
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from mfvpr import InputError, Matches
-from mfvpr.stores.manifest import MATCHES as KIND
-from mfvpr.stores.manifest import recipe_fingerprint, store_path
-from mfvpr.stores.matches import forecast_bytes, open_match_store
+from mfvpr.storage.manifest import MATCHES as KIND
+from mfvpr.storage.manifest import recipe_fingerprint, store_path
+from mfvpr.storage.matches import forecast_bytes, open_match_store
 from mfvpr.types import per_match, per_pair
 from tests.stores.made_up import MATCH_RECIPE, MATCHES, digests, fill, matches_of, read_all
 

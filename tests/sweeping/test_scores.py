@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr import match_sets, pipeline, reranking, sweeping
-from mfvpr.match_sets import MatchSet, Scales
+from mfvpr.evaluation import stages
+from mfvpr.matching import match_set as match_sets
+from mfvpr.matching.match_set import MatchSet, Scales
+from mfvpr.reranking import ranking
+from mfvpr.tuning import sweeps
 from tests import oracles
 from tests.programs import ROOT
 from tests.scorers import plain
@@ -46,7 +49,7 @@ def devices_agree():
     """What a process with 8 devices checks."""
     import jax
 
-    from mfvpr.sweeping import scores
+    from mfvpr.reranking import batched_scoring
 
     match_sets.PAIRS_STEP = match_sets.BATCH_SLOTS = 2  # pairs of a batch
     match_set, candidates = make_set()
@@ -58,18 +61,18 @@ def devices_agree():
         placed.append((matches.mask.shape, *matches.mask.devices()))
         return matches.mask.sum(axis=1)
 
-    made = scores.all_batches(match_set, range(QUERIES), settings=1)
-    for places, counts in scores.scored(program, (), made, devices=devices):
+    made = batched_scoring.all_batches(match_set, range(QUERIES), settings=1)
+    for places, counts in batched_scoring.scored(program, (), made, devices=devices):
         np.testing.assert_array_equal(counts, match_set.counts.reshape(-1)[places])
     assert {device for _, device in placed} == {*devices}
     assert {shape for shape, _ in placed} == {(2, 96)}
 
-    alone, together = (pipeline.score({"it": plain}, match_set, candidates, devices=some) for some in (None, devices))
+    alone, together = (stages.score({"it": plain}, match_set, candidates, devices=some) for some in (None, devices))
     np.testing.assert_array_equal(alone["it"], together["it"], strict=True)
     assert len(np.unique(alone["it"])) > CANDIDATES
     settings = [{"max_distance": limit, "c": 0.1} for limit in (0.8, 1.5)]
     alone, together = (
-        sweeping.sweep(plain, settings, match_set, candidates, devices=some) for some in (None, devices[3:5])
+        sweeps.sweep(plain, settings, match_set, candidates, devices=some) for some in (None, devices[3:5])
     )
     np.testing.assert_array_equal(alone, together)
 
@@ -86,21 +89,21 @@ def test_devices_share_the_batches_and_change_no_bit():
 
 def test_scores_of_scales_are_fused_over_the_candidates_of_a_query(two_scales):
     scales, candidates = two_scales
-    got = pipeline.score(SCORERS, scales, candidates)
-    each = [pipeline.score(SCORERS, one, candidates) for one in scales.match_sets]
+    got = stages.score(SCORERS, scales, candidates)
+    each = [stages.score(SCORERS, one, candidates) for one in scales.match_sets]
     for name in SCORERS:
         assert not each[1][name][1].any()
         assert got[name].dtype == np.float32
         for query in range(QUERIES):
-            scores = np.stack([scores[name][query] for scores in each], axis=-1)
-            expected = oracles.fuse_scales(scores, candidates.mask[query], WEIGHTS, "zscore")
+            batched_scoring = np.stack([batched_scoring[name][query] for batched_scoring in each], axis=-1)
+            expected = oracles.fuse_scales(batched_scoring, candidates.mask[query], WEIGHTS, "zscore")
             np.testing.assert_allclose(got[name][query], expected, rtol=1e-4, atol=1e-5)
 
 
 def test_one_scale_as_it_is_scores_as_without(data):
     match_set, candidates = data
-    alone = pipeline.score(SCORERS, match_set, candidates)
-    one = pipeline.score(SCORERS, Scales([match_set], normalize="none"), candidates)
+    alone = stages.score(SCORERS, match_set, candidates)
+    one = stages.score(SCORERS, Scales([match_set], normalize="none"), candidates)
     for name in SCORERS:
         np.testing.assert_array_equal(one[name], alone[name])
 
@@ -110,8 +113,8 @@ def test_sweeps_of_scales_rank_by_the_fused_scores_of_what_is_ranked(two_scales,
     scales, candidates = two_scales
     scales = replace(scales, normalize=normalize)
     view = np.random.default_rng(1).random(candidates.mask.shape) < 0.7
-    settings = sweeping.grid({"mean": ["unweighted", "median"], "c": [None, 0.5]})
-    got = sweeping.sweep(
+    settings = sweeps.grid({"mean": ["unweighted", "median"], "c": [None, 0.5]})
+    got = sweeps.sweep(
         SCORERS["sum"], settings, scales, candidates, views=[candidates.mask, view], depth=CANDIDATES,
         queries_per_block=3, settings_per_block=1, folder=tmp_path,
     )  # fmt: skip
@@ -119,8 +122,8 @@ def test_sweeps_of_scales_rank_by_the_fused_scores_of_what_is_ranked(two_scales,
         listed = replace(candidates, mask=seen)
         for rows, setting in zip(by_setting, settings, strict=True):
             scorer = {"it": mfvpr.AggregatedScore(mean=setting["mean"])}
-            fused = reranking.fuse_shortlist(listed, pipeline.score(scorer, scales, listed)["it"], setting["c"])
-            order = reranking.rank_shortlist(listed, fused)
+            fused = ranking.fuse_shortlist(listed, stages.score(scorer, scales, listed)["it"], setting["c"])
+            order = ranking.rank_shortlist(listed, fused)
             indices = np.where(seen, candidates.indices, -1)
             np.testing.assert_array_equal(rows, np.take_along_axis(indices, order, axis=1))
 
@@ -133,8 +136,8 @@ def test_blocks_of_other_weights_or_scales_are_not_taken(two_scales, tmp_path):
         Scales([first, first], WEIGHTS), Scales([second, first], WEIGHTS), first, second,
     ]  # fmt: skip
     for number, case in enumerate(cases, start=1):
-        expected = sweeping.sweep(SCORERS["sum"], [{"c": 0.1}], case, candidates)
-        kept = sweeping.sweep(SCORERS["sum"], [{"c": 0.1}], case, candidates, folder=tmp_path)
+        expected = sweeps.sweep(SCORERS["sum"], [{"c": 0.1}], case, candidates)
+        kept = sweeps.sweep(SCORERS["sum"], [{"c": 0.1}], case, candidates, folder=tmp_path)
         np.testing.assert_array_equal(kept, expected)
         assert len(list(tmp_path.iterdir())) == number
 
@@ -152,7 +155,7 @@ def test_scales_that_do_not_belong_together_are_refused(data):
 def test_progress_is_of_the_batches_of_all_scales(two_scales):
     scales, candidates = two_scales
     seen = []
-    pipeline.score(SCORERS, scales, candidates, track=lambda items, total: seen.append(total) or items)
+    stages.score(SCORERS, scales, candidates, track=lambda items, total: seen.append(total) or items)
     assert seen == [2]
 
 
@@ -160,6 +163,6 @@ def test_nothing_matches_anywhere(data):
     match_set, candidates = data
     nothing = [replace(one, **{n: v[:0] for n, v in match_sets.per_match(one).items()}, mask=one.mask[:0])
                for one in match_set.matches]  # fmt: skip
-    scores = pipeline.score(SCORERS, MatchSet(nothing, 0 * match_set.counts, 64), candidates)
-    for values in scores.values():
+    batched_scoring = stages.score(SCORERS, MatchSet(nothing, 0 * match_set.counts, 64), candidates)
+    for values in batched_scoring.values():
         np.testing.assert_array_equal(values, np.where(candidates.mask, 0.0, np.nan))

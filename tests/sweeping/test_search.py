@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr import InputError, sweeping
-from mfvpr.data.ground_truth import FrameTruth
+from mfvpr import InputError
+from mfvpr.datasets.ground_truth import FrameTruth
 from mfvpr.evaluation import best_setting, hits, judge, statistics
 from mfvpr.report import sweeps
-from mfvpr.sweeping import Axes, search
+from mfvpr.tuning import sweeps as sweeping
+from mfvpr.tuning.sweeps import Axes, search
 from tests.learning.paths import QUERIES, TOLERANCES, split
 from tests.scorers import Wrapped
 

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr import reranking, sweeping
-from mfvpr.match_sets import PROGRAM_SLOTS, MatchSet, block_bytes, shapes, slots
+from mfvpr.matching.match_set import PROGRAM_SLOTS, MatchSet, block_bytes, shapes, slots
+from mfvpr.reranking import ranking
 from mfvpr.scoring.parameters import with_parameters
-from mfvpr.sweeping.settings import groups
+from mfvpr.tuning import sweeps
+from mfvpr.tuning.sweeps.settings import groups
 from mfvpr.types import Shortlist
 from tests.builders import of_query, random_matches
 from tests.scorers import FOREIGN, Sampled, Strongest, Wrapped, title
@@ -61,8 +62,8 @@ def one_by_one(scorer, setting, match_set, candidates, view=None, **options):
     view = candidates.mask if view is None else view
     seen = replace(candidates, mask=candidates.mask & view)
     scores = np.array(scores, np.float32)
-    scores = reranking.fuse_shortlist(seen, scores, c) if fused else scores
-    order = reranking.rank_shortlist(seen, scores, **options)
+    scores = ranking.fuse_shortlist(seen, scores, c) if fused else scores
+    order = ranking.rank_shortlist(seen, scores, **options)
     return np.where(np.take_along_axis(seen.mask, order, 1), np.take_along_axis(candidates.indices, order, 1), -1)
 
 
@@ -84,8 +85,8 @@ CASES = [
 
 @pytest.mark.parametrize(("scorer", "axes"), CASES, ids=lambda value: "" if isinstance(value, dict) else title(value))
 def test_sweep_is_one_evaluation_per_setting(data, scorer, axes):
-    settings = sweeping.grid(axes)
-    got = sweeping.sweep(scorer, settings, *data, depth=CANDIDATES)
+    settings = sweeps.grid(axes)
+    got = sweeps.sweep(scorer, settings, *data, depth=CANDIDATES)
     assert got.shape == (1, len(settings), QUERIES, CANDIDATES)
     for rows, setting in zip(got[0], settings, strict=True):
         np.testing.assert_array_equal(rows, one_by_one(scorer, setting, *data), err_msg=str(setting))
@@ -94,12 +95,12 @@ def test_sweep_is_one_evaluation_per_setting(data, scorer, axes):
 def test_one_setting_beside_a_grid_leaves_it_whole(data):
     """The grid's weightings still share their Gaussians."""
     scorer = mfvpr.HistogramOfShifts()
-    settings = sweeping.grid({"sigma": [9.0, 20.0, 30.0], "weight": [FS, DMF], "max_distance": [0.8, 2.0]})
+    settings = sweeps.grid({"sigma": [9.0, 20.0, 30.0], "weight": [FS, DMF], "max_distance": [0.8, 2.0]})
     settings.insert(3, {"sigma": 9.0, "weight": FS, "max_distance": 1.1})
     found = list(groups(scorer, settings, data[0].image_sizes))
     assert sorted(group.rows.shape for group in found) == [(1, 5), (2, 4)]
     assert sorted(row for group in found for row in group.rows.reshape(-1)) == list(range(13))
-    for rows, setting in zip(sweeping.sweep(scorer, settings, *data)[0], settings, strict=True):
+    for rows, setting in zip(sweeps.sweep(scorer, settings, *data)[0], settings, strict=True):
         np.testing.assert_array_equal(rows[:, :CANDIDATES], one_by_one(scorer, setting, *data))
 
 
@@ -110,7 +111,7 @@ def test_settings_need_not_be_a_grid(data):
         {"sigma": 30.0, "max_distance": 0.9, "weight": DMF},
         {"sigma": 14.0, "max_distance": 2.0, "weight": DMF},
     ]
-    got = sweeping.sweep(scorer, settings, *data, depth=2)
+    got = sweeps.sweep(scorer, settings, *data, depth=2)
     for rows, setting in zip(got[0], settings, strict=True):
         np.testing.assert_array_equal(rows, one_by_one(scorer, setting, *data)[:, :2])
 
@@ -118,19 +119,19 @@ def test_settings_need_not_be_a_grid(data):
 @pytest.mark.parametrize("settings_per_block", [1, 5, 100])
 @pytest.mark.parametrize("queries_per_block", [1, 4, 100])
 def test_chunks_change_nothing(data, settings_per_block, queries_per_block):
-    settings = sweeping.grid(CASES[0][1] | {"c": [None, 1.0]})
-    got = sweeping.sweep(
+    settings = sweeps.grid(CASES[0][1] | {"c": [None, 1.0]})
+    got = sweeps.sweep(
         CASES[0][0], settings, *data,
         settings_per_block=settings_per_block, queries_per_block=queries_per_block,
     )  # fmt: skip
-    np.testing.assert_array_equal(got, sweeping.sweep(CASES[0][0], settings, *data))
+    np.testing.assert_array_equal(got, sweeps.sweep(CASES[0][0], settings, *data))
 
 
 def test_views_hide_candidates_and_ties_may_go_by_index(data):
     _, candidates = data
     view = np.random.default_rng(1).random(candidates.mask.shape) < 0.6
     settings = [{"max_distance": limit, "c": c} for limit in (0.05, 2.0) for c in (None, 0.0)]  # 0.05: mostly ties
-    got = sweeping.sweep(mfvpr.MatchCount(), settings, *data, views=[candidates.mask, view], ties="index")
+    got = sweeps.sweep(mfvpr.MatchCount(), settings, *data, views=[candidates.mask, view], ties="index")
     for seen, rows in zip((candidates.mask, view), got, strict=True):
         for found, setting in zip(rows, settings, strict=True):
             expected = one_by_one(mfvpr.MatchCount(), setting, *data, view=seen, ties="index")
@@ -139,8 +140,8 @@ def test_views_hide_candidates_and_ties_may_go_by_index(data):
 
 
 def test_finished_blocks_are_read_and_damaged_ones_computed_again(data, tmp_path, monkeypatch):
-    scorer, settings = mfvpr.HistogramOfShifts(), sweeping.grid({"sigma": [9.0, 12.0, 20.0], "c": [None, 0.5]})
-    expected = sweeping.sweep(scorer, settings, *data)
+    scorer, settings = mfvpr.HistogramOfShifts(), sweeps.grid({"sigma": [9.0, 12.0, 20.0], "c": [None, 0.5]})
+    expected = sweeps.sweep(scorer, settings, *data)
 
     class Stopped(Exception):
         pass
@@ -153,7 +154,7 @@ def test_finished_blocks_are_read_and_damaged_ones_computed_again(data, tmp_path
 
     chunks = {"settings_per_block": 1, "queries_per_block": 3, "folder": tmp_path}
     with pytest.raises(Stopped):
-        sweeping.sweep(scorer, settings, *data, track=stops, **chunks)
+        sweeps.sweep(scorer, settings, *data, track=stops, **chunks)
     kept = sorted(tmp_path.iterdir())
     assert len(kept) == 4
     kept[0].write_bytes(kept[0].read_bytes()[:-5])
@@ -162,27 +163,27 @@ def test_finished_blocks_are_read_and_damaged_ones_computed_again(data, tmp_path
     turned[len(turned) // 2] ^= 1  # a row of the right shape, but another
     kept[2].write_bytes(turned)
     computed = []
-    module = sweeping.sweep.__globals__
+    module = sweeps.sweep.__globals__
     scores = module["block_scores"]
     monkeypatch.setitem(module, "block_scores", lambda *inputs: computed.append(1) or scores(*inputs))
-    np.testing.assert_array_equal(sweeping.sweep(scorer, settings, *data, **chunks), expected)
+    np.testing.assert_array_equal(sweeps.sweep(scorer, settings, *data, **chunks), expected)
     assert len(computed) == 9 - 4 + 3
-    np.testing.assert_array_equal(sweeping.sweep(scorer, settings, *data, **chunks), expected)
+    np.testing.assert_array_equal(sweeps.sweep(scorer, settings, *data, **chunks), expected)
     assert len(computed) == 9 - 4 + 3
     other = [{**setting, "sigma": setting["sigma"] + 1} for setting in settings]
-    sweeping.sweep(scorer, other, *data, **chunks)
+    sweeps.sweep(scorer, other, *data, **chunks)
     assert len(computed) == 9 - 4 + 3 + 9
 
 
 def test_one_program_per_shape_and_capacity(data, compilations):
     match_set, _ = data
     axes = {"sigma": [9.0, 22.5, 30.0], "bin_size": [12.5, 14.9, 15.0], "max_distance": [0.8, 2.0]}
-    sweeping.sweep(mfvpr.HistogramOfShifts(), sweeping.grid(axes), *data)
+    sweeps.sweep(mfvpr.HistogramOfShifts(), sweeps.grid(axes), *data)
     compilations.reset()
     axes = {"sigma": [7.0, 21.5, 33.0], "bin_size": [12.4, 14.8, 15.1], "max_distance": [0.7, 1.0]}
-    sweeping.sweep(mfvpr.HistogramOfShifts(), sweeping.grid(axes), *data)
+    sweeps.sweep(mfvpr.HistogramOfShifts(), sweeps.grid(axes), *data)
     assert compilations.count == 0
-    sweeping.sweep(mfvpr.HistogramOfShifts(), sweeping.grid(axes | {"bin_size": [8.0, 12.0, 12.1]}), *data)
+    sweeps.sweep(mfvpr.HistogramOfShifts(), sweeps.grid(axes | {"bin_size": [8.0, 12.0, 12.1]}), *data)
     assert 1 <= compilations.count <= 2 * len(shapes(match_set))  # two capacities
 
 
@@ -224,7 +225,7 @@ def test_slots_of_no_matches():
 
 def test_memory_is_told_beforehand(data):
     match_set, _ = data
-    assert sweeping.result_bytes(2, 10, 7, 3) == np.zeros((2, 10, 7, 3), np.int32).nbytes
+    assert sweeps.result_bytes(2, 10, 7, 3) == np.zeros((2, 10, 7, 3), np.int32).nbytes
     assert block_bytes(match_set, 10, 1) < block_bytes(match_set, 20, 1) < block_bytes(match_set, 20, 7)
     uneven, largest = (MatchSet([], np.array(counts), 320) for counts in ([[0, 9], [300, 300], [9, 9]], [[300, 300]]))
     many = 10**7  # settings, for which padding to one size would not pay
@@ -253,12 +254,12 @@ def other_filter(match_set, candidates):
 @pytest.mark.parametrize("change", [other_matches, other_sizes, other_shortlist, other_filter])
 def test_blocks_of_other_data_in_the_same_folder_are_not_taken(data, tmp_path, change):
     scorer, settings = mfvpr.HistogramOfShifts(bin_size=20.0), [{"sigma": 9.0, "c": 0.5}, {"sigma": 20.0, "c": 0.5}]
-    sweeping.sweep(scorer, settings, *data, folder=tmp_path)
+    sweeps.sweep(scorer, settings, *data, folder=tmp_path)
     other = change(*data)
-    expected = sweeping.sweep(scorer, settings, *other)
-    np.testing.assert_array_equal(sweeping.sweep(scorer, settings, *other, folder=tmp_path), expected)
+    expected = sweeps.sweep(scorer, settings, *other)
+    np.testing.assert_array_equal(sweeps.sweep(scorer, settings, *other, folder=tmp_path), expected)
     np.testing.assert_array_equal(
-        sweeping.sweep(scorer, settings, *data, folder=tmp_path), sweeping.sweep(scorer, settings, *data)
+        sweeps.sweep(scorer, settings, *data, folder=tmp_path), sweeps.sweep(scorer, settings, *data)
     )
 
 
@@ -288,13 +289,13 @@ def test_nor_are_those_of_other_views_options_or_scorers_of_one_name(data, tmp_p
     ]
     fused = [{"c": c} for c in (10.0, 20.0)]
     for made, options in cases:
-        expected = sweeping.sweep(made, settings, *data, **options)
+        expected = sweeps.sweep(made, settings, *data, **options)
         np.testing.assert_array_equal(
-            sweeping.sweep(made, settings, *data, **options, folder=tmp_path), expected, err_msg=str(options)
+            sweeps.sweep(made, settings, *data, **options, folder=tmp_path), expected, err_msg=str(options)
         )
     for kind in ("cosine", "negative_euclidean"):
-        expected = sweeping.sweep(mfvpr.MatchCount(), fused, *data, filter_score=kind)
-        kept = sweeping.sweep(mfvpr.MatchCount(), fused, *data, filter_score=kind, folder=tmp_path)
+        expected = sweeps.sweep(mfvpr.MatchCount(), fused, *data, filter_score=kind)
+        kept = sweeps.sweep(mfvpr.MatchCount(), fused, *data, filter_score=kind, folder=tmp_path)
         np.testing.assert_array_equal(kept, expected)
 
 
@@ -305,21 +306,21 @@ def test_scores_by_the_number_of_keypoints_are_kept(data, tmp_path):
     fewer = [replace(matches, count0=np.int32(1)) for matches in match_set.matches]
     expected = []
     for matches in (match_set.matches, fewer):
-        expected.append(sweeping.sweep(scorer, settings, replace(match_set, matches=matches), candidates))
+        expected.append(sweeps.sweep(scorer, settings, replace(match_set, matches=matches), candidates))
         for _ in range(2):
-            kept = sweeping.sweep(scorer, settings, replace(match_set, matches=matches), candidates, folder=tmp_path)
+            kept = sweeps.sweep(scorer, settings, replace(match_set, matches=matches), candidates, folder=tmp_path)
             np.testing.assert_array_equal(kept, expected[-1])
     assert (expected[0] != expected[1]).any()
 
 
 def test_whole_numbers_and_keys_are_swept_and_kept(data, tmp_path):
     settings = [{"place": 0}, {"place": 2}]
-    got = sweeping.sweep(Strongest(), settings, *data, folder=tmp_path)
+    got = sweeps.sweep(Strongest(), settings, *data, folder=tmp_path)
     for rows, setting in zip(got[0], settings, strict=True):
         np.testing.assert_array_equal(rows[:, :CANDIDATES], one_by_one(Strongest(), setting, *data))
     sampled, settings = Sampled(jax.random.key(3)), [{"scale": 10.0}]
     for _ in range(2):
-        got = sweeping.sweep(sampled, settings, *data, folder=tmp_path)
+        got = sweeps.sweep(sampled, settings, *data, folder=tmp_path)
         np.testing.assert_array_equal(got[0, 0, :, :CANDIDATES], one_by_one(sampled, settings[0], *data))
 
 
@@ -328,8 +329,8 @@ def test_code_that_depends_on_the_shape_is_told_apart(data, tmp_path):
         return lambda matches: mfvpr.MatchCount()(matches) * (1.0 if len(matches.mask) <= 8 else sign)
 
     for sign in (1.0, -1.0):
-        expected = sweeping.sweep(scorer(sign), [{"max_distance": 2.0}], *data)
-        got = sweeping.sweep(scorer(sign), [{"max_distance": 2.0}], *data, folder=tmp_path)
+        expected = sweeps.sweep(scorer(sign), [{"max_distance": 2.0}], *data)
+        got = sweeps.sweep(scorer(sign), [{"max_distance": 2.0}], *data, folder=tmp_path)
         np.testing.assert_array_equal(got, expected)
 
 
@@ -342,7 +343,7 @@ def test_a_number_named_as_the_filters_share_is_refused(data):
             return self.c * mfvpr.MatchCount()(matches)
 
     with pytest.raises(ValueError, match=r"Score\.c: a grid means something else by c"):
-        sweeping.sweep(Score(), [{"c": 0.5}], *data)
+        sweeps.sweep(Score(), [{"c": 0.5}], *data)
 
 
 def test_code_that_depends_on_the_number_of_pairs_is_told_apart(data, tmp_path):
@@ -358,8 +359,8 @@ def test_code_that_depends_on_the_number_of_pairs_is_told_apart(data, tmp_path):
         return lambda matches: signed(mfvpr.MatchCount()(matches))
 
     for sign in (1.0, -1.0):
-        expected = sweeping.sweep(scorer(sign), [{"max_distance": 2.0}], *data)
-        got = sweeping.sweep(scorer(sign), [{"max_distance": 2.0}], *data, folder=tmp_path)
+        expected = sweeps.sweep(scorer(sign), [{"max_distance": 2.0}], *data)
+        got = sweeps.sweep(scorer(sign), [{"max_distance": 2.0}], *data, folder=tmp_path)
         np.testing.assert_array_equal(got, expected)
 
 
@@ -371,25 +372,25 @@ def test_pairs_score_the_same_in_a_smaller_set(data, scorer, monkeypatch):
     match_set, candidates = data
     few = replace(match_set, matches=match_set.matches[:2], counts=match_set.counts[:2])
     assert shapes(few) == shapes(match_set)
-    found, module = [], sweeping.sweep.__globals__
+    found, module = [], sweeps.sweep.__globals__
     scores = module["block_scores"]
     monkeypatch.setitem(module, "block_scores", lambda *inputs: found.append(scores(*inputs)) or found[-1])
     for one in (match_set, few):
         listed = jax.tree.map(lambda rows: rows[: len(one.matches)], candidates)  # noqa: B023
-        sweeping.sweep(scorer, [{"max_distance": 2.0}], one, listed)
+        sweeps.sweep(scorer, [{"max_distance": 2.0}], one, listed)
     np.testing.assert_array_equal(found[0][..., :2, :], found[1])
 
 
 def test_a_folder_that_goes_meanwhile_costs_nothing_but_a_full_disk_is_told(data, tmp_path, monkeypatch):
     """Of blocks: whoever ends the same sweep first removes it."""
-    settings, expected = [{"c": 0.5}], sweeping.sweep(mfvpr.MatchCount(), [{"c": 0.5}], *data)
+    settings, expected = [{"c": 0.5}], sweeps.sweep(mfvpr.MatchCount(), [{"c": 0.5}], *data)
     error = FileNotFoundError
 
     def write(*_):
         raise error(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(sys.modules["mfvpr.sweeping.sweep"], "write_arrays", write)
-    np.testing.assert_array_equal(sweeping.sweep(mfvpr.MatchCount(), settings, *data, folder=tmp_path), expected)
+    monkeypatch.setattr(sys.modules["mfvpr.tuning.sweeps.sweep"], "write_arrays", write)
+    np.testing.assert_array_equal(sweeps.sweep(mfvpr.MatchCount(), settings, *data, folder=tmp_path), expected)
     error = OSError
     with pytest.raises(OSError, match="No space left"):
-        sweeping.sweep(mfvpr.MatchCount(), settings, *data, folder=tmp_path)
+        sweeps.sweep(mfvpr.MatchCount(), settings, *data, folder=tmp_path)

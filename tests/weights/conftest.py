@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from mfvpr.weights import networks, registry
-from mfvpr.weights.conversion import Layout, Rule, Table
+from mfvpr.checkpoints import networks, registry
+from mfvpr.checkpoints.conversion import Layout, Rule, Table
 
 
 class Tiny(nnx.Module):

@@ -11,9 +11,9 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from mfvpr.errors import InputError
-from mfvpr.foreign import pickles
-from mfvpr.weights.checkpoint import read_checkpoint
+from mfvpr.checkpoints.checkpoint import read_checkpoint
+from mfvpr.io.foreign import pickles
+from mfvpr.utils.errors import InputError
 from tests.checkpoints import ALIKED, Call, Global, View, Writer, random_checkpoint, write_legacy, write_zip
 from tests.weights.conftest import SOURCE_SHAPES
 

@@ -5,11 +5,11 @@ import hashlib
 import numpy as np
 import pytest
 
-from mfvpr.errors import InputError
-from mfvpr.weights.checkpoint import read_checkpoint
-from mfvpr.weights.conversion import Layout, Rule, Table, convert
-from mfvpr.weights.networks import NETWORKS, blueprint, resemblance
-from mfvpr.weights.registry import REGISTRY, entry_of
+from mfvpr.checkpoints.checkpoint import read_checkpoint
+from mfvpr.checkpoints.conversion import Layout, Rule, Table, convert
+from mfvpr.checkpoints.networks import NETWORKS, blueprint, resemblance
+from mfvpr.checkpoints.registry import REGISTRY, entry_of
+from mfvpr.utils.errors import InputError
 from tests.checkpoints import (
     ALIKED,
     LIGHTGLUE,

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from safetensors.numpy import save as serialized
 
-from mfvpr.errors import InputError
-from mfvpr.weights import files
-from mfvpr.weights.files import (
+from mfvpr.checkpoints import files
+from mfvpr.checkpoints.files import (
     WeightsError,
     fingerprint,
     install,
@@ -21,7 +20,8 @@ from mfvpr.weights.files import (
     save,
     weights_folder,
 )
-from mfvpr.weights.registry import REGISTRY
+from mfvpr.checkpoints.registry import REGISTRY
+from mfvpr.utils.errors import InputError
 from tests.checkpoints import d2net_shapes, random_checkpoint, write_legacy, write_zip
 from tests.weights.conftest import PARAMETERS, SOURCE_SHAPES, tiny_entry
 

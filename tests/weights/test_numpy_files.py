@@ -8,8 +8,8 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from mfvpr.errors import InputError
-from mfvpr.weights.checkpoint import read_checkpoint
+from mfvpr.checkpoints.checkpoint import read_checkpoint
+from mfvpr.utils.errors import InputError
 from tests.checkpoints import HEADER, Call, Global, Writer, layered, write_numpy
 from tests.weights.test_checkpoint import Runs, assert_same, flipped, refused
 

@@ -15,8 +15,8 @@ import pytest
 
 from experiments.errors import one_line
 from experiments.weights import main
-from mfvpr.weights.files import file_sha256, load_model, save
-from mfvpr.weights.registry import REGISTRY
+from mfvpr.checkpoints.files import file_sha256, load_model, save
+from mfvpr.checkpoints.registry import REGISTRY
 from tests.checkpoints import (
     ALIKED,
     d2net_shapes,
@@ -200,7 +200,7 @@ def test_ctrl_c_while_converting_leaves_nothing(program, folder, tiny_checkpoint
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("mfvpr.weights.files.write_text", interrupted)
+    monkeypatch.setattr("mfvpr.checkpoints.files.write_text", interrupted)
     monkeypatch.setattr("atexit.register", lambda *_: None)  # or this process would end so
     code, stdout, stderr = program("convert", tiny_checkpoint)
     assert (code, stdout) == (130, "")
@@ -305,7 +305,7 @@ def test_ctrl_c_while_downloading_leaves_nothing(folder, site):
     code = f"""
 import dataclasses
 from experiments.weights import main
-from mfvpr.weights.registry import REGISTRY
+from mfvpr.checkpoints.registry import REGISTRY
 entry = REGISTRY["aliked-t16"]
 REGISTRY["aliked-t16"] = dataclasses.replace(entry, source={site("slow")!r}, size={len(CONTENT)})
 main()

@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-from mfvpr.data.files import printable
 from mfvpr.report.colors import COLORS, color_and_dash
+from mfvpr.utils.files import printable
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure

@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from mfvpr.data.datasets import MEANS
-from mfvpr.errors import InputError, require_word
-from mfvpr.evaluation.truth import Unit, middle, threshold_words
+from mfvpr.datasets.datasets import MEANS
+from mfvpr.datasets.truth import Unit, middle, threshold_words
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.file_names import file_names
 from mfvpr.report.tables import Table
+from mfvpr.utils.errors import InputError, require_word
 
 _LEFT_BY = "expected the run folder of an evaluation"
 _KINDS_OF_A_ROW = {"system": str, "decides": bool, "parameters": dict, "recall_at": dict}

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from mfvpr.ranked import FILTER
 from mfvpr.report.pages import sections
 from mfvpr.report.pages.files import Run, read_run
 from mfvpr.report.pages.rendering import write_page
+from mfvpr.reranking.results import FILTER
 
 PAGE = "report.html"  # in a run folder
 _NAMELESS = "folder"  # the default name of a data set of own folders

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from PIL import Image
 
-from mfvpr.errors import InputError
 from mfvpr.report.evaluations import ABOUT
+from mfvpr.utils.errors import InputError
 
 MOST_PICTURES = 60
 _WIDTH, _QUALITY = 1000, 75  # px, of JPEG: some 60 kB each

@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 from hashlib import sha256
 from pathlib import Path
 
-from mfvpr.data.files import write_text
 from mfvpr.report.pages.sections import Section
+from mfvpr.utils.files import write_text
 
 # Jinja2 and plotly are imported where they are needed, since everything else can do without.
 _TEMPLATES = Path(__file__).parent / "templates"

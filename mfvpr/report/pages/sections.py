@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from mfvpr.data.datasets import MEANS
+from mfvpr.datasets.datasets import MEANS
 from mfvpr.evaluation.precision import PrecisionRecall
 from mfvpr.evaluation.statistics import recall_interval
-from mfvpr.ranked import FILTER
 from mfvpr.report.pages.charts import Bar, Chart, amounts, bars, lines
 from mfvpr.report.pages.files import Answer, Gains, Run
 from mfvpr.report.pages.pictures import Picture, pictures
 from mfvpr.report.tables import Table
+from mfvpr.reranking.results import FILTER
 
 MOST_ANSWERS = 5000  # rows of a table that a browser still sorts at once
 _P_VALUES = ("McNemar p", "p by blocks")

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from mfvpr.errors import InputError
 from mfvpr.evaluation.statistics import block_sign_flips, mcnemar
 from mfvpr.report.pages.charts import Bar, Chart, bars, lines
 from mfvpr.report.pages.files import Run, read_run
@@ -25,6 +24,7 @@ from mfvpr.report.pages.sections import (
     recall_by_tolerance,
 )
 from mfvpr.report.tables import Table
+from mfvpr.utils.errors import InputError
 
 _ONLY = ("run", "other", "only run", "only other", "McNemar p", "queries in a block", "blocks", "p by blocks")
 

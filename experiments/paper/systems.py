@@ -1,0 +1,205 @@
+"""What is evaluated: the rows of the tables, the evaluations that give them, and the data sets that are here."""
+
+import difflib
+import os
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from experiments.build import expanded
+from experiments.quoting import as_typed
+from experiments.settings import RULES, SettingsError
+from mfvpr.checkpoints.files import is_installed
+from mfvpr.checkpoints.registry import REGISTRY, Entry
+from mfvpr.datasets.published import PUBLISHED
+from mfvpr.reranking.results import FILTER
+
+DRAWN = "streets_seasons"
+REAL = {  # those without a layout of their own, by the folders that they hold
+    "grief_season": ("database", "queries"),
+    "corridor": ("ref", "query"),
+}
+_SIDES = ("database", "queries")
+_POSITIONS = "@"  # what names of images begin with that tell where they were taken: @easting@northing@...
+COMBINED = f"histogram + {FILTER}"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of the tables.
+
+    Attributes:
+        name: of the row, in the printed numbers as well.
+        title: for people.
+        run: the evaluation that gives it.
+        ranking: which of the evaluation's; None = the one that decides.
+    """
+
+    name: str
+    title: str
+    run: str
+    ranking: str | None = None
+
+    @property
+    def leads(self) -> bool:
+        """Whether it is the first score of its evaluation, which is timed and compared with others."""
+        return self.ranking in (None, "histogram")
+
+
+@dataclass(frozen=True)
+class Place:
+    """A data set that is here.
+
+    Attributes:
+        name: of it.
+        settings: of `experiments.evaluate`, that choose it.
+        root: its folder; None = it is drawn.
+    """
+
+    name: str
+    settings: tuple[str, ...]
+    root: Path | None = None
+
+
+_SSM = {"hist": "hist", "anchor": "anchor", "sum": "sum", "ran_8": "RAN 8 px", "ran_24": "RAN 24 px"}
+_MIX = {"hist_10": "hist 10", "hist_50": "hist 50", "hist_comb_10": "hist-comb 10", "hist_comb_50": "hist-comb 50"}
+_PAPER = (
+    Row("patch_netvlad_performance", "Patch-NV perf.", "patch_netvlad_performance"),
+    Row("patch_netvlad_speed", "Patch-NV speed", "patch_netvlad_speed"),
+    Row("mixvpr", "MixVPR", "mix_hist_50", FILTER),
+    Row("selavpr_pitts_stage_1", "SelaVPR pits. stage 1", "selavpr_pitts", FILTER),
+    Row("selavpr_pitts", "SelaVPR pits.", "selavpr_pitts"),
+    Row("selavpr_msls_stage_1", "SelaVPR msls stage 1", "selavpr_msls", FILTER),
+    Row("selavpr_msls", "SelaVPR msls", "selavpr_msls"),
+    Row("ssm_vpr", "SSM-VPR", "ssm_vpr"),
+    *(Row(f"ssm_{name}", f"SSM-{title}", f"ssm_{name}") for name, title in _SSM.items()),
+    *(Row(f"mix_{name}", f"Mix-{title}", f"mix_{name}") for name, title in _MIX.items()),
+    Row("mix_hist_aliked_50", "Mix-hist 50, ALIKED", "mix_hist_aliked_50"),
+)
+_SCORES = {"count": "count", "rapid": "rapid", "sum": "sum", "anchor": "anchor", "histogram": "hist 50",
+           "homography_8": "RAN 8 px", "homography_24": "RAN 24 px", COMBINED: "hist-comb 50"}  # fmt: skip
+_NAMES = {"histogram": "hist_50", "homography_8": "ran_8", "homography_24": "ran_24", COMBINED: "hist_comb_50"}
+
+
+def _stand_ins(features: str, title: str) -> Iterator[Row]:
+    """The methods with features whose weights are here, after VLAD of the same features."""
+    yield Row(f"{features}_vlad", f"VLAD of {title}", f"{features}_50", FILTER)
+    for ranking, words in _SCORES.items():
+        yield Row(f"{features}_{_NAMES.get(ranking, ranking)}", f"{title}-{words}", f"{features}_50", ranking)
+    yield Row(f"{features}_hist_10", f"{title}-hist 10", f"{features}_10", "histogram")
+    yield Row(f"{features}_hist_comb_10", f"{title}-hist-comb 10", f"{features}_10", COMBINED)
+    yield Row(f"{features}_mfvpr", f"{title}, system=mfvpr", f"{features}_mfvpr")
+
+
+ROWS = (*_PAPER, *_stand_ins("sift", "SIFT"), *_stand_ins("aliked", "ALIKED"))
+
+_SIFT, _ALIKED = (
+    ("features=sift", "retrieval=vlad"),
+    ("features=aliked", "features.weights=aliked-n32", "retrieval=vlad"),
+)
+_ALL, _FEW = ("scorer=compared", "candidates=50"), ("scorer=histogram", "candidates=10")
+_RUNS = {
+    "sift_50": (*_SIFT, *_ALL),
+    "sift_10": (*_SIFT, *_FEW),
+    "sift_mfvpr": ("system=mfvpr", "features=sift"),
+    "aliked_50": (*_ALIKED, *_ALL),
+    "aliked_10": (*_ALIKED, *_FEW),
+    "aliked_mfvpr": ("system=mfvpr",),
+}
+
+
+def overrides(run: str, dataset: str) -> tuple[str, ...]:
+    """Settings of `experiments.evaluate` that make an evaluation, without its data set."""
+    chosen = _RUNS.get(run, (f"system={run}",))
+    if run.startswith("selavpr"):
+        return (*chosen, "candidates=50")
+    if run.startswith("patch_netvlad") and dataset == "robotcar_seasons":
+        return (*chosen, "features.image_size=[480,480]", *_reach(run))
+    return chosen
+
+
+def _reach(run: str) -> tuple[str, ...]:
+    """The largest place of patches in square images, by which the rapid score goes."""
+    return ("scorer.size=[400,400]",) if run == "patch_netvlad_speed" else ()
+
+
+def chosen_rows(names: Sequence[str] | None) -> tuple[Row, ...]:
+    """Rows by name, in the order of the tables; all for None."""
+    known = [row.name for row in ROWS]
+    for name in names or ():
+        if name not in known:
+            raise SettingsError(_unknown("systems", name, known))
+    return tuple(row for row in ROWS if names is None or row.name in names)
+
+
+def _unknown(setting: str, name: str, known: Sequence[str]) -> str:
+    nearest = difflib.get_close_matches(name, known, n=1) or [one for one in known if name in one]
+    hint = f"; the nearest is {nearest[0]}" if nearest else ""
+    return f"{setting}=[{name}]: expected some of {', '.join(known)}{hint}"
+
+
+def places(data: str | None, names: Sequence[str] | None) -> tuple[list[Place], list[str]]:
+    """The data sets that are here, and a line for each that is not."""
+    root = None if data is None else expanded(data)
+    if root is not None and not root.is_dir():
+        got = "a file" if root.exists() else "nothing"
+        raise SettingsError(f"data={data}: expected a folder with a folder per data set, got {got}; check the path")
+    positioned = {place.name: place for place in _positioned(root)} if root else {}
+    known = list(dict.fromkeys((DRAWN, *REAL, *PUBLISHED, *positioned)))
+    for name in names or ():
+        if name not in known:
+            raise SettingsError(_unknown("datasets", name, known))
+    found, missing = [], []
+    for name in known if names is None else [one for one in known if one in names]:
+        if name == DRAWN:
+            found.append(Place(name, (f"dataset={name}",)))
+            if root and (root / name).is_dir():
+                missing.append(f"{root / name}: the drawn data set has this name; rename the folder")
+        elif name in positioned and name in (*REAL, *PUBLISHED):
+            missing.append(f"{name}: needs another layout than that of names with positions; rename the folder")
+        elif name in positioned and not RULES["dataset.name"].holds(name):
+            missing.append(f"{name}: needs a folder's name of {RULES['dataset.name'].expected}; rename it")
+        elif name in positioned:
+            found.append(positioned[name])
+        elif folder := _folder(root, name, positioned):
+            found.append(Place(name, (f"dataset={name}", as_typed(f"dataset.root={folder}")), folder))
+        else:
+            missing.append(f"{name}: {_needed(name, data)}")
+    return found, missing
+
+
+def _positioned(root: Path) -> Iterator[Place]:
+    """Folders whose names of images tell positions, as those of VPR-datasets-downloader do."""
+    for folder in sorted(path for path in root.iterdir() if path.is_dir()):
+        for inside in (folder, folder / "images" / "test"):
+            sides = {side: inside / side for side in _SIDES}
+            if all(side.is_dir() and _first(side).startswith(_POSITIONS) for side in sides.values()):
+                chosen = {"name": folder.name, **sides, "ground_truth": "utm"}
+                settings = (as_typed(f"dataset.{name}={value}") for name, value in chosen.items())
+                yield Place(folder.name, ("dataset=folder", *settings), folder)
+                break
+
+
+def _first(folder: Path) -> str:
+    """The name of some file; empty where there is none."""
+    with os.scandir(folder) as entries:
+        return next((entry.name for entry in entries if entry.is_file()), "")
+
+
+def _folder(root: Path | None, name: str, taken: Collection[str]) -> Path | None:
+    names = PUBLISHED[name].folders if name in PUBLISHED else (name,)
+    return next((root / one for one in names if one not in taken and (root / one).is_dir()), None) if root else None
+
+
+def _needed(name: str, data: str | None) -> str:
+    where = f"{data or 'data=DIR'}/{name}"
+    if name in REAL:
+        return f"needs {where} with {' and '.join(REAL[name])}"
+    return f"needs {where} ({PUBLISHED[name].source})"
+
+
+def missing_weights(settings: Mapping[str, Any]) -> list[Entry]:
+    """Of the networks that settings name, those whose weights are not installed."""
+    named = [settings[group].get("weights") for group in ("features", "retrieval", "matching")]
+    return [REGISTRY[name] for name in dict.fromkeys(named) if name in REGISTRY and not is_installed(REGISTRY[name])]

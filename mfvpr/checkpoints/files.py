@@ -1,0 +1,238 @@
+"""Runtime files of weights: `<name>.safetensors` and its manifest `<name>.json`, whole and verified or refused."""
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mfvpr.checkpoints.checkpoint import read_checkpoint, require_checkpoint
+from mfvpr.checkpoints.conversion import convert, is_ignored
+from mfvpr.checkpoints.registry import REGISTRY, Entry, entry_of
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import replacing, write_text
+
+if TYPE_CHECKING:
+    from flax import nnx
+
+FORMAT = 1
+_MEND = "install it again"
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What a runtime file must be, and what it was made from."""
+
+    name: str
+    sha256: str
+    size: int
+    parameters: int  # of the network, without running statistics
+    source_file: str
+    source_sha256: str
+    format: int = FORMAT
+    rounded: int = 0  # of the tensors taken from the source, from float64 to float32
+
+
+class WeightsError(InputError):
+    """Weights that are not installed, or no longer as they were; `entry` says which to install."""
+
+    def __init__(self, message: str, entry: Entry) -> None:
+        super().__init__(message, entry)
+        self.entry = entry
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
+def weights_folder() -> Path:
+    """Where runtime files live: the environment variable MFVPR_WEIGHTS, or ~/.cache/mfvpr/weights."""
+    return Path(os.path.expanduser(os.environ.get("MFVPR_WEIGHTS") or "~/.cache/mfvpr/weights"))
+
+
+def install(checkpoint: Path, name: str, folder: Path | None = None) -> Path:
+    """Convert an official checkpoint to the runtime file of this name; the checkpoint stays as it is.
+
+    Raises:
+        InputError: unknown name, not the published file, no checkpoint, or keys that do not fit.
+    """
+    from mfvpr.checkpoints.networks import blueprint, network_of, resemblance
+
+    entry = entry_of(name)
+    network = network_of(entry)
+    require_checkpoint(checkpoint)  # a web page is told before its hash is
+    check_published(checkpoint, entry)
+    tensors = read_checkpoint(checkpoint)
+    plan = blueprint(entry)
+    try:
+        arrays = convert(tensors, network.table, plan.shapes)
+    except InputError as error:
+        reason = resemblance(list(tensors), network) or error
+        raise InputError(f"{checkpoint}: {reason}; use the official {entry.file}") from error
+    needed = (tensor for key, tensor in tensors.items() if not is_ignored(key, network.table))
+    rounded = sum(tensor.dtype == np.float64 for tensor in needed)
+    return save(name, arrays, checkpoint, parameters=plan.parameters, rounded=rounded, folder=folder)
+
+
+def check_published(checkpoint: Path, entry: Entry) -> None:
+    """Whether a file is the published one, where a hash is published.
+
+    Raises:
+        InputError: it is not, or cannot be read.
+    """
+    if entry.sha256 is None:
+        return
+    try:
+        sha256 = file_sha256(checkpoint)
+    except OSError as error:
+        raise InputError(f"{checkpoint}: expected a checkpoint file, got: {error.strerror}") from error
+    check_sha256(sha256, entry, checkpoint)
+
+
+def check_sha256(sha256: str, entry: Entry, origin: object) -> None:
+    """Whether this is the published hash; `origin` begins the message.
+
+    Raises:
+        InputError: it is not.
+    """
+    if sha256 != entry.sha256:
+        others = [other.name for other in REGISTRY.values() if other.sha256 == sha256]
+        got = f"that of {others[0]}" if others else f"{sha256[:12]}...: damaged, or another file"
+        raise InputError(f"{origin}: expected the sha256 of {entry.name}, {str(entry.sha256)[:12]}..., got {got}")
+
+
+def save(
+    name: str,
+    arrays: Mapping[str, np.ndarray],
+    source: Path,
+    *,
+    parameters: int,
+    rounded: int = 0,
+    folder: Path | None = None,
+) -> Path:
+    """Write the arrays and, last, the manifest: until then, and if it never comes, `load` refuses the file.
+
+    Args:
+        name: of the registry's entry.
+        arrays: by dotted path.
+        source: the checkpoint they came from.
+        parameters: how many the network has.
+        rounded: how many of the source's tensors were rounded from float64.
+        folder: `weights_folder()` by default.
+
+    Raises:
+        InputError: unknown name, or values that are not finite.
+    """
+    from safetensors.numpy import save as serialized
+
+    entry = entry_of(name)
+    for path, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise InputError(f"{source}: expected finite values, got NaN or infinity in {path}; use the official file")
+    content = serialized({path: np.ascontiguousarray(array) for path, array in arrays.items()})
+    target = _path(entry, folder)
+    with replacing(target) as temporary:
+        temporary.write_bytes(content)
+    sha256 = hashlib.sha256(content).hexdigest()
+    manifest = Manifest(name, sha256, len(content), parameters, source.name, file_sha256(source), rounded=rounded)
+    write_text(target.with_suffix(".json"), json.dumps(asdict(manifest), indent=1) + "\n")
+    return target
+
+
+def load(name: str, folder: Path | None = None) -> dict[str, np.ndarray]:
+    """Arrays by dotted path, from a file that is byte for byte what was saved.
+
+    Raises:
+        InputError: unknown name.
+        WeightsError: not installed; no manifest, another's, or a damaged file.
+    """
+    from safetensors import SafetensorError
+    from safetensors.numpy import load as deserialized
+
+    entry = entry_of(name)
+    manifest = read_manifest(name, folder)
+    path = _path(entry, folder)
+    if (size := path.stat().st_size) != manifest.size:
+        raise WeightsError(f"{path}: expected {manifest.size} bytes, got {size}; {_MEND}", entry)
+    content = path.read_bytes()
+    if hashlib.sha256(content).hexdigest() != manifest.sha256:
+        raise WeightsError(f"{path}: the file has changed since it was written (sha256 differs); {_MEND}", entry)
+    try:
+        return deserialized(content)
+    except (SafetensorError, KeyError, ValueError, TypeError) as error:
+        raise WeightsError(f"{path}: expected a safetensors file, got: {error}; {_MEND}", entry) from error
+
+
+def load_model(name: str, folder: Path | None = None) -> "nnx.Module":
+    """The network of this name with its weights, ready for inference.
+
+    Raises:
+        InputError: unknown name.
+        WeightsError: as `load`; or the file's arrays are not this network's.
+    """
+    from mfvpr.checkpoints.networks import blueprint
+
+    entry = entry_of(name)
+    arrays = load(name, folder)
+    try:
+        return blueprint(entry).filled(arrays)
+    except InputError as error:  # written by another version of the network
+        raise WeightsError(f"{_path(entry, folder)}: {error}; {_MEND}", entry) from error
+
+
+def fingerprint(name: str, folder: Path | None = None) -> str:
+    """The sha256 of the runtime file, as its manifest has it.
+
+    Raises:
+        WeightsError: not installed, or no manifest.
+    """
+    return read_manifest(name, folder).sha256
+
+
+def read_manifest(name: str, folder: Path | None = None) -> Manifest:
+    """The manifest of an installed runtime file; the file itself is not read.
+
+    Raises:
+        WeightsError: not installed, or no manifest of this name and format.
+    """
+    entry = entry_of(name)
+    path = _path(entry, folder).with_suffix(".json")
+    if not path.with_suffix(".safetensors").is_file():
+        raise WeightsError(
+            f"{name}: not installed in {folder or weights_folder()}; get {entry.file} from {entry.source} "
+            f"({entry.license}) and install it",
+            entry,
+        )
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        manifest = Manifest(**values)
+        if any(type(getattr(manifest, field.name)) is not field.type for field in fields(Manifest)):
+            raise TypeError
+    except FileNotFoundError as error:
+        raise WeightsError(f"{path}: there is no manifest, so the file was never finished; {_MEND}", entry) from error
+    except (ValueError, TypeError) as error:
+        raise WeightsError(f"{path}: expected a manifest of format {FORMAT}; {_MEND}", entry) from error
+    if manifest.format != FORMAT:
+        raise WeightsError(f"{path}: expected a manifest of format {FORMAT}, got {manifest.format}; {_MEND}", entry)
+    if manifest.name != name:
+        raise WeightsError(f"{path}: expected the manifest of {name}, got that of {manifest.name}; {_MEND}", entry)
+    return manifest
+
+
+def is_installed(entry: Entry, folder: Path | None = None) -> bool:
+    """Whether the runtime file and its manifest are there; `load` says whether they are good."""
+    path = _path(entry, folder)
+    return path.is_file() and path.with_suffix(".json").is_file()
+
+
+def file_sha256(path: Path) -> str:
+    """Of a file of any size."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _path(entry: Entry, folder: Path | None) -> Path:
+    return (folder or weights_folder()) / f"{entry.name}.safetensors"

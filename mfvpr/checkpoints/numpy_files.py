@@ -1,0 +1,48 @@
+"""Reads the one kind of .npy file that holds a network: layers by name, of arrays by name, pickled, as plain data."""
+
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from mfvpr.io.foreign.numpy_objects import Array, read_objects
+from mfvpr.io.foreign.pickles import MEND, excerpt, file_size, of_type
+from mfvpr.utils.errors import InputError
+
+_LONGEST_NAME = 100  # characters
+_ENTRY = 16  # bytes that an array takes in the file at least, besides its values
+_EXPECTED = "a dictionary of layers"
+
+
+def read_layers(file: BinaryIO) -> dict[str, np.ndarray]:
+    """Arrays by `layer.name`, read-only, in the file's own types.
+
+    Raises:
+        InputError: it holds anything else.
+        LookupError, TypeError, ValueError: it is damaged.
+    """
+    match read_objects(file, _EXPECTED):
+        case [dict() as layers] if layers:
+            return _arrays(layers, file_size(file))
+    raise InputError(f"expected {_EXPECTED}, got another object; use the official file")
+
+
+def _arrays(layers: dict[Any, Any], room: int) -> dict[str, np.ndarray]:
+    """The layers' arrays, which together take at most `room` bytes: in the file, many names may share a few of them."""
+    arrays = {}
+    for layer, parts in layers.items():
+        if not isinstance(parts, dict):
+            raise InputError(f"expected arrays by layer, got {type(parts).__name__} at {excerpt(str(layer))}; {MEND}")
+        for name, array in parts.items():
+            if len(of_type(str, layer)) + len(of_type(str, name)) > _LONGEST_NAME:
+                raise ValueError
+            key = f"{layer}.{name}"
+            where = f" at {excerpt(key)}"
+            if not isinstance(array, Array):
+                raise InputError(f"expected arrays by layer, got {type(array).__name__}{where}; {MEND}")
+            room -= array.num_bytes(where) + _ENTRY
+            if room < 0:
+                raise InputError(f"expected no more values than the file stores{where}; use the official file")
+            if key in arrays:
+                raise ValueError
+            arrays[key] = array.numbers(where)
+    return arrays

@@ -1,0 +1,242 @@
+"""The published weights: what they are called, where they are, what may be done with them. No weights are in here."""
+
+import difflib
+from dataclasses import dataclass
+
+from mfvpr.utils.errors import InputError
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One published file."""
+
+    name: str
+    network: str
+    file: str  # the official file name
+    source: str  # where its authors put it
+    size: int | None  # bytes; None where not published
+    sha256: str | None  # None where not published
+    code_license: str
+    weights_license: str
+    cite: str
+    parameters: int  # without the running statistics of batch normalization
+
+    @property
+    def license(self) -> str:
+        """Of the code and of the weights, as their authors state it."""
+        return f"code {self.code_license}, weights {self.weights_license}"
+
+
+def _d2net(name: str) -> Entry:
+    return Entry(
+        name=name,
+        network="d2net",
+        file=f"{name}.pth",
+        source=f"https://dusmanu.com/files/d2-net/{name}.pth",
+        size=None,
+        sha256=None,
+        code_license="BSD-3-Clause-Clear",
+        weights_license="none stated",
+        cite="Dusmanu et al., D2-Net: A Trainable CNN for Joint Description and Detection of Local Features, CVPR 2019",
+        parameters=7_635_264,
+    )
+
+
+def _mixvpr(channels: int, rows: int, drive_id: str, parameters: int) -> Entry:
+    width = channels * rows
+    return Entry(
+        name=f"mixvpr_{width}",
+        network="mixvpr",
+        file=f"resnet50_MixVPR_{width}_channels({channels})_rows({rows}).ckpt",
+        source=f"https://drive.google.com/file/d/{drive_id}/view",
+        size=None,
+        sha256=None,
+        code_license="none stated",
+        weights_license="none stated",
+        cite="Ali-bey, Chaib-draa, Giguere, MixVPR: Feature Mixing for Visual Place Recognition, WACV 2023",
+        parameters=parameters,
+    )
+
+
+def _aliked(variant: str, parameters: int, size: int, sha256: str) -> Entry:
+    return Entry(
+        name=f"aliked-{variant}",
+        network="aliked",
+        file=f"aliked-{variant}.pth",
+        source=f"https://github.com/Shiaoming/ALIKED/raw/main/models/aliked-{variant}.pth",
+        size=size,
+        sha256=sha256,
+        code_license="BSD-3-Clause",
+        weights_license="BSD-3-Clause",
+        cite="Zhao et al., ALIKED: A Lighter Keypoint and Descriptor Extraction Network via Deformable Transformation, "
+        "IEEE TIM 2023",
+        parameters=parameters,
+    )
+
+
+def _lightglue() -> Entry:
+    return Entry(
+        name="aliked_lightglue",
+        network="lightglue",
+        file="aliked_lightglue.pth",
+        source="https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/aliked_lightglue.pth",
+        size=47_632_827,
+        sha256="d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
+        code_license="Apache-2.0",
+        weights_license="Apache-2.0",
+        cite="Lindenberger, Sarlin, Pollefeys, LightGlue: Local Feature Matching at Light Speed, ICCV 2023",
+        parameters=11_884_625,
+    )
+
+
+def _ssm() -> Entry:
+    return Entry(
+        name="vgg16_places365",
+        network="ssm",
+        file="vgg16_places365.npy",
+        source="https://imr.ciirc.cvut.cz/uploads/Datasets/checkpoints.zip, or the Caffe model it was made from, "
+        "http://places2.csail.mit.edu/models_places365/vgg16_places365.caffemodel",
+        size=None,
+        sha256=None,
+        code_license="MIT (SSM-VPR)",
+        weights_license="CC BY (Places365)",
+        cite="Zhou et al., Places: A 10 Million Image Database for Scene Recognition, TPAMI 2017",
+        parameters=12_354_880,
+    )
+
+
+def _patchnetvlad(training: str, outputs: int, size: int | None, sha256: str) -> Entry:
+    clusters = 16 if training == "mapillary" else 64
+    vgg, vlad, projection = 14_714_688, 2 * 512 * clusters, (512 * clusters + 1) * outputs
+    return Entry(
+        name=f"patchnetvlad_{training}_{outputs}",
+        network="patch_netvlad",
+        file=f"{training}_WPCA{outputs}.pth.tar",
+        source=f"https://huggingface.co/TobiasRobotics/Patch-NetVLAD/resolve/main/{training}_WPCA{outputs}.pth.tar",
+        size=size,
+        sha256=sha256,
+        code_license="MIT",
+        weights_license="MIT",
+        cite="Hausler et al., Patch-NetVLAD: Multi-Scale Fusion of Locally-Global Descriptors for Place Recognition, "
+        "CVPR 2021",
+        parameters=vgg + vlad + projection,
+    )
+
+
+_HLOC = "https://cvg-data.inf.ethz.ch/hloc/netvlad"
+_NANNE = "vgg16_netvlad_checkpoint.zip at https://drive.google.com/open?id=17luTjZFCX639guSVy00OUtzfTQo4AMF2"
+
+
+def _netvlad(name: str, file: str, source: str, license: str, outputs: int | None) -> Entry:
+    return Entry(
+        name=f"netvlad_{name}",
+        network="netvlad",
+        file=file,
+        source=source,
+        size=None,
+        sha256=None,
+        code_license=license,
+        weights_license=license,
+        cite="Arandjelovic et al., NetVLAD: CNN Architecture for Weakly Supervised Place Recognition, CVPR 2016",
+        parameters=14_714_688 + 2 * 512 * 64 + (512 * 64 + 1) * (outputs or 0),
+    )
+
+
+def _cosplace(backbone: str, outputs: int) -> Entry:
+    file = f"{backbone}_{outputs}_cosplace.pth"
+    convolutions, channels = {"VGG16": (14_714_688, 512), "ResNet50": (23_508_032, 2048)}[backbone]
+    return Entry(
+        name=f"cosplace_{backbone.lower()}_{outputs}",
+        network="gem",
+        file=file,
+        source=f"https://github.com/gmberton/CosPlace/releases/download/v1.0/{file}",
+        size=None,
+        sha256=None,
+        code_license="MIT",
+        weights_license="MIT",
+        cite="Berton, Masone, Caputo, Rethinking Visual Geo-localization for Large-Scale Applications, CVPR 2022",
+        parameters=convolutions + 1 + (channels + 1) * outputs,
+    )
+
+
+def _dinov2(name: str, parameters: int) -> Entry:
+    file = f"dinov2_{name}_pretrain.pth"
+    return Entry(
+        name=f"dinov2_{name}",
+        network="dinov2",
+        file=file,
+        source=f"https://dl.fbaipublicfiles.com/dinov2/dinov2_{name}/{file}",
+        size=None,
+        sha256=None,
+        code_license="Apache-2.0",
+        weights_license="Apache-2.0",
+        cite="Oquab et al., DINOv2: Learning Robust Visual Features without Supervision, TMLR 2024",
+        parameters=parameters,
+    )
+
+
+def _selavpr(training: str, file: str, drive_id: str, registers: int = 0) -> Entry:
+    return Entry(
+        name=f"selavpr_{training}",
+        network="selavpr",
+        file=file,
+        source=f"https://drive.google.com/file/d/{drive_id}/view",
+        size=None,
+        sha256=None,
+        code_license="MIT, Apache-2.0",
+        weights_license="none stated",
+        cite="Lu et al., Towards Seamless Adaptation of Pre-trained Models for Visual Place Recognition, ICLR 2024",
+        parameters=357_427_585 + 1024 * registers,  # without the training's mask token
+    )
+
+
+# fmt: off
+_ENTRIES = (
+    _d2net("d2_tf"),
+    _d2net("d2_ots"),
+    _d2net("d2_tf_no_phototourism"),
+    _mixvpr(1024, 4, "1vuz3PvnR7vxnDDLQrdHJaOA04SQrtk5L", 10_880_900),
+    _mixvpr(256, 2, "1khiTUNzZhfV2UUupZoIsPIbsMRBYVDqj", 10_092_898),
+    _mixvpr(64, 2, "1DQnefjk1hVICOEYPwE4-CZAZOvi1NSJz", 9_896_098),
+    _aliked("t16", 192_100, 794_859, "56782336919db220144a884e710e2b6af13b3b8f8da15b915a239078ab471085"),
+    _aliked("n16", 677_356, 2_738_091, "5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2"),
+    _aliked("n16rot", 677_356, 2_738_325, "ddf3abbf38e86f6a74540d214e1a9712c54b2d8551abc864542199f2347d7332"),
+    _aliked("n32", 979_500, 3_946_667, "055283fd1624d3ab46a05c3b617b1a79a3f28d1f551737eef2d653e8c8232890"),
+    _lightglue(),
+    _ssm(),
+    _netvlad("pitts30k", "Pitts30K_struct.mat", f"{_HLOC}/Pitts30K_struct.mat", "MIT", 4096),
+    _netvlad("tokyotm", "TokyoTM_struct.mat", f"{_HLOC}/TokyoTM_struct.mat", "MIT", 4096),
+    _netvlad("pytorch", "checkpoint.pth.tar", _NANNE, "none stated", None),
+    _cosplace("VGG16", 512),
+    _cosplace("ResNet50", 512),
+    _cosplace("ResNet50", 2048),
+    _patchnetvlad("mapillary", 128, 67_319_611, "5b6de8a5537061bbe7a477b62bb687b042d92d472e5231e2072026ecc59ec4b1"),
+    _patchnetvlad("mapillary", 512, 92_488_008, "acbe2597c1c23c95482883c05969006a74bf7e68c4151dbb4ab5d67b69e8e346"),
+    _patchnetvlad("mapillary", 4096, 327_398_210, "4b22ad1619bb7f085a5229d35f0f865740f2cdad2bced2ddbc7b28791c5b1542"),
+    _patchnetvlad("pitts", 128, 92_681_537, "74bb0e0113c074ed9b07651a5f01bd424171d8e3b91d7024d2ccb0b0392164f3"),
+    _patchnetvlad("pitts", 512, None, "309611d927c759e897e1eb27977994236b5618d9d3cd7202035cea1b56c08c1c"),
+    _patchnetvlad("pitts", 4096, 1_132_901_186, "2c3cf17de91974156cb6aee40a6f7a229825095273d7de87c0792084ae1bf4aa"),
+    _patchnetvlad("landmarks", 4096, None, "659a837b11883ed8a8ea5e1d1a46eb2871ea26514fbfc2ad7d9d4e1334380a34"),
+    _dinov2("vits14", 22_056_192),
+    _dinov2("vitb14", 86_579_712),
+    _dinov2("vitl14", 304_367_616),
+    _selavpr("pitts30k", "SelaVPR_pitts30k.pth", "1LKTZZRHfMH3dY3UPagCt2TIlMN5LguGO"),
+    _selavpr("msls", "SelaVPR_msls.pth", "1vy05l0JTEgr6n8iSoz_P_yjWfEzFPAkV"),
+    _selavpr("msls_registers", "SelaVPR_reg4_msls.pth", "16Qkr6MGe3k0kYtFfw3YLQXZFn4c9YvJk", registers=4),
+)
+# fmt: on
+
+REGISTRY: dict[str, Entry] = {entry.name: entry for entry in _ENTRIES}
+
+
+def entry_of(name: str) -> Entry:
+    """The entry called `name`.
+
+    Raises:
+        InputError: there is none; the message names the nearest, or all.
+    """
+    if name in REGISTRY:
+        return REGISTRY[name]
+    nearest = difflib.get_close_matches(name, REGISTRY, n=1)
+    hint = f"the nearest is {nearest[0]}" if nearest else f"expected one of {', '.join(REGISTRY)}"
+    raise InputError(f"{name}: no weights of this name; {hint}")

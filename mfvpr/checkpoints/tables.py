@@ -1,0 +1,220 @@
+"""Keys of the published checkpoints -> paths of our networks."""
+
+from collections.abc import Mapping
+
+from mfvpr.checkpoints.conversion import Layout, Rule, Table
+
+_COUNTERS = r".*\.num_batches_tracked"
+
+
+def _batch_norm(source: str, target: str) -> tuple[Rule, ...]:
+    names = {"weight": "scale", "bias": "bias", "running_mean": "mean", "running_var": "var"}
+    return tuple(Rule(rf"{source}\.{theirs}", f"{target}.{ours}") for theirs, ours in names.items())
+
+
+def _linear(source: str, target: str) -> tuple[Rule, ...]:
+    return Rule(rf"{source}\.weight", f"{target}.kernel", Layout.LINEAR), Rule(rf"{source}\.bias", f"{target}.bias")
+
+
+def _convolution(source: str, target: str) -> tuple[Rule, ...]:
+    return (
+        Rule(rf"{source}\.weight", f"{target}.kernel", Layout.CONV),
+        Rule(rf"{source}\.bias", f"{target}.bias"),
+    )
+
+
+# Positions of VGG16's convolutions in the public Sequential; pooling and ReLU lie between.
+_VGG = {
+    0: "conv1_1", 2: "conv1_2", 5: "conv2_1", 7: "conv2_2", 10: "conv3_1", 12: "conv3_2", 14: "conv3_3",
+    17: "conv4_1", 19: "conv4_2", 21: "conv4_3", 24: "conv5_1", 26: "conv5_2", 28: "conv5_3",
+}  # fmt: skip
+
+
+def _vgg(source: str, target: str = "vgg") -> tuple[Rule, ...]:
+    layers = (_convolution(rf"{source}\.{position}", f"{target}.{name}") for position, name in _VGG.items())
+    return tuple(rule for rules in layers for rule in rules)
+
+
+D2NET = Table(_vgg(r"dense_feature_extraction\.model"))
+
+# SSM-VPR's own file and torch files of the same Caffe model, with Caffe's names or with torchvision's.
+SSM = Table(
+    (
+        Rule(r"(conv\d_\d)\.weights?", r"vgg.\1.kernel", Layout.CONV),
+        Rule(r"(conv\d_\d)\.bias", r"vgg.\1.bias", Layout.SQUEEZED),
+        *_vgg("features"),
+    ),
+    ignored=(  # layers behind the last map
+        r"(conv5_3|fc[678]\w*)\.(weights?|bias)",
+        r"(features\.28|classifier\.\d)\.(weight|bias)",
+    ),
+    expected={r"fc8\w*\.weights?|classifier\.6\.weight": (365, 4096)},  # ImageNet's networks have 1000 classes
+)
+
+
+def _resnet(conv1: str, bn1: str, layers: Mapping[str, str]) -> tuple[Rule, ...]:
+    """Of a backbone; what the file calls its layers, and what we do."""
+    rules = [Rule(rf"{conv1}\.weight", "backbone.conv1.kernel", Layout.CONV), *_batch_norm(bn1, "backbone.bn1")]
+    for source, layer in layers.items():
+        block, ours = rf"{source}\.(\d)", rf"backbone.{layer}.\1"
+        rules += [
+            Rule(rf"{block}\.(conv\d)\.weight", rf"{ours}.\2.kernel", Layout.CONV),
+            *_batch_norm(rf"{block}\.(bn\d)", rf"{ours}.\2"),
+            Rule(rf"{block}\.downsample\.0\.weight", f"{ours}.shortcut.kernel", Layout.CONV),
+            *_batch_norm(rf"{block}\.downsample\.1", f"{ours}.shortcut_bn"),
+        ]
+    return tuple(rules)
+
+
+MIXVPR = Table(
+    (
+        *_resnet(
+            r"backbone\.model\.conv1",
+            r"backbone\.model\.bn1",
+            {rf"backbone\.model\.layer{number}": f"layer{number}" for number in (1, 2, 3)},
+        ),
+        Rule(r"aggregator\.mix\.(\d)\.mix\.0\.weight", r"mix.\1.norm.scale"),
+        Rule(r"aggregator\.mix\.(\d)\.mix\.0\.bias", r"mix.\1.norm.bias"),
+        *_linear(r"aggregator\.mix\.(\d)\.mix\.1", r"mix.\1.linear1"),
+        *_linear(r"aggregator\.mix\.(\d)\.mix\.3", r"mix.\1.linear2"),
+        *_linear(r"aggregator\.channel_proj", "channel_proj"),
+        *_linear(r"aggregator\.row_proj", "row_proj"),
+    ),
+    ignored=(_COUNTERS,),
+)
+
+_CONV = r"(block\d\.conv\d|conv\d)"
+
+ALIKED = Table(
+    (
+        Rule(rf"{_CONV}\.weight", r"\1.kernel", Layout.CONV),
+        Rule(r"(block\d\.conv\d)\.regular_conv\.weight", r"\1.kernel", Layout.CONV),  # the deformable convolution's
+        Rule(r"(block\d\.conv\d)\.offset_conv\.weight", r"\1.offset.kernel", Layout.CONV),
+        Rule(r"(block\d\.conv\d)\.offset_conv\.bias", r"\1.offset.bias"),
+        *_batch_norm(r"(block\d\.bn\d)", r"\1"),
+        Rule(r"(block\d)\.downsample\.weight", r"\1.shortcut.kernel", Layout.CONV),
+        Rule(r"(block\d)\.downsample\.bias", r"\1.shortcut.bias"),
+        *(
+            Rule(rf"score_head\.{position}\.weight", f"score_head.{place}.kernel", Layout.CONV)
+            for place, position in enumerate((0, 2, 4, 6))
+        ),
+        Rule(r"desc_head\.agg_weights", "desc_head.agg_weights"),
+        Rule(r"desc_head\.offset_conv\.0\.weight", "desc_head.offset1.kernel", Layout.CONV),
+        Rule(r"desc_head\.offset_conv\.0\.bias", "desc_head.offset1.bias"),
+        Rule(r"desc_head\.offset_conv\.2\.weight", "desc_head.offset2.kernel", Layout.CONV),
+        Rule(r"desc_head\.offset_conv\.2\.bias", "desc_head.offset2.bias"),
+        Rule(r"desc_head\.sf_conv\.weight", "desc_head.sample.kernel", Layout.CONV),
+    ),
+    ignored=(_COUNTERS,),
+)
+
+_LAYER = r"(?:transformers\.(\d)\.{0}_attn|{0}_attn\.(\d))"  # the latter in older files; the other group is empty
+
+
+def _attention(source: str, target: str, parts: dict[str, str]) -> tuple[Rule, ...]:
+    layer, ours = _LAYER.format(source), rf"layers.\1\2.{target}"
+    parts = parts | {r"ffn\.0": "feed_forward.hidden", r"ffn\.3": "feed_forward.update"}
+    linear = (_linear(rf"{layer}\.{theirs}", f"{ours}.{name}") for theirs, name in parts.items())
+    norm = rf"{layer}\.ffn\.1", f"{ours}.feed_forward.norm"
+    return (
+        *(rule for rules in linear for rule in rules),
+        Rule(rf"{norm[0]}\.weight", f"{norm[1]}.scale"),
+        Rule(rf"{norm[0]}\.bias", f"{norm[1]}.bias"),
+    )
+
+
+LIGHTGLUE = Table(
+    (
+        *_linear("input_proj", "input"),
+        Rule(r"posenc\.Wr\.weight", "position.kernel", Layout.LINEAR),
+        *_attention("self", "self_attention", {"Wqkv": "qkv", "out_proj": "message"}),
+        *_attention("cross", "cross_attention", {"to_qk": "key", "to_v": "value", "to_out": "message"}),
+        *_linear(r"log_assignment\.(\d)\.final_proj", r"layers.\1.projection"),
+        *_linear(r"log_assignment\.(\d)\.matchability", r"layers.\1.matchability"),
+        *_linear(r"token_confidence\.(\d)\.token\.0", r"confidences.\1"),
+    ),
+    ignored=("confidence_thresholds",),  # follow from the number of layers
+)
+
+# Patch-NetVLAD's, and pytorch-NetVlad's without the projection, where several devices trained it below `module`.
+NETVLAD = Table(
+    (
+        *_vgg(r"encoder(?:\.module)?"),
+        Rule(r"pool(?:\.module)?\.conv\.weight", "pool.assignment.kernel", Layout.POINTWISE),
+        Rule(r"pool(?:\.module)?\.centroids", "pool.centers"),
+        Rule(r"WPCA\.0\.weight", "projection.kernel", Layout.POINTWISE),
+        Rule(r"WPCA\.0\.bias", "projection.bias"),
+    )
+)
+
+# The original's layers, MATLAB's axes: height, width, inputs, outputs. The centers are stored with the other sign.
+NETVLAD_MATLAB = Table(
+    (
+        *(
+            Rule(rf"net\.layers\.{position}\.weights\.{place}", f"vgg.{name}.{part}", Layout.SQUEEZED)
+            for position, name in _VGG.items()
+            for place, part in enumerate(("kernel", "bias"))
+        ),
+        Rule(r"net\.layers\.30\.weights\.0", "pool.assignment.kernel", Layout.SQUEEZED),
+        Rule(r"net\.layers\.30\.weights\.1", "pool.centers", Layout.OPPOSITE),
+        Rule(r"net\.layers\.33\.weights\.0", "projection.kernel", Layout.SQUEEZED),
+        Rule(r"net\.layers\.33\.weights\.1", "projection.bias", Layout.SQUEEZED),
+        Rule(r"net\.meta\.normalization\.averageImage", "average", Layout.PIXEL),
+    ),
+    ignored=(r"net\.(?!layers\.\d+\.weights|meta\.normalization\.averageImage).*",),  # how it was trained
+)
+
+_GEM = (
+    Rule(r"aggregation\.1\.p", "pool.power"),
+    *_linear(r"aggregation\.3", "projection"),
+)
+GEM_VGG16 = Table((*_vgg("backbone", "backbone"), *_GEM))
+GEM_RESNET50 = Table(
+    (
+        *_resnet(
+            r"backbone\.0", r"backbone\.1", {rf"backbone\.{place}": f"layer{place - 3}" for place in (4, 5, 6, 7)}
+        ),
+        *_GEM,
+    ),
+    ignored=(_COUNTERS,),
+)
+
+
+def _transformer(source: str, target: str) -> tuple[Rule, ...]:
+    block, ours = rf"{source}blocks\.(\d+)", rf"{target}blocks.\1"
+    return (
+        Rule(rf"{source}cls_token", f"{target}first", Layout.SQUEEZED),
+        Rule(rf"{source}pos_embed", f"{target}positions", Layout.SQUEEZED),
+        Rule(rf"{source}register_tokens", f"{target}registers", Layout.SQUEEZED),
+        *_convolution(rf"{source}patch_embed\.proj", f"{target}patches"),
+        *_linear(rf"{block}\.attn\.qkv", f"{ours}.attention.qkv"),
+        *_linear(rf"{block}\.attn\.proj", f"{ours}.attention.output"),
+        *_linear(rf"{block}\.mlp\.fc1", f"{ours}.perceptron.hidden"),
+        *_linear(rf"{block}\.mlp\.fc2", f"{ours}.perceptron.output"),
+        Rule(rf"{block}\.ls(\d)\.gamma", rf"{ours}.scale\2"),
+        Rule(rf"{block}\.norm(\d)\.weight", rf"{ours}.norm\2.scale"),
+        Rule(rf"{block}\.norm(\d)\.bias", rf"{ours}.norm\2.bias"),
+        Rule(rf"{source}norm\.weight", f"{target}norm.scale"),
+        Rule(rf"{source}norm\.bias", f"{target}norm.bias"),
+    )
+
+
+_MASK = "mask_token"  # of the training
+
+DINOV2 = Table(_transformer("", ""), ignored=(_MASK,))
+
+# Its training on several devices puts `module` before all keys.
+_SELA, _BLOCK = r"(?:module\.)?", r"backbone\.blocks\.(\d+)"
+SELAVPR = Table(
+    (
+        *_transformer(rf"{_SELA}backbone\.", "backbone."),
+        *_linear(rf"{_SELA}{_BLOCK}\.adapter1\.D_fc1", r"backbone.blocks.\1.serial.down"),
+        *_linear(rf"{_SELA}{_BLOCK}\.adapter1\.D_fc2", r"backbone.blocks.\1.serial.up"),
+        *_linear(rf"{_SELA}{_BLOCK}\.adapter2\.D_fc1", r"backbone.blocks.\1.parallel.down"),
+        *_linear(rf"{_SELA}{_BLOCK}\.adapter2\.D_fc2", r"backbone.blocks.\1.parallel.up"),
+        Rule(rf"{_SELA}aggregation\.1\.p", "pool.power"),
+        Rule(rf"{_SELA}LocalAdapt\.upconv(\d)\.weight", r"upsampling\1.kernel", Layout.UPSAMPLING),
+        Rule(rf"{_SELA}LocalAdapt\.upconv(\d)\.bias", r"upsampling\1.bias"),
+    ),
+    ignored=(rf"{_SELA}backbone\.{_MASK}",),
+)

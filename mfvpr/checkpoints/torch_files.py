@@ -1,0 +1,194 @@
+"""Reads torch's checkpoints, of both formats and without torch, as plain data.
+
+Ordered dictionaries, tensors and parameters are known by their names, a training's notes beside them are left unread.
+"""
+
+import io
+import math
+import os
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, BinaryIO, Literal
+
+import numpy as np
+
+from mfvpr.io.foreign.pickles import MEND, Name, excerpt, file_size, natural, of_type, read_pickle, refused
+from mfvpr.utils.errors import InputError
+
+Order = Literal["little", "big"]
+
+_WRAPPERS = ("model", "state_dict", "model_state_dict")
+_ORDERS: dict[bytes, Order] = {b"little": "little", b"big": "big"}
+_DTYPES = {
+    "FloatStorage": np.dtype("f4"),
+    "DoubleStorage": np.dtype("f8"),
+    "LongStorage": np.dtype("i8"),  # this and the following hold counters
+    "IntStorage": np.dtype("i4"),
+    "ShortStorage": np.dtype("i2"),
+    "CharStorage": np.dtype("i1"),
+    "ByteStorage": np.dtype("u1"),
+    "BoolStorage": np.dtype("?"),
+}
+_MAGIC, _PROTOCOL = 0x1950A86A20F9469CFC6C, 1001  # with which files begin that are no zip, those before torch 1.6
+_NOTES = {  # the command line and the losses, as D2-Net's training keeps them
+    "argparse.Namespace",
+    "_codecs.encode",
+    "numpy.dtype",
+    *(f"numpy.{core}.multiarray.scalar" for core in ("core", "_core")),
+}
+
+
+@dataclass(frozen=True)
+class Storage:
+    """Where a tensor's values lie."""
+
+    kind: str  # torch's name of its type: FloatStorage, ...
+    key: str
+    count: int  # values
+
+
+@dataclass(frozen=True)
+class Tensor:
+    """A strided view of a storage; offset and strides count values."""
+
+    storage: Storage
+    offset: int
+    shape: tuple[int, ...]
+    strides: tuple[int, ...]
+
+
+class Unread:
+    """A note that nobody asks for."""
+
+
+class _Names:
+    """The vocabulary; storages gather by key."""
+
+    def __init__(self) -> None:
+        self.storages: dict[str, Storage] = {}
+
+    def called(self, name: Name, arguments: tuple) -> Any:
+        match str(name), arguments:
+            case "collections.OrderedDict", ():
+                return {}
+            case "torch._utils._rebuild_tensor_v2", (Storage() as storage, offset, shape, strides, _, _):
+                return Tensor(storage, natural(offset), _counts(shape), _counts(strides))
+            case "torch._utils._rebuild_parameter", (Tensor() as tensor, _, _):
+                return tensor
+            case note, _ if note in _NOTES:
+                return Unread()
+        raise _refused(name)
+
+    def built(self, instance: Any, state: Any) -> None:
+        """Fills a note, or adds one to an ordered dictionary."""
+        if type(instance) not in (dict, Unread):
+            raise TypeError
+
+    def stored(self, identity: Any) -> Storage:
+        match identity:
+            case ("storage", Name("torch" | "torch.storage", kind), str(key), _, count, *rest):
+                if rest not in ([], [None]):  # of older files: a view of another storage
+                    raise InputError(f"expected plain dense tensors, got one in a part of another's storage; {MEND}")
+                storage = Storage(kind, key, natural(count))
+            case ("module", Name() as name, *_):
+                raise _refused(name)
+            case _:
+                raise TypeError
+        if self.storages.setdefault(key, storage) != storage:
+            raise ValueError
+        return storage
+
+
+def _refused(name: Name) -> InputError:
+    return refused(name, "plain dense tensors")
+
+
+def _counts(values: Any) -> tuple[int, ...]:
+    return tuple(natural(value) for value in of_type(tuple, values))
+
+
+def read_zip(file: BinaryIO) -> dict[str, np.ndarray]:
+    """A pickle, and one entry for the values of each storage; uncompressed, with checksums."""
+    with zipfile.ZipFile(file) as archive:
+        entries = archive.infolist()
+        names = [entry.filename for entry in entries]
+        packed = any(entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1 for entry in entries)
+        if packed or len(set(names)) < len(names) or sum(entry.file_size for entry in entries) > file_size(file):
+            raise InputError("expected each entry of the zip file once and uncompressed; use the official file")
+        if broken := archive.testzip():
+            raise InputError(f"this checkpoint is damaged, by the checksum of {excerpt(broken)}; download it again")
+        (pickle,) = (name for name in names if name.split("/")[1:] == ["data.pkl"])
+        folder = pickle.removesuffix("data.pkl")
+        order = _ORDERS[archive.read(f"{folder}byteorder") if f"{folder}byteorder" in names else b"little"]
+        content = read_pickle(io.BytesIO(archive.read(pickle)), _Names())
+        return _arrays(content, order, lambda storage: archive.read(f"{folder}data/{storage.key}"))
+
+
+def read_legacy(file: BinaryIO) -> dict[str, np.ndarray]:
+    """Five pickles: two numbers, the byte order, the content, the keys of its storages; then their values."""
+    names = _Names()
+    if (read_pickle(file, names), read_pickle(file, names)) != (_MAGIC, _PROTOCOL):
+        raise InputError("expected a torch checkpoint, got another pickle; use the official file")
+    order: Order = "little" if read_pickle(file, names)["little_endian"] else "big"
+    content, keys = read_pickle(file, names), read_pickle(file, names)
+    places = {}
+    for key in keys:
+        storage = names.storages[key]
+        size = storage.count * _dtype(storage).itemsize
+        if int.from_bytes(file.read(8), order) != storage.count or file.tell() + size > file_size(file):
+            raise ValueError
+        places[key] = file.tell(), size
+        file.seek(size, os.SEEK_CUR)
+    if file.tell() != file_size(file):
+        raise ValueError
+
+    def values(storage: Storage) -> bytes:
+        place, size = places[storage.key]
+        file.seek(place)
+        return file.read(size)
+
+    return _arrays(content, order, values)
+
+
+def _arrays(content: Any, order: Order, values: Callable[[Storage], bytes]) -> dict[str, np.ndarray]:
+    """Tensors of a pickle's content as arrays; `order` is that of their bytes."""
+    values = cache(values)
+    for key in _WRAPPERS:
+        if isinstance(content, dict) and isinstance(content.get(key), dict):
+            content = content[key]
+            break
+    if not isinstance(content, dict) or not content:
+        kind = "an empty dict" if content == {} else type(content).__name__
+        raise InputError(f"expected tensors by name, got {kind}; use the official file")
+    arrays = {}
+    for key, tensor in content.items():
+        if not isinstance(key, str):
+            number = excerpt(str(key))
+            raise InputError(f"expected tensors by name, got one by the number {number}; use the official file")
+        where = f" at {excerpt(key)}"
+        if not isinstance(tensor, Tensor):
+            raise InputError(f"expected tensors only, got {type(tensor).__name__}{where}")
+        dtype = _dtype(tensor.storage, where).newbyteorder(order)
+        raw = values(tensor.storage)
+        if len(raw) != tensor.storage.count * dtype.itemsize:
+            raise ValueError
+        if math.prod(tensor.shape) > tensor.storage.count:
+            raise InputError(f"expected no more values than the file stores{where}; use the official file")
+        strides = [step * dtype.itemsize for step in tensor.strides]
+        view = np.ndarray(tensor.shape, dtype, raw, tensor.offset * dtype.itemsize, strides)  # checks its bounds
+        arrays[key] = view.astype(dtype.newbyteorder("="), copy=False)
+    return arrays
+
+
+def _dtype(storage: Storage, where: str = "") -> np.dtype:
+    """Of a storage's values; `where` ends the message.
+
+    Raises:
+        InputError: neither float32 nor float64 nor an integer.
+    """
+    if storage.kind not in _DTYPES:
+        kind = excerpt(storage.kind.removesuffix("Storage"))
+        raise InputError(f"expected tensors of float32 or float64, got {kind}{where}; use the official file")
+    return _DTYPES[storage.kind]

@@ -1,0 +1,298 @@
+"""A data set: database images, query images, and where the queries really are."""
+
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mfvpr.datasets.ground_truth import CHOICES, KINDS, truth_by_order, truth_from_names
+from mfvpr.datasets.images import read_image
+from mfvpr.datasets.positives import Positives
+from mfvpr.datasets.truth import Truth
+from mfvpr.datasets.truth_files import truth_from_file, truth_from_labels
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import IMAGE_SUFFIXES
+
+MEANS = ("mean", "pooled")  # what results call the means over sequences, and over all of their queries
+
+
+@dataclass(frozen=True)
+class ImageFolder:
+    """Images below `root`, by relative POSIX path in natural order (image2 before image10).
+
+    Attributes:
+        root: folder.
+        names: of the images.
+        orient: how they are read, see `mfvpr.datasets.images.read_image`.
+        bits: likewise.
+    """
+
+    root: Path
+    names: tuple[str, ...]
+    orient: bool = True
+    bits: int | None = 16
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "root", Path(self.root))
+
+    @property
+    def paths(self) -> list[Path]:
+        """Full paths, in order."""
+        return [self.root / name for name in self.names]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def read(self, row: int) -> np.ndarray:
+        """One image, `[H, W, 3]` uint8 RGB; raises as `read_image` does."""
+        return read_image(self.root / self.names[row], orient=self.orient, bits=self.bits)
+
+
+@dataclass(frozen=True)
+class QuerySequence:
+    """Query images of one drive or walk, with their ground truth.
+
+    Attributes:
+        name: what results call it.
+        images: to find in the database.
+        truth: which database images are right; None = only rankings can be told.
+        excluded: the database images that each query may not find; None = it may find all.
+    """
+
+    name: str
+    images: ImageFolder
+    truth: Truth | None
+    excluded: Positives | None = None
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """One database, and the query sequences that are to be found in it.
+
+    Attributes:
+        name: what results call it.
+        database: images to find.
+        sequences: at least one.
+    """
+
+    name: str
+    database: ImageFolder
+    sequences: tuple[QuerySequence, ...]
+
+    @property
+    def only(self) -> QuerySequence:
+        """The only sequence.
+
+        Raises:
+            InputError: there are several.
+        """
+        if len(self.sequences) != 1:
+            raise InputError(f"{self.name}: expected one query sequence, got {len(self.sequences)}; choose one of "
+                             f"{', '.join(sequence.name for sequence in self.sequences)}")  # fmt: skip
+        [sequence] = self.sequences
+        return sequence
+
+    @property
+    def queries(self) -> ImageFolder:
+        """Of the only sequence."""
+        return self.only.images
+
+    @property
+    def truth(self) -> Truth | None:
+        """Of the only sequence."""
+        return self.only.truth
+
+    @property
+    def excluded(self) -> Positives | None:
+        """Of the only sequence."""
+        return self.only.excluded
+
+
+def image_folder(root: Path | str, *, orient: bool = True, bits: int | None = 16) -> ImageFolder:
+    """All images below `root`, subfolders included, linked ones as well; hidden files and folders are not.
+
+    Args:
+        root: folder.
+        orient: how the images are read, see `mfvpr.datasets.images.read_image`.
+        bits: likewise.
+
+    Raises:
+        InputError: no such folder, one that cannot be listed, a link that leads to nothing or back to a folder that it
+            is in, or no images.
+    """
+    root = Path(root)
+    if not root.is_dir():
+        found = "a file" if os.path.lexists(root) else "nothing"
+        raise InputError(f"{root}: expected a folder of images, got {found}; check the path")
+    names = [path.relative_to(root).as_posix() for path in _images_below(root)]
+    if not names:
+        raise InputError(f"{root}: expected images ({', '.join(sorted(IMAGE_SUFFIXES))}), found none; check the path")
+    if bits is not None and not 8 <= bits <= 16:
+        raise InputError(f"bits={bits}: expected from 8 to 16 bits in use, or none")
+    return ImageFolder(root, tuple(sorted(names, key=_natural)), orient, bits)
+
+
+def folder_dataset(
+    database: Path | str,
+    queries: Path | str,
+    *,
+    ground_truth: str,
+    name: str = "folder",
+    index_file: Path | str | None = None,
+    widen_index: bool = False,
+    database_labels: Path | str | None = None,
+    query_labels: Path | str | None = None,
+    orient: bool = True,
+    bits: int | None = 16,
+) -> Dataset:
+    """Two folders of images as a data set.
+
+    Args:
+        database: folder of database images.
+        queries: folder of query images.
+        ground_truth: one of `ground_truth.KINDS`, which says what each means; "none" = rankings only. Nothing is
+            assumed.
+        name: what results call it.
+        index_file: for `index`, see `truth_files.truth_from_file`.
+        widen_index: for `index`, whether database images within a tolerance in frames count as well.
+        database_labels: for `label`, see `truth_files.truth_from_labels`.
+        query_labels: likewise.
+        orient: how the images are read, see `mfvpr.datasets.images.read_image`.
+        bits: likewise.
+    """
+    images = image_folder(database, orient=orient, bits=bits)
+    sequence = _sequence(
+        name, images, queries, ground_truth=ground_truth, index_file=index_file, widen_index=widen_index,
+        database_labels=database_labels, query_labels=query_labels,
+    )  # fmt: skip
+    return Dataset(name, images, (sequence,))
+
+
+def sequences_dataset(
+    database: Path | str,
+    queries: Sequence[Path | str],
+    *,
+    ground_truth: str,
+    name: str = "sequences",
+    index_file: str | None = None,
+    widen_index: bool = False,
+    orient: bool = True,
+    bits: int | None = 16,
+) -> Dataset:
+    """One folder of database images and several of queries, each a sequence that is called as its folder.
+
+    Args:
+        database: folder of database images.
+        queries: folders of query images, each of another name, and none called as a mean (`MEANS`).
+        ground_truth: one of `ground_truth.KINDS` but `label`, of every sequence.
+        name: what results call it.
+        index_file: for `index`, the file's name in the folder of each sequence, see `truth_files.truth_from_file`.
+        widen_index: for `index`, whether database images within a tolerance in frames count as well.
+        orient: how the images are read, see `mfvpr.datasets.images.read_image`.
+        bits: likewise.
+
+    Raises:
+        InputError: no sequence, two of one name, or one with the name of a mean; or as `folder_dataset`.
+    """
+    folders = [Path(folder) for folder in queries]
+    names = [(folder.resolve() if folder.name in ("", "..") else folder).name for folder in folders]
+    if not names:
+        raise InputError("queries: expected the folder of at least one sequence, got none")
+    for twice in {one for one in names if names.count(one) > 1}:
+        raise InputError(
+            f"queries: expected sequences of different names, got {twice} twice; rename one of the folders"
+        )
+    for taken in {*names} & {*MEANS}:
+        raise InputError(
+            f"queries: expected no sequence called {taken}, as results call one of their means; rename the folder"
+        )
+    images = image_folder(database, orient=orient, bits=bits)
+    sequences = (
+        _sequence(
+            one, images, folder, ground_truth=ground_truth, index_file=folder / index_file if index_file else None,
+            widen_index=widen_index, database_labels=None, query_labels=None,
+        )
+        for one, folder in zip(names, folders, strict=True)
+    )  # fmt: skip
+    return Dataset(name, images, tuple(sequences))
+
+
+def _sequence(
+    name: str,
+    database: ImageFolder,
+    queries: Path | str,
+    *,
+    ground_truth: str,
+    index_file: Path | str | None,
+    widen_index: bool,
+    database_labels: Path | str | None,
+    query_labels: Path | str | None,
+) -> QuerySequence:
+    """The queries of a folder, read as the database is, with their ground truth."""
+    images = image_folder(queries, orient=database.orient, bits=database.bits)
+    files = {"index_file": index_file, "database_labels": database_labels, "query_labels": query_labels}
+    _check_files(ground_truth, files)
+    names = images.names, database.names
+    truth: Truth | None = None
+    if ground_truth == "order":
+        truth = truth_by_order(len(images), len(database))
+    elif ground_truth == "utm":
+        truth = truth_from_names(*names)
+    elif index_file:
+        truth = truth_from_file(index_file, *names, widened=widen_index)
+    elif query_labels and database_labels:
+        truth = truth_from_labels(query_labels, database_labels, *names)
+    return QuerySequence(name, images, truth)
+
+
+def _check_files(ground_truth: str, files: Mapping[str, Path | str | None]) -> None:
+    """Refuse an unknown kind of ground truth, and files that it lacks or does not read."""
+    if ground_truth not in KINDS:
+        raise InputError(f"ground_truth={ground_truth}: expected one of {CHOICES}")
+    for option, path in files.items():
+        kind = "index" if option == "index_file" else "label"
+        if path is not None and kind != ground_truth:
+            raise InputError(f"{path}: given as {option}, but ground_truth={ground_truth}; set it to {kind}")
+        if path is None and kind == ground_truth:
+            raise InputError(f"ground_truth={kind}: expected a file; give {option} as well")
+
+
+def _images_below(root: Path) -> Iterator[Path]:
+    """Paths of all images."""
+    waiting: list[tuple[Path, tuple[tuple[int, int], ...]]] = [(root, ())]  # folders, with those that they are in
+    while waiting:
+        folder, above = waiting.pop()
+        try:
+            status = folder.stat()
+            entries = list(os.scandir(folder))
+            folders = {entry.name for entry in entries if entry.is_dir()}
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be listed ({error.strerror}); make it readable, or remove it") from None
+        this = (status.st_dev, status.st_ino)
+        if this in above:
+            raise InputError(f"{folder}: a link back to {folder.resolve()}, which it is in; remove it")
+        for entry in entries:
+            path = folder / entry.name
+            if entry.name.startswith("."):
+                continue
+            if entry.name in folders:
+                waiting.append((path, (*above, this)))
+            elif path.suffix.lower() in IMAGE_SUFFIXES:
+                yield path
+            elif entry.is_symlink() and not path.exists():
+                raise InputError(f"{path}: a link to nothing, which may have been a folder; mend or remove it")
+
+
+def _natural(name: str) -> tuple[list[tuple[int, int, str]], str]:
+    """Sort key in which runs of digits compare as numbers."""
+    parts = re.split(r"(\d+)", name)
+    return [_number(part) if part.isdecimal() else (0, 0, part) for part in parts], name
+
+
+def _number(digits: str) -> tuple[int, int, str]:
+    """As its value sorts, at any length."""
+    value = digits.lstrip("0")
+    return 1, len(value), value

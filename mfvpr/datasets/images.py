@@ -1,0 +1,212 @@
+"""Image files -> RGB arrays `[H, W, 3]` of a stated size (width, height) in pixels.
+
+Decoding and the default resampling are Pillow's, which the published networks were fed with. Two things that Pillow
+leaves to its callers are done here: images are turned as their EXIF orientation says, and images of 16 bits a channel
+become images of 8 bits by their upper ones.
+"""
+
+import stat
+import warnings
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from PIL import Image, ImageFile
+
+from mfvpr.utils.errors import InputError
+
+MAX_PIXELS = 64_000_000
+
+Interpolation = Literal[
+    "pil_bilinear", "pil_bicubic", "cv2_linear", "cv2_area", "cv2_cubic", "torch_bilinear", "torch_no_antialias"
+]
+_PIL = {"pil_bilinear": Image.Resampling.BILINEAR, "pil_bicubic": Image.Resampling.BICUBIC}
+_CV2 = {"cv2_linear": cv2.INTER_LINEAR, "cv2_area": cv2.INTER_AREA, "cv2_cubic": cv2.INTER_CUBIC}
+
+_GRAY, _COLOR = ("I", "I;16", "I;16L", "I;16B", "I;16N"), ("RGB", "RGBA", "LA")  # Pillow's modes of 16-bit files
+_ORIENTATION = 0x0112
+_TURN = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180, 4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE, 6: Image.Transpose.ROTATE_270, 7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}  # fmt: skip
+_INVERSE = {6: 8, 8: 6}  # all others undo themselves
+_MAY_BE_TURNED = (b"eXIf", b"Raw profile type exif", b"XML:com.adobe.xmp")  # of a PNG file
+
+# Pillow warns from 89 megapixels on; `read_image` refuses earlier, with the file's name.
+warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
+warnings.filterwarnings("ignore", message="Palette images with Transparency")
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a file says of its image.
+
+    Attributes:
+        orientation: EXIF's, 1 .. 8; 1 = as stored.
+        largest: of the values of 16 bits a channel, not all of which need be in use; 0 where the file itself states its
+            range, cannot be decoded, or has 32 bits; None = no such image.
+    """
+
+    orientation: int
+    largest: int | None
+
+
+def read_image(path: Path | str, *, orient: bool = True, bits: int | None = 16) -> np.ndarray:
+    """`[H, W, 3]` uint8 RGB.
+
+    Args:
+        path: image file.
+        orient: turn the image as its EXIF orientation says.
+        bits: how many bits of 16-bit gray and color files are in use (cameras of 12 bits write 16 as well): the upper 8
+            of them are taken, so that 2^bits - 1 becomes 255, and 256 v and 257 v become v. The same for all images,
+            since the brightness of one would not be comparable if it depended on its own darkest and brightest pixel.
+            Netpbm files state their largest value, which is used instead. None = as Pillow converts: gray cut off at
+            255, the upper 8 of 16 bits of color.
+
+    Raises:
+        InputError: not a regular file, empty, not an image, truncated, over 64 megapixels (refused from the header,
+            before anything is decoded), or of 32 bits a channel, whose range nobody knows (unless `bits` is None).
+    """
+    path = Path(path)
+    _check_file(path)
+    try:
+        with Image.open(path) as image:
+            if image.width * image.height > MAX_PIXELS:
+                raise InputError(_too_large(path, f"{image.width} x {image.height} px"))
+            used = _bits_in_use(image, bits)
+            if used is None and bits is not None and image.mode in ("I", "F"):
+                raise InputError(f"{path}: expected 8 or 16 bits a channel, got 32, of unknown range; convert it")
+            orientation = _orientation(image)
+            rgb = _as_rgb(image, path, used)
+            if image.format == "TIFF":  # is turned already
+                orientation = 1 if orient else _INVERSE.get(orientation, orientation)
+            elif not orient:
+                orientation = 1
+            converted = rgb.transpose(_TURN[orientation]) if orientation in _TURN else rgb
+            return np.asarray(converted)
+    except InputError:
+        raise
+    except Image.DecompressionBombError:
+        raise InputError(_too_large(path, "several times as many")) from None
+    except (
+        Exception
+    ) as error:  # decoders raise whatever a broken file leads them to: OSError, SyntaxError, struct.error
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{path}: cannot be read as an image ({reason}); replace or remove it") from None
+
+
+def read_header(content: bytes) -> Header:
+    """What an image file's `content` says; orientation 1 and no largest value where it cannot be read."""
+    try:
+        with Image.open(BytesIO(content)) as image:
+            used = _bits_in_use(image, 16) if image.width * image.height <= MAX_PIXELS else None
+            may_be_turned = image.format != "PNG" or any(mark in content for mark in _MAY_BE_TURNED)
+            orientation = _orientation(image) if may_be_turned else 1  # of a PNG file, this decodes all
+            if used is None:  # of 32 bits nobody knows the range
+                return Header(orientation, 0 if image.mode in ("I", "F") and image.format != "PPM" else None)
+            own_range = used != 16 or image.format == "PPM"
+            return Header(orientation, 0 if own_range else _largest(image, content))
+    except Exception:  # whoever reads the image will tell
+        return Header(1, None)
+
+
+def resize(image: np.ndarray, size: tuple[int, int], interpolation: Interpolation = "pil_bilinear") -> np.ndarray:
+    """`image` `[H, W, 3]` uint8 squashed to `size` (width, height), no crop, aspect not kept. Half-pixel centers.
+
+    | interpolation | as | result |
+    | :-- | :-- | :-- |
+    | `pil_bilinear`, `pil_bicubic` | Pillow, antialiased; torch's of uint8, but for a level in 1 % of values | uint8 |
+    | `cv2_linear`, `cv2_area`, `cv2_cubic` | OpenCV; only `cv2_area` is antialiased | uint8 |
+    | `torch_bilinear` | torch's antialiasing of floats, not rounded | float32, 0 .. 255 |
+    | `torch_no_antialias` | torch's bilinear of floats as it was up to 2022, not rounded | float32, 0 .. 255 |
+
+    Networks take both types; SIFT refuses floats.
+    """
+    if interpolation == "torch_bilinear":
+        return _resized_in_float(image, size)
+    if interpolation == "torch_no_antialias":
+        return np.asarray(cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_LINEAR))
+    if interpolation in _PIL:
+        return np.asarray(Image.fromarray(image).resize(size, _PIL[interpolation]))
+    return np.asarray(cv2.resize(image, size, interpolation=_CV2[interpolation]))
+
+
+def _resized_in_float(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Bilinear, antialiased, `[H, W, 3]` float32: Pillow's kernel is torch's, and its float images are not rounded."""
+    channels = (Image.fromarray(channel) for channel in np.moveaxis(image.astype(np.float32), -1, 0))
+    return np.stack([np.asarray(channel.resize(size, Image.Resampling.BILINEAR)) for channel in channels], axis=-1)
+
+
+def _orientation(image: Image.Image) -> int:
+    try:
+        value = image.getexif().get(_ORIENTATION, 1)
+    except Exception:  # damaged tags do not keep anybody from seeing the image
+        return 1
+    return value if value in _TURN else 1
+
+
+def _bits_in_use(image: ImageFile.ImageFile, bits: int | None) -> int | None:
+    """Of 16 bits a channel; None = 8 bits, or whatever Pillow makes of it. To be asked before anything is decoded."""
+    if bits is None or not image.tile:
+        return None
+    tile = image.tile[0]
+    raw = tile.args[0] if isinstance(tile.args, tuple) else tile.args or image.mode
+    if image.format == "PPM":
+        return 16 if image.mode == "I" else None  # gray; Pillow scales it to all 16 bits, and color to 8
+    if raw == "I;12":
+        return 12
+    return bits if ";16" in raw else None
+
+
+def _as_rgb(image: Image.Image, path: Path, used: int | None) -> Image.Image:
+    """8-bit RGB as stored, but of TIFF files, which Pillow and OpenCV turn."""
+    color = image.mode not in _GRAY
+    if used is None or (color and used == 16):  # of which Pillow takes the upper 8 itself
+        return image.convert("RGB")
+    if color and image.mode not in _COLOR:
+        raise ValueError(f"its 16 bits a channel are {image.mode}, not gray or RGB")
+    values = _color_values(np.fromfile(path, np.uint8)) if color else np.asarray(image)
+    upper = np.clip(values.astype(np.int32), 0, 2**used - 1) >> (used - 8)
+    return Image.fromarray(upper.astype(np.uint8)).convert("RGB")
+
+
+def _largest(image: Image.Image, content: bytes) -> int:
+    try:
+        gray = image.mode in _GRAY
+        return int((np.asarray(image) if gray else _color_values(np.frombuffer(content, np.uint8))).max())
+    except Exception:  # whoever reads the image will tell
+        return 0
+
+
+def _color_values(content: np.ndarray) -> np.ndarray:
+    """`[H, W, 3]` uint16 RGB, of which Pillow gives the upper 8 bits alone."""
+    found = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
+    if found is None or found.dtype != np.uint16 or found.ndim != 3:
+        raise ValueError("its 16 bits of color cannot be decoded")
+    return found[..., 2::-1]
+
+
+def _check_file(path: Path) -> None:
+    try:
+        status = path.stat()
+    except (OSError, ValueError) as error:  # a character that no file name has is a ValueError
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{path}: cannot be opened ({reason}); check the path and its permissions") from None
+    if not stat.S_ISREG(status.st_mode):
+        kind = "a directory" if stat.S_ISDIR(status.st_mode) else "a device or pipe"
+        raise InputError(f"{path}: expected an image file, got {kind}; rename or remove it")
+    if status.st_size == 0:
+        raise InputError(f"{path}: expected an image file, got 0 bytes; replace or remove it")
+    try:
+        with path.open("rb"):
+            return
+    except OSError as error:
+        raise InputError(f"{path}: cannot be opened ({error.strerror}); make it readable, or remove it") from None
+
+
+def _too_large(path: Path, size: str) -> str:
+    return f"{path}: expected at most {MAX_PIXELS // 10**6} megapixels, got {size}; shrink the image"

@@ -1,0 +1,142 @@
+"""The published data sets: what their folders hold, and the numbers of images that papers report."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from mfvpr.datasets.datasets import Dataset
+from mfvpr.datasets.published import msls, nordland, pittsburgh, robotcar, ssm_vpr
+from mfvpr.utils.errors import InputError
+
+
+@dataclass(frozen=True)
+class Published:
+    """One of them.
+
+    Attributes:
+        name: of the choice `dataset=`, and of its folder below a folder of data sets.
+        title: what it is, and whose.
+        layout: what its folder holds, in lines.
+        database: published number of database images.
+        queries: published numbers of queries, by sequence.
+        read: `read(folder, name)`, and `seasons=` where it has them.
+        archive: the name it is distributed under, which its folder may keep.
+        source: where it is, or how to come by it.
+        seasons: (database, queries), where they can be chosen.
+    """
+
+    name: str
+    title: str
+    layout: str
+    database: int
+    queries: Mapping[str, int]
+    read: Callable[..., Dataset]
+    source: str
+    archive: str | None = None
+    seasons: tuple[str, str] | None = None
+
+    @property
+    def folders(self) -> tuple[str, ...]:
+        """Names that its folder may have."""
+        return (self.name,) if self.archive is None else (self.name, self.archive)
+
+
+def _one(name: str, queries: int) -> Mapping[str, int]:
+    return {name: queries}
+
+
+def _ssm(name: str, title: str, database: int, queries: int, archive: str) -> Published:
+    source = "http://imr.ciirc.cvut.cz/Datasets/Ssm-vpr"
+    return Published(
+        name, f"{title}, as SSM-VPR has it", ssm_vpr.LAYOUT, database, _one(name, queries), ssm_vpr.ssm_vpr, source,
+        archive,
+    )  # fmt: skip
+
+
+def _pittsburgh(part: str, queries: int) -> Published:
+    name = f"pitts30k_{part}"
+    return Published(
+        name, f"Pittsburgh30k, {part} part", pittsburgh.LAYOUT.format(part=part), 10_000, _one(name, queries),
+        pittsburgh.pitts30k, "on request from its authors: https://github.com/Relja/netvlad", "pitts30k",
+    )  # fmt: skip
+
+
+_ROBOTCAR: Mapping[str, int] = dict(zip(robotcar.CONDITIONS, (218, 179, 183, 218, 195, 192, 226), strict=True))
+
+PUBLISHED = {
+    entry.name: entry
+    for entry in (
+        _ssm("berlin_a100", "Berlin A100: a motorway from two cars", 85, 81, "BerlinA100_RAS2020"),
+        _ssm("berlin_halenseestrasse", "Berlin Halenseestrasse: a road and its bicycle lane", 67, 157, "Halen_RAS2020"),
+        _ssm("berlin_kudamm", "Berlin Kudamm: a busy street from a bus and a bicycle", 201, 222, "Kudamm_RAS2020"),
+        _ssm("gardens_point", "Gardens Point: a campus by day and at night", 200, 200, "Gardens_point_RAS2020"),
+        _ssm("nordland_1415", "Synthesized Nordland, 1415 frames", 1415, 1415, "Nordland_RAS2020"),
+        Published(
+            "nordland_27592", "Nordland, every frame but tunnels and stations (Patch-NetVLAD's)",
+            nordland.LAYOUT_27592, 27_592, _one("nordland_27592", 27_592), nordland.nordland_27592,
+            "https://github.com/QVPR/Patch-NetVLAD", "nordland", ("summer", "winter"),
+        ),
+        Published(
+            "nordland_3450", "Nordland, the test part of Olid, Facil and Civera", nordland.LAYOUT_3450, 3450,
+            _one("nordland_3450", 3450), nordland.nordland_3450, "http://webdiis.unizar.es/~jmfacil/pr-nordland/", None,
+            ("summer", "winter"),
+        ),
+        Published(
+            "nordland_vprbench", "Nordland, VPR-Bench's: winter, every tenth frame of summer", nordland.LAYOUT_VPRBENCH,
+            27_592, _one("nordland_vprbench", 2760), nordland.nordland_vprbench,
+            "https://github.com/MubarizZaffar/VPR-Bench",
+        ),
+        Published(
+            "robotcar_seasons", "Oxford RobotCar Seasons v2, rear camera, seven conditions against summer",
+            robotcar.LAYOUT, 220, _ROBOTCAR, robotcar.robotcar_seasons, "https://www.visuallocalization.net/datasets/",
+            "RobotCar-Seasons",
+        ),
+        _pittsburgh("val", 7608),
+        _pittsburgh("test", 6816),
+        Published(
+            "msls_val", "Mapillary Street-Level Sequences, validation part", msls.LAYOUT, 18_871,
+            _one("msls_val", 740), msls.msls_val, "https://www.mapillary.com/dataset/places", "msls",
+        ),
+    )
+}  # fmt: skip
+
+
+def published_dataset(name: str, root: Path | str, *, seasons: tuple[str, str] | None = None) -> Dataset:
+    """A published data set, from the folder that holds it.
+
+    Args:
+        name: of `PUBLISHED`.
+        root: its folder.
+        seasons: (database, queries) of Nordland's.
+
+    Raises:
+        InputError: no such folder, or another layout than the data set's.
+    """
+    entry, root = PUBLISHED[name], Path(root)
+    if not root.is_dir():
+        found = "a file" if root.exists() else "nothing"
+        raise InputError(f"{root}: expected the folder of {name}, got {found}; it is to be had at {entry.source}")
+    known = seasons is None or (entry.seasons is not None and {*seasons} <= {*nordland.SEASONS})
+    if seasons is not None and not (known and len({*seasons}) == 2):
+        raise InputError(f"seasons={list(seasons)}: expected two of {', '.join(nordland.SEASONS)}")
+    read = entry.read if entry.seasons is None else partial(entry.read, seasons=seasons or entry.seasons)
+    try:
+        return read(root, name)
+    except InputError as error:
+        raise InputError(f"{error} (layout: python -m experiments.data list {name})") from error
+
+
+def differences(dataset: Dataset) -> Iterator[str]:
+    """Where numbers of images are not the published ones, in words; of other data sets nothing."""
+    entry = PUBLISHED.get(dataset.name)
+    if entry is None:
+        return
+    if len(dataset.database) != entry.database:
+        yield f"{len(dataset.database):,} database images where {entry.database:,} are published"
+    for sequence in dataset.sequences:
+        got, number = len(sequence.images), entry.queries.get(sequence.name)
+        if number is None:
+            yield f"queries in {sequence.name}, which is none of its sequences"
+        elif got != number:
+            yield f"{got:,} queries in {sequence.name} where {number:,} are published"

@@ -1,0 +1,89 @@
+"""Oxford RobotCar Seasons (Sattler et al., CVPR 2018), version 2, as the paper takes it.
+
+Its rear camera alone, and of its images those whose position is public: summer is the database, seven other conditions
+are the queries. The right answer is the reference whose camera was nearest, and frames around it; a query without one
+within five meters is left out.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mfvpr.datasets.datasets import Dataset, QuerySequence
+from mfvpr.datasets.ground_truth import FARTHEST, FrameTruth
+from mfvpr.datasets.published.lists import listed_images, read_lines
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.numbers import parse_number
+
+REFERENCE = "overcast-summer"  # the paper's figure; its text says overcast-reference, whose images are 6,954
+CONDITIONS = ("dawn", "dusk", "night", "night-rain", "overcast-winter", "rain", "snow")
+REACH = 5.0  # meters
+POSES = "robotcar_v2_train.txt"
+_LAST_ROW = 1e-6  # tolerance of its numbers
+LAYOUT = f"""images/CONDITION/rear/TIMESTAMP.jpg  of {REFERENCE} (the database),
+                                     {", ".join(CONDITIONS)}
+{POSES}                per line CONDITION/rear/TIMESTAMP.jpg and 16 numbers, camera to world"""
+
+
+def robotcar_seasons(root: Path, name: str) -> Dataset:
+    """The database, and a sequence per condition, in the order of their timestamps.
+
+    Raises:
+        InputError: a file is missing, damaged, or without one of the conditions.
+    """
+    path = root / POSES
+    centers = camera_centers(path)
+    database = _of(centers, REFERENCE, path)
+    images = listed_images(root / "images", database, path)
+    places = np.array([centers[one] for one in database])
+    sequences = []
+    for condition in CONDITIONS:
+        names = _of(centers, condition, path)
+        nearest, distances = nearest_places(np.array([centers[one] for one in names]), places)
+        kept = np.flatnonzero(distances <= REACH)
+        rows = tuple((int(row),) for row in nearest[kept])
+        queries = listed_images(root / "images", [names[row] for row in kept.tolist()], path)
+        sequences.append(QuerySequence(condition, queries, FrameTruth(rows, len(database))))
+    return Dataset(name, images, tuple(sequences))
+
+
+def camera_centers(path: Path) -> dict[str, np.ndarray]:
+    """`[3]` meters by image name, of a file of poses.
+
+    Raises:
+        InputError: a line is no pose.
+    """
+    centers = {}
+    for number, line in enumerate(read_lines(path), start=1):
+        name, *texts = line.split()
+        try:
+            numbers = [parse_number(text) for text in texts]
+        except ValueError:
+            numbers = []
+        center = np.array(numbers[3:12:4])
+        is_pose = len(numbers) == 16 and np.allclose(numbers[12:], (0, 0, 0, 1), rtol=0, atol=_LAST_ROW)
+        if not is_pose or not np.all(np.abs(center) <= FARTHEST):
+            raise InputError(
+                f"{path}: line {number}: expected a name and the 16 numbers of a pose by rows, the last 0 0 0 1, got "
+                f"{line[:60]!r}; get the file again"
+            )
+        image = str(Path(name).with_suffix(".jpg").as_posix())
+        if image in centers and not np.array_equal(centers[image], center):
+            raise InputError(f"{path}: line {number}: expected one pose of {image}, got another; get the file again")
+        centers[image] = center
+    return centers
+
+
+def nearest_places(queries: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Row `[Q]` of the nearest of places `[N, 3]` for each of `[Q, 3]`, the first of equal ones, and how far it is."""
+    distances = np.linalg.norm(queries[:, None] - places[None], axis=-1)
+    nearest = np.argmin(distances, axis=1)
+    return nearest, distances[np.arange(len(queries)), nearest]
+
+
+def _of(centers: Mapping[str, np.ndarray], condition: str, path: Path) -> Sequence[str]:
+    names = sorted(name for name in centers if name.startswith(f"{condition}/rear/"))
+    if not names:
+        raise InputError(f"{path}: expected poses of {condition}/rear, got none; use the file of the data set")
+    return names

@@ -1,0 +1,60 @@
+"""How far the scene moves between two images, from the geometry of the street."""
+
+import csv
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mfvpr.datasets.streets.camera import Camera
+from mfvpr.datasets.streets.types import Floats
+
+
+@dataclass(frozen=True)
+class Facade:
+    """The street side of a house, in meters: the plane x = `x` between two z, up to `height`."""
+
+    x: float
+    start: float
+    end: float
+    height: float
+
+
+def visible_points(facades: Iterable[Facade], camera: Camera, step: int = 8) -> Floats:
+    """Facade points `[n, 3]` that a grid of one px in `step` of the image sees, other facades in front removed."""
+    width, height = camera.image_size
+    u, v = np.meshgrid(np.arange(step / 2, width, step), np.arange(step / 2, height, step))
+    rays = np.stack([(u - width / 2) / camera.focal, (v - height / 2) / camera.focal, np.ones_like(u)], -1)
+    rays = rays.reshape(-1, 3) @ camera.rotation()
+    nearest = np.full(len(rays), np.inf)
+    for facade in facades:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = (facade.x - camera.x) / rays[:, 0]
+            points = camera.center() + distance[:, None] * rays
+        hit = (distance > 0) & (points[:, 2] >= facade.start) & (points[:, 2] <= facade.end)
+        hit &= (points[:, 1] <= 0) & (points[:, 1] >= -facade.height)
+        nearest = np.where(hit & (distance < nearest), distance, nearest)
+    seen = np.isfinite(nearest)
+    return camera.center() + nearest[seen, None] * rays[seen]
+
+
+def image_shift(points: Floats, query: Camera, database: Camera) -> tuple[float, float]:
+    """Where the scene of the query image has to move to fall on the database image, (x, y) in px.
+
+    It is the median, per axis, over the world points `[n, 3]` inside both images, of the point's position in the
+    database image minus its position in the query image.
+    """
+    (before, inside_query), (after, inside_database) = query.project(points), database.project(points)
+    x, y = np.median((after - before)[inside_query & inside_database], axis=0)
+    return float(x), float(y)
+
+
+def write_ground_truth(path: Path, facades: Iterable[Facade], queries: list[Camera], database: list[Camera]) -> None:
+    """Write the pairs of frames and their shifts in px; see `draw_streets`."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(("query", "database", "shift_x", "shift_y"))
+        for i, (query, candidate) in enumerate(zip(queries, database, strict=True)):
+            shift = image_shift(visible_points(facades, query), query, candidate)
+            writer.writerow((f"{i:04d}.png", f"{i:04d}.png", *(f"{s:.3f}" for s in shift)))

@@ -1,0 +1,93 @@
+"""What stands between the houses: the ground, trees, lamps, signs, hedges."""
+
+import numpy as np
+
+from mfvpr.datasets.streets.colors import tone
+from mfvpr.datasets.streets.sheets import Sheet, blotches, draw_glyphs
+from mfvpr.datasets.streets.types import Rng
+
+
+def draw_ground(rng: Rng, half_width: float, length: float) -> Sheet:
+    """A strip of the street seen from above: y runs against the driving direction."""
+    sheet = Sheet(2 * half_width, length, (164, 158, 148), scale=24)
+    middle = half_width
+    for y in np.arange(0, length, 1.0):  # slabs of the sidewalk
+        sheet.rect(0, y, 2 * middle, 0.05, (136, 130, 122))
+    for x in np.arange(0, 2 * middle, 1.0):
+        sheet.rect(x, 0, 0.05, length, (136, 130, 122))
+    sheet.rect(middle - 4.4, 0, 8.8, length, (196, 192, 184))
+    sheet.rect(middle - 4.2, 0, 8.4, length, (98, 98, 102))
+    for _ in range(rng.integers(0, 3)):  # patches and manholes
+        x, y = rng.uniform((middle - 3.8, 0), (middle + 2, length - 2))
+        sheet.rect(x, y, rng.uniform(0.6, 1.8), rng.uniform(0.8, 2.0), tone((98, 98, 102), rng.uniform(0.75, 1.15)))
+        sheet.ellipse(middle + rng.uniform(-3, 3), y, 0.35, 0.35, (70, 68, 66))
+    for y in np.arange(0, length, 4.0):
+        sheet.rect(middle - 0.08, y, 0.16, 2.2, (222, 220, 210))
+    if rng.random() < 0.15:
+        for x in np.arange(-3.8, 3.8, 1.0):
+            sheet.rect(middle + x, length / 2 - 1.5, 0.5, 3.0, (226, 224, 216))
+    wear_ground(sheet, rng)
+    return sheet
+
+
+def wear_ground(sheet: Sheet, rng: Rng) -> None:
+    """Grain and stains on the strip, and snow that is thinner where wheels have passed."""
+    shape = sheet.day.shape[:2]
+    fade = np.sin(np.linspace(0, np.pi, shape[0]))[:, None]  # no stain may end at the edge of a strip
+    grain = 0.03 * rng.standard_normal(shape, np.float32)
+    sheet.shade((1 + grain + 0.05 * fade * blotches(rng, shape, 30))[..., None])
+    x = np.linspace(-sheet.width / 2, sheet.width / 2, shape[1])
+    ruts = sum(np.exp(-(((x - rut) / 0.24) ** 4)) for rut in (-2.7, -1.2, 1.2, 2.7))
+    sheet.settle_snow(np.clip(235 - 110 * ruts + 18 * fade * blotches(rng, shape, 10), 0, 250))
+
+
+def draw_tree(rng: Rng, width: float, height: float) -> Sheet:
+    """A tree in leaf: trunk, branches and a round crown of many dabs."""
+    sheet = Sheet(width, height, None)
+    middle, bark = width / 2, (88, 68, 54)
+    sheet.line([(middle, height), (middle + 0.1, 0.45 * height)], 0.28, bark)
+    for x in rng.uniform(0.25, 0.75, 5) * width:
+        sheet.line([(middle, 0.62 * height), (x, 0.25 * height)], 0.1, bark)
+    leaf = tone((92, 132, 62), rng.uniform(0.8, 1.1))
+    for angle, radius in zip(rng.uniform(0, 2 * np.pi, 700), np.sqrt(rng.random(700)), strict=True):
+        x, y = middle + radius * 0.42 * width * np.cos(angle), 0.34 * height * (1 + 0.85 * radius * np.sin(angle))
+        light = 1.15 - 0.5 * y / (0.68 * height) + rng.uniform(-0.1, 0.1)
+        size = rng.uniform(0.07, 0.2)
+        sheet.ellipse(x, y, size, 0.8 * size, tone(leaf, light), snow=int(rng.uniform(120, 220) * min(1.0, light)))
+    return sheet
+
+
+def draw_lamp() -> Sheet:
+    """A street lamp."""
+    sheet = Sheet(1.0, 5.2, None)
+    sheet.rect(0.44, 0.6, 0.12, 4.6, (52, 58, 56))
+    sheet.rect(0.38, 4.3, 0.24, 0.9, (52, 58, 56))
+    sheet.polygon([(0.22, 0.1), (0.78, 0.1), (0.66, 0.75), (0.34, 0.75)], (226, 222, 204), (255, 236, 190))
+    sheet.polygon([(0.15, 0.14), (0.85, 0.14), (0.5, 0.0)], (52, 58, 56), snow=240)
+    return sheet
+
+
+def draw_sign(rng: Rng) -> Sheet:
+    """A traffic sign on its post: round, triangular or square."""
+    sheet = Sheet(0.9, 2.9, None)
+    sheet.rect(0.41, 0.4, 0.08, 2.5, (120, 122, 124))
+    kind = rng.integers(3)
+    if kind == 0:
+        sheet.ellipse(0.45, 0.45, 0.42, 0.42, (186, 40, 36))
+        sheet.ellipse(0.45, 0.45, 0.32, 0.32, (240, 238, 232))
+    elif kind == 1:
+        sheet.polygon([(0.0, 0.85), (0.9, 0.85), (0.45, 0.05)], (186, 40, 36))
+        sheet.polygon([(0.16, 0.76), (0.74, 0.76), (0.45, 0.25)], (240, 238, 232))
+    else:
+        sheet.rect(0.05, 0.05, 0.8, 0.8, (36, 78, 150))
+    draw_glyphs(sheet, rng, 0.3, 0.32, 0.4, 0.36, (30, 30, 34) if kind < 2 else (240, 238, 232))
+    return sheet
+
+
+def draw_hedge(rng: Rng, width: float, height: float) -> Sheet:
+    """A garden hedge."""
+    sheet = Sheet(width, height, None)
+    for x, y in rng.uniform((0.1, 0.15), (width - 0.1, height), (500, 2)):
+        light = 1.15 - 0.4 * y / height + rng.uniform(-0.2, 0.2)
+        sheet.ellipse(x, y, 0.17, 0.14, tone((80, 118, 60), light), snow=int(150 * light))
+    return sheet

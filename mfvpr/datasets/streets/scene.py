@@ -1,0 +1,130 @@
+"""The street: houses on both sides, ground, trees, lamps, signs, cars."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mfvpr.datasets.streets.cars import Car, build_car
+from mfvpr.datasets.streets.colors import WALLS, pick
+from mfvpr.datasets.streets.ground_truth import Facade
+from mfvpr.datasets.streets.houses import Design, draw_facade, draw_gable, draw_roof, make_design
+from mfvpr.datasets.streets.objects import draw_ground, draw_hedge, draw_lamp, draw_sign, draw_tree
+from mfvpr.datasets.streets.panels import Panel, Prop, upright
+from mfvpr.datasets.streets.sheets import Texture, texture
+from mfvpr.datasets.streets.sky import sky_texture
+from mfvpr.datasets.streets.types import Floats, Rng
+
+LAMP_SPACING = 22.0  # meters
+NUM_CARS = 24
+
+
+@dataclass(frozen=True)
+class Scene:
+    """All that stands along the street; each of ground, houses and street is painted as one layer."""
+
+    ground: tuple[Prop, ...]
+    houses: tuple[Prop, ...]
+    street: tuple[Prop, ...]
+    facades: tuple[Facade, ...]
+    cars: tuple[Car, ...]
+    sky: Texture
+
+
+def build_scene(seed: int, length: float) -> Scene:
+    """The street from z = 0 to `length` meters."""
+    rows = [build_row(seed, side, length) for side in (-1, 1)]
+    return Scene(
+        ground=tuple(build_ground(seed, length)),
+        houses=tuple(prop for props, _ in rows for prop in props),
+        street=tuple(build_furniture(seed, length)),
+        facades=tuple(facade for _, facades in rows for facade in facades),
+        cars=tuple(build_car(seed, index) for index in range(NUM_CARS)),
+        sky=sky_texture(seed),
+    )
+
+
+def lamp_light(z: Floats) -> Floats:
+    """How strongly the street lamps light what is at z (meters), 0..1."""
+    return np.exp(-((((z + LAMP_SPACING / 2) % LAMP_SPACING - LAMP_SPACING / 2) / 5.0) ** 2))
+
+
+def build_row(seed: int, side: int, length: float) -> tuple[list[Prop], list[Facade]]:
+    """The houses of one side of the street (-1: left, 1: right), now and then with a garden in between."""
+    rng = np.random.default_rng([seed, 1, side + 1])
+    # Both sides take turns through the same few designs, so that the street looks alike every 35 m or so.
+    designs = [make_design(np.random.default_rng([seed, 0, index])) for index in range(4)]
+    props, facades, z = [], [], 2.0
+    while z < length:
+        if rng.random() < 0.2:
+            gap = rng.uniform(2.0, 4.0)
+            props += [build_tree(rng, side * 12.5, z + gap - 0.5)]
+            props += [upright(texture(draw_hedge(rng, 5.0, 1.9)), side * 9.9, z + 0.2, 5.0, 1.9)]
+            z += gap
+        design = designs[len(facades) % len(designs)]
+        prop, facade = build_house(rng, design, side, rng.choice((7.4, 7.9, 8.4, 9.4)), z)
+        props.append(prop)
+        facades.append(facade)
+        z += design.width
+    return props, facades
+
+
+def build_house(rng: Rng, design: Design, side: int, x: float, z: float) -> tuple[Prop, Facade]:
+    """A house whose facade stands at side * x (side -1: left) from z onwards, in meters."""
+    width, depth, rise = design.width, 9.0, rng.uniform(1.8, 3.4)
+    wall = pick(rng, WALLS)
+    sheet = draw_facade(rng, wall, design)
+    height = sheet.height
+    along = np.linspace(z, z + width, sheet.day.shape[1])[::-side]
+    above = np.linspace(height, 0, sheet.day.shape[0])[:, None]
+    light = lamp_light(along) * np.exp(-(((above - 3.5) / 3.0) ** 2))
+    near, far = (z, z + width) if side < 0 else (z + width, z)
+    step = (0.0, 0.0, far - near)
+    inner, outer = side * x, side * (x + depth)
+    facade = Panel(texture(sheet, light, 1.06 if side < 0 else 0.84), (inner, -height, near), step, (0, height, 0))
+    roof = Panel(
+        texture(draw_roof(rng, width, float(np.hypot(depth / 2, rise))), sun=1.05),
+        (side * (x + depth / 2), -height - rise, near),
+        step,
+        (-side * depth / 2, rise, 0),
+    )
+    gable = Panel(
+        texture(draw_gable(rng, wall, depth, height, rise)),
+        (min(inner, outer), -height - rise, z),
+        (depth, 0, 0),
+        (0, height + rise, 0),
+    )
+    return Prop(z + width / 2, (gable, roof, facade)), Facade(inner, z, z + width, height)
+
+
+def build_tree(rng: Rng, x: float, z: float) -> Prop:
+    """A tree with its trunk at x and z, in meters."""
+    width, height = rng.uniform(3.0, 4.4), rng.uniform(5.0, 6.6)
+    return upright(texture(draw_tree(rng, width, height), 0.5 * lamp_light(np.array(z))), x, z, width, height)
+
+
+def build_furniture(seed: int, length: float) -> list[Prop]:
+    """Lamps, trees and signs along both sidewalks."""
+    rng = np.random.default_rng([seed, 2])
+    lamp = texture(draw_lamp())
+    props = []
+    for index, z in enumerate(np.arange(LAMP_SPACING, length, LAMP_SPACING)):
+        props.append(upright(lamp, 5.4 if index % 2 else -5.4, z, 1.0, 5.2))
+    for side in (-1, 1):
+        for z in np.arange(6.0, length, 11.0):
+            kind = rng.random()
+            if kind < 0.35:
+                props.append(build_tree(rng, side * 5.6, z + rng.uniform(-2, 2)))
+            elif kind < 0.75:
+                props.append(upright(texture(draw_sign(rng)), side * 4.9, z + rng.uniform(-3, 3), 0.9, 2.9))
+    return props
+
+
+def build_ground(seed: int, length: float) -> list[Prop]:
+    """Strips of 8 m, seen from above; the first lies partly behind the first camera."""
+    props = []
+    for index, z in enumerate(np.arange(-8.0, length, 8.0)):
+        sheet = draw_ground(np.random.default_rng([seed, 3, index]), 12.0, 8.0)
+        across = np.linspace(-12, 12, sheet.day.shape[1])
+        light = lamp_light(np.linspace(z + 8, z, sheet.day.shape[0]))[:, None] * np.exp(-((across / 8) ** 2))
+        props.append(Prop(z + 4, (Panel(texture(sheet, 0.8 * light), (-12, 0, z + 8), (24, 0, 0), (0, 0, -8)),)))
+    return props

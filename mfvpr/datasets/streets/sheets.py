@@ -1,0 +1,109 @@
+"""Sheets: flat drawings in meters, and the textures they become in each weather.
+
+Besides its summer-day colors a sheet knows where it glows at night and where snow settles, so that it can be seen in
+any weather.
+"""
+
+from collections.abc import Callable
+from functools import cache
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mfvpr.datasets.streets.colors import DARK, as_array, tone
+from mfvpr.datasets.streets.types import Color, Floats, Image, Rng
+from mfvpr.datasets.streets.weather import Weather
+
+Texture = Callable[[Weather], Image]  # colors and opacity (RGBA) in a weather
+
+
+class Sheet:
+    """A drawing of `width` by `height` meters at `scale` px per meter; transparent where `color` is None.
+
+    x is to the right, y down, in meters from the top left corner.
+    """
+
+    def __init__(self, width: float, height: float, color: Color | None, scale: int = 32) -> None:
+        shape = (max(2, round(height * scale)), max(2, round(width * scale)), 4)
+        self.width, self.height, self.scale = width, height, scale
+        self.day = np.zeros(shape, np.uint8)  # RGB and opacity
+        self.effects = np.zeros(shape, np.uint8)  # RGB of the glow at night, and how much snow settles
+        if color is not None:
+            self.day[:] = (*color, 255)
+
+    def rect(
+        self, x: float, y: float, width: float, height: float, color: Color, glow: Color = DARK, snow: int = 0
+    ) -> None:
+        """A rectangle with its upper left corner at (x, y)."""
+        x0, y0, x1, y1 = (max(0, round(a * self.scale)) for a in (x, y, x + width, y + height))
+        self.day[y0:y1, x0:x1] = (*color, 255)
+        self.effects[y0:y1, x0:x1] = (*glow, snow)
+
+    def polygon(self, points: ArrayLike, color: Color, glow: Color = DARK, snow: int = 0) -> None:
+        """A filled polygon with corners `[n, 2]`."""
+        corners = np.rint(np.asarray(points, float) * self.scale * 16).astype(np.int32)
+        cv2.fillPoly(self.day, [corners], (*color, 255), shift=4)
+        cv2.fillPoly(self.effects, [corners], (*glow, snow), shift=4)
+
+    def ellipse(
+        self, x: float, y: float, rx: float, ry: float, color: Color, glow: Color = DARK, snow: int = 0
+    ) -> None:
+        """An ellipse around (x, y) with half axes rx and ry."""
+        angles = np.linspace(0, 2 * np.pi, 20, endpoint=False)
+        points = np.stack([x + rx * np.cos(angles), y + ry * np.sin(angles)], 1)
+        self.polygon(points, color, glow, snow)
+
+    def line(self, points: ArrayLike, width: float, color: Color) -> None:
+        """An open line through points `[n, 2]`; it neither glows nor takes snow."""
+        corners = np.rint(np.asarray(points, float) * self.scale * 16).astype(np.int32)
+        cv2.polylines(self.day, [corners], False, (*color, 255), max(1, round(width * self.scale)), shift=4)
+
+    def shade(self, gain: NDArray[np.floating]) -> None:
+        """Multiply the colors by `gain`, broadcast over rows, columns and channels."""
+        self.day[..., :3] = np.clip(self.day[..., :3] * gain, 0, 255)
+
+    def settle_snow(self, amount: ArrayLike) -> None:
+        """Let snow settle on the whole sheet: `amount` is 0..255, broadcast over rows and columns."""
+        self.effects[..., 3] = amount
+
+    def mirrored(self) -> "Sheet":
+        """The sheet with left and right exchanged."""
+        sheet = Sheet(self.width, self.height, None, self.scale)
+        sheet.day[:], sheet.effects[:] = self.day[:, ::-1], self.effects[:, ::-1]
+        return sheet
+
+
+def texture(sheet: Sheet, lamp_light: NDArray[np.floating] | float = 0.0, sun: float = 1.0) -> Texture:
+    """What a finished sheet looks like, drawn for a weather when that is first asked for.
+
+    `lamp_light` (0..1, broadcast over rows and columns) is the light of street lamps that falls on it, `sun` the gain
+    of a surface that faces the sun as this one does.
+    """
+    light = np.asarray(lamp_light, np.float32)
+
+    @cache
+    def seen_in(weather: Weather) -> Image:
+        lamps = np.broadcast_to(light, sheet.day.shape[:2])[..., None]
+        color = sheet.day[..., :3].astype(np.float32)
+        glow, cover = sheet.effects[..., :3].astype(np.float32), sheet.effects[..., 3:].astype(np.float32) / 255
+        ambient = np.multiply(weather.ambient, 1 + weather.sun * (sun - 1), dtype=np.float32)
+        seen = np.maximum(color * (ambient + lamps * as_array(weather.lamp)), weather.glow * glow)
+        seen += weather.snow * cover * (as_array(tone(weather.horizon, 1.15)) - seen)
+        return np.dstack([np.clip(seen, 0, 255).astype(np.uint8), sheet.day[..., 3]])
+
+    return seen_in
+
+
+def blotches(rng: Rng, shape: tuple[int, int], cell: float) -> Floats:
+    """Smooth noise of about unit spread whose spots are `cell` px wide."""
+    rows, columns = (max(2, round(n / cell)) for n in shape)
+    return cv2.resize(rng.standard_normal((rows, columns), np.float32), shape[::-1], interpolation=cv2.INTER_CUBIC)
+
+
+def draw_glyphs(sheet: Sheet, rng: Rng, x: float, y: float, width: float, height: float, color: Color) -> None:
+    """A word in no alphabet: glyphs of random strokes between the corners of a small grid."""
+    step = height * 0.85
+    for left in np.arange(x, x + width - 0.6 * step, step):
+        nodes = rng.integers(0, (3, 4), (5, 2)) / (2, 3) * (0.6 * step, height)
+        sheet.line(nodes + (left, y), height * 0.14, color)

@@ -1,0 +1,200 @@
+"""Ground truth from files: pairs of images, positions, or labels. Nothing in them is ever executed."""
+
+import csv
+import json
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from mfvpr.datasets.ground_truth import FARTHEST, FrameTruth, LabelTruth, RadiusTruth
+from mfvpr.datasets.truth import Truth
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import require_file
+
+MAX_DIGITS = 20  # of a row number
+
+
+def truth_from_labels(
+    query_file: Path | str, database_file: Path | str, query_names: Sequence[str], database_names: Sequence[str]
+) -> LabelTruth:
+    """Same label = right, from a csv with the columns `name,label` for each side, one line per image.
+
+    A query with an empty label has no right answer, and a database image with one is nobody's; labels are compared as
+    they are written, but for spaces around them.
+    """
+    labels = [_labels(Path(query_file), query_names), _labels(Path(database_file), database_names)]
+    numbers = {"": -1} | {label: number for number, label in enumerate(sorted({*labels[0], *labels[1]} - {""}))}
+    return LabelTruth(*(np.array([numbers[label] for label in side], np.int32) for side in labels))
+
+
+def truth_from_file(
+    path: Path | str, query_names: Sequence[str], database_names: Sequence[str], *, widened: bool = False
+) -> Truth:
+    """Truth from an index file.
+
+    * `.csv`: a header with the columns `query` and `database` (or SSM-VPR's `Live` and `Reference`), then one line per
+      pair: file names, or numbers from 0 in file order. Several lines for one query are several true places; an empty
+      database cell says that there is none.
+    * `.npz`: arrays `query` and `database`, the same pairs; or Patch-NetVLAD's `utmQ` and `utmDb`.
+    * `.json`: VPR-Bench's `[[query, [database, ...]], ...]`.
+
+    Args:
+        path: index file.
+        query_names: of the images.
+        database_names: of the images.
+        widened: whether database images within a tolerance in frames of a pair's count as well, as in a sequence; if
+            not, the pairs are all that is right.
+    """
+    path = Path(path)
+    readers = {".csv": _csv_pairs, ".npz": _npz_pairs, ".json": _json_pairs}
+    if path.suffix.lower() not in readers:
+        raise InputError(f"{path}: expected an index file named .csv, .npz or .json, got {path.suffix or 'no suffix'}")
+    content = _parsed(path, readers[path.suffix.lower()])
+    if isinstance(content, RadiusTruth):
+        _same_count(path, "query positions (utmQ)", len(content.query_xy), len(query_names))
+        _same_count(path, "database positions (utmDb)", len(content.database_xy), len(database_names))
+        return content
+    return _frame_truth(path, content, query_names, database_names, widened)
+
+
+def _parsed(path: Path, reader: Callable[[Path], Any]) -> Any:
+    """What `reader` finds in a foreign file."""
+    require_file(path, "a ground truth file")
+    try:
+        return reader(path)
+    except InputError:
+        raise
+    except Exception as error:
+        reason = "it holds Python objects, which are never loaded" if "allow_pickle" in str(error) else str(error)
+        reason = " ".join(reason.split())
+        raise InputError(
+            f"{path}: cannot be read as {path.suffix or 'csv'} ({reason}); see README, Your own images"
+        ) from None
+
+
+def _frame_truth(
+    path: Path, pairs: Iterable[tuple[Any, Any]], queries: Sequence[str], database: Sequence[str], widened: bool
+) -> Truth:
+    query_rows, database_rows = _row_table(queries), _row_table(database)
+    rows: dict[int, list[int]] = {}
+    for line, (query, place) in enumerate(pairs, start=1):
+        row = _row(path, line, "query", query, query_rows, len(queries))
+        places = rows.setdefault(row, [])
+        if str(place).strip():
+            places.append(_row(path, line, "database", place, database_rows, len(database)))
+    missing = [name for row, name in enumerate(queries) if row not in rows]
+    if missing:
+        raise InputError(
+            f"{path}: expected ground truth for all {len(queries)} queries, got it for {len(rows)}; the first without "
+            f"is {missing[0]} (a line with an empty database cell says that it has no place)"
+        )
+    return FrameTruth(tuple(tuple(rows[row]) for row in range(len(queries))), len(database), widened)
+
+
+def _labels(path: Path, names: Sequence[str]) -> list[str]:
+    """The label of every image."""
+    table = _row_table(names)
+    labels: dict[int, str] = {}
+    for number, (name, label) in enumerate(_parsed(path, _csv_labels), start=1):
+        row = table.get(name.strip())
+        if row is None:
+            several = any(PurePosixPath(one).name == name.strip() for one in names)
+            mend = "several images have this name, give their paths" if several else "no image has this name, remove it"
+            raise InputError(f"{path}: entry {number}: got {_shortened(name)!r}; {mend}")
+        if row in labels:
+            raise InputError(f"{path}: entry {number}: {_shortened(name)!r} has a label already; keep one of them")
+        labels[row] = label.strip()
+    missing = [name for row, name in enumerate(names) if row not in labels]
+    if missing:
+        raise InputError(
+            f"{path}: expected labels of all {len(names)} images, got {len(labels)}; the first without is {missing[0]} "
+            "(a line with an empty label says that it has none)"
+        )
+    return [labels[row] for row in range(len(names))]
+
+
+def _csv_columns(path: Path, *choices: tuple[str, str]) -> list[tuple[str, str]]:
+    """The first of the pairs of columns that a csv has."""
+    with path.open(newline="", encoding="utf-8-sig", errors="surrogateescape") as file:  # as file names are read
+        lines = csv.reader(file)
+        names = [name.strip().lower() for name in next(lines, [])]
+        for pair in choices:
+            if all(names.count(column) == 1 for column in pair):
+                first, second = map(names.index, pair)
+                short = [""] * len(names)  # cells that a line lacks are empty
+                return [((line + short)[first], (line + short)[second]) for line in lines if line]
+    got = _shortened(",".join(names)) or "no header"
+    raise InputError(f"{path}: expected a header with the columns {','.join(choices[0])}; got {got}")
+
+
+def _csv_pairs(path: Path) -> list[tuple[str, str]]:
+    return _csv_columns(path, ("query", "database"), ("live", "reference"))
+
+
+def _csv_labels(path: Path) -> list[tuple[str, str]]:
+    return _csv_columns(path, ("name", "label"))
+
+
+def _npz_pairs(path: Path) -> list[tuple[Any, Any]] | RadiusTruth:
+    with np.load(path, allow_pickle=False) as arrays:
+        if len({*arrays.files}) < len(arrays.files):
+            raise InputError(f"{path}: expected every array once, got {', '.join(arrays.files)}; write the file anew")
+        if {"utmQ", "utmDb"} <= set(arrays):
+            positions = [arrays[name].astype(np.float64) for name in ("utmQ", "utmDb")]
+            for name, xy in zip(("utmQ", "utmDb"), positions, strict=True):
+                if xy.ndim != 2 or xy.shape[1] != 2:
+                    raise InputError(f"{path}: {name}: expected positions [n, 2] in meters, got shape {xy.shape}")
+                if not (np.abs(xy) <= FARTHEST).all():  # NaN neither
+                    raise InputError(f"{path}: {name}: expected positions of at most {FARTHEST:g} m, got others")
+            return RadiusTruth(*positions)
+        if {"query", "database"} <= set(arrays):
+            if arrays["query"].shape != arrays["database"].shape or arrays["query"].ndim != 1:
+                raise InputError(f"{path}: expected query and database of one length, got "
+                                 f"{arrays['query'].shape} and {arrays['database'].shape}")  # fmt: skip
+            return list(zip(arrays["query"].tolist(), arrays["database"].tolist(), strict=True))
+        raise InputError(f"{path}: expected arrays query and database, or utmQ and utmDb; got {', '.join(arrays)}")
+
+
+def _json_pairs(path: Path) -> list[tuple[Any, Any]]:
+    entries = json.loads(path.read_text(encoding="utf-8"))
+    if not isinstance(entries, list) or not all(
+        isinstance(entry, list) and len(entry) == 2 and isinstance(entry[1], list) for entry in entries
+    ):
+        raise InputError(f"{path}: expected [[query, [database, ...]], ...] as in VPR-Bench")
+    return [(query, place) for query, places in entries for place in (places or [""])]
+
+
+def _row_table(names: Sequence[str]) -> dict[str, int]:
+    """Rows by relative path, and by file name where that is unique."""
+    table: dict[str, int] = {}
+    ambiguous = set()
+    for row, name in enumerate(names):
+        base = PurePosixPath(name).name
+        ambiguous |= {base} & table.keys()
+        table[base] = row
+    table = {base: row for base, row in table.items() if base not in ambiguous}
+    return table | {name: row for row, name in enumerate(names)}
+
+
+def _row(path: Path, line: int, side: str, value: Any, table: dict[str, int], count: int) -> int:
+    text = str(value).strip()
+    if text in table:
+        return table[text]
+    if text.isascii() and text.isdigit() and len(text) < MAX_DIGITS and int(text) < count:
+        return int(text)
+    raise InputError(
+        f"{path}: pair {line}: expected the name of a {side} image or a number from 0 to {count - 1}, got "
+        f"{_shortened(text)!r}"
+    )
+
+
+def _shortened(text: str) -> str:
+    """Foreign text, for a message of one line."""
+    return text if len(text) <= 60 else f"{text[:40]}... ({len(text)} characters)"
+
+
+def _same_count(path: Path, what: str, got: int, expected: int) -> None:
+    if got != expected:
+        raise InputError(f"{path}: expected {expected} {what}, one per image, got {got}")

@@ -1,0 +1,143 @@
+"""The protocol of choosing and reporting: which queries decide, which are reported on, and what counts as right."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from mfvpr.datasets.positives import Positives
+from mfvpr.datasets.truth import Truth, Unit, threshold_words
+from mfvpr.evaluation.paths import places_along_path
+from mfvpr.evaluation.recall import hits
+from mfvpr.evaluation.selection import Half, halves
+from mfvpr.types import Shortlist
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.fingerprints import content_hash
+
+Split = Literal["first_half", "second_half", "both"]
+_HALVES = ("first_half", "second_half")
+
+
+@dataclass(frozen=True)
+class Judge:
+    """What rankings are judged by.
+
+    Attributes:
+        thresholds: what counts as right, frames or meters, ascending.
+        unit: of the thresholds.
+        positives: at each threshold.
+        places: images of a query's place at the widest threshold, also those that are no answer.
+        halves: where to choose and where to report; none = both on all queries.
+        views: candidates `[Q, C]` bool that are ranked: all, and for each half those that choosing may see.
+        split: which half to choose on, or both in turn; "other sets" where whole data sets are the halves, see
+            `mfvpr.tuning.learning.data_sets`; None = no halves.
+        reported_sets: queries of each data set that is reported on, by its name, where they are several sets.
+    """
+
+    thresholds: Sequence[float]
+    unit: Unit
+    positives: Sequence[Positives]
+    places: Positives
+    halves: Sequence[Half]
+    views: Sequence[np.ndarray] = ()
+    split: Split | Literal["other sets"] | None = None
+    reported_sets: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def main(self) -> int:
+        """The threshold that decides: the middle one."""
+        return len(self.thresholds) // 2
+
+    @property
+    def names(self) -> list[str]:
+        """Of the halves."""
+        return list(_HALVES) if self.split == "both" else [self.split] if self.split else []
+
+    @property
+    def fingerprint(self) -> str:
+        """Of what is right at each threshold."""
+        return content_hash([(right.offsets, right.rows) for right in self.positives])
+
+    def of(self, candidates: Shortlist) -> "Judge":
+        """With the views of a shortlist."""
+        allowed = [half.allowed[np.maximum(candidates.indices, 0)] for half in self.halves]
+        return replace(self, views=[candidates.mask, *(candidates.mask & one for one in allowed)])
+
+    def label(self, k: int, threshold: float) -> str:
+        """R@K and what counts, for tables."""
+        return f"R@{k}{threshold_words(self.unit, threshold)}"
+
+    def recall(self, rows: np.ndarray, k: int = 1) -> np.ndarray:
+        """`[S, thresholds]` recall at k of all queries, of rows `[S, Q, depth]`."""
+        return np.stack([hits(rows, right, k).mean(axis=-1) for right in self.positives], axis=-1)
+
+    def tuning(self, rows: np.ndarray) -> np.ndarray:
+        """`[halves, S, thresholds]` recall at 1 that choosing may see, of rows `[V, S, Q, depth]`."""
+        if not self.halves:
+            return self.recall(rows[0])[None]
+        seen = [
+            [hits(rows[view][:, half.tune], right.take(half.tune)).mean(axis=-1) for right in self.positives]
+            for view, half in enumerate(self.halves, start=1)
+        ]
+        return np.moveaxis(np.array(seen), 1, -1)
+
+    def reported(self, rows: np.ndarray, chosen: Sequence[int]) -> np.ndarray:
+        """`[thresholds, R]` hits of the queries that are reported on, each by the setting chosen without it."""
+        if not self.halves:
+            return np.stack([hits(rows[0][chosen[0]], right) for right in self.positives])[:, self.order]
+        parts = [
+            [hits(rows[0][setting][half.report], right.take(half.report)) for right in self.positives]
+            for setting, half in zip(chosen, self.halves, strict=True)
+        ]
+        return self.joined([np.array(part) for part in parts])
+
+    def joined(self, parts: Sequence[np.ndarray]) -> np.ndarray:
+        """`[thresholds, R]` of `[thresholds, r]`, what each half reports: in the order of the path.
+
+        Neighbors fail together, so intervals depend on who is whose neighbor.
+        """
+        place = np.argsort(self.order)[np.concatenate([half.report for half in self.halves])]
+        return np.concatenate(parts, axis=1)[:, np.argsort(place)]
+
+    @cached_property
+    def order(self) -> np.ndarray:
+        """`[Q]` queries in the order of their path, and of data sets one after the other.
+
+        That is theirs, but names with positions in meters may be sorted by anything.
+        """
+        if self.unit != "m":
+            return np.arange(len(self.places))
+        places = places_along_path(self.places, self.unit)
+        sizes = [*self.reported_sets.values()]
+        before = len(self.places) - sum(sizes)  # those that are learned on
+        part = np.repeat(np.arange(len(sizes) + 1), [before, *sizes])
+        return np.lexsort((places, part))
+
+
+def judge(truth: Truth, thresholds: Iterable[float], split: Split | None = None) -> Judge:
+    """What rankings are judged by, before there are any: what is wrong with the ground truth is told early.
+
+    Args:
+        truth: of the queries, in the order of their path.
+        thresholds: at least one, in any order; the middle one decides, and no place within the widest is shared by
+            the queries to choose on and those to report on.
+        split: the half of the path to choose on, or both in turn; None = choose and report on all queries.
+
+    Raises:
+        InputError: no threshold, or a half without queries to choose on.
+    """
+    thresholds = sorted(set(thresholds))
+    if not thresholds:
+        raise InputError("thresholds: expected at least one, got none")
+    if split not in (None, *_HALVES, "both"):
+        raise InputError(f"split={split}: expected one of None, {', '.join(_HALVES)}, both")
+    positives = [truth.positives(threshold) for threshold in thresholds]
+    places = truth.shows_place(thresholds[-1])
+    chosen = [half for name, half in zip(_HALVES, halves(places), strict=True) if split in (name, "both")]
+    for half in chosen:
+        if not positives[-1].take(half.tune).any():
+            raise InputError(f"split={split}: no query of one half has a place far enough from the other half; "
+                             "use more queries, or smaller tolerances or radius")  # fmt: skip
+    return Judge(thresholds, truth.unit, positives, places, chosen, split=split)

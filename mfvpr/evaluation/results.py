@@ -1,0 +1,105 @@
+"""What an evaluation found: candidates, matches and rankings of every sequence, and their recall."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from typing import Literal
+
+import numpy as np
+
+from mfvpr.datasets.datasets import Dataset
+from mfvpr.datasets.positives import Positives
+from mfvpr.evaluation.recall import Tally
+from mfvpr.reranking.results import Matched, Ranked
+from mfvpr.utils.errors import InputError
+
+Reason = Literal["no candidates", "too few features", "too few matches", "low confidence"]  # why there is no place
+
+
+@dataclass(frozen=True)
+class Recall:
+    """Recall of one system: counts for each sequence, and in it for each threshold."""
+
+    tallies: Sequence[Sequence[Tally]]
+
+    @property
+    def by_sequence(self) -> np.ndarray:
+        """`[sequences, thresholds, ks]`."""
+        return np.array([[tally.recall for tally in of_sequence] for of_sequence in self.tallies])
+
+    @property
+    def queries(self) -> np.ndarray:
+        """`[sequences]` how many each has."""
+        return np.array([of_sequence[0].queries for of_sequence in self.tallies])
+
+    @property
+    def mean(self) -> np.ndarray:
+        """`[thresholds, ks]` plain mean over the sequences."""
+        return self.by_sequence.mean(axis=0)
+
+    @property
+    def pooled(self) -> np.ndarray:
+        """`[thresholds, ks]` over all queries of all sequences."""
+        return np.array([reduce(Tally.merged, of_threshold).recall for of_threshold in zip(*self.tallies, strict=True)])
+
+
+@dataclass(frozen=True, repr=False)
+class Result:
+    """What an evaluation found.
+
+    Attributes:
+        dataset: what was evaluated.
+        matched: by sequence.
+        systems: by name and sequence: the filter alone, each scorer, and those combined with the filter.
+        seconds: by stage.
+    """
+
+    dataset: Dataset
+    matched: Sequence[Matched]
+    systems: Mapping[str, Sequence[Ranked]]
+    seconds: Mapping[str, float]
+
+    def __repr__(self) -> str:
+        sizes = ", ".join(f"{one.sequence.name} ({len(one.sequence.images)} queries)" for one in self.matched)
+        return f"Result({self.dataset.name}: {sizes}; {', '.join(self.systems)})"
+
+    def positives(self, threshold: float) -> list[Positives]:
+        """What is right at a threshold, by sequence.
+
+        Raises:
+            InputError: a sequence has no ground truth, or one of other images.
+        """
+        if not threshold >= 0:
+            raise InputError(f"threshold={threshold}: expected a number from 0")
+        truths = [sequence.truth for sequence in self.dataset.sequences]
+        if any(truth is None for truth in truths):
+            raise InputError(f"{self.dataset.name}: there is no ground truth, so rankings only")
+        positives = [truth.positives(threshold) for truth in truths if truth is not None]
+        for sequence, right in zip(self.dataset.sequences, positives, strict=True):
+            expected, got = (len(sequence.images), len(self.dataset.database)), (len(right), right.num_database)
+            if got != expected:
+                raise InputError(f"{sequence.name}: expected a ground truth of {expected[0]} queries and {expected[1]} "
+                                 f"database images, got one of {got[0]} and {got[1]}")  # fmt: skip
+        return positives
+
+    def recall(self, thresholds: Sequence[float], ks: Sequence[int] = (1, 5, 10)) -> dict[str, Recall]:
+        """Recall@K of every system; a query without a right answer counts as a failure.
+
+        Args:
+            thresholds: what counts as right, in the unit of the ground truth.
+            ks: depths, from 1.
+
+        Raises:
+            InputError: as `positives`, or a depth below 1.
+        """
+        if min(ks, default=1) < 1:
+            raise InputError(f"ks={[*ks]}: expected depths from 1")
+        right = [self.positives(threshold) for threshold in thresholds]
+
+        def of(ranked: Sequence[Ranked]) -> Recall:
+            return Recall([
+                [Tally.of(sequence.rows, positives[number], ks) for positives in right]
+                for number, sequence in enumerate(ranked)
+            ])  # fmt: skip
+
+        return {name: of(ranked) for name, ranked in self.systems.items()}

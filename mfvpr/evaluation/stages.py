@@ -1,0 +1,228 @@
+"""The stages of re-ranking a data set: match, score, explain. `mfvpr.reranking` fuses and ranks.
+
+Files and threads stay on the host; each computation is one compiled program per shape. `track` wraps the iterable of a
+stage: a progress bar, or nothing.
+"""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mfvpr.features.feature_set import FeatureSet, memory_budget
+from mfvpr.matching import batched
+from mfvpr.matching.match_set import MatchSet, Scales
+from mfvpr.matching.matcher import NEIGHBORS, Matcher
+from mfvpr.reranking.batched_scoring import score
+from mfvpr.reranking.ranking import BIN_STEP
+from mfvpr.scoring.histogram import HistogramOfShifts, ShiftHistogram
+from mfvpr.scoring.parameters import fit
+from mfvpr.scoring.weights import match_weights
+from mfvpr.storage.matches import MatchStore, StoredMatches
+from mfvpr.types import Array, Matches, Shortlist
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.numerics import Device, at_least_single, compiled, device_of
+from mfvpr.utils.progress import Track, untracked
+
+__all__ = ["Explanation", "FeatureSet", "MatchSet", "Scales", "explain", "match", "score", "stored_matches"]
+
+SHIFTS_AT_ONCE = 64  # pairs
+STORE_BATCH = 8  # queries whose matches may be lost when a run is killed
+
+
+def match(
+    queries: FeatureSet,
+    database: FeatureSet,
+    candidates: Shortlist,
+    matcher: Matcher = NEIGHBORS,
+    *,
+    memory: float | None = None,
+    devices: Sequence[Device] | None = None,
+    store: MatchStore | None = None,
+    rows: Sequence[int] | None = None,
+    track: Track = untracked,
+) -> MatchSet:
+    """Matches of every query with its candidates, with their ratio: weights may ask for it.
+
+    Args:
+        queries: Q images.
+        database: M images.
+        candidates: `[Q, C]` rows of the database.
+        matcher: of one pair.
+        memory: GB that features of the database may take on the devices, and, of a store, the matches in memory; None
+            = a third of what is free.
+        devices: that share the queries; None = the one that JAX takes.
+        store: of these features, candidates and matcher. Only queries that it lacks are matched; some at a time are on
+            disk before the next are begun; and what comes back was read from it.
+        rows: of the queries that are matched, and given; None = all.
+        track: progress, over queries.
+
+    Raises:
+        InputError: the two sides' descriptors do not fit; or the store cannot be used, or is of other candidates: then
+            nothing is written.
+    """
+    if (queries.counts > 0).any() and (database.counts > 0).any() and queries.dimension != database.dimension:
+        raise InputError(f"features: expected as many dimensions on both sides, got {queries.dimension} "
+                         f"and {database.dimension} (database); extract all images alike")  # fmt: skip
+    made = partial(
+        batched.matched, queries, database, candidates, matcher=matcher, memory=memory,
+        devices=devices or [device_of(())],
+    )  # fmt: skip
+    asked = range(len(queries)) if rows is None else rows
+    if store is None:
+        found = [row for _, row in track(made(asked), len(asked))]
+        return MatchSet.of([row.matches for row in found], np.array([row.counts for row in found]))
+    if missing := [row for row in asked if not store.done[row]]:
+        before = {query: row.indices for query, row in store.read()}
+        _require_same(store, candidates, before)  # then nothing is written
+        tracked = iter(track(made(missing), len(missing)))
+        while batch := dict(itertools.islice(tracked, STORE_BATCH)):
+            store.write(batch)
+    match_set, listed = stored_matches(store, rows, memory=memory)
+    if not missing:
+        _require_same(store, candidates, dict(zip(asked, listed.indices, strict=True)))
+    return match_set
+
+
+def _require_same(store: MatchStore, candidates: Shortlist, stored: Mapping[int, np.ndarray]) -> None:
+    """That what the store holds, by row, is of these candidates."""
+    same_shape = candidates.indices.shape == tuple(store.sizes.values())
+    if not same_shape or any((indices != candidates.indices[row]).any() for row, indices in stored.items()):
+        raise InputError(
+            f"{store.folder}: expected matches of these candidates, got those of another shortlist; choose another "
+            "path, or delete this folder"
+        )
+
+
+def stored_matches(
+    store: MatchStore, rows: Sequence[int] | None = None, *, memory: float | None = None
+) -> tuple[MatchSet, Shortlist]:
+    """What a store holds, NumPy: the features are not needed any more.
+
+    Args:
+        store: of matches.
+        rows: of the queries whose matches are asked for; None = all.
+        memory: GB that all matches may take in memory; None = a third of what is free. Where that is not enough, none
+            stays there, and they are read whenever they are asked for.
+
+    Raises:
+        InputError: matches of some queries are missing or damaged.
+    """
+    rows = range(len(store.done)) if rows is None else rows
+    if not (done := store.done[[*rows]]).all():
+        raise InputError(
+            f"{store.folder}: expected the matches of all {len(done)} queries, got {done.sum()}; finish the matching "
+            "first"
+        )
+    left, matches, lists = memory_budget(memory, jax.local_devices(backend="cpu")[:1]), [], []
+    for _, row in store.read(rows):
+        left -= sum(leaf.nbytes for leaf in jax.tree.leaves(row.matches))
+        matches.append(row.matches)
+        if left < 0:
+            matches.clear()
+        lists.append((row.counts, row.indices, row.filter_scores))
+    counts, indices, scores = (
+        (np.array(values).reshape(len(rows), store.sizes["num_candidates"]) for values in zip(*lists, strict=True))
+        if lists
+        else [np.zeros((0, store.sizes["num_candidates"]), np.int32)] * 3
+    )
+    shortlist = Shortlist(indices=indices, scores=scores, mask=indices >= 0)
+    return MatchSet.of(matches or StoredMatches(store, rows), counts), shortlist
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """What a histogram says of one pair, NumPy.
+
+    Attributes:
+        histogram: all bins `[B, B]` (-inf beyond the range of shifts) with their centers, px.
+        score: the tallest bin.
+        shift: `[2]` its center (x, y), px.
+        peak: `[2]` the refined peak between bin centers, px.
+        weights: `[K]` of the matches.
+        agrees: `[K]` whether a match's shift lies within two standard deviations of the peak along both axes.
+        scale: of the scorer's, at which all of this is.
+        direction: of the shifts, the scorer's.
+    """
+
+    histogram: ShiftHistogram
+    score: Array
+    shift: Array
+    peak: Array
+    weights: Array
+    agrees: Array
+    scale: Array
+    direction: str
+
+
+def explain(scorer: HistogramOfShifts, matches: Matches) -> Explanation:
+    """The parts of one pair's score, for figures and for steering; one program for all pairs."""
+    fitted = fit(scorer, matches.image_size0, matches.image_size1, multiple=BIN_STEP)
+    return Explanation(*jax.tree.map(np.asarray, _explain(fitted, matches)), direction=scorer.direction)
+
+
+@compiled
+def _explain(scorer: HistogramOfShifts, matches: Matches) -> tuple[Any, ...]:
+    shift, peak = scorer.dominant_shift(matches), scorer.dominant_shift(matches, refine=True)
+    weights = match_weights(scorer.weight, matches)
+    agrees, scale = scorer.agrees(matches, peak), scorer.dominant_scale(matches)
+    return scorer.histogram(matches), scorer(matches), shift, peak, weights, agrees, scale
+
+
+def dominant_shifts(
+    scorer: HistogramOfShifts, match_set: MatchSet, queries: np.ndarray, places: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How far candidates show what is at the center of their queries from there, px: refined dominant shifts `[n, 2]`
+    (candidate minus query), their 95 % intervals `[n, 2, 2]` (low, high), and the scales `[n]`; one program.
+
+    Args:
+        scorer: whose histogram is taken.
+        match_set: of all queries.
+        queries: `[n]`.
+        places: `[n]` of the candidates in their shortlists.
+
+    Returns:
+        NaN where nothing votes.
+    """
+    fitted = fit(scorer, *match_set.image_sizes, multiple=BIN_STEP)
+    parts = [(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))]
+    for start in range(0, len(queries), SHIFTS_AT_ONCE):
+        some = slice(start, start + SHIFTS_AT_ONCE)
+        pairs = match_set.pairs(queries[some], places[some], match_set.capacity, total=SHIFTS_AT_ONCE)
+        number = len(queries[some])
+        shifts, intervals, scales = pair_shifts(fitted, pairs)
+        parts.append((shifts[:number], intervals[:number], scales[:number]))
+    shifts, intervals, scales = (np.concatenate(same) for same in zip(*parts, strict=True))
+    return shifts, intervals, scales
+
+
+def pair_shifts(scorer: HistogramOfShifts, matches: Matches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`dominant_shifts` of matches `[P, K, ...]`, by a scorer that is fitted to their images."""
+    votes, shifts, intervals, scales = jax.tree.map(np.asarray, _pair_shifts(scorer, matches))
+    none = ~votes  # the host makes the NaN: `jax_debug_nans` stops at those of programs
+    return (
+        np.where(none[:, None], np.nan, shifts),
+        np.where(none[:, None, None], np.nan, intervals),
+        np.where(none, np.nan, scales),
+    )
+
+
+@compiled
+def _pair_shifts(scorer: HistogramOfShifts, matches: Matches) -> tuple[Array, Array, Array, Array]:
+    """Whether anything votes `[P]`, and `pair_shifts`, 0 where nothing does."""
+
+    def of_pair(one: Matches) -> tuple[Array, Array, Array, Array]:
+        scale, votes = scorer.dominant_scale(one), scorer(one) > 0
+        found = jnp.concatenate([scorer.dominant_shift(one, refine=True)[None], scorer.shift_interval(one)])
+        if scorer.direction == "query_minus_candidate":
+            found = -found[jnp.array([0, 2, 1])]
+        apart = (at_least_single(one.image_size1) - at_least_single(one.image_size0))[None] / 2  # of the centers
+        found = jnp.where(votes, apart + jnp.sqrt(scale) * (found - apart), 0.0)
+        return votes, found[0], found[1:], jnp.where(votes, scale, 0.0)
+
+    return jax.vmap(of_pair)(matches)

@@ -1,0 +1,167 @@
+"""What an evaluation is asked for, and what filters and scorers of others give: told in one line."""
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from mfvpr.datasets.datasets import ImageFolder
+from mfvpr.features.extractor import Extractor, Source
+from mfvpr.features.feature_set import FeatureSet
+from mfvpr.features.sift import Sift
+from mfvpr.matching.lightglue import LightGlueMatching
+from mfvpr.matching.matcher import Matcher, Matching
+from mfvpr.matching.nearest_neighbors import CrossCheck
+from mfvpr.reranking.fusion import Fusion
+from mfvpr.reranking.ranking import Ties
+from mfvpr.reranking.results import COHORT, FILTER, FRAMES, Matched, Ranked
+from mfvpr.retrieval.retriever import Filtered
+from mfvpr.scoring.fields import check_bounds
+from mfvpr.scoring.registry import SCORERS
+from mfvpr.types import Shortlist
+from mfvpr.utils.errors import InputError, require_word
+
+
+def check_request(
+    scorers: Mapping[str, Any], fused: Mapping[str, Fusion], correlated: Iterable[str], ties: Ties,
+    memory: float | None, *, cohort: bool = False,
+) -> None:  # fmt: skip
+    """What `mfvpr.evaluate` is asked to do with matches.
+
+    Args:
+        scorers: by name.
+        fused: how the filter's score is added to some of them, by name.
+        correlated: names of scorers, and of those that are fused.
+        ties: see there.
+        memory: see there.
+        cohort: whether there is one, so that scorers are ranked with it as well.
+
+    Raises:
+        InputError: one cannot be used.
+    """
+    require_word("ties", ties, Ties)
+    if memory is not None and not 0 < memory < math.inf:
+        raise InputError(f"memory={memory!r}: expected GB above 0, or None")
+    with_cohort = [f"{name} + {COHORT}" for name in scorers] if cohort else []
+    alone = [*scorers, *with_cohort]
+    for name, how in fused.items():
+        how.check(name, alone)
+    combined = [how.system(name) for name, how in fused.items()]
+    several = {*alone, *combined}
+    if unknown := [name for name in correlated if name not in several]:
+        raise InputError(f"correlated: expected names of scorers ({', '.join(several) or 'there are none'}), got "
+                         f"{unknown[0]}")  # fmt: skip
+    made = {FILTER, *with_cohort, *combined, *(f"{other} + {FRAMES}" for other in correlated)}
+    for name, scorer in scorers.items():
+        if name in made:
+            raise InputError(f"scorers: {name} is the name of another system; choose another one")
+        if isinstance(scorer, type) or not callable(scorer):
+            got = f"the class {scorer.__name__}; write {scorer.__name__}(...)" if isinstance(scorer, type) else scorer
+            raise InputError(f"scorers: expected {name} to map Matches to a score, got {got}")
+        if type(scorer) in SCORERS.values():
+            check_bounds(scorer)
+
+
+def check_matching(candidates: Any, extractor: Extractor | Source, matching: Matcher) -> None:
+    """What is asked of the matches of a sequence.
+
+    Raises:
+        InputError: one cannot be used.
+    """
+    whole = isinstance(candidates, int | np.integer) and not isinstance(candidates, bool)
+    if candidates != "all" and not (whole and candidates >= 1):
+        raise InputError(f"candidates={candidates!r}: expected a whole number from 1, or 'all'")
+    if not extractor.scales:
+        raise InputError(f"{type(extractor).__name__}: gives no local features; expected an extractor that does")
+    if isinstance(matching, type) or not callable(matching):
+        got = f"the class {matching.__name__}" if isinstance(matching, type) else repr(matching)
+        raise InputError(f"matching: expected what maps the features of two images to Matches, got {got}; see "
+                         "mfvpr.Matcher")  # fmt: skip
+    if isinstance(matching, Matching):
+        require_word("cross_check", matching.cross_check, CrossCheck)
+    if isinstance(matching, LightGlueMatching):
+        for name in ("filter_threshold", "depth_confidence"):
+            if (share := getattr(matching, name)) is not None and not 0 <= share <= 1:
+                raise InputError(f"{name}={share}: expected a number from 0 to 1")
+        dimensions = [scale.dimension for scale in extractor.scales if scale.dimension]  # 0 = not known
+        if isinstance(extractor, Sift) or {*dimensions} - {matching.dimension}:
+            got = f"{type(extractor).__name__} of {', '.join(map(str, dimensions))}"
+            raise InputError(f"LightGlue: expected ALIKED's features, of {matching.dimension} dimensions, got {got}; "
+                             "extract these, or match nearest neighbors")  # fmt: skip
+
+
+def checked_candidates(filtered: Any, who: str, num_queries: int, num_database: int, num_candidates: int) -> Filtered:
+    """What a filter of somebody's own gives, with -1 and 0 as padding.
+
+    Args:
+        filtered: of the filter.
+        who: the filter's name.
+        num_queries: Q.
+        num_database: N.
+        num_candidates: C.
+
+    Raises:
+        InputError: no Filtered, or no Shortlist `[Q, C]` in it, rows that the database lacks, or a row twice for one
+            query.
+    """
+    if not isinstance(filtered, Filtered):
+        raise InputError(f"{who}: expected a Filtered, got {type(filtered).__name__}; return "
+                         "Filtered(shortlist, {}, {})")  # fmt: skip
+    shortlist = filtered.candidates
+    if not isinstance(shortlist, Shortlist):
+        raise InputError(f"{who}: expected a Shortlist as the candidates of Filtered, got {type(shortlist).__name__}")
+    indices, scores, mask = (np.asarray(part) for part in (shortlist.indices, shortlist.scores, shortlist.mask))
+    expected = (num_queries, num_candidates)
+    if {indices.shape, scores.shape, mask.shape} != {expected} or mask.dtype != bool or indices.dtype.kind not in "iu":
+        shapes = f"{list(indices.shape)}, {list(scores.shape)} and {list(mask.shape)}"
+        raise InputError(f"{who}: expected indices (whole), scores and mask (bool) of {list(expected)} each, got "
+                         f"{shapes}; pad with -1")  # fmt: skip
+    if not ((indices[mask] >= 0) & (indices[mask] < num_database)).all():
+        raise InputError(f"{who}: expected rows of the database from 0 to {num_database - 1}, got "
+                         f"{indices[mask].min()} to {indices[mask].max()}")  # fmt: skip
+    ordered = np.sort(np.where(mask, indices, -1), axis=1)
+    if (twice := (ordered[:, 1:] == ordered[:, :-1]) & (ordered[:, 1:] >= 0)).any():
+        query, place = np.argwhere(twice)[0]
+        raise InputError(f"{who}: expected every row of the database once, got {ordered[query, place]} twice for query "
+                         f"{query}")  # fmt: skip
+    if not np.isfinite(scores[mask]).all():
+        raise InputError(f"{who}: expected finite scores")
+    indices, scores = np.where(mask, indices, -1).astype(np.int32), np.where(mask, scores, 0).astype(np.float32)
+    return filtered._replace(candidates=Shortlist(indices, scores, mask))
+
+
+def wrong_with(folder: ImageFolder, features: FeatureSet, bad: Mapping[int, str]) -> Iterator[str]:
+    """What is wrong with some images, which rank last, or have no matches."""
+    yield from bad.values()
+    counts = np.asarray(features.source.counts)
+    if empty := [row for row in np.flatnonzero(counts == 0).tolist() if row not in bad]:
+        yield (f"{folder.paths[empty[0]]}: no keypoints, so no matches ({len(empty)} such images of {len(folder)}); "
+               "scores are 0")  # fmt: skip
+
+
+def nan_scores(
+    matched: Sequence[Matched], ranked: Sequence[Mapping[str, Ranked]], scorers: Iterable[str]
+) -> Iterator[str]:
+    """What says of scores that are no numbers: scorers of one's own may divide by 0.
+
+    Args:
+        matched: by sequence.
+        ranked: by sequence and system.
+        scorers: the systems that are no sums of others, whose 0 may say that all are equal.
+
+    Raises:
+        InputError: a scorer gives no other number than 0, where nothing matches: its ranking would be another's.
+    """
+    for name in scorers:
+        values = np.concatenate([systems[name].scores[systems[name].rows >= 0] for systems in ranked])
+        if not np.isfinite(values).all() and not values[np.isfinite(values)].any():
+            raise InputError(f"{name}: every score of a pair that has matches is NaN or infinite; check what the "
+                             "scorer expects of features and sizes")  # fmt: skip
+    for sequence, systems in zip(matched, ranked, strict=True):
+        for name, system in systems.items():
+            values = system.scores[system.rows >= 0]
+            if number := int(np.isnan(values).sum()):
+                yield f"{sequence.sequence.name}: {number} scores of {name} are NaN, and rank last"
+            if number := int(np.isinf(values).sum()):
+                yield f"{sequence.sequence.name}: {number} scores of {name} are infinite"

@@ -1,0 +1,137 @@
+"""Global descriptors from other programs, and for them."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mfvpr.io.checks import Lengths, as_float32, require_lengths, with_length
+from mfvpr.io.containers import FileEntry, reading, shortened
+from mfvpr.io.feature_files import as_written
+from mfvpr.io.h5 import H5File, write_h5
+from mfvpr.io.names import match_names, require_all, require_different
+from mfvpr.io.npz import parse_npy, read_npz, write_npz
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import printable, replacing, require_file
+
+PART = "global_descriptor"  # what hloc calls it
+
+
+def read_global_descriptors(path: Path | str, names: Sequence[str], *, lengths: Lengths = "unit") -> np.ndarray:
+    """Global descriptors of the images `names`.
+
+    Args:
+        path: `.npy`: `[M, D]`, in the order of the names as Python sorts them (image10 before image2);
+            `.npz`: `descriptors` `[M, D]`, with `names` `[M]`, or without in the order of `.npy`;
+            `.h5` or `.hdf5`: as hloc, a `global_descriptor` `[D]` for each image.
+        names: `[M]` relative POSIX paths, matched as in `names.match_names`.
+        lengths: as in `open_features`.
+
+    Returns:
+        `[M, D]` float32 in the order of `names`.
+
+    Raises:
+        InputError: no such file, damaged, images that are missing or could be several, values that are not finite, or
+            not of unit length.
+    """
+    return read_with_entries(path, names, lengths=lengths)[0]
+
+
+def read_with_entries(
+    path: Path | str, names: Sequence[str], *, lengths: Lengths = "unit"
+) -> tuple[np.ndarray, list[FileEntry]]:
+    """Descriptors as `read_global_descriptors` returns them, and `[M]` the entry of each image."""
+    path = Path(path)
+    require_lengths(lengths)
+    readers = {".npy": _from_npy, ".npz": _from_npz, ".h5": _from_h5, ".hdf5": _from_h5}
+    require_file(path)
+    if path.suffix.lower() not in readers:
+        raise InputError(f"{path}: expected a file named {', '.join(readers)}, got {path.suffix or 'no suffix'}")
+    entries, values = readers[path.suffix.lower()](path, names)
+    if values.ndim != 2 or len(values) != len(names) or not values.shape[1]:
+        raise InputError(f"{path}: expected descriptors [{len(names)}, D] of the images, got {list(values.shape)}")
+    values = with_length(str(path), as_float32(str(path), values), lengths)
+    return values, [FileEntry(path, entry) for entry in entries]
+
+
+def write_global_descriptors(
+    path: Path | str, names: Sequence[str], descriptors: np.ndarray, *, half: bool = False
+) -> None:
+    """Write global descriptors `[M, D]` as `read_global_descriptors` reads them, atomically.
+
+    Args:
+        path: `.npy`, `.npz`, `.h5` or `.hdf5`.
+        names: `[M]`.
+        descriptors: `[M, D]` in the order of `names`.
+        half: float16 instead of float32, as hloc by default.
+    """
+    path = Path(path)
+    require_different(path, names)
+    values = as_written(str(path), np.asarray(descriptors), half)
+    if values.ndim != 2 or len(values) != len(names):
+        raise InputError(f"{path}: expected descriptors [{len(names)}, D] to write, got {list(values.shape)}")
+    suffix = path.suffix.lower()
+    if suffix == ".npy":
+        with replacing(path) as temporary, temporary.open("wb") as file:
+            np.lib.format.write_array(file, values[_sorted_rows(names)], allow_pickle=False)
+    elif suffix == ".npz":
+        write_npz(path, {"names": np.array([printable(name) for name in names]), "descriptors": values}.items())
+    elif suffix in (".h5", ".hdf5"):
+        write_h5(path, ((name, {PART: value}) for name, value in zip(names, values, strict=True)))
+    else:
+        raise InputError(f"{path}: expected a name that ends with .npy, .npz, .h5 or .hdf5")
+
+
+Rows = tuple[list[str], np.ndarray]  # the entry of each image, and its descriptor
+
+
+def _from_npy(path: Path, names: Sequence[str]) -> Rows:
+    with reading(path):
+        return _from_sorted(path, names, parse_npy(str(path), path.read_bytes()))
+
+
+def _from_npz(path: Path, names: Sequence[str]) -> Rows:
+    arrays = read_npz(path, ("descriptors", "names"))
+    if "descriptors" not in arrays:
+        raise InputError(f"{path}: expected an array descriptors [M, D], and names [M]; got no descriptors")
+    descriptors, foreign = arrays["descriptors"], arrays.get("names")
+    if foreign is None:
+        return _from_sorted(path, names, descriptors)
+    if foreign.dtype.kind != "U" or foreign.shape != descriptors.shape[:1]:
+        raise InputError(
+            f"{path}: expected names as text [M] and descriptors [M, D], got {foreign.dtype}{list(foreign.shape)} and "
+            f"{list(descriptors.shape)}"
+        )
+    rows = {name: row for row, name in enumerate(foreign.tolist())}
+    if len(rows) < len(foreign):
+        raise InputError(f"{path}: expected different names, got {len(foreign) - len(rows)} again; keep one of each")
+    matched = match_names(path, names, rows)
+    require_all(path, names, matched, "descriptors")
+    images = [image for image in matched if image is not None]
+    return images, descriptors[[rows[image] for image in images]]
+
+
+def _from_h5(path: Path, names: Sequence[str]) -> Rows:
+    file = H5File(path)
+    matched = match_names(path, names, file.images)
+    require_all(path, names, matched, "descriptors")
+    images = [image for image in matched if image is not None]
+    rows = []
+    for image, parts in zip(images, file.arrays(images, (PART,)), strict=True):
+        if PART not in parts or parts[PART].shape != (rows[0] if rows else parts[PART].reshape(-1)).shape:
+            got = list(parts[PART].shape) if PART in parts else "none"
+            raise InputError(f"{path}: {shortened(image)}: expected {PART} [D], the same D for all, got {got}")
+        rows.append(parts[PART])
+    return images, np.stack(rows) if rows else np.zeros((0, 0), np.float32)
+
+
+def _from_sorted(path: Path, names: Sequence[str], descriptors: np.ndarray) -> Rows:
+    if descriptors.ndim != 2 or len(descriptors) != len(names):
+        raise InputError(f"{path}: expected descriptors [{len(names)}, D] of the images, got {list(descriptors.shape)}")
+    places = np.argsort(_sorted_rows(names))
+    return [f"row {place}" for place in places.tolist()], descriptors[places]
+
+
+def _sorted_rows(names: Sequence[str]) -> np.ndarray:
+    """`[M]` rows of the names in the order in which Python sorts them."""
+    return np.array(sorted(range(len(names)), key=names.__getitem__), np.int64)

@@ -1,0 +1,74 @@
+"""Features written as other programs read them."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from mfvpr.io.containers import shortened
+from mfvpr.io.h5 import write_h5
+from mfvpr.io.names import require_different
+from mfvpr.io.npz import write_npz
+from mfvpr.types import Features
+from mfvpr.utils.errors import InputError
+
+
+def write_features(
+    path: Path | str, names: Sequence[str], rows: Iterable[tuple[int, Features]], *, half: bool = False
+) -> None:
+    """Write features, which `open_features` reads back, one image after the other; padding is left out.
+
+    A file is there whole or not at all.
+
+    Args:
+        path: `.h5` or `.hdf5`: as hloc, descriptors `[D, N]`; `.npz`: all images in one, arrays named `image/part`,
+            descriptors `[N, D]`; another name: a folder, with `image.npz` for each, the arrays named by their part.
+        names: `[M]` of the images; hloc looks for paths below its own image folder.
+        rows: of images and their features, as the `read` of a source gives them.
+        half: float16 instead of float32, as hloc by default. Positions lose up to 0.5 px beyond 1024 px.
+
+    Raises:
+        InputError: values that float16 cannot hold, names that no file can have, or two images with one name.
+    """
+    path = Path(path)
+    require_different(path, names)
+    parts = ((names[row], _parts(names[row], features, half)) for row, features in rows)
+    if path.suffix.lower() in (".h5", ".hdf5"):
+        write_h5(path, ((name, arrays | {"descriptors": arrays["descriptors"].T}) for name, arrays in parts))
+    elif path.suffix.lower() == ".npz":
+        write_npz(path, ((f"{name}/{part}", array) for name, arrays in parts for part, array in arrays.items()))
+    else:
+        for name, arrays in parts:
+            write_npz(path / f"{_below(name)}.npz", arrays.items())
+
+
+def as_written(where: str, values: np.ndarray, half: bool) -> np.ndarray:
+    """Float32, or float16 where that holds them.
+
+    Raises:
+        InputError: finite values become infinite.
+    """
+    if not half:
+        return np.asarray(values, np.float32)
+    with np.errstate(over="ignore"):
+        halves = np.asarray(values, np.float16)
+    if not np.isfinite(halves).all():
+        raise InputError(f"{where}: expected values that float16 holds (up to 65504), got others; write float32")
+    return halves
+
+
+def _parts(name: str, features: Features, half: bool) -> dict[str, np.ndarray]:
+    mask, size = np.asarray(features.mask), np.asarray(features.image_size)
+    arrays = {
+        part: as_written(f"{shortened(name)}: {part}", np.asarray(getattr(features, part))[mask], half)
+        for part in ("keypoints", "descriptors", "scores")
+    }
+    return arrays | {"image_size": size.astype(np.int64) if (size == np.round(size)).all() else size}
+
+
+def _below(name: str) -> str:
+    """The name, as long as it stays in the folder."""
+    parts = PurePosixPath(name).parts
+    if not parts or PurePosixPath(name).is_absolute() or ".." in parts:
+        raise InputError(f"{shortened(name)}: expected a path below the folder of images; rename it")
+    return name

@@ -1,0 +1,169 @@
+"""Features and descriptors in NumPy's archives: one file for all images, or one for each in a folder."""
+
+import io
+import math
+import os
+import zipfile
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from mfvpr.io.containers import Contents, FileEntry, reading, require_plain, shortened
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import printable, replacing, require_file
+
+SUFFIXES = (".npz", ".d2-net")  # of the files of images; D2-Net names its own so
+
+
+class NpzFile:
+    """One archive for all images, with arrays named `image/part`: `a/1.jpg/keypoints`.
+
+    Its directory is read by every call, which takes half a second for 10,000 images: ask for many rows in one.
+    """
+
+    transposed = False
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with _open_archive(path) as archive:
+            members = [name.removesuffix(".npy") for name in archive.namelist()]
+        self.images = tuple(dict.fromkeys(name.rpartition("/")[0] for name in members if "/" in name))
+        if not self.images:
+            got = shortened(", ".join(members)) or "none"
+            raise InputError(
+                f"{path}: expected arrays named by images (a.jpg/keypoints), got {got}; where every image has a file "
+                "of its own, give their folder"
+            )
+
+    def contents(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Contents]:
+        with _open_archive(self.path) as archive:
+            members: dict[str, set[str]] = defaultdict(set)
+            for name in archive.namelist():
+                image, _, part = name.rpartition("/")
+                members[image].add(part)
+            for image in images:
+                yield _contents(archive, members[image], f"{image}/", parts)
+
+    def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:
+        with _open_archive(self.path) as archive:
+            members = set(archive.namelist())
+            for image in images:
+                yield {part: _array(archive, name) for part, name in _members(members, f"{image}/", parts)}
+
+    def entry(self, image: str) -> FileEntry:
+        return FileEntry(self.path, image)
+
+
+class NpzFolder:
+    """An archive for each image, named as the image with `.npz` or `.d2-net` behind: `a/1.jpg.npz`."""
+
+    transposed = False
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._paths: dict[str, Path] = {}
+        for file in sorted(_files_below(path)):
+            image = file.relative_to(path).as_posix().removesuffix(file.suffix)
+            if image in self._paths:
+                raise InputError(
+                    f"{file}: {self._paths[image].name} beside it is of the same image; remove one of them"
+                )
+            self._paths[image] = file
+        self.images = tuple(self._paths)
+        if not self.images:
+            raise InputError(f"{path}: expected files named {' or '.join(SUFFIXES)}, got none; check the path")
+
+    def contents(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Contents]:
+        for image in images:
+            with _open_archive(self._paths[image]) as archive:
+                yield _contents(archive, set(archive.namelist()), "", parts)
+
+    def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:
+        for image in images:
+            yield read_npz(self._paths[image], parts)
+
+    def entry(self, image: str) -> FileEntry:
+        return FileEntry(self._paths[image], "")
+
+
+def read_npz(path: Path, parts: Sequence[str]) -> dict[str, np.ndarray]:
+    """Those of the arrays that are there.
+
+    Raises:
+        InputError: no archive, a damaged one, or an array of objects.
+    """
+    with _open_archive(path) as archive:
+        return {part: _array(archive, name) for part, name in _members(set(archive.namelist()), "", parts)}
+
+
+def write_npz(path: Path, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
+    """Arrays by name, one after the other, atomically."""
+    with replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+        for name, array in arrays:
+            with archive.open(f"{printable(name)}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
+
+
+@contextmanager
+def _open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
+    """An archive whose members have different names: of several, readers take the first or the last."""
+    require_file(path)
+    with reading(path), zipfile.ZipFile(path) as archive:
+        if twice := [name for name, count in Counter(archive.namelist()).items() if count > 1]:
+            raise InputError(f"{path}: expected every array once, got {shortened(twice[0])} again; write the file anew")
+        yield archive
+
+
+def _members(members: set[str], prefix: str, parts: Sequence[str]) -> Iterator[tuple[str, str]]:
+    return ((part, name) for part in parts if (name := f"{prefix}{part}.npy") in members)
+
+
+def _contents(archive: zipfile.ZipFile, members: set[str], prefix: str, parts: Sequence[str]) -> Contents:
+    names = {name.removesuffix(".npy") for name in members}
+    return Contents(names, {part: _shape(archive, f"{prefix}{part}.npy") for part in parts if part in names})
+
+
+def _shape(archive: zipfile.ZipFile, member: str) -> tuple[int, ...]:
+    with archive.open(member) as file:
+        return _read_header(f"{archive.filename}: {shortened(member)}", file)[0]
+
+
+def _read_header(where: str, file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
+    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    version = np.lib.format.read_magic(file)
+    if version not in readers:
+        raise InputError(f"{where}: expected an array of NumPy's format 1.0 or 2.0, got {version}")
+    shape, _, dtype = readers[version](file)
+    require_plain(where, dtype)
+    return shape, dtype
+
+
+def _array(archive: zipfile.ZipFile, member: str) -> np.ndarray:
+    content = archive.read(member)  # the whole member, so that its checksum is compared
+    return parse_npy(f"{archive.filename}: {shortened(member)}", content)
+
+
+def parse_npy(where: str, content: bytes) -> np.ndarray:
+    """The array in the bytes of a `.npy`; there must be all of it, and nothing else."""
+    file = io.BytesIO(content)
+    shape, dtype = _read_header(where, file)
+    expected = math.prod(shape) * dtype.itemsize
+    if expected != len(content) - file.tell():
+        raise InputError(f"{where}: expected {expected} bytes of values, got {len(content) - file.tell()}")
+    file.seek(0)
+    return np.lib.format.read_array(file, allow_pickle=False)
+
+
+def _files_below(root: Path) -> Iterator[Path]:
+    def refuse(error: OSError) -> None:
+        raise InputError(f"{error.filename}: cannot be listed ({error.strerror}); make it readable") from None
+
+    for folder, folders, files in os.walk(root, onerror=refuse, followlinks=False):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        for name in files:
+            if name.endswith(SUFFIXES) and not name.startswith("."):
+                yield Path(folder, name)

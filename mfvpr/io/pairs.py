@@ -1,0 +1,94 @@
+"""Lists of image pairs as text: hloc's `query database` and kapture's `query, reference, score`."""
+
+import re
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
+
+from mfvpr.io.containers import shortened
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import printable
+from mfvpr.utils.numbers import parse_number
+
+_SEPARATOR = re.compile(r"\s*,\s*|\s+")
+_SCORED = re.compile(r"(.*?)\s*,\s*([-+.\w]+)")
+
+
+class Pair(NamedTuple):
+    """Names in a line, and the score if it has one."""
+
+    query: str
+    database: str
+    score: float | None = None
+
+
+class _Names:
+    """What may be the name of an image of one side."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self.whole = {printable(name) for name in names}
+        bases = {PurePosixPath(name).name for name in self.whole}
+        self.ends = bases | {PurePosixPath(name).stem for name in bases}
+
+    def ends_of(self, text: str) -> bool:
+        return PurePosixPath(text).name in self.ends
+
+
+def read_pairs(path: Path, query_names: Sequence[str], database_names: Sequence[str]) -> list[Pair]:
+    """The pairs of a file in its order.
+
+    Names with spaces or commas are told apart by the names that there are: hloc itself splits at every space. Lines
+    that begin with # and hold no known pair are comments.
+
+    Raises:
+        InputError: a line that is no pair of names, or may be several.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); expected a text file of image pairs") from None
+    queries, database = _Names(query_names), _Names(database_names)
+    pairs = []
+    for number, line in enumerate(text.split("\n"), start=1):
+        stripped = printable(line.strip())
+        if stripped and (pair := _pair(f"{path}: line {number}", stripped, queries, database)):
+            pairs.append(pair)
+    return pairs
+
+
+def _pair(where: str, line: str, queries: _Names, database: _Names) -> Pair | None:
+    words = line.split()
+    if len(words) == 2 and words[0] in queries.whole and words[1] in database.whole:
+        return Pair(words[0], words[1])  # nearly every line of hloc's
+    possible = list(_splits(line))
+    likely = [pair for pair in possible if pair.query in queries.whole and pair.database in database.whole]
+    likely = likely or [pair for pair in possible if queries.ends_of(pair.query) and database.ends_of(pair.database)]
+    if len(likely) == 1:
+        return likely[0]
+    if not likely and line.startswith("#"):
+        return None
+    got = "several ways to read" if likely else "names of none in"
+    raise InputError(f"{where}: expected the names of a query and a database image, got {got} {shortened(line)!r}")
+
+
+def _splits(line: str) -> Iterator[Pair]:
+    """Every way to read a line."""
+    for separator in _SEPARATOR.finditer(line):
+        query, database = line[: separator.start()], line[separator.end() :]
+        yield Pair(query, database)
+        if (scored := _SCORED.fullmatch(database)) and (score := _number(scored[2])) is not None:
+            yield Pair(query, scored[1], score)
+
+
+def _number(text: str) -> float | None:
+    try:
+        return parse_number(text)
+    except ValueError:
+        return None
+
+
+def require_lines(path: Path, names: Collection[str]) -> None:
+    """Refuse names that would end a line, or look like the end of one."""
+    for name in names:
+        if name != name.strip() or "\n" in name or "\r" in name:
+            raise InputError(f"{path}: expected names of one line without spaces around, got {name!r}; write .npz")

@@ -1,0 +1,219 @@
+"""Shortlists and rankings of other programs, and for them."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from mfvpr.io.containers import FileEntry, shortened
+from mfvpr.io.names import adds_folders, match_names, require_different
+from mfvpr.io.npz import read_npz, write_npz
+from mfvpr.io.pairs import Pair, read_pairs, require_lines
+from mfvpr.types import Ranking, Shortlist
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import require_file, write_text
+
+PairLayout = Literal["hloc", "kapture"]
+Candidates = list[tuple[int, float | None]]  # of one query: database rows and their scores, best first
+
+
+def read_shortlist(
+    path: Path | str, query_names: Sequence[str], database_names: Sequence[str], *, num_candidates: int | None = None
+) -> Shortlist:
+    """The candidates that another program chose.
+
+    Args:
+        path: `.npz`: `predictions` `[Q, K]`, rows of the database, -1 = none, and maybe `scores` `[Q, K]`, both sides
+            in the order of the names given here; else lines of text: `query database` as hloc, or
+            `query, reference[, score]` as kapture and Patch-NetVLAD's predictions, # before comments. A query's best
+            candidate comes first.
+        query_names: `[Q]` relative POSIX paths, matched as in `names.match_names`.
+        database_names: `[N]` likewise.
+        num_candidates: C; None = those of the query with the most.
+
+    Returns:
+        Shortlist `[Q, C]`, NumPy, -1 where a query has fewer (it may have none). A candidate that a query has twice
+        counts where it comes first. Scores are those of the file; without, C for the first candidate, then C - 1, ...
+
+    Raises:
+        InputError: no such file, damaged, unknown or ambiguous names, rows out of range, scores of some pairs only, not
+            finite, or ascending.
+    """
+    return read_with_entries(path, query_names, database_names, num_candidates=num_candidates)[0]
+
+
+def read_with_entries(
+    path: Path | str, query_names: Sequence[str], database_names: Sequence[str], *, num_candidates: int | None = None
+) -> tuple[Shortlist, list[FileEntry | None], list[FileEntry | None]]:
+    """Shortlist as `read_shortlist` returns it, and the entries of queries `[Q]` and database images `[N]`.
+
+    Only names with additional folders are entries. A file name alone may mean an image on either side.
+    """
+    path = Path(path)
+    require_file(path)
+    if num_candidates is not None and num_candidates < 1:
+        raise InputError(f"num_candidates={num_candidates}: expected at least 1")
+    queries, database = {}, {}
+    if path.suffix.lower() == ".npz":
+        candidates = _from_npz(path, len(query_names), len(database_names))
+    else:
+        pairs = read_pairs(path, query_names, database_names)
+        queries = _rows(path, query_names, dict.fromkeys(pair.query for pair in pairs), "query")
+        database = _rows(path, database_names, dict.fromkeys(pair.database for pair in pairs), "database")
+        candidates = _from_pairs(pairs, queries, database, len(query_names))
+    if not any(candidates):
+        raise InputError(f"{path}: expected candidates of {len(query_names)} queries, got none at all")
+    shortlist = _shortlist(path, [_first_of_each(own) for own in candidates], query_names, num_candidates)
+    return shortlist, _entries(path, query_names, queries), _entries(path, database_names, database)
+
+
+def write_shortlist(
+    path: Path | str,
+    shortlist: Shortlist,
+    query_names: Sequence[str],
+    database_names: Sequence[str],
+    *,
+    layout: PairLayout = "hloc",
+) -> None:
+    """Write a shortlist as `read_shortlist` reads it, atomically.
+
+    Args:
+        path: `.npz`: `predictions` int32 and `scores` float32 `[Q, C]`; another name: a line for each pair.
+        shortlist: `[Q, C]`.
+        query_names: `[Q]`.
+        database_names: `[N]`.
+        layout: of lines. `hloc`: no scores; `kapture`: with them, to float32's last digit.
+
+    Raises:
+        InputError: names that are missing or no line can have; scores to write that are not finite, or ascending.
+    """
+    path = Path(path)
+    if layout not in ("hloc", "kapture"):
+        raise InputError(f"layout={layout}: expected hloc or kapture")
+    indices, scores, mask = (np.asarray(part) for part in (shortlist.indices, shortlist.scores, shortlist.mask))
+    if len(indices) != len(query_names):
+        raise InputError(f"{path}: expected the names of {len(indices)} queries, got {len(query_names)}")
+    if indices.max(initial=-1) >= len(database_names):
+        raise InputError(f"{path}: expected database rows below {len(database_names)}, got {indices.max()}")
+    packed = path.suffix.lower() == ".npz"
+    for query in range(len(indices)) if packed or layout == "kapture" else ():
+        _descending(f"{path}: {shortened(query_names[query])}", scores[query][mask[query]])
+    if packed:
+        predictions = np.where(mask, indices, -1).astype(np.int32)
+        write_npz(path, {"predictions": predictions, "scores": np.where(mask, scores, 0).astype(np.float32)}.items())
+        return
+    for names in (query_names, database_names):
+        require_different(path, names)
+        require_lines(path, names)
+    lines = ["# kapture format: 1.0", "# query_image, map_image, score"] if layout == "kapture" else []
+    for query, position in np.argwhere(mask).tolist():
+        names = (query_names[query], database_names[int(indices[query, position])])
+        score = np.float32(scores[query, position])
+        lines.append(" ".join(names) if layout == "hloc" else ", ".join((*names, str(score))))
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def reranked(shortlist: Shortlist, ranking: Ranking) -> Shortlist:
+    """The shortlist in the order of a ranking, with its scores, `[Q, C]`."""
+    indices, scores, mask, order = (
+        np.asarray(part) for part in (shortlist.indices, ranking.scores, shortlist.mask, ranking.order)
+    )
+    indices, scores, mask = (np.take_along_axis(part, order, 1) for part in (indices, scores, mask))
+    return Shortlist(indices=np.where(mask, indices, -1), scores=np.where(mask, scores, 0), mask=mask)
+
+
+def _from_npz(path: Path, num_queries: int, num_database: int) -> list[Candidates]:
+    arrays = read_npz(path, ("predictions", "scores"))
+    predictions, scores = arrays.get("predictions"), arrays.get("scores")
+    if predictions is None or predictions.ndim != 2 or predictions.dtype.kind not in "iu":
+        got = "none" if predictions is None else f"{predictions.dtype}{list(predictions.shape)}"
+        raise InputError(f"{path}: expected predictions [{num_queries}, K], whole numbers, got {got}")
+    if len(predictions) != num_queries:
+        raise InputError(f"{path}: expected predictions of {num_queries} queries, got {len(predictions)}")
+    wrong = (predictions >= num_database) | (predictions < -1)
+    if wrong.any():
+        query, position = np.argwhere(wrong)[0].tolist()
+        raise InputError(
+            f"{path}: predictions of query {query}: expected database rows from 0 to {num_database - 1}, or -1 "
+            f"for none, got {predictions[query, position]}"
+        )
+    if scores is not None and (scores.shape != predictions.shape or scores.dtype.kind not in "fiu"):
+        raise InputError(
+            f"{path}: expected scores {list(predictions.shape)} of numbers, got {scores.dtype}{list(scores.shape)}"
+        )
+    values = [[None] * predictions.shape[1]] * num_queries if scores is None else scores.tolist()
+    return [
+        [(row, score) for row, score in zip(rows, own, strict=True) if row >= 0]
+        for rows, own in zip(predictions.tolist(), values, strict=True)
+    ]
+
+
+def _from_pairs(
+    pairs: Sequence[Pair], queries: dict[str, int], database: dict[str, int], num_queries: int
+) -> list[Candidates]:
+    candidates: list[Candidates] = [[] for _ in range(num_queries)]
+    for pair in pairs:
+        candidates[queries[pair.query]].append((database[pair.database], pair.score))
+    return candidates
+
+
+def _rows(path: Path, names: Sequence[str], foreign: dict[str, None], side: str) -> dict[str, int]:
+    """Row of each foreign name; all must be known."""
+    rows = {name: row for row, name in enumerate(match_names(path, names, foreign)) if name is not None}
+    for name in foreign:
+        if name not in rows:
+            raise InputError(
+                f"{path}: expected the relative path of a {side} image, got {shortened(name)!r}, which none of the "
+                f"{len(names)} has, or one has by its full path; give names with their folders as the file has them"
+            )
+    return rows
+
+
+def _entries(path: Path, names: Sequence[str], rows: dict[str, int]) -> list[FileEntry | None]:
+    entries: list[FileEntry | None] = [None] * len(names)
+    for match, row in rows.items():
+        if adds_folders(names[row], match):
+            entries[row] = FileEntry(path, match)
+    return entries
+
+
+def _first_of_each(candidates: Candidates) -> Candidates:
+    """A candidate counts where it comes first."""
+    first: dict[int, float | None] = {}
+    for row, score in candidates:
+        first.setdefault(row, score)
+    return list(first.items())
+
+
+def _shortlist(path: Path, candidates: list[Candidates], names: Sequence[str], num_candidates: int | None) -> Shortlist:
+    depth = num_candidates or max(map(len, candidates))
+    indices = np.full((len(candidates), depth), -1, np.int32)
+    scores = np.zeros((len(candidates), depth), np.float32)
+    scored = {score is not None for own in candidates for _, score in own}
+    if len(scored) == 2:
+        raise InputError(f"{path}: expected scores of all pairs or of none, got some without")
+    for query, own in enumerate(candidates):
+        count = min(len(own), depth)
+        indices[query, :count] = [row for row, _ in own[:count]]
+        if scored == {True}:
+            scores[query, :count] = _descending(f"{path}: {shortened(names[query])}", [score for _, score in own])[
+                :count
+            ]
+        else:
+            scores[query, :count] = np.arange(depth, depth - count, -1)
+    return Shortlist(indices=indices, scores=scores, mask=indices >= 0)
+
+
+def _descending(where: str, scores: Any) -> np.ndarray:
+    """Finite float32, best first: distances would turn the ranking around without a word."""
+    with np.errstate(over="ignore"):
+        values = np.array(scores, np.float32)
+    if not np.isfinite(values).all():
+        raise InputError(f"{where}: expected finite scores, got others")
+    if (np.diff(values) > 0).any():
+        raise InputError(
+            f"{where}: expected scores, larger = better, that descend from the first candidate on, got ascending ones; "
+            "sort the candidates, and negate distances"
+        )
+    return values

@@ -1,0 +1,123 @@
+"""Images -> local features and a global descriptor, as a map keeps them of its own images and takes them of queries."""
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeGuard
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mfvpr.datasets.datasets import ImageFolder
+from mfvpr.datasets.images import read_image, resize
+from mfvpr.features.extraction import described, described_images
+from mfvpr.features.extractor import Aggregation, Description, Extractor
+from mfvpr.storage.features import as_stored
+from mfvpr.types import Features
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.fingerprints import recipe_of
+from mfvpr.utils.progress import Track, untracked
+
+Image = Path | str | ArrayLike
+Described = tuple[Features, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Describing:
+    """What describes images; features are as a store gives them back, those of queries as well.
+
+    Attributes:
+        extractor: of the local features, of one scale.
+        describer: of the global descriptor: the same extractor, another, or an aggregation of the local features.
+    """
+
+    extractor: Extractor
+    describer: Extractor | Aggregation
+
+    @property
+    def recipe(self) -> dict[str, Any]:
+        """All that changes what it gives."""
+        return {"extractor": recipe_of(self.extractor), "describer": recipe_of(self.describer)}
+
+    def image(self, image: Image) -> Described:
+        """Describe one image: a file, or `[H, W, 3]` uint8 RGB in any form that `np.asarray` converts.
+
+        Raises:
+            InputError: it cannot be read, is something else, or something is not finite.
+        """
+        pixels, name = (read_image(image), str(image)) if is_file(image) else (_pixels(image), "image")
+        description = _one(self.extractor, pixels, name)
+        features = as_stored(description.features)
+        if self.describer is self.extractor:
+            return features, _flat(description)
+        if isinstance(describer := self.describer, Extractor):
+            return features, _flat(_one(describer, pixels, name))
+        return features, describer([features])[0]
+
+    def folder(
+        self, images: ImageFolder, rows: Sequence[int], track: Track = untracked
+    ) -> Iterator[dict[int, Described]]:
+        """Of some images of a folder, by row, batch by batch.
+
+        Raises:
+            InputError: as `image`.
+        """
+        for local in _batches(images, self.extractor, rows, track):
+            features = {row: as_stored(description.features) for row, description in local.items()}
+            if self.describer is self.extractor:
+                vectors = {row: _flat(description) for row, description in local.items()}
+            elif isinstance(describer := self.describer, Extractor):
+                parts = _batches(images, describer, [*features], untracked)
+                vectors = {row: _flat(description) for part in parts for row, description in part.items()}
+            else:
+                vectors = dict(zip(features, describer([*features.values()]), strict=True))
+            yield {row: (features[row], vectors[row]) for row in features}
+
+
+def is_file(image: Image) -> TypeGuard[Path | str]:
+    """Whether an image is given by its path."""
+    return isinstance(image, str | os.PathLike)
+
+
+def _pixels(image: Any) -> np.ndarray:
+    try:
+        pixels = np.asarray(image)
+    except Exception as error:  # other libraries raise what they like, as torch for tensors with gradients
+        reason = " ".join(str(error).split())
+        raise InputError(f"image: expected a file or [H, W, 3] uint8 RGB, got {type(image).__name__} ({reason}). "
+                         "Convert it to a NumPy array.") from None  # fmt: skip
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size or pixels.dtype != np.uint8:
+        what = f"{list(pixels.shape)} {pixels.dtype}" if pixels.shape else type(image).__name__
+        raise InputError(f"image: expected a file or [H, W, 3] uint8 RGB, got {what}. Check that the camera gave an "
+                         "image.")  # fmt: skip
+    return pixels
+
+
+def local_features(images: ImageFolder, extractor: Extractor, track: Track = untracked) -> Iterator[Features]:
+    """Of all images of a folder."""
+    for batch in _batches(images, extractor, range(len(images)), track):
+        yield from (as_stored(description.features) for description in batch.values())
+
+
+def _one(extractor: Extractor, pixels: np.ndarray, name: str) -> Description:
+    [found] = described_images(resize(pixels, extractor.image_size, extractor.interpolation)[None], extractor)
+    if found is None:
+        raise InputError(f"{name}: features are not finite (NaN or infinite)")
+    return found
+
+
+def _batches(
+    images: ImageFolder, extractor: Extractor, rows: Sequence[int], track: Track
+) -> Iterator[dict[int, Description]]:
+    bad: dict[int, str] = {}
+    for batch in described(images, extractor, rows, bad, track=track):
+        if bad:
+            raise InputError(next(iter(bad.values())))
+        yield batch
+
+
+def _flat(description: Description) -> np.ndarray:
+    if description.vector is None:
+        raise InputError("describer: gives no global descriptor; expected one that does, or VladFitting()")
+    return np.asarray(description.vector, np.float32).reshape(-1)

@@ -1,0 +1,37 @@
+"""Where to steer: the shift between a query and a candidate, where a score tells one."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mfvpr.evaluation.stages import pair_shifts
+from mfvpr.reranking.ranking import BIN_STEP
+from mfvpr.scoring.histogram import HistogramOfShifts
+from mfvpr.scoring.parameters import fit
+from mfvpr.scoring.scorer import Scorer
+from mfvpr.types import Matches
+
+Point = tuple[float, float]
+
+
+class Shift(NamedTuple):
+    """As of `mfvpr.localization.Answer`."""
+
+    shift: Point | None = None
+    interval: tuple[Point, Point] | None = None
+    scale: float | None = None
+
+
+def shift_of(scorer: Scorer, pair: Matches) -> Shift:
+    """Of one pair's matches `[1, K, ...]`."""
+    if not isinstance(scorer, HistogramOfShifts):
+        return Shift()
+    fitted = fit(scorer, pair.image_size0, pair.image_size1, multiple=BIN_STEP)
+    shift, interval, scale = (np.asarray(values)[0] for values in pair_shifts(fitted, pair))
+    low, high = _pair(interval[0]), _pair(interval[1])
+    return Shift(_pair(shift), (low, high) if low and high else None, float(scale) if np.isfinite(scale) else None)
+
+
+def _pair(values: np.ndarray) -> Point | None:
+    """(x, y), None where it is not finite."""
+    return (float(values[0]), float(values[1])) if np.isfinite(values).all() else None

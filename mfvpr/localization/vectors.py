@@ -1,0 +1,67 @@
+"""Global descriptors of a map's rows in memory, and the rows that resemble a query's most."""
+
+from functools import partial
+
+import numpy as np
+
+from mfvpr.utils.numerics import available_cpus
+from mfvpr.utils.threads import ordered_map
+
+_FIRST = 1024  # rows; twice as many whenever they are full
+
+
+class Vectors:
+    """Descriptors by row; rows may come in any order, and some may be missing.
+
+    Attributes:
+        total: one more than the largest row.
+    """
+
+    def __init__(self) -> None:
+        """None yet."""
+        self._values = np.zeros((0, 0), np.float32)
+        self._there = np.zeros(0, bool)
+        self.total = 0
+
+    @property
+    def length(self) -> int | None:
+        """D, None = there is no descriptor yet."""
+        return self._values.shape[1] if self._values.size else None
+
+    def put(self, row: int, vector: np.ndarray) -> None:
+        """The descriptor `[D]` of a row."""
+        if not self._values.size:
+            self._values, self._there = np.zeros((_FIRST, len(vector)), np.float32), np.zeros(_FIRST, bool)
+        while row >= len(self._there):
+            self._values = np.concatenate([self._values, np.zeros_like(self._values)])
+            self._there = np.concatenate([self._there, np.zeros_like(self._there)])
+        self._values[row] = vector
+        # Of no features, which resembles all alike: nobody's candidate, as in `mfvpr.retrieval.retriever.Retrieval`.
+        self._there[row] = bool(np.isfinite(vector).all() and vector.any())
+        self.total = max(self.total, row + 1)
+
+    def nearest(self, query: np.ndarray, number: int, *, before: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """(rows, their products with the query `[D]`), best first, of equal ones the lowest row first.
+
+        Args:
+            query: a descriptor; of no features it finds nothing.
+            number: rows, at most.
+            before: rows from this on are left out; None = none.
+        """
+        total = self.total if before is None else max(0, min(self.total, before))
+        rows = np.flatnonzero(self._there[:total])
+        if not len(rows) or not query.any():
+            return rows[:0], np.zeros(0, np.float32)
+        products = _products(self._values[:total], query)
+        if len(rows) > number:
+            least = np.partition(products[rows], -number)[-number]
+            rows = rows[products[rows] >= least]
+        best = rows[np.argsort(-products[rows], kind="stable")][:number]
+        return best, products[best]
+
+
+def _products(vectors: np.ndarray, query: np.ndarray) -> np.ndarray:
+    """`vectors @ query`, whose own threads wait for the next product with the cores kept busy: a third of an answer."""
+    workers = available_cpus()
+    parts = np.array_split(vectors, workers)
+    return np.concatenate([*ordered_map(partial(np.vecdot, query), parts, workers=workers)])

@@ -1,0 +1,252 @@
+"""Features of two images -> Matches: nearest neighbors, and filters of the matches.
+
+The similarity matrix is the cost. It is formed once per pair, read once along its rows and once along its columns while
+it is in cache (see `neighbors`), and never stored for more than one chunk of candidates.
+"""
+
+from collections.abc import Callable
+from dataclasses import fields, replace
+from functools import partial
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mfvpr.matching.similarity import even_size, nearest, nearest_two
+from mfvpr.types import Array, Features, Matches, per_keypoint, per_match
+from mfvpr.utils import ragged
+from mfvpr.utils.errors import InputError, require_word
+from mfvpr.utils.numerics import at_least_single, compiled, device_bytes, masked, safe_sqrt
+
+CrossCheck = Literal["mutual", "opencv_legacy", "none", "candidate"]
+MEMORY_SHARE = 1 / 256  # of a device's own memory, for the similarities that exist at the same time
+
+
+def match(
+    features0: Features, features1: Features, *, cross_check: CrossCheck = "mutual", with_ratio: bool = False
+) -> Matches:
+    """Nearest neighbors of one pair of images (paper, section IV-A).
+
+    Slot k of the result belongs to keypoint k of image 0 (K = N0), or of image 1 (K = N1) where cross_check is
+    `candidate`; the first index wins a tie.
+
+    Args:
+        features0: query, keypoints `[N0, 2]`; padding may hold anything.
+        features1: candidate, keypoints `[N1, 2]`.
+        cross_check: `mutual` keeps i, j where each is the other's nearest. `opencv_legacy` is OpenCV's BFMatcher
+            before 2019: every candidate keypoint picks its nearest query keypoint, which keeps the closest of its
+            suitors. `none` keeps the nearest of every query keypoint, `candidate` that of every candidate keypoint,
+            as SSM-VPR does. (The paper says cross-check.)
+        with_ratio: also give the ratio of the distances to the nearest and the second nearest descriptor of the
+            candidate, matched or not (Lowe, IJCV 2004): 1 where both are 0 or there is no second. With `candidate`,
+            the two are descriptors of the query.
+
+    Returns:
+        Matches with K = N0 slots (`candidate`: N1). A descriptor that is not finite matches nothing.
+    """
+    require_word("cross_check", cross_check, CrossCheck)
+    if cross_check == "candidate":
+        return _exchanged(match(features1, features0, cross_check="none", with_ratio=with_ratio))
+    slots = features0.mask.shape[-1]
+    features0, features1 = ready(_even(features0)), ready(_even(at_least_one(features1)))
+    similarity = _similarity(features0, features1)
+    nearest1, valid = _neighbors(similarity, cross_check)
+    ratio = _ratio(features0, features1, similarity) if with_ratio else None
+    matches = paired(features0, features1, nearest1, valid, ratio=ratio)
+    own = {name: values[:slots] for name, values in per_match(matches).items()}
+    return replace(matches, mask=matches.mask[:slots], **own)
+
+
+def match_candidates(
+    query: Features,
+    candidates: Features,
+    *,
+    cross_check: CrossCheck = "mutual",
+    with_ratio: bool = False,
+    chunk_size: int | None = None,
+) -> Matches:
+    """`match` of one query with C candidates.
+
+    Args:
+        query: keypoints `[N0, 2]`.
+        candidates: keypoints `[C, N1, 2]`.
+        cross_check: as in `match`.
+        with_ratio: as in `match`.
+        chunk_size: candidates whose similarity matrices exist at the same time; by default as many as fit a
+            processor's own cache, or a small part of an accelerator's memory.
+
+    Returns:
+        Matches with leading axis C and slots as of `match`.
+    """
+    if np.ndim(query.mask) != 1 or np.ndim(candidates.mask) != 2:
+        shapes = f"{np.shape(query.mask)} and {np.shape(candidates.mask)}"
+        raise ValueError(f"expected one query [N0] and candidates [C, N1], got masks of shapes {shapes}; see match")
+    chunk_size = pairs_at_once(chunk_size, query, candidates)
+    if 0 in (np.shape(query.mask)[0], np.shape(candidates.mask)[1]):  # of which `lax.map` cannot make chunks
+        chunk_size = 1
+    return _match_candidates(query, candidates, cross_check=cross_check, with_ratio=with_ratio, chunk_size=chunk_size)
+
+
+@partial(compiled, static_argnames=("cross_check", "with_ratio", "chunk_size"))
+def _match_candidates(query: Features, candidates: Features, *, chunk_size: int, **options: Any) -> Matches:
+    return _chunked_map(lambda candidate: match(query, candidate, **options), candidates, chunk_size)
+
+
+def pairs_at_once(asked: int | None, query: Features, candidates: Features) -> int:
+    """As asked for; else one where its similarities then stay in a processor's cache; else what MEMORY_SHARE holds."""
+    if asked is None:
+        available = device_bytes((query, candidates))
+        matrix = 4 * query.mask.shape[-1] * candidates.mask.shape[-1] + 1
+        return 1 if available is None else max(1, int(MEMORY_SHARE * available) // matrix)
+    if asked < 1:
+        raise ValueError(f"chunk_size={asked}: expected a whole number above 0")
+    return asked
+
+
+def _chunked_map(function: Callable[[Any], Matches], items: Any, chunk_size: int) -> Matches:
+    return jax.lax.map(function, items, batch_size=None if chunk_size == 1 else chunk_size)
+
+
+def filter_matches(
+    matches: Matches, *, max_distance: float | Array | None = None, max_matches: int | None = None
+) -> Matches:
+    """The matches of one pair that are close enough, and of those the `max_matches` closest.
+
+    Slots stay where they are, the mask shrinks; among equal distances the first slots are kept.
+    """
+    if max_distance is not None:
+        matches = replace(matches, mask=matches.mask & (matches.distance <= max_distance))
+    if max_matches is not None:
+        by_distance = jnp.argsort(masked(matches.distance, matches.mask, jnp.inf), stable=True)
+        place = jnp.zeros_like(by_distance).at[by_distance].set(jnp.arange(len(by_distance)))
+        matches = replace(matches, mask=matches.mask & (place < max_matches))
+    return matches
+
+
+def compact(matches: Matches, capacity: int) -> Matches:
+    """The real matches of one pair moved to the front, in their order, in `capacity` slots.
+
+    Everything after matching costs in proportion to K or to its square, so slots should be few. Matches beyond the
+    capacity are dropped: compare `matches.mask.sum()` with it.
+    """
+    entries = ragged.in_front(per_match(matches), jnp.asarray(matches.mask), capacity)
+    return replace(matches, mask=jnp.arange(capacity) < jnp.sum(matches.mask), **entries)
+
+
+def ready(features: Features) -> Features:
+    """On the device, in at least single precision: products of half ones flip near-ties, sums of points overflow."""
+    wide = {name: at_least_single(values) for name, values in per_keypoint(features).items() if name != "mask"}
+    return replace(features, **wide, mask=jnp.asarray(features.mask), image_size=at_least_single(features.image_size))
+
+
+def paired(features0: Features, features1: Features, index1: Array, real: Array, **more: Array | None) -> Matches:
+    """Matches of every keypoint of image 0, N0 slots, where it is `real`.
+
+    Args:
+        features0: query, `ready`.
+        features1: candidate, `ready`, with one slot or more.
+        index1: `[N0]` int32, the candidate's keypoint of each match.
+        real: `[N0]` bool.
+        **more: further fields of the matches.
+    """
+    return Matches(
+        points0=features0.keypoints,
+        points1=features1.keypoints[index1],
+        distance=_distance(features0, features1, index1, real),
+        scores0=features0.scores,
+        scores1=features1.scores[index1],
+        mask=real,
+        image_size0=features0.image_size,
+        image_size1=features1.image_size,
+        index0=slot_numbers(features0),
+        index1=index1,
+        count0=keypoint_count(features0),
+        count1=keypoint_count(features1),
+        **more,
+    )
+
+
+def _exchanged(matches: Matches) -> Matches:
+    """The same matches, the images in each other's place."""
+    sides = [(f.name, f"{f.name[:-1]}1") for f in fields(matches) if f.name.endswith("0")]
+    others = {name0: getattr(matches, name1) for name0, name1 in sides}
+    return replace(matches, **others, **{name1: getattr(matches, name0) for name0, name1 in sides})
+
+
+def slot_numbers(features: Features) -> Array:
+    return jnp.arange(features.mask.shape[-1], dtype=jnp.int32)
+
+
+def keypoint_count(features: Features) -> Array:
+    return jnp.sum(features.mask, dtype=jnp.int32)
+
+
+def at_least_one(features: Features) -> Features:
+    """An image without a single slot gets one of padding."""
+    return replace(features, **ragged.at_least_one(per_keypoint(features)))
+
+
+def _even(features: Features) -> Features:
+    """With as many slots more as come out even in the blocks that similarities are searched by.
+
+    A few rows of padding are cheap; filling up the matrix itself takes several times as long as all of the matching.
+    """
+    size = features.mask.shape[-1]
+    missing = even_size(size) - size
+    if not missing:
+        return features
+    padded = jax.tree.map(
+        lambda values: jnp.pad(values, [(0, missing)] + [(0, 0)] * (np.ndim(values) - 1)), per_keypoint(features)
+    )
+    return replace(features, **padded)
+
+
+def _similarity(features0: Features, features1: Features) -> Array:
+    """`[N0, N1]` dot products, -inf where either keypoint is padding or its descriptor is not finite."""
+    similarity = products(features0.descriptors, features1.descriptors)
+    real = features0.mask[:, None] & features1.mask[None] & jnp.isfinite(similarity)
+    return jnp.where(real, similarity, -jnp.inf)
+
+
+def products(rows0: Array, rows1: Array) -> Array:
+    """Dot products of all rows of both, in full precision on every device."""
+    if rows0.shape[-1] != rows1.shape[-1]:
+        raise InputError(f"descriptors: expected as many dimensions on both sides, got {rows0.shape[-1]} and "
+                         f"{rows1.shape[-1]}; extract all images alike")  # fmt: skip
+    return jnp.matmul(rows0, rows1.T, precision=jax.lax.Precision.HIGHEST)
+
+
+def _distance(features0: Features, features1: Features, index1: Array, real: Array) -> Array:
+    """`[N0]` distances to the candidate's descriptors `index1`; 0 where not `real`."""
+    # The difference, not sqrt(2 - 2 cos): in float32 that would turn a distance of 0 into up to 3.5e-4.
+    difference = masked(features0.descriptors - features1.descriptors[index1], real)
+    return safe_sqrt(jnp.sum(difference * difference, axis=-1))
+
+
+def distance_ratio(features0: Features, features1: Features) -> Array:
+    """`[N0]` as `match` gives it, of features that are `ready`."""
+    return _ratio(features0, features1, _similarity(features0, features1))
+
+
+def _ratio(features0: Features, features1: Features, similarity: Array) -> Array:
+    """`[N0]` distance to the nearest descriptor over that to the second nearest; 1 where there is no second."""
+    nearest1, second1 = nearest_two(similarity)
+    some = second1.similarity > -jnp.inf
+    closest, next_closest = (_distance(features0, features1, found.index, some) for found in (nearest1, second1))
+    apart = some & (closest < next_closest)  # not where both are 0, nor where rounding swaps two of one distance
+    return jnp.where(apart, closest / jnp.where(apart, next_closest, 1.0), 1.0)
+
+
+def _neighbors(similarity: Array, cross_check: CrossCheck) -> tuple[Array, Array]:
+    """For each row its column `[N0]` int32, and whether the pair counts `[N0]` bool."""
+    rows = jnp.arange(similarity.shape[0], dtype=jnp.int32)
+    nearest1 = nearest(similarity, axis=1)
+    some = nearest1.similarity > -jnp.inf
+    if cross_check == "none":
+        return nearest1.index, some
+    nearest0 = nearest(similarity, axis=0)
+    if cross_check == "mutual":
+        return nearest1.index, some & (nearest0.index[nearest1.index] == rows)
+    suitors = nearest(jnp.where(nearest0.index[None] == rows[:, None], similarity, -jnp.inf), axis=1)
+    return suitors.index, jnp.isfinite(suitors.similarity)

@@ -1,0 +1,62 @@
+"""Generalized mean pooling (Radenovic et al., TPAMI 2019) on VGG16 and ResNet-50, as CosPlace (CVPR 2022) trains it."""
+
+from typing import Literal
+
+import jax.numpy as jnp
+from flax import nnx
+from jax import Array
+
+from mfvpr.networks.imagenet import preprocess
+from mfvpr.networks.lengths import of_unit_length
+from mfvpr.networks.resnet import ResNet50
+from mfvpr.networks.vgg import Vgg16, require_position
+
+Backbone = Literal["vgg16", "resnet50"]
+
+_CHANNELS = {"vgg16": 512, "resnet50": 2048}
+_SMALLEST = 1e-6  # of what is pooled, as published
+
+
+class GeneralizedMean(nnx.Module):
+    """(mean_p max(x_p, 1e-6)^power)^(1 / power) of every channel: from the mean, power 1, towards the maximum."""
+
+    def __init__(self, power: float = 3.0) -> None:
+        self.power = nnx.Param(jnp.full(1, power, jnp.float32))
+
+    def __call__(self, maps: Array) -> Array:
+        """`[B, h, w, C]` -> `[B, C]`."""
+        power, values = self.power[...][0], jnp.maximum(maps, _SMALLEST)
+        largest = jnp.max(values, axis=(1, 2), keepdims=True)  # relative to it, no power of small values is lost
+        means = jnp.mean((values / largest) ** power, axis=(1, 2))
+        return largest[:, 0, 0] * means ** (1 / power)
+
+
+class Gem(nnx.Module):
+    """A backbone's last map, of unit length at every position, its generalized mean, and a projection.
+
+    Args:
+        backbone: VGG16 to `conv5_3`, before its ReLU, or ResNet-50 without its classifier.
+        outputs: numbers of a descriptor.
+        precision: of the products where the hardware offers less than float32.
+    """
+
+    def __init__(
+        self, backbone: Backbone = "resnet50", outputs: int = 2048, *, precision: str = "highest", rngs: nnx.Rngs
+    ) -> None:
+        made = {"vgg16": Vgg16, "resnet50": ResNet50}[backbone]
+        self.backbone = made(precision=precision, rngs=rngs)
+        self.pool = GeneralizedMean()
+        self.projection = nnx.Linear(_CHANNELS[backbone], outputs, precision=precision, rngs=rngs)
+        self.dimension = outputs
+        self.has_components = False
+
+    require = staticmethod(require_position)
+
+    @staticmethod
+    def preprocess(images: Array) -> Array:
+        """`[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32 -> what the network takes, float32."""
+        return preprocess(images, "torch")
+
+    def __call__(self, images: Array) -> Array:
+        """Descriptors `[B, dimension]` of unit length of preprocessed images `[B, H, W, 3]`."""
+        return of_unit_length(self.projection(self.pool(of_unit_length(self.backbone(images)))))

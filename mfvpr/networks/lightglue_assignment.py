@@ -1,0 +1,117 @@
+"""LightGlue's assignment of the keypoints of two images to each other, see `mfvpr.networks.lightglue`; without Flax."""
+
+from collections.abc import Sequence
+from typing import NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from mfvpr.networks.lightglue_attention import Affine, Block, Rotation, across, product, within
+from mfvpr.types import Features
+from mfvpr.utils.numerics import masked
+
+Tree = TypeVar("Tree")
+
+
+class PackedLayer(NamedTuple):
+    """What a layer computes with; the projection is divided by the fourth root of the width."""
+
+    within: Block
+    across: Block
+    projection: Affine
+    matchability: Affine
+
+
+class Packed(NamedTuple):
+    """All weights, those of the layers with a leading axis L; the last of the confidences fills up and is not used."""
+
+    input: Affine
+    frequencies: Array  # [2, d / 2], d numbers of a head
+    layers: PackedLayer
+    confidences: Affine
+
+
+def assignment(
+    weights: Packed, features0: Features, features1: Features, *, depth_confidence: Array | float | None = None
+) -> Array:
+    """How surely each keypoint of one image is the same point as each of the other, as a logarithm.
+
+    Args:
+        weights: of the network.
+        features0: of one image, keypoints `[N0, 2]`; padding may hold anything.
+        features1: of the other, keypoints `[N1, 2]`.
+        depth_confidence: where after some layer more than this share of both images' keypoints is sure, the layers
+            behind it are left out (published: 0.95). None = never.
+
+    Returns:
+        `[N0, N1]`, at most 0; -inf where either keypoint is padding, or its descriptor or position is not finite.
+    """
+    sides = _finite(features0), _finite(features1)
+    masks = [side.mask for side in sides]
+    turns = [Rotation.of(_normalized(side), weights.frequencies) for side in sides]
+    num_layers, head = len(weights.layers.projection.bias), 2 * weights.frequencies.shape[1]
+
+    def after_another(progress: _Progress) -> _Progress:
+        layer = _at(weights.layers, progress.layers)
+        seen = [within(layer.within, *side) for side in zip(progress.states, masks, turns, strict=True)]
+        states = across(layer.across, (seen[0], seen[1]), (masks[0], masks[1]), head)
+        done = jnp.zeros((), bool)
+        if depth_confidence is not None:
+            threshold = 0.8 + 0.1 * jnp.exp(-4 * progress.layers.astype(states[0].dtype) / num_layers)
+            done = _share_sure(_at(weights.confidences, progress.layers), states, masks, threshold) > depth_confidence
+        return _Progress(progress.layers + 1, states, done)
+
+    def is_more(progress: _Progress) -> Array:
+        return (progress.layers < num_layers) & ~progress.done
+
+    inputs = weights.input(sides[0].descriptors), weights.input(sides[1].descriptors)
+    start = _Progress(jnp.zeros((), jnp.int32), inputs, jnp.zeros((), bool))
+    layers, states, _ = jax.lax.while_loop(is_more, after_another, start)
+    return _read(_at(weights.layers, layers - 1), *states, *masks)
+
+
+class _Progress(NamedTuple):
+    """How many layers both sides' states have gone through, and whether the others are left out."""
+
+    layers: Array
+    states: tuple[Array, Array]
+    done: Array
+
+
+def _at(stacked: Tree, layer: Array) -> Tree:
+    return jax.tree.map(lambda leaf: leaf[layer], stacked)
+
+
+def _share_sure(confidence: Affine, states: Sequence[Array], masks: Sequence[Array], threshold: Array) -> Array:
+    """Of the keypoints of both sides."""
+    unsure = [
+        jnp.sum(mask & (jax.nn.sigmoid(confidence(side)[:, 0]) < threshold))
+        for side, mask in zip(states, masks, strict=True)
+    ]
+    return 1 - sum(unsure[1:], start=unsure[0]) / jnp.maximum(jnp.sum(masks[0]) + jnp.sum(masks[1]), 1)
+
+
+def _read(layer: PackedLayer, states0: Array, states1: Array, mask0: Array, mask1: Array) -> Array:
+    """The assignment after a layer."""
+    similarity = product(layer.projection(states0), layer.projection(states1).T)
+    real = mask0[:, None] & mask1[None]
+    similarity = jnp.where(real, similarity, jnp.finfo(similarity.dtype).min)  # -inf gives NaN where none is real
+    matchable0, matchable1 = (jax.nn.log_sigmoid(layer.matchability(states)[:, 0]) for states in (states0, states1))
+    both = jax.nn.log_softmax(similarity, axis=0) + jax.nn.log_softmax(similarity, axis=1)
+    return masked(both + matchable0[:, None] + matchable1[None], real, -jnp.inf)
+
+
+def _finite(features: Features) -> Features:
+    """Without what is not finite, and zeros in the padding."""
+    finite = [jnp.all(jnp.isfinite(values), axis=-1) for values in (features.descriptors, features.keypoints)]
+    mask = features.mask & finite[0] & finite[1]
+    return Features(
+        masked(features.keypoints, mask), masked(features.descriptors, mask), features.scores, mask, features.image_size
+    )
+
+
+def _normalized(features: Features) -> Array:
+    """Keypoints in units of half of the image's longer side, from its center."""
+    size = features.image_size
+    return (features.keypoints - size[None] / 2) / (jnp.max(size) / 2)

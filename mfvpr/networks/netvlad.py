@@ -1,0 +1,117 @@
+"""NetVLAD (Arandjelovic et al., CVPR 2016): how a map's vectors differ from the centers of clusters, summed.
+
+Patch-NetVLAD (Hausler et al., CVPR 2021) sums over every square of the map as well, which gives features of patches.
+"""
+
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jax import Array
+
+from mfvpr.networks.imagenet import preprocess
+from mfvpr.networks.lengths import of_unit_length
+from mfvpr.networks.resnet import PointwiseConv
+from mfvpr.networks.vgg import Vgg16, require_position
+
+CHANNELS = 512  # of VGG16's conv5_3
+Order = Literal["clusters", "channels"]  # whose numbers stand together in a descriptor
+
+
+class Statistic(nnx.Variable):
+    """What belongs to a network's images and is no parameter of it."""
+
+
+class NetVlad(nnx.Module):
+    """V_k = sum_p a_k(x_p) (x_p - c_k), x of unit length, a the softmax over k of a linear map of x.
+
+    Each V_k is scaled to unit length, then all together.
+
+    Args:
+        clusters: K.
+        order: "clusters" gives V as `[K, D]`, as PyTorch's codes do, "channels" as `[D, K]`, as the original.
+        precision: of the products where the hardware offers less than float32.
+    """
+
+    def __init__(self, clusters: int, order: Order = "clusters", *, precision: str, rngs: nnx.Rngs) -> None:
+        self.assignment = PointwiseConv(CHANNELS, clusters, precision=precision, rngs=rngs)
+        self.centers = nnx.Param(jnp.zeros((clusters, CHANNELS), jnp.float32))
+        self.order = order
+        self.precision = precision
+
+    def __call__(self, maps: Array) -> Array:
+        """`[B, h, w, D]` -> `[B, K D]` of unit length."""
+        x = of_unit_length(maps.reshape(len(maps), -1, CHANNELS))
+        share = self._shares(x)
+        sums = jnp.einsum("bpk,bpd->bkd", share, x, precision=self.precision)
+        return self._descriptors(sums - jnp.sum(share, axis=1)[..., None] * self.centers[...][None])
+
+    def patches(self, maps: Array, size: int) -> Array:
+        """`[B, h, w, D]` -> `[B, (h - size + 1) (w - size + 1), K D]`, of every square of `size` positions, by rows."""
+        x = of_unit_length(maps)
+        residuals = self._shares(x)[..., None] * (x[..., None, :] - self.centers[...][None, None, None])
+        sums = residuals
+        for axis in (1, 2):  # a matrix of ones and zeros, since sums of the whole map, subtracted, would round more
+            inside = np.subtract.outer(np.arange(sums.shape[axis]), np.arange(sums.shape[axis] - size + 1))
+            band = jnp.asarray((inside >= 0) & (inside < size), sums.dtype)
+            sums = jnp.moveaxis(jnp.tensordot(band, sums, axes=(0, axis), precision=self.precision), 0, axis)
+        return self._descriptors(sums.reshape(len(maps), -1, *sums.shape[3:]))
+
+    def _shares(self, x: Array) -> Array:
+        """`[..., K]` of vectors of unit length."""
+        return nnx.softmax(jnp.matmul(x, self.assignment.kernel[0, 0], precision=self.precision), axis=-1)
+
+    def _descriptors(self, sums: Array) -> Array:
+        """`[..., K, D]` -> `[..., K D]`."""
+        sums = of_unit_length(sums)
+        ordered = sums if self.order == "clusters" else sums.swapaxes(-1, -2)
+        return of_unit_length(ordered.reshape(*sums.shape[:-2], -1))
+
+
+class VggNetVlad(nnx.Module):
+    """VGG16 to `conv5_3`, before its ReLU, NetVLAD, and a projection to whitened principal components.
+
+    Args:
+        clusters: of NetVLAD; 16 or 64 are published.
+        outputs: numbers of a descriptor; None = all of NetVLAD's, without projection.
+        original: preprocess as the original code, minus the average image that comes with its weights; otherwise as
+            PyTorch's networks. Its descriptors have the order of the channels.
+        precision: of the products where the hardware offers less than float32.
+    """
+
+    def __init__(
+        self, clusters: int = 64, outputs: int | None = 4096, *, original: bool = False, precision: str = "highest",
+        rngs: nnx.Rngs,
+    ) -> None:  # fmt: skip
+        self.vgg = Vgg16(precision=precision, rngs=rngs)
+        self.pool = NetVlad(clusters, "channels" if original else "clusters", precision=precision, rngs=rngs)
+        self.dimension = outputs or clusters * CHANNELS
+        self.has_components = outputs is not None
+        if outputs is not None:
+            self.projection = nnx.Linear(clusters * CHANNELS, outputs, precision=precision, rngs=rngs)
+        self.original = original
+        if original:
+            self.average = Statistic(jnp.zeros(3, jnp.float32))
+
+    require = staticmethod(require_position)
+
+    def preprocess(self, images: Array) -> Array:
+        """`[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32 -> what the network takes, float32."""
+        if self.original:
+            return images.astype(jnp.float32) - self.average[...][None, None, None]
+        return preprocess(images, "torch")
+
+    def __call__(self, images: Array) -> Array:
+        """Descriptors `[B, dimension]` of unit length of preprocessed images `[B, H, W, 3]`."""
+        return self.projected(self.pool(self.vgg(images)))
+
+    def with_patches(self, images: Array, sizes: tuple[int, ...]) -> tuple[Array, tuple[Array, ...]]:
+        """The same, and of every size the descriptors `[B, P, dimension]` of all patches, by rows."""
+        maps = self.vgg(images)
+        patches = (self.pool.patches(maps, size) for size in sizes)
+        return self.projected(self.pool(maps)), tuple(map(self.projected, patches))
+
+    def projected(self, descriptors: Array) -> Array:
+        """`[..., K D]` -> `[..., dimension]` of unit length."""
+        return of_unit_length(self.projection(descriptors)) if self.has_components else descriptors

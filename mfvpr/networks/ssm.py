@@ -1,0 +1,47 @@
+"""The networks of SSM-VPR (Camara et al., ICRA 2020): two maps of one VGG16, trained on Places365.
+
+The first stage, which makes the shortlist, looks at `conv5_2`, the second, which ranks it, at `conv4_2`; both before
+their ReLU. Pooling rounds sizes up, so that a map has ceil(H / stride) x ceil(W / stride) positions.
+"""
+
+from flax import nnx
+from jax import Array
+
+from mfvpr.networks.imagenet import Preprocessing, preprocess
+from mfvpr.networks.vgg import Vgg16
+
+STAGE1_LAYER, STAGE2_LAYER = "conv5_2", "conv4_2"
+STAGE1_STRIDE, STAGE2_STRIDE = 16, 8  # px between positions of the maps
+
+
+class SsmVgg(nnx.Module):
+    """VGG16 to `conv5_2`.
+
+    Args:
+        precision: of the products where the hardware offers less than float32.
+    """
+
+    def __init__(self, *, precision: str = "highest", rngs: nnx.Rngs) -> None:
+        self.vgg = Vgg16(STAGE1_LAYER, pools=("max_ceil",) * 4, precision=precision, rngs=rngs)
+
+    def __call__(self, images: Array) -> tuple[Array, Array]:
+        """`stage1` and `stage2` of the same images, in one pass."""
+        first, second = self.vgg.maps(images, (STAGE1_LAYER, STAGE2_LAYER))
+        return first, second
+
+    def stage1(self, images: Array) -> Array:
+        """Preprocessed images `[B, H, W, 3]` -> `[B, h, w, 512]`, before the ReLU; h = ceil(H / 16)."""
+        return self.vgg(images)
+
+    def stage2(self, images: Array) -> Array:
+        """Preprocessed images `[B, H, W, 3]` -> `[B, h, w, 512]`, before the ReLU; h = ceil(H / 8)."""
+        (second,) = self.vgg.maps(images, (STAGE2_LAYER,))
+        return second
+
+    @staticmethod
+    def preprocess(images: Array, preprocessing: Preprocessing = "torch") -> Array:
+        """RGB images `[B, H, W, 3]` from 0 to 255 -> what the stages take, float32; see `mfvpr.networks.imagenet`.
+
+        "torch" is what the published code does, although its weights, trained by Caffe, want "caffe".
+        """
+        return preprocess(images, preprocessing)

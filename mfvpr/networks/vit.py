@@ -1,0 +1,212 @@
+"""Vision transformers (Dosovitskiy et al., ICLR 2021) as DINOv2 (Oquab et al., TMLR 2024) has them."""
+
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jax import Array
+
+from mfvpr.networks.gem import GeneralizedMean
+from mfvpr.networks.imagenet import preprocess
+from mfvpr.networks.lengths import of_unit_length
+from mfvpr.utils.errors import InputError
+
+Pooling = Literal["cls", "gem"]
+
+PATCH = 14  # px a side
+_TRAINED = 37  # patches a side of the images that the positions were learned on, of 518 px
+_OFFSET = 0.1  # patches that are added before the positions' scale is computed, as published
+_EPSILON = 1e-6  # of the normalization
+_EXPANSION = 4  # of the hidden values
+_CUBIC = -0.75  # torch's parameter of bicubic interpolation
+
+
+class Tokens(NamedTuple):
+    """What a transformer makes of images."""
+
+    whole: Array  # [B, D], of the class token
+    maps: Array  # [B, h, w, D], of the patches
+
+
+class Patches(nnx.Module):
+    """A linear map of every patch: `kernel` `[14, 14, 3, D]`, `bias` `[D]`."""
+
+    def __init__(self, width: int, *, precision: str, rngs: nnx.Rngs) -> None:
+        initial = nnx.initializers.lecun_normal()
+        self.kernel = nnx.Param(initial(rngs.params(), (PATCH, PATCH, 3, width), jnp.float32))
+        self.bias = nnx.Param(jnp.zeros(width, jnp.float32))
+        self.precision = precision
+
+    def __call__(self, images: Array) -> Array:
+        """`[B, 14 h, 14 w, 3]` -> `[B, h w, D]`."""
+        batch, rows, columns = len(images), images.shape[1] // PATCH, images.shape[2] // PATCH
+        pixels = images.reshape(batch, rows, PATCH, columns, PATCH, 3).swapaxes(2, 3)
+        kernel = self.kernel[...].reshape(-1, self.kernel.shape[-1])
+        products = jnp.matmul(pixels.reshape(batch, rows * columns, -1), kernel, precision=self.precision)
+        return products + self.bias[...][None, None]
+
+
+class Attention(nnx.Module):
+    """Every token's sum of all values, by the softmax of its query's products with their keys, head by head."""
+
+    def __init__(self, width: int, heads: int, *, precision: str, rngs: nnx.Rngs) -> None:
+        self.qkv = nnx.Linear(width, 3 * width, precision=precision, rngs=rngs)
+        self.output = nnx.Linear(width, width, precision=precision, rngs=rngs)
+        self.heads = heads
+        self.precision = precision
+
+    def __call__(self, x: Array) -> Array:
+        """`[B, N, D]` -> `[B, N, D]`."""
+        batch, tokens, width = x.shape
+        queries, keys, values = jnp.moveaxis(self.qkv(x).reshape(batch, tokens, 3, self.heads, -1), (2, 3), (0, 2))
+        queries = queries * (width // self.heads) ** -0.5
+        logits = jnp.matmul(queries, keys.swapaxes(2, 3), precision=self.precision)
+        weights = jnp.exp(logits - jnp.max(logits, axis=-1, keepdims=True))
+        seen = jnp.matmul(weights, values, precision=self.precision) / jnp.sum(weights, axis=-1, keepdims=True)
+        return self.output(jnp.moveaxis(seen, 1, 2).reshape(x.shape))
+
+
+class Perceptron(nnx.Module):
+    """Two linear layers, GELU between."""
+
+    def __init__(self, width: int, *, precision: str, rngs: nnx.Rngs) -> None:
+        self.hidden = nnx.Linear(width, _EXPANSION * width, precision=precision, rngs=rngs)
+        self.output = nnx.Linear(_EXPANSION * width, width, precision=precision, rngs=rngs)
+
+    def __call__(self, x: Array) -> Array:
+        """`[B, N, D]` -> `[B, N, D]`."""
+        return self.output(jax.nn.gelu(self.hidden(x), approximate=False))
+
+
+class Block(nnx.Module):
+    """x + scale1 attention(norm1(x)), then x + scale2 perceptron(norm2(x)); who adapts it overrides what is added."""
+
+    def __init__(self, width: int, heads: int, *, precision: str, rngs: nnx.Rngs) -> None:
+        self.norm1, self.norm2 = (_norm(width, rngs) for _ in range(2))
+        self.attention = Attention(width, heads, precision=precision, rngs=rngs)
+        self.perceptron = Perceptron(width, precision=precision, rngs=rngs)
+        self.scale1, self.scale2 = (nnx.Param(jnp.ones(width, jnp.float32)) for _ in range(2))
+
+    def __call__(self, x: Array) -> Array:
+        """`[B, N, D]` -> `[B, N, D]`."""
+        x = x + self.scale1[...][None, None] * self.attended(self.norm1(x))
+        return x + self.scale2[...][None, None] * self.transformed(self.norm2(x))
+
+    def attended(self, x: Array) -> Array:
+        """Of normalized tokens, what their attention adds, before its scale."""
+        return self.attention(x)
+
+    def transformed(self, x: Array) -> Array:
+        """Of normalized tokens, what the perceptron adds, before its scale."""
+        return self.perceptron(x)
+
+
+class VisionTransformer(nnx.Module):
+    """Tokens of patches of 14 x 14 px, of the whole image, and of registers, which nobody looks at afterwards.
+
+    Args:
+        width: numbers D of a token; 384, 768 and 1024 are DINOv2's small, base and large networks.
+        depth: blocks; theirs 12, 12 and 24.
+        heads: of the attention; theirs 6, 12 and 16.
+        registers: tokens besides; 4 or none are published.
+        block: what the blocks are.
+        precision: of the products where the hardware offers less than float32.
+    """
+
+    def __init__(
+        self, width: int, depth: int, heads: int, *, registers: int = 0, block: type[Block] = Block,
+        precision: str = "highest", rngs: nnx.Rngs,
+    ) -> None:  # fmt: skip
+        self.patches = Patches(width, precision=precision, rngs=rngs)
+        self.first = nnx.Param(jnp.zeros(width, jnp.float32))  # the class token
+        self.positions = nnx.Param(jnp.zeros((1 + _TRAINED**2, width), jnp.float32))
+        if registers:
+            self.registers = nnx.Param(jnp.zeros((registers, width), jnp.float32))
+        self.has_registers = registers > 0
+        blocks = (block(width, heads, precision=precision, rngs=rngs) for _ in range(depth))
+        self.blocks = nnx.List(list(blocks))
+        self.norm = _norm(width, rngs)
+        self.width = width
+        self.precision = precision
+
+    @staticmethod
+    def preprocess(images: Array) -> Array:
+        """`[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32 -> what the network takes, float32."""
+        return preprocess(images, "torch")
+
+    def __call__(self, images: Array) -> Tokens:
+        """Normalized tokens of preprocessed images `[B, 14 h, 14 w, 3]`."""
+        batch, rows, columns = len(images), images.shape[1] // PATCH, images.shape[2] // PATCH
+        maps = self.patches(images) + self._positions(rows, columns)[None]
+        first = (self.first[...] + self.positions[...][0])[None]
+        others = jnp.concatenate([first, self.registers[...]]) if self.has_registers else first
+        x = jnp.concatenate([jnp.broadcast_to(others, (batch, *others.shape)), maps], axis=1)
+        for block in self.blocks:
+            x = block(x)
+        x = self.norm(x)
+        return Tokens(x[:, 0], x[:, len(others) :].reshape(batch, rows, columns, self.width))
+
+    def _positions(self, rows: int, columns: int) -> Array:
+        """`[h w, D]` what is added to the patches' tokens: the learned ones, resized without antialiasing."""
+        learned = self.positions[...][1:]
+        if rows == columns == _TRAINED:
+            return learned
+        grid = learned.reshape(_TRAINED, _TRAINED, -1)
+        for axis, count in enumerate((rows, columns)):
+            resized = jnp.tensordot(_bicubic(_TRAINED, count), grid, axes=(1, axis), precision=self.precision)
+            grid = jnp.moveaxis(resized, 0, axis)
+        return grid.reshape(rows * columns, -1)
+
+
+class TokenDescriptor(nnx.Module):
+    """Images' descriptors of a transformer's tokens.
+
+    Args:
+        network: with its weights.
+        pooling: "cls" takes the class token, "gem" the generalized mean of the patches' tokens of unit length.
+        power: of that mean.
+    """
+
+    def __init__(self, network: VisionTransformer, pooling: Pooling = "cls", power: float = 3.0) -> None:
+        self.network = network
+        self.pool = GeneralizedMean(power)
+        self.pooling = pooling
+        self.dimension = network.width
+        self.has_components = False
+
+    preprocess = staticmethod(VisionTransformer.preprocess)
+
+    @staticmethod
+    def require(size: tuple[int, int]) -> None:
+        """Raise an InputError unless images of this (width, height) px are made of patches."""
+        require_patches(size)
+
+    def __call__(self, images: Array) -> Array:
+        """`[B, D]` of unit length of preprocessed images `[B, 14 h, 14 w, 3]`."""
+        whole, maps = self.network(images)
+        return of_unit_length(whole if self.pooling == "cls" else self.pool(of_unit_length(maps)))
+
+
+def require_patches(size: tuple[int, int]) -> None:
+    """Raise an InputError unless images of this (width, height) px are made of patches."""
+    if any(side < PATCH or side % PATCH for side in size):
+        raise InputError(f"image_size={list(size)}: expected multiples of {PATCH}, the side of a patch in px")
+
+
+def _norm(width: int, rngs: nnx.Rngs) -> nnx.LayerNorm:
+    return nnx.LayerNorm(width, epsilon=_EPSILON, use_fast_variance=False, rngs=rngs)
+
+
+def _bicubic(size: int, count: int) -> Array:
+    """`[count, size]` of the interpolation at `count` places, which lie `size / (count + 0.1)` apart; edges repeat."""
+    places = (np.arange(count) + 0.5) * size / (count + _OFFSET) - 0.5
+    before, matrix = np.floor(places).astype(int), np.zeros((count, size))
+    for step in (-1, 0, 1, 2):
+        distance = np.abs(places - (before + step))
+        near = ((_CUBIC + 2) * distance - (_CUBIC + 3)) * distance**2 + 1
+        far = ((distance - 5) * distance + 8) * distance * _CUBIC - 4 * _CUBIC
+        pixel = np.clip(before + step, 0, size - 1)
+        np.add.at(matrix, (np.arange(count), pixel), np.where(distance <= 1, near, far))
+    return jnp.asarray(matrix, jnp.float32)

@@ -1,0 +1,119 @@
+"""Rankings of a sequence by every system: the filter alone, each scorer, and what is made of several scores."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from mfvpr.reranking.cohort_normalization import by_hubness
+from mfvpr.reranking.frame_correlation import FrameCorrelation
+from mfvpr.reranking.ranking import FilterScore, Ties, filter_scores, fuse_scales, fuse_shortlist, rank_shortlist
+from mfvpr.reranking.results import COHORT, FILTER, FRAMES, Matched, Ranked
+from mfvpr.scoring.fields import POSITIVE
+from mfvpr.types import Shortlist
+from mfvpr.utils.errors import InputError, require_word
+
+
+@dataclass(frozen=True)
+class Fusion:
+    """How the filter's score, and those of further scorers, are added to the score of another, the main one.
+
+    Attributes:
+        c: the main score gets c times the filter's; None = as much as balances both per query. "zscore" = the sum of
+            all scores, each with mean 0 and standard deviation 1 over the query's candidates (where all are equal, 0):
+            of filter and main score it ranks as None does, but its values have the same unit for every query. A score
+            that is not finite is its candidate's alone.
+        filter_score: the filter's, see `mfvpr.reranking.ranking.filter_scores`.
+        weights: of "zscore" only, above 0: of the filter (as `filter`) and of the main scorer, 1 where they are not
+            named; and of further scorers, which take part by being named.
+    """
+
+    c: float | Literal["zscore"] | None = None
+    filter_score: FilterScore = "cosine"
+    weights: Mapping[str, float] = field(default_factory=dict)
+
+    def members(self, main: str) -> list[str]:
+        """Names of the scorers that take part, the main one first."""
+        return [main, *(name for name in self.weights if name not in (main, FILTER))]
+
+    def renamed(self, main: str, name: str) -> "Fusion":
+        """The same of a main scorer of another name, such as one with a cohort."""
+        return replace(self, weights={name if key == main else key: weight for key, weight in self.weights.items()})
+
+    def system(self, main: str) -> str:
+        """The name of what is ranked, such as `histogram + filter`."""
+        return " + ".join([*self.members(main), FILTER])
+
+    def check(self, main: str, scorers: Collection[str]) -> None:
+        """Refuse what cannot be fused.
+
+        Args:
+            main: name of the main scorer.
+            scorers: names of all that score.
+
+        Raises:
+            InputError: a value, or a name that is none of theirs.
+        """
+        require_word("filter_score", self.filter_score, FilterScore)
+        known = ", ".join(scorers) or "there are none"
+        if main not in scorers:
+            raise InputError(f"fused: expected names of scorers ({known}), got {main}")
+        if self.c not in (None, "zscore") and not _between(self.c, 0, POSITIVE[1]):
+            raise InputError(f"c={self.c!r}: expected a number from 0 to {POSITIVE[1]:g}, 'zscore', or None")
+        if self.weights and self.c != "zscore":
+            raise InputError(f"weights: expected c='zscore' as well, got c={self.c!r}")
+        for name, weight in self.weights.items():
+            if name not in {FILTER, *scorers}:
+                raise InputError(f"weights: expected {FILTER} or names of scorers ({known}), got {name}; score by it "
+                                 "as well")  # fmt: skip
+            if not _between(weight, *POSITIVE):
+                raise InputError(f"weights: expected numbers from {POSITIVE[0]:g} to {POSITIVE[1]:g}, got {name}="
+                                 f"{weight!r}")  # fmt: skip
+
+    def __call__(self, main: str, candidates: Shortlist, scores: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Combined scores `[Q, C]`, NumPy, of those `[Q, C]` of every scorer by name."""
+        if self.c != "zscore":
+            return fuse_shortlist(candidates, scores[main], self.c, filter_score=self.filter_score)
+        parts = {FILTER: filter_scores(candidates, self.filter_score)}
+        parts |= {name: scores[name] for name in self.members(main)}
+        weights = np.array([self.weights.get(name, 1.0) for name in parts], np.float32)
+        return np.asarray(fuse_scales(np.stack([*parts.values()], axis=-1), candidates.mask, weights))
+
+
+def rank_sequence(
+    matched: Matched,
+    scores: Mapping[str, np.ndarray],
+    fused: Mapping[str, Fusion],
+    correlated: Mapping[str, FrameCorrelation],
+    ties: Ties,
+    *,
+    hubness: Mapping[str, np.ndarray] | None = None,
+) -> dict[str, Ranked]:
+    """Rankings of a sequence by name of the system, see `mfvpr.evaluate`.
+
+    Args:
+        matched: the sequence.
+        scores: `[Q, C]` by name of the scorer.
+        fused: see there.
+        correlated: see there.
+        ties: see there.
+        hubness: `[N]` by name of the scorer; None = no cohort.
+    """
+    candidates, scores = matched.candidates, {**scores}
+    scores |= {
+        f"{name} + {COHORT}": by_hubness(candidates, scores[name], strengths, who=name)
+        for name, strengths in (hubness or {}).items()
+    }
+    scores |= {how.system(name): how(name, candidates, scores) for name, how in fused.items()}
+    scores |= {f"{name} + {FRAMES}": how(candidates, scores[name]) for name, how in correlated.items()}
+    return {name: _ranked(candidates, values, ties) for name, values in ({FILTER: candidates.scores} | scores).items()}
+
+
+def _between(value: Any, low: float, high: float) -> bool:
+    return isinstance(value, int | float | np.number) and bool(low <= value <= high)
+
+
+def _ranked(candidates: Shortlist, scores: np.ndarray, ties: Ties) -> Ranked:
+    order = rank_shortlist(candidates, scores, ties=ties)
+    return Ranked(*(np.take_along_axis(values, order, axis=1) for values in (candidates.indices, scores)))

@@ -1,0 +1,87 @@
+"""What goes wrong with a store on disk, each told in one line, and its lock."""
+
+import errno
+import fcntl
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from mfvpr.utils.errors import InputError
+
+
+@contextmanager
+def locked(folder: Path, content: str, waiting: Callable[[str], None] | None = None) -> Iterator[None]:
+    """Hold the store's lock, which ends with the process, however that ends.
+
+    Args:
+        folder: the store's.
+        content: what it holds.
+        waiting: is told, in one line, whom this waits for; None = refuse a store that is in use.
+    """
+    with told(folder, content):
+        handle = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        with told(folder, content):
+            _take(handle, folder, waiting)
+        with suppress(OSError):  # a full disk; the lock holds without its owner's name
+            os.ftruncate(handle, 0)
+            os.write(handle, str(os.getpid()).encode())
+        yield
+        with suppress(OSError):
+            os.ftruncate(handle, 0)
+    finally:
+        os.close(handle)
+
+
+def _take(handle: int, folder: Path, waiting: Callable[[str], None] | None) -> None:
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        holder = os.pread(handle, 20, 0).decode(errors="replace") or "unknown"
+        if waiting is None:
+            raise InputError(f"{folder}: in use by process {holder}; wait until it ends, or stop it") from None
+        waiting(f"{folder}: in use by process {holder}; waiting until it is free")
+        fcntl.flock(handle, fcntl.LOCK_EX)
+
+
+@contextmanager
+def told(folder: Path, content: str, needed: Callable[[], int] = lambda: 10**6) -> Iterator[None]:
+    """What the file system raises, as one line.
+
+    Args:
+        folder: the store's.
+        content: what it holds.
+        needed: bytes that are still to be written when the disk is full.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise InputError(too_full(folder, needed(), free_bytes(folder))) from None
+        raise InputError(
+            f"{folder}: cannot hold {content} ({error.strerror}); check the path, its permissions and its disk"
+        ) from None
+
+
+def used_bytes(folder: Path) -> int:
+    """Bytes on disk of all that is below a folder; nothing for what others remove or rename meanwhile."""
+    total = 0
+    for parent, folders, files in os.walk(folder):
+        for name in (*folders, *files):
+            with suppress(FileNotFoundError):
+                total += os.stat(os.path.join(parent, name)).st_blocks * 512
+    return total
+
+
+def free_bytes(folder: Path) -> int:
+    folder = folder.absolute()
+    return shutil.disk_usage(next(path for path in (folder, *folder.parents) if path.exists())).free
+
+
+def too_full(folder: Path, needed: int, free: int) -> str:
+    return (
+        f"{folder}: expected about {needed / 1e6:.1f} MB of free disk space, got {free / 1e6:.1f} MB; free some space "
+        "and run again, which goes on from here"
+    )

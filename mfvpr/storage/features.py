@@ -1,0 +1,87 @@
+"""Local features of the images of one folder on disk: extracted once, read by every later run.
+
+    with open_store(store_path(root, "sift", recipe), recipe, num_images=len(folder)) as store:
+        store.write({row: features})  # batch by batch, the rows that are not done
+        for row, features in store.read():
+            ...
+
+A row store (`mfvpr.storage.rows`), whose rows are `keypoints` float32 `[N, 2]` (px), `descriptors` float16 `[N, D]`,
+all of unit length but for rounding, `scales` float32 `[N]` that give them back the lengths that they had, `scores`
+float32 `[N]` and `image_size` float32 `[2]` (px). Padding is left out. What comes back is float32; a descriptor has its
+length, and its direction to 5e-4, all else is as it was.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mfvpr.storage.manifest import FEATURES, Kind
+from mfvpr.storage.rows import RowStore, open_rows, require_space, row_bytes
+from mfvpr.types import Features
+
+__all__ = ["FeatureStore", "forecast_bytes", "open_store", "require_space"]
+
+FeatureStore = RowStore[Features]
+_NUM_ARRAYS = 5
+
+
+def open_store(
+    folder: Path, recipe: Mapping[str, Any], *, num_images: int, kind: Kind = FEATURES, **options: Any
+) -> FeatureStore:
+    """The store in `folder`; `with` it, rows are written, and while it lacks images no other process can do so.
+
+    Args:
+        folder: see `manifest.store_path`.
+        recipe: what the features are made from (JSON values only): weights, settings, images. Kept in plain text.
+        num_images: M.
+        kind: with messages of its own, where the store is part of something else.
+        **options: `waiting`, `shard` and `tokens` of `rows.open_rows`.
+
+    Raises:
+        InputError: made from something else, or no store at all.
+    """
+    return open_rows(folder, kind, recipe, {"num_images": num_images}, pack=pack_features, unpack=_unpack, **options)
+
+
+def forecast_bytes(num_images: int, features_per_image: float, dimension: int) -> int:
+    """Bytes on disk that images with so many features of D = `dimension` take at most."""
+    return num_images * row_bytes(features_per_image * (2 * dimension + 16) + 8, _NUM_ARRAYS)
+
+
+def as_stored(features: Features) -> Features:
+    """Features `[N, ...]` as they come back from a store: without padding, descriptors to 5e-4."""
+    return _unpack(pack_features(features))
+
+
+def pack_features(features: Features) -> dict[str, np.ndarray]:
+    mask = np.asarray(features.mask)
+    keypoints, descriptors, scores = (
+        np.asarray(values, np.float32)[mask] for values in (features.keypoints, features.descriptors, features.scores)
+    )
+    lengths = np.sqrt(np.einsum("nd,nd->n", descriptors, descriptors, dtype=np.float64)).astype(np.float32)
+    image_size = np.asarray(features.image_size, np.float32)
+    if not all(np.isfinite(part).all() for part in (keypoints, lengths, scores, image_size)):
+        raise ValueError("features must be finite")
+    directions = (descriptors / np.where(lengths > 0, lengths, 1)[:, None]).astype(np.float16)
+    norms = np.sqrt(np.einsum("nd,nd->n", directions, directions, dtype=np.float32))
+    return {
+        "keypoints": keypoints,
+        "descriptors": directions,
+        "scales": lengths / np.where(norms > 0, norms, 1),
+        "scores": scores,
+        "image_size": image_size,
+    }
+
+
+def _unpack(parts: Mapping[str, np.ndarray]) -> Features:
+    descriptors = parts["descriptors"].astype(np.float32)
+    descriptors *= parts["scales"][:, None]
+    return Features(
+        keypoints=parts["keypoints"],
+        descriptors=descriptors,
+        scores=parts["scores"],
+        mask=np.ones(len(descriptors), bool),
+        image_size=parts["image_size"],
+    )

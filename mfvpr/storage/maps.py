@@ -1,0 +1,399 @@
+"""The rows of a map on disk: of every image its features, and behind them its descriptor, its name and its place.
+
+    rows = MapRows(folder, recipe)
+    with hold_map(folder):
+        settle_map(folder, settings)
+        with rows.adding():
+            rows.add([(features, Entry(name, place, vector)), ...])
+    for row, entry in rows.new():  # since the last time, whoever added them
+        ...
+
+One process adds at a time, any number read. Rows lie in segments of `SEGMENT`, each of two row stores
+(`mfvpr.storage.rows`), so that no folder holds too many files, and of a file of tokens: a random number of each row,
+which the files of both stores know as well. So features and entries that were not written together, here, are noticed.
+A row is there when its token is, which is written last: nobody sees half of one, and a file that is removed later is
+missed. A process that is killed leaves out some numbers.
+
+The file of tokens grows before the files of a row are written: a row beyond its end shows that the file was cut. Until
+the tokens are written it lacks one byte: its size changes with every new row, even where the clock stands still.
+
+A map of format 1 has no tokens, and no manifest beside its segments. It can be read, but not added to.
+"""
+
+import json
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mfvpr.storage.disk import locked, told
+from mfvpr.storage.features import FeatureStore, open_store
+from mfvpr.storage.manifest import FEATURES, MANIFEST, Kind, is_settled, manifest_of, settle_manifest
+from mfvpr.storage.rows import RowStore, open_rows
+from mfvpr.types import Features
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import clipped
+
+SEGMENT = 4096  # rows
+DEEPEST = 50  # levels of a place: Python's JSON reads fewer levels, the more functions are called already
+MAP = Kind("map", 2, "places", "images", None, compress=False)
+_MAP_1, _FEATURES = replace(MAP, version=1), replace(FEATURES, remake=None)
+_TOKENS, _TOKEN = "tokens", np.dtype("<u8")
+
+
+class Entry(NamedTuple):
+    """What a map knows of an image beside its features.
+
+    name: of the image.
+    place: where it was taken: any JSON value.
+    vector: `[D]` global descriptor, float32.
+    """
+
+    name: str
+    place: Any
+    vector: np.ndarray
+
+
+def check_name(name: Any) -> None:
+    """Refuse a name that is no text: JSON would give back another one, or none."""
+    if not isinstance(name, str):
+        raise InputError(f"name: expected text, got {clipped(repr(name), 80)}. Use `str(name)`.")
+
+
+def check_place(name: str, place: Any) -> None:
+    """Refuse a place that is None, or that JSON would not give back as it is: a tuple comes back as a list."""
+    try:
+        text = json.dumps(place, allow_nan=False)
+        if place is None or json.loads(text) != place:
+            raise ValueError(f"{clipped(repr(place), 80)}, which JSON gives back as {clipped(text, 80)}")
+        if _levels(place) > DEEPEST:
+            raise RecursionError
+    except RecursionError:
+        raise InputError(
+            f"{name}: expected a place of at most {DEEPEST} levels, got a deeper one; flatten it"
+        ) from None
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: expected a place that JSON can say, and not null, got {error}; use text, numbers, "
+                         "lists, and dictionaries by text") from None  # fmt: skip
+
+
+def _levels(place: Any) -> int:
+    """Number of lists and dictionaries within each other."""
+    parts = place.values() if isinstance(place, dict) else place if isinstance(place, list) else None
+    return 0 if parts is None else 1 + max(map(_levels, parts), default=0)
+
+
+@contextmanager
+def hold_map(folder: Path) -> Iterator[None]:
+    """Hold a map, which need not be there yet, so that nobody else learns its vocabulary or adds to it.
+
+    Raises:
+        InputError: another process does, or the folder cannot be written.
+    """
+    with told(folder, MAP.content):
+        folder.mkdir(parents=True, exist_ok=True)
+    with locked(folder, MAP.content):
+        yield
+
+
+def settle_map(folder: Path, settings: Mapping[str, Any]) -> None:
+    """Write down what a map is made with, where that is not there; within `hold_map`.
+
+    Raises:
+        InputError: it is made with something else, or of format 1, or the folder cannot be written.
+    """
+    if _is_old(folder):
+        raise InputError(f"{folder}: expected {MAP.format!r}, got {_MAP_1.format!r}, which can only be read. Build the "
+                         "map anew in another folder.")  # fmt: skip
+    with told(folder, MAP.content):
+        settle_manifest(folder, MAP, manifest_of(MAP, settings, {}))
+
+
+def is_map_settled(folder: Path, settings: Mapping[str, Any]) -> bool:
+    """Whether it is written down what a map is made with.
+
+    Raises:
+        InputError: it is made with something else.
+    """
+    with told(folder, MAP.content):
+        return is_settled(folder, MAP, manifest_of(MAP, settings, {}))
+
+
+def has_rows(folder: Path) -> bool:
+    """Whether rows were ever added to a map."""
+    return _segment_folder(folder, 0).is_dir()
+
+
+def _is_old(folder: Path) -> bool:
+    """Whether a map is of format 1."""
+    return has_rows(folder) and not ((folder / MANIFEST).exists() or (_segment_folder(folder, 0) / _TOKENS).exists())
+
+
+def _segment_folder(folder: Path, number: int) -> Path:
+    return folder / f"{number:04d}"
+
+
+@dataclass
+class _Segment:
+    """Both stores of some rows, and their tokens, as they were when they were opened.
+
+    Attributes:
+        features: local ones.
+        entries: all else.
+        tokens: `[SEGMENT]` of the rows that are there; 0 = there is none.
+        stamp: `file_stamp` of the file of tokens.
+        is_held: rows may be added.
+    """
+
+    features: FeatureStore
+    entries: RowStore[Entry]
+    tokens: np.ndarray
+    stamp: tuple[int, ...] | None
+    is_held: bool = False
+
+    @property
+    def folder(self) -> Path:
+        return self.entries.folder.parent
+
+    @property
+    def done(self) -> np.ndarray:
+        """`[SEGMENT]` bool, rows that are there."""
+        return (self.tokens > 0) & self.entries.done
+
+    @property
+    def taken(self) -> np.ndarray:
+        """`[SEGMENT]` bool, rows that are there, or were begun, or are gone."""
+        return (self.tokens > 0) | self.features.done | self.entries.done
+
+    @property
+    def is_current(self) -> bool:
+        """Whether nothing was added or replaced since: the file of tokens would have grown, or be another."""
+        return self.is_held or self.stamp == file_stamp(self.folder / _TOKENS)
+
+    def add(self, first: int, items: Sequence[tuple[Features, Entry]]) -> range:
+        """Rows of images that are now on disk, from the first on."""
+        rows = range(first, first + len(items))
+        new = np.random.default_rng().integers(1, 2**64 - 1, len(items), np.uint64)
+        self.tokens[first : rows.stop] = new
+        try:
+            features = self.features.pack({row: features for row, (features, _) in zip(rows, items, strict=True)})
+            entries = self.entries.pack({row: entry for row, (_, entry) in zip(rows, items, strict=True)})
+            with told(self.folder, MAP.content), (self.folder / _TOKENS).open("r+b") as file:
+                file.truncate(rows.stop * _TOKEN.itemsize - 1)
+                os.fsync(file.fileno())  # a row must not be on disk before
+                self.features.write_packed(features)
+                self.entries.write_packed(entries)
+                file.seek(first * _TOKEN.itemsize)
+                file.write(new.astype(_TOKEN).tobytes())
+                file.flush()
+                os.fsync(file.fileno())
+        except BaseException:
+            self.tokens[first : rows.stop] = 0
+            raise
+        self.stamp = file_stamp(self.folder / _TOKENS)
+        return rows
+
+    def check(self) -> None:
+        """Compare the files that are there with the tokens.
+
+        Raises:
+            InputError: one of the two files of a row is gone, or that of the tokens is gone or was cut.
+        """
+        path = self.folder / _TOKENS
+        stamp = file_stamp(path)  # the rows were listed earlier, and an add grows this file before it writes rows
+        if self.entries.done.any() and stamp is None:
+            raise InputError(f"{path}: expected a file, got none. Put it back.")
+        whole = np.flatnonzero(self.features.done & self.entries.done)
+        if stamp and len(lost := whole[(whole + 1) * _TOKEN.itemsize - 1 > stamp[0]]):
+            raise InputError(f"{path}: expected tokens of rows up to {lost[-1]}, got a file that was cut to {stamp[0]} "
+                             f"bytes. Put it back, or delete the files of {len(lost)} rows from {lost[0]} on in "
+                             f"{self.features.folder} and {self.entries.folder}, which leaves them out.")  # fmt: skip
+        halves = np.flatnonzero((self.tokens > 0) & (self.features.done != self.entries.done))
+        if len(halves):
+            row = halves[0]
+            stores = self.features, self.entries
+            missing, other = stores if self.entries.done[row] else stores[::-1]
+            raise InputError(f"{missing.folder}: expected a file of row {row}, got none ({len(halves)} rows lack one). "
+                             f"Put it back, or delete {other.folder}/{row}-{other.counts[row]}.npz as well, which "
+                             "leaves the row out.")  # fmt: skip
+
+
+@dataclass(eq=False)
+class MapRows:
+    """The rows of the map in a folder, which need not be there before the first is added.
+
+    Attributes:
+        folder: of the map.
+        recipe: what its rows are made with (JSON values): another is refused.
+
+    Rows are added within `hold_map`.
+    """
+
+    folder: Path
+    recipe: Mapping[str, Any]
+    _segments: list[_Segment] = field(default_factory=list, repr=False)
+    _known: list[np.ndarray] = field(default_factory=list, repr=False)  # by segment, the rows that `new` gave
+    _held: ExitStack | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        self.folder = self.folder.absolute()  # the working directory may change
+
+    def new(self) -> Iterator[tuple[int, Entry]]:
+        """(row, entry) of all rows that were not given before, in their order.
+
+        Raises:
+            InputError: they were made with something else, or are damaged, or rows that were given are others now.
+        """
+        if self._segments:
+            self._open(0)  # full or not: all maps have this one, so it tells whether the map was replaced
+        number = next((number for number, known in enumerate(self._known) if not known.all()), len(self._known))
+        while self._open(number):
+            segment, known = self._segments[number], self._known[number]
+            for row, entry in segment.entries.read(np.flatnonzero(segment.done & ~known).tolist()):
+                known[row] = True
+                yield number * SEGMENT + row, entry
+            if not segment.taken[-1]:
+                break
+            number += 1
+
+    def counts(self, rows: Iterable[int]) -> np.ndarray:
+        """`[n]` keypoints of rows, -1 = a row is not there."""
+        row_numbers = np.fromiter(rows, int)
+        counts = np.full(len(row_numbers), -1)
+        for number in np.unique(row_numbers // SEGMENT):
+            segment, is_here = self._segments[number], row_numbers // SEGMENT == number
+            counts[is_here] = np.where(segment.done, segment.features.counts, -1)[row_numbers[is_here] % SEGMENT]
+        return counts
+
+    def features(self, rows: Sequence[int]) -> Iterator[tuple[int, Features]]:
+        """(row, features) of rows that are there, in no order.
+
+        Raises:
+            InputError: they are damaged, or were and are gone.
+        """
+        segments: dict[int, list[int]] = {}
+        for row in rows:
+            segments.setdefault(row // SEGMENT, []).append(row % SEGMENT)
+        for number, own in segments.items():
+            if gone := [row for row in own if not self._segments[number].done[row]]:
+                raise InputError(f"{self.folder}: expected features of row {number * SEGMENT + gone[0]}, got none. "
+                                 "Open the map again, without rows that were deleted.")  # fmt: skip
+            for row, features in self._segments[number].features.read(own):
+                yield number * SEGMENT + row, features
+
+    @contextmanager
+    def adding(self) -> Iterator[None]:
+        """Hold the rows, so that nobody else adds any.
+
+        Raises:
+            InputError: another process does, the map is of something else, or its folder cannot be written.
+        """
+        with ExitStack() as held:
+            self._held = held
+            try:
+                self._hold_last()
+                yield
+            finally:
+                self._held = None
+                for segment in self._segments:
+                    segment.is_held = False
+
+    def add(self, items: Sequence[tuple[Features, Entry]]) -> list[int]:
+        """Rows of images that are now on disk; within `adding`.
+
+        Raises:
+            InputError: the disk is full, or cannot be written. Rows from before stay.
+        """
+        rows: list[int] = []
+        while len(rows) < len(items):
+            number, free = self._hold_last()
+            part = items[len(rows) : len(rows) + SEGMENT - free]
+            rows += [number * SEGMENT + row for row in self._segments[number].add(free, part)]
+        return rows
+
+    def _hold_last(self) -> tuple[int, int]:
+        """The last segment, held, and its first free row."""
+        if self._held is None:
+            raise ValueError(f"{self.folder}: rows are added within `adding`")
+        number = max(0, len(self._segments) - 1)
+        while True:
+            segment = self._opened(number)
+            if not segment.is_held and not segment.taken[-1]:
+                for store in (segment.features, segment.entries):
+                    self._held.enter_context(store)
+                with told(segment.folder, MAP.content):
+                    (segment.folder / _TOKENS).touch()
+                segment.is_held = True
+            if not segment.taken[-1]:
+                return number, int(np.max(np.flatnonzero(segment.taken), initial=-1)) + 1
+            number += 1
+
+    def _open(self, number: int) -> bool:
+        """Have a segment as it is on disk; False where there never was one."""
+        is_open = number < len(self._segments)
+        if is_open and self._segments[number].is_current:
+            return True
+        there = is_open or _segment_folder(self.folder, number).is_dir()
+        if there:
+            self._opened(number)
+        return there
+
+    def _opened(self, number: int) -> _Segment:
+        """A segment as it is on disk."""
+        before = self._segments[number] if number < len(self._segments) else None
+        if before is not None and before.is_held:
+            return before
+        folder, is_old = _segment_folder(self.folder, number), _is_old(self.folder)
+        tokens, stamp = _read_tokens(folder / _TOKENS)  # before the names of files, which come first on disk
+        options: dict[str, Any] = {"tokens": None if is_old else tokens}
+        entries = open_rows(folder / "entries", _MAP_1 if is_old else MAP, self.recipe, {"num_images": SEGMENT},
+                            pack=pack_entry, unpack=unpack_entry, **options)  # fmt: skip
+        features = open_store(folder / "features", self.recipe, num_images=SEGMENT, kind=_FEATURES, **options)
+        segment = _Segment(features, entries, tokens, stamp)
+        if is_old:
+            tokens[entries.done] = 1
+        else:
+            segment.check()
+        if before is not None and (before.tokens != tokens)[self._known[number]].any():
+            raise InputError(f"{self.folder}: expected the map that was opened, got another one that replaced it, or "
+                             "none. Open the map again.")  # fmt: skip
+        if before is None:
+            self._segments.append(segment)
+            self._known.append(np.zeros(SEGMENT, bool))
+        else:
+            self._segments[number] = segment
+        return segment
+
+
+def file_stamp(path: Path) -> tuple[int, ...] | None:
+    """Size of a file in bytes, and what else differs where another file replaces it; None = there is no file."""
+    with told(path.parent, MAP.content):
+        try:
+            status = path.stat()
+        except FileNotFoundError:
+            return None
+    return status.st_size, status.st_ino, status.st_mtime_ns
+
+
+def _read_tokens(path: Path) -> tuple[np.ndarray, tuple[int, ...] | None]:
+    """`[SEGMENT]`, 0 beyond the end of the file, and the `file_stamp` of the file."""
+    tokens, stamp = np.zeros(SEGMENT, _TOKEN), file_stamp(path)  # first the stamp: what comes later is noticed
+    with told(path.parent, MAP.content):
+        content = path.read_bytes() if stamp else b""
+    stored = np.frombuffer(content, _TOKEN, len(content) // _TOKEN.itemsize)
+    tokens[: len(stored)] = stored
+    return tokens, stamp
+
+
+def pack_entry(entry: Entry) -> dict[str, np.ndarray]:
+    text = json.dumps([entry.name, entry.place], allow_nan=False)
+    return {"vector": np.asarray(entry.vector, np.float32), "text": np.frombuffer(text.encode("ascii"), np.uint8)}
+
+
+def unpack_entry(parts: Mapping[str, np.ndarray]) -> Entry:
+    name, place = json.loads(parts["text"].tobytes().decode("ascii"))
+    return Entry(name, place, parts["vector"])

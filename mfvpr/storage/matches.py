@@ -1,0 +1,95 @@
+"""Matches of all queries with their candidates on disk: matched once, read by every sweep of parameters.
+
+    with open_match_store(path, recipe, num_queries=Q, num_candidates=C) as store:
+        store.write({row: query_matches})  # batch by batch, the rows that are not done
+        for row, query_matches in store.read():
+            ...
+
+A row store (`mfvpr.storage.rows`) that gives back the very same bits. Its rows are the fields of QueryMatches, and
+those of its Matches that are there, by their names. They are compressed, since points of the query come again with
+every candidate: a match takes about 23 bytes of the 32 that it has.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mfvpr.matching.match_set import QueryMatches
+from mfvpr.storage.manifest import MATCHES
+from mfvpr.storage.rows import RowStore, open_rows, row_bytes
+from mfvpr.types import Matches
+
+_OF_QUERY = ("counts", "indices", "filter_scores")
+_OF_MATCHES = tuple(part.name for part in fields(Matches) if part.name != "mask")  # there is no padding
+_NUM_ARRAYS = len(_OF_QUERY + _OF_MATCHES)
+
+
+MatchStore = RowStore[QueryMatches]
+
+
+def open_match_store(
+    folder: Path,
+    recipe: Mapping[str, Any],
+    *,
+    num_queries: int,
+    num_candidates: int,
+    **options: Any,
+) -> MatchStore:
+    """The store in `folder`; `with` it, rows are written, and while it lacks queries no other process can do so.
+
+    Args:
+        folder: see `manifest.store_path`, with the kind `MATCHES`.
+        recipe: what the matches are made from (JSON values only): features, shortlist, settings. Kept in plain text.
+        num_queries: Q.
+        num_candidates: C.
+        **options: `waiting` and `shard` of `rows.open_rows`.
+
+    Raises:
+        InputError: made from something else, or no store at all.
+    """
+    sizes, pack = {"num_queries": num_queries, "num_candidates": num_candidates}, partial(_pack, num_candidates)
+    return open_rows(folder, MATCHES, recipe, sizes, pack=pack, unpack=_unpack, **options)
+
+
+class StoredMatches(Sequence[Matches]):
+    """Matches of some queries of a store, as in QueryMatches: read whenever they are asked for."""
+
+    def __init__(self, store: MatchStore, rows: Sequence[int]) -> None:
+        """Of rows that are done."""
+        self._store, self._rows = store, rows
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, query: Any) -> Matches:
+        """Of one query; there are no slices."""
+        [(_, found)] = self._store.read([self._rows[query]])
+        return found.matches
+
+    def __iter__(self) -> Iterator[Matches]:
+        return (found.matches for _, found in self._store.read(self._rows))
+
+
+def forecast_bytes(num_queries: int, num_candidates: int, matches_per_candidate: float) -> int:
+    """Bytes on disk that queries with so many matches take at most."""
+    return num_queries * row_bytes(num_candidates * (40 * matches_per_candidate + 24) + 8, _NUM_ARRAYS)
+
+
+def _pack(num_candidates: int, query: QueryMatches) -> dict[str, np.ndarray]:
+    flat = query.matches
+    if not np.all(flat.mask) or np.sum(query.counts) != len(flat.mask):
+        raise ValueError("expected real matches, as many as counted")
+    if not query.counts.shape == query.indices.shape == query.filter_scores.shape == (num_candidates,):
+        raise ValueError(f"expected {num_candidates} candidates")
+    found = {name: getattr(flat, name) for name in _OF_MATCHES} | {name: getattr(query, name) for name in _OF_QUERY}
+    return {name: np.asarray(values) for name, values in found.items() if values is not None}
+
+
+def _unpack(parts: Mapping[str, np.ndarray]) -> QueryMatches:
+    of_matches = {name: values for name, values in parts.items() if name in _OF_MATCHES}
+    matches = Matches(mask=np.ones(len(parts["points0"]), bool), **of_matches)
+    return QueryMatches(matches, *(parts[name] for name in _OF_QUERY))

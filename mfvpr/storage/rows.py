@@ -1,0 +1,292 @@
+"""Rows of arrays on disk, for whoever makes them slowly and reads them often: the common part of all stores.
+
+A store is a folder with a manifest, which says what the rows were made from, and one file for each row that is done:
+`<row>-<entries>.npz` (`mfvpr.utils.arrays`). A file appears as a whole, when it is on disk, so a process may be killed
+at any moment, and the next one goes on. A file knows its store and its row: exchanged ones are noticed like damaged
+ones. Shards write stores of their own in the folder `shards` of a store, and whoever reads sees one.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, Generic, Self, TypeVar
+
+import numpy as np
+
+from mfvpr.storage.disk import free_bytes, locked, told, too_full, used_bytes
+from mfvpr.storage.manifest import Kind, check_owned, is_settled, leave_manifest, manifest_of, settle_manifest
+from mfvpr.storage.places import SHARDS, Places, places
+from mfvpr.storage.shards import Shard
+from mfvpr.utils.arrays import read_arrays, write_arrays
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.fingerprints import difference
+from mfvpr.utils.threads import ordered_map
+
+THREADS = 4  # that read ahead, or write the rows of a batch
+BLOCK = 4096  # bytes that a file system hands out at a time
+ARRAY_OVERHEAD = 400  # bytes at most that an array takes in its file beside its values
+
+Item = TypeVar("Item")
+Parts = Mapping[str, np.ndarray]
+
+
+@dataclass(eq=False)
+class RowStore(Generic[Item]):
+    """A store; made by `open_rows`.
+
+    Anybody reads it, also while another process adds to it. Rows are written `with store:`, which holds it alone where
+    some are not done.
+
+    Attributes:
+        folder: where it is, absolute.
+        kind: what it holds.
+        sizes: lengths of axes by name, first M.
+        shard: which writes, into a folder of its own; None = whoever alone makes the store.
+        tokens: `[M]` a number of each row that its file knows as well: a file of the same name that was written with
+            another number is a damaged one. None = names alone tell rows apart.
+    """
+
+    folder: Path
+    kind: Kind
+    sizes: Mapping[str, int]
+    shard: Shard | None
+    _manifest: Mapping[str, Any] = field(repr=False)
+    _waiting: Callable[[str], None] | None = field(repr=False)
+    _pack: Callable[[Item], Parts] = field(repr=False)
+    _unpack: Callable[[Parts], Item] = field(repr=False)
+    tokens: np.ndarray | None = field(default=None, repr=False)
+    _places: Places = field(init=False, repr=False)
+    _layout: dict[str, str] | None = field(default=None, repr=False)
+    _is_writable: bool = field(default=False, repr=False)
+    _held: list[ExitStack] = field(default_factory=list, repr=False)  # of the blocks that are entered
+
+    def __enter__(self) -> Self:
+        """Hold the store alone, unless all rows are done; what another process made meanwhile is done as well.
+
+        Raises:
+            InputError: in use by another process, or the folder cannot be written.
+        """
+        with ExitStack() as held, told(self.folder, self.kind.content):
+            if not self._held:
+                self.look()
+            if not self._is_writable and not self.done.all():
+                if self.shard is not None:
+                    leave_manifest(self.folder, self.kind, self._manifest)
+                self.own.mkdir(parents=True, exist_ok=True)
+                held.enter_context(locked(self.own, self.kind.content, self._waiting))
+                settle_manifest(self.own, self.kind, self._manifest)
+                self.look()
+                held.callback(setattr, self, "_is_writable", False)
+                self._is_writable = True
+            self._held.append(held.pop_all())
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._held.pop().close()
+
+    @property
+    def own(self) -> Path:
+        """Where rows are written."""
+        return self.folder if self.shard is None else self.folder / SHARDS / self.shard.folder
+
+    @property
+    def counts(self) -> np.ndarray:
+        """`[M]` int32 entries of each row, -1 = not done, as they were when the store was opened, last entered, or
+        looked at. To be read only."""
+        return self._places.counts
+
+    def look(self) -> None:
+        """See what is done by now, as the names of the files tell.
+
+        Raises:
+            InputError: made from something else.
+        """
+        with told(self.folder, self.kind.content):
+            known = is_settled(self.folder, self.kind, self._manifest)
+            self._places = places(self.folder, next(iter(self.sizes.values())), own=self.own, known=known)
+
+    @property
+    def done(self) -> np.ndarray:
+        """`[M]` bool, the rows that are on disk."""
+        return self.counts >= 0
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes that the store takes on disk."""
+        return used_bytes(self.folder)
+
+    def write(self, items: Mapping[int, Item]) -> None:
+        """Store a batch of rows. When this returns they are done, and on disk.
+
+        Args:
+            items: by row.
+
+        Raises:
+            InputError: the disk is full, or cannot be written: rows done before stay intact. Or a row has other arrays
+                than those before it.
+            ValueError: a row that is done or does not exist, what cannot be stored, or a store that is not held.
+        """
+        if items:
+            self.write_packed(self.pack(items))
+
+    def pack(self, items: Mapping[int, Item]) -> dict[int, Parts]:
+        """Check a batch of rows and pack it for `write_packed`, without a write; raises as `write`."""
+        if refused := [row for row in items if not 0 <= row < len(self.counts) or self.counts[row] >= 0]:
+            raise ValueError(f"{self.folder}: row {refused[0]} is done or does not exist")
+        if not self._is_writable:
+            raise ValueError(f"{self.folder}: is read only, or was complete; write `with store:`")
+        rows = {row: self._packed(row, item) for row, item in items.items()}
+        self._check_layouts(rows)
+        return rows
+
+    def write_packed(self, rows: Mapping[int, Parts]) -> None:
+        """Store what `pack` gave, as `write` does."""
+        sizes = {row: row_bytes(sum(part.nbytes for part in parts.values()), len(parts)) for row, parts in rows.items()}
+        missing = partial(self._missing_bytes, sizes)
+        with told(self.folder, self.kind.content, missing):
+            for _ in ordered_map(self._write_row, rows.items(), workers=THREADS):
+                pass
+
+    def read(self, rows: Iterable[int] | None = None) -> Iterator[tuple[int, Item]]:
+        """(row, item) of rows that are done, by default of all; some are read ahead on threads.
+
+        Raises:
+            InputError: some are damaged on disk; all that are asked for are looked at, none is given after the first,
+                and they are removed, so that the next run makes them anew, where it can. Or the disk cannot be read.
+            ValueError: a row that is not done.
+        """
+        rows = np.flatnonzero(self.done).tolist() if rows is None else list(rows)
+        if missing := [row for row in rows if self.counts[row] < 0]:
+            raise ValueError(f"{self.folder}: row {missing[0]} is not done")
+        damaged: dict[int, Path] = {}
+        for row, item in zip(rows, ordered_map(self._read_item, rows, workers=THREADS), strict=True):
+            if item is None:
+                damaged[row] = self._places.path(row)
+            elif not damaged:
+                yield row, item
+        if damaged:
+            raise InputError(self._remove(damaged))
+
+    def _about(self, row: int, path: Path) -> str:
+        token = "" if self.tokens is None else f" {self.tokens[row]:x}"
+        return f"{self._manifest['fingerprint']} {path.name}{token}"
+
+    def _packed(self, row: int, item: Item) -> Parts:
+        try:
+            return self._pack(item)
+        except ValueError as error:
+            raise ValueError(f"{self.folder}: row {row}: {error}") from None
+
+    def _missing_bytes(self, sizes: Mapping[int, int]) -> int:
+        return sum(size for row, size in sizes.items() if self.counts[row] < 0)
+
+    def _write_row(self, row_parts: tuple[int, Parts]) -> None:
+        row, parts = row_parts
+        count = len(next(iter(parts.values())))
+        path = self._places.add(row, count, self.own)
+        write_arrays(path, parts, self._about(row, path), compress=self.kind.compress)
+        self.counts[row] = count
+
+    def _read_item(self, row: int) -> Item | None:
+        parts = self._read_parts(row)
+        return None if parts is None else self._unpack(parts)
+
+    def _read_parts(self, row: int) -> Parts | None:
+        """None where the file is damaged, or another's, or gone."""
+        path = self._places.path(row)
+        with told(self.folder, self.kind.content):
+            try:
+                return read_arrays(path, self._about(row, path))
+            except (InputError, FileNotFoundError):
+                return None
+
+    def _check_layouts(self, rows: Mapping[int, Parts]) -> None:
+        """What one row has, all have: nothing is lost, or made up, where rows are put together."""
+        layouts = {row: _layout_of(parts) for row, parts in rows.items()}
+        expected = self._layout or self._stored_layout() or next(iter(layouts.values()))
+        for row, layout in layouts.items():
+            if differs := difference(layout, expected):
+                advice = self.kind.advice("describe all of them alike")
+                raise InputError(f"{self.folder}: row {row}: {differs} as in the other {self.kind.rows}; {advice}")
+        self._layout = expected
+
+    def _stored_layout(self) -> dict[str, str] | None:
+        found = (self._read_parts(row) for row in np.flatnonzero(self.done).tolist())
+        return next((_layout_of(parts) for parts in found if parts), None)
+
+    def _remove(self, damaged: Mapping[int, Path]) -> str:
+        """What is told of damaged rows, which are no longer done where they can be made anew."""
+        row, path = next(iter(damaged.items()))
+        if self.kind.remake is None:
+            mend = "put back the files that were written here, or delete these to leave the rows out"
+        else:
+            self.counts[list(damaged)] = -1
+            mend = f"run again, which {self.kind.remake} them anew"
+            for file in damaged.values():
+                with suppress(OSError):
+                    file.unlink(missing_ok=True)
+            if any(file.exists() for file in damaged.values()):
+                mend = f"they cannot be removed; make the folder writable and {mend}"
+        return (
+            f"{self.folder}: {self.kind.content} of {len(damaged)} {self.kind.rows} are damaged on disk, the first in "
+            f"row {row} ({path.name}); {mend}"
+        )
+
+
+def open_rows(
+    folder: Path,
+    kind: Kind,
+    recipe: Mapping[str, Any],
+    sizes: Mapping[str, int],
+    *,
+    pack: Callable[[Item], Parts],
+    unpack: Callable[[Parts], Item],
+    waiting: Callable[[str], None] | None = None,
+    shard: Shard | None = None,
+    tokens: np.ndarray | None = None,
+) -> RowStore[Item]:
+    """The store in `folder`, which need not be there before the first row is written, nor be writable when all are.
+
+    Args:
+        folder: see `manifest.store_path`.
+        kind: what it holds.
+        recipe: what the rows are made from (JSON values only). Kept in plain text.
+        sizes: lengths of axes by name, first that of the rows.
+        pack: what is stored of an item, arrays by name; the first has a value for each of the row's entries.
+        unpack: the item again.
+        waiting: whoever writes waits for a process that does, and is told, in one line, for which; None = refuses.
+        shard: which writes, beside others.
+        tokens: see `RowStore`.
+
+    Raises:
+        InputError: made from something else, or no store at all.
+    """
+    folder = folder.absolute()  # the working directory may change
+    store = RowStore(folder, kind, sizes, shard, manifest_of(kind, recipe, sizes), waiting, pack, unpack, tokens)
+    with told(folder, kind.content):
+        check_owned(folder, kind)
+    store.look()
+    return store
+
+
+def row_bytes(num_bytes: float, num_arrays: int) -> int:
+    """Bytes on disk that a row takes at most whose values take `num_bytes`."""
+    return -(-int(num_bytes + num_arrays * ARRAY_OVERHEAD) // BLOCK) * BLOCK
+
+
+def require_space(folder: Path, num_bytes: int) -> None:
+    """Refuse to start what will not fit.
+
+    Raises:
+        InputError: less than `num_bytes` are free where `folder` is, or will be.
+    """
+    free = free_bytes(folder)
+    if free < num_bytes:
+        raise InputError(too_full(folder, num_bytes, free))
+
+
+def _layout_of(parts: Parts) -> dict[str, str]:
+    """What rows have in common: names, types and lengths of axes but for the first."""
+    return {name: f"{part.dtype}{list(part.shape[1:])}" for name, part in parts.items()}

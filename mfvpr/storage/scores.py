@@ -1,0 +1,37 @@
+"""Scores of all queries' candidates on disk, of shards: computed once, read by whichever comes last.
+
+A row store (`mfvpr.storage.rows`), whose rows are the `scores` float32 `[S, C]` of a query's candidates by S scorers,
+to the bit, and the `indices` int32 `[C]` of these.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mfvpr.storage.manifest import SCORES
+from mfvpr.storage.rows import RowStore, open_rows
+
+
+class QueryScores(NamedTuple):
+    """Of one query; see above."""
+
+    scores: np.ndarray
+    indices: np.ndarray
+
+
+ScoreStore = RowStore[QueryScores]
+
+
+def open_score_store(folder: Path, recipe: Mapping[str, Any], *, num_queries: int, **options: Any) -> ScoreStore:
+    """The store in `folder`; see `features.open_store`."""
+    return open_rows(folder, SCORES, recipe, {"num_queries": num_queries}, pack=_pack, unpack=_unpack, **options)
+
+
+def _pack(query: QueryScores) -> dict[str, np.ndarray]:
+    return {"scores": np.asarray(query.scores, np.float32), "indices": np.asarray(query.indices, np.int32)}
+
+
+def _unpack(parts: Mapping[str, np.ndarray]) -> QueryScores:
+    return QueryScores(parts["scores"], parts["indices"])

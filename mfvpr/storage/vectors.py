@@ -1,0 +1,33 @@
+"""Global descriptors of the images of one folder on disk: described once, read by every later run.
+
+A row store (`mfvpr.storage.rows`), whose rows are a `vector` float32 `[D]` or several `[V, D]`, to the bit.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mfvpr.storage.manifest import VECTORS
+from mfvpr.storage.rows import RowStore, open_rows, row_bytes
+
+VectorStore = RowStore[np.ndarray]
+
+
+def open_vector_store(folder: Path, recipe: Mapping[str, Any], *, num_images: int, **options: Any) -> VectorStore:
+    """The store in `folder`; see `features.open_store`."""
+    return open_rows(folder, VECTORS, recipe, {"num_images": num_images}, pack=_pack, unpack=_unpack, **options)
+
+
+def forecast_bytes(num_images: int, size: int) -> int:
+    """Bytes on disk that vectors of so many numbers take at most."""
+    return num_images * row_bytes(4 * size, 1)
+
+
+def _pack(vector: np.ndarray) -> dict[str, np.ndarray]:
+    return {"vector": np.asarray(vector, np.float32)}
+
+
+def _unpack(parts: Mapping[str, np.ndarray]) -> np.ndarray:
+    return parts["vector"]

@@ -1,0 +1,115 @@
+"""What is learned: a model is its start, and how its parameters score the candidates of a query."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mfvpr.reranking.ranking import combine, score_candidates
+from mfvpr.scoring.histogram import HistogramOfShifts
+from mfvpr.scoring.learned_weight import LearnedWeight
+from mfvpr.tuning.learning import losses
+from mfvpr.tuning.learning.losses import Loss
+from mfvpr.tuning.learning.parameters import from_logarithms, starts, to_logarithms
+from mfvpr.tuning.learning.splits import Batch
+from mfvpr.types import Array, Matches
+from mfvpr.utils.numerics import masked_mean
+
+Parameters = dict[str, Any]  # `numbers` by name and `c` as logarithms, `sharpness`, `weight`
+Objective = Callable[["Parameters", Batch], Array]
+
+SHARPNESS = 2.0  # of the loss at the start, per unit of the scores
+LEAST_C = 1e-3  # of the filter at the start, in units of the scores
+
+
+@dataclass(frozen=True)
+class Model:
+    """One way to score.
+
+    Attributes:
+        scorer: whose numbers are learned; its other parameters stay.
+        start: the parameters to begin with.
+        unit: spread of the scores at the start; what the loss sees is in this unit.
+        teacher: says which matches of a right pair are right, and these teach the match weight; None = the ranking
+            teaches.
+    """
+
+    scorer: Any
+    start: Parameters
+    unit: float
+    teacher: HistogramOfShifts | None = None
+
+    @classmethod
+    def of(cls, scorer: Any, unit: float, *, c: float | None = None, weight: LearnedWeight | None = None) -> "Model":
+        """A model that starts from a hard scorer's values.
+
+        Args:
+            scorer: the hand-set one.
+            unit: spread of its scores.
+            c: the filter's weight to start with; None = not fused.
+            weight: the match weight to start with; None = the scorer's own, not learned.
+        """
+        numbers = to_logarithms(starts(scorer, unit))
+        start: Parameters = {"numbers": numbers, "sharpness": jnp.log(jnp.asarray(SHARPNESS))}
+        if c is not None:
+            start["c"] = jnp.log(jnp.asarray(max(c, LEAST_C * unit) / unit))
+        if weight is not None:
+            start["weight"] = weight
+        return cls(scorer, start, unit)
+
+    @classmethod
+    def of_matches(cls, scorer: Any, weight: LearnedWeight, teacher: HistogramOfShifts) -> "Model":
+        """A model whose match weight alone is learned, match by match.
+
+        Args:
+            scorer: the hand-set one.
+            weight: to start with.
+            teacher: has a capacity.
+        """
+        return cls(scorer, {"numbers": {}, "weight": weight}, 1.0, teacher)
+
+    def scorer_of(self, parameters: Parameters) -> Any:
+        """The soft scorer."""
+        numbers = from_logarithms(parameters["numbers"])
+        weight = {"weight": parameters["weight"]} if "weight" in parameters else {}
+        return replace(self.scorer, **numbers, **weight)
+
+    def c_of(self, parameters: Parameters) -> Array | None:
+        """Weight of the filter, None where it is not asked."""
+        return self.unit * jnp.exp(parameters["c"]) if "c" in parameters else None
+
+    def values(self, parameters: Parameters) -> dict[str, float]:
+        """What was learned, by name, but for the match weight."""
+        scorer, c = self.scorer_of(parameters), self.c_of(parameters)
+        numbers = {name: float(getattr(scorer, name)) for name in parameters["numbers"]}
+        return numbers if c is None else numbers | {"c": float(c)}
+
+    def objective(self, loss: Loss) -> Objective:
+        """Parameters and a batch -> mean loss of its queries; of its matches, where these teach."""
+        return self._of_ranking(loss) if self.teacher is None else partial(_of_matches, self.teacher)
+
+    def _of_ranking(self, loss: Loss) -> Objective:
+        def mean(parameters: Parameters, batch: Batch) -> Array:
+            scorer, c = self.scorer_of(parameters), self.c_of(parameters)
+            scores = jax.vmap(lambda matches: score_candidates(scorer, matches))(batch.matches)
+            scores = scores if c is None else combine(batch.filter_scores, scores, c=c)
+            logits = scores / self.unit * jnp.exp(parameters["sharpness"])
+            return losses.mean_loss(loss, logits, batch.positives, batch.mask)
+
+        return mean
+
+
+def _of_matches(teacher: HistogramOfShifts, parameters: Parameters, batch: Batch) -> Array:
+    """Cross entropy of whether a match is right, where right and wrong ones count the same in all, `[]`, in nats."""
+    weight: LearnedWeight = parameters["weight"]
+
+    def judged(matches: Matches, positive: Array) -> tuple[Array, Array]:
+        peak = teacher.dominant_shift(matches, refine=True)
+        return weight.logits(matches), teacher.agrees(matches, peak) & positive
+
+    logits, right = (values.reshape(-1) for values in jax.vmap(jax.vmap(judged))(batch.matches, batch.positives))
+    wrong = (batch.matches.mask & batch.mask[..., None]).reshape(-1) & ~right
+    return (masked_mean(jax.nn.softplus(-logits), right) + masked_mean(jax.nn.softplus(logits), wrong)) / 2

@@ -1,0 +1,49 @@
+"""A linear projection of local descriptors to fewer dimensions."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mfvpr.types import Array, Features, value
+from mfvpr.utils.numerics import masked, safe_sqrt
+
+
+@value
+class Projection:
+    """x -> x M / |x M|; a descriptor that M annihilates, and padding, become 0.
+
+    Attributes:
+        matrix: `[D, d]`.
+    """
+
+    matrix: Array  # [D, d]
+
+    def __call__(self, features: Features) -> Features:
+        """Features whose descriptors `[..., N, D]` became `[..., N, d]`, of unit length; all else stays."""
+        descriptors = masked(jnp.asarray(features.descriptors, dtype=self.matrix.dtype), features.mask)
+        projected = jnp.matmul(descriptors, self.matrix, precision=jax.lax.Precision.HIGHEST)
+        length = safe_sqrt(jnp.sum(projected**2, axis=-1, keepdims=True))
+        return replace(features, descriptors=projected / jnp.where(length > 0, length, 1.0))
+
+    @classmethod
+    def principal(cls, descriptors: np.ndarray, dimension: int) -> "Projection":
+        """The projection that keeps most of the descriptors' squared length: PCA without centering.
+
+        Without a mean, since matching compares dot products, which a translation would change. The columns are
+        orthonormal, the strongest first.
+
+        Args:
+            descriptors: `[n, D]`, all real.
+            dimension: d, at most D.
+
+        Raises:
+            ValueError: `dimension` is not in 1 ... D.
+        """
+        available = np.shape(descriptors)[1]
+        if not 1 <= dimension <= available:
+            raise ValueError(f"Projection.principal(dimension={dimension}): expected 1 to {available}")
+        values = np.asarray(descriptors, np.float64)
+        _, vectors = np.linalg.eigh(values.T @ values)  # D x D: far cheaper than the singular vectors of n x D
+        return cls(jnp.asarray(vectors[:, : -dimension - 1 : -1], dtype=float))

@@ -1,0 +1,214 @@
+"""Gradient descent on a pytree of arrays: validated, stopped in time, and resumed to the bit."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from mfvpr.tuning.learning import checkpoints
+from mfvpr.types import Array
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.progress import Track, untracked
+
+
+class TrainingError(InputError):
+    """Something became NaN or infinite. The message is one line: when, what, with which values, and the mend."""
+
+
+class Record(NamedTuple):
+    """One validation: after how many steps, their mean loss since the one before, and its result (smaller = better).
+
+    Before the first step there is no loss; without `validate` there is no validation.
+    """
+
+    step: int
+    loss: float | None
+    validation: float | None
+
+
+class Fit(NamedTuple):
+    """What a training came to.
+
+    parameters: those of the best validation, the start included; the last ones where nothing validates.
+    step: after how many steps they were reached.
+    history: every validation, the start first.
+    ended: why the training ended, in words.
+    """
+
+    parameters: Any
+    step: int
+    history: tuple[Record, ...]
+    ended: str
+
+
+class _State(NamedTuple):
+    """All that a training goes on from, but for its history."""
+
+    parameters: Any
+    best: Any
+    optimizer: Any
+
+
+def fit(
+    parameters: Any,
+    objective: Callable[[Any, Any], Array],
+    batches: Callable[[int], Any],
+    *,
+    optimizer: optax.GradientTransformation,
+    steps: int,
+    validate: Callable[[Any], float] | None = None,
+    every: int = 10,
+    patience: int | None = None,
+    folder: Path | None = None,
+    recipe: Mapping[str, Any] | None = None,
+    track: Track = untracked,
+) -> Fit:
+    """Minimize the objective.
+
+    Args:
+        parameters: pytree of floating-point arrays to start from.
+        objective: parameters and a batch -> loss `[]`; compiled once per shape of the batches.
+        batches: a step, counted from 0, -> its batch; the same whenever it is asked.
+        optimizer: of optax.
+        steps: updates in all, those of a run that is resumed included.
+        validate: parameters -> a number, smaller = better.
+        every: steps from one validation, and checkpoint, to the next; the last step has both as well.
+        patience: validations without a gain after which to stop.
+        folder: where checkpoints are kept; a training that is found there goes on, and ends with the very bits of one
+            that was never interrupted (given the same `every`), also where it had ended and is given more steps.
+        recipe: JSON values that say what is trained: the model, the data, every setting that the result depends on.
+        track: progress over the steps.
+
+    Raises:
+        InputError: the folder cannot be used, another process trains in it, or it holds something else, or the
+            checkpoint of something else, or of more steps.
+        TrainingError: loss, gradient, parameters or validation are not finite. The last checkpoint stays.
+    """
+    if every < 1 or steps < 0 or (patience is not None and (validate is None or patience < 1)):
+        raise ValueError(f"fit({steps=}, {every=}, {patience=}): expected counts, and a patience only with validate")
+    update = _update(objective, optimizer)
+    training = _Training(update, batches, validate, steps, every, patience, folder, recipe or {}, track)
+    parameters = _strong(parameters)
+    start = _State(parameters, parameters, _strong(optimizer.init(parameters)))
+    with checkpoints.held(folder) if folder else nullcontext():
+        state, history = training.descend(*training.begin(start))
+    exhausted = _exhausted(history, patience)
+    ended = f"no gain in {patience} validations" if exhausted else f"all {steps} steps are done"
+    return Fit(state.best, _best(history).step, tuple(history), ended)
+
+
+def _update(objective: Callable, optimizer: optax.GradientTransformation) -> Callable:
+    """The compiled step: parameters, optimizer state, batch -> both updated, loss, gradient, all is finite `[]`."""
+
+    @jax.jit
+    def update(parameters: Any, memory: Any, batch: Any) -> tuple[Any, Any, Array, Any, Array]:
+        loss, gradient = jax.value_and_grad(objective)(parameters, batch)
+        with jax.numpy_dtype_promotion("standard"):  # Optax's Adam multiplies a float with an integer
+            change, memory = optimizer.update(gradient, memory, parameters)
+        parameters = optax.apply_updates(parameters, change)
+        finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((loss, gradient, parameters))]
+        return parameters, _strong(memory), loss, gradient, jnp.all(jnp.stack(finite))
+
+    return update
+
+
+@dataclass(frozen=True)
+class _Training:
+    """The way from a state and its history to the next; the fields are the arguments of `fit`."""
+
+    update: Callable
+    batches: Callable[[int], Any]
+    validate: Callable[[Any], float] | None
+    steps: int
+    every: int
+    patience: int | None
+    folder: Path | None
+    recipe: Mapping[str, Any]
+    track: Track
+
+    def begin(self, state: _State) -> tuple[_State, list[Record], list[float]]:
+        """Where the folder's training stands, or `state` at the start; and the losses since the last validation."""
+        stored = checkpoints.restore(self.folder, self.recipe, state) if self.folder else None
+        if stored is None:
+            return state, [Record(0, None, self.validation(state.parameters, 0))], []
+        state, (rows, losses) = _strong(stored[0]), stored[1]
+        history = [Record(*row) for row in rows]
+        if (done := history[-1].step + len(losses)) > self.steps:
+            raise InputError(
+                f"{self.folder}: this checkpoint is of step {done}, expected at most {self.steps}; ask for more steps, "
+                "or choose another folder"
+            )
+        return state, history, losses
+
+    def descend(self, state: _State, history: list[Record], losses: list[float]) -> tuple[_State, list[Record]]:
+        """All steps that are left, unless patience ends before."""
+        done = history[-1].step + len(losses)
+        left = 0 if _exhausted(history, self.patience) else self.steps - done
+        for step in self.track(range(done, done + left), left):
+            state, loss = self.advance(state, step)
+            losses = [*losses, loss]
+            if due := (step + 1) % self.every == 0:
+                state, history, losses = self.validated(state, history, losses)
+            if self.folder and (due or step + 1 == self.steps):
+                checkpoints.save(self.folder, step + 1, self.recipe, state, (history, losses))
+            if _exhausted(history, self.patience):
+                break
+        if losses:  # after the checkpoint: whoever asks for more steps would not have validated here
+            state, history, _ = self.validated(state, history, losses)
+        return state, history
+
+    def validated(self, state: _State, history: list[Record], losses: list[float]) -> tuple[_State, list[Record], list]:
+        """With one more record; no losses are left."""
+        step = history[-1].step + len(losses)
+        history = [*history, Record(step, float(np.mean(losses)), self.validation(state.parameters, step))]
+        return state._replace(best=state.parameters) if _best(history) is history[-1] else state, history, []
+
+    def advance(self, state: _State, step: int) -> tuple[_State, float]:
+        """One step, and its loss before it."""
+        batch = self.batches(step)
+        parameters, memory, loss, gradient, finite = self.update(state.parameters, state.optimizer, batch)
+        if not finite:
+            suspects = checkpoints.named({"loss": loss, "gradient": gradient, "updated": parameters})
+            culprit = next(name for name, leaf in suspects.items() if not np.all(np.isfinite(leaf)))
+            raise self.broken(f"{culprit} of batch {step}", state.parameters, step)
+        return _State(parameters, state.best, memory), float(loss)
+
+    def validation(self, parameters: Any, step: int) -> float | None:
+        if self.validate is None:
+            return None
+        value = float(self.validate(parameters))
+        if not math.isfinite(value):
+            raise self.broken("validation", parameters, step)
+        return value
+
+    def broken(self, what: str, parameters: Any, step: int) -> TrainingError:
+        leaves = checkpoints.named(parameters).items()
+        scalars = [f"{name or 'parameter'}={float(leaf):.6g}" for name, leaf in leaves if leaf.ndim == 0]
+        values = f" at {', '.join(scalars)}" if scalars else ""
+        saved = self.folder and checkpoints.newest(self.folder)
+        kept = f"the last good checkpoint is {saved}" if saved else "there is no checkpoint yet"
+        return TrainingError(
+            f"step {step}: {what} is not finite{values}; {kept}; look at the data, or lower the learning rate"
+        )
+
+
+def _best(history: Sequence[Record]) -> Record:
+    """The first record of the smallest validation; the last record where nothing validates."""
+    validated = [(record.validation, record.step, record) for record in history if record.validation is not None]
+    return min(validated)[-1] if validated else history[-1]
+
+
+def _exhausted(history: Sequence[Record], patience: int | None) -> bool:
+    return patience is not None and len(history) - 1 - history.index(_best(history)) >= patience
+
+
+def _strong(tree: Any) -> Any:
+    """Arrays of a definite type: a Python number would compile once more when an array takes its place."""
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=jnp.result_type(leaf)), tree)

@@ -1,0 +1,10 @@
+"""Parameters of the re-ranking searched over whole data sets, in compiled calls on cached matches."""
+
+from mfvpr.tuning.sweeps.axes import Axes
+from mfvpr.tuning.sweeps.outcome import Outcome
+from mfvpr.tuning.sweeps.search import search_grid, search_optuna
+from mfvpr.tuning.sweeps.settings import Setting, grid
+from mfvpr.tuning.sweeps.sweep import result_bytes, sweep
+
+__all__ = ["Axes", "Outcome", "Setting", "grid", "result_bytes", "search_grid", "search_optuna",
+           "sweep"]  # fmt: skip

@@ -1,0 +1,256 @@
+"""Every setting of a sweep on every query: scores, rankings, and of those the first few rows.
+
+Settings are batch axes of one compiled call. Matches are scored pair by pair, whatever query they belong to. Work goes
+block by block (some settings, some queries), which bounds the memory and is where an interrupted sweep goes on.
+"""
+
+import itertools
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from mfvpr.matching.match_set import MatchSet, Scales, queries_that_fit, scales, shapes
+from mfvpr.reranking import grids, ranking
+from mfvpr.reranking.batched_scoring import PaddedBatch, all_batches, fuse_all, scored
+from mfvpr.reranking.ranking import FilterScore, Ties, filter_scores, indexed
+from mfvpr.scoring.scorer import check_host, on_host
+from mfvpr.tuning.sweeps.settings import FUSION, Group, Setting, distinct, groups
+from mfvpr.types import Array, Matches, Shortlist, per_match, per_pair
+from mfvpr.utils.arrays import read_arrays, write_arrays
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.fingerprints import content_hash
+from mfvpr.utils.numerics import Device, compiled
+from mfvpr.utils.progress import Track, untracked
+
+SETTINGS_PER_BLOCK = 64
+_ALONE = "alone"  # the c of a score that is not fused
+
+
+@dataclass(frozen=True)
+class Work:
+    """What `sweep` was asked for, and a part of the queries.
+
+    Attributes:
+        match_set: of all queries.
+        queries: the part.
+        settings: that a program serves, for which the batches are made.
+        candidates: of the part, `[q, C]`.
+        views: V times the candidates `[q, C]` bool that are ranked.
+        depth: rows kept of each ranking.
+        ties: as in `reranking.rank_shortlist`.
+        filter_score: as in `reranking.fuse_shortlist`.
+    """
+
+    match_set: MatchSet | Scales
+    queries: range
+    settings: float
+    candidates: Shortlist
+    views: Sequence[np.ndarray]
+    depth: int
+    ties: Ties
+    filter_score: FilterScore
+
+    @cached_property
+    def digest(self) -> str:
+        """Of the matches, how scales are fused, the shortlist and the views of these queries."""
+        taken = [scale.take(self.queries) for scale in scales(self.match_set)]
+        fusion = (self.match_set.weights, self.match_set.normalize) if isinstance(self.match_set, Scales) else ()
+        return content_hash(
+            fusion, [(scale.counts, scale.matches) for scale in taken], self.candidates, list(self.views)
+        )
+
+    def parts(self, size: int) -> Iterator["Work"]:
+        """The same for at most `size` queries at a time."""
+        for start in range(0, len(self.queries), size):
+            part = slice(start, start + size)
+            candidates = jax.tree.map(lambda values: values[part], self.candidates)  # noqa: B023
+            views = [view[part] & candidates.mask for view in self.views]
+            yield replace(self, queries=self.queries[part], candidates=candidates, views=views)
+
+
+def sweep(
+    scorer: Any, settings: Sequence[Setting], match_set: MatchSet | Scales, candidates: Shortlist, *,
+    views: Sequence[np.ndarray] | None = None, depth: int = 10, ties: Ties = "filter",
+    filter_score: FilterScore = "cosine",
+    settings_per_block: int | None = None, queries_per_block: int | None = None,
+    folder: Path | None = None, devices: Sequence[Device] | None = None, track: Track = untracked,
+) -> np.ndarray:  # fmt: skip
+    """The first rows of every query's ranking by every setting.
+
+    Args:
+        scorer: whose other parameters stay.
+        settings: S times values by name, the same names in each: fields of the scorer (numbers are batch axes, what
+            is static costs a program for each value), `weight` (a Weight), `max_distance` of matches, and `c` of the
+            fusion with the filter (None = balanced). Without `c` the score alone ranks.
+        match_set: matches of Q queries with C candidates; those of several scales are scored one by one and fused over
+            the candidates that are ranked.
+        candidates: their shortlist.
+        views: V times the candidates `[Q, C]` bool that are ranked; by default one, all of the shortlist.
+        depth: how many rows of a ranking are kept.
+        ties: as in `reranking.rank_shortlist`.
+        filter_score: as in `reranking.fuse_shortlist`.
+        settings_per_block: by default 64. The result does not depend on it, nor on the next.
+        queries_per_block: by default what 256 MB hold.
+        folder: where finished blocks are kept, to be read instead of being computed again; None = nowhere. Blocks of
+            other matches, shortlists, values or scorers, by what their code computes, may lie there as well. A scorer
+            that calls back to Python, or scores on the host, is computed anew: nobody sees what that does.
+        devices: that share the batches of pairs; no bit of the scores depends on it. None = the one that JAX takes.
+        track: progress over blocks.
+
+    Returns:
+        `[V, S, Q, depth]` int32 database rows, best first, -1 where there is none.
+    """
+    check_host(scorer)
+    names = {name for setting in settings for name in setting}
+    grids.refuse_own_names(scorer, names, reserved=(*grids.WEIGHTINGS, FUSION))
+    num_queries = len(candidates.mask)
+    views = [candidates.mask] if views is None else views
+    scored_once, places = distinct(settings)
+    per_block = min(settings_per_block or SETTINGS_PER_BLOCK, len(scored_once))
+    queries = queries_per_block or queries_that_fit(match_set, per_block)
+    found_groups = list(groups(scorer, scored_once, match_set.image_sizes))
+    per_program = len(scored_once) / len(found_groups)
+    work = Work(match_set, range(num_queries), per_program, candidates, views, depth, ties, filter_score)
+    if folder is not None:
+        found_groups = [replace(group, program=group_program(work, group)) for group in found_groups]
+    blocks = [block for group in found_groups for block in group.blocks(per_block)]
+    found = np.full((len(views), len(settings), num_queries, depth), -1, np.int32)
+    steps = ((part, block) for part in work.parts(queries) for block in blocks)
+    held: dict[range, list[PaddedBatch]] = {}
+    for part, block in track(steps, len(blocks) * -(-num_queries // queries)):
+        if part.queries not in held:  # the batches of one part at a time, and only if some block needs them
+            held = {part.queries: []}
+        sharing = [places[row] for row in dict.fromkeys(block.rows.reshape(-1).tolist())]
+        wanted, shares = list(itertools.chain.from_iterable(sharing)), list(map(len, sharing))
+        cs = [settings[place].get(FUSION, _ALONE) for place in wanted]
+        compute = partial(_rows, part, block, held[part.queries], cs, shares, devices)
+        rows = _kept(folder, part, block, cs, compute)
+        found[:, wanted, part.queries.start : part.queries.stop] = rows
+    return found
+
+
+def result_bytes(num_views: int, num_settings: int, num_queries: int, depth: int) -> int:
+    """Bytes that `sweep` returns."""
+    return 4 * num_views * num_settings * num_queries * depth
+
+
+def _rows(
+    part: Work, block: Group, held: list[PaddedBatch], cs: Sequence[Any], shares: Sequence[int],
+    devices: Sequence[Device] | None,
+) -> np.ndarray:  # fmt: skip
+    """`[V, W, q, depth]`: the block's distinct settings, each as often as it has values of c."""
+    if not held:
+        held.extend(all_batches(part.match_set, part.queries, settings=part.settings))
+    shape = len(scales(part.match_set)), *part.candidates.mask.shape
+    scores = block_scores(block, held, shape, devices)
+    _, first = np.unique(block.rows, return_index=True)
+    scores = scores.reshape(shape[0], -1, *shape[1:])[:, np.sort(first)]
+
+    def first_rows(view: np.ndarray) -> np.ndarray:
+        return _first_rows(part, np.repeat(fuse_all(part.match_set, scores, view), shares, axis=0), cs, view)
+
+    return np.stack([first_rows(view) for view in part.views])
+
+
+def block_scores(
+    block: Group, held: Sequence[PaddedBatch], shape: tuple[int, int, int], devices: Sequence[Device] | None
+) -> np.ndarray:
+    """`[S, G, W, q, C]` of every scale; a pair without matches scores 0."""
+    scores = np.zeros((*block.rows.shape, math.prod(shape)), np.float32)
+    inputs = block.scorer, block.settings, block.weightings
+    for places, values in scored(_score_settings, inputs, held, devices=devices):
+        scores[..., places] = values
+    return np.moveaxis(scores.reshape(*block.rows.shape, *shape), 2, 0)
+
+
+def _score_settings(matches: Matches, scorer: Any, *values: Mapping[str, Array]) -> Array:
+    return grids.score_settings(scorer, matches, *values)
+
+
+def _first_rows(part: Work, scores: np.ndarray, cs: Sequence[Any], view: np.ndarray) -> np.ndarray:
+    """`[W, q, depth]` database rows by scores `[W, q, C]`, each fused with its own c."""
+    indices, of_filter = part.candidates.indices, filter_scores(part.candidates, part.filter_score)
+    rows = np.full((*scores.shape[:2], part.depth), -1, np.int32)
+    kinds = np.array(["alone" if c == _ALONE else "balanced" if c is None else "given" for c in cs])
+    for kind in np.unique(kinds):
+        members = np.flatnonzero(kinds == kind)
+        c = np.array([cs[int(member)] for member in members], np.float32) if kind == "given" else None
+        tie_break = indices if indexed(part.ties) else None
+        order = np.asarray(_orders(of_filter, scores[members], c, view, tie_break, fused=kind != "alone"))
+        order = order[..., : part.depth]
+        ranked = np.where(np.take_along_axis(view[None], order, -1), np.take_along_axis(indices[None], order, -1), -1)
+        rows[members, :, : ranked.shape[-1]] = ranked
+    return rows
+
+
+@partial(compiled, static_argnames="fused")
+def _orders(
+    of_filter: Array, scores: Array, c: Array | None, view: Array, tie_break: Array | None, *, fused: bool
+) -> Array:
+    """`[W, q, C]` positions into the shortlist, best first, one ranking of all queries at a time."""
+
+    def one(scores_c: tuple[Array, Array | None]) -> Array:
+        scores, c = scores_c
+        return ranking.rank(ranking.fuse(of_filter, scores, view, c) if fused else scores, view, tie_break=tie_break)
+
+    return jax.lax.map(one, (scores, c))
+
+
+def _kept(
+    folder: Path | None, part: Work, block: Group, cs: Sequence[Any], compute: Callable[[], np.ndarray]
+) -> np.ndarray:
+    """A block's rows, from its file where that is there and whole; else computed and written."""
+    if folder is None or "callback" in block.program:
+        return compute()
+    key = _fingerprint(part, block, cs)
+    path = folder / f"{key}.npz"
+    try:
+        return read_arrays(path, key)["rows"]
+    except (OSError, InputError):
+        pass  # not there, or damaged
+    rows = compute()
+    with suppress(FileNotFoundError):  # the folder goes where another process ends the same sweep meanwhile
+        write_arrays(path, {"rows": rows}, key)
+    return rows
+
+
+def _fingerprint(part: Work, block: Group, cs: Sequence[Any]) -> str:
+    """All that a block's rows depend on: matches and shortlist, the scorer's program, and its numbers."""
+    options = (
+        part.depth,
+        part.ties,
+        part.filter_score,
+        [repr(c) for c in cs],
+        block.rows.tolist(),
+        [*block.settings, *block.weightings],
+    )
+    numbers = block.scorer, dict(block.settings), dict(block.weightings)
+    return content_hash(repr(options), block.program, part.digest, numbers)
+
+
+def group_program(work: Work, group: Group) -> str:
+    """What the scorer computes of batches of these shapes: a user's code may change while its class keeps its name."""
+    if on_host(group.scorer):
+        return "callback"
+
+    def text(matches: Matches, size: int, pairs: int) -> str:
+        entries, of_pair = per_match(matches).items(), per_pair(matches).items()
+        example = {name: np.zeros((pairs, size, *values.shape[1:]), values.dtype) for name, values in entries}
+        shape = {name: np.shape(values)[name.endswith("1") :] for name, values in of_pair}  # of one candidate
+        ones = {name: np.ones((pairs, *shape[name]), values.dtype) for name, values in of_pair}
+        batch = Matches(**example, **ones, mask=np.ones((pairs, size), bool))
+        settings = {name: axis[:1] for name, axis in group.settings.items()}
+        score_settings = partial(grids.score_settings)  # equal to no other: nor is another class's program
+        return jax.jit(score_settings).lower(group.scorer, batch, settings, group.weightings).as_text()
+
+    sets = scales(work.match_set)
+    return "".join(
+        text(scale.matches[0], *shape) for scale in sets for shape in shapes(scale, settings=work.settings).items()
+    )

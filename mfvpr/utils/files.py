@@ -1,0 +1,111 @@
+"""Files that are whole or not there at all."""
+
+import os
+import re
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from mfvpr.utils.errors import InputError
+
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
+_TEMPORARY = re.compile(r"\..+-[a-z0-9_]{8}(\.\w+)?")  # names that `replacing` makes
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary path beside `path` (same suffix) that replaces it when the block ends without an error."""
+    with _beside(path) as temporary:
+        yield temporary
+        temporary.chmod(0o644)  # mkstemp's 0600 would surprise whoever shares the folder
+        os.replace(temporary, path)
+
+
+@contextmanager
+def placing(path: Path) -> Iterator[Path]:
+    """As `replacing`, but what is there stays: of several that try at the same time, the first counts."""
+    with _beside(path) as temporary:
+        yield temporary
+        temporary.chmod(0o644)
+        with suppress(FileExistsError):
+            os.link(temporary, path)
+
+
+@contextmanager
+def _beside(path: Path) -> Iterator[Path]:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def require_file(path: Path, expected: str = "a file") -> None:
+    """Refuse a path that is no regular file: a pipe would block its reader forever.
+
+    Raises:
+        InputError: the path is something else, or there is nothing.
+    """
+    if not path.is_file():
+        got = "a folder" if path.is_dir() else "a pipe or device" if path.exists() else "nothing"
+        raise InputError(f"{path}: expected {expected}, got {got}; check the path")
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what `replacing` left below a folder when its process was killed; nobody may be writing there."""
+    for path in folder.rglob(".*"):
+        if _TEMPORARY.fullmatch(path.name) and path.is_file():
+            path.unlink()
+
+
+def printable(text: str) -> str:
+    """`text` that any stream, figure or file of UTF-8 takes: what no UTF-8 stands for is written as \\udcXX.
+
+    Such characters are how Python gives the bytes of a file name that is not UTF-8; in JSON, \\udcXX reads back as the
+    same name.
+    """
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
+def clipped(text: str, most: int) -> str:
+    """`text` of at most so many characters, the middle left out."""
+    half = (most - 1) // 2
+    return text if len(text) <= most else f"{text[:half]}\N{HORIZONTAL ELLIPSIS}{text[-half:]}"
+
+
+def written_once(path: Path, text: str) -> str:
+    """What `path` holds: this `printable` text, where it was not there."""
+    with placing(path) as temporary:
+        temporary.write_text(printable(text), encoding="utf-8")
+    return path.read_text(encoding="utf-8")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write `printable` text as UTF-8, atomically."""
+    with replacing(path) as temporary:
+        temporary.write_text(printable(text), encoding="utf-8")
+
+
+def canonical_name(path: Path | str) -> str:
+    """Absolute path that is the same for every spelling: links to folders are followed, a link to a file is not."""
+    path = Path(path)
+    return str(path.parent.resolve() / path.name)
+
+
+def below(root: Path, name: str) -> Path:
+    """The file of a folder that a name from elsewhere stands for, which may not be there; its links are followed.
+
+    Raises:
+        InputError: a name that leads out of the folder: from another root, with "..", or by a link.
+    """
+    try:
+        path = (root / name).resolve()
+        if ".." not in Path(name).parts and path.is_relative_to(root.resolve()):
+            return path
+    except (OSError, RuntimeError, ValueError):  # links in a circle, a character that no name has
+        pass
+    raise InputError(f"{clipped(name, 200)!r}: expected the name of a file below {root}, got one that leads elsewhere")

@@ -1,0 +1,219 @@
+"""The few array idioms that every room shares: masked reductions, safe roots, capacities, and where `jit` begins."""
+
+import os
+import re
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial, wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.core import Tracer
+from jax.tree_util import Partial
+from jax.typing import ArrayLike
+
+from mfvpr.utils.errors import NoGradientError
+
+if TYPE_CHECKING:  # which of jax's names is a class for whoever checks types
+    from jaxlib._jax import Device
+else:
+    Device = jax.Device
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+Tree = TypeVar("Tree")
+
+
+def masked(values: Array, mask: Array, fill: ArrayLike = 0.0) -> Array:
+    """`values` where `mask`, `fill` elsewhere; trailing axes of `values` that `mask` lacks are broadcast.
+
+    Padding may hold NaN: apply this before any arithmetic, or gradients turn NaN as well.
+    """
+    extra = values.ndim - mask.ndim
+    return jnp.where(mask.reshape(mask.shape + (1,) * extra), values, fill)
+
+
+def or_nan(values: Array, mask: Array) -> Array:
+    """`values` where `mask`, NaN elsewhere: there is no value.
+
+    Where nothing is traced the host makes the NaN, as `jax_debug_nans` stops at those that a program makes.
+    """
+    if is_concrete((values, mask)):
+        return jax.device_put(np.where(mask, values, np.nan))
+    return jnp.where(mask, values, jnp.nan)
+
+
+def as_float(values: ArrayLike) -> Array:
+    """`values` themselves where they are floating point, else in the default float type."""
+    values = jnp.asarray(values)
+    return values if jnp.issubdtype(values.dtype, jnp.floating) else values.astype(float)
+
+
+def at_least_single(values: ArrayLike) -> Array:
+    """`values` as `as_float`, and float16 or bfloat16 as float32, which holds their products exactly."""
+    values = as_float(values)
+    return values.astype(jnp.float32) if jnp.finfo(values.dtype).bits < 32 else values
+
+
+def positive(value: ArrayLike | None, dtype: Any) -> Array:
+    """A width or a temperature where it is above 0, NaN elsewhere: without one there is no score."""
+    value = jnp.asarray(value, dtype=dtype)
+    return jnp.where(value > 0, value, jnp.nan)
+
+
+def masked_mean(values: Array, mask: Array, weights: Array | None = None) -> Array:
+    """(Weighted) mean over axis 0 of the real entries; 0 where there are none."""
+    weights = masked(jnp.ones(mask.shape, values.dtype) if weights is None else weights, mask)
+    total = jnp.sum(weights)
+    weighted = masked(values, mask) * weights.reshape(weights.shape + (1,) * (values.ndim - 1))
+    return jnp.sum(weighted, axis=0) / jnp.where(total == 0, 1.0, total)
+
+
+def masked_median(values: Array, mask: Array) -> Array:
+    """Median over axis 0 of the real entries (mean of the middle two when even); 0 where there are none."""
+    if len(mask) == 0:
+        return jnp.zeros(values.shape[1:], values.dtype)
+    ordered = jnp.sort(masked(values, mask, jnp.inf), axis=0)
+    real = jnp.sum(mask)
+    middle = (ordered[jnp.maximum(real - 1, 0) // 2] + ordered[jnp.minimum(real // 2, len(mask) - 1)]) / 2
+    return jnp.where(real > 0, middle, 0.0)
+
+
+def where_finite(score: Array, *inputs: Array) -> Array:
+    """`score` where all inputs are finite, else NaN, which ranks last: of NaN or infinity no score says anything."""
+    return jnp.where(jnp.all(jnp.stack([jnp.all(jnp.isfinite(values)) for values in inputs])), score, jnp.nan)
+
+
+def safe_sqrt(squared: Array) -> Array:
+    """Square root of max(x, 0) whose gradient at 0 is 0 instead of infinite."""
+    positive = squared > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
+
+
+def without_gradient(why: str, values: Tree) -> Tree:
+    """The values, of which nobody can ask for a derivative.
+
+    Raises:
+        NoGradientError: somebody does; `why` is what he is told.
+    """
+
+    @jax.custom_jvp
+    def same(values: Tree) -> Tree:
+        return values
+
+    @same.defjvp
+    def refuse(*_: Any) -> Any:
+        raise NoGradientError(why)
+
+    return same(values)
+
+
+def round_up(size: int, multiple: int) -> int:
+    """The smallest multiple of `multiple` that is at least `size` (and at least one `multiple`)."""
+    return max(1, -(-size // multiple)) * multiple
+
+
+def masked_std(values: Array, mask: Array) -> Array:
+    """Standard deviation of all real entries, `[]`, with a gradient of 0 where it is 0; 0 where there are none."""
+    values, mask = values.reshape(-1), mask.reshape(-1)
+    return safe_sqrt(masked_mean(masked(values - masked_mean(values, mask), mask) ** 2, mask))
+
+
+def compiled(function: Function, **options: Any) -> Function:
+    """`jax.jit` of what is plural, where it is defined; under a caller's `jit` it is inlined.
+
+    The classes of all nodes of the arguments choose the program as well, whoever registered them.
+
+    With a plain function among the arguments, such as a user's scorer, or the weight of one, it runs op by op: a kept
+    program would go on with what the function's closure held at the first call (as it does where a function stands in a
+    static field). `held` is for many calls in a row.
+    """
+    programs: dict[tuple[type, ...], Any] = {}
+
+    @wraps(function)
+    def call(*arguments: Any, **named: Any) -> Any:
+        leaves, classes = leaves_and_classes((arguments, named))
+        if any(map(callable, leaves)):
+            return function(*arguments, **named)
+        if classes not in programs:  # `jit` shares programs between equal functions, and a `partial` equals no other
+            programs.setdefault(classes, jax.jit(partial(function), **options))
+        return programs[classes](*arguments, **named)
+
+    return call  # pyright: ignore[reportReturnType]
+
+
+def leaves_and_classes(tree: Any) -> tuple[list[Any], tuple[type, ...]]:
+    """The leaves of a pytree, and the classes of its nodes, parents first.
+
+    Up to jaxlib 0.10 tree structures are equal whatever the classes that `jax.tree_util.register_dataclass` registered.
+    """
+    seen: list[Any] = []
+    leaves = jax.tree.leaves(tree, is_leaf=lambda node: bool(seen.append(node)))  # asked of every node; never a leaf
+    of_leaves = set(map(type, leaves))
+    return leaves, tuple([cls for cls in map(type, seen) if cls not in of_leaves])
+
+
+def holds_function(tree: Any) -> bool:
+    """Whether a leaf is a plain function, as a user's scorer may be, or the weight of one."""
+    return any(map(callable, jax.tree.leaves(tree)))
+
+
+def held(tree: Tree) -> Tree:
+    """`tree` whose plain functions are static parts, new ones at each call: what `compiled` keeps serves until then."""
+    return jax.tree.map(lambda leaf: Partial(partial(leaf)) if callable(leaf) else leaf, tree)
+
+
+def is_concrete(tree: Any) -> bool:
+    """True where no leaf is traced, so that Python may look at the values."""
+    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def knows_own_context() -> bool:
+    """Whether other threads compute as this one: not below `with jax.enable_x64(True)` and its like."""
+    with ThreadPoolExecutor(1) as fresh:
+        return dict(jax.config.values) == fresh.submit(lambda: dict(jax.config.values)).result()
+
+
+def available_cpus() -> int:
+    """Processors that this process may run on: fewer than the machine has where a scheduler or container says so."""
+    if hasattr(os, "sched_getaffinity"):  # Linux
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def device_bytes(tree: Any) -> int | None:
+    """Memory of the device where the first array is; None where it has none of its own, but a processor's caches."""
+    stats = device_of(tree).memory_stats()
+    return stats["bytes_limit"] if stats else None
+
+
+def free_bytes(device: Device) -> int:
+    """Bytes that may still be taken where a device keeps its arrays: its own memory, or the machine's."""
+    if stats := device.memory_stats():
+        return stats["bytes_limit"] - stats["bytes_in_use"]
+    return free_host_bytes()
+
+
+def free_host_bytes() -> int:
+    """Bytes that a program may still take of the machine's memory; all of it where the system is silent."""
+    try:  # what caches of files take is free
+        return 1024 * int(re.findall(r"MemAvailable: *(\d+)", Path("/proc/meminfo").read_text())[0])
+    except (OSError, IndexError):
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
+def platform(tree: Any) -> str:
+    """Where the first array on a device is, "cpu" or "gpu"; where there is none, JAX's default."""
+    return device_of(tree).platform
+
+
+def device_of(tree: Any) -> Device:
+    """That of the first array that is on one; where there is none, JAX's default."""
+    for leaf in jax.tree.leaves(tree):
+        if isinstance(leaf, Array) and not isinstance(leaf, Tracer):
+            return next(iter(leaf.devices()))
+    default = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    return default if isinstance(default, Device) else jax.local_devices(backend=default)[0]

@@ -1,0 +1,102 @@
+"""Principal components of unit variance, out of the smaller of two matrices: covariance, or Gram matrix."""
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import eigh
+from scipy.sparse.linalg import ArpackNoConvergence, eigsh
+
+from mfvpr.utils.errors import InputError
+
+FEW = 10  # times as many dimensions there must be as components for Lanczos' method
+SMALLEST = 1e-6  # of the largest standard deviation, below which there is but rounding
+_BLOCK = 2**25  # numbers in double precision at a time
+
+
+@dataclass(frozen=True)
+class Whitening:
+    """Principal components divided by the standard deviations: `(vectors - mean) @ components.T`.
+
+    Attributes:
+        mean: `[D]`.
+        components: `[D', D]`, most variance first; 0 where there is none.
+        origin: hash of what makes such vectors, which no other may be whitened with; "" = any of as many numbers may.
+    """
+
+    mean: np.ndarray
+    components: np.ndarray
+    origin: str = ""
+
+    @property
+    def dimension(self) -> int:
+        """D'."""
+        return len(self.components)
+
+
+def fit_whitening(sample: np.ndarray, dimension: int) -> Whitening:
+    """The components of a sample `[n, D]` float32 or float64, which is summed in double precision.
+
+    As PCA(whiten=True, svd_solver="full") of scikit-learn; a component's entry of the largest magnitude, the first of
+    several, is positive.
+
+    Args:
+        sample: finite.
+        dimension: D'.
+
+    Returns:
+        Arrays of the sample's type.
+
+    Raises:
+        InputError: there are not more vectors than components, fewer numbers in each, or all are alike.
+    """
+    count, size = sample.shape
+    if not 1 <= dimension < count or dimension > size:
+        raise InputError(f"whitening: expected more than {dimension} descriptors of as many numbers, got {count} of "
+                         f"{size}; keep fewer components")  # fmt: skip
+    mean = sample.mean(axis=0, dtype=np.float64)
+    by_rows = size <= count
+    products = np.zeros((min(count, size),) * 2)
+    for part in _centered(sample, mean, by_rows=by_rows):
+        products += part.T @ part if by_rows else part @ part.T
+    squares, vectors = _largest(products, dimension)
+    if squares[0] <= count * (SMALLEST**2 * 1e-4) * (mean @ mean):
+        raise InputError(f"whitening: expected descriptors that differ, got {count} that are alike; use other images")
+    if not by_rows:
+        vectors = np.concatenate([part.T @ vectors for part in _centered(sample, mean, by_rows=False)])
+    some = squares > SMALLEST**2 * squares[0]
+    lengths = np.linalg.norm(vectors, axis=0)
+    largest = np.take_along_axis(vectors, np.abs(vectors).argmax(axis=0)[None], axis=0)[0]
+    spread = np.sqrt(np.where(some, squares, 1) / (count - 1))
+    scale = np.where(some, np.sign(largest) / np.where(some, lengths * spread, 1), 0)
+    return Whitening(mean.astype(sample.dtype), (vectors * scale).T.astype(sample.dtype))
+
+
+def fit_bytes(count: int, size: int, itemsize: int) -> int:
+    """Memory that a sample of `count` vectors and their fit take, about."""
+    matrix = 8 * min(count, size) ** 2
+    return itemsize * count * size + 2 * matrix + 2 * 8 * min(_BLOCK, count * size)
+
+
+def _largest(products: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
+    """The largest eigenvalues `[number]` of a symmetric matrix, the largest first, and their vectors in columns."""
+    order = len(products)
+    if FEW * number < order:  # to the last bits as well, in a small part of the time
+        with suppress(ArpackNoConvergence):
+            start = np.random.default_rng(0).normal(size=order)
+            squares, vectors = eigsh(products, k=number, which="LA", v0=start)
+            descending = np.argsort(-squares)
+            return squares[descending], vectors[:, descending]
+    kept = (order - number, order - 1)
+    squares, vectors = eigh(products, subset_by_index=kept, overwrite_a=True, check_finite=False)
+    return squares[::-1], vectors[:, ::-1]
+
+
+def _centered(sample: np.ndarray, mean: np.ndarray, *, by_rows: bool) -> Iterator[np.ndarray]:
+    """The sample without its mean in double precision, some rows or some columns at a time."""
+    count, size = sample.shape
+    step = max(1, _BLOCK // (size if by_rows else count))
+    for start in range(0, count if by_rows else size, step):
+        part = slice(start, start + step)
+        yield sample[part] - mean if by_rows else sample[:, part] - mean[part]
