@@ -16,7 +16,7 @@ from mfvpr.checkpoints.files import save
 from mfvpr.checkpoints.networks import blueprint, network_of
 from mfvpr.checkpoints.registry import entry_of
 from mfvpr.datasets.streets import streets_folder
-from tests import checkpoints
+from tests import random_checkpoints
 
 gc.set_threshold(50_000, 20, 100)  # tracing makes many objects, and the usual thresholds collect too often
 # A shell ignores Ctrl-C for what it runs in the background; the tests of Ctrl-C need it there too.
@@ -102,7 +102,7 @@ def cache(tmp_path_factory) -> Iterator[None]:
 def weights(tmp_path_factory) -> Path:
     """A folder of installed weights: random ones, but ALIKED's real ones where they are at hand."""
     root = tmp_path_factory.mktemp("weights")
-    for name, tensors in checkpoints.at_hand():
+    for name, tensors in random_checkpoints.at_hand():
         entry, source = entry_of(name), root / f"{name}.source"
         source.write_text("not published")
         plan = blueprint(entry)

@@ -11,7 +11,7 @@ import pytest
 from nbclient import NotebookClient
 
 from mfvpr.datasets.streets import streets_folder
-from tests.test_layering import imports
+from tests.test_layering import imported_modules
 
 FOLDER = Path(__file__).parent.parent / "notebooks"
 PATHS = sorted(FOLDER.glob("*.ipynb"))
@@ -66,7 +66,7 @@ def test_cells_are_short_and_need_the_library_alone(path, tmp_path):
         assert len([line for line in cell.source.splitlines() if line.strip()]) <= 12, cell.id
     script = tmp_path / "cells.py"
     script.write_text("\n".join(cell.source for cell in cells))
-    assert {name.partition(".")[0] for name in imports(script)} <= LIBRARIES | sys.stdlib_module_names
+    assert {name.partition(".")[0] for name in imported_modules(script)} <= LIBRARIES | sys.stdlib_module_names
 
 
 @pytest.mark.slow

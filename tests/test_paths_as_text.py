@@ -18,7 +18,7 @@ from mfvpr.retrieval.precomputed import DescriptorFiles, FeatureFiles, File
 from mfvpr.scoring import weight_files
 from mfvpr.scoring.weight_files import read_weight
 from tests.builders import fill
-from tests.exchange.foreign import feature
+from tests.io.other_programs import feature
 
 
 def public_functions():

@@ -17,7 +17,7 @@ from mfvpr.datasets.datasets import image_folder
 from mfvpr.features.sift import Sift
 from mfvpr.io import write_features
 from mfvpr.storage.feature_cache import Archive
-from tests import checkpoints
+from tests import random_checkpoints
 from tests.builders import make_matches
 from tests.programs import QUICK, ROOT, composed, typed
 
@@ -49,7 +49,7 @@ def test_make_targets_exist(target):
     ],
 )
 def test_commands_run(command, small_street, weights, tmp_path, monkeypatch, capsys):
-    if "aliked" in command and not checkpoints.ALIKED.is_dir():
+    if "aliked" in command and not random_checkpoints.ALIKED.is_dir():
         pytest.skip("no ../shared/weights: ALIKED's are not shipped")
     root = tmp_path / "root"
     shutil.copytree(small_street, root)

@@ -12,9 +12,9 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from experiments.benchmark.made_up import BATCH, GLOBAL, MadeUp
 from experiments.benchmark.projection import ASSUMED, Plan, Rates, projected
 from experiments.benchmark.scale import CANDIDATES, MEMORY, Answer, Counted, peak_bytes, reranked
+from experiments.benchmark.synthetic_features import BATCH, GLOBAL, MadeUp
 from experiments.console import bar
 from mfvpr.datasets.positives import Positives
 from mfvpr.evaluation.recall import recall_at_k

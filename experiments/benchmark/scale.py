@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from experiments.benchmark.made_up import MadeUp
+from experiments.benchmark.synthetic_features import MadeUp
 from experiments.console import bar
 from mfvpr import HistogramOfShifts
 from mfvpr.evaluation import stages

@@ -7,8 +7,8 @@ import numpy as np
 
 from mfvpr.checkpoints.numpy_files import read_layers
 from mfvpr.checkpoints.torch_files import read_legacy, read_zip
-from mfvpr.io.foreign import matlab_files, numpy_objects
-from mfvpr.io.foreign.matlab_files import read_matlab
+from mfvpr.io.formats import matlab_files, numpy_objects
+from mfvpr.io.formats.matlab_files import read_matlab
 from mfvpr.utils.errors import InputError
 
 _DAMAGE = (ArithmeticError, LookupError, TypeError, ValueError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile)

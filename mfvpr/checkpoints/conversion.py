@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mfvpr.io.foreign.pickles import excerpt
+from mfvpr.io.formats.pickles import excerpt
 from mfvpr.utils.errors import InputError
 
 

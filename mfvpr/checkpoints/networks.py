@@ -24,7 +24,7 @@ from mfvpr.checkpoints.tables import (
     SELAVPR,
     SSM,
 )
-from mfvpr.io.foreign.pickles import excerpt
+from mfvpr.io.formats.pickles import excerpt
 
 if TYPE_CHECKING:
     from flax import nnx

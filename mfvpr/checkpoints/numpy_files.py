@@ -4,8 +4,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from mfvpr.io.foreign.numpy_objects import Array, read_objects
-from mfvpr.io.foreign.pickles import MEND, excerpt, file_size, of_type
+from mfvpr.io.formats.numpy_objects import Array, read_objects
+from mfvpr.io.formats.pickles import MEND, excerpt, file_size, of_type
 from mfvpr.utils.errors import InputError
 
 _LONGEST_NAME = 100  # characters

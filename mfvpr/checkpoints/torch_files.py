@@ -14,7 +14,7 @@ from typing import Any, BinaryIO, Literal
 
 import numpy as np
 
-from mfvpr.io.foreign.pickles import MEND, Name, excerpt, file_size, natural, of_type, read_pickle, refused
+from mfvpr.io.formats.pickles import MEND, Name, excerpt, file_size, natural, of_type, read_pickle, refused
 from mfvpr.utils.errors import InputError
 
 Order = Literal["little", "big"]

@@ -14,8 +14,8 @@ import numpy as np
 
 from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.datasets.images import read_image, resize
-from tests.checkpoints import random_checkpoint
 from tests.golden.make_d2net import projections, samples, texture
+from tests.random_checkpoints import random_checkpoint
 
 GOLDEN = Path(__file__).parent / "aliked.npz"
 WIDTHS = {"aliked-t16": (8, 16, 32, 64)}  # of the others 16, 32, 64, 128; the last is the descriptor's too

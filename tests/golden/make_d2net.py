@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tests.checkpoints import d2net_shapes, random_checkpoint
+from tests.random_checkpoints import d2net_shapes, random_checkpoint
 
 GOLDEN = Path(__file__).parent / "d2net.npz"
 SAMPLES = 1000

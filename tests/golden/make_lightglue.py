@@ -13,7 +13,7 @@ import numpy as np
 from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.types import Features
 from tests.builders import make_features
-from tests.checkpoints import lightglue_shapes, random_checkpoint
+from tests.random_checkpoints import lightglue_shapes, random_checkpoint
 
 GOLDEN = Path(__file__).parent / "lightglue.npz"
 SMALL = {"inputs": 16, "width": 32, "layers": 3, "heads": 2}

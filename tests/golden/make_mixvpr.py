@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.checkpoints import mixvpr_shapes, random_checkpoint
+from tests.random_checkpoints import mixvpr_shapes, random_checkpoint
 
 GOLDEN = Path(__file__).parent / "mixvpr.npz"
 SIZES = ((1024, 4), (256, 2), (64, 2))  # channels and rows of the published networks

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.checkpoints import gem_checkpoint, matlab_netvlad, netvlad_checkpoint, write_matlab
+from tests.random_checkpoints import gem_checkpoint, matlab_netvlad, netvlad_checkpoint, write_matlab
 
 GOLDEN = Path(__file__).parent / "netvlad.npz"
 SAMPLES = 1000

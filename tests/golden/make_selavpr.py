@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from tests.checkpoints import dinov2_shapes, selavpr_shapes, transformer_checkpoint
 from tests.golden.make_netvlad import name, normalized, samples
+from tests.random_checkpoints import dinov2_shapes, selavpr_shapes, transformer_checkpoint
 
 GOLDEN = Path(__file__).parent / "selavpr.npz"
 SIZE = (224, 224)

@@ -17,7 +17,7 @@ from unittest.mock import MagicMock
 import numpy as np
 from PIL import Image
 
-from tests.checkpoints import places365_shapes, random_checkpoint
+from tests.random_checkpoints import places365_shapes, random_checkpoint
 
 GOLDEN = Path(__file__).parent / "ssm.npz"
 DATABASE, QUERIES, CANDIDATES = 5, 4, 4

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tests.checkpoints import layered, places365_shapes, random_checkpoint
 from tests.golden.make_d2net import samples, texture
+from tests.random_checkpoints import layered, places365_shapes, random_checkpoint
 
 GOLDEN = Path(__file__).parent / "ssm_maps.npz"
 SEEDS = (0, 1, 2)

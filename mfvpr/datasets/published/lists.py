@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.io.foreign.numpy_objects import Array, read_objects
+from mfvpr.io.formats.numpy_objects import Array, read_objects
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_file
 

@@ -8,7 +8,7 @@ import numpy as np
 from mfvpr.datasets.datasets import Dataset, QuerySequence
 from mfvpr.datasets.ground_truth import FrameTruth, RadiusTruth
 from mfvpr.datasets.published.lists import expected_file, listed_images, read_names, read_rows
-from mfvpr.io.foreign.matlab_files import read_matlab
+from mfvpr.io.formats.matlab_files import read_matlab
 from mfvpr.utils.errors import InputError
 
 LAYOUT = """000/*.jpg, ..., queries_real/000/*.jpg, ...

@@ -1,0 +1,410 @@
+"""torch's files: read as data without torch, or refused in one line and nothing executed."""
+
+import os
+import pickle
+import struct
+import tracemalloc
+import zipfile
+from argparse import Namespace
+from contextlib import suppress
+
+import numpy as np
+import pytest
+
+from mfvpr.checkpoints.checkpoint import read_checkpoint
+from mfvpr.io.formats import pickles
+from mfvpr.utils.errors import InputError
+from tests.checkpoints.conftest import SOURCE_SHAPES
+from tests.random_checkpoints import ALIKED, Call, Global, View, Writer, random_checkpoint, write_legacy, write_zip
+
+WRITERS = pytest.mark.parametrize("write", [write_zip, write_legacy])
+REAL = (*ALIKED.glob("*.pth"), *(ALIKED.parent / "lightglue").glob("*.pth"))
+
+
+class Runs:
+    """A pickle that wants to make a file."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)
+
+
+def refused(path):
+    with pytest.raises(InputError) as caught:
+        read_checkpoint(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
+    assert len(message) < len(str(path)) + 250
+    return message
+
+
+def refused_content(path, content):
+    """What is said of this content in a zip file; in an old one the same is said."""
+    old = refused(write_legacy(path, content))
+    assert refused(write_zip(path, content)) == old
+    return old
+
+
+def assert_same(found, expected):
+    assert list(found) == list(expected)
+    for key, array in expected.items():
+        np.testing.assert_array_equal(found[key], array)
+        assert (found[key].dtype, found[key].shape) == (array.dtype, array.shape)
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "file.pth"
+
+
+@pytest.fixture
+def arrays():
+    return random_checkpoint(SOURCE_SHAPES)
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        lambda tensors: tensors,
+        lambda tensors: {"model": tensors, "optimizer": {"lr": 1e-3, 0: [None, (True, 2**40)]}, "epoch": 3},
+        lambda tensors: {"state_dict": tensors, "num_pcs": 128},
+    ],
+    ids=["flat", "model", "state_dict"],
+)
+@WRITERS
+def test_layouts_of_checkpoints(path, arrays, wrap, write):
+    assert_same(read_checkpoint(write(path, wrap(arrays))), arrays)
+
+
+@WRITERS
+def test_strided_views_of_storages(path, write):
+    whole = np.arange(24, dtype=np.float32)
+    views = {
+        "part": View(whole, 2, (2, 3), (6, 2)),
+        "transposed": np.arange(6.0).reshape(2, 3).T,
+        "last": View(whole, 23, (), ()),
+        "none": View(whole, 24, (0, 5), (5, 1)),
+        "ends": View(whole, 3, (4,), (7,), count=25, key="9"),
+    }
+    with pytest.raises(InputError, match="damaged"):
+        read_checkpoint(write(path, views))
+    del views["ends"]
+    found = read_checkpoint(write(path, views))
+    np.testing.assert_array_equal(found["part"], [[2, 4, 6], [8, 10, 12]])
+    np.testing.assert_array_equal(found["transposed"], [[0, 3], [1, 4], [2, 5]])
+    assert found["last"] == 23
+    assert found["none"].shape == (0, 5)
+
+
+def test_both_byte_orders(path, arrays):
+    assert_same(read_checkpoint(write_zip(path, arrays, order="big")), arrays)
+    with pytest.raises(ValueError, match=r"byte.*order|middle"):
+        write_zip(path, arrays, order="middle")
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("file/data.pkl", Writer().pickled({}))
+        archive.writestr("file/byteorder", "middle")
+    assert "damaged" in refused(path)
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_files_of_torch_are_read_as_torch_reads_them(torch, path, zipped):
+    grid = torch.arange(24.0).reshape(2, 3, 4)
+    tensors = {
+        "plain": grid, "turned": grid.permute(2, 0, 1), "part": grid[1:, ::2, 1:], "scalar": torch.tensor(7),
+        "same": grid, "parameter": torch.nn.Parameter(torch.randn(3, dtype=torch.float64)), "empty": torch.zeros(0, 3),
+        "int": torch.tensor([-1], dtype=torch.int32), "bool": torch.tensor([True, False]), "int16": grid.short(),
+        "int8": torch.tensor(-3, dtype=torch.int8), "uint8": torch.tensor([255], dtype=torch.uint8),
+    }  # fmt: skip
+    network = torch.nn.Sequential(torch.nn.Conv2d(3, 4, 3), torch.nn.BatchNorm2d(4))
+    for content in (tensors, network.state_dict(), {"state_dict": network.state_dict(), "lr": [0.1, None]}):
+        torch.save(content, path, _use_new_zipfile_serialization=zipped)
+        theirs = torch.load(path, weights_only=True)
+        theirs = theirs.get("state_dict", theirs)
+        assert_same(read_checkpoint(path), {key: tensor.detach().numpy() for key, tensor in theirs.items()})
+
+
+@pytest.mark.skipif(not REAL, reason="no ../shared/weights: weights do not ship with the project")
+@pytest.mark.parametrize("path", REAL, ids=lambda path: path.stem)
+def test_real_files_are_read_as_torch_reads_them(torch, path):
+    theirs = torch.load(path, map_location="cpu", weights_only=True)
+    assert_same(read_checkpoint(path), {key: tensor.numpy() for key, tensor in theirs.items()})
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_other_tensors_of_torch_are_refused(torch, path, zipped):
+    plain = torch.zeros(2)
+    for tensor, words in (
+        (plain.half(), "expected tensors of float32 or float64, got Half"),
+        (plain.bfloat16(), "got BFloat16"),
+        (plain.cfloat(), "got ComplexFloat"),
+        (plain.to(torch.float8_e4m3fn), "torch._utils._rebuild_tensor_v3"),
+        (torch.empty(2, device="meta"), "torch._utils._rebuild_meta_tensor_no_storage"),
+        (torch.eye(3).to_sparse(), "torch.serialization._get_layout"),
+        (torch.nn.Linear(2, 2), "torch.nn.modules.linear.Linear"),
+        (torch.zeros(1).expand(9), "than the file stores at a"),
+    ):
+        torch.save({"a": tensor}, path, _use_new_zipfile_serialization=zipped)
+        assert words in refused(path)
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_notes_of_a_training_are_left_unread(torch, path, zipped):
+    """As the public training code of D2-Net writes them, which torch's own safe reader refuses."""
+    network = torch.nn.Linear(2, 3)
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
+    network(torch.ones(1, 2)).sum().backward()
+    optimizer.step()
+    losses = [np.mean([0.5, 0.25]), np.float32(0.1)]
+    notes = {"args": Namespace(lr=1e-3, gpu=None, dataset=("a", 2)), "epoch_idx": 9, "train_loss_history": losses}
+    content = notes | {"model": network.state_dict(), "optimizer": optimizer.state_dict()}
+    torch.save(content, path, _use_new_zipfile_serialization=zipped)
+    assert_same(read_checkpoint(path), {key: tensor.numpy() for key, tensor in network.state_dict().items()})
+
+
+@WRITERS
+def test_notes_are_known_without_torch(path, arrays, write):
+    dtype = Call(Global("numpy", "dtype"), ("f8", 0, 1))
+    loss = Call(Global("numpy.core.multiarray", "scalar"), (dtype, Call(Global("_codecs", "encode"), ("x", "latin1"))))
+    line = b"cargparse\nNamespace\n)\x81}(X\x02\0\0\0lrK\x01ub"
+    assert_same(read_checkpoint(write(path, {"args": line, "losses": [loss], "model": arrays})), arrays)
+    assert "expected tensors only, got Unread at args" in refused(write(path, {"args": line}))
+
+
+def test_types_are_refused_by_key(path):
+    for dtype in (np.float16, np.complex64):
+        assert f"got {'Half' if dtype is np.float16 else 'ComplexFloat'} at net.a" in refused(
+            write_zip(path, {"net.a": np.zeros(3, dtype)})
+        )
+    assert "got Q" in refused(write_zip(path, {"a": View(np.zeros(3), kind="QInt8Storage")}))
+
+
+def test_code_is_refused_and_not_executed(path, tmp_path):
+    made = tmp_path / "made"
+    for content in (
+        Call(Global("os", "mkdir"), (str(made),)),
+        {"a": np.zeros(3), "b": Call(Global("builtins", "exec"), (f"import os; os.mkdir({str(made)!r})",))},
+        {"optimizer": [Call(Global("posix", "system"), (f"mkdir {made}",))]},
+        Call(Global("collections", "OrderedDict"), ([("a", 1)],)),
+        Call(Global("torch._utils", "_rebuild_tensor_v2"), (Global("os", "mkdir"), 0, (), (), False, None)),
+        Call(Global("torch._utils", "_rebuild_parameter"), (str(made), True, {})),
+        {"a": View(np.zeros(3), module="os")},
+    ):
+        assert "asks for" in (message := refused_content(path, content)) or "damaged" in message
+    assert "it asks for os.mkdir" in refused(write_zip(path, Call(Global("os", "mkdir"), (str(made),))))
+    assert not made.exists()
+
+
+@pytest.mark.parametrize("protocol", range(1, pickle.HIGHEST_PROTOCOL + 1))
+def test_plain_pickles_are_refused_and_not_executed(path, tmp_path, protocol):
+    path.write_bytes(b"\x80\x01" * (protocol < 2) + pickle.dumps(Runs(tmp_path / "made"), protocol))
+    assert "nothing was executed" in refused(path)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.write(__file__, "file/data/0")
+        archive.writestr("file/data.pkl", pickle.dumps({"model": {"weight": Runs(tmp_path / "made")}}, protocol))
+    assert "nothing was executed" in refused(path)
+    assert not (tmp_path / "made").exists()
+
+
+MKDIR = b"cos\nmkdir\n"
+
+
+@pytest.mark.parametrize(
+    "instructions",
+    [
+        b"(X\x01\0\0\0xios\nmkdir\n",  # INST
+        b"(" + MKDIR + b"X\x01\0\0\0xo",  # OBJ
+        MKDIR + b"X\x01\0\0\0x\x85\x81",  # NEWOBJ
+        MKDIR + b"}b",  # BUILD on what is no dictionary
+        b"}" + MKDIR + b"K\x01s",  # a name as a key
+        b"}" + 60 * b"2\x86" + b"K\x01s",  # a tuple of tuples of ..., whose hash takes years
+        b"\x82\x01",  # the registry of extensions
+        b"\x8c\x02os\x8c\x05mkdir\x93)R",  # names by the stack
+        b"Pos.mkdir\n",  # an identity in text
+        b"X\x02\0\0\0osQ",  # an identity that is no storage
+        b"t",  # no mark
+        b"0",
+        b"R",
+        b"h\x05",
+        b"(s",
+        b"}(K\x01u",  # a key without a value
+        b"(K\x01(h\0ee",
+    ],
+)
+def test_instructions_out_of_place_are_refused(path, instructions):
+    message = refused_content(path, instructions)
+    assert "damaged" in message or "nothing was executed" in message
+
+
+def test_nothing_grows_beyond_the_file(path, monkeypatch):
+    array = np.ones(3, np.float32)
+    put = b"]r\xff\xff\xff\x7f0"  # memo 2,147,483,647 of a list that is dropped
+    nested = b"X\x01\0\0\0n" + 20_000 * b"(" + b"N" + 20_000 * b"t"
+    content = b"}(" + Writer()._put("a") + b"K\x01u"
+    tracemalloc.start()
+    try:
+        refused(write_zip(path, content))
+        refused(write_zip(path, b"}(" + nested + b"u"))
+        refused(write_zip(path, put + b"}"))
+        refused(write_zip(path, {"a": View(array, count=2**31 - 1)}))
+        refused(write_zip(path, {"a": View(array, 0, (10**12, 10**12), (0, 0))}))
+        refused(write_legacy(path, {"a": View(array, count=2**31 - 1)}))
+        refused(write_legacy(path, b"X\xff\xff\xff\x7f"))  # a string of 2 GB
+        assert tracemalloc.get_traced_memory()[1] < 20e6
+    finally:
+        tracemalloc.stop()
+    monkeypatch.setattr(pickles, "_MOST", 1000)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("file/data.pkl", Writer().pickled(b"](" + 1000 * b"N" + b"e"))
+    assert "its pickle has more than 1,000 instructions" in refused(path)
+
+
+@pytest.mark.parametrize(
+    "view",
+    [
+        {"offset": 1},
+        {"offset": -1},
+        {"offset": 2**62},
+        {"offset": 0.0},
+        {"offset": True},
+        {"shape": (7,), "strides": (1,)},
+        {"shape": (2, 2), "strides": (1, 5)},
+        {"shape": (3,), "strides": (-1,)},
+        {"shape": (-3,), "strides": (1,)},
+        {"shape": (3,), "strides": ()},
+        {"shape": [6], "strides": [1]},
+        {"shape": (6, *(1,) * 99), "strides": (1,) * 100},
+        {"shape": (2**62, 2**62), "strides": (1, 1)},
+        {"shape": ("6",), "strides": (1,)},
+        {"count": 5},
+        {"count": 7},
+        {"count": -6},
+        {"count": "6"},
+        {"key": 0},
+        {"kind": "DoubleStorage"},
+    ],
+    ids=str,
+)
+@WRITERS
+def test_views_that_are_no_part_of_their_storage_are_refused(path, write, view):
+    message = refused(write(path, {"a": View(np.zeros(6, np.float32), **view)}))
+    assert "damaged" in message or "than the file stores at a" in message
+
+
+def flipped(content, place):
+    return content[:place] + bytes([content[place] ^ 16]) + content[place + 1 :]
+
+
+def test_a_flipped_bit_is_refused(path, arrays):
+    whole = write_zip(path, arrays).read_bytes()
+    values = arrays["net.conv.weight"].tobytes()
+    for place in (
+        whole.index(values),
+        whole.index(values) + 101,
+        whole.index(b"net.conv.weight"),
+        whole.index(b"little"),
+    ):
+        path.write_bytes(flipped(whole, place))
+        assert "the checksum of file/" in refused(path)
+
+
+def test_damage_is_refused_wherever_it_is(path):
+    """In every third byte of a small file: what is read in spite of it is what was written."""
+    expected = {"a": np.arange(5, dtype=np.float32)}
+    whole = write_zip(path, expected).read_bytes()
+    for place in range(0, len(whole), 3):
+        path.write_bytes(flipped(whole, place))
+        with suppress(InputError):
+            assert_same(read_checkpoint(path), expected)
+    for length in range(1, len(whole), 7):
+        path.write_bytes(whole[:length])
+        assert "truncated" in (message := refused(path)) or "expected" in message
+
+
+def test_damaged_pickles_give_arrays_or_one_line(path):
+    rng = np.random.default_rng(0)
+    writer = Writer()
+    pickled = bytearray(writer.pickled({"a": np.zeros((2, 3), np.float32), "state_dict": {"b": np.zeros(3)}}))
+    for _ in range(400):
+        changed = pickled.copy()
+        for place in rng.integers(2, len(pickled), rng.integers(1, 4)):
+            changed[place] = rng.integers(256)
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("file/data.pkl", bytes(changed))
+            for key, array in writer.storages.items():
+                archive.writestr(f"file/data/{key}", array.tobytes())
+        with suppress(InputError):
+            assert all(isinstance(array, np.ndarray) for array in read_checkpoint(path).values())
+
+
+def test_damaged_old_files(path, arrays):
+    whole = write_legacy(path, arrays).read_bytes()
+    for content in (whole[:-1], whole + b"\0", whole[: len(whole) // 2], whole[:20], whole[:3]):
+        path.write_bytes(content)
+        assert "damaged; download it again" in refused(path)
+    size = struct.pack("<q", arrays["net.bn.bias"].size)
+    path.write_bytes(size.join(whole.rsplit(size, 1)).replace(b"\x01e.", b"\x02e.") + bytes(4))
+    assert "damaged; download it again" in refused(path)
+    path.write_bytes(Writer().pickled(1) + Writer().pickled(2))
+    assert "expected a torch checkpoint, got another pickle" in refused(path)
+
+
+def test_zip_files_of_other_making(path, arrays, tmp_path):
+    once = "once and uncompressed"
+    assert once in refused(write_zip(path, arrays, compression=zipfile.ZIP_DEFLATED))
+    write_zip(path, arrays)
+    with pytest.warns(UserWarning, match="Duplicate"), zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("file/data/0", bytes(432))
+    assert once in refused(path)
+    encrypted = bytearray(write_zip(path, arrays).read_bytes())
+    for sign, place in ((b"PK\1\2", 8), (b"PK\3\4", 6)):
+        encrypted[encrypted.index(sign) + place] |= 1
+    path.write_bytes(encrypted)
+    assert once in refused(path)
+    write_zip(path, arrays)
+    with zipfile.ZipFile(path, "a") as archive:  # all entries on the same bytes
+        for number in range(20):
+            archive.filelist.append(zipfile.ZipInfo(f"file/again{number}"))
+            copied = archive.getinfo("file/data/0")
+            for field in ("header_offset", "CRC", "compress_size", "file_size"):
+                setattr(archive.filelist[-1], field, getattr(copied, field))
+        archive._didModify = True
+    assert once in refused(path)
+    write_zip(path, arrays)
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("../outside", "text")
+        archive.writestr("/absolute", "text")
+    assert_same(read_checkpoint(path), arrays)
+    assert list(tmp_path.iterdir()) == [path]
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("other/data.pkl", "")
+    assert "damaged" in refused(path)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("hello.txt", "hello")
+    assert "damaged" in refused(path)
+
+
+def test_what_is_no_checkpoint(path, tmp_path):
+    assert "No such file" in refused(path)
+    assert "got a folder" in refused(tmp_path)
+    path.write_bytes(b"")
+    assert "got an empty file" in refused(path)
+    path.write_text("<!DOCTYPE html><title>Virus scan warning</title>")
+    assert "got a text file" in refused(path)
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(100))
+    assert "got another kind of file" in refused(path)
+    os.mkfifo(tmp_path / "pipe")
+    assert "got no plain file" in refused(tmp_path / "pipe")
+
+
+def test_other_content(path):
+    assert "expected tensors by name, got list" in refused_content(path, [np.zeros(3)])
+    assert "got an empty dict" in refused_content(path, {"state_dict": {}})
+    assert "expected tensors only, got str at note" in refused_content(path, {"a": np.zeros(3), "note": "text"})
+    assert "expected tensors only, got Name at a" in refused_content(path, {"a": Global("os", "system")})
+    assert "got one by the number 3" in refused_content(path, {3: np.zeros(3)})
+    assert r"got str at two\nlines \x1b[2J" in refused_content(path, {"two\nlines \x1b[2J": "text"})
+    assert r"it asks for os.\x1b[2Jsystem," in refused_content(path, Call(Global("os", "\x1b[2Jsystem"), ()))
+    assert len(refused_content(path, {1000 * "long": "text"})) < len(str(path)) + 150

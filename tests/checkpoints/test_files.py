@@ -1,0 +1,283 @@
+"""Runtime files: what was saved comes back byte for byte, or is refused by name and with the mend."""
+
+import hashlib
+import json
+import pickle
+import struct
+
+import numpy as np
+import pytest
+from safetensors.numpy import save as serialized
+
+from mfvpr.checkpoints import files
+from mfvpr.checkpoints.files import (
+    WeightsError,
+    fingerprint,
+    install,
+    load,
+    load_model,
+    read_manifest,
+    save,
+    weights_folder,
+)
+from mfvpr.checkpoints.registry import REGISTRY
+from mfvpr.utils.errors import InputError
+from tests.checkpoints.conftest import PARAMETERS, SOURCE_SHAPES, tiny_entry
+from tests.random_checkpoints import d2net_shapes, random_checkpoint, write_legacy, write_zip
+
+
+@pytest.fixture
+def installed(folder, arrays, tmp_path):
+    (tmp_path / "tiny.pth").write_bytes(b"the source")
+    return save("tiny", arrays, tmp_path / "tiny.pth", parameters=PARAMETERS)
+
+
+def refused(words, name="tiny"):
+    with pytest.raises(WeightsError) as caught:
+        load(name)
+    message = str(caught.value)
+    assert words in message
+    assert message.endswith(("; install it again", "and install it"))
+    assert "\n" not in message
+    assert caught.value.entry.name == name
+    copied = pickle.loads(pickle.dumps(caught.value))  # noqa: S301  from a worker process
+    assert (str(copied), copied.entry) == (message, caught.value.entry)
+
+
+def test_round_trip(installed, folder, arrays):
+    assert installed == folder / "tiny.safetensors"
+    found = load("tiny")
+    assert found.keys() == arrays.keys()
+    for path, array in arrays.items():
+        np.testing.assert_array_equal(found[path], array)
+        assert found[path].dtype == np.float32
+    assert sorted(path.name for path in folder.iterdir()) == ["tiny.json", "tiny.safetensors"]
+
+
+def test_manifest(installed, tmp_path):
+    content = installed.read_bytes()
+    sha256 = hashlib.sha256(content).hexdigest()
+    assert json.loads(installed.with_suffix(".json").read_text()) == {
+        "name": "tiny", "sha256": sha256, "size": len(content), "parameters": PARAMETERS, "source_file": "tiny.pth",
+        "source_sha256": hashlib.sha256(b"the source").hexdigest(), "format": 1, "rounded": 0,
+    }  # fmt: skip
+    assert fingerprint("tiny") == sha256
+
+
+def test_saving_twice_makes_the_same_bytes(installed, arrays, tmp_path):
+    before = installed.read_bytes()
+    save("tiny", dict(reversed(arrays.items())), tmp_path / "tiny.pth", parameters=PARAMETERS)
+    assert installed.read_bytes() == before
+
+
+def test_model(installed, arrays):
+    model = load_model("tiny")
+    np.testing.assert_array_equal(model.conv.kernel[...], arrays["conv.kernel"])
+    np.testing.assert_array_equal(model.mix[1].bias[...], arrays["mix.1.bias"])
+    np.testing.assert_array_equal(model.bn.var[...], arrays["bn.var"])
+    image = np.random.default_rng(0).standard_normal((1, 6, 6, 3)).astype(np.float32)
+    once, again = model(image), model(image)
+    np.testing.assert_array_equal(once, again)  # evaluation mode: no statistics are gathered
+    assert once.shape == (1, 6, 6, 2)
+
+
+def test_arrays_of_another_network_are_refused(installed, arrays, tmp_path):
+    arrays["conv.extra"] = arrays.pop("conv.bias")
+    arrays["mix.0.kernel"] = arrays["mix.0.kernel"].T
+    save("tiny", arrays, tmp_path / "tiny.pth", parameters=PARAMETERS)
+    with pytest.raises(InputError, match=r"tiny\.safetensors: keys") as caught:
+        load_model("tiny")
+    assert all(name in str(caught.value) for name in ("conv.extra", "mix.0.kernel", "conv.bias", "install it again"))
+
+
+@pytest.mark.parametrize("place", [0.02, 0.5, 0.999])
+def test_a_flipped_bit_is_refused(installed, place):
+    content = bytearray(installed.read_bytes())
+    content[int(place * len(content))] ^= 1
+    installed.write_bytes(content)
+    refused("sha256")
+
+
+def test_truncated(installed):
+    installed.write_bytes(installed.read_bytes()[:-1])
+    refused(f"expected {installed.stat().st_size + 1} bytes, got {installed.stat().st_size}")
+
+
+def test_without_manifest(installed):
+    installed.with_suffix(".json").unlink()
+    refused("no manifest")
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"name": "tiny"}', '{"format": 1, "more": 2}', "\x00\x01"])
+def test_damaged_manifest(installed, text):
+    installed.with_suffix(".json").write_text(text)
+    refused("expected a manifest of format 1")
+
+
+def test_manifest_of_another(installed):
+    manifest = installed.with_suffix(".json")
+    values = json.loads(manifest.read_text())
+    manifest.write_text(json.dumps(values | {"parameters": "many"}))
+    refused("expected a manifest of format 1")
+    manifest.write_text(json.dumps(values | {"name": "d2_tf"}))
+    refused("expected the manifest of tiny, got that of d2_tf")
+    manifest.write_text(json.dumps(values | {"format": 2}))
+    refused("expected a manifest of format 1, got 2")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        struct.pack("<Q", 2**62) + b"{}",
+        struct.pack("<Q", 2**27) + b"{" + b" " * 1000,
+        struct.pack("<Q", 2) + b"{}" + b"more",
+        b"",
+        serialized({"a": np.zeros(3)})[:-4],
+        struct.pack("<Q", 60) + b'{"a":{"dtype":"BF16","shape":[2],"data_offsets":[0,4]}}'.ljust(60) + bytes(4),
+    ],
+    ids=["endless header", "huge header", "uncovered", "empty", "short", "bfloat16"],
+)
+def test_what_is_no_safetensors_file_is_refused_even_with_its_hash(installed, content):
+    installed.write_bytes(content)
+    manifest = installed.with_suffix(".json")
+    values = json.loads(manifest.read_text())
+    values |= {"size": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+    manifest.write_text(json.dumps(values))
+    with pytest.raises(InputError) as caught:
+        load_model("tiny")
+    assert str(caught.value).startswith(f"{installed}: ")
+
+
+def test_a_crash_between_file_and_manifest_leaves_nothing_that_looks_complete(folder, arrays, tmp_path, monkeypatch):
+    (tmp_path / "tiny.pth").write_bytes(b"the source")
+
+    def crash(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(files, "write_text", crash)
+        with pytest.raises(KeyboardInterrupt):
+            save("tiny", arrays, tmp_path / "tiny.pth", parameters=PARAMETERS)
+    refused("there is no manifest")
+    save("tiny", arrays, tmp_path / "tiny.pth", parameters=PARAMETERS)
+    with monkeypatch.context() as patch:
+        patch.setattr(files, "write_text", crash)
+        with pytest.raises(KeyboardInterrupt):
+            save("tiny", arrays | {"conv.bias": np.ones(4, np.float32)}, tmp_path / "tiny.pth", parameters=PARAMETERS)
+    refused("sha256")
+
+
+def test_not_installed_is_told_with_file_place_and_license(folder):
+    refused("tiny: not installed in")
+    refused("tiny.pth from https://example.org/tiny.pth (code MIT, weights none stated)")
+    with pytest.raises(InputError, match="not installed"):
+        fingerprint("tiny")
+
+
+@pytest.mark.parametrize("name", ["../tiny", "", "/etc/passwd", "unknown"])
+def test_unknown_names(folder, name):
+    with pytest.raises(InputError, match="no weights of this name"):
+        load(name)
+
+
+def test_values_that_are_not_finite_are_not_saved(folder, arrays, tmp_path):
+    arrays["conv.bias"][1] = np.nan
+    with pytest.raises(InputError, match=r"NaN or infinity in conv\.bias"):
+        save("tiny", arrays, tmp_path / "tiny.pth", parameters=PARAMETERS)
+    assert not folder.exists()
+
+
+def test_folder(monkeypatch):
+    monkeypatch.setenv("MFVPR_WEIGHTS", "~/w")
+    assert weights_folder().is_absolute()
+    assert weights_folder().name == "w"
+    monkeypatch.setenv("MFVPR_WEIGHTS", "~nobody-of-this-name/w")  # a folder of this name, as shells have it
+    assert weights_folder().parts == ("~nobody-of-this-name", "w")
+    monkeypatch.setenv("MFVPR_WEIGHTS", "")
+    assert weights_folder().parts[-3:] == (".cache", "mfvpr", "weights")
+
+
+class TestInstall:
+    """A checkpoint -> the runtime file."""
+
+    @pytest.fixture
+    def checkpoint(self, folder, tmp_path):
+        tensors = random_checkpoint(SOURCE_SHAPES)
+        return write_zip(tmp_path / "tiny.pth", tensors), tensors
+
+    def test_whole_way(self, checkpoint):
+        path, tensors = checkpoint
+        before = path.read_bytes()
+        install(path, "tiny")
+        np.testing.assert_array_equal(load_model("tiny").mix[0].kernel[...], tensors["net.mix.0.weight"].T)
+        assert path.read_bytes() == before
+
+    def test_keys_that_do_not_fit(self, checkpoint, folder):
+        path, tensors = checkpoint
+        tensors["net.conv.bis"] = tensors.pop("net.conv.bias")
+        write_zip(path, tensors)
+        with pytest.raises(
+            InputError,
+            match=r"tiny\.pth: .*1 unknown \(net\.conv\.bis\), 1 missing .*tiny\.pth",
+        ):
+            install(path, "tiny")
+        assert not folder.exists()
+
+    @pytest.mark.parametrize(
+        ("tensors", "words"),
+        [
+            (random_checkpoint(d2net_shapes()), "expected the keys of another network, got those of d2net"),
+            (
+                {f"module.{key}": np.zeros(2) for key in SOURCE_SHAPES},
+                "its keys begin with module.",
+            ),
+            ({f"layer{place}.weight": np.zeros(2) for place in range(500)}, "500 unknown (layer0.weight), 10 missing"),
+            (
+                {"net.conv.weight": np.zeros(2, np.float16)},
+                "got Half at net.conv.",
+            ),
+            (random_checkpoint(SOURCE_SHAPES) | {"net.conv.bias": np.ones(4, np.int64)}, "got int64"),
+        ],
+        ids=["another network", "prefix", "unknown network", "half", "integer"],
+    )
+    def test_foreign_files_are_one_short_line(self, checkpoint, folder, tensors, words):
+        path, _ = checkpoint
+        write_zip(path, tensors)
+        with pytest.raises(InputError) as caught:
+            install(path, "tiny")
+        message = str(caught.value).removeprefix(f"{path}: ")
+        assert words in message
+        assert "use the official" in message
+        assert "\n" not in message
+        assert len(message) < 250
+        assert not folder.exists()
+
+    def test_float64_is_rounded_and_that_is_noted(self, checkpoint):
+        path, tensors = checkpoint
+        third = tensors["net.conv.bias"].astype(np.float64) / 3
+        unused = {"net.bn.num_batches_tracked": np.array(7.0)}  # float64 as well
+        write_legacy(path, tensors | {"net.conv.bias": third} | unused)
+        install(path, "tiny")
+        np.testing.assert_array_equal(load("tiny")["conv.bias"], third.astype(np.float32))
+        assert read_manifest("tiny").rounded == 1
+
+    def test_manifests_without_that_note_are_read(self, checkpoint):
+        path, _ = checkpoint
+        manifest = install(path, "tiny").with_suffix(".json")
+        values = json.loads(manifest.read_text())
+        del values["rounded"]
+        manifest.write_text(json.dumps(values))
+        assert read_manifest("tiny").rounded == 0
+
+    def test_wrong_hash(self, checkpoint, folder, monkeypatch):
+        path, _ = checkpoint
+        sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+        monkeypatch.setitem(REGISTRY, "tiny", tiny_entry(sha256="0" * 64))
+        with pytest.raises(InputError, match=r"tiny\.pth: .*sha256 of tiny, 0{12}\.\.\., got [0-9a-f]{12}"):
+            install(path, "tiny")
+        monkeypatch.setitem(REGISTRY, "other", tiny_entry("other", sha256=sha256))
+        with pytest.raises(InputError, match="got that of other"):
+            install(path, "tiny")
+        assert not folder.exists()
+        monkeypatch.setitem(REGISTRY, "tiny", tiny_entry(sha256=sha256))
+        assert install(path, "tiny").is_file()

@@ -1,0 +1,398 @@
+"""NumPy's files of pickled layers: read as data, or refused in one line and nothing executed."""
+
+import pickle
+import struct
+import tracemalloc
+from contextlib import suppress
+
+import numpy as np
+import pytest
+
+from mfvpr.checkpoints.checkpoint import read_checkpoint
+from mfvpr.utils.errors import InputError
+from tests.checkpoints.test_checkpoint import Runs, assert_same, flipped, refused
+from tests.random_checkpoints import HEADER, Call, Global, Writer, layered, write_numpy
+
+RECONSTRUCT = Global("numpy.core.multiarray", "_reconstruct")
+NDARRAY = Global("numpy", "ndarray")
+PLAIN = (3, "<", None, None, None, -1, -1, 0)  # of a type, what follows its code
+OBJECT = (3, "|", None, None, None, -1, -1, 63)
+
+
+def put(value):
+    return Writer()._put(value)
+
+
+def built(instance, state):
+    """What a call gives, filled."""
+    return put(instance) + put(state) + b"b"
+
+
+def typed(code="f4", state=PLAIN):
+    return built(Call(Global("numpy", "dtype"), (code, 0, 1)), state)
+
+
+def held(values):
+    """Instructions that make these bytes, in protocol 3."""
+    return b"B" + struct.pack("<I", len(values)) + values
+
+
+TYPE, VALUES, EMPTY = typed(), held(bytes(24)), Call(RECONSTRUCT, (NDARRAY, (0,), "b"))
+
+
+def array(shape=(6,), kind=TYPE, fortran=False, values=VALUES, version=1, call=EMPTY):
+    """Instructions that make an array."""
+    return built(call, (version, shape, kind, fortran, values))
+
+
+def outer(value, **changes):
+    """The pickle of an array that holds one object."""
+    return b"\x80\x02" + array(**({"shape": (), "kind": typed("O8", OBJECT), "values": [value]} | changes)) + b"."
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "file.npy"
+
+
+@pytest.fixture
+def arrays():
+    rng = np.random.default_rng(0)
+    return {
+        "conv1_1.weights": rng.standard_normal((4, 3, 3, 3)).astype(np.float32),
+        "conv1_1.bias": rng.standard_normal(300),
+        "fc8a_1.weights": np.asfortranarray(rng.standard_normal((5, 2))),
+        "fc8a_1.count": np.arange(-3, 3),
+    }
+
+
+def refused_array(path, instructions):
+    return refused(write_numpy(path, outer({"conv": {"weights": instructions}})))
+
+
+@pytest.mark.parametrize("protocol", range(5))
+def test_every_protocol(path, arrays, protocol):
+    assert_same(read_checkpoint(write_numpy(path, layered(arrays), protocol=protocol)), arrays)
+    theirs = np.load(path, allow_pickle=True).item()
+    assert theirs["conv1_1"]["bias"].tolist() == arrays["conv1_1.bias"].tolist()
+
+
+def test_files_of_this_numpy_and_of_older_ones(path, arrays):
+    np.save(path, layered(arrays))
+    assert_same(read_checkpoint(path), arrays)
+    content = pickle.dumps(np.array(layered(arrays), dtype=object), protocol=3)
+    old = content.replace(b"numpy._core.multiarray", b"numpy.core.multiarray")
+    assert old != content
+    assert_same(read_checkpoint(write_numpy(path, old)), arrays)
+    for version in ((1, 0), (2, 0), (3, 0)):
+        with path.open("wb") as file:
+            np.lib.format.write_array(file, np.array(layered(arrays), dtype=object), version)
+        assert_same(read_checkpoint(path), arrays)
+
+
+class Python2(pickle._Pickler):  # type: ignore
+    """Writes strings as Python 2 does, where text is bytes."""
+
+    dispatch = pickle._Pickler.dispatch.copy()  # type: ignore
+
+    def save_string(self, value):
+        content = value.encode("latin-1") if isinstance(value, str) else value
+        length = len(content)
+        self.write(b"U" + bytes([length]) if length < 256 else b"T" + struct.pack("<i", length))
+        self.write(content)
+        self.memoize(value)
+
+    dispatch[str] = dispatch[bytes] = save_string
+
+
+@pytest.mark.parametrize("protocol", [1, 2])
+def test_files_of_python_2(path, arrays, protocol):
+    with path.open("wb") as file:
+        write_numpy(path, b"")
+        file.seek(0, 2)
+        Python2(file, protocol).dump(np.array(layered(arrays), dtype=object))
+    assert b"U\x07conv1_1" in path.read_bytes()
+    assert_same(read_checkpoint(path), arrays)
+
+
+def test_layouts_of_values(path):
+    grid = np.arange(24.0).reshape(2, 3, 4)
+    arrays = {
+        "a.big": grid.astype(">f4"), "a.fortran": np.asfortranarray(grid), "a.turned": grid.transpose(2, 0, 1),
+        "a.both": np.asfortranarray(grid.astype(">f8")), "a.part": grid[:, ::2, 1:], "a.scalar": np.array(2.5),
+        "a.none": np.zeros((0, 3)), "b.i8": np.array([-1]), "b.i4": np.array([2], "i4"), "b.i2": np.array([2], ">i2"),
+        "b.i1": np.array([-3], "i1"), "b.u1": np.array([255], "u1"), "b.bool": np.array([True, False]),
+    }  # fmt: skip
+    found = read_checkpoint(write_numpy(path, layered(arrays), protocol=3))
+    assert_same(found, {key: value.astype(value.dtype.newbyteorder("=")) for key, value in arrays.items()})
+    assert not any(value.flags.writeable for key, value in found.items() if value.size and key == "a.fortran")
+
+
+def test_written_byte_by_byte(path):
+    found = read_checkpoint(
+        write_numpy(path, outer({"conv": {"weights": array(values=held(np.arange(6, dtype="f4").tobytes()))}}))
+    )
+    assert_same(found, {"conv.weights": np.arange(6, dtype=np.float32)})
+
+
+@pytest.mark.parametrize("protocol", range(5))
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        lambda bad: bad,
+        lambda bad: {"conv": bad},
+        lambda bad: {"conv": {"weights": bad}},
+        lambda bad: {"conv": {"weights": np.zeros(3), "bias": np.array([bad, 1])}},
+        lambda bad: {"conv": {"weights": np.zeros(3)}, "notes": [1, (bad,)]},
+    ],
+)
+def test_code_is_refused_and_not_executed(path, tmp_path, protocol, wrap):
+    write_numpy(path, wrap(Runs(tmp_path / "made")), protocol=protocol)
+    message = refused(path)
+    assert "it asks for posix.mkdir" in message
+    assert not (tmp_path / "made").exists()
+    np.load(path, allow_pickle=True)
+    assert (tmp_path / "made").exists()
+
+
+@pytest.mark.parametrize("protocol", range(5))
+def test_plain_pickles_are_refused(path, tmp_path, protocol):
+    write_numpy(path, pickle.dumps(Runs(tmp_path / "made"), protocol))
+    assert "it asks for posix.mkdir" in refused(path)
+    assert not (tmp_path / "made").exists()
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (Call(RECONSTRUCT, (Global("os", "mkdir"), ("/made",), "b")), "it asks for numpy.core.multiarray._reconstruct"),
+        (Call(RECONSTRUCT, (Global("os", "mkdir"), (0,), "b")), "it asks for os.mkdir"),
+        (Call(RECONSTRUCT, (Global("numpy", "matrix"), (0,), "b")), "it asks for numpy.matrix"),
+        (Call(RECONSTRUCT, (NDARRAY, (10**12,), "b")), "it asks for numpy.core.multiarray._reconstruct"),
+        (Call(RECONSTRUCT, (NDARRAY, (0,), "O")), "it asks for numpy.core.multiarray._reconstruct"),
+        (Call(RECONSTRUCT, ()), "it asks for numpy.core.multiarray._reconstruct"),
+        (Call(NDARRAY, ((2, 3),)), "it asks for numpy.ndarray"),
+        (Call(Global("numpy", "zeros"), (10**12,)), "it asks for numpy.zeros"),
+        (Call(Global("numpy", "load"), ("other.npy", None, True)), "it asks for numpy.load"),
+        (Call(Global("numpy.core.multiarray", "scalar"), (TYPE, "abcd")), "it asks for numpy.core.multiarray.scalar"),
+        (Call(Global("numpy.core.numeric", "_frombuffer"), ("abcd", TYPE, (1,), "C")), "it asks for numpy.core.num"),
+        (Call(Global("collections", "OrderedDict"), ()), "it asks for collections.OrderedDict"),
+        (Call(Global("_codecs", "encode"), ("abcd", "rot13")), "it asks for _codecs.encode"),
+        (Call(Global("builtins", "eval"), ("1",)), "it asks for builtins.eval"),
+        (Call(Global("os", "\x1b[2J\nsystem"), ()), "damaged"),
+        (Call("os.mkdir", ("/made",)), "damaged"),
+    ],
+)  # fmt: skip
+def test_other_names_are_refused(path, call, words):
+    for instructions in (put(call), array(call=call)):
+        assert words in refused_array(path, instructions)
+    assert words in refused(write_numpy(path, outer({}, call=call)))
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        (
+            typed("O8", OBJECT),
+            "got O8 at conv.weights",
+        ),
+        (typed("f2"), "got f2 at conv.weights"),
+        (typed("c8"), "got c8"),
+        (typed("S4", (3, "|", None, None, None, 4, 1, 0)), "got S4"),
+        (typed("V4", (3, "|", None, ("a",), {"a": (typed(), 0)}, 4, 1, 16)), "got V4"),
+        (typed("V8", (3, "|", (typed(), (2,)), None, None, 8, 4, 0)), "got V8"),
+        (typed("f4", (4, "<", None, None, None, -1, -1, 0, {"a": 1})), "got f4"),
+        (typed("M8", (4, "<", None, None, None, -1, -1, 0, ({}, ("s", 1, 1, 1)))), "got M8"),
+        (typed("f4", (3, "=", None, None, None, -1, -1, 0)), "got f4"),
+        (typed("f4", (3, "6", None, None, None, -1, -1, 0)), "got f4"),
+        (typed("f4", (3, "f4,", None, None, None, -1, -1, 0)), "got f4"),
+        (typed("f4", OBJECT), "damaged"),
+        (typed("u1"), "damaged"),
+        (typed("f4", ()), "got f4"),
+        (typed("6f4"), "got 6f4"),
+        (typed("f4,f4"), "got f4,f4"),
+        (typed(1000 * "long"), "got longlong"),
+        (put(Call(Global("numpy", "dtype"), ("f4", 0, 1))), "damaged"),  # not filled
+        (built(typed(), PLAIN), "got f4"),  # filled twice
+        (put("f4"), "damaged"),
+        (put(Global("numpy", "float32")), "damaged"),
+    ],
+)
+def test_other_types_are_refused(path, kind, words):
+    assert words in refused_array(path, array(kind=kind))
+
+
+@pytest.mark.filterwarnings("ignore:metadata on a dtype")
+def test_other_types_that_numpy_writes_are_refused(path):
+    for values, code in (
+        (np.array(["a", 3], dtype=object), "O8"),
+        (np.array(["text"]), "U4"),
+        (np.zeros(2, "f2"), "f2"),
+        (np.zeros(2, [("a", "f4"), ("b", "i4")]), "V8"),
+        (np.array(["2020-01-01"], "M8[D]"), "M8"),
+        (np.zeros(2, np.dtype("f4", metadata={"a": 1})), "f4"),
+    ):
+        write_numpy(path, {"a": {"b": values}})
+        assert f"got {code}" in refused(path)
+    for values in (np.ma.zeros(3), np.zeros(3).view(np.recarray), np.float32(3)):
+        assert "it asks for numpy" in refused(write_numpy(path, {"a": {"b": values}}))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"shape": (7,)},
+        {"shape": (5,)},
+        {"shape": ()},
+        {"shape": (-6,)},
+        {"shape": (-2, -3)},
+        {"shape": (6.0,)},
+        {"shape": (True, 6)},
+        {"shape": [6]},
+        {"shape": ("6",)},
+        {"shape": 6},
+        {"shape": (6, *(1,) * 64)},
+        {"shape": (2**40, 2**40)},
+        {"shape": (0, 2**62, 2**62), "values": held(b"")},
+        {"shape": (2**62, 4), "values": held(b"")},
+        {"values": held(bytes(23))},
+        {"values": held(bytes(25))},
+        {"values": put("\u0100" + 23 * "a")},
+        {"values": [24]},
+        {"values": ["a"] * 24},
+        {"values": {}},
+        {"values": 24},
+        {"values": put(None)},
+        {"fortran": 2},
+        {"fortran": "F"},
+        {"version": 0},
+        {"version": "1"},
+    ],
+    ids=str,
+)
+def test_other_sizes_than_the_values_have_are_refused(path, changes):
+    message = refused_array(path, array(**changes))
+    assert "damaged" in message or "than the file stores at conv.weights" in message
+
+
+def test_arrays_are_filled_once(path):
+    state = (1, (), typed(), False, b"C\x04abcd")
+    for instructions in (put(EMPTY), built(array(), state), built({}, {}), b"}}b"):
+        assert "damaged" in refused_array(path, instructions)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (outer({}), "expected a dictionary of layers"),
+        (outer([array()]), "expected a dictionary of layers"),
+        (outer({"conv": {}}, shape=(1,)), "expected a dictionary of layers"),
+        (outer({"conv": {}}, values=[{"a": {}}, {}]), "expected a dictionary of layers"),
+        (outer({"conv": {}}, kind=typed()), "expected a dictionary of layers"),
+        (b"\x80\x02" + array() + b".", "expected a dictionary of layers"),
+        (b"\x80\x02}.", "expected a dictionary of layers"),
+        (outer({"conv": array()}), "expected arrays by layer, got Array at conv"),
+        (outer({"conv": {"weights": [1.0, 2.0]}}), "expected arrays by layer, got list at conv.weights"),
+        (outer({"conv": {"weights": Global("os", "system")}}), "expected arrays by layer, got Name at conv.weights"),
+        (outer({"a\n\x1b[2J": {"b": "text"}}), r"got str at a\n\x1b[2J.b"),
+        (outer({3: {"weights": array()}}), "damaged"),
+        (outer({"conv": {3: array()}}), "damaged"),
+        (outer({"a.b": {"c": array()}, "a": {"b.c": array()}}), "damaged"),
+        (outer({100 * "long": {"c": array()}}), "damaged"),
+        (outer({"conv": {"weights": array()}}) + b"\0", "damaged"),
+        (b"", "damaged"),
+        (b"\x80\x02S'text'\n.", "its pickle is more than data (STRING)"),
+        (b"\x80\x02S'\\d'\n.", "damaged"),  # which Python's own reader of strings warns of
+        (b"\x80\x05\x96" + struct.pack("<Q", 4) + b"abcd.", "its pickle is more than data (BYTEARRAY8)"),
+        (b"\x80\x04\x8c\x02os\x8c\x05mkdir\x93)R.", "it asks for os.mkdir"),
+        (b"\x80\x02X\x02\0\0\0osQ.", "damaged"),
+    ],
+)
+def test_other_content(path, content, words):
+    assert words in refused(write_numpy(path, content))
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        (
+            "{'descr': '<f4', 'fortran_order': False, 'shape': (3,), }",
+            "expected a dictionary of layers, got an array",
+        ),
+        (HEADER.replace("()", "(1,)"), "got another object"),
+        (HEADER.replace("|O", "|V4"), "got an array"),
+        ("__import__('os').mkdir('made')", "got an array, __import__"),
+        ("9" * 117, "got an array"),
+        (HEADER + "\n\x1b[2J", "got an array"),
+        (HEADER.ljust(3000), None),
+        (HEADER.replace(", }", "}"), None),
+    ],
+)
+def test_headers(path, arrays, header, words):
+    write_numpy(path, layered(arrays), header=header)
+    if words is None:
+        assert_same(read_checkpoint(path), arrays)
+    else:
+        assert words in refused(path)
+
+
+def test_plain_arrays_are_told(path):
+    np.save(path, np.zeros((3, 2), np.float32))
+    assert "got an array, {\\'descr\\': \\'<f4\\', \\'fortran_order\\'" in refused(path).replace("'", "\\'")
+
+
+def entries(items):
+    """Instructions that make a dictionary."""
+    return b"}(" + b"".join(put(key) + value for key, value in items) + b"u"
+
+
+def test_nothing_grows_beyond_the_file(path):
+    keep, recall = b"r\1\1\0\0", b"j\1\1\0\0"
+    big_endian = typed("f4", (3, ">", *PLAIN[2:]))
+    views = [array((25_000,), big_endian, values=values) for values in (held(bytes(100_000)) + keep, recall)]
+    shared_values = entries((str(place), views[place > 0]) for place in range(500))  # 50 MB
+    empty = array((0,), values=held(b""))
+    layer = entries((str(place), empty) for place in range(500)) + keep
+    shared_layers = entries((str(place), recall if place else layer) for place in range(2000))  # a million arrays
+    name = put("long" * 25_000) + keep
+    long_names = entries((name if place == 0 else recall, entries([(str(place), empty)])) for place in range(3))
+    tracemalloc.start()
+    try:
+        for length in (b"\x8e\0\0\0\0\0\1\0\0", b"\x8d\0\0\0\0\0\1\0\0", b"B\xff\xff\xff\xff", b"T\xff\xff\xff\x7f"):
+            assert "damaged" in refused(write_numpy(path, b"\x80\x04" + length))  # of up to 1 TB
+        assert "no more values than the file stores" in refused(write_numpy(path, outer({"a": shared_values})))
+        assert "no more values than the file stores" in refused(write_numpy(path, outer(shared_layers)))
+        assert "damaged" in refused(write_numpy(path, outer(long_names)))
+        refused(write_numpy(path, b"\x80\x02" + 20_000 * b"(" + b"N" + 20_000 * b"t" + b"."))
+        path.write_bytes(b"\x93NUMPY\x02\0\xff\xff\xff\xff" + HEADER.encode())
+        assert "damaged" in refused(path)
+        assert tracemalloc.get_traced_memory()[1] < 30e6
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("protocol", [2, 4])
+def test_damage_is_refused_wherever_it_is(path, protocol):
+    """What is cut anywhere is refused; with a changed byte, one line or arrays, which a checkpoint is checked for."""
+    expected = {"conv": {"weights": np.arange(4, dtype=np.float32).reshape(2, 2), "bias": np.zeros(2)}}
+    whole = write_numpy(path, expected, protocol=protocol).read_bytes()
+    for length in range(len(whole)):
+        path.write_bytes(whole[:length])
+        refused(path)
+    for place in range(len(whole)):
+        path.write_bytes(flipped(whole, place))
+        with suppress(InputError):
+            assert all(isinstance(values, np.ndarray) for values in read_checkpoint(path).values())
+
+
+def test_random_damage_gives_arrays_or_one_line(path):
+    rng = np.random.default_rng(0)
+    expected = {"conv": {"weights": np.arange(4, dtype=np.float32).reshape(2, 2), "bias": np.zeros(2)}}
+    whole = bytearray(write_numpy(path, expected).read_bytes())
+    for _ in range(400):
+        changed = whole.copy()
+        for place in rng.integers(128, len(whole), rng.integers(1, 4)):
+            changed[place] = rng.integers(256)
+        path.write_bytes(changed)
+        with suppress(InputError):
+            assert all(isinstance(values, np.ndarray) for values in read_checkpoint(path).values())

@@ -1,0 +1,379 @@
+"""`python -m experiments.weights` as a user types it."""
+
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.errors import one_line
+from experiments.weights import main
+from mfvpr.checkpoints.files import file_sha256, load_model, save
+from mfvpr.checkpoints.registry import REGISTRY
+from tests.checkpoints.conftest import PARAMETERS, SOURCE_SHAPES, tiny_entry
+from tests.random_checkpoints import (
+    ALIKED,
+    d2net_shapes,
+    layered,
+    places365_shapes,
+    random_checkpoint,
+    write_legacy,
+    write_numpy,
+    write_zip,
+)
+
+ROOT = Path(__file__).parent.parent.parent
+CONTENT = bytes(range(256)) * 4096
+SHA256 = hashlib.sha256(CONTENT).hexdigest()
+
+
+@pytest.fixture
+def program(folder, monkeypatch, capfd):
+    """Runs the command line in this process: exit code, stdout, stderr."""
+    handler = signal.getsignal(signal.SIGTERM)
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["weights", *map(str, arguments)])
+        code = 0
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code or 0
+        return code, *capfd.readouterr()
+
+    yield run
+    signal.signal(signal.SIGTERM, handler)
+
+
+@pytest.fixture
+def refused(program):
+    def run(words, *arguments):
+        code, stdout, stderr = program(*arguments)
+        assert (code, stdout) == (2, "")
+        assert stderr.startswith("error: ")
+        assert stderr.count("\n") == 1
+        assert words in stderr
+
+    return run
+
+
+@pytest.fixture
+def tiny_checkpoint(tmp_path):
+    return write_zip(tmp_path / "tiny.pth", {"model": random_checkpoint(SOURCE_SHAPES)})
+
+
+def test_help_and_wrong_usage_do_not_wait_for_jax():
+    code = """
+import sys
+from experiments.weights import main
+try:
+    main()
+except SystemExit:
+    print(sorted({"jax", "flax", "numpy", "torch", "hydra", "mfvpr"} & set(sys.modules)))
+"""
+    done = subprocess.run([sys.executable, "-c", code, "--help"], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.stderr == ""
+    *text, loaded = done.stdout.splitlines()
+    assert loaded == "[]"
+    assert all(any(command in line for line in text) for command in ("list", "convert", "verify", "download"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "arguments are required: COMMAND"),
+        (["lst"], "invalid choice: 'lst'"),
+        (["convert"], "arguments are required: FILE"),
+        (["list", "3"], "unrecognized arguments: 3"),
+        (["convert", "some.pth"], "some.pth: no such file"),
+        (["convert", "some.pth", "--as", "d2_tff"], "the nearest is d2_tf"),
+        (["convert", "nowhere/d2_tf.pth"], "nowhere/d2_tf.pth: expected a checkpoint file"),
+        (
+            ["convert", "nowhere/aliked-n16.pth"],
+            "nowhere/aliked-n16.pth: expected a checkpoint file",
+        ),
+        (["convert", "pitts_WPCA512.pth.tar"], "pitts_WPCA512.pth.tar: expected a checkpoint file"),
+        (["verify", "d2"], "expected one of d2_tf, "),
+        (
+            ["download", "d2_tf"],
+            "d2_tf: no hash is published",
+        ),
+    ],
+)
+def test_mistakes_are_one_line_and_exit_code_2(refused, folder, arguments, words):
+    refused(words, *arguments)
+    assert not folder.exists()
+
+
+def test_list(program, folder):
+    code, stdout, stderr = program("list")
+    assert (code, stderr) == (0, "")
+    lines = {line.split()[0]: line for line in stdout.splitlines()[2:]}
+    assert lines.keys() == REGISTRY.keys()
+    assert "BSD-3-Clause-Clear  none stated" in lines["d2_tf"]
+    assert lines["aliked-n16"].split()[-2:] == ["no", "2.7"]
+    assert lines["patchnetvlad_pitts_512"].split()[-2:] == ["no", "-"]
+
+
+def test_convert_list_verify(program, folder, tiny_checkpoint):
+    assert program("verify") == (0, f"nothing is installed in {folder}\n", "")
+    code, stdout, stderr = program("convert", tiny_checkpoint)
+    assert (code, stderr) == (0, "")
+    assert stdout == f"{folder}/tiny.safetensors: tiny, {PARAMETERS} parameters\n"
+    assert program("list")[1].splitlines()[-1].split()[-2:] == ["yes", "-"]
+    for arguments in ([], ["tiny"]):
+        code, stdout, stderr = program("verify", *arguments)
+        assert (code, stderr) == (0, "")
+        source = f"from a tiny.pth of sha256 {file_sha256(tiny_checkpoint)[:12]}..., which nobody published"
+        assert stdout == f"tiny: good, {PARAMETERS} parameters as converted, {source}\n"
+
+
+def test_convert_says_what_was_rounded(program, tmp_path):
+    tensors = random_checkpoint(SOURCE_SHAPES)
+    tensors["net.bn.bias"] = tensors["net.bn.bias"].astype(float)
+    code, stdout, _ = program("convert", write_zip(tmp_path / "tiny.pth", tensors))
+    assert code == 0
+    assert stdout.endswith(f"tiny, {PARAMETERS} parameters, 1 of its tensors rounded from float64 to float32\n")
+
+
+def test_missing_weights_are_answered_with_a_command(program, folder, capfd):
+    for name, command in (("aliked-n16", "download aliked-n16"), ("d2_tf", "convert d2_tf.pth"),
+                          ("mixvpr_512", "convert 'resnet50_MixVPR_512_channels(256)_rows(2).ckpt'")):  # fmt: skip
+        with pytest.raises(SystemExit) as caught, one_line():
+            load_model(name)
+        assert caught.value.code == 2
+        stderr = capfd.readouterr().err
+        assert stderr.startswith(f"error: {name}: not installed in {folder}; get ")
+        assert stderr.endswith(f" and install it: python -m experiments.weights {command}\n")
+        assert f" and install it: python -m experiments.weights {command}\n" in program("verify", name)[1]
+
+
+def test_convert_under_another_name(program, refused, folder, tiny_checkpoint):
+    other = tiny_checkpoint.rename(tiny_checkpoint.with_name("it's (1).pth"))
+    refused("--as NAME, one of d2_tf", "convert", other)
+    refused("expected the sha256 of aliked-t16", "convert", other, "--as", "aliked-t16")
+    assert not folder.exists()
+    assert program("convert", other, "--as", "tiny")[0] == 0
+
+
+def test_verify_tells_each_bad_file(program, folder, arrays, tmp_path, monkeypatch):
+    (tmp_path / "tiny.pth").write_bytes(b"the source")
+    save("tiny", arrays, tmp_path / "tiny.pth", parameters=PARAMETERS)
+    assert program("verify", "tiny")[0] == 0
+    monkeypatch.setitem(REGISTRY, "tiny", tiny_entry(parameters=1))
+    code, stdout, _ = program("verify")
+    assert (code, stdout) == (2, f"tiny: BAD, expected 1 parameters, got {PARAMETERS}\n")
+    path = folder / "tiny.safetensors"
+    content = bytearray(path.read_bytes())
+    content[-1] ^= 4
+    path.write_bytes(content)
+    code, stdout, stderr = program("verify", "tiny", "d2_tf", "patchnetvlad_pitts_128")
+    assert code == 2
+    assert stderr == "error: 3 of 3 could not be verified\n"
+    bad, missing, original = stdout.splitlines()
+    assert bad.startswith(f"tiny: BAD, {path}: ")
+    assert missing.startswith("d2_tf: BAD, not installed in")
+    assert original.startswith("patchnetvlad_pitts_128: BAD, not installed in")
+    path.with_suffix(".json").unlink()
+    assert "there is no manifest" in program("verify")[1]
+
+
+def test_what_is_not_converted_is_verified_by_its_published_hash(program, folder, monkeypatch):
+    name, file = "patchnetvlad_pitts_128", "pitts_WPCA128.pth.tar"
+    folder.mkdir()
+    (folder / file).write_bytes(b"other")
+    code, stdout, _ = program("verify")
+    assert code == 2
+    assert f"{name}: BAD, {folder / file}: expected the sha256 of {name}, 74bb0e0113c0..., got " in stdout
+    monkeypatch.setitem(REGISTRY, name, tiny_entry(name, file=file, sha256=hashlib.sha256(b"other").hexdigest()))
+    assert program("verify") == (0, f"{name}: good, {file} has the published hash\n", "")
+
+
+def test_ctrl_c_while_converting_leaves_nothing(program, folder, tiny_checkpoint, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("mfvpr.checkpoints.files.write_text", interrupted)
+    monkeypatch.setattr("atexit.register", lambda *_: None)  # or this process would end so
+    code, stdout, stderr = program("convert", tiny_checkpoint)
+    assert (code, stdout) == (130, "")
+    assert "interrupted" in stderr
+    assert program("verify")[0] == 2
+
+
+class Site(BaseHTTPRequestHandler):
+    """Serves one file, a longer one, a shorter one, and one that never ends."""
+
+    def do_GET(self):
+        if self.path not in ("/good", "/long", "/short", "/slow"):
+            return self.send_error(404)
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(CONTENT)))
+        self.end_headers()
+        if self.path == "/long":
+            self.wfile.write(CONTENT[:-4] + b"else")
+        elif self.path == "/slow":
+            self.wfile.write(CONTENT[: 1 << 19])
+            self.wfile.flush()
+            threading.Event().wait(20)
+        else:
+            self.wfile.write(CONTENT if self.path == "/good" else CONTENT[: 1 << 18])
+
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture
+def site(folder, monkeypatch):
+    """Registers `tiny` with an address of a local server."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Site)
+    server.daemon_threads = True
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+    thread.start()
+    monkeypatch.setenv("no_proxy", "*")
+
+    def publish(page):
+        source = f"http://127.0.0.1:{server.server_port}/{page}"
+        monkeypatch.setitem(REGISTRY, "tiny", tiny_entry(source=source, sha256=SHA256, size=len(CONTENT)))
+        return source
+
+    yield publish
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+def test_download(program, folder, site):
+    source = site("good")
+    code, stdout, stderr = program("download", "tiny")
+    assert code == 0, stderr
+    target = folder / "tiny.pth"
+    assert stdout.splitlines() == [
+        f"tiny.pth: {source}, {len(CONTENT):,} bytes, code MIT, weights none stated",
+        f"{target}: downloaded, with the published hash",
+        f"to install it: python -m experiments.weights convert {target}",
+    ]
+    assert "100%" in stderr
+    assert target.read_bytes() == CONTENT
+    site("nowhere")
+    code, stdout, _ = program("download", "tiny")
+    assert code == 0
+    assert "is there already" in stdout
+    target.write_bytes(b"damaged")
+    site("good")
+    assert program("download", "tiny")[0] == 0
+    assert target.read_bytes() == CONTENT
+
+
+@pytest.mark.parametrize(
+    ("page", "words"),
+    [
+        ("nowhere", "could not be downloaded to"),
+        ("long", f"expected the sha256 of tiny, {SHA256[:12]}..., got "),
+        ("short", "tiny"),
+    ],
+)
+def test_download_that_fails_leaves_nothing(program, folder, site, page, words):
+    source = site(page)
+    code, stdout, stderr = program("download", "tiny")
+    assert code == 2
+    assert stdout.startswith(f"tiny.pth: {source}")
+    assert stderr.splitlines()[-1].startswith(f"error: {source}: ")
+    assert words in stderr.splitlines()[-1]
+    assert "Traceback" not in stderr
+    assert list(folder.iterdir()) == []
+
+
+def test_download_without_network(program, folder, monkeypatch):
+    monkeypatch.setenv("no_proxy", "*")
+    monkeypatch.setitem(REGISTRY, "tiny", tiny_entry(source="http://127.0.0.1:9/x", sha256=SHA256))
+    code, _, stderr = program("download", "tiny")
+    assert code == 2
+    assert stderr.startswith("error: http://127.0.0.1:9/x: ")
+    assert stderr.count("\n") == 1
+    assert list(folder.iterdir()) == []
+
+
+def test_ctrl_c_while_downloading_leaves_nothing(folder, site):
+    code = f"""
+import dataclasses
+from experiments.weights import main
+from mfvpr.checkpoints.registry import REGISTRY
+entry = REGISTRY["aliked-t16"]
+REGISTRY["aliked-t16"] = dataclasses.replace(entry, source={site("slow")!r}, size={len(CONTENT)})
+main()
+"""
+    process = subprocess.Popen([sys.executable, "-c", code, "download", "aliked-t16"], cwd=ROOT, text=True,
+                               stdout=subprocess.PIPE, stderr=subprocess.PIPE)  # fmt: skip
+    deadline = time.monotonic() + 60
+    while not (folder.is_dir() and any(path.stat().st_size for path in folder.iterdir())):  # until it is amid the file
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=20)
+    assert process.returncode == 130, stderr
+    assert "interrupted" in stderr
+    assert list(folder.iterdir()) == []
+
+
+def run(*arguments, **environment):
+    return subprocess.run([sys.executable, "-m", "experiments.weights", *map(str, arguments)], cwd=ROOT, text=True,
+                          capture_output=True, timeout=120, env=os.environ | environment)  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not ALIKED.is_dir(), reason="no ../shared/weights: weights do not ship with the project")
+def test_real_weights_from_checkpoint_to_network(tmp_path):
+    place = {"MFVPR_WEIGHTS": str(tmp_path)}
+    done = run("convert", ALIKED / "aliked-n16.pth", **place)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == f"{tmp_path}/aliked-n16.safetensors: aliked-n16, 677,356 parameters\n"
+    done = run("verify", **place)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "aliked-n16: good, 677,356 parameters as converted\n", "")
+    wrong = run("convert", ALIKED / "aliked-n16.pth", "--as", "aliked-n16rot", **place)
+    assert wrong.returncode == 2
+    assert "got that of aliked-n16\n" in wrong.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["aliked-n16.json", "aliked-n16.safetensors"]
+
+
+def test_d2net_from_checkpoint_to_network(program, tmp_path):
+    arrays = random_checkpoint(d2net_shapes())
+    path = write_legacy(tmp_path / "d2_tf.pth", {"model": arrays})
+    code, stdout, _ = program("convert", path)
+    assert code == 0
+    assert stdout.endswith("d2_tf, 7,635,264 parameters\n")
+    kernel = load_model("d2_tf").vgg.conv4_3.kernel[...]
+    assert (kernel == arrays["dense_feature_extraction.model.21.weight"].transpose(2, 3, 1, 0)).all()
+
+
+def test_places365_from_numpys_file_to_network(program, refused, folder, tmp_path):
+    arrays = random_checkpoint(places365_shapes(full=False))
+    unused = {"conv5_3.weights": np.zeros((512, 512, 3, 3), np.float32), "fc8a_1.bias": np.zeros(365)}  # float64
+    path = write_numpy(tmp_path / "vgg16_places365.npy", layered(arrays | unused))
+    code, stdout, _ = program("convert", path)
+    assert code == 0
+    assert stdout == f"{folder}/vgg16_places365.safetensors: vgg16_places365, 12,354,880 parameters\n"
+    model = load_model("vgg16_places365")
+    assert (model.vgg.conv5_2.kernel[...] == arrays["conv5_2.weights"].transpose(2, 3, 1, 0)).all()
+    assert program("verify")[1].startswith("vgg16_places365: good, 12,354,880 parameters as converted, from a vgg16")
+    write_numpy(path, {"conv1_1": {"weights": Path("/")}})
+    refused("vgg16_places365.npy: it asks for pathlib.PosixPath", "convert", path)
+    write_numpy(path, layered(random_checkpoint(SOURCE_SHAPES)))
+    refused("got those of tiny", "convert", path)
+
+
+def test_where_places365_is_to_be_had(refused, program):
+    where = (
+        "get vgg16_places365.npy from https://imr.ciirc.cvut.cz/uploads/Datasets/checkpoints.zip, or the Caffe model"
+    )
+    refused(where, "download", "vgg16_places365")
+    line = next(line for line in program("list")[1].splitlines() if line.startswith("vgg16_places365"))
+    assert " ".join(line.split()[1:]) == "ssm vgg16_places365.npy MIT (SSM-VPR) CC BY (Places365) no -"

@@ -1,0 +1,494 @@
+"""Published data sets from miniature trees in their exact layouts."""
+
+import csv
+import itertools
+import os
+import pickle
+
+import cv2
+import numpy as np
+import pytest
+
+from mfvpr.datasets.published import PUBLISHED, differences, published_dataset
+from mfvpr.datasets.published.lists import read_lines, read_names, read_rows
+from mfvpr.datasets.published.robotcar import CONDITIONS, REFERENCE, nearest_places
+from mfvpr.utils.errors import InputError
+from tests.random_checkpoints import write_matlab
+
+IMAGE = cv2.imencode(".png", np.zeros((4, 6, 3), np.uint8))[1].tobytes()
+
+
+def put(root, *names):
+    for name in names:
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(IMAGE)
+
+
+def rows(dataset, threshold, sequence=0):
+    positives = dataset.sequences[sequence].truth.positives(threshold)
+    return [positives.of(query).tolist() for query in range(len(positives))]
+
+
+def refused(name, root, words, **options):
+    with pytest.raises(InputError) as caught:
+        published_dataset(name, root, **options)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+# SSM-VPR
+
+
+@pytest.fixture
+def ssm(tmp_path):
+    put(tmp_path, *(f"Reference/image{i:04d}.png" for i in range(12)), *(f"Live/image{i:04d}.jpg" for i in range(3)))
+    (tmp_path / "GroundTruth.csv").write_text("Reference,Live\n0,0\n10,1\n4,2\n")
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", ["berlin_a100", "berlin_halenseestrasse", "berlin_kudamm", "gardens_point",
+                                  "nordland_1415"])  # fmt: skip
+def test_ssm_vprs_are_right_around_the_named_image(ssm, name):
+    dataset = published_dataset(name, ssm)
+    assert dataset.name == dataset.only.name == name
+    assert (len(dataset.database), len(dataset.queries)) == (12, 3)
+    assert rows(dataset, 1) == [[0, 1], [9, 10, 11], [3, 4, 5]]
+    assert dataset.truth.thresholds(tolerances=[1, 2, 5], radius=25) == [1, 2, 5]
+
+
+def test_ssm_vprs_have_five_digits_beyond_9999_files(tmp_path):
+    put(tmp_path, *(f"Reference/image{i:05d}.png" for i in range(11)), "Live/image00000.png")
+    (tmp_path / "GroundTruth.csv").write_text("Reference,Live\n10,0\n")
+    assert rows(published_dataset("nordland_1415", tmp_path), 0) == [[10]]
+
+
+@pytest.mark.parametrize(("side", "number"), [("Reference", 5), ("Live", 1), ("Reference", 0)])
+def test_a_gap_is_refused_since_the_table_counts_numbers(ssm, side, number):
+    next((ssm / side).glob(f"image{number:04d}.*")).unlink()
+    refused("gardens_point", ssm, f"{ssm / side}: expected images numbered from 0 without gaps")
+
+
+def test_ssm_vprs_lack_something(ssm, tmp_path):
+    (ssm / "GroundTruth.csv").write_text("Reference,Live\n0,0\n12,1\n4,2\n")
+    refused("gardens_point", ssm, "from 0 to 11, got '12'")
+    (ssm / "GroundTruth.csv").write_text("Reference,Live\n0,0\n4,2\n")
+    refused("gardens_point", ssm, "expected ground truth for all 3 queries")
+    (ssm / "GroundTruth.csv").unlink()
+    refused("gardens_point", ssm, "GroundTruth.csv: expected")
+    refused("gardens_point", tmp_path / "no", "no: expected the folder of gardens_point")
+
+
+# RobotCar
+
+
+def write_poses(root, centers, suffix=".jpg"):
+    """A camera-to-world matrix per image, turned by an angle of its own."""
+    lines = []
+    for number, (name, (x, y, z)) in enumerate(centers.items()):
+        cosine, sine = np.cos(number), np.sin(number)
+        matrix = [cosine, -sine, 0, x, sine, cosine, 0, y, 0, 0, 1, z, 0, 0, 0, 1]
+        lines.append(f"{name}{suffix} {' '.join(f'{value:.9f}' for value in matrix)}\n")
+    (root / "robotcar_v2_train.txt").write_text("".join(lines))
+    put(root, *(f"images/{name}.jpg" for name in centers))
+
+
+def place(condition, timestamp):
+    return f"{condition}/rear/{timestamp}"
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_robotcar_takes_the_nearest_reference_within_five_meters(tmp_path, suffix):
+    centers = {place(REFERENCE, 30): (0, 0, 0), place(REFERENCE, 10): (20, 0, 0), place(REFERENCE, 20): (10, 0, 0)}
+    for number, condition in enumerate(CONDITIONS):
+        centers |= {place(condition, 200): (14.9, 0, 0), place(condition, 100): (3, 0, 4.1 if number == 2 else 4),
+                    place(condition, 300): (0, 900, 0)}  # fmt: skip
+    centers |= {place("sun", 1): (0, 0, 0), "dawn/left/7": (0, 0, 0)}
+    write_poses(tmp_path, centers, suffix)
+    dataset = published_dataset("robotcar_seasons", tmp_path)
+    assert dataset.database.names == tuple(f"{REFERENCE}/rear/{time}.jpg" for time in (10, 20, 30))
+    assert [sequence.name for sequence in dataset.sequences] == list(CONDITIONS)
+    assert dataset.sequences[0].images.names == ("dawn/rear/100.jpg", "dawn/rear/200.jpg")
+    assert rows(dataset, 0) == [[2], [1]]  # 5 m is near enough; of the order of timestamps
+    assert rows(dataset, 1) == [[1, 2], [0, 1, 2]]
+    assert dataset.sequences[2].images.names == ("night/rear/200.jpg",)  # 5.08 m is not
+    assert all(path.is_file() for sequence in dataset.sequences for path in sequence.images.paths)
+
+
+def test_robotcar_keeps_as_many_queries_as_the_paper(tmp_path):
+    """Of a file of that layout: 49 places, 220 references, and more images than those that have one nearby."""
+    rng = np.random.default_rng(0)
+    published, given = (218, 179, 183, 218, 195, 192, 226), (241, 197, 219, 220, 195, 210, 244)
+    spots = 100.0 * np.arange(49)
+    near = np.stack([np.resize(spots, 220) + rng.uniform(-20, 20, 220), *rng.uniform(-1, 1, (2, 220))], axis=1)
+    centers = {place(REFERENCE, 10**15 + row): center for row, center in enumerate(near)}
+    for number, (kept, count) in enumerate(zip(published, given, strict=True)):
+        within = near[rng.integers(220, size=kept)] + rng.uniform(-1, 1, (kept, 3)) * 5 / np.sqrt(3)
+        beyond = rng.uniform(-1, 1, (count - kept, 3)) + (0, 0, 7.5)
+        beyond[:, 0] = rng.choice(spots, count - kept)
+        some = rng.permutation(np.concatenate([within, beyond]))
+        centers |= {place(CONDITIONS[number], 2 * 10**15 + row): center for row, center in enumerate(some)}
+    write_poses(tmp_path, centers)
+    dataset = published_dataset("robotcar_seasons", tmp_path)
+    assert list(differences(dataset)) == []
+    assert [len(sequence.images) for sequence in dataset.sequences] == list(published)
+    assert len(dataset.database) == 220
+
+
+def test_nearest_places_of_equal_ones_are_the_first():
+    found, distance = nearest_places(np.array([[1.0, 0, 0]]), np.array([[2.0, 0, 0], [0.0, 0, 0], [1.0, 3, 4]]))
+    assert found.tolist() == [0]
+    assert distance.tolist() == [1]
+
+
+def test_robotcar_knows_one_pose_of_each_image(tmp_path):
+    centers = {place(condition, 1): (0, 0, 0) for condition in (REFERENCE, *CONDITIONS)}
+    write_poses(tmp_path, centers)
+    poses = tmp_path / "robotcar_v2_train.txt"
+    text = poses.read_text()
+    poses.write_text(f"\ufeff{text}{text}", encoding="utf-8")  # a byte order mark, and every line twice
+    assert published_dataset("robotcar_seasons", tmp_path).database.names == (f"{REFERENCE}/rear/1.jpg",)
+    line = text.splitlines()[0].split()
+    poses.write_text(text + " ".join([*line[:4], "3.0", *line[5:]]) + "\n")
+    refused("robotcar_seasons", tmp_path, f"pose of {REFERENCE}/rear/1.jpg")
+
+
+def test_robotcar_lacks_something(tmp_path):
+    refused("robotcar_seasons", tmp_path, "robotcar_v2_train.txt: expected a list, got nothing")
+    centers = {place(condition, 1): (0, 0, 0) for condition in (REFERENCE, *CONDITIONS)}
+    write_poses(tmp_path, centers)
+    (tmp_path / "images/snow/rear/1.jpg").unlink()
+    refused("robotcar_seasons", tmp_path, "1 of the 1 images of robotcar_v2_train.txt are missing")
+    write_poses(tmp_path, {name: center for name, center in centers.items() if "rain" not in name})
+    refused("robotcar_seasons", tmp_path, "expected poses of night-rain/rear, got none")
+    for line in ("dawn/rear/1.jpg 1 2 3", "dawn/rear/1.jpg " + "nan " * 16, "dawn/rear/1.jpg " + "x " * 16):
+        (tmp_path / "robotcar_v2_train.txt").write_text(f"\n{line}\n")
+        refused("robotcar_seasons", tmp_path, "line 1: expected a name and the 16 numbers")
+    identity = np.eye(4)
+    identity[:3, 3] = 7
+    for numbers in (identity.T, 10 * identity):  # transposed, and in other units
+        (tmp_path / "robotcar_v2_train.txt").write_text(f"dawn/rear/1.jpg {' '.join(map(str, numbers.ravel()))}\n")
+        refused(
+            "robotcar_seasons",
+            tmp_path,
+            "the last 0 0 0 1",
+        )
+    digits = " ".join(map(str, identity.ravel())).replace("7.0", "7_0")
+    (tmp_path / "robotcar_v2_train.txt").write_text(f"dawn/rear/1.jpg {digits}\n")
+    refused("robotcar_seasons", tmp_path, "line 1: expected a name and the 16 numbers")
+    (tmp_path / "robotcar_v2_train.txt").write_text(f"{REFERENCE}/rear/../../../x.jpg {'0 ' * 15}1\n")
+    refused("robotcar_seasons", tmp_path, "expected names below")
+
+
+# Nordland
+
+
+def test_nordland_pairs_frames_of_one_number(tmp_path):
+    put(tmp_path, *(f"{season}/images-{i:05d}.png" for season in ("summer", "winter", "fall") for i in (7, 8, 12)))
+    dataset = published_dataset("nordland_27592", tmp_path)
+    assert dataset.database.root.name == "summer"
+    assert dataset.queries.root.name == "winter"
+    assert rows(dataset, 0) == [[0], [1], [2]]
+    assert rows(dataset, 1) == [[0, 1], [0, 1, 2], [1, 2]]
+    turned = published_dataset("nordland_27592", tmp_path, seasons=("winter", "fall"))
+    assert turned.database.root.name == "winter"
+    assert turned.queries.root.name == "fall"
+    refused("nordland_27592", tmp_path, "expected two of fall, spring", seasons=("may", "fall"))
+    (tmp_path / "winter/images-00008.png").rename(tmp_path / "winter/images-00009.png")
+    refused("nordland_27592", tmp_path, "got images-00009.png")
+    (tmp_path / "winter/images-00009.png").unlink()
+    refused("nordland_27592", tmp_path, "expected as many frames as in")
+
+
+def test_nordland_takes_the_frames_of_patch_netvlads_lists(tmp_path):
+    put(tmp_path, *(f"{season}/images-{i:05d}.png" for season in ("summer", "winter") for i in range(9)))
+    for side, season in (("index", "summer"), ("query", "winter")):
+        lines = "".join(f"./nordland/{season}/images-{i:05d}.png\n" for i in (2, 3, 6))
+        (tmp_path / f"nordland_imageNames_{side}.txt").write_text(lines)
+    dataset = published_dataset("nordland_27592", tmp_path)
+    assert dataset.database.names == dataset.queries.names == tuple(f"images-{i:05d}.png" for i in (2, 3, 6))
+    (tmp_path / "winter/images-00003.png").unlink()
+    refused("nordland_27592", tmp_path, "1 of the 3 images of nordland_imageNames_query.txt")
+
+
+def test_nordlands_test_part_is_two_sections(tmp_path):
+    names = [f"{season}_images_test/section{part}/{i}.png" for season in ("summer", "winter") for part in (1, 2)
+             for i in (9, 10)]  # fmt: skip
+    put(tmp_path, *names)
+    dataset = published_dataset("nordland_3450", tmp_path)
+    assert dataset.database.names == ("section1/9.png", "section1/10.png", "section2/9.png", "section2/10.png")
+    assert rows(dataset, 0) == [[0], [1], [2], [3]]
+    assert rows(dataset, 2) == [[0, 1], [0, 1], [2, 3], [2, 3]]  # a frame of section 2 is none of section 1
+    assert dataset.truth.distance(1).tolist() == [1, 0, np.inf, np.inf]
+
+
+def test_vpr_bench_asks_every_tenth_frame(tmp_path):
+    put(tmp_path, *(f"ref/{i:07d}.jpg" for i in range(22)), *(f"query/{i:07d}.jpg" for i in range(3)))
+    assert rows(published_dataset("nordland_vprbench", tmp_path), 1) == [[0, 1], [9, 10, 11], [19, 20, 21]]
+    put(tmp_path, "query/0000003.jpg")
+    refused("nordland_vprbench", tmp_path, "got 22 for 4")
+
+
+# Pittsburgh
+
+DATABASE = [f"00{i}/00{i}829_pitch1_yaw{i + 1}.jpg" for i in range(3)]
+QUERIES = [f"00{i}/00{i}546_pitch1_yaw1.jpg" for i in range(2)]
+PLACES = np.array([[584000.0, 4476000], [584025.0, 4476000], [584060.0, 4476000]])
+ASKED = np.array([[584025.0, 4476025], [584010.0, 4476000]])
+
+
+@pytest.fixture
+def pittsburgh(tmp_path):
+    put(tmp_path, *DATABASE, *(f"queries_real/{name}" for name in QUERIES))
+    return tmp_path
+
+
+def cells(names):
+    content = np.empty((len(names), 1), object)
+    content[:, 0] = names
+    return content
+
+
+def write_structure(path, places=PLACES, **changes):
+    path.parent.mkdir(exist_ok=True)
+    content = {"whichSet": "val", "dbImageFns": cells(DATABASE), "utmDb": places.T, "qImageFns": cells(QUERIES),
+               "utmQ": ASKED.T, "numImages": 3, "numQueries": 2, "posDistThr": 25, "posDistSqThr": 625,
+               "nonTrivPosDistSqThr": 100}  # fmt: skip
+    write_matlab(path, {"dbStruct": content | changes})
+
+
+def write_lists(root, name, truth):
+    np.save(root / f"{name}_dbImages.npy", np.array(DATABASE))
+    np.save(root / f"{name}_qImages.npy", np.array([f"queries_real/{one}" for one in QUERIES]))
+    np.save(root / f"{name}_gt.npy", truth, allow_pickle=True)
+
+
+def objects(*parts):
+    content = np.empty(len(parts), object)
+    content[:] = parts
+    return content
+
+
+@pytest.mark.parametrize("folder", ["datasets/", ""])
+def test_pittsburgh_is_right_within_25_m(pittsburgh, folder):
+    write_structure(pittsburgh / f"{folder}pitts30k_val.mat")
+    dataset = published_dataset("pitts30k_val", pittsburgh)
+    assert dataset.database.names == tuple(DATABASE)
+    assert dataset.queries.names == tuple(f"queries_real/{name}" for name in QUERIES)
+    assert rows(dataset, 25) == [[1], [0, 1]]
+    refused("pitts30k_test", pittsburgh, "datasets/pitts30k_test.mat")
+
+
+def test_pittsburghs_names_pack_well(pittsburgh):
+    """To a 27th and less, where those of weights hardly do."""
+    path = pittsburgh / "datasets/pitts30k_val.mat"
+    names = [f"{i // 1000:03d}/{i // 24:06d}_pitch{i % 24 // 12 + 1}_yaw{i % 12 + 1}.jpg" for i in range(500)]
+    write_structure(path, np.zeros((500, 2)), dbImageFns=cells(names))
+    refused("pitts30k_val", pittsburgh, "500 of the 500 images of pitts30k_val.mat are missing")
+
+
+@pytest.mark.parametrize("suffix", ["gt", "gt_25m"])
+@pytest.mark.parametrize(
+    "truth",
+    [objects(*(np.array(some, kind) for some in ([1], [0, 1]))) for kind in (int, "u2", "u4", "u8")]
+    + [objects([1], [0, 1])],
+)
+def test_pittsburgh_of_lists(pittsburgh, truth, suffix):
+    write_lists(pittsburgh, "pitts30k_test", truth)
+    (pittsburgh / "pitts30k_test_gt.npy").rename(pittsburgh / f"pitts30k_test_{suffix}.npy")
+    dataset = published_dataset("pitts30k_test", pittsburgh)
+    assert rows(dataset, 0) == [[1], [0, 1]]
+    assert dataset.truth.unit == "exact"
+
+
+def test_pittsburghs_rows_may_be_an_array(pittsburgh):
+    write_lists(pittsburgh, "pitts30k_test", np.array([[1], [2]]))
+    assert rows(published_dataset("pitts30k_test", pittsburgh), 0) == [[1], [2]]
+
+
+class Hostile:
+    def __reduce__(self):
+        return (pytest.fail, ("it was executed",))
+
+
+@pytest.mark.parametrize(("truth", "words"), [
+    (objects(np.array([3]), np.array([0])), "query 0: expected rows from 0 to 2, got 3 to 3"),
+    (objects(np.array([-1]), np.array([0])), "expected rows from 0 to 2, got -1"),
+    (objects(np.array([0])), "expected rows of 2 queries, got 1"),
+    (objects(np.array([0.5]), np.array([0])), "expected lists of rows, got float64"),
+    (objects(Hostile(), np.array([0])), "nothing was executed"),
+    (np.array(["a", "b"]), "expected lists of rows, got <U1"),
+])  # fmt: skip
+def test_lists_that_are_no_rows(pittsburgh, truth, words):
+    write_lists(pittsburgh, "pitts30k_test", truth)
+    refused("pitts30k_test", pittsburgh, words)
+
+
+def test_damaged_lists(pittsburgh):
+    write_lists(pittsburgh, "pitts30k_test", objects(np.arange(2), np.arange(3)))
+    path = pittsburgh / "pitts30k_test_gt.npy"
+    whole = path.read_bytes()
+    for end in range(0, len(whole), 7):
+        path.write_bytes(whole[:end])
+        refused("pitts30k_test", pittsburgh, str(path))
+    path.write_bytes(whole)
+    names = pittsburgh / "pitts30k_test_dbImages.npy"
+    np.save(names, objects("a", "b"), allow_pickle=True)
+    refused("pitts30k_test", pittsburgh, "expected an array of NumPy")
+    np.save(names, np.arange(3))
+    refused("pitts30k_test", pittsburgh, "expected a list of names")
+    np.save(names, np.array(["../../secret.jpg"]))
+    refused("pitts30k_test", pittsburgh, "expected names below")
+    with names.open("wb") as file:
+        np.savez(file, np.array(DATABASE))
+    refused("pitts30k_test", pittsburgh, "expected an array of NumPy")
+
+
+def test_structures_that_are_not_pittsburghs(pittsburgh):
+    path = pittsburgh / "datasets/pitts30k_val.mat"
+    write_structure(path, places=PLACES[:2])
+    refused("pitts30k_val", pittsburgh, "3 images, got [2, 2]")
+    write_structure(path, places=np.full((3, 2), np.nan))
+    refused("pitts30k_val", pittsburgh, "expected a position for each")
+    write_structure(path, qImageFns=cells(["../x.jpg", "y.jpg"]))
+    refused("pitts30k_val", pittsburgh, "expected names below")
+    write_matlab(path, {"other": np.ones(3)})
+    refused("pitts30k_val", pittsburgh, "expected the structure dbStruct")
+    path.write_bytes(b"MATLAB 5.0")
+    refused("pitts30k_val", pittsburgh, "expected the structure dbStruct")
+    write_structure(path)
+    (pittsburgh / "queries_real" / QUERIES[1]).unlink()
+    refused("pitts30k_val", pittsburgh, "1 of the 2 images of pitts30k_val.mat are missing")
+
+
+# MSLS
+
+
+def write_table(path, header, lines):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([["", *header], *([number, *line] for number, line in enumerate(lines))])
+
+
+def write_msls(root):
+    """Per city: three database images, 100 m apart, one of them a panorama; four queries, of which one is asked."""
+    for number, city in enumerate(("cph", "sf")):
+        for side, images in (
+            ("database", [(0, False, True), (100, True, True), (200, False, True)]),
+            ("query", [(24, False, True), (101, False, True), (1, True, True), (2, False, False)]),
+        ):
+            folder, keys = root / "train_val" / city / side, [f"{side[0]}{row}" for row in range(len(images))]
+            put(folder, *(f"images/{key}.jpg" for key in keys))
+            positions = [(1e6 * number + east, 5e6) for east, _, _ in images]
+            write_table(folder / "raw.csv", ["key", "lon", "lat", "ca", "captured_at", "pano"],
+                        [(key, 0, 0, 0, 0, pano) for key, (_, pano, _) in zip(keys, images, strict=True)])  # fmt: skip
+            write_table(folder / "postprocessed.csv", ["key", "easting", "northing", "unique_cluster", "night"],
+                        [(key, *at, 0, False) for key, at in zip(keys, positions, strict=True)])  # fmt: skip
+            write_table(folder / "subtask_index.csv", ["key", "all", "s2w"],
+                        [(key, task, False) for key, (_, _, task) in zip(keys, images, strict=True)])  # fmt: skip
+
+
+def test_msls_of_tables(tmp_path):
+    write_msls(tmp_path)
+    dataset = published_dataset("msls_val", tmp_path)
+    assert dataset.database.names == tuple(
+        f"train_val/{city}/database/images/{key}.jpg" for city, key in itertools.product(("cph", "sf"), ("d0", "d2"))
+    )
+    assert dataset.queries.names == tuple(f"train_val/{city}/query/images/q0.jpg" for city in ("cph", "sf"))
+    assert rows(dataset, 25) == [[0], [2]]
+
+
+@pytest.mark.parametrize("words", [("TRUE", "FALSE"), ("true", "false"), ("1", "0")])
+def test_msls_flags_may_have_been_saved_again(tmp_path, words):
+    write_msls(tmp_path)
+    for table in ("raw", "subtask_index"):
+        for path in tmp_path.glob(f"train_val/*/*/{table}.csv"):
+            path.write_text(path.read_text().replace("True", words[0]).replace("False", words[1]))
+    dataset = published_dataset("msls_val", tmp_path)
+    assert [name[-6:] for name in dataset.database.names] == ["d0.jpg", "d2.jpg"] * 2
+    assert [name[-6:] for name in dataset.queries.names] == ["q0.jpg"] * 2
+
+
+@pytest.mark.parametrize("table", ["raw", "postprocessed", "subtask_index"])
+def test_msls_tables_are_joined_by_their_keys(tmp_path, table):
+    write_msls(tmp_path)
+    for path in tmp_path.glob(f"train_val/*/*/{table}.csv"):
+        header, *lines = path.read_text().splitlines()
+        path.write_text("\n".join([header, *lines[::-1]]))
+    dataset = published_dataset("msls_val", tmp_path)
+    assert sorted(name[-6:] for name in dataset.database.names) == ["d0.jpg"] * 2 + ["d2.jpg"] * 2
+    assert [name[-6:] for name in dataset.queries.names] == ["q0.jpg"] * 2
+
+
+def test_msls_of_lists(tmp_path):
+    write_msls(tmp_path)
+    names = [f"train_val/{city}/database/images/d{row}.jpg" for city in ("cph", "sf") for row in (0, 2)]
+    np.save(tmp_path / "msls_val_dbImages.npy", np.array(names))
+    refused("msls_val", tmp_path, "beside the other lists")
+    asked = [f"train_val/cph/query/images/q{row}.jpg" for row in range(3)]
+    np.save(tmp_path / "msls_val_qImages.npy", np.array(asked))
+    np.save(tmp_path / "msls_val_qIdx.npy", np.array([0, 2]))
+    np.save(tmp_path / "msls_val_pIdx.npy", objects(np.array([1, 3]), np.array([0])), allow_pickle=True)
+    dataset = published_dataset("msls_val", tmp_path)
+    assert dataset.database.names == tuple(names)
+    assert dataset.queries.names == (asked[0], asked[2])
+    assert rows(dataset, 0) == [[1, 3], [0]]
+    np.save(tmp_path / "msls_val_qIdx.npy", np.array([0, 3]))
+    refused("msls_val", tmp_path, "expected rows from 0 to 2, got 3")
+    np.save(tmp_path / "msls_val_qIdx.npy", np.array([0]))
+    refused("msls_val", tmp_path, "expected rows of the 1 queries of msls_val_qIdx.npy, got 2")
+
+
+def test_msls_lacks_something(tmp_path):
+    refused("msls_val", tmp_path, "raw.csv: expected a table")
+    write_msls(tmp_path)
+    table = tmp_path / "train_val/sf/query/postprocessed.csv"
+    text = table.read_text()
+    table.write_text("".join(text.splitlines(keepends=True)[:-1]))
+    refused("msls_val", tmp_path, "raw.csv, postprocessed.csv, subtask_index.csv, got 4, 3 and 4")
+    table.write_text(text.replace("q3", "q4"))
+    refused("msls_val", tmp_path, "expected the same keys")
+    table.write_text(text.replace("q3", "q2"))
+    refused("msls_val", tmp_path, "got 3 in 4 lines")
+    for change in (text.replace("easting", "east"), *(text.replace("5000000.0", word) for word in ("nan", "x", "5_0"))):
+        table.write_text(change)
+        refused("msls_val", tmp_path, "key 'q0': expected pano in raw.csv")
+    table.write_text(text)
+    raw = table.with_name("raw.csv")
+    raw.write_text(raw.read_text().replace("False", "maybe"))
+    refused("msls_val", tmp_path, "key 'q0': expected pano in raw.csv")
+
+
+@pytest.mark.parametrize("pipe", ["robotcar_v2_train.txt", "msls_val_dbImages.npy", "train_val/cph/database/raw.csv",
+                                  "pitts30k_val.mat", "nordland_imageNames_index.txt"])  # fmt: skip
+def test_pipes_are_not_waited_for(tmp_path, pipe):
+    path = tmp_path / pipe
+    path.parent.mkdir(parents=True, exist_ok=True)
+    os.mkfifo(path)
+    for name in ("robotcar_seasons", "msls_val", "pitts30k_val", "nordland_27592"):
+        with pytest.raises(InputError):
+            published_dataset(name, tmp_path)
+    for read in (read_lines, read_names, lambda path: read_rows(path, 1)):
+        with pytest.raises(InputError, match=r"expected a list, got a pipe"):
+            read(path)
+
+
+# All
+
+
+def test_numbers_of_images_are_compared_with_the_published(ssm, tmp_path):
+    assert list(differences(published_dataset("berlin_a100", ssm))) == [
+        "12 database images where 85 are published",
+        "3 queries in berlin_a100 where 81 are published",
+    ]
+
+
+def test_every_entry_says_what_it_is():
+    for name, entry in PUBLISHED.items():
+        assert entry.name == name
+        assert entry.title
+        assert entry.source.strip()
+        assert len(entry.layout.splitlines()) >= 2
+        assert all(len(line) <= 120 for line in entry.layout.splitlines())
+        assert "{" not in entry.layout
+    assert pickle.dumps(sorted(PUBLISHED))  # names alone: nothing of it is read from files

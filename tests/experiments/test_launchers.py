@@ -1,0 +1,90 @@
+"""Launchers of jobs: they compose, what is not installed is told, and shards go through one."""
+
+import json
+
+import hydra
+import pytest
+from hydra.core.config_store import ConfigStore
+from hydra.core.plugins import Plugins
+
+from experiments.groups import choices
+from experiments.settings import CONF
+from tests.experiments.test_shards_program import tables
+from tests.programs import composed, run, small, typed
+
+PLUGINS = {"joblib": "joblib", "submitit_local": "submitit_local", "slurm": "submitit_slurm"}  # their launchers
+EXTRAS = {"joblib": "sweep", "submitit_local": "slurm", "slurm": "slurm"}
+
+
+def installed():
+    """The launchers that Hydra finds; it looks for them once."""
+    Plugins.instance()
+    return ConfigStore.instance().repo["hydra"]["launcher"]
+
+
+def test_every_file_is_known_here():
+    assert {*choices("launcher")} == {*PLUGINS}
+
+
+@pytest.mark.parametrize("launcher", PLUGINS)
+def test_a_launcher_composes_and_adds_no_setting(launcher):
+    """Of a structured configuration, which refuses what the plugin does not know."""
+    if f"{PLUGINS[launcher]}.yaml" not in installed():
+        pytest.skip(f"pip install 'mfvpr[{EXTRAS[launcher]}]'")
+    for config in ("config", "sweep", "learn"):
+        with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+            found = hydra.compose(config, [f"launcher={launcher}"], return_hydra_config=True).hydra
+        assert found.job.env_set == {"PJRT_NPROC": str(found.launcher.get("cpus_per_task") or 1)}
+        assert PLUGINS[launcher].rpartition("_")[2] in found.launcher._target_.lower()
+        assert composed(f"launcher={launcher}", config=config) == composed(config=config)
+
+
+@pytest.mark.parametrize("launcher", PLUGINS)
+def test_what_is_not_installed_is_told_in_one_line(launcher, monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(installed(), f"{PLUGINS[launcher]}.yaml", raising=False)
+    told = f"error: {PLUGINS[launcher]}: this launcher is not installed; pip install 'mfvpr[{EXTRAS[launcher]}]'\n"
+    for setting in (f"launcher={launcher}", f"hydra/launcher={PLUGINS[launcher]}"):
+        assert typed(monkeypatch, capsys, "evaluate", "-m", setting, "candidates=4,8") == (2, "", told)
+    assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["launcher=joblib"], "launcher=joblib: expected one, and --multirun"),
+        (["-m", "launcher=joblib,slurm"], "launcher=joblib,slurm: expected one, and --multirun"),
+        (["-m", "launcher=job"], "the nearest is joblib"),
+        (["-m", "launcher=null"], "leave it out for none"),
+        (["-m", "hydra/launcher=nope"], "nope: this launcher is not installed; there are basic joblib"),
+    ],
+)
+def test_wrong_launchers(arguments, words, monkeypatch, capsys):
+    code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *arguments)
+    assert (code, stdout, stderr.count("\n")) == (2, "", 1)
+    assert words in stderr
+
+
+def test_help_shows_the_settings_of_a_launcher_where_they_are(monkeypatch, capsys):
+    _, without, _ = typed(monkeypatch, capsys, "evaluate", "--help")
+    assert "  launcher=null           joblib, slurm, submitit_local\n" in without
+    _, stdout, _ = typed(monkeypatch, capsys, "sweep", "--help", "launcher=slurm")
+    assert "\nhydra:\n  # An array of Slurm" in stdout
+    assert "\n  launcher:\n    name: mfvpr\n    array_parallelism: 64  # tasks" in stdout
+    assert "@" not in stdout[stdout.index("hydra:") : stdout.index("scorer:")]
+
+
+@pytest.mark.slow
+def test_shards_are_one_command_line_until_nothing_is_missing(tmp_path, monkeypatch, capsys):
+    settings = [setting for setting in small(tmp_path) if not setting.startswith("store=")] + ["figures=0"]
+    plain, out = tmp_path / "plain", tmp_path / "out"
+    assert typed(monkeypatch, capsys, "evaluate", *settings, f"store={tmp_path}/other", f"out={plain}")[0] == 0
+    shards = ("-m", "launcher=joblib", "hydra.launcher.n_jobs=2", "shard=0/2,1/2", f"hydra.sweep.dir={tmp_path}/jobs")
+    missing, rounds = "0-1", 0
+    while missing:
+        done = run(*settings, *shards, f"store={tmp_path}/store", f"out={out}")
+        assert done.returncode == 0, done.stderr
+        missing, rounds = typed(monkeypatch, capsys, "shards", "missing", out)[1], rounds + 1
+        assert rounds <= 3
+    assert tables(out) == tables(plain)
+    assert "launcher" not in json.loads((out / "run.json").read_text())["command"]

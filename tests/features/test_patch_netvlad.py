@@ -1,0 +1,251 @@
+"""Patch-NetVLAD as a system: patches of several sizes, scored by themselves and fused; one pass with its own filter."""
+
+import json
+from dataclasses import replace
+from functools import partial
+
+import jax
+import numpy as np
+import pytest
+
+import mfvpr
+from experiments import stages
+from mfvpr.checkpoints.conversion import convert
+from mfvpr.checkpoints.networks import planned
+from mfvpr.checkpoints.tables import NETVLAD
+from mfvpr.datasets.datasets import folder_dataset
+from mfvpr.features.patch_netvlad import PatchNetVladFeatures
+from mfvpr.networks.netvlad import VggNetVlad
+from mfvpr.reranking.ranking import fuse_scales
+from mfvpr.retrieval.retriever import Retrieval
+from mfvpr.storage import features, vectors
+from mfvpr.storage.feature_cache import Archive
+from mfvpr.utils.errors import InputError
+from tests.golden import make_patch_scores as patch_scores
+from tests.golden.make_netvlad import GOLDEN, POSITIONS, image, name
+from tests.programs import results, typed
+from tests.random_checkpoints import netvlad_checkpoint
+
+pytestmark = pytest.mark.thorough
+
+SIZE = (160, 128)
+
+
+def _vacant(outputs):
+    """A network that is never run."""
+    plan = planned(partial(VggNetVlad, 2, outputs))
+    return plan.filled({path: np.zeros(shape, np.float32) for path, shape in plan.shapes.items()})
+
+
+SCORERS = {"count": mfvpr.MatchCount(), "histogram": mfvpr.HistogramOfShifts()}
+
+
+@pytest.fixture(scope="module")
+def model():
+    plan = planned(partial(VggNetVlad, 4, 16))
+    return plan.filled(convert(netvlad_checkpoint(4, 16), NETVLAD, plan.shapes))
+
+
+@pytest.fixture(scope="module")
+def dataset(small_street):
+    return folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
+
+
+@pytest.mark.optimized
+@pytest.mark.first_case
+@pytest.mark.parametrize("position", POSITIONS, ids=map(str, POSITIONS))
+def test_patches_are_where_the_public_code_has_them(model, position):
+    size, patch = position
+    extractor = PatchNetVladFeatures(model, size, patch_sizes=(patch,))
+    [scale], [description] = extractor.scales, extractor(image(size))
+    expected = np.load(GOLDEN)[name("positions", *position)]
+    np.testing.assert_array_equal(description.features.keypoints, expected)
+    assert description.features.descriptors.shape == (len(expected), 16)
+    assert scale == (16, len(expected), 1.0)
+
+
+@pytest.mark.slow
+def test_one_pass_gives_what_the_network_gives(model):
+    extractor = PatchNetVladFeatures(model, SIZE, patch_sizes=(1, 3))
+    [found] = extractor(image(SIZE))
+    whole, patches = model.with_patches(model.preprocess(image(SIZE)), (1, 3))
+    np.testing.assert_allclose(found.vector, whole[0], atol=1e-6)
+    for local, expected in zip(found.local, patches, strict=True):
+        np.testing.assert_allclose(local.descriptors, expected[0], atol=1e-6)
+        np.testing.assert_allclose(np.linalg.norm(local.descriptors, axis=1), 1, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("options", "words"), [
+    ({"patch_sizes": ()}, r"patch_sizes=\[\]: .*from 1 to 8, .*10 x 8"),
+    ({"patch_sizes": (9,)}, "expected sizes from 1 to 8"), ({"patch_sizes": (0, 2)}, "expected sizes from 1 to 8"),
+    ({"patch_sizes": (2, 2)}, r"patch_sizes=\[2, 2\]: .*once"),
+    ({"scale_weights": (1.0, 2.0)}, r"scale_weights=\[1.0, 2.0\]: .*patch_sizes=\[5\], or None"),
+])  # fmt: skip
+def test_what_cannot_be_is_refused(model, options, words):
+    with pytest.raises(InputError, match=words):
+        PatchNetVladFeatures(model, SIZE, **options)
+    with pytest.raises(InputError, match=r"Patch-NetVLAD: .*VggNetVlad .*got Vgg16"):
+        PatchNetVladFeatures(model.vgg, SIZE)
+    with pytest.raises(ValueError, match=r"one scale, got 2; .*`local`"):
+        _ = PatchNetVladFeatures(model, SIZE, patch_sizes=(2, 3))(image(SIZE))[0].features
+    with pytest.raises(InputError, match=r"160 x 128 px, got 128 x 160"):
+        PatchNetVladFeatures(model, SIZE)(np.zeros((1, 160, 128, 3), np.uint8))
+
+
+@pytest.mark.slow
+def test_scales_are_standardized_weighted_and_summed(model, dataset, tmp_path):
+    """As the public code does: z-scores over a query's candidates by scale, by float64 loops; also out of its store."""
+    sizes, weights = (2, 3, 5), (0.45, 0.15, 0.4)
+    extractor = PatchNetVladFeatures(model, SIZE, patch_sizes=sizes, scale_weights=weights)
+    lines = []
+    archive = partial(Archive, tmp_path, tell=lines.append)
+    options = {"candidates": 6, "archive": archive()}
+    found = mfvpr.evaluate(dataset, extractor, Retrieval(extractor), SCORERS, **options)
+    assert sum("images to do" in line for line in lines) == 2  # one pass a side: descriptors and patches
+    single = []
+    for size in sizes:  # out of stores as well, which round descriptors
+        one, kept = replace(extractor, patch_sizes=(size,), scale_weights=None), Archive(tmp_path / str(size))
+        single.append(mfvpr.evaluate(dataset, one, Retrieval(one), SCORERS, candidates=6, archive=kept))
+    for scorer in SCORERS:
+        expected = 0.0
+        for weight, alone in zip(weights, single, strict=True):
+            [ranked] = alone.systems[scorer]
+            scores = np.take_along_axis(ranked.scores, np.argsort(ranked.rows, axis=1), axis=1).astype(np.float64)
+            expected += weight * (scores - scores.mean(axis=1, keepdims=True)) / scores.std(axis=1, keepdims=True)
+        [ranked] = found.systems[scorer]
+        actual = np.take_along_axis(ranked.scores, np.argsort(ranked.rows, axis=1), axis=1)
+        np.testing.assert_allclose(actual, expected, atol=1e-4)
+    again = mfvpr.evaluate(dataset, extractor, Retrieval(extractor), SCORERS, candidates=6, archive=archive())
+    other = replace(extractor, scale_weights=(1.0, 2.0, 3.0))
+    changed = mfvpr.evaluate(dataset, other, Retrieval(other), SCORERS, candidates=6, archive=archive())
+    assert sum("images to do" in line for line in lines) == 2  # weights are no part of what is kept
+    for scorer in SCORERS:
+        np.testing.assert_array_equal(again.systems[scorer][0].scores, found.systems[scorer][0].scores)
+        assert np.abs(changed.systems[scorer][0].scores - found.systems[scorer][0].scores).max() > 0.1
+
+
+@pytest.mark.parametrize(("images", "size", "patch_sizes", "outputs", "printed"), [
+    (220, (480, 480), (2, 5, 8), 4096, 7040), (1415, (640, 480), (2, 5, 8), 4096, 62520),
+    (220, (480, 480), (5,), 512, 292), (1415, (640, 480), (5,), 512, 2596),
+])  # fmt: skip
+def test_databases_are_of_the_published_size(images, size, patch_sizes, outputs, printed):
+    """In MiB, in float32; stores, of float16, take half of it."""
+    extractor = PatchNetVladFeatures(_vacant(outputs), size, patch_sizes=patch_sizes)
+    numbers = extractor.vector_size + sum(scale.dimension * scale.typical_count for scale in extractor.scales)
+    assert images * 4 * numbers / 2**20 == pytest.approx(printed, rel=0.01)
+    stored = vectors.forecast_bytes(images, extractor.vector_size)
+    stored += sum(features.forecast_bytes(images, scale.typical_count, scale.dimension) for scale in extractor.scales)
+    assert stored / 2**20 == pytest.approx(printed / 2, rel=0.03)
+
+
+@pytest.mark.optimized
+@pytest.mark.first_case
+@pytest.mark.parametrize(("matcher", "scorer", "unit"), [
+    ("spatialApproximator", lambda patch: mfvpr.RapidSpatialScore(
+        size=tuple(16.0 * (side - patch) for side in reversed(patch_scores.MAP)), per_feature=True), 256),
+    ("RANSAC", lambda patch: mfvpr.Homography(24.0, few="zero", per_feature=True), 1),
+])  # fmt: skip
+def test_scores_and_rankings_are_the_public_codes(model, matcher, scorer, unit):
+    """Of every size, for pairs and over candidates; the public scores are the smaller, the better, and in patches.
+
+    Where few patches show a place, RANSAC finds one more or less by luck; here most do.
+    """
+    golden, height, width = np.load(patch_scores.GOLDEN), *(16 * side for side in patch_scores.MAP)
+    scores = []
+    for patch in patch_scores.PATCHES:
+        [places] = PatchNetVladFeatures(model, (width, height), patch_sizes=(patch,))(image((width, height)))
+        query, candidates = patch_scores.descriptors(patch)
+        everywhere = jax.tree.map(partial(np.repeat, repeats=len(candidates), axis=0),
+                                  jax.tree.map(lambda field: field[None], places.features))  # fmt: skip
+        sides = (replace(side, descriptors=own) for side, own in ((places.features, query), (everywhere, candidates)))
+        matches = mfvpr.match_candidates(*sides)
+        scores.append(np.asarray(mfvpr.score_candidates(scorer(patch), matches)) / unit)
+    found, real = np.stack(scores, axis=1), np.ones(len(scores[0]), bool)
+    np.testing.assert_allclose(found, -golden[f"{matcher}/scales"], rtol=1e-4)
+    weights = np.array(patch_scores.WEIGHTS)
+    pairs = fuse_scales(found, real, weights, normalize="none")
+    np.testing.assert_allclose(pairs, -golden[f"{matcher}/pairs"], rtol=1e-4)
+    fused = fuse_scales(found, real, weights)
+    np.testing.assert_allclose(fused, -golden[f"{matcher}/fused"], atol=1e-4)
+    np.testing.assert_array_equal(mfvpr.rerank(fused).order, np.argsort(golden[f"{matcher}/fused"]))
+
+
+@pytest.fixture
+def program(weights, small_street, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("MFVPR_WEIGHTS", str(weights))
+    folders = f"dataset.database={small_street}/database", f"dataset.queries={small_street}/queries"
+    small = ("features.weights=patchnetvlad_mapillary_128", "features.image_size=[160,128]", "candidates=5")
+
+    def run(kind, *more, last=()):
+        out = tmp_path / str(len([*tmp_path.iterdir()]))
+        own = ("dataset=folder", *folders, "dataset.ground_truth=order", *more, *small, f"out={out}", *last)
+        code, stdout, stderr = typed(monkeypatch, capsys, kind, *own)
+        return out, code, stdout, stderr
+
+    return run
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("system", "scorer"), [
+    ("patch_netvlad_performance", "homography"), ("patch_netvlad_speed", "rapid"), ("patch_netvlad_storage", "rapid"),
+])  # fmt: skip
+def test_its_configurations_run_by_name(program, system, scorer):
+    reach = () if scorer == "homography" else ("scorer.size=[80,48]",)
+    if reach:  # at another size of images, that of the configuration is another score
+        _, code, _, stderr = program("evaluate", f"system={system}")
+        assert code == 2
+        assert "scorer.size=[560, 400]: expected [80, 48]" in stderr
+    out, code, _, stderr = program("evaluate", f"system={system}", "figures=2", *reach)
+    assert code == 0, stderr
+    rows = json.loads((out / "results.json").read_text())
+    assert [row["system"] for row in rows if row["decides"]] == [scorer] * 3
+    assert rows[0]["features"]["patch_sizes"] == ([2, 5, 8] if "performance" in system else [5])
+    assert rows[0]["filter"]["name"] == "same"
+
+
+@pytest.mark.slow
+def test_a_sweep_fuses_the_scales_as_an_evaluation_does(program):
+    options = ("features=patch_netvlad", "features.patch_sizes=[2,4]", "retrieval=same", "scorer=count")
+    many = (*options, "scorer=histogram", "features.scale_weights=[1,3]")
+    out, code, _, stderr = program("sweep", *many, "grid.bin_size=[8,16]")
+    assert code == 0, stderr
+    swept = results(out)["settings"]
+    for setting in swept[:2]:
+        alone, code, _, stderr = program("evaluate", *many, f"scorer.bin_size={setting['parameters']['bin_size']}",
+                                         "figures=0")  # fmt: skip
+        assert code == 0, stderr
+        rows = json.loads((alone / "results.json").read_text())
+        expected = [row["recall_at"]["1"] for row in rows if row["system"] == "histogram"]
+        assert [row["1"] for row in setting["recall_at"].values()] == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("options", "words"), [
+    (("scorer=all", "scorer.rapid.size=[560,400]"), "scorer.rapid.size=[560, 400]: expected [80, 48]"),
+    (("scorer=rapid", "scorer.size=[560,400]", "features.patch_sizes=[9]"), "[9]: expected sizes from 1 to 8"),
+    (("features.image_size=null",), "features.image_size=null: expected width and height"),
+])  # fmt: skip
+def test_settings_of_other_sizes_are_refused(program, options, words):
+    _, code, _, stderr = program("evaluate", "features=patch_netvlad", "retrieval=same", last=options)
+    assert code == 2
+    assert words in stderr
+
+
+def test_what_it_cannot_be_used_for_is_one_line(program, monkeypatch):
+    scales = ("features=patch_netvlad", "features.patch_sizes=[2,4]")
+    _, code, _, stderr = program("learn", *scales, "retrieval=same", "scorer=sum", "steps=1", "recall.tolerances=[0]")
+    assert code == 2
+    words = "features.patch_sizes=[2, 4]: expected one size"
+    assert words in stderr.splitlines()[-1]
+    monkeypatch.setattr(stages, "dataset_of", None)  # told before
+    _, code, _, stderr = program("evaluate", *scales, "retrieval=same", "features.scale_weights=[1]")
+    assert code == 2
+    assert "scale_weights=[1]: expected one for each of patch_sizes=[2, 4]" in stderr
+
+
+def test_other_features_have_no_global_descriptor(small_street, tmp_path, monkeypatch, capsys):
+    folders = f"dataset.database={small_street}/database", f"dataset.queries={small_street}/queries"
+    code, _, stderr = typed(monkeypatch, capsys, "evaluate", "dataset=folder", *folders, "dataset.ground_truth=order",
+                            "retrieval=same", f"out={tmp_path}/out")  # fmt: skip
+    assert code == 2
+    assert "retrieval=same: expected features with a global descriptor" in stderr

@@ -1,0 +1,164 @@
+"""SSM-VPR against its public program's numbers (tests/golden/make_ssm.py), stage by stage, and the whole way."""
+
+import jax
+import numpy as np
+import pytest
+
+import mfvpr
+from mfvpr import Features, GridAnchors, Shortlist
+from mfvpr.checkpoints.conversion import convert
+from mfvpr.checkpoints.networks import blueprint
+from mfvpr.checkpoints.registry import entry_of
+from mfvpr.checkpoints.tables import SSM
+from mfvpr.datasets.images import resize
+from mfvpr.features.ssm import SsmMaps
+from mfvpr.features.windows import WindowFitting, Windows, kernels, normalized, whitened
+from mfvpr.reranking.frame_correlation import FrameCorrelation
+from mfvpr.retrieval.ssm_voting import voted
+from tests.builders import make_matches
+from tests.golden.make_ssm import (
+    CANDIDATES,
+    DATABASE,
+    DIMENSIONS,
+    GOLDEN,
+    IMAGES,
+    MAPS,
+    QUERIES,
+    made_up_map,
+    picture,
+)
+from tests.random_checkpoints import places365_shapes, random_checkpoint
+
+pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
+
+FITTINGS = WindowFitting(DIMENSIONS[0]), WindowFitting(DIMENSIONS[1], zero_row=True, dtype="float64")
+SIZES = 9, 3
+project = jax.jit(whitened, static_argnames="stride")
+score = jax.jit(lambda scorer, matches: scorer(matches))
+match = jax.jit(mfvpr.match, static_argnames="cross_check")
+
+
+@pytest.fixture(scope="module")
+def golden():
+    return dict(np.load(GOLDEN))
+
+
+def described(maps, stage, num_database):
+    """Whitened windows `[V, D']` of maps, learned from the first, those of the database."""
+    found, how = Windows(maps.shape[1:], SIZES[stage - 1]), FITTINGS[stage - 1]
+    learned = how.fit([dict(enumerate(maps[:num_database]))], found, how.drawn(num_database))
+    vectors = np.asarray(project(maps, *kernels(learned, found), stride=1))
+    return vectors[:num_database], vectors[num_database:]
+
+
+def of_maps(seed, stage):
+    """Of the made-up ones."""
+    rows = [(row, False) for row in range(DATABASE)] + [(row, True) for row in range(QUERIES)]
+    return described(
+        np.asarray(normalized(np.stack([made_up_map(seed, stage, *row) for row in rows]))), stage, DATABASE
+    )
+
+
+def assert_same_space(got, expected, tolerance):
+    """But for the signs of its axes."""
+    got, expected = (vectors.reshape(-1, vectors.shape[-1]).astype(np.float64) for vectors in (got, expected))
+    signs = np.sign((got * expected).sum(axis=0))
+    np.testing.assert_allclose(got, signs * expected, atol=tolerance * np.abs(expected).max())
+
+
+def assert_votes(shortlist, votes, candidates):
+    """As listed there; images of equal votes, which the program's sort does not order, by row here."""
+    expected = np.argsort(-votes, axis=1, kind="stable")[:, : candidates.shape[1]]
+    np.testing.assert_array_equal(shortlist.indices, expected)
+    np.testing.assert_array_equal(shortlist.scores, np.take_along_axis(votes, expected, axis=1))
+    np.testing.assert_array_equal(np.take_along_axis(votes, candidates.astype(int), axis=1), shortlist.scores)
+
+
+@pytest.mark.parametrize("case", MAPS)
+def test_windows_and_their_votes(golden, case):
+    database, queries = of_maps(MAPS[case], 1)
+    assert_same_space(database, golden[f"{case}/windows"], 2e-4)  # which sums in float32
+    assert_votes(voted(queries, database, CANDIDATES), golden[f"{case}/votes"], golden[f"{case}/candidates"])
+
+
+@pytest.mark.parametrize("case", MAPS)
+def test_cells_and_their_matches(golden, case):
+    database, queries = of_maps(MAPS[case], 2)
+    assert_same_space(database, golden[f"{case}/cells"], 1e-6)
+    for query, rows in enumerate(golden[f"{case}/candidates"]):
+        for place, row in enumerate(rows):
+            matches = match(image(queries[query]), image(database[row]), cross_check="candidate")
+            np.testing.assert_array_equal(matches.index0, golden[f"{case}/index"][query, place].reshape(-1))
+            np.testing.assert_array_equal(matches.index1, np.arange(len(database[row])))
+            assert int(score(GridAnchors(10), matches)) == golden[f"{case}/scores"][query, place]
+
+
+def image(vectors):
+    """Features of cells."""
+    count = len(vectors)
+    return Features(np.zeros((count, 2), np.float32), vectors, np.ones(count, np.float32), np.ones(count, bool),
+                    np.full(2, 100, np.float32))  # fmt: skip
+
+
+@pytest.mark.parametrize("case", [*MAPS, *IMAGES])
+def test_scores_are_equal_as_whole_numbers(golden, case):
+    """Of the program's own matches; with its padding on a CPU, and on a GPU."""
+    index = golden[f"{case}/index"]
+    side = index.shape[-1]
+    cells = np.arange(side**2)
+    points = np.zeros((side**2, 2))
+    for query, place in np.ndindex(index.shape[:2]):
+        pair = make_matches(points, points, index0=index[query, place].reshape(-1), index1=cells,
+                            count0=side**2, count1=side**2)  # fmt: skip
+        assert int(score(GridAnchors(side), pair)) == golden[f"{case}/scores"][query, place]
+        assert int(score(GridAnchors(side, outside="zero"), pair)) == golden[f"{case}/zero_scores"][query, place]
+
+
+@pytest.mark.parametrize("case", [*MAPS, *IMAGES])
+def test_frame_correlation_weighs_as_published(golden, case):
+    """The program rounds the scores that it looks back at to two digits."""
+    rows, scores = golden[f"{case}/candidates"].astype(np.int32), golden[f"{case}/scores"].astype(np.float32)
+    got = FrameCorrelation(2)(Shortlist(rows, scores, rows >= 0), scores)
+    np.testing.assert_allclose(got / scores, golden[f"{case}/weights"], rtol=1e-5)
+    assert (got[2:] > scores[2:]).all()
+
+
+@pytest.fixture(scope="module")
+def of_images():
+    """Whitened windows of the pictures by a network with random weights."""
+
+    def of_images(case, stage):
+        seed, pixels, num_database, num_queries = IMAGES[case]
+        pixels = 224 if stage == 1 else pixels
+        plan = blueprint(entry_of("vgg16_places365"))
+        model = plan.filled(convert(random_checkpoint(places365_shapes(full=False), seed), SSM, plan.shapes))
+        rows = [(row, False) for row in range(num_database)] + [(row, True) for row in range(num_queries)]
+        maps = SsmMaps(model, stage, (pixels, pixels))
+        computed = maps(np.stack([resize(picture(*row), (pixels, pixels)) for row in rows]))
+        return described(np.stack([one.vector.reshape(maps.shape) for one in computed]), stage, num_database)
+
+    return of_images
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", IMAGES)
+def test_images_get_the_votes_of_the_public_program(golden, of_images, case):
+    database, queries = of_images(case, 1)
+    assert_same_space(database, golden[f"{case}/windows"], 1e-4)
+    found = voted(queries, database, min(CANDIDATES, len(database)))
+    assert_votes(found, golden[f"{case}/votes"], golden[f"{case}/candidates"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", IMAGES)
+def test_images_get_the_matches_of_the_public_program(golden, of_images, case):
+    """None differs where this was written; elsewhere rounding may choose the other of two that are as near."""
+    database, queries = of_images(case, 2)
+    side = golden[f"{case}/index"].shape[-1]
+    for query, rows in enumerate(golden[f"{case}/candidates"]):
+        for place, row in enumerate(rows):
+            matches = match(image(queries[query]), image(database[row]), cross_check="candidate")
+            equal = np.asarray(matches.index0) == golden[f"{case}/index"][query, place].reshape(-1)
+            assert equal.mean() > 0.999
+            if equal.all():
+                assert int(score(GridAnchors(side), matches)) == golden[f"{case}/scores"][query, place]

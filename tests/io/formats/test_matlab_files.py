@@ -1,0 +1,144 @@
+"""MATLAB's files as arrays by their path, and what is no such file, or more than it says, as one line."""
+
+import struct
+import zlib
+from contextlib import suppress
+
+import numpy as np
+import pytest
+
+from mfvpr.checkpoints.checkpoint import read_checkpoint
+from mfvpr.checkpoints.conversion import convert
+from mfvpr.checkpoints.networks import network_of, planned
+from mfvpr.checkpoints.registry import entry_of
+from mfvpr.checkpoints.tables import NETVLAD_MATLAB
+from mfvpr.utils.errors import InputError
+from tests.random_checkpoints import matlab_netvlad, matlab_shapes, random_checkpoint, write_matlab
+
+pytestmark = pytest.mark.thorough
+
+
+def cell(*parts):
+    content = np.empty((1, len(parts)), object)
+    for place, part in enumerate(parts):
+        content[0, place] = part
+    return content
+
+
+CONTENT = {
+    "net": {"layers": cell({"w": cell(np.arange(6.0).reshape(2, 3), np.float32([[7]]))}, {"name": "relu"}),
+            "note": "text", "empty": np.zeros((0, 0)), "flag": np.array([[True]])},
+    "other": np.int16([[1, -2]]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("packed", [True, False])
+def test_arrays_have_their_path(tmp_path, packed):
+    found = read_checkpoint(write_matlab(tmp_path / "a.mat", CONTENT, packed=packed))
+    assert {path: array.tolist() for path, array in found.items() if path != "net.flag"} == {
+        "net.layers.0.w.0": [[0, 1, 2], [3, 4, 5]], "net.layers.0.w.1": [[7]], "other": [[1, -2]],
+    }  # fmt: skip
+    assert {path: array.dtype for path, array in found.items()}["net.layers.0.w.1"] == np.float32
+
+
+def test_an_array_of_structures_is_as_a_cell_of_them(tmp_path):
+    several = np.zeros((1, 2), [("w", object)])
+    several[0, 0]["w"], several[0, 1]["w"] = np.ones((1, 2)), np.zeros((2, 1))
+    found = read_checkpoint(write_matlab(tmp_path / "a.mat", {"net": {"layers": several}}))
+    assert {path: array.shape for path, array in found.items()} == {"net.layers.0.w": (1, 2), "net.layers.1.w": (2, 1)}
+
+
+def test_shapes_are_those_of_a_file(tmp_path):
+    read = read_checkpoint(write_matlab(tmp_path / "a.mat", matlab_netvlad(4, 3)))
+    assert {path: array.shape for path, array in read.items()} == matlab_shapes(4, 3)
+
+
+def test_signs_and_axes(tmp_path):
+    """The centers are stored with the other sign, all else as inputs, then outputs."""
+    read = read_checkpoint(write_matlab(tmp_path / "a.mat", matlab_netvlad(4, 3)))
+    with pytest.raises(InputError, match="of another shape"):
+        convert(read, NETVLAD_MATLAB, planned(network_of(entry_of("netvlad_pitts30k")).builder()).shapes)
+    from mfvpr.networks.netvlad import VggNetVlad
+
+    plan = planned(lambda rngs: VggNetVlad(4, 3, original=True, rngs=rngs))
+    found = convert(read, NETVLAD_MATLAB, plan.shapes)
+    np.testing.assert_array_equal(found["pool.centers"], -read["net.layers.30.weights.1"].T)
+    np.testing.assert_array_equal(found["pool.assignment.kernel"][0, 0], read["net.layers.30.weights.0"])
+    np.testing.assert_array_equal(found["projection.kernel"], read["net.layers.33.weights.0"][0, 0])
+    np.testing.assert_array_equal(found["vgg.conv2_1.kernel"], read["net.layers.5.weights.0"])
+    np.testing.assert_allclose(found["average"], [123.68, 116.779, 103.939], rtol=1e-6)
+
+
+def refused(path, words):
+    with pytest.raises(InputError, match=words) as told:
+        read_checkpoint(path)
+    assert "\n" not in str(told.value)
+
+
+def test_cut_and_changed_files_are_arrays_or_one_line(tmp_path):
+    whole = write_matlab(tmp_path / "a.mat", CONTENT, packed=False).read_bytes()
+    packed = write_matlab(tmp_path / "a.mat", CONTENT).read_bytes()
+    rng = np.random.default_rng(0)
+    path = tmp_path / "b.mat"
+    for content in (whole, packed):
+        for end in range(6, len(content), 7):
+            path.write_bytes(content[:end])
+            with suppress(InputError):
+                read_checkpoint(path)
+        for _ in range(400):
+            changed = bytearray(content)
+            for place in rng.integers(116, len(content), rng.integers(1, 4)):
+                changed[place] = rng.integers(256)
+            path.write_bytes(changed)
+            with suppress(InputError):
+                read_checkpoint(path)
+
+
+HEADER = b"MATLAB 5.0 MAT-file".ljust(124) + b"\0\1IM"
+
+
+def element(kind, content):
+    return struct.pack("<II", kind, len(content)) + content + bytes(-len(content) % 8)
+
+
+def nested(depth):
+    """Cells within each other, around a number."""
+    shape = element(5, struct.pack("<ii", 1, 1))
+    inner = element(
+        14, element(6, struct.pack("<II", 6, 0)) + shape + element(1, b"") + element(9, struct.pack("<d", 5))
+    )
+    for level in range(depth):
+        name = element(1, b"x" * (level == depth - 1))
+        inner = element(14, element(6, struct.pack("<II", 1, 0)) + shape + name + inner)
+    return inner
+
+
+def test_depth_is_bounded_before_anything_is_read(tmp_path):
+    path = tmp_path / "a.mat"
+    path.write_bytes(HEADER + nested(5))
+    [(name, array)] = read_checkpoint(path).items()
+    assert (name.count(".0"), array.tolist()) == (5, [[5]])
+    path.write_bytes(HEADER + nested(20_000))
+    refused(path, "expected layers of arrays, got deeper structures")
+
+
+def test_what_unpacks_to_much_more_than_the_file_is_refused(tmp_path):
+    path = tmp_path / "a.mat"
+    path.write_bytes(HEADER + element(15, zlib.compress(bytes(200_000_000), 9)))
+    refused(path, "much larger when it is unpacked")
+
+
+def test_other_versions(tmp_path):
+    path = tmp_path / "a.mat"
+    path.write_bytes(b"MATLAB 7.3 MAT-file, Platform".ljust(124) + b"\0\2IM" + bytes(1000))
+    refused(path, "expected a MATLAB file of version 5, got 7.3; save it with -v7")
+    path.write_bytes(b"MATLAB".ljust(200, b"\1"))
+    refused(path, "this checkpoint is damaged")
+
+
+def test_another_networks_file_is_told(tmp_path):
+    other = {"net": {"layers": cell({"weights": cell(*random_checkpoint({"a": (3, 3, 3, 4)}).values())})}}
+    read = read_checkpoint(write_matlab(tmp_path / "a.mat", other))
+    plan = planned(network_of(entry_of("netvlad_tokyotm")).builder())
+    with pytest.raises(InputError, match=r"keys do not fit the network: .*missing"):
+        convert(read, NETVLAD_MATLAB, plan.shapes)

@@ -1,0 +1,105 @@
+"""Features that are written: read back the same, as other programs expect them."""
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mfvpr import InputError
+from mfvpr.io import open_features, write_features
+from tests.builders import make_features
+from tests.io.other_programs import NAMES, assert_equal, feature, features_of
+
+PATHS = ["feats.h5", "feats.hdf5", "feats.npz", "feats"]
+
+
+@pytest.mark.parametrize("file", PATHS)
+@pytest.mark.parametrize("half", [False, True])
+def test_written_and_read(tmp_path, file, half):
+    made = [feature(seed, count=seed * 8) for seed in range(3)]
+    write_features(tmp_path / file, NAMES, enumerate(made), half=half)
+    source = open_features(tmp_path / file, NAMES, lengths="keep" if half else "unit")
+    assert source.counts.tolist() == [0, 8, 16]
+    for row, found in source.read():
+        kind = np.float16 if half else np.float32
+        values = {name: getattr(made[row], name).astype(kind) for name in ("keypoints", "descriptors", "scores")}
+        assert_equal(found, type(found)(**(vars(made[row]) | values)))
+    if file != "feats":
+        assert [path.name for path in tmp_path.iterdir()] == [file]
+
+
+@pytest.mark.parametrize("file", PATHS)
+def test_padding_is_left_out_and_rows_may_be_few(tmp_path, file):
+    padded = make_features(np.random.default_rng(0), 9, capacity=20, garbage=np.nan)
+    write_features(tmp_path / file, NAMES, [(1, padded)])
+    source = open_features(tmp_path / file, NAMES, partial=True)
+    assert source.counts.tolist() == [-1, 9, -1]
+    [(row, found)] = source.read()
+    assert row == 1
+    np.testing.assert_array_equal(found.keypoints, padded.keypoints[:9])
+    np.testing.assert_array_equal(found.descriptors, padded.descriptors[:9])
+
+
+def test_what_is_read_is_written_again(tmp_path):
+    """From one layout to the next and back: the same file of hloc."""
+    write_features(tmp_path / "0.h5", NAMES, enumerate(features_of(3)))
+    for before, after in (("0.h5", "1.npz"), ("1.npz", "2"), ("2", "3.h5")):
+        write_features(tmp_path / after, NAMES, open_features(tmp_path / before, NAMES).read())
+    assert (tmp_path / "0.h5").read_bytes() == (tmp_path / "3.h5").read_bytes()
+
+
+def test_hloc_reads_what_is_written(tmp_path):
+    made = feature(0)
+    write_features(tmp_path / "f.h5", ["a/b.jpg"], [(0, made)], half=True)
+    with h5py.File(tmp_path / "f.h5", "r", libver="latest") as file:
+        group = file["a/b.jpg"]
+        assert {name: (data.dtype.name, data.shape) for name, data in group.items()} == {
+            "keypoints": ("float16", (30, 2)),
+            "descriptors": ("float16", (16, 30)),
+            "scores": ("float16", (30,)),
+            "image_size": ("int64", (2,)),
+        }
+        np.testing.assert_array_equal(group["descriptors"], made.descriptors.T.astype(np.float16))
+        assert group["image_size"][()].tolist() == [640, 480]
+
+
+names = st.text(st.characters(exclude_categories=["Cc"], exclude_characters="/\\"), min_size=1, max_size=8).filter(
+    lambda text: text.strip(".") == text
+)
+
+
+@settings(max_examples=20)
+@given(st.lists(names, min_size=1, max_size=3, unique=True))
+def test_any_name(tmp_path_factory, drawn):
+    folder, made = tmp_path_factory.mktemp("names"), feature(0, count=3)
+    paths = [f"sub/{name}" for name in drawn]
+    for file in ("f.h5", "f.npz"):
+        write_features(folder / file, paths, [(row, made) for row in range(len(paths))])
+        assert open_features(folder / file, paths).counts.tolist() == [3] * len(paths)
+
+
+@pytest.mark.parametrize("file", PATHS)
+def test_a_failure_leaves_what_was_there(tmp_path, file):
+    write_features(tmp_path / file, NAMES, enumerate(features_of(3)))
+
+    def broken():
+        yield 0, feature(9)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_features(tmp_path / file, NAMES, broken())
+    source = open_features(tmp_path / file, NAMES)
+    assert dict(source.read([2]))[2].keypoints.shape == (30, 2)
+    assert not [path for path in tmp_path.rglob("*") if path.name.startswith(".")]
+
+
+def test_what_cannot_be_written(tmp_path):
+    made = feature(0)
+    loud = type(made)(**(vars(made) | {"scores": made.scores * 1e6}))
+    with pytest.raises(InputError, match=r"a\.jpg: scores: .*float16"):
+        write_features(tmp_path / "f.h5", ["a.jpg"], [(0, loud)], half=True)
+    for name in ("../a.jpg", "/a.jpg", ""):
+        with pytest.raises(InputError, match="expected a path below the folder of images"):
+            write_features(tmp_path / "f", [name], [(0, made)])
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,282 @@
+"""hloc's h5 as hloc writes it: what comes back, and what is refused."""
+
+import sys
+import tracemalloc
+
+import h5py
+import numpy as np
+import pytest
+
+import mfvpr.io.h5
+from mfvpr import InputError
+from mfvpr.io import open_features
+from tests.io.other_programs import (
+    NAMES,
+    SIZE,
+    append_hloc,
+    assert_equal,
+    feature,
+    features_of,
+    hloc_parts,
+    write_hloc,
+)
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "feats-d2net-ss.h5"
+
+
+def test_float32_comes_back_exactly_in_the_order_of_the_names(path):
+    made = features_of(3, count=40)
+    write_hloc(path, NAMES, made, half=False)
+    source = open_features(path, NAMES[::-1])
+    assert source.counts.tolist() == [40] * 3
+    assert source.counts.dtype == np.int32
+    assert (len(source), source.dimension, source.scored, source.paths) == (3, 16, True, (path,))
+    for (row, found), expected in zip(source.read(), made[::-1], strict=True):
+        assert_equal(found, expected)
+        assert 0 <= row < 3
+    assert [row for row, _ in source.read([2, 0, 2])] == [2, 0, 2]
+
+
+def test_float16_becomes_float32_of_unit_length(path):
+    made = feature(0, count=200)
+    write_hloc(path, ["a.jpg"], [made])
+    [(_, found)] = open_features(path, ["a.jpg"]).read()
+    np.testing.assert_array_equal(found.keypoints, made.keypoints.astype(np.float16).astype(np.float32))
+    np.testing.assert_allclose(np.linalg.norm(found.descriptors, axis=1), 1, atol=1.2e-6)
+    assert_equal(found, made, atol=0.13)  # float16 at 480 px
+    np.testing.assert_allclose(found.descriptors, made.descriptors, atol=5e-4)
+
+
+def test_the_file_is_closed_between_readings_and_may_hold_other_images(path):
+    write_hloc(path, NAMES, features_of(3))
+    source = open_features(path, NAMES[:1])
+    append_hloc(path, "query/later.jpg", hloc_parts(feature(5)))
+    assert len(dict(source.read())) == 1
+
+
+def test_images_without_keypoints(path):
+    write_hloc(path, ["a.jpg", "b.jpg"], [feature(0, count=0), feature(1, count=7)])
+    source = open_features(path, ["a.jpg", "b.jpg"])
+    assert source.counts.tolist() == [0, 7]
+    [(_, empty), _] = source.read()
+    assert (empty.keypoints.shape, empty.descriptors.shape, empty.mask.shape) == ((0, 2), (0, 16), (0,))
+
+
+def test_descriptors_of_no_keypoints(path):
+    append_hloc(path, "a.jpg", hloc_parts(feature(0)))
+    for name, shape in (("b.jpg", (0,)), ("c.jpg", (0, 16)), ("d.jpg", (16, 3))):
+        append_hloc(path, name, hloc_parts(feature(0, count=0)) | {"descriptors": np.ones(shape, np.float16)})
+    source = open_features(path, ["a.jpg", "b.jpg", "c.jpg", "d.jpg"])
+    assert [found.descriptors.shape for _, found in source.read(range(3))] == [(30, 16), (0, 16), (0, 16)]
+    with pytest.raises(InputError, match=r"d\.jpg: expected 0 keypoints"):
+        list(source.read([3]))
+
+
+def test_as_many_keypoints_as_dimensions(path):
+    """The other images of the file tell the layout; alone, it is hloc's."""
+    square = feature(0, count=16)
+    write_hloc(path, ["a.jpg"], [square], half=False)
+    [(_, found)] = open_features(path, ["a.jpg"]).read()
+    np.testing.assert_array_equal(found.descriptors, square.descriptors)
+    for name, made in (("b.jpg", square), ("c.jpg", feature(1, count=9))):
+        append_hloc(path, name, hloc_parts(made, half=False) | {"descriptors": made.descriptors})
+    source = open_features(path, ["b.jpg", "c.jpg"])
+    np.testing.assert_array_equal(dict(source.read())[0].descriptors, square.descriptors)
+
+
+def test_scores_by_another_name_or_missing(path):
+    made = feature(0)
+
+    def renamed(name, parts):
+        scores = parts.pop("scores")
+        return parts | ({"keypoint_scores": scores} if name == "a.jpg" else {})
+
+    write_hloc(path, ["a.jpg", "b.jpg"], [made, made], half=False, change=renamed)
+    source = open_features(path, ["a.jpg"])
+    assert source.scored
+    np.testing.assert_array_equal(next(source.read())[1].scores, made.scores)
+    source = open_features(path, ["b.jpg"])
+    assert not source.scored
+    np.testing.assert_array_equal(next(source.read())[1].scores, np.ones(30))
+    with pytest.raises(InputError, match=r"scores .*got none .*b\.jpg"):
+        open_features(path, ["a.jpg", "b.jpg"])
+
+
+def test_image_size_that_the_file_lacks_is_given(path):
+    write_hloc(path, NAMES, features_of(3), change=lambda _, parts: parts | {"image_size": parts.pop("image_size")})
+    write_hloc(path, ["x.jpg"], features_of(1), change=lambda _, parts: {k: parts[k] for k in list(parts)[:3]})
+    with pytest.raises(InputError, match=r"x\.jpg: .*image_size .*got none; .*image_size="):
+        open_features(path, ["x.jpg"])
+    for size in ((640, 480), [[640, 480]]):
+        [(_, found)] = open_features(path, ["x.jpg"], image_size=size).read()
+        assert found.image_size.tolist() == [640, 480]
+    with pytest.raises(InputError, match=r"a/image 1\.jpg: .*image_size .*\[320"):
+        next(open_features(path, NAMES, image_size=(320, 240)).read())
+    for size in ((0, 3), (np.nan, 1), (1, 2, 3), [[1, 2]]):
+        with pytest.raises(InputError, match=r"image_size: .*width, height"):
+            open_features(path, NAMES, image_size=size)
+
+
+def test_missing_images(path):
+    write_hloc(path, NAMES[:2], features_of(2))
+    with pytest.raises(InputError, match=r"feats-d2net-ss\.h5: .*all 3 .*image10\.png"):
+        open_features(path, NAMES)
+    source = open_features(path, NAMES, partial=True)
+    assert source.counts.tolist() == [30, 30, -1]
+    assert [row for row, _ in source.read()] == [0, 1]
+    for row in (2, 3, -1):
+        with pytest.raises(InputError, match=f"image {row}, got none"):
+            next(source.read([row]))
+    with pytest.raises(InputError, match="got 0; the first without"):
+        open_features(path, ["other.jpg"], partial=True)
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (lambda p: {"keypoints": p["keypoints"]}, "got no descriptors"),
+        (lambda p: {"descriptors": p["descriptors"]}, "got no keypoints"),
+        (lambda p: p | {"keypoints": p["keypoints"][:, :1]}, r"keypoints: expected \[N, 2\].* got \[30, 1\]"),
+        (lambda p: p | {"keypoints": p["keypoints"].T}, r"keypoints: expected \[N, 2\].* got \[2, 30\]"),
+        (lambda p: p | {"keypoints": p["keypoints"][0]}, r"keypoints: expected \[N, 2\].* got \[2\]"),
+        (lambda p: p | {"descriptors": p["descriptors"][:, :-1]}, r"expected \[30, D\] or \[D, 30\].* got \[16, 29\]"),
+        (lambda p: p | {"descriptors": p["descriptors"][0]}, r"expected \[30, D\] or \[D, 30\].* got \[30\]"),
+        (lambda p: p | {"descriptors": p["descriptors"][:8]}, "expected 16 numbers each, got 8"),
+        (
+            lambda p: p | {"descriptors": p["descriptors"].T},
+            r"got \[D, N\] .*a\.jpg .*\[N, D\] .*b\.",
+        ),
+    ],
+)
+def test_arrays_that_do_not_fit(path, change, message):
+    write_hloc(path, ["a.jpg"], features_of(1))
+    append_hloc(path, "b.jpg", change(hloc_parts(feature(1))))
+    with pytest.raises(InputError, match=message) as error:
+        open_features(path, ["a.jpg", "b.jpg"])
+    assert "b.jpg" in str(error.value)
+    assert "feats-d2net-ss.h5" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def spoiled(part, value, row=3):
+    def change(parts):
+        array = parts[part].copy()
+        array[row] = value
+        return parts | {part: array}
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (spoiled("keypoints", np.nan), r"keypoints: .*finite .*nan at \[3, 0\]"),
+        (spoiled("descriptors", np.inf), r"descriptors: .*finite .*inf at \[3, 0\]"),
+        (spoiled("scores", np.nan), r"scores: .*finite .*nan at \[3\]"),
+        (lambda p: p | {"scores": np.full(30, 1e300)}, "scores: .*finite .*1e.300"),
+        (lambda p: p | {"descriptors": p["descriptors"] * 2}, r"got length 2.* lengths='normalize'"),
+        (lambda p: p | {"descriptors": np.zeros((16, 30), np.uint8)}, "floating-point .*got uint8"),
+        (lambda p: p | {"keypoints": np.zeros((30, 2), np.complex64)}, "keypoints: .*numbers, got complex64"),
+        (lambda p: p | {"scores": p["scores"][1:]}, r"expected 30 keypoints with scores .* got 30, 29 and \[30, 16\]"),
+        (lambda p: p | {"scores": np.zeros(30, bool)}, "scores: .*floating-point .*got bool"),
+        (lambda p: p | {"image_size": np.array([640, 0])}, r"image_size: expected .* got \[640, 0\]"),
+        (lambda p: p | {"image_size": np.array([640, 480, 3])}, r"image_size: expected .* got \[640, 480, 3\]"),
+        (spoiled("keypoints", 700), r"keypoints .*640 x 480 .*got \(700, 700\)"),
+        (spoiled("keypoints", -20), r"got \(-20, -20\)"),
+        (lambda p: p | {"keypoints": np.full((30, 2), (100, 600))}, r"got \(100, 600\)"),
+    ],
+)
+def test_values_that_cannot_be_used(path, change, message):
+    append_hloc(path, "a/b.jpg", change(hloc_parts(feature(1))))
+    source = open_features(path, ["a/b.jpg"])
+    with pytest.raises(InputError, match=message) as error:
+        list(source.read())
+    assert "a/b.jpg" in str(error.value)
+    assert "feats-d2net-ss.h5" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("point", "is_inside"), [((645, 200), True), ((-6, 483), True), ((646, 200), False),
+                                                  ((-7, 200), False), ((300, 484), False)])  # fmt: skip
+def test_keypoints_may_lie_a_hundredth_of_the_image_outside(path, point, is_inside):
+    """640 x 480 pixels: as float16 rounds them, and as detectors extrapolate."""
+    append_hloc(path, "a.jpg", spoiled("keypoints", point)(hloc_parts(feature(1))))
+    source = open_features(path, ["a.jpg"])
+    if is_inside:
+        assert next(source.read())[1].keypoints[3].tolist() == list(point)
+    else:
+        with pytest.raises(InputError, match="expected keypoints"):
+            list(source.read())
+
+
+def test_lengths_of_descriptors(path):
+    made = feature(0)
+    lengths = np.linspace(0.5, 3, 30, dtype=np.float32)[:, None]
+    parts = hloc_parts(made, half=False) | {"descriptors": (made.descriptors * lengths).T}
+    append_hloc(path, "a.jpg", parts)
+    [(_, kept)] = open_features(path, ["a.jpg"], lengths="keep").read()
+    np.testing.assert_array_equal(kept.descriptors, parts["descriptors"].T)
+    [(_, unit)] = open_features(path, ["a.jpg"], lengths="normalize").read()
+    np.testing.assert_allclose(unit.descriptors, made.descriptors, atol=1e-6)
+    append_hloc(path, "zero.jpg", spoiled("descriptors", 0, row=slice(None))(parts))
+    with pytest.raises(InputError, match=r"zero\.jpg: descriptors: .*got zeros at 0"):
+        list(open_features(path, ["zero.jpg"], lengths="normalize").read())
+    with pytest.raises(InputError, match=r"lengths=l2: .*unit, normalize, keep"):
+        open_features(path, ["a.jpg"], lengths="l2")  # type: ignore[arg-type]
+
+
+def test_a_file_that_changes_after_it_was_opened(path):
+    write_hloc(path, ["a.jpg"], features_of(1))
+    source = open_features(path, ["a.jpg"])
+    path.unlink()
+    write_hloc(path, ["a.jpg"], [feature(0, count=31)])
+    with pytest.raises(InputError, match=r"a\.jpg: .*30 keypoints .*changed"):
+        list(source.read())
+    path.unlink()
+    write_hloc(
+        path, ["a.jpg"], features_of(1), change=lambda _, parts: {k: v for k, v in parts.items() if k != "scores"}
+    )
+    with pytest.raises(InputError, match="changed since it was opened"):
+        list(source.read())
+    path.unlink()
+    write_hloc(path, ["b.jpg"], features_of(1))
+    with pytest.raises(InputError, match="cannot be read"):
+        list(source.read())
+
+
+def test_opening_and_reading_take_the_memory_of_what_is_read(path):
+    """2,000 images of 200 KB each, of which 5 are read; the others cannot be, as they were never written."""
+    shared = hloc_parts(feature(0, count=50, dimension=1024), half=False)
+    names = [f"db/{index // 100}/{index:05d}.jpg" for index in range(2000)]
+    parts = ("keypoints", "descriptors")
+    with h5py.File(path, "w", libver="latest") as file:
+        unwritten = file.create_group("other.jpg")
+        for part in parts:
+            unwritten.create_dataset(part, shape=shared[part].shape, dtype=np.float32)
+        for index, name in enumerate(names):
+            group = file.create_group(name)
+            for part in parts:
+                group[part] = shared[part] if index < 5 else unwritten[part]
+    tracemalloc.start()
+    try:
+        source = open_features(path, names, image_size=SIZE)
+        read = list(source.read(range(5)))
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert len(read) == 5
+    assert (source.counts == 50).all()
+    assert peak < 6e6  # of 400 MB; what is read takes 1 MB, headers 2 MB
+    with pytest.raises(InputError, match=r"db/0/00005\.jpg/keypoints: .*not written"):
+        list(source.read([5]))
+
+
+def test_without_h5py(path, monkeypatch):
+    path.write_bytes(b"")
+    assert not hasattr(mfvpr.io.h5, "h5py")  # it is imported where it is needed
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(InputError, match=r"h5py; pip install 'mfvpr\[hloc\]'"):
+        open_features(path, NAMES)

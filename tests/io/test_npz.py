@@ -1,0 +1,216 @@
+"""Features in npz: D2-Net's files, one for each image, one for all."""
+
+import os
+import warnings
+import zipfile
+
+import numpy as np
+import pytest
+
+from mfvpr import InputError
+from mfvpr.io import open_features, read_global_descriptors
+from tests.io.other_programs import SIZE, assert_equal, feature
+
+
+def d2net(path, features, scale=1.0):
+    """As D2-Net's extract_features.py writes `path.d2-net`: (x, y, scale), rows of descriptors, no image size."""
+    count = len(features.keypoints)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(f"{path}.d2-net", "wb") as file:
+        np.savez(
+            file,
+            keypoints=np.c_[features.keypoints, np.full(count, scale)].astype(np.float64),
+            scores=features.scores,
+            descriptors=features.descriptors,
+        )
+
+
+def parts_of(features):
+    return {part: getattr(features, part) for part in ("keypoints", "descriptors", "scores", "image_size")}
+
+
+def test_files_of_d2net_beside_their_images(tmp_path):
+    names, made = ["a/1.jpg", "a/2.jpg", "b/1.jpg"], [feature(seed) for seed in range(3)]
+    for name, one in zip(names, made, strict=True):
+        d2net(tmp_path / name, one)
+        (tmp_path / name).write_bytes(b"the image itself")
+    source = open_features(tmp_path, names[::-1], image_size=SIZE)
+    assert source.counts.tolist() == [30] * 3
+    assert source.paths == tuple(tmp_path / f"{name}.d2-net" for name in names[::-1])
+    for (_, found), expected in zip(source.read(), made[::-1], strict=True):
+        assert_equal(found, expected)
+    with pytest.raises(InputError, match=r"b/1\.jpg: expected image_size"):
+        open_features(tmp_path, names[::-1])
+
+
+def test_one_for_each_image_by_path_or_stem(tmp_path):
+    made = feature(0)
+    (tmp_path / "a").mkdir()
+    np.savez(tmp_path / "a" / "1.jpg.npz", **parts_of(made))
+    np.savez(tmp_path / "a" / "2.npz", **parts_of(made))
+    np.savez(tmp_path / ".hidden.npz", nothing=0)
+    for names in (["a/1.jpg", "a/2.jpg"], ["1.jpg", "2.png"]):
+        for _, found in open_features(tmp_path, names).read():
+            assert_equal(found, made)
+
+
+def test_one_for_all(tmp_path):
+    names, made = ["a/1.jpg", "keypoints", "b"], [feature(seed, count=seed + 5) for seed in range(3)]
+    arrays = {f"{n}/{part}": array for n, one in zip(names, made, strict=True) for part, array in parts_of(one).items()}
+    np.savez_compressed(tmp_path / "all.npz", **arrays)
+    source = open_features(tmp_path / "all.npz", names)
+    assert source.counts.tolist() == [5, 6, 7]
+    assert source.paths == (tmp_path / "all.npz",)
+    for row, found in source.read([2, 0, 1]):
+        assert_equal(found, made[row])
+
+
+def test_rows_of_descriptors_where_shapes_cannot_tell(tmp_path):
+    made = feature(0, count=16)
+    np.savez(tmp_path / "1.jpg.npz", **parts_of(made))
+    [(_, found)] = open_features(tmp_path, ["1.jpg"]).read()
+    np.testing.assert_array_equal(found.descriptors, made.descriptors)
+
+
+def test_only_what_is_asked_for_is_read(tmp_path):
+    """The other member's values are damaged: its header is not, so that nobody notices until it is read."""
+    made = {name: feature(seed, count=2000) for seed, name in enumerate(("a.jpg", "b.jpg"))}
+    path = tmp_path / "all.npz"
+    np.savez(path, **{f"{name}/{part}": array for name, one in made.items() for part, array in parts_of(one).items()})
+    with zipfile.ZipFile(path) as archive:
+        start = archive.getinfo("b.jpg/descriptors.npy").header_offset
+    content = bytearray(path.read_bytes())
+    content[start + 5000] ^= 1
+    path.write_bytes(content)
+    source = open_features(path, ["a.jpg", "b.jpg"])
+    [(_, found)] = source.read([0])
+    assert_equal(found, made["a.jpg"])
+    with pytest.raises(InputError, match=r"all\.npz: .*CRC-32 .*'b\.jpg/descriptors\.npy'"):
+        list(source.read([1]))
+
+
+def test_pipes_are_not_waited_for(tmp_path):
+    made, names = feature(0), ["1.jpg", "2.jpg"]
+    np.savez(tmp_path / "1.jpg.npz", **parts_of(made))
+    os.mkfifo(tmp_path / "2.jpg.npz")
+    for path, wanted in ((tmp_path, names), (tmp_path / "2.jpg.npz", names)):
+        with pytest.raises(InputError, match=r"2\.jpg\.npz: .*a pipe"):
+            open_features(path, wanted)
+    [(_, found)] = open_features(tmp_path, names[:1]).read()
+    assert_equal(found, made)
+    (tmp_path / "2.jpg.npz").unlink()
+    np.savez(tmp_path / "2.jpg.npz", **parts_of(made))
+    source = open_features(tmp_path, names)
+    (tmp_path / "2.jpg.npz").unlink()
+    os.mkfifo(tmp_path / "2.jpg.npz")
+    with pytest.raises(InputError, match=r"2\.jpg\.npz: .*a pipe"):
+        list(source.read([1]))
+    for name in ("a.h5", "a.npy"):
+        os.mkfifo(tmp_path / name)
+        with pytest.raises(InputError, match="got a pipe"):
+            read_global_descriptors(tmp_path / name, names)
+
+
+def test_an_array_twice(tmp_path):
+    """Of several arrays with one name, NumPy takes the last and others the first."""
+    np.savez(tmp_path / "1.jpg.npz", **parts_of(feature(0)))
+    np.savez(tmp_path / "all.npz", **{f"1.jpg/{part}": array for part, array in parts_of(feature(0)).items()})
+    source, whole = (open_features(path, ["1.jpg"]) for path in (tmp_path / "all.npz", tmp_path))
+    for path, member in ((tmp_path / "1.jpg.npz", "scores.npy"), (tmp_path / "all.npz", "1.jpg/scores.npy")):
+        with zipfile.ZipFile(path, "a") as archive, warnings.catch_warnings(action="ignore"):
+            archive.writestr(member, archive.read(member))
+    for use in (
+        lambda: open_features(tmp_path / "all.npz", ["1.jpg"]),
+        lambda: open_features(tmp_path, ["1.jpg"]),
+        lambda: list(source.read()),
+        lambda: list(whole.read()),
+    ):
+        with pytest.raises(InputError, match=r"npz: .*once, got .*scores\.npy"):
+            use()
+
+
+def test_pickles_are_never_loaded(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return exec, ("raise SystemExit('executed')",)
+
+    parts = parts_of(feature(0))
+    np.savez(tmp_path / "1.jpg.npz", **(parts | {"scores": np.array([Trap()], object)}))
+    np.savez(tmp_path / "all.npz", **{"1.jpg/keypoints": np.array([Trap()], object)})
+    for path in (tmp_path / "all.npz", tmp_path):
+        with pytest.raises(InputError, match=r"npz: .*array of numbers .*got objects"):
+            list(open_features(path, ["1.jpg"]).read())
+    records = np.zeros(30, np.dtype([("x", "f4")]))
+    np.savez(tmp_path / "1.jpg.npz", **(parts | {"scores": records}))
+    (tmp_path / "all.npz").unlink()
+    with pytest.raises(InputError, match="got objects"):
+        list(open_features(tmp_path, ["1.jpg"]).read())
+
+
+def test_truncated_at_any_place(tmp_path):
+    path = tmp_path / "1.jpg.npz"
+    np.savez(path, **parts_of(feature(0)))
+    content = path.read_bytes()
+    for length in (0, 10, 100, len(content) // 2, len(content) - 1):
+        path.write_bytes(content[:length])
+        with pytest.raises(InputError, match=r"1\.jpg\.npz: cannot be read") as error:
+            list(open_features(tmp_path, ["1.jpg"]).read())
+        assert "\n" not in str(error.value)
+
+
+def npy(header, values=b""):
+    """The bytes of a `.npy` whose header says whatever it likes."""
+    text = header.encode() + b" " * (117 - len(header)) + b"\n"
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + values
+
+
+@pytest.mark.parametrize(
+    "content, message",
+    [
+        (npy("{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000, 2)}"), "expected 8000000000000 bytes"),
+        (
+            npy("{'descr': '<f4', 'fortran_order': False, 'shape': (3, 2)}", bytes(25)),
+            "expected 24 bytes of values, got 25",
+        ),
+        (npy("{'descr': '<f4', 'fortran_order': False, 'shape': (3, -2)}"), "cannot be read|expected"),
+        (npy("__import__('os').system('true')"), "cannot be read"),
+        (b"\x93NUMPY\x09\x00", r"expected an array of NumPy's format 1\.0 or 2\.0"),
+        (b"text", "cannot be read"),
+    ],
+)
+def test_forged_arrays(tmp_path, content, message):
+    with zipfile.ZipFile(tmp_path / "1.jpg.npz", "w") as archive:
+        for part, array in parts_of(feature(0, count=3)).items():
+            if part != "image_size":
+                with archive.open(f"{part}.npy", "w") as member:
+                    np.lib.format.write_array(member, array)
+        archive.writestr("image_size.npy", content)
+    with pytest.raises(InputError, match=message) as error:
+        list(open_features(tmp_path, ["1.jpg"]).read())
+    assert "1.jpg" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_more_keypoints_than_can_be_counted(tmp_path):
+    header = "{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000, 2)}"
+    with zipfile.ZipFile(tmp_path / "1.jpg.npz", "w") as archive:
+        for part in ("keypoints", "descriptors"):
+            archive.writestr(f"{part}.npy", npy(header))
+    with pytest.raises(InputError, match=r"1\.jpg: keypoints: .*\[N, 2\].* got \[1000000000000, 2\]"):
+        open_features(tmp_path, ["1.jpg"], image_size=SIZE)
+
+
+def test_what_is_no_store_of_features(tmp_path):
+    path = tmp_path / "1.jpg.npz"
+    np.savez(path, **parts_of(feature(0)))
+    with pytest.raises(InputError, match=r"got keypoints, descriptors, scores, image_size; .*folder"):
+        open_features(path, ["1.jpg"])
+    np.savez(path)
+    with pytest.raises(InputError, match=r"expected arrays named by images .* got none"):
+        open_features(path, ["1.jpg"])
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"empty: .*\.npz .*\.d2-net, got none"):
+        open_features(tmp_path / "empty", ["1.jpg"])
+    d2net(tmp_path / "1.jpg", feature(0))
+    with pytest.raises(InputError, match=r"1\.jpg\.npz: 1\.jpg\.d2-net .*same image"):
+        open_features(tmp_path, ["1.jpg"])

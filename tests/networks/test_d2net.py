@@ -1,0 +1,325 @@
+"""D2-Net: as the public code (golden values), as an independent oracle, and where either has nothing to say."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from mfvpr import InputError
+from mfvpr.checkpoints.conversion import convert
+from mfvpr.checkpoints.networks import blueprint
+from mfvpr.checkpoints.registry import entry_of
+from mfvpr.checkpoints.tables import D2NET
+from mfvpr.features import d2net as features_d2net
+from mfvpr.features.d2net import D2NetFeatures
+from mfvpr.features.network import compiled
+from mfvpr.networks.d2net import SCALES, D2Net, detect, extract, select, survey
+from mfvpr.networks.imagenet import preprocess
+from tests.builders import local
+from tests.golden.make_d2net import CASES, GOLDEN, PLAIN, projections, samples, texture
+from tests.networks import d2net_oracle as oracle
+from tests.random_checkpoints import d2net_shapes, random_checkpoint
+
+pytestmark = pytest.mark.thorough
+
+
+@pytest.fixture(scope="module")
+def model() -> D2Net:
+    plan = blueprint(entry_of("d2_tf"))
+    return plan.filled(convert(random_checkpoint(d2net_shapes()), D2NET, plan.shapes))
+
+
+class Tiny(nnx.Module):
+    """A network of the same stride that compiles fast: means of 4 x 4 px, smoothed, and six random mixtures of them."""
+
+    def __init__(self) -> None:
+        self.mixture = nnx.Param(jnp.asarray(np.random.default_rng(0).normal(size=(3, 6)), jnp.float32))
+
+    def __call__(self, images):
+        batch, height, width = images.shape[0], images.shape[1] // 4, images.shape[2] // 4
+        blocks = images[:, : 4 * height, : 4 * width].reshape(batch, height, 4, width, 4, 3).mean((2, 4))
+        smoothed = blocks[:, 1:, 1:] + blocks[:, :-1, 1:] + blocks[:, 1:, :-1] + blocks[:, :-1, :-1]
+        return nnx.relu(smoothed @ self.mixture[...])
+
+
+@pytest.fixture(scope="module")
+def small() -> D2NetFeatures:
+    return D2NetFeatures(Tiny(), image_size=(64, 48))
+
+
+@pytest.fixture(scope="module")
+def images() -> np.ndarray:
+    return np.stack([texture(64, 48, seed) for seed in range(3)])
+
+
+_detect = jax.jit(detect, static_argnums=1)
+
+
+def detected(*maps, ratios=((1.0, 1.0),)):
+    """Detections of one image's maps."""
+    return _detect([jnp.asarray(dense) for dense in maps], ratios)
+
+
+def smooth(seed: int, height: int = 12, width: int = 10, channels: int = 6) -> np.ndarray:
+    """A map after ReLU: noise, blurred a little, with many maxima."""
+    noise = np.random.default_rng(seed).normal(size=(height + 1, width + 1, channels))
+    return np.maximum(noise[1:, 1:] + 0.5 * noise[:-1, 1:] + 0.5 * noise[1:, :-1], 0).astype(np.float32)
+
+
+def assert_same(level, expected, ratio=1.0):
+    """One map's Detections, and the oracle's keypoints."""
+    count = len(expected)
+    assert level.count == count
+    np.testing.assert_array_equal(level.mask, np.arange(len(level.mask)) < count)
+    points = np.array([(one.x, one.y) for one in expected]).reshape(-1, 2) * ratio
+    np.testing.assert_allclose(level.keypoints[:count], points, atol=1e-4)
+    np.testing.assert_allclose(level.scores[:count], [one.score for one in expected], rtol=1e-6)
+    descriptors = np.array([one.descriptor for one in expected]).reshape(count, -1)
+    np.testing.assert_allclose(level.descriptors[:count], descriptors.reshape(count, -1), atol=1e-5)
+
+
+def test_the_network_has_the_published_size():
+    plan = blueprint(entry_of("d2_tf"))
+    assert plan.parameters == 7_635_264
+    model = plan.filled({path: np.zeros(shape, np.float32) for path, shape in plan.shapes.items()})
+    for pixels, side in ((336, 83), (320, 79)):
+        image = jax.ShapeDtypeStruct((1, pixels, pixels, 3), jnp.float32)
+        assert jax.eval_shape(model, image).shape == (1, side, side, 512)
+
+
+@pytest.mark.optimized
+@pytest.mark.first_case
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_maps_and_features_are_those_of_the_public_code(model, case):
+    with np.load(GOLDEN) as file:
+        golden = {name: file[f"{case}/{name}"] for name in ("dense", "keypoints", "scores", "projections")}
+    maps = []
+
+    class Observed(nnx.Module):
+        """The network, whose maps are kept: one program gives them and the features."""
+
+        def __init__(self) -> None:
+            self.network = model
+
+        def __call__(self, images):
+            dense = self.network(images)
+            jax.debug.callback(lambda dense: maps.append(np.asarray(dense)), dense, ordered=True)
+            return dense
+
+    size = (case.width, case.height)
+    extractor = D2NetFeatures(Observed(), size, preprocessing=case.preprocessing, multiscale=case.multiscale)
+    features = extractor(texture(*size)[None])[0].features
+    jax.effects_barrier()
+    (dense,) = maps[len(maps) // 2]  # at full size
+    np.testing.assert_allclose(samples(dense), golden["dense"], rtol=1e-5, atol=1e-5 * golden["dense"].max())
+    assert len(features.scores) == len(golden["scores"]) > 200
+    np.testing.assert_allclose(features.keypoints, golden["keypoints"], atol=1e-3)
+    np.testing.assert_allclose(features.scores, golden["scores"], rtol=1e-5)
+    np.testing.assert_allclose(projections(features.descriptors), golden["projections"], atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1, atol=1e-6)
+    np.testing.assert_array_equal(features.image_size, size)
+    assert features.mask.all()
+
+
+@pytest.fixture(scope="module")
+def plain(model) -> D2NetFeatures:
+    return D2NetFeatures(model, (PLAIN[0].width, PLAIN[0].height))
+
+
+@pytest.mark.optimized
+@pytest.mark.first_case
+@pytest.mark.parametrize("case", PLAIN, ids=str)
+def test_plain_areas_have_the_keypoints_of_the_public_code_and_no_more(plain, case):
+    """Fast convolutions that round by position would make peaks of what is level, and lose those at its rim."""
+    with np.load(GOLDEN) as file:
+        golden = {name: file[f"{case}/{name}"] for name in ("keypoints", "scores", "projections")}
+    (features,) = local(plain(case.image[None]))
+    assert len(features.scores) == len(golden["scores"]) > 10
+    np.testing.assert_allclose(features.keypoints, golden["keypoints"], atol=1e-2)
+    np.testing.assert_allclose(features.scores, golden["scores"], rtol=1e-5)
+    np.testing.assert_allclose(projections(features.descriptors), golden["projections"], atol=1e-4)
+
+
+@pytest.mark.optimized
+def test_neighbors_that_see_the_same_pixels_have_the_same_bits(model):
+    """A position sees 92 x 92 px; elsewhere the fast convolutions are at work."""
+    image = texture(160, 128)
+    wide, tall = image.copy(), image.copy()
+    wide[2:94, 30:126] = 200
+    tall[30:126, 2:94] = 200
+    maps = compiled(model, lambda model, images: (model(images), nnx.relu(model.vgg(images, uniform=True))))
+    (usual, wide, tall), (uniform, *_) = zip(
+        *(maps(preprocess(image[None], "caffe")) for image in (image, wide, tall)), strict=True
+    )
+    np.testing.assert_array_equal(wide[0, 11, 18], wide[0, 11, 19])
+    np.testing.assert_array_equal(tall[0, 18, 11], tall[0, 19, 11])
+    if jax.default_backend() == "cpu":
+        assert not np.array_equal(usual, uniform)
+    np.testing.assert_allclose(usual, uniform, atol=1e-5 * uniform.max())
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_detection_agrees_with_the_oracle(seed):
+    dense = smooth(seed)
+    expected = oracle.keypoints(dense.astype(np.float64))
+    assert expected
+    assert_same(*detected(dense), expected)
+
+
+def test_detection_agrees_with_the_oracle_without_relu():
+    dense = smooth(0) - np.float32(4)  # all below the zeros around the map
+    expected = oracle.keypoints(dense.astype(np.float64))
+    assert expected
+    assert_same(*detected(dense), expected)
+
+
+def test_maps_of_the_oracle_meet_every_rule():
+    found = refused = at_border = 0
+    for seed in range(6):
+        dense = smooth(seed).astype(np.float64)
+        kept = {(one.row, one.column) for one in oracle.keypoints(dense)}
+        detected = {(row, column) for _, row, column in oracle.detected(dense)}
+        found += len(kept)
+        refused += len(detected - kept)
+        at_border += sum(row in (0, 11) or column in (0, 9) for row, column in kept)
+    assert found > 60
+    assert refused > 5
+    assert at_border > 5
+
+
+def test_scales_agree_with_the_oracle():
+    maps = [smooth(seed, *size) for seed, size in enumerate(((4, 7), (9, 15), (20, 31)))]
+    expected = oracle.pyramid([dense.astype(np.float64) for dense in maps])
+    assert all(expected)
+    ratios = ((2.0, 2.0), (1.0, 1.0), (0.5, 0.5))
+    found = detected(*maps, ratios=ratios)
+    for level, ours, (ratio, _) in zip(found, expected, ratios, strict=True):
+        assert_same(level, ours, ratio)
+
+
+def test_a_scale_without_keypoints_adds_nothing_to_the_next():
+    flat, textured = np.ones((6, 5, 6), np.float32), smooth(1)
+    empty, level = detected(flat, textured, ratios=((2.0, 2.0), (1.0, 1.0)))
+    assert empty.count == 0
+    expected = oracle.pyramid([flat.astype(np.float64), textured.astype(np.float64)])[1]
+    assert_same(level, expected)
+
+
+def test_of_channels_that_tie_the_first_is_reported():
+    dense = np.zeros((5, 5, 3), np.float32)
+    dense[2, 2] = [0, 3, 3]
+    twice = oracle.keypoints(dense.astype(np.float64))
+    assert [one.channel for one in twice] == [1, 2]
+    assert_same(*detected(dense), twice[:1])
+
+
+@pytest.mark.parametrize("value", [0, 1, -1, np.nan, np.inf])
+def test_a_constant_map_has_no_keypoints(value):
+    (level,) = detected(np.full((6, 7, 4), value, np.float32))
+    assert level.count == 0
+    assert not level.mask.any()
+
+
+def test_what_does_not_fit_is_counted_and_the_strongest_stay():
+    dense = smooth(3)
+    everything, few = jax.jit(lambda dense: [select(dense, survey(dense), slots) for slots in (1000, 5)])(dense)
+    assert everything.mask.shape == (120,)
+    count = int(everything.count)
+    assert few.count == count > 5
+    assert few.mask.all()
+    strongest = np.sort(np.argsort(-everything.scores[:count], stable=True)[:5])
+    np.testing.assert_array_equal(few.scores, everything.scores[strongest])
+    np.testing.assert_array_equal(few.keypoints, everything.keypoints[strongest])
+    np.testing.assert_allclose(few.descriptors, everything.descriptors[strongest], atol=1e-6)
+
+
+def test_crowded_images_are_extracted_again(small, images, monkeypatch):
+    monkeypatch.setattr(features_d2net, "_SHARE", 0.01)
+    crowded = D2NetFeatures(small.model, small.image_size)
+    for ours, expected in zip(local(crowded(images)), local(small(images)), strict=True):
+        assert len(expected.scores) > 2
+        jax.tree.map(lambda ours, theirs: np.testing.assert_allclose(ours, theirs, rtol=1e-5), ours, expected)
+
+
+@pytest.mark.optimized
+@pytest.mark.slow
+def test_images_of_a_batch_do_not_mix(model, images):
+    extracted = compiled(model, extract)
+    order = np.array([2, 0, 1])
+    (level,), (turned,) = extracted(images), extracted(images[order])
+    assert level.mask.any(1).all()
+    jax.tree.map(lambda ours, theirs: np.testing.assert_array_equal(ours[order], theirs), level, turned)
+
+
+def test_one_program_per_extractor(images, compilations):
+    extractor = D2NetFeatures(Tiny(), image_size=(64, 48), batch_size=2)
+    extractor(images)
+    compilations.reset()
+    extractor(images[:1])
+    extractor(images[::-1])
+    assert compilations.count == 0
+
+
+def test_the_highest_scores_are_kept_in_order(small, images):
+    limited = D2NetFeatures(small.model, small.image_size, max_keypoints=4)
+    for ours, everything in zip(local(limited(images)), local(small(images)), strict=True):
+        kept = np.sort(np.argsort(-everything.scores, kind="stable")[:4])
+        np.testing.assert_array_equal(ours.scores, everything.scores[kept])
+        np.testing.assert_array_equal(ours.keypoints, everything.keypoints[kept])
+
+
+@pytest.mark.slow
+def test_an_image_without_keypoints_gives_empty_features(images):
+    graph, state = nnx.split(Tiny())
+    blind = nnx.merge(graph, jax.tree.map(jnp.zeros_like, state))
+    for multiscale in (False, True):
+        features = D2NetFeatures(blind, image_size=(64, 48), multiscale=multiscale)(images[:1])[0].features
+        assert features.keypoints.shape == (0, 2)
+        assert features.descriptors.shape == (0, 6)
+        assert features.scores.shape == features.mask.shape == (0,)
+
+
+def test_no_images_give_no_features(small, images):
+    assert small(images[:0]) == []
+
+
+@pytest.mark.parametrize(
+    "size, multiscale, smallest", [((11, 64), False, 12), ((64, 23), True, 24), ((0, 0), False, 12)]
+)
+def test_images_too_small_are_refused(size, multiscale, smallest):
+    with pytest.raises(InputError, match=f"{smallest} x {smallest} px .*got {size[0]} x {size[1]}"):
+        D2NetFeatures(Tiny(), image_size=size, multiscale=multiscale)
+
+
+@pytest.mark.first_case
+@pytest.mark.parametrize("size, multiscale", [((12, 12), False), ((24, 24), True)])
+def test_the_smallest_images_are_taken(model, size, multiscale):
+    D2NetFeatures(Tiny(), size, multiscale=multiscale)(texture(*size)[None])
+    levels = jax.eval_shape(
+        lambda image: extract(model, image, scales=SCALES if multiscale else (1.0,)),
+        jax.ShapeDtypeStruct((1, *size, 3), jnp.uint8),
+    )
+    assert levels[0].keypoints.shape == (1, 4, 2)
+
+
+def test_images_of_another_size_are_refused(small, images):
+    with pytest.raises(InputError, match=r"expected images of 64 x 48 px, got 48 x 64"):
+        small(images.swapaxes(1, 2))
+
+
+def test_the_forecast_grows_with_the_map(model):
+    assert D2NetFeatures(model).scales[0].typical_count == 740
+    assert D2NetFeatures(model).scales[0].dimension == 512
+    assert D2NetFeatures(model, (320, 320)).scales[0].typical_count == pytest.approx(684, abs=20)
+    assert D2NetFeatures(model, multiscale=True).scales[0].typical_count > 740
+    assert D2NetFeatures(model, max_keypoints=100).scales[0].typical_count == 100
+
+
+def test_relu_is_an_option(model, images):
+    open_ended = nnx.merge(*nnx.split(model))
+    open_ended.relu = False
+    both = compiled(nnx.List([model, open_ended]), lambda models, images: [model(images) for model in models])
+    usual, dense = both(preprocess(images[:1, :24, :24], "caffe"))
+    assert dense.min() < 0
+    np.testing.assert_array_equal(usual, np.maximum(dense, 0))

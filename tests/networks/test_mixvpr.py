@@ -1,0 +1,158 @@
+"""MixVPR against the public code's numbers (tests/golden), and what its parts promise."""
+
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from mfvpr.checkpoints.conversion import convert
+from mfvpr.checkpoints.networks import blueprint
+from mfvpr.checkpoints.registry import entry_of
+from mfvpr.checkpoints.tables import MIXVPR
+from mfvpr.features.mixvpr import MixVprDescriptor
+from mfvpr.networks.mixvpr import MixVPR, preprocess
+from mfvpr.networks.resnet import ResNet50
+from mfvpr.utils.errors import InputError
+from tests.golden.make_mixvpr import GOLDEN, SIZES, faint_maps, images, samples
+from tests.random_checkpoints import mixvpr_shapes, random_checkpoint
+
+pytestmark = pytest.mark.thorough
+
+RELATIVE = 1e-5
+PARAMETERS = {4096: 10_880_900, 512: 10_092_898, 128: 9_896_098}
+
+
+@pytest.fixture(scope="module")
+def golden():
+    return dict(np.load(GOLDEN))
+
+
+def published(channels, rows):
+    """The network with random weights, through the published keys."""
+    network = blueprint(entry_of(f"mixvpr_{channels * rows}"))
+    checkpoint = random_checkpoint(mixvpr_shapes(channels, rows))
+    return network.filled(convert(checkpoint, MIXVPR, network.shapes))
+
+
+@pytest.fixture(scope="module")
+def model():
+    return published(*SIZES[0])
+
+
+@pytest.fixture(scope="module")
+def computed(model):
+    """All stages for both images at once."""
+
+    @jax.jit
+    def stages(model, images):
+        maps = model.backbone(preprocess(images))
+        mixed, mixers = maps.reshape(len(maps), 400, 1024).swapaxes(1, 2), []
+        for mixer in model.mix:
+            mixed = mixer(mixed)
+            mixers.append(mixed)
+        return {"maps": maps, "mixers": mixers, "descriptors": model.aggregate(maps)}
+
+    return SimpleNamespace(**stages(model, images()))
+
+
+def assert_close(actual, expected):
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=RELATIVE * np.abs(expected).max())
+
+
+def assert_same_descriptors(actual, expected):
+    assert actual.shape == expected.shape
+    assert np.linalg.norm(actual - expected, axis=1).max() < RELATIVE
+
+
+@pytest.mark.optimized
+def test_backbone_is_the_public_codes(computed, golden):
+    assert computed.maps.shape == (2, 20, 20, 1024)
+    assert_close(samples(np.asarray(computed.maps)), golden["backbone"])
+    assert_close(computed.maps.mean((1, 2)), golden["backbone/means"])
+
+
+@pytest.mark.optimized
+def test_each_mixer_is_the_public_codes(computed, golden):
+    for place, mixed in enumerate(computed.mixers):
+        assert_close(samples(np.asarray(mixed)), golden[f"mixer{place}"])
+
+
+@pytest.mark.optimized
+@pytest.mark.first_case
+@pytest.mark.parametrize("channels, rows", SIZES)
+def test_descriptors_are_the_public_codes(computed, golden, channels, rows):
+    aggregate = jax.jit(MixVPR.aggregate)
+    network, width = published(channels, rows), channels * rows
+    assert_same_descriptors(aggregate(network, computed.maps), golden[f"{width}/descriptors"])
+    assert_same_descriptors(aggregate(network, faint_maps()), golden[f"{width}/faint"])
+
+
+def test_epsilon_of_the_normalization_shows_on_faint_maps(golden):
+    network = published(64, 2)
+    for mixer in network.mix:
+        mixer.norm.epsilon = 1e-6  # Flax's default
+    wrong = jax.jit(MixVPR.aggregate)(network, faint_maps())
+    assert np.linalg.norm(wrong - golden["128/faint"]) > 100 * RELATIVE
+
+
+def vectors(descriptions):
+    return np.array([description.vector for description in descriptions])
+
+
+@pytest.mark.optimized
+def test_extractor_gives_the_public_codes_descriptors_and_compiles_once(model, golden, compilations):
+    extractor = MixVprDescriptor(model, batch_size=2)
+    assert (extractor.image_size, extractor.vector_size, extractor.interpolation) == ((320, 320), 4096, "pil_bicubic")
+    compilations.reset()
+    one, three = (vectors(extractor(images()[rows])) for rows in ([0], [0, 1, 0]))
+    assert compilations.count == 1
+    assert three.dtype == np.float32
+    np.testing.assert_array_equal(three[[0, 2]], one[[0, 0]])
+    assert_same_descriptors(three[:2], golden["4096/descriptors"])
+    np.testing.assert_allclose(np.linalg.norm(three, axis=1), 1, rtol=1e-6)
+    floats = vectors(extractor(images()[:1].astype(np.float32)))
+    assert_same_descriptors(floats, one)
+
+
+@pytest.mark.optimized
+def test_images_of_a_batch_do_not_see_each_other(model, computed):
+    alone = jax.jit(MixVPR.aggregate)(model, computed.maps[1:])
+    assert_same_descriptors(alone, computed.descriptors[1:])
+
+
+def test_bytes_and_floats_are_preprocessed_alike():
+    byte = np.arange(256, dtype=np.uint8).repeat(3).reshape(1, 16, 16, 3)
+    np.testing.assert_array_equal(preprocess(byte), preprocess(byte.astype(np.float32)))
+    expected = (np.arange(256)[:, None] / 255 - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
+    np.testing.assert_allclose(preprocess(byte).reshape(256, 3), expected, atol=1e-6)
+
+
+def test_other_image_sizes_are_refused(model):
+    with pytest.raises(ValueError, match="320 x 320 px only, got 640 x 480"):
+        model(jnp.zeros((1, 480, 640, 3)))
+    with pytest.raises(InputError, match=r"MixVPR: .*320 x 320 px, got 336 x 300"):
+        MixVprDescriptor(model)(np.zeros((1, 300, 336, 3), np.uint8))
+
+
+def test_no_images_give_no_descriptors(model):
+    assert MixVprDescriptor(model)(np.zeros((0, 320, 320, 3), np.uint8)) == []
+
+
+@pytest.mark.parametrize("channels, rows", SIZES)
+def test_parameter_counts(channels, rows):
+    width = channels * rows
+    assert blueprint(entry_of(f"mixvpr_{width}")).parameters == PARAMETERS[width]
+
+
+@pytest.mark.parametrize(
+    "last, shape, parameters", [("layer3", (20, 20, 1024), 8_543_296), ("layer4", (10, 10, 2048), 23_508_032)]
+)
+def test_backbones_sizes(last, shape, parameters):
+    with jax.numpy_dtype_promotion("standard"):  # Flax's initializers mix types
+        backbone = nnx.eval_shape(lambda: ResNet50(last, rngs=nnx.Rngs(0)))
+    images = jax.ShapeDtypeStruct((1, 320, 320, 3), jnp.float32)
+    assert nnx.eval_shape(lambda model, x: model(x), backbone, images).shape == (1, *shape)
+    assert sum(leaf.size for leaf in jax.tree.leaves(nnx.state(backbone, nnx.Param))) == parameters

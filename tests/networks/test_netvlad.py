@@ -1,0 +1,166 @@
+"""NetVLAD, its patches, and generalized means: against the public codes' numbers (tests/golden), and by definition."""
+
+from functools import partial
+
+import jax
+import numpy as np
+import pytest
+from flax import nnx
+
+from mfvpr.checkpoints.checkpoint import read_checkpoint
+from mfvpr.checkpoints.conversion import convert
+from mfvpr.checkpoints.networks import network_of, planned
+from mfvpr.checkpoints.registry import entry_of
+from mfvpr.checkpoints.tables import NETVLAD, NETVLAD_MATLAB
+from mfvpr.features.global_descriptor import GlobalDescriptor
+from mfvpr.networks.gem import GeneralizedMean
+from mfvpr.networks.netvlad import CHANNELS, NetVlad, VggNetVlad
+from mfvpr.utils.errors import InputError
+from tests.golden.make_netvlad import CASES, GEM, GOLDEN, MATLAB, PATCHES, image, name, samples
+from tests.random_checkpoints import gem_checkpoint, matlab_netvlad, netvlad_checkpoint, write_matlab
+
+pytestmark = pytest.mark.thorough
+
+RELATIVE = 1e-5  # of the largest value
+
+
+@pytest.fixture(scope="module")
+def golden():
+    return dict(np.load(GOLDEN))
+
+
+def filled(build, table, checkpoint):
+    plan = planned(build)
+    return plan.filled(convert(checkpoint, table, plan.shapes))
+
+
+def assert_close(actual, expected):
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=RELATIVE * np.abs(expected).max())
+
+
+@pytest.mark.optimized
+@pytest.mark.first_case
+@pytest.mark.parametrize("case", CASES, ids=map(str, CASES))
+def test_descriptors_and_patches_are_the_public_codes(golden, case):
+    clusters, outputs, size, seed = case
+    network = filled(partial(VggNetVlad, clusters, outputs), NETVLAD, netvlad_checkpoint(clusters, outputs, seed))
+    sizes = PATCHES.get(outputs, ())
+    whole, patches = nnx.jit(VggNetVlad.with_patches, static_argnums=2)(network, network.preprocess(image(size)), sizes)
+    key, (width, height) = name("patch", *case), (side // 16 for side in size)
+    assert whole.shape == (1, outputs or clusters * CHANNELS)
+    assert_close(whole[0] if outputs else samples(np.asarray(whole)), golden[f"{key}/global"])
+    for patch, found in zip(sizes, patches, strict=True):
+        assert found.shape == (1, (height - patch + 1) * (width - patch + 1), outputs)
+        assert_close(samples(np.asarray(found[0])), golden[f"{key}/{patch}"])
+        assert_close(np.asarray(found[0], np.float64).mean(axis=0), golden[f"{key}/{patch}/means"])
+
+
+@pytest.mark.optimized
+@pytest.mark.slow
+def test_the_originals_file_gives_the_descriptors_of_hlocs_code(golden, tmp_path):
+    clusters, outputs, size, seed = MATLAB
+    read = read_checkpoint(write_matlab(tmp_path / "struct.mat", matlab_netvlad(clusters, outputs, seed)))
+    network = filled(partial(VggNetVlad, clusters, outputs, original=True), NETVLAD_MATLAB, read)
+    found = GlobalDescriptor(network, size)(image(size))[0].vector
+    assert_close(found, golden[name("matlab", *MATLAB)])
+    floats = GlobalDescriptor(network, size)(image(size).astype(np.float32))[0].vector
+    np.testing.assert_allclose(floats, found, atol=1e-7)
+
+
+@pytest.mark.optimized
+@pytest.mark.first_case
+@pytest.mark.parametrize("case", GEM, ids=map(str, GEM))
+def test_generalized_means_are_cosplaces(golden, case):
+    backbone, outputs, size, seed = case
+    network = network_of(entry_of(f"cosplace_{backbone}_{outputs}"))
+    model = filled(network.builder(), network.table, gem_checkpoint(backbone, outputs, seed))
+    extractor = GlobalDescriptor(model, size)
+    assert (extractor.vector_size, extractor.scales) == (outputs, ())
+    assert_close(extractor(image(size))[0].vector, golden[name("gem", *case)])
+
+
+@pytest.mark.parametrize("order", ["clusters", "channels"])
+def test_layer_and_patches_are_those_of_loops(order):
+    rng = np.random.default_rng(0)
+    maps = rng.normal(size=(2, 4, 5, CHANNELS))
+    with jax.numpy_dtype_promotion("standard"):
+        layer = NetVlad(3, order, precision="highest", rngs=nnx.Rngs(0))
+    layer.centers[...] = jax.numpy.asarray(rng.normal(size=(3, CHANNELS)) / 20, np.float32)
+    kernel, centers = (np.asarray(one[...], np.float64) for one in (layer.assignment.kernel, layer.centers))
+
+    def pooled(vectors):
+        sums = np.zeros((3, CHANNELS))
+        for x in vectors.reshape(-1, CHANNELS):
+            x = x / np.linalg.norm(x)
+            odds = np.exp(x @ kernel[0, 0])
+            sums += (odds / odds.sum())[:, None] * (x - centers)
+        sums /= np.linalg.norm(sums, axis=1, keepdims=True)
+        flat = (sums if order == "clusters" else sums.T).reshape(-1)
+        return flat / np.linalg.norm(flat)
+
+    single = jax.numpy.asarray(maps, np.float32)
+    np.testing.assert_allclose(layer(single), [pooled(one) for one in maps], atol=1e-6)
+    for size in (1, 2, 4):
+        expected = [[pooled(one[row : row + size, column : column + size])
+                     for row in range(5 - size) for column in range(6 - size)] for one in maps]  # fmt: skip
+        np.testing.assert_allclose(layer.patches(single, size), expected, atol=1e-6)
+
+
+def test_where_a_map_is_zero_there_is_no_nan():
+    with jax.numpy_dtype_promotion("standard"):
+        layer = NetVlad(2, precision="highest", rngs=nnx.Rngs(0))
+    zero = np.zeros((1, 3, 3, CHANNELS), np.float32)
+    assert not np.asarray(layer(zero)).any()
+    assert not np.asarray(layer.patches(zero, 2)).any()
+
+
+@pytest.mark.parametrize("power", [1.0, 2.5, 30.0, 1000.0])
+@pytest.mark.parametrize("unit", [1.0, 0.03])
+def test_the_generalized_mean_is_its_definition(power, unit):
+    """Also where powers of small values, as those of long vectors of unit length, would be 0 in float32."""
+    maps = unit * np.random.default_rng(0).normal(size=(2, 3, 4, 5)).astype(np.float32)
+    positive = np.maximum(maps.astype(np.float64), 1e-6)
+    largest = positive.max(axis=(1, 2), keepdims=True)
+    expected = largest[:, 0, 0] * np.mean((positive / largest) ** power, axis=(1, 2)) ** (1 / power)
+    np.testing.assert_allclose(GeneralizedMean(power)(jax.numpy.asarray(maps)), expected, rtol=1e-5)
+    constant = np.full((1, 2, 2, 3), 0.7, np.float32)
+    np.testing.assert_allclose(GeneralizedMean(power)(jax.numpy.asarray(constant)), 0.7, rtol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def small():
+    return filled(partial(VggNetVlad, 4, 8), NETVLAD, netvlad_checkpoint(4, 8))
+
+
+@pytest.mark.slow
+def test_fewer_components_are_the_first_of_all(small):
+    every, first = (GlobalDescriptor(small, (64, 48), components=number) for number in (None, 3))
+    assert (every.vector_size, first.vector_size) == (8, 3)
+    whole, part = (extractor(image((64, 48)))[0].vector for extractor in (every, first))
+    np.testing.assert_allclose(part, whole[:3] / np.linalg.norm(whole[:3]), atol=1e-6)
+
+
+@pytest.mark.optimized
+def test_images_of_a_batch_do_not_see_each_other_and_one_program_is_compiled(small, compilations):
+    extractor = GlobalDescriptor(small, (64, 48))
+    images = np.concatenate([image((64, 48)), image((64, 48))[:, ::-1]])
+    compilations.reset()
+    both = [one.vector for one in extractor(images)]
+    np.testing.assert_array_equal(both[1], extractor(images[1:])[0].vector)
+    assert compilations.count == 1
+    assert np.abs(both[0] - both[1]).max() > 1e-3
+
+
+@pytest.mark.parametrize(("options", "words"), [
+    ({"image_size": (15, 100)}, "expected 16 x 16 px or more"),
+    ({"components": 9}, "components=9: expected from 1 to 8"),
+    ({"components": 0}, "components=0: expected from 1 to 8"),
+])  # fmt: skip
+def test_what_cannot_be_is_refused(small, options, words):
+    with pytest.raises(InputError, match=words):
+        GlobalDescriptor(small, **options)
+    with pytest.raises(InputError, match="expected images of 64 x 48 px, got 48 x 64"):
+        GlobalDescriptor(small, (64, 48))(np.zeros((1, 64, 48, 3), np.uint8))
+    unprojected = filled(partial(VggNetVlad, 4, None), NETVLAD, netvlad_checkpoint(4, None))
+    with pytest.raises(InputError, match=r"components=3: expected None.*whitening"):
+        GlobalDescriptor(unprojected, components=3)

@@ -1,0 +1,201 @@
+"""DINOv2 and SelaVPR against the public code's numbers (tests/golden), and their layers by definition."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+import mfvpr
+from mfvpr.checkpoints.tables import DINOV2, SELAVPR
+from mfvpr.features.global_descriptor import GlobalDescriptor
+from mfvpr.features.selavpr import SelaVprFeatures
+from mfvpr.networks.selavpr import AdaptedBlock, SelaVpr, Upsampling
+from mfvpr.networks.vit import Block, TokenDescriptor, VisionTransformer
+from mfvpr.storage import features, vectors
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.fingerprints import fingerprint, recipe_of
+from tests.builders import make_matches
+from tests.golden.make_netvlad import image, name, samples
+from tests.golden.make_selavpr import BACKBONES, GOLDEN, MATCHES, NETWORKS, SIZE, WIDTH, maps
+from tests.networks.test_netvlad import assert_close, filled
+from tests.random_checkpoints import dinov2_shapes, selavpr_shapes, transformer_checkpoint
+
+pytestmark = pytest.mark.thorough
+
+
+@pytest.fixture(scope="module")
+def golden():
+    return dict(np.load(GOLDEN))
+
+
+def network(depth=1, registers=0, seed=0, width=1024, prefix=""):
+    build = partial(SelaVpr, width, depth, width // 64, registers=registers)
+    return filled(build, SELAVPR, transformer_checkpoint(selavpr_shapes(width, depth, registers, prefix), seed))
+
+
+@pytest.mark.optimized
+@pytest.mark.first_case
+@pytest.mark.parametrize("case", NETWORKS, ids=map(str, NETWORKS))
+def test_descriptors_are_the_public_codes(golden, case):
+    [found] = SelaVprFeatures(network(*case))(image(SIZE))
+    [local] = found.local
+    key = name("network", *case)
+    assert_close(found.vector, golden[f"{key}/global"])
+    assert local.descriptors.shape == (61 * 61, 128)
+    assert_close(samples(local.descriptors), golden[f"{key}/local"])
+    assert_close(local.descriptors.astype(np.float64).mean(axis=0), golden[f"{key}/means"])
+
+
+@pytest.mark.optimized
+@pytest.mark.parametrize("case", BACKBONES, ids=map(str, BACKBONES))
+def test_tokens_are_the_public_codes(golden, case):
+    """Of any size: positions are resized but for those that were trained; images need not be square."""
+    depth, registers, adapted, size, seed = case
+    if adapted:
+        shapes = selavpr_shapes(WIDTH, depth, registers, prefix="")
+        own = transformer_checkpoint(dinov2_shapes(WIDTH, depth, registers, adapted=True), seed)
+        others = transformer_checkpoint(shapes, seed)
+        checkpoint = others | {f"backbone.{key}": value for key, value in own.items()}
+        transformer = filled(partial(SelaVpr, WIDTH, depth, 4, registers=registers), SELAVPR, checkpoint).backbone
+    else:
+        build = partial(VisionTransformer, WIDTH, depth, 4, registers=registers)
+        checkpoint = transformer_checkpoint(dinov2_shapes(WIDTH, depth, registers), seed)
+        transformer = filled(build, DINOV2, checkpoint)
+    whole, found = nnx.jit(type(transformer).__call__)(transformer, transformer.preprocess(image(size)))
+    key = name("backbone", *case[:3], *size, seed)
+    assert found.shape == (1, size[1] // 14, size[0] // 14, WIDTH)
+    assert_close(whole[0], golden[f"{key}/whole"])
+    assert_close(samples(np.asarray(found)), golden[f"{key}/maps"])
+
+
+@pytest.mark.optimized
+@pytest.mark.parametrize("case", MATCHES, ids=map(str, MATCHES))
+def test_scores_are_the_public_codes(golden, case):
+    """Numbers of mutual matches, equal as integers; a single match counts nothing there."""
+    matches = mfvpr.match_candidates(*(as_features(one) for one in maps(*case)))
+    published, counted = (mfvpr.score_candidates(mfvpr.MatchCount(one), matches) for one in ("zero", "count"))
+    np.testing.assert_array_equal(published, golden[name("scores", *case)])
+    np.testing.assert_array_equal(np.where(counted == 1, 0, counted), published)
+    assert (counted >= 1).all()  # the nearest pair of all is mutual
+    assert (case[0] == 1) == (counted == 1).all()
+
+
+@pytest.mark.parametrize(("confidence", "published"), [
+    ([0.5, 0.0], 0.0), ([0.5, 0.25], 0.75), ([0.0, 0.0], 0.0), ([np.nan, 0.25], np.nan), ([np.nan, 0.0], np.nan),
+])  # fmt: skip
+def test_a_single_match_is_one_with_confidence(confidence, published):
+    matches = make_matches(np.zeros((2, 2)), np.ones((2, 2)), capacity=4)
+    matches = replace(matches, confidence=np.array([*confidence, np.nan, np.nan], np.float32))
+    np.testing.assert_array_equal(mfvpr.MatchCount("zero")(matches), np.float32(published))
+    np.testing.assert_array_equal(mfvpr.MatchCount()(matches), np.float32(sum(confidence)))
+
+
+def as_features(values):
+    rows = values.reshape(*values.shape[:-3], -1, values.shape[-1])
+    return mfvpr.Features(
+        keypoints=np.zeros((*rows.shape[:-1], 2), np.float32), descriptors=rows,
+        scores=np.ones(rows.shape[:-1], np.float32), mask=np.ones(rows.shape[:-1], bool),
+        image_size=np.full((*rows.shape[:-2], 2), 224, np.float32),
+    )  # fmt: skip
+
+
+def test_upsampling_is_the_sum_of_what_positions_add():
+    rng = np.random.default_rng(0)
+    with jax.numpy_dtype_promotion("standard"):
+        layer = Upsampling(5, 3, precision="highest", rngs=nnx.Rngs(0))
+    layer.bias[...] = jnp.asarray(rng.normal(size=3), jnp.float32)
+    x = rng.normal(size=(2, 3, 4, 5)).astype(np.float32)
+    expected = np.zeros((2, 7, 9, 3))  # with a border, which is dropped
+    for row, column, a, b in np.ndindex(3, 4, 3, 3):
+        expected[:, 2 * row + a, 2 * column + b] += x[:, row, column] @ np.asarray(layer.kernel[...], float)[a, b]
+    expected = expected[:, 1:-1, 1:-1] + np.asarray(layer.bias[...])
+    np.testing.assert_allclose(layer(jnp.asarray(x)), expected, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_without_adapters_an_adapted_block_is_a_plain_one():
+    with jax.numpy_dtype_promotion("standard"):
+        plain, adapted = (kind(64, 2, precision="highest", rngs=nnx.Rngs(0)) for kind in (Block, AdaptedBlock))
+    x = jax.random.normal(jax.random.key(1), (2, 5, 64))
+    for part in ("attention", "perceptron"):
+        nnx.update(getattr(adapted, part), nnx.state(getattr(plain, part)))
+    assert np.abs(adapted(x) - plain(x)).max() > 1e-3
+    for adapter in (adapted.serial, adapted.parallel):
+        adapter.up.kernel[...] = jnp.zeros_like(adapter.up.kernel[...])
+    np.testing.assert_array_equal(adapted(x), plain(x))
+
+
+@pytest.mark.parametrize("prefix", ["", "module."])
+def test_keys_of_a_training_on_several_devices_are_the_same(prefix):
+    found = network(width=64, prefix=prefix)
+    expected = transformer_checkpoint(selavpr_shapes(64, 1, prefix=prefix))[f"{prefix}LocalAdapt.upconv2.weight"]
+    np.testing.assert_array_equal(found.upsampling2.kernel[1, 2], expected[:, :, 1, 2])
+
+
+def test_features_lie_between_the_middles_of_patches():
+    size = (42, 28)
+    extractor = SelaVprFeatures(network(width=64), size)
+    [description] = extractor(image(size))
+    [local] = description.local
+    assert extractor.scales == ((128, 9 * 5, 1.0),)
+    assert (extractor.vector_size, description.vector.shape) == (64, (64,))
+    np.testing.assert_allclose(np.linalg.norm(local.descriptors, axis=1), 1, rtol=1e-5)
+    keypoints = local.keypoints.reshape(5, 9, 2)
+    np.testing.assert_array_equal(keypoints[0, :, 0], 6.5 + 3.5 * np.arange(9))  # every fourth a patch's middle
+    np.testing.assert_array_equal(keypoints[:, 0, 1], 6.5 + 3.5 * np.arange(5))
+    assert (keypoints.max(axis=(0, 1)) == np.array(size) - 7.5).all()
+    floats = extractor(image(size).astype(np.float32))[0]
+    np.testing.assert_allclose(floats.vector, description.vector, atol=1e-6)
+
+
+@pytest.mark.parametrize(("images", "printed"), [(220, 401), (1415, 2577)])
+def test_databases_are_of_the_published_size(images, printed):
+    """In MiB, in float32; stores, of float16, take little more than half of it."""
+    [scale] = SelaVprFeatures(network(width=64)).scales
+    numbers = 1024 + scale.dimension * scale.typical_count
+    assert images * 4 * numbers / 2**20 == pytest.approx(printed, rel=0.01)
+    stored = vectors.forecast_bytes(images, 1024)
+    stored += features.forecast_bytes(images, scale.typical_count, scale.dimension)
+    assert stored / 2**20 == pytest.approx(0.54 * printed, rel=0.02)
+
+
+@pytest.mark.parametrize("size", [(224, 225), (7, 14), (0, 14)])
+def test_sizes_without_whole_patches_are_refused(size):
+    model = network(width=64)
+    for extractor in (SelaVprFeatures, lambda model, size: GlobalDescriptor(TokenDescriptor(model.backbone), size)):
+        with pytest.raises(InputError, match=r"image_size=\[.*\]: .*multiples of 14"):
+            extractor(model, size)
+    with pytest.raises(InputError, match=r"SelaVPR: .*28 x 14 px, got 14 x 28"):
+        SelaVprFeatures(model, (28, 14))(np.zeros((1, 28, 14, 3), np.uint8))
+
+
+def test_tokens_are_descriptors_of_images():
+    shapes = dinov2_shapes(64, 2)
+    transformer = filled(partial(VisionTransformer, 64, 2, 4), DINOV2, transformer_checkpoint(shapes))
+    size = (42, 28)
+    whole, found = transformer(transformer.preprocess(image(size)))
+    tokens = np.asarray(found[0], np.float64).reshape(-1, 64)
+    tokens /= np.linalg.norm(tokens, axis=1, keepdims=True)
+    means = {power: np.mean(np.maximum(tokens, 1e-6) ** power, axis=0) ** (1 / power) for power in (1.0, 3.0)}
+    recipes = set()
+    for pooling, power, expected in (("cls", 3.0, whole[0]), ("gem", 3.0, means[3.0]), ("gem", 1.0, means[1.0])):
+        extractor = GlobalDescriptor(TokenDescriptor(transformer, pooling, power), size)
+        np.testing.assert_allclose(extractor(image(size))[0].vector, expected / np.linalg.norm(expected), atol=1e-6)
+        recipes.add(fingerprint(recipe_of(extractor)))
+    assert len(recipes) == 3  # stores of one are not read for another
+
+
+@pytest.mark.optimized
+def test_tokens_of_a_batch_do_not_see_each_other_and_one_program_is_compiled(compilations):
+    size = (28, 28)
+    extractor = SelaVprFeatures(network(width=64), size)
+    images = np.concatenate([image(size), image(size)[:, ::-1]])
+    compilations.reset()
+    both = [one.vector for one in extractor(images)]
+    np.testing.assert_array_equal(both[1], extractor(images[1:])[0].vector)
+    assert compilations.count == 1
+    assert np.abs(both[0] - both[1]).max() > 1e-3

@@ -1,0 +1,168 @@
+"""Scores of whole data sets: on several devices, and of several scales."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import mfvpr
+from mfvpr.evaluation import stages
+from mfvpr.matching import match_set as match_sets
+from mfvpr.matching.match_set import MatchSet, Scales
+from mfvpr.reranking import ranking
+from mfvpr.tuning import sweeps
+from tests import oracles
+from tests.programs import ROOT
+from tests.scorers import plain
+from tests.tuning.sweeps.test_sweep import CANDIDATES, QUERIES, make_set
+
+pytestmark = pytest.mark.thorough
+
+SCORERS = {"sum": mfvpr.AggregatedScore(), "histogram": mfvpr.HistogramOfShifts(bin_size=40.0)}
+WEIGHTS = (0.7, 0.3)
+
+
+@pytest.fixture(scope="module")
+def data():
+    return make_set()
+
+
+@pytest.fixture(scope="module")
+def two_scales(data):
+    """The second scale has fewer matches of its own, and a query that it says nothing of."""
+    match_set, candidates = data
+    keep = [np.arange(len(one.mask)) % 3 > 0 for one in match_set.matches]
+    keep[1][:] = False
+    ends = np.cumsum(match_set.counts, axis=1)
+    counts = np.array([[part.sum() for part in np.split(k, e)[:-1]] for k, e in zip(keep, ends, strict=True)])
+    fewer = [
+        replace(one, **{name: values[k] for name, values in match_sets.per_match(one).items()}, mask=one.mask[k])
+        for one, k in zip(match_set.matches, keep, strict=True)
+    ]
+    return Scales([match_set, MatchSet(fewer, counts, 64)], WEIGHTS), candidates
+
+
+def devices_agree():
+    """What a process with 8 devices checks."""
+    import jax
+
+    from mfvpr.reranking import batched_scoring
+
+    match_sets.PAIRS_STEP = match_sets.BATCH_SLOTS = 2  # pairs of a batch
+    match_set, candidates = make_set()
+    devices = jax.devices()
+    assert len(devices) == 8
+    placed = []
+
+    def program(matches):
+        placed.append((matches.mask.shape, *matches.mask.devices()))
+        return matches.mask.sum(axis=1)
+
+    made = batched_scoring.all_batches(match_set, range(QUERIES), settings=1)
+    for places, counts in batched_scoring.scored(program, (), made, devices=devices):
+        np.testing.assert_array_equal(counts, match_set.counts.reshape(-1)[places])
+    assert {device for _, device in placed} == {*devices}
+    assert {shape for shape, _ in placed} == {(2, 96)}
+
+    alone, together = (stages.score({"it": plain}, match_set, candidates, devices=some) for some in (None, devices))
+    np.testing.assert_array_equal(alone["it"], together["it"], strict=True)
+    assert len(np.unique(alone["it"])) > CANDIDATES
+    settings = [{"max_distance": limit, "c": 0.1} for limit in (0.8, 1.5)]
+    alone, together = (
+        sweeps.sweep(plain, settings, match_set, candidates, devices=some) for some in (None, devices[3:5])
+    )
+    np.testing.assert_array_equal(alone, together)
+
+
+def test_devices_share_the_batches_and_change_no_bit():
+    code = "from tests.sweeping.test_scores import devices_agree; devices_agree()"
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=8"
+    environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=100
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_scores_of_scales_are_fused_over_the_candidates_of_a_query(two_scales):
+    scales, candidates = two_scales
+    got = stages.score(SCORERS, scales, candidates)
+    each = [stages.score(SCORERS, one, candidates) for one in scales.match_sets]
+    for name in SCORERS:
+        assert not each[1][name][1].any()
+        assert got[name].dtype == np.float32
+        for query in range(QUERIES):
+            batched_scoring = np.stack([batched_scoring[name][query] for batched_scoring in each], axis=-1)
+            expected = oracles.fuse_scales(batched_scoring, candidates.mask[query], WEIGHTS, "zscore")
+            np.testing.assert_allclose(got[name][query], expected, rtol=1e-4, atol=1e-5)
+
+
+def test_one_scale_as_it_is_scores_as_without(data):
+    match_set, candidates = data
+    alone = stages.score(SCORERS, match_set, candidates)
+    one = stages.score(SCORERS, Scales([match_set], normalize="none"), candidates)
+    for name in SCORERS:
+        np.testing.assert_array_equal(one[name], alone[name])
+
+
+@pytest.mark.parametrize("normalize", ["zscore", "none"])
+def test_sweeps_of_scales_rank_by_the_fused_scores_of_what_is_ranked(two_scales, normalize, tmp_path):
+    scales, candidates = two_scales
+    scales = replace(scales, normalize=normalize)
+    view = np.random.default_rng(1).random(candidates.mask.shape) < 0.7
+    settings = sweeps.grid({"mean": ["unweighted", "median"], "c": [None, 0.5]})
+    got = sweeps.sweep(
+        SCORERS["sum"], settings, scales, candidates, views=[candidates.mask, view], depth=CANDIDATES,
+        queries_per_block=3, settings_per_block=1, folder=tmp_path,
+    )  # fmt: skip
+    for seen, by_setting in zip((candidates.mask, view & candidates.mask), got, strict=True):
+        listed = replace(candidates, mask=seen)
+        for rows, setting in zip(by_setting, settings, strict=True):
+            scorer = {"it": mfvpr.AggregatedScore(mean=setting["mean"])}
+            fused = ranking.fuse_shortlist(listed, stages.score(scorer, scales, listed)["it"], setting["c"])
+            order = ranking.rank_shortlist(listed, fused)
+            indices = np.where(seen, candidates.indices, -1)
+            np.testing.assert_array_equal(rows, np.take_along_axis(indices, order, axis=1))
+
+
+def test_blocks_of_other_weights_or_scales_are_not_taken(two_scales, tmp_path):
+    scales, candidates = two_scales
+    first, second = scales.match_sets
+    cases = [
+        scales, replace(scales, weights=(0.0, 1.0)), replace(scales, weights=None), replace(scales, normalize="none"),
+        Scales([first, first], WEIGHTS), Scales([second, first], WEIGHTS), first, second,
+    ]  # fmt: skip
+    for number, case in enumerate(cases, start=1):
+        expected = sweeps.sweep(SCORERS["sum"], [{"c": 0.1}], case, candidates)
+        kept = sweeps.sweep(SCORERS["sum"], [{"c": 0.1}], case, candidates, folder=tmp_path)
+        np.testing.assert_array_equal(kept, expected)
+        assert len(list(tmp_path.iterdir())) == number
+
+
+def test_scales_that_do_not_belong_together_are_refused(data):
+    match_set, _ = data
+    with pytest.raises(mfvpr.InputError, match=r"queries and candidates, got \[\(2, 5"):
+        Scales([match_set, match_set.take(range(2))])
+    with pytest.raises(mfvpr.InputError, match=r"weight .*2 scales, got 1"):
+        Scales([match_set] * 2, [1.0])
+    with pytest.raises(mfvpr.InputError, match="expected match sets"):
+        Scales([])
+
+
+def test_progress_is_of_the_batches_of_all_scales(two_scales):
+    scales, candidates = two_scales
+    seen = []
+    stages.score(SCORERS, scales, candidates, track=lambda items, total: seen.append(total) or items)
+    assert seen == [2]
+
+
+def test_nothing_matches_anywhere(data):
+    match_set, candidates = data
+    nothing = [replace(one, **{n: v[:0] for n, v in match_sets.per_match(one).items()}, mask=one.mask[:0])
+               for one in match_set.matches]  # fmt: skip
+    batched_scoring = stages.score(SCORERS, MatchSet(nothing, 0 * match_set.counts, 64), candidates)
+    for values in batched_scoring.values():
+        np.testing.assert_array_equal(values, np.where(candidates.mask, 0.0, np.nan))

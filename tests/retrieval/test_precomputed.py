@@ -1,0 +1,129 @@
+"""What belongs to which folder of images, and what is missing, of files of other programs."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from experiments import build
+from experiments.settings import SettingsError
+from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
+from mfvpr.io import write_features, write_global_descriptors
+from mfvpr.retrieval.precomputed import DescriptorFiles, FeatureFiles, File, ShortlistFiles
+from mfvpr.storage.feature_cache import Archive
+from mfvpr.utils.errors import InputError
+from tests.io.other_programs import feature
+
+
+def folder(root, count=3):
+    return ImageFolder(root, tuple(f"{row}.png" for row in range(count)))
+
+
+@pytest.mark.parametrize(
+    "read",
+    [
+        lambda files, other: FeatureFiles(files).opened(other, partial=False),
+        lambda files, other: DescriptorFiles(files).shortlist(QuerySequence("a", other, None), other, 2, Archive()),
+        lambda files, other: ShortlistFiles(files).shortlist(QuerySequence("a", other, None), other, 2, Archive()),
+    ],
+)
+def test_a_folder_without_a_file_is_refused_with_those_that_have_one(tmp_path, read):
+    with pytest.raises(InputError, match=r"/other: .*one of: .*/known; "):
+        read({tmp_path / "known": File(tmp_path / "a.npz")}, folder(tmp_path / "other"))
+
+
+@pytest.mark.parametrize(
+    ("change", "refused"), [({"queries": "b.h5"}, "b.h5"), ({"query_prefix": "q/"}, "a.h5"), ({}, "")]
+)
+def test_two_files_of_one_folder_are_refused(tmp_path, change, refused):
+    """The second would be read for the database as well."""
+    same = folder(tmp_path)
+    data = Dataset("same", same, (QuerySequence("same", same, None),))
+    common = {"database": "a.h5", "queries": "a.h5", "database_prefix": "", "query_prefix": "", "lengths": "unit"}
+    for group, made, own in (("features", build.extractor, {"image_size": None}),
+                             ("retrieval", lambda *options: build.filter(*options[:1], SimpleNamespace(), data),
+                              {"whiten": None})):  # fmt: skip
+        settings = {"name": "import"} | common | own | change
+        if not refused:
+            assert made(settings, data).files == {tmp_path: File(build.expanded("a.h5"))}
+            continue
+        with pytest.raises(SettingsError, match=rf"^{group}\.queries={refused}: .*file .*prefix"):
+            made(settings, data)
+
+
+def written(root, names, file):
+    """Features in a file; global descriptors where the file is called so."""
+    if "global" in file:
+        write_global_descriptors(root / file, names, np.eye(len(names)))
+    else:
+        write_features(root / file, names, [(row, feature(row, count=3)) for row in range(len(names))])
+    return root / file
+
+
+def read_both(database, queries, files):
+    """Read the database, then the queries."""
+    if "global" in files[database.root].path.name:
+        sequence = QuerySequence("q", queries, None)
+        return DescriptorFiles(files).shortlist(sequence, database, 1, Archive())
+    source = FeatureFiles(files)
+    return [source.opened(folder, partial=False) for folder in (database, queries)]
+
+
+@pytest.mark.parametrize("file", ["f.h5", "f.npz", "global.h5", "global.npz", "global.npy"])
+@pytest.mark.parametrize("prefix", ["", "db/"])
+def test_an_entry_is_of_one_image(tmp_path, file, prefix):
+    """Queries do not get the features of database images with equal names, also through a link to the file."""
+    database, queries = folder(tmp_path / "database"), folder(tmp_path / "queries")
+    path = written(tmp_path, [prefix + name for name in database.names], file)
+    link = tmp_path / f"link_{file}"
+    link.symlink_to(path)
+    for other in (path, tmp_path / "x" / ".." / file, link):
+        (tmp_path / "x").mkdir(exist_ok=True)
+        both = r"(0\.png|row 0) for .*database/0\.png and for .*queries/0\.png; "
+        with pytest.raises(InputError, match=both) as error:
+            read_both(database, queries, {database.root: File(path), queries.root: File(other)})
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("file", ["f.npz", "global.npz"])
+def test_folders_share_a_file_with_different_entries_or_images_of_one_path(tmp_path, file):
+    database, queries = folder(tmp_path / "database"), folder(tmp_path / "queries")
+    names = [f"{side.root.name}/{name}" for side in (database, queries) for name in side.names]
+    path = written(tmp_path, names, file)
+    sides = {side.root: File(path, f"{side.root.name}/") for side in (database, queries)}
+    assert read_both(database, queries, sides)
+    database.root.mkdir()
+    (tmp_path / "link").symlink_to(database.root)
+    same = folder(tmp_path / "link")
+    assert read_both(database, same, sides | {same.root: sides[database.root]})
+    assert read_both(database, database, sides)
+
+
+def test_a_file_of_a_folder_is_of_one_image(tmp_path):
+    """Whatever it is called from the folder that was given."""
+    database, queries = folder(tmp_path / "database"), folder(tmp_path / "queries")
+    (tmp_path / "features" / "db").mkdir(parents=True)
+    for row, name in enumerate(database.names):
+        parts = {part: np.asarray(getattr(feature(row, count=3), part))
+                 for part in ("keypoints", "descriptors", "scores", "image_size")}  # fmt: skip
+        np.savez(tmp_path / "features" / "db" / f"{name}.npz", **parts)
+    files = {database.root: File(tmp_path / "features" / "db"), queries.root: File(tmp_path / "features")}
+    with pytest.raises(InputError, match=r"0\.png\.npz for .*database/0\.png and for .*queries/0\.png; "):
+        read_both(database, queries, files)
+
+
+def test_pairs_within_the_database_are_not_of_queries(tmp_path):
+    """Plain names mean an image on either side, and the names of a prefix that was given do."""
+    database, queries = folder(tmp_path / "database"), folder(tmp_path / "queries")
+    pairs = tmp_path / "pairs.txt"
+
+    def candidates(names, images=queries, **prefixes):
+        pairs.write_text("{} {}\n".format(*names))
+        files = ShortlistFiles({images.root: File(pairs, prefixes.get("query", ""))}, prefixes.get("database", ""))
+        return files.shortlist(QuerySequence("q", images, None), database, 1, Archive()).candidates.indices[0].tolist()
+
+    with pytest.raises(InputError, match=r"db/0\.png for .*database/0\.png and for .*queries/0\.png; "):
+        candidates(["db/0.png", "db/0.png"])
+    assert candidates(["db/0.png", "db/0.png"], images=database) == [0]
+    assert candidates(["db/0.png", "db/0.png"], query="db/", database="db/") == [0]
+    assert candidates(["q/0.png", "db/0.png"]) == candidates(["0.png", "0.png"]) == [0]

@@ -1,0 +1,336 @@
+"""Stores when processes are killed, files are damaged and disks are full."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mfvpr import InputError
+from mfvpr.storage.features import forecast_bytes, open_store
+from tests.small_disks import UNSHARE, mount, need_small_disks
+from tests.storage.synthetic_features import (
+    DAMAGE,
+    FEATURES,
+    MATCHES,
+    RECIPE,
+    ROOT,
+    Subject,
+    digests,
+    features_of,
+    file_of,
+    fill,
+    matches_of,
+    read_all,
+    run_here,
+)
+
+pytestmark = pytest.mark.thorough
+
+# Two processes
+
+
+def hold(folder: str) -> None:
+    """Open a store, say so, and wait to be killed."""
+    with open_store(Path(folder), RECIPE, num_images=3) as store:
+        store.write({0: features_of(0)})
+        print("open", flush=True)
+        time.sleep(60)
+
+
+def test_a_second_process_is_told_and_a_killed_one_leaves_no_lock(tmp_path):
+    call = f"from tests.stores.test_faults import *; hold({str(tmp_path / 's')!r})"
+    with subprocess.Popen([sys.executable, "-c", call], cwd=ROOT, stdout=subprocess.PIPE) as holder:
+        try:
+            assert holder.stdout is not None
+            assert holder.stdout.readline() == b"open\n"
+            with pytest.raises(InputError, match=rf"s: in use by process {holder.pid}\b"):
+                fill(tmp_path / "s")
+        finally:
+            holder.kill()
+    assert fill(tmp_path / "s") == [1, 2]
+
+
+def test_the_lock_holds_within_a_process_and_ends_with_an_error(tmp_path):
+    def fail():
+        with open_store(tmp_path / "s", RECIPE, num_images=3):
+            with pytest.raises(InputError, match=f"in use by process {os.getpid()}"):
+                fill(tmp_path / "s")
+            raise KeyError("of the caller")
+
+    with pytest.raises(KeyError, match="of the caller"):
+        fail()
+    assert fill(tmp_path / "s") == [0, 1, 2]
+    assert (tmp_path / "s" / "lock").read_text() == ""
+
+
+def read_whole(folder: str) -> None:
+    """Print the rows of a complete store."""
+    print(*read_all(Path(folder)))
+
+
+@pytest.mark.parametrize("subject", [FEATURES, MATCHES], ids=["features", "matches"])
+def test_a_complete_store_is_read_by_any_number_at_the_same_time(tmp_path, subject):
+    fill(tmp_path / "s", subject=subject)
+    with subject.open(tmp_path / "s", 3) as first, subject.open(tmp_path / "s", 3) as second:
+        assert first.done.all()
+        assert [row for row, _ in second.read()] == [row for row, _ in first.read()] == [0, 1, 2]
+        if subject is FEATURES:
+            assert run_here(f"read_whole({str(tmp_path / 's')!r})").split() == ["0", "1", "2"]
+
+
+def test_a_store_is_read_while_another_process_writes_it(tmp_path):
+    """And what that has done meanwhile is done for whoever opens the store again, or enters it."""
+    call = f"from tests.stores.test_faults import *; hold({str(tmp_path / 's')!r})"
+    before = open_store(tmp_path / "s", RECIPE, num_images=3)
+    with subprocess.Popen([sys.executable, "-c", call], cwd=ROOT, stdout=subprocess.PIPE) as holder:
+        try:
+            assert holder.stdout is not None
+            assert holder.stdout.readline() == b"open\n"
+            store = open_store(tmp_path / "s", RECIPE, num_images=3)
+            assert store.counts.tolist() == [40, -1, -1]
+            [(row, found)] = store.read()
+            assert row == 0
+            np.testing.assert_array_equal(found.keypoints, features_of(0).keypoints)
+            with pytest.raises(ValueError, match="row 1 is not done"):
+                list(store.read([1]))
+            with pytest.raises(ValueError, match="write `with store:`"):
+                store.write({1: features_of(1)})
+            assert not before.done.any()
+        finally:
+            holder.kill()
+    with before:
+        assert before.done.tolist() == [True, False, False]
+
+
+def test_who_completes_a_store_lets_others_read_it(tmp_path):
+    with open_store(tmp_path / "s", RECIPE, num_images=3) as writer:
+        writer.write({row: features_of(row) for row in range(3)})
+        assert len(read_all(tmp_path / "s")) == 3
+
+
+def test_a_complete_store_is_not_written(tmp_path):
+    fill(tmp_path / "s")
+    DAMAGE["empty"](file_of(tmp_path / "s"))
+    with open_store(tmp_path / "s", RECIPE, num_images=3) as store:
+        with pytest.raises(InputError, match="damaged"):
+            list(store.read())
+        with pytest.raises(ValueError, match="read only, or was complete"):
+            store.write({1: features_of(1)})
+    assert fill(tmp_path / "s") == [1]
+
+
+# Damage
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+@pytest.mark.parametrize("subject", [FEATURES, MATCHES], ids=["features", "matches"])
+def test_a_damaged_row_is_told_and_made_anew(tmp_path, subject, damage):
+    folder, words = tmp_path / "s", subject.kind
+    fill(folder, subject=subject)
+    before = digests(folder)
+    DAMAGE[damage](file_of(folder))
+    with subject.open(folder, 3) as store:
+        assert store.done.all()
+        found = store.read()
+        assert next(found)[0] == 0
+        expected = rf"s: {words.content} of 1 {words.rows} are damaged.*row 1 \(1-.*\); run again, which {words.remake}"
+        with pytest.raises(InputError, match=expected) as told:
+            next(found)
+        assert "\n" not in str(told.value)
+        assert store.done.tolist() == [True, False, True]
+    assert fill(folder, subject=subject) == [1]
+    assert digests(folder) == before
+    assert len(read_all(folder, subject=subject)) == 3
+
+
+@pytest.mark.parametrize("subject", [FEATURES, MATCHES], ids=["features", "matches"])
+def test_a_row_that_is_gone_is_made_anew(tmp_path, subject):
+    folder = tmp_path / "s"
+    fill(folder, subject=subject)
+    with subject.open(folder, 3) as store:
+        file_of(folder, 2).unlink()
+        with pytest.raises(InputError, match=r"damaged.*row 2"):
+            list(store.read())
+    assert fill(folder, subject=subject) == [2]
+
+
+@pytest.mark.parametrize("subject", [FEATURES, MATCHES], ids=["features", "matches"])
+def test_exchanged_rows_are_noticed(tmp_path, subject):
+    """Whole files, each with its checksum, in each other's place."""
+    folder = tmp_path / "s"
+    fill(folder, subject=subject)
+    before = digests(folder)
+    one, other = file_of(folder, 0), file_of(folder, 2)
+    content = one.read_bytes(), other.read_bytes()
+    one.write_bytes(content[1])
+    other.write_bytes(content[0])
+    with pytest.raises(InputError, match=r"of 2 \w+ are damaged.*row 0"):
+        read_all(folder, subject=subject)
+    assert fill(folder, subject=subject) == [0, 2]
+    assert digests(folder) == before
+
+
+def test_a_row_of_another_store_is_noticed(tmp_path):
+    fill(tmp_path / "s")
+    with open_store(tmp_path / "t", {**RECIPE, "weights": None}, num_images=3) as other:
+        other.write({row: features_of(row) for row in range(3)})
+    shutil.copy(file_of(tmp_path / "t"), file_of(tmp_path / "s"))
+    with pytest.raises(InputError, match=r"of 1 images are damaged.*row 1"):
+        read_all(tmp_path / "s")
+    assert fill(tmp_path / "s") == [1]
+
+
+def test_a_damaged_row_of_a_half_done_store_stops_nobody_from_going_on(tmp_path):
+    with open_store(tmp_path / "s", RECIPE, num_images=3) as store:
+        store.write({0: features_of(0)})
+    DAMAGE["half"](file_of(tmp_path / "s", 0))
+    assert fill(tmp_path / "s") == [1, 2]
+    with pytest.raises(InputError, match="the first in row 0"):
+        read_all(tmp_path / "s")
+    assert fill(tmp_path / "s") == [0]
+
+
+# Kill -9
+
+NUM_ROWS = 60
+LARGER: dict[str, Subject] = {
+    "features": replace(FEATURES, row_of=lambda row: features_of(row, 200, 64)),
+    "matches": replace(MATCHES, row_of=lambda row: matches_of(row, (300, 0, 1, 200))),
+}
+
+
+def _make(subject: Subject, folder: Path, log: Path, ready: int) -> None:
+    """A child process: do what is not done, noting each row, and saying so before the first is written."""
+    with subject.open(folder, NUM_ROWS) as store:
+        todo = np.flatnonzero(~store.done).tolist()
+        for start in range(0, len(todo), 4):
+            batch = {row: subject.row_of(row) for row in todo[start : start + 4]}
+            with log.open("a") as file:
+                file.writelines(f"{row}\n" for row in batch)
+            os.write(ready, b".")
+            store.write(batch)
+
+
+def _child(subject: Subject, folder: Path, log: Path, delay: float | None, *, from_first_write: bool) -> int:
+    """Exit status of a child that is killed after `delay` s; None = not at all."""
+    reading, writing = os.pipe()
+    if (pid := os.fork()) == 0:
+        os.close(reading)
+        _make(subject, folder, log, writing)
+        os._exit(0)
+    os.close(writing)
+    if delay is not None:
+        if from_first_write:
+            os.read(reading, 1)
+        time.sleep(delay)
+        os.kill(pid, signal.SIGKILL)
+    status = os.waitpid(pid, 0)[1]
+    os.close(reading)
+    return status
+
+
+def _rows(folder: Path) -> set[int]:
+    return {int(path.name.partition("-")[0]) for path in folder.glob("[0-9]*.npz")}
+
+
+def kill_rounds(root: str, kind: str, rounds: int) -> None:
+    """Kill `rounds` processes at random times, finish their work, and print what happened.
+
+    Forks, which saves a second of imports per round.
+    """
+    rng, subject = np.random.default_rng(0), LARGER[kind]
+    told = {"killed": 0, "torn": 0, "twice": 0, "failed": 0, "stores": 0, "different": 0}
+    _child(subject, Path(root, "whole"), Path(root, "log"), None, from_first_write=False)
+    expected = digests(Path(root, "whole"))
+    while told["killed"] < rounds:
+        folder, told["stores"] = Path(root, str(told["stores"])), told["stores"] + 1
+        while len(_rows(folder)) < NUM_ROWS:
+            done, log = _rows(folder), Path(root, "log")
+            log.write_text("")
+            finish = told["killed"] == rounds
+            early = rng.random() < 0.3  # while the store is made or opened
+            delay = None if finish else rng.uniform(0, 0.02 if early else 0.03)
+            status = _child(subject, folder, log, delay, from_first_write=not early)
+            told["killed"] += status == signal.SIGKILL
+            told["failed"] += status not in (0, signal.SIGKILL)
+            told["twice"] += len(done.intersection(map(int, log.read_text().split())))
+            told["torn"] += any(folder.glob(".*"))
+            for name, digest in digests(folder).items():  # what is there is whole, at any moment
+                told["different"] += not name.startswith(".") and digest != expected[name]
+        told["different"] += digests(folder) != expected
+    print(json.dumps(told))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "rounds"), [("features", 50), ("matches", 30)])
+def test_killed_processes_end_in_the_same_files(tmp_path, kind, rounds):
+    told = json.loads(run_here(f"kill_rounds({str(tmp_path)!r}, {kind!r}, {rounds})"))
+    assert told["killed"] == rounds
+    assert told["torn"] > 0  # kills in the middle of writing, as the files show
+    assert (told["failed"], told["twice"], told["different"]) == (0, 0, 0)
+
+
+# Disks
+
+
+def full_disk(root: str) -> None:
+    """A store on a disk of 5 MB, which then grows: what is told, and what is left. Prints JSON."""
+    disk, told = Path(root), {}
+    mount(disk, "-o", "size=5m")
+
+    def extract() -> list[int]:
+        with open_store(disk / "s", RECIPE, num_images=12) as store:
+            todo = np.flatnonzero(~store.done).tolist()
+            for row in todo:
+                store.write({row: features_of(row, 700, 512)})
+        return todo
+
+    for name in ("first", "second"):
+        try:
+            extract()
+        except InputError as error:
+            told[name] = str(error)
+    kept = read_all(disk / "s", 12)
+    told["kept"] = [row for row, found in kept.items() if (found.scores == features_of(row, 700, 512).scores).all()]
+    mount(disk, "-o", "remount,size=12m")
+    told["resumed"] = extract()
+    told["all"] = len(read_all(disk / "s", 12))
+    (disk / "ballast").write_bytes(bytes(shutil.disk_usage(disk).free))
+    told["read_when_full"] = len(read_all(disk / "s", 12))
+    mount(disk, "-o", "remount,ro")
+    told["read_when_read_only"] = len(read_all(disk / "s", 12))
+    try:
+        read_all(disk / "new", 12)
+    except InputError as error:
+        told["new"] = str(error)
+    mount(disk, "-o", "remount,rw")
+    DAMAGE["flipped"](file_of(disk / "s", 3))
+    mount(disk, "-o", "remount,ro")
+    try:
+        read_all(disk / "s", 12)
+    except InputError as error:
+        told["damaged"] = str(error)
+    print(json.dumps(told))
+
+
+def test_a_full_disk_is_told_and_extraction_goes_on_when_it_is_not(tmp_path):
+    need_small_disks(tmp_path)
+    told = json.loads(run_here(f"full_disk({str(tmp_path)!r})", prefix=UNSHARE))
+    done = told["kept"]
+    assert 5 <= len(done) <= 8
+    for name in ("first", "second"):
+        needed = forecast_bytes(1, 700, 512) / 1e6  # of the row that was being written
+        assert told[name].startswith(f"{tmp_path}/s: expected about {needed:.1f} MB of free disk space, got 0.")
+        assert "MB; free some space" in told[name]
+    assert told["resumed"] == [row for row in range(12) if row not in done]
+    assert told["all"] == told["read_when_full"] == told["read_when_read_only"] == 12
+    assert f"{tmp_path}/new: cannot hold features (Read-only file system)" in told["new"]
+    assert "row 3 (3-700.npz); " in told["damaged"]

@@ -1,0 +1,359 @@
+"""What is taken from the images of a folder: extracted once, whatever happens in between."""
+
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+
+from mfvpr import match
+from mfvpr.datasets.datasets import image_folder
+from mfvpr.evaluation import stages
+from mfvpr.features import Aggregated, Description, Scale
+from mfvpr.features.sift import Sift
+from mfvpr.features.vlad import VladFitting
+from mfvpr.retrieval.search import EXACT
+from mfvpr.storage import feature_cache as archive_module
+from mfvpr.storage import vectors
+from mfvpr.storage.feature_cache import Archive
+from mfvpr.storage.features import forecast_bytes, open_store
+from mfvpr.types import Features
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.fingerprints import recipe_of
+from tests.builders import make_features
+from tests.storage.synthetic_features import assert_same
+
+pytestmark = pytest.mark.thorough
+
+SIFT = Sift(max_keypoints=60, batch_size=3)
+
+
+class Counted:
+    """SIFT that counts its images, and is killed after some."""
+
+    image_size, interpolation, batch_size = SIFT.image_size, SIFT.interpolation, SIFT.batch_size
+    vector_size, scales, recipe = SIFT.vector_size, SIFT.scales, recipe_of(SIFT)
+
+    def __init__(self, limit=100):
+        self.seen, self.limit = 0, limit
+
+    def __call__(self, images):
+        if self.seen + len(images) > self.limit:
+            raise KeyboardInterrupt
+        self.seen += len(images)
+        return SIFT(images)
+
+
+class Mean:
+    """A global descriptor: the mean color, of unit length."""
+
+    image_size, interpolation, batch_size, vector_size, scales = (16, 16), "pil_bilinear", 4, 3, ()
+    recipe = "mean"
+
+    def __init__(self):
+        self.seen = 0
+
+    def __call__(self, images):
+        self.seen += len(images)
+        mean = images.mean((1, 2)).astype(np.float32) + 1
+        return [Description(vector / np.linalg.norm(vector)) for vector in mean]
+
+
+class Both:
+    """A global descriptor, and local features of two scales, from one pass."""
+
+    image_size, interpolation, batch_size, vector_size = SIFT.image_size, SIFT.interpolation, 3, 3
+    scales, recipe = (Scale(128, 60), Scale(128, 30)), "both"
+
+    def __init__(self):
+        self.seen = 0
+
+    def __call__(self, images):
+        self.seen += len(images)
+        local = SIFT(images)
+        return [
+            Description(np.full(3, row, np.float32), (one.features, jax.tree.map(half, one.features)))
+            for row, one in enumerate(local)
+        ]
+
+
+def half(values):
+    return values if values.shape == (2,) else values[::2]
+
+
+@pytest.fixture(scope="module")
+def folder(small_street):
+    return image_folder(small_street / "database")
+
+
+def all_of(features):
+    return [features[row] for row in range(len(features))]
+
+
+def assert_same_features(got, expected):
+    for one, other in zip(all_of(got), all_of(expected), strict=True):
+        assert_same(one, other)
+
+
+def test_what_was_extracted_is_read_ever_after(folder, tmp_path):
+    [plain] = Archive().local(folder, SIFT)
+    extractor, found = Counted(), []
+    for _ in range(2):
+        [features] = Archive(tmp_path).local(folder, extractor)
+        found.append(features)
+    assert extractor.seen == len(folder)
+    assert_same_features(*found)
+    for first, exact in zip(all_of(found[0]), all_of(plain), strict=True):
+        for name in ("keypoints", "descriptors", "scores", "mask", "image_size"):
+            tolerance = 2e-4 if name == "descriptors" else 0
+            np.testing.assert_allclose(getattr(first, name), getattr(exact, name), atol=tolerance)
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_only_what_is_asked_for_is_extracted_and_nothing_twice(folder, tmp_path, kept):
+    extractor, archive = Counted(), Archive(tmp_path if kept else None)
+    for rows, seen in (([7, 2], 2), ([2], 2), ([2, 3, 7], 3), ([], 3)):
+        [features] = archive.local(folder, extractor, rows)
+        assert extractor.seen == seen
+        assert len(features) == len(folder)
+    assert sorted(np.flatnonzero(features.counts).tolist()) == [2, 3, 7]
+    [whole] = archive.local(folder, extractor)
+    assert extractor.seen == len(folder)
+    assert_same_features(whole, Archive(tmp_path if kept else None).local(folder, SIFT)[0])
+
+
+@dataclass
+class Fewer:
+    """SIFT's first features, as many as somebody may change at any time."""
+
+    number: int
+    image_size, interpolation, batch_size = SIFT.image_size, SIFT.interpolation, SIFT.batch_size
+    vector_size, scales = SIFT.vector_size, SIFT.scales
+
+    def __call__(self, images):
+        return [Description(None, (jax.tree.map(self.first, one.features),)) for one in SIFT(images)]
+
+    def first(self, values):
+        return values if values.shape == (2,) else values[: self.number]
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_an_extractor_that_was_changed_is_another_one(folder, tmp_path, kept):
+    extractor, archive = Fewer(5), Archive(tmp_path if kept else None)
+    for number in (5, 9, 5):
+        extractor.number = number
+        [features] = archive.local(folder, extractor)
+        assert features.counts.tolist() == [number] * len(folder)
+
+
+def test_what_another_version_decodes_are_other_images(folder, monkeypatch):
+    known, recipe = archive_module.versions(), Archive().recipe(folder, SIFT)
+    for name in ("mfvpr", "opencv-python-headless", "pillow"):
+        monkeypatch.setattr(archive_module, "versions", lambda name=name: {**known, name: "0"})
+        assert Archive().recipe(folder, SIFT) != recipe
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_files_that_were_changed_are_looked_at_again(tmp_path, kept, small_street, monkeypatch):
+    root = tmp_path / "images"
+    shutil.copytree(small_street / "database", root)
+    archive, folder = Archive(tmp_path / "s" if kept else None), image_folder(root)
+    [before] = archive.local(folder, SIFT, [0, 1])
+    before = before[1]
+    for row in range(len(folder)):
+        shutil.copy(small_street / "queries" / f"{9 - row:04d}.png", root / f"{row:04d}.png")
+    [after] = archive.local(folder, SIFT)
+    [expected] = Archive(tmp_path / "other" if kept else None).local(folder, SIFT)
+    assert_same_features(after, expected)
+    assert not np.array_equal(before.keypoints, after[1].keypoints)
+    monkeypatch.chdir(small_street)
+    here = replace(folder, root=Path("database"))
+    [first] = archive.local(here, SIFT)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "database")
+    [second] = archive.local(here, SIFT)
+    assert_same_features(second, expected)
+    assert not np.array_equal(first[1].keypoints, second[1].keypoints)
+
+
+def test_one_pass_gives_a_vector_and_several_scales(folder, tmp_path):
+    for root in (None, tmp_path, tmp_path):
+        extractor, archive = Both(), Archive(root)
+        vectors = archive.vectors(folder, extractor, folder)
+        assert vectors.values.shape == (len(folder), 3)
+        np.testing.assert_array_equal(vectors.values[:4, 0], [0, 1, 2, 0])
+        first, second = archive.local(folder, extractor, [1, 4])
+        assert (second.counts == -(-first.counts // 2)).all()
+        np.testing.assert_array_equal(second[4].keypoints, first[4].keypoints[::2])
+        assert extractor.seen == (0 if root and (tmp_path / "seen").exists() else len(folder))
+        if root:
+            (tmp_path / "seen").mkdir(exist_ok=True)
+
+
+def test_an_interrupted_extraction_goes_on_where_it_was(folder, tmp_path):
+    interrupted, resumed = Counted(limit=7), Counted()
+    with pytest.raises(KeyboardInterrupt):
+        Archive(tmp_path).local(folder, interrupted)
+    [found] = Archive(tmp_path).local(folder, resumed)
+    assert interrupted.seen == 6
+    assert resumed.seen == len(folder) - 6
+    [expected] = Archive(tmp_path / "uninterrupted").local(folder, SIFT)
+    assert_same_features(found, expected)
+
+
+def test_bad_images_are_tried_again_by_the_next_run(tmp_path):
+    images = tmp_path / "images"
+    images.mkdir()
+    for name in "abc":
+        Image.effect_noise((64, 64), 80).convert("RGB").save(images / f"{name}.png")
+    good = (images / "b.png").read_bytes()
+    (images / "b.png").write_bytes(b"")
+    folder, archive = image_folder(images), Archive(tmp_path / "s", skip_bad=True)
+    for _ in range(2):
+        assert list(archive.local(folder, SIFT)[0].bad) == [1]
+    (images / "b.png").write_bytes(good)
+    [found] = Archive(tmp_path / "s", skip_bad=True).local(folder, SIFT)
+    assert found.bad == {}
+    assert found.counts.all()
+
+
+def test_bad_images_fail_by_default_with_the_mend(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"")
+    with pytest.raises(InputError, match=r"a\.png.*0 bytes.*, or skip bad images"):
+        Archive().local(image_folder(tmp_path), SIFT)
+    with pytest.raises(InputError, match=r"none of 1 images .*a\.png"):
+        Archive(skip_bad=True).local(image_folder(tmp_path), SIFT)
+
+
+@pytest.fixture
+def colors(tmp_path):
+    """Three plain images and one that cannot be read."""
+    root = tmp_path / "images"
+    root.mkdir()
+    for name, color in (("a", (200, 10, 10)), ("b", (0, 0, 0)), ("d", (10, 10, 200))):
+        Image.new("RGB", (30, 20), color).save(root / f"{name}.png")
+    (root / "c.png").write_bytes(b"")
+    return image_folder(root)
+
+
+def test_global_descriptors_are_stored_as_well(colors, tmp_path):
+    mean = Mean()
+    plain = Archive(skip_bad=True).vectors(colors, mean, colors)
+    found = [Archive(tmp_path / "s", skip_bad=True).vectors(colors, mean, colors) for _ in range(2)]
+    assert mean.seen == 3 + 3
+    for one in found:
+        np.testing.assert_array_equal(one.values, plain.values)
+        assert list(one.bad) == [2]
+    assert np.isnan(plain.values[2]).all()
+    np.testing.assert_allclose(np.linalg.norm(plain.values[[0, 1, 3]], axis=1), 1, rtol=1e-5)
+
+
+class Dark(Mean):
+    """Divides by the mean color, which is not finite where all is black."""
+
+    recipe = "dark"
+
+    def __call__(self, images):
+        with np.errstate(divide="ignore"):
+            return [Description(vector) for vector in (1 / images.mean((1, 2))).astype(np.float32)]
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_images_without_a_global_descriptor_are_listed(colors, tmp_path, kept):
+    found = Archive(tmp_path / "s" if kept else None, skip_bad=True).vectors(colors, Dark(), colors)
+    assert sorted(found.bad) == [1, 2]
+    assert "b.png: features are not finite" in found.bad[1]
+    assert np.isnan(found.values).any(axis=1).tolist() == [False, True, True, False]
+
+
+def test_stores_are_found_by_content_whatever_folders_are_called(folder, tmp_path, small_street):
+    copy = tmp_path / "copy"
+    shutil.copytree(small_street / "database", copy)
+    lines, extractor = [], Counted()
+    for images, label in ((folder, "summer"), (image_folder(copy), "winter")):
+        Archive(tmp_path / "s", tell=lines.append).local(images, extractor, label=label)
+    assert extractor.seen == len(folder)
+    [path] = [path for path in (tmp_path / "s").iterdir() if path.name != "contents"]
+    assert lines[0].startswith(
+        "summer features: 10 of 10 images to do, about 60 features of 128 dimensions each: about 0.2 MB"
+    )
+    assert lines[1].startswith("summer features: 0.")
+    assert " features an image; as the paper stores them, in float32, 0." in lines[1]
+    assert lines[2] == f"winter features: all 10 images from {path}"
+
+
+def test_aggregations_are_fitted_on_the_database(folder, small_street, tmp_path):
+    queries, describer = image_folder(small_street / "queries"), Aggregated(SIFT, VladFitting(num_words=4))
+    archive = Archive(tmp_path)
+    [local] = archive.local(folder, SIFT)
+    expected = VladFitting(num_words=4).fit(local)(all_of(local))
+    np.testing.assert_allclose(archive.vectors(folder, describer, folder).values, expected, atol=1e-6)
+    [others] = archive.local(queries, SIFT)
+    np.testing.assert_allclose(
+        archive.vectors(queries, describer, folder).values,
+        VladFitting(num_words=4).fit(local)(all_of(others)), atol=1e-6,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("images", "features", "paper", "readme"), [(220, 686, 304, 155), (1415, 681, 1942, 989)])
+def test_the_papers_databases_take_about_half(images, features, paper, readme):
+    ours = (forecast_bytes(images, features, 512) + vectors.forecast_bytes(images, 4096)) / 2**20
+    assert ours <= 0.55 * paper
+    assert round(ours) == readme
+
+
+def test_a_forecast_is_not_exceeded(folder, tmp_path):
+    """Random descriptors, which compress worst."""
+    rng = np.random.default_rng(0)
+    with open_store(tmp_path / "s", {}, num_images=len(folder)) as store:
+        for row in range(len(folder)):
+            descriptors = rng.normal(size=(700, 512)).astype(np.float32)
+            descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+            points, scores = rng.uniform(0, 336, (700, 2)).astype(np.float32), rng.uniform(size=700).astype(np.float32)
+            size = np.full(2, 336, np.float32)
+            store.write({row: Features(points, descriptors, scores, np.ones(700, bool), size)})
+        forecast = forecast_bytes(len(folder), 700, 512)
+        assert 0.8 * forecast < store.size_bytes <= forecast + 100_000  # folders and what describes the arrays
+        assert store.size_bytes <= 0.55 * 2064 * 700 * len(folder)
+
+
+def test_features_of_ones_own_are_matched_as_they_are():
+    """As hloc keeps them: half precision, another number in every image; and padded ones."""
+    rng = np.random.default_rng(0)
+    images = [make_features(rng, count, capacity=40) for count in (7, 0, 40, 33)]
+    images[2] = replace(images[2], descriptors=images[2].descriptors.astype(np.float16).astype(np.float32))
+    found = stages.FeatureSet.of(images)
+    assert len(found) == 4
+    assert found.counts.tolist() == [7, 0, 40, 33]
+    candidates = EXACT.shortlist(np.eye(4, dtype=np.float32), np.ones((4, 4), np.float32) / 2, 4)
+    matches = stages.match(found, found, candidates)
+    for query, row in ((0, 2), (2, 3), (3, 0), (1, 2)):
+        alone = match(images[query], images[row])
+        place = candidates.indices[query].tolist().index(row)
+        assert matches.counts[query, place] == alone.mask.sum()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"descriptors": np.ones((16, 5), np.float32)}, r"image 0: expected keypoints .* transpose descriptors"),
+        ({"mask": np.ones(5)}, r"mask \[N\] bool"),
+        ({"descriptors": np.full((5, 16), 7.0, np.float32)}, "unit length, got 28; divide"),
+    ],
+)
+def test_features_of_ones_own_that_do_not_fit_are_told(change, words):
+    image = replace(make_features(np.random.default_rng(0), 5), **change)
+    with pytest.raises(InputError, match=words):
+        stages.FeatureSet.of([image])
+    with pytest.raises(InputError, match="at least one image"):
+        stages.FeatureSet.of([])
+
+
+def test_descriptors_are_of_unit_length_only_where_that_is_asked():
+    image = make_features(np.random.default_rng(0), 5)
+    longer = replace(image, descriptors=3 * image.descriptors)
+    found = stages.FeatureSet.of([longer], unit_length=False)
+    np.testing.assert_array_equal(found[0].descriptors, longer.descriptors)

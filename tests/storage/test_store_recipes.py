@@ -1,0 +1,135 @@
+"""Which store belongs to what; stores half done, or of something else, as the pipeline and the programs meet them."""
+
+import shutil
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from mfvpr import InputError, Shortlist
+from mfvpr.evaluation import stages
+from mfvpr.features.feature_set import FeatureSet
+from mfvpr.storage.matches import open_match_store
+from mfvpr.types import Matches
+from tests.programs import composed, matches_path
+from tests.storage.synthetic_features import digests, features_of
+
+# Matches of another shortlist
+
+QUERIES, CANDIDATES = 6, 4
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    """Features of a few images by chance, as queries and as database."""
+    return FeatureSet.of([features_of(row) for row in range(QUERIES)])
+
+
+@pytest.fixture(scope="module")
+def candidates():
+    indices = (np.arange(QUERIES)[:, None] + np.arange(CANDIDATES)).astype(np.int32) % QUERIES
+    return Shortlist(indices, np.full(indices.shape, 0.5, np.float32), indices >= 0)
+
+
+@pytest.fixture
+def opened(tmp_path):
+    sizes = {"num_queries": QUERIES, "num_candidates": CANDIDATES}
+    return lambda: open_match_store(tmp_path / "s", {"of": "any"}, **sizes)
+
+
+def assert_same(got, expected):
+    np.testing.assert_array_equal(got.counts, expected.counts)
+    for one, other in zip(got.matches, expected.matches, strict=True):
+        for part in fields(Matches):
+            np.testing.assert_array_equal(getattr(one, part.name), getattr(other, part.name))
+
+
+class Interrupted(Exception):
+    pass
+
+
+def _interrupting(after):
+    def track(rows, _):
+        for number, row in enumerate(rows):
+            if number == after:
+                raise Interrupted
+            yield row
+
+    return track
+
+
+def test_another_shortlist_is_refused_before_anything_is_written(drawn, candidates, opened, monkeypatch):
+    monkeypatch.setattr(stages, "STORE_BATCH", 2)
+    with opened() as store, pytest.raises(Interrupted):
+        stages.match(drawn, drawn, candidates, store=store, track=_interrupting(5))
+    others = [
+        replace(candidates, indices=candidates.indices[:, ::-1]),
+        replace(candidates, indices=np.where(np.arange(QUERIES)[:, None] == 3, 0, candidates.indices)),
+        Shortlist(*(values[:, :3] for values in (candidates.indices, candidates.scores, candidates.mask))),
+        Shortlist(*(values[:2] for values in (candidates.indices, candidates.scores, candidates.mask))),
+    ]
+    for other in others:
+        with opened() as store:
+            assert store.done.tolist() == [True] * 4 + [False] * 2
+            before = digests(store.folder)
+            with pytest.raises(InputError, match=r"s: .*candidates.*shortlist"):
+                stages.match(drawn, drawn, other, store=store)
+            assert digests(store.folder) == before
+    with opened() as store:
+        assert_same(
+            stages.match(drawn, drawn, candidates, store=store),
+            stages.match(drawn, drawn, candidates),
+        )
+        np.testing.assert_array_equal(stages.stored_matches(store)[1].indices, candidates.indices)
+
+
+def test_matching_without_a_store_is_the_same(drawn, candidates, opened):
+    """To the last bit, the ratio too."""
+    plain = stages.match(drawn, drawn, candidates)
+    assert plain.matches[0].ratio is not None
+    for _ in range(2):
+        with opened() as store:
+            kept = stages.match(drawn, drawn, candidates, store=store)
+        assert_same(kept, plain)
+
+
+# The programs' stores
+
+
+def settings_of(folder, *changes):
+    return composed(
+        "dataset=folder", f"dataset.database={folder}/database", f"dataset.queries={folder}/queries",
+        "dataset.ground_truth=order", "candidates=3", "features.max_keypoints=40",
+        "features.image_size=[160,120]", "retrieval.num_words=4", *changes,
+        config="sweep",
+    )  # fmt: skip
+
+
+def test_matches_belong_to_images_whatever_their_data_set_is_called(small_street, tmp_path):
+    paths = {
+        matches_path(settings_of(small_street, f"store={tmp_path}", f"dataset.name={name}"))[0]
+        for name in ("one", "two")
+    }
+    assert len(paths) == 1
+
+
+@pytest.mark.parametrize(
+    "change",
+    ["on_bad_image=skip", "candidates=4", "features.max_keypoints=41", "retrieval.num_words=5", "retrieval.whiten=3",
+     "matching.max_distance=1", "dataset.exclude_neighbors=0"],
+)  # fmt: skip
+def test_matches_of_other_settings_are_kept_apart(small_street, tmp_path, change):
+    """Of those that skip bad images too: else a run that stops at one would find all matches, and not stop."""
+    street = tmp_path / "street"  # whose queries are database images
+    for side in ("database", "queries"):
+        shutil.copytree(small_street / "database", street / side)
+    plain, other = (matches_path(settings_of(street, f"store={tmp_path}/s", *more))[0] for more in ((), (change,)))
+    assert plain != other
+
+
+def test_matches_do_not_depend_on_how_they_are_computed(small_street, tmp_path):
+    paths = {
+        matches_path(settings_of(small_street, f"store={tmp_path}", change))[0]
+        for change in ("memory=1", "devices=all")
+    }
+    assert len(paths) == 1

@@ -1,0 +1,169 @@
+"""Checkpoints: nothing foreign is read or overwritten, damage is told, and Orbax keeps quiet."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import optax
+import orbax.checkpoint as ocp
+import pytest
+
+from mfvpr import InputError
+from mfvpr.tuning.learning import checkpoints
+from tests.tuning.learning.toys import RECIPE, ROOT, START, contents, program, same, train
+
+pytestmark = pytest.mark.thorough
+
+STATE = {"a": np.float32([1.5, -2.0]), "b": {"c": np.int32(3), "d": np.arange(600, dtype=np.float32).reshape(20, 30)}}
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("trained")
+    train(folder, steps=10)
+    return folder
+
+
+def test_what_comes_back_is_what_was_saved(tmp_path):
+    folder = tmp_path / "new" / "folder"
+    assert checkpoints.restore(folder, RECIPE, STATE) is None
+    for step in (3, 12, 100):
+        checkpoints.save(folder, step, RECIPE, STATE, [[step, None, 0.1 + 0.2]])
+    assert sorted(path.name for path in folder.iterdir()) == ["100", "12"]
+    restored = checkpoints.restore(folder, RECIPE, STATE)
+    assert restored is not None
+    state, progress = restored
+    assert progress == [[100, None, 0.1 + 0.2]]
+    for got, expected in (
+        (state["a"], STATE["a"]),
+        (state["b"]["c"], STATE["b"]["c"]),
+        (state["b"]["d"], STATE["b"]["d"]),
+    ):
+        assert got.dtype == expected.dtype
+        np.testing.assert_array_equal(got, expected)
+
+
+@pytest.mark.parametrize(
+    "changes, difference",
+    [
+        ({"recipe": {**RECIPE, "model": {"scorer": "curve"}}}, 'model.scorer="line", expected "curve"'),
+        ({"recipe": {**RECIPE, "data": {"name": "drawn", "images": 99}}}, "data.images=100, expected 99"),
+        ({"recipe": {**RECIPE, "seed": 0}}, "seed=null, expected 0"),
+        ({"recipe": {**RECIPE, "model": {"scorer": "line", "sizes": [1]}}}, "model.sizes[1]=3, expected nothing"),
+        ({"recipe": {**RECIPE, "rate": 0.1}}, "rate=nothing, expected 0.1"),
+        ({"recipe": None}, 'model={"scorer": "line", "sizes": [1, 3]}, expected nothing'),
+        ({"parameters": {**START, "offset": np.zeros(4, np.float32)}},
+         'parameters.offset="float32[3]", expected "float32[4]"'),
+        ({"parameters": {"slope": 1.0}}, 'parameters.offset="float32[3]", expected nothing'),
+        ({"optimizer": optax.sgd(0.1)}, 'optimizer.0.count="int32[]", expected nothing'),
+    ],
+)  # fmt: skip
+def test_another_training_is_refused_and_nothing_changes(trained, changes, difference):
+    before = contents(trained)
+    with pytest.raises(InputError) as told:
+        train(trained, **changes)
+    assert str(told.value).startswith(f"{trained}: ")
+    assert f"{difference}; " in str(told.value)
+    assert contents(trained) == before
+
+
+def test_fewer_steps_than_were_made_are_refused(trained):
+    before = contents(trained)
+    with pytest.raises(InputError, match=r"step 10, .*5; "):
+        train(trained, steps=5)
+    assert contents(trained) == before
+
+
+def test_the_remains_of_a_kill_are_not_touched_by_a_refusal(trained, tmp_path):
+    folder = Path(shutil.copytree(trained, tmp_path / "copy"))
+    (folder / "15.orbax-checkpoint-tmp" / "arrays").mkdir(parents=True)
+    before = contents(folder)
+    with pytest.raises(InputError, match="this checkpoint is of"):
+        train(folder, recipe={})
+    assert contents(folder) == before
+    assert train(folder).history[-1].step == 20
+    assert sorted(path.name for path in folder.iterdir()) == ["15", "20"]
+
+
+def test_folders_of_something_else_are_refused(tmp_path):
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "photos" / "summer").mkdir(parents=True)
+    with ocp.CheckpointManager(
+        tmp_path / "foreign", options=ocp.CheckpointManagerOptions(enable_async_checkpointing=False)
+    ) as manager:
+        manager.save(3, args=ocp.args.StandardSave({"x": np.ones(3)}))
+    before = contents(tmp_path)
+    for name, message in (
+        ("file", r"file: .*got a file"),
+        ("photos", r"photos: .*got .*summer"),
+        ("foreign", r"foreign/3: .*checkpoint of mfvpr"),
+    ):
+        with pytest.raises(InputError, match=message):
+            train(tmp_path / name)
+    assert contents(tmp_path) == before
+
+
+def flip(content):
+    middle = len(content) // 2
+    return content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
+
+
+def tear(content):
+    return content[: len(content) // 2]
+
+
+@pytest.mark.parametrize("item, damage", [("arrays", flip), ("arrays", tear), ("record", tear)])
+def test_damage_is_told_and_the_one_before_still_serves(tmp_path, item, damage):
+    state = {"only": np.random.default_rng(0).normal(size=(20, 30)).astype(np.float32)}
+    for step in (1, 2):
+        checkpoints.save(tmp_path, step, {}, state, [step])
+    files = [path for path in (tmp_path / "2" / item).rglob("*") if path.is_file() and path.suffix != ".txt"]
+    largest = max(files, key=lambda path: path.stat().st_size)
+    largest.write_bytes(damage(largest.read_bytes()))
+    with pytest.raises(InputError, match=r"/2: damaged \(.+\); delete") as told:
+        checkpoints.restore(tmp_path, {}, state)
+    assert "\n" not in str(told.value)
+    shutil.rmtree(tmp_path / "2")
+    restored = checkpoints.restore(tmp_path, {}, state)
+    assert restored is not None
+    assert restored[1] == [1]
+
+
+def test_changed_progress_is_damage(tmp_path):
+    checkpoints.save(tmp_path, 1, {}, STATE, [[1, 0.25]])
+    path = tmp_path / "1" / "record" / "metadata"
+    record = json.loads(path.read_text())
+    path.write_text(json.dumps({**record, "progress": [[1, 0.75]]}))
+    with pytest.raises(InputError, match=r"/1: damaged \(.*checksum\); delete"):
+        checkpoints.restore(tmp_path, {}, STATE)
+
+
+def test_a_place_that_cannot_be_written_is_told(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"file/sub: .*checkpoint .*path"):
+        train(tmp_path / "file" / "sub")
+    with pytest.raises(InputError, match=r"file/sub: .*step 5 .*path"):
+        checkpoints.save(tmp_path / "file" / "sub", 5, RECIPE, STATE, [])
+
+
+def test_killed_while_saving_the_newest_whole_one_is_there(tmp_path):
+    """Processes killed while they make, fill, rename and remove folders; each checks what the one before left."""
+    done = program(f"killed_savers(Path({str(tmp_path)!r}), 3)")
+    assert done.returncode == 0, done.stderr
+    left = done.stdout.splitlines()
+    assert len(left) > 10
+    assert any("orbax-checkpoint-tmp" in line for line in left)
+    assert any("tmp" not in line and line.count("'") == 6 for line in left)  # three: before the oldest is removed
+    assert len([path.name for path in tmp_path.iterdir()]) == 2
+
+
+def test_the_terminal_stays_quiet_and_the_package_light(tmp_path):
+    """In a process of its own, where no test has set up warnings or logs."""
+    light = "import sys, mfvpr; assert not {'optax', 'orbax'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", light], cwd=ROOT, check=True)
+    done = program(f"train(Path({str(tmp_path)!r}), steps=10); train(Path({str(tmp_path)!r}))")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert same(train(tmp_path), train())

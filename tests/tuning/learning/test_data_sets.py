@@ -1,0 +1,116 @@
+"""Learned on some data sets, reported on others: what is whose, and that each counts as it would alone."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from mfvpr import HistogramOfShifts, InputError
+from mfvpr.datasets.positives import Positives, side_by_side
+from mfvpr.tuning.learning import comparison
+from mfvpr.tuning.learning.data_sets import Part, joined
+from mfvpr.tuning.learning.splits import VALIDATION, training_splits
+from mfvpr.tuning.learning.teaching import Options
+from mfvpr.tuning.sweeps import Axes
+from mfvpr.tuning.sweeps.search import untracked_stages
+from mfvpr.types import per_match
+from tests.tuning.learning.paths import QUERIES, TOLERANCES, path
+
+
+def part(name, seed, width=QUERIES):
+    """A data set of its own; the best so many candidates of every query."""
+    judge, matches, candidates = path(seed=seed)
+    judge = replace(judge, halves=(), split=None)
+    keep = [int(ends[width - 1]) for ends in np.cumsum(matches.counts, axis=1)]
+    flat = [
+        replace(one, image_size1=one.image_size1[:width], **{n: values[:end] for n, values in per_match(one).items()},
+                mask=one.mask[:end])
+        for one, end in zip(matches.matches, keep, strict=True)
+    ]  # fmt: skip
+    matches = replace(matches, matches=flat, counts=matches.counts[:, :width])
+    return Part(name, judge, matches, jax.tree.map(lambda values: values[:, :width], candidates))
+
+
+@pytest.fixture(scope="module")
+def parts():
+    return [part("a", 0), part("b", 1, width=20), part("c", 2, width=25)]
+
+
+@pytest.fixture(scope="module")
+def whole(parts):
+    return joined(parts[:2], parts[2:])
+
+
+def test_every_query_keeps_its_own(parts, whole):
+    assert len(whole.match_set) == 3 * QUERIES
+    assert whole.candidates.indices.shape == (3 * QUERIES, QUERIES)
+    for number, one in enumerate(parts):
+        width = one.candidates.indices.shape[1]
+        for query in (0, 7, QUERIES - 1):
+            row = number * QUERIES + query
+            np.testing.assert_array_equal(
+                whole.candidates.indices[row, :width], one.candidates.indices[query] + number * QUERIES
+            )
+            assert np.all(whole.candidates.indices[row, width:] == -1)
+            assert not whole.candidates.mask[row, width:].any()
+            np.testing.assert_array_equal(whole.candidates.scores[row, :width], one.candidates.scores[query])
+            ours, own = whole.match_set[row], one.match_set[query]
+            for name, values in per_match(own).items():
+                np.testing.assert_array_equal(getattr(ours, name)[:width], values)
+            assert not ours.mask[width:].any()
+            for level, positives in enumerate(whole.judge.positives):
+                right = one.judge.positives[level].of(query) + number * QUERIES
+                np.testing.assert_array_equal(positives.of(row), right)
+    assert whole.judge.reported_sets == {"c": QUERIES}
+
+
+def test_the_last_quarter_of_each_set_validates_and_nothing_reported_is_seen(whole):
+    [split] = training_splits(whole.match_set, whole.candidates, whole.judge)
+    assert split.name == "other sets"
+    assert {*split.half.report} == {*range(2 * QUERIES, 3 * QUERIES)}
+    for number in range(2):
+        end = QUERIES * (number + 1)
+        first = end - round(VALIDATION * QUERIES)
+        own = range(number * QUERIES, end)
+        assert {query for query in split.validation if query in own} <= {*range(first, end)}
+        assert {query for query in split.train if query in own} <= {*range(end - QUERIES, first - TOLERANCES[-1])}
+        assert min(sum(query in own for query in queries) for queries in (split.train, split.validation)) >= 5
+    assert not split.seen[2 * QUERIES :].any()
+    assert whole.candidates.indices[split.usable].max() < 2 * QUERIES
+
+
+def test_what_is_reported_is_what_the_set_has_alone(parts, whole):
+    [split] = training_splits(whole.match_set, whole.candidates, whole.judge)
+    scorer = HistogramOfShifts(bin_size=20.0, sigma=20.0)
+    compared = comparison._Compared(split, Axes(scorer, {}, {}), Options(), None, untracked_stages)
+    last = parts[2]
+    alone = training_splits(*_halved(last))[0]
+    expected = comparison._Compared(alone, Axes(scorer, {}, {}), Options(), None, untracked_stages)
+    for setting in ({}, {"c": None}, {"c": 3.0}):
+        got = compared.reported("it", scorer, setting).hits[:, alone.half.report]
+        np.testing.assert_array_equal(got, expected.reported("it", scorer, setting).hits)
+
+
+def _halved(one):
+    judge, _, _ = path(seed=2)
+    return one.match_set, one.candidates, judge
+
+
+def test_databases_stand_side_by_side():
+    first, second = Positives.from_rows([[0, 2], []], 3), Positives.from_rows([[1], [0], []], 2)
+    both = side_by_side([first, second])
+    assert [both.of(query).tolist() for query in range(5)] == [[0, 2], [], [4], [3], []]
+    assert both.num_database == 5
+
+
+def test_sets_that_do_not_go_together_are_refused(parts):
+    a, b, c = parts
+    with pytest.raises(InputError, match=r"learn on .*report on, got 3 and 0"):
+        joined(parts, [])
+    with pytest.raises(InputError, match=r"names, got a, b, a"):
+        joined([a, b], [replace(c, name="a")])
+    with pytest.raises(InputError, match=r"c: .*unit of a, frames, got m;"):
+        joined([a], [replace(c, judge=replace(c.judge, unit="m"))])
+    with pytest.raises(InputError, match=r"c: .*thresholds of a, \(0, 1, 2\), got \(0, 1, 3\);"):
+        joined([a], [replace(c, judge=replace(c.judge, thresholds=(0, 1, 3)))])

@@ -1,0 +1,94 @@
+"""Matches that teach: which of them count as right, the loss against a loop, and what is learned from them."""
+
+import math
+from dataclasses import replace
+
+import jax
+import numpy as np
+import optax
+import pytest
+
+from mfvpr import AggregatedScore, HistogramOfShifts, RatioWeight
+from mfvpr.scoring.learned_weight import RELATIVE, LearnedWeight
+from mfvpr.tuning.learning.models import Model
+from mfvpr.tuning.learning.splits import Batch
+from mfvpr.tuning.learning.teaching import TEACHER_SIGMA, Options, of_matches
+from mfvpr.tuning.learning.training import fit
+from tests.builders import make_matches
+from tests.tuning.learning.paths import SIZES, split
+
+pytestmark = pytest.mark.thorough
+
+SHIFT = (30, -20)
+TEACHER = HistogramOfShifts(bin_size=5.0, sigma=10.0, weight=RatioWeight(), max_bins=160)
+
+
+def pair(rng, right, size=24, capacity=30):
+    """Half of the matches of a right pair share a shift; these have the smaller ratios, wrong ones look alike."""
+    agree = (np.arange(size) < size // 2) & right
+    points0 = rng.uniform(50, 250, (size, 2))
+    apart = rng.uniform(60, 150, (size, 2)) * rng.choice([-1, 1], (size, 2))  # further than the teacher's reach
+    points1 = points0 + SHIFT + np.where(agree[:, None], 0, apart)
+    ratio = np.where(agree, rng.uniform(0.3, 0.7, size), rng.uniform(0.6, 1, size))
+    return make_matches(points0, points1, distance=rng.uniform(0.2, 1, size), ratio=ratio, capacity=capacity)
+
+
+def batch(seed=0, queries=4, candidates=3):
+    """The first candidate of every query is right; the last of the last query is none."""
+    rng = np.random.default_rng(seed)
+    made = [pair(rng, candidate == 0) for _ in range(queries) for candidate in range(candidates)]
+    matches = jax.tree.map(lambda *leaves: np.stack(leaves).reshape(queries, candidates, *leaves[0].shape), *made)
+    mask = np.ones((queries, candidates), bool)
+    mask[-1, -1] = False
+    positives = np.tile(np.arange(candidates) == 0, (queries, 1))
+    return Batch(matches, np.zeros(mask.shape, np.float32), positives, mask)
+
+
+def model(taught):
+    return Model.of_matches(AggregatedScore(), LearnedWeight.create(jax.random.key(0), taught.matches, 4), TEACHER)
+
+
+def test_the_loss_is_that_of_a_loop():
+    taught = batch()
+    made = model(taught)
+    rng = np.random.default_rng(3)
+    output = np.float32(rng.normal(size=4))
+    start = made.start | {"weight": replace(made.start["weight"], output=output, output_bias=np.float32(0.3))}
+    right, wrong = [], []
+    for query, candidate in np.argwhere(taught.mask):
+        one = jax.tree.map(lambda leaf: leaf[query, candidate], taught.matches)  # noqa: B023
+        logits = np.asarray(start["weight"].logits(one), np.float64)
+        for k in np.flatnonzero(one.mask):
+            off = np.abs(one.points1[k] - one.points0[k] - np.float32(SHIFT)).max()
+            if taught.positives[query, candidate] and off < 2:
+                right.append(math.log1p(math.exp(-logits[k])))
+            else:
+                wrong.append(math.log1p(math.exp(logits[k])))
+    assert len(right) == 4 * 12
+    expected = (np.mean(right) + np.mean(wrong)) / 2
+    assert float(jax.jit(made.objective(None))(start, taught)) == pytest.approx(expected, rel=1e-5)
+
+
+def test_it_finds_what_tells_right_matches_from_wrong_ones():
+    taught, other = batch(), batch(seed=9)
+    made = model(taught)
+    found = fit(made.start, made.objective(None), lambda _: taught, optimizer=optax.adam(0.05), steps=40)
+    loss = jax.jit(made.objective(None))
+    assert loss(found.parameters, other) < 0.85 * loss(made.start, other)
+    learned = made.scorer_of(found.parameters)
+    assert isinstance(learned, AggregatedScore)
+    clear, doubtful = (
+        jax.tree.map(lambda leaf: leaf[0, 0], replace(other.matches, ratio=np.full_like(other.matches.ratio, ratio)))
+        for ratio in (0.4, 0.9)
+    )
+    weigh = jax.jit(LearnedWeight.__call__)
+    assert np.all((weigh(learned.weight, clear) > 2 * weigh(learned.weight, doubtful))[:24])
+    assert made.values(found.parameters) == {}
+
+
+def test_the_teacher_goes_with_the_size_of_the_images():
+    made = of_matches(split(), HistogramOfShifts(bin_size=20.0, sigma=20.0), Options(batch=4))
+    assert made.teacher.sigma == pytest.approx(TEACHER_SIGMA * max(SIZES))
+    assert made.teacher.bin_size == pytest.approx(made.teacher.sigma / 2)
+    assert made.teacher.max_bins >= 2 * max(SIZES) / made.teacher.bin_size
+    assert made.start["weight"].names == RELATIVE

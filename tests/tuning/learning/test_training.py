@@ -1,0 +1,259 @@
+"""Training: what it finds, when it ends, and that an interruption changes nothing."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from mfvpr import HistogramOfShifts, InputError, score_candidates
+from mfvpr.scoring.learned_weight import ABSOLUTE, LearnedWeight
+from mfvpr.tuning.learning.losses import cross_entropy, mean_loss
+from mfvpr.tuning.learning.parameters import from_logarithms, to_logarithms
+from mfvpr.tuning.learning.training import TrainingError, fit
+from tests.builders import make_matches
+from tests.tuning.learning.toys import START, batches, contents, objective, program, same, train, validate
+
+pytestmark = pytest.mark.thorough
+
+
+@pytest.fixture(scope="module")
+def whole():
+    """The training that nothing interrupts."""
+    return train()
+
+
+def test_finds_the_least_squares_line():
+    x, y = (np.concatenate(parts) for parts in zip(*(batches(step) for step in range(20)), strict=True))
+    design = np.concatenate([np.repeat(x, 3)[:, None], np.tile(np.eye(3), (len(x), 1))], axis=1)
+    slope, *offset = np.linalg.lstsq(design, y.reshape(-1), rcond=None)[0]
+    found = train(steps=400, batches=lambda step: (x, y), optimizer=optax.adam(0.1), validate=None, every=400)
+    np.testing.assert_allclose(found.parameters["slope"], slope, atol=1e-4)
+    np.testing.assert_allclose(found.parameters["offset"], offset, atol=1e-4)
+
+
+def test_recovers_a_planted_temperature():
+    """Labels drawn from softmax(scores / 0.4): the likelihood is largest there."""
+    rng = np.random.default_rng(0)
+    scores = rng.normal(size=(4000, 6)).astype(np.float32)
+    right = np.argmax(scores / 0.4 + rng.gumbel(size=scores.shape), axis=1)
+    positives, mask = np.arange(6)[None] == right[:, None], np.ones(scores.shape, bool)
+
+    def likelihood(parameters, _):
+        return mean_loss(cross_entropy, scores / from_logarithms(parameters)["temperature"], positives, mask)
+
+    found = fit(
+        to_logarithms({"temperature": 3.0}), likelihood, lambda step: None, optimizer=optax.adam(0.1), steps=120
+    )
+    assert float(from_logarithms(found.parameters)["temperature"]) == pytest.approx(0.4, rel=0.05)
+
+
+def test_a_learned_weight_finds_which_matches_count():
+    """Right candidates agree on a shift by their close matches, wrong ones by their distant matches."""
+    rng = np.random.default_rng(1)
+
+    def pair(right):
+        close = np.arange(20) < 10
+        points0 = rng.uniform(50, 250, (20, 2))
+        agree = close if right else ~close
+        points1 = np.where(agree[:, None], points0 + 30, rng.uniform(50, 250, (20, 2)))
+        distance = np.where(close, 0.3, 1.1) + rng.uniform(-0.1, 0.1, 20)
+        return make_matches(points0, points1, distance=distance, ratio=rng.uniform(0, 1, 20), capacity=24)
+
+    pairs = [pair(candidate == 0) for _ in range(6) for candidate in range(4)]
+    matches = jax.tree.map(lambda *leaves: np.stack(leaves).reshape(6, 4, *leaves[0].shape), *pairs)
+    positives, mask = np.tile(np.arange(4) == 0, (6, 1)), np.ones((6, 4), bool)
+
+    def scores(weight):
+        scorer = HistogramOfShifts(bin_size=40.0, sigma=40.0, weight=weight, max_bins=17)
+        return jax.vmap(lambda one: score_candidates(scorer, one))(matches)
+
+    start = LearnedWeight.create(jax.random.key(0), matches, names=ABSOLUTE)
+
+    @jax.jit
+    def loss(weight, _):
+        return mean_loss(cross_entropy, scores(weight), positives, mask)
+
+    found = fit(start, loss, lambda step: None, optimizer=optax.adam(0.05), steps=40)
+    assert loss(start, None) > 1
+    assert loss(found.parameters, None) < 0.1
+    close, distant = (replace(pairs[0], distance=np.full(24, distance, np.float32)) for distance in (0.3, 1.1))
+    weigh = jax.jit(LearnedWeight.__call__)
+    assert np.all((weigh(found.parameters, close) > 2 * weigh(found.parameters, distant))[:20])
+    for name in ("center", "scale"):
+        np.testing.assert_array_equal(getattr(found.parameters, name), getattr(start, name))
+
+
+def test_history_and_best(whole):
+    assert [record.step for record in whole.history] == [0, 5, 10, 15, 20]
+    assert whole.history[0].loss is None
+    assert whole.history[0].validation == validate(START)
+    assert whole.ended == "all 20 steps are done"
+    first = train(steps=5, every=1)
+    assert whole.history[1].loss == np.mean([record.loss for record in first.history[1:]])
+    assert validate(whole.parameters) == min(record.validation for record in whole.history)
+
+
+def test_stops_in_time_and_returns_the_best():
+    scripted = iter([5.0, 4.0, 6.0, 3.0, 3.0, 9.0, 0.0])
+    seen = []
+
+    def scripted_validation(parameters):
+        seen.append(parameters)
+        return next(scripted)
+
+    found = train(steps=100, every=2, patience=2, validate=scripted_validation)
+    assert [record.validation for record in found.history] == [5.0, 4.0, 6.0, 3.0, 3.0, 9.0]
+    assert (found.step, found.ended) == (6, "no gain in 2 validations")
+    jax.tree.map(np.testing.assert_array_equal, found.parameters, seen[3])
+
+
+def test_the_start_may_be_the_best():
+    found = train(steps=3, every=1, validate=lambda parameters: float(parameters["slope"]))
+    assert found.step == 0
+    assert found.parameters["slope"] == 1
+
+
+def test_one_compilation_for_all_steps(compilations):
+    traces, compiled = [], []
+
+    def traced(parameters, batch):
+        traces.append(1)
+        return objective(parameters, batch)
+
+    def counted(step):
+        compiled.append(compilations.count)
+        return batches(step)
+
+    train(objective=traced, batches=counted, validate=None)
+    assert len(traces) == 1
+    assert compiled[1] == compiled[-1]
+
+
+def test_goes_on_to_the_bit(tmp_path, whole):
+    half = train(tmp_path, steps=10)
+    assert half.history == whole.history[:3]
+    assert same(train(tmp_path), whole)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["15", "20"]
+    before = contents(tmp_path)
+    assert same(train(tmp_path, batches=None), whole)  # nothing is left to do
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("validated", [True, False])
+def test_more_steps_than_were_asked_for_first_change_nothing(tmp_path, validated):
+    """Seven steps end between two validations, where one of 20 steps would neither look nor choose."""
+    given = {} if validated else {"validate": None}
+    short = train(tmp_path, steps=7, **given)
+    assert [record.step for record in short.history] == [0, 5, 7]
+    before = contents(tmp_path)
+    assert same(train(tmp_path, steps=7, batches=None, **given), short)
+    assert contents(tmp_path) == before
+    assert same(short, train(steps=7, **given))
+    assert same(train(tmp_path, steps=9, **given), train(steps=9, **given))
+    assert same(train(tmp_path, **given), train(**given))
+
+
+def test_the_best_between_two_validations_is_of_the_shorter_training_alone(tmp_path):
+    """Step 7 has the best validation; whoever goes on to step 20 never saw it."""
+
+    def at_seven(parameters):
+        return abs(float(parameters["slope"]) - float(seven["slope"]))
+
+    seven = train(steps=7, every=7, validate=None).parameters
+    assert train(tmp_path, steps=7, validate=at_seven).step == 7
+    longer = train(tmp_path, validate=at_seven)
+    assert longer.step != 7
+    assert same(longer, train(validate=at_seven))
+
+
+def test_a_second_training_in_one_folder_is_refused(tmp_path):
+    def second(step):
+        if step == 8:
+            with pytest.raises(InputError, match="another process"):
+                train(tmp_path)
+        return batches(step)
+
+    assert same(train(tmp_path, batches=second), train(tmp_path))
+
+
+def test_an_ended_training_stays_ended(tmp_path):
+    falling = iter(range(100))
+    ended = train(tmp_path, steps=100, patience=3, validate=lambda parameters: -min(next(falling), 2))
+    assert (ended.step, ended.history[-1].step) == (10, 25)
+    assert same(train(tmp_path, steps=100, patience=3, batches=None), ended)
+
+
+@pytest.mark.parametrize("stop", [2, 13])
+def test_an_interruption_changes_nothing(tmp_path, whole, stop):
+    def interrupted(step):
+        if step == stop:
+            raise KeyboardInterrupt
+        return batches(step)
+
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path, batches=interrupted)
+    assert same(train(tmp_path), whole)
+
+
+def test_killed_in_the_middle_it_ends_the_same(tmp_path, whole):
+    done = program(f"folder = Path({str(tmp_path)!r}); print(killed(lambda: train(folder), folder, 80))")
+    assert done.stdout == "True\n", done.stderr
+    left = {path.name for path in tmp_path.iterdir()}
+    assert "10" in left
+    assert "20" not in left
+    assert same(train(tmp_path), whole)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["15", "20"]
+
+
+@pytest.mark.parametrize(
+    "broken, culprit",
+    [
+        (lambda p, b: objective(p, b) + jnp.where(b[0][0] > 1e5, jnp.nan, 0.0), "loss"),
+        (lambda p, b: objective(p, b) + jnp.sqrt(jnp.maximum(1e5 - b[0][0], 0.0)) * 0 * p["slope"], "gradient.slope"),
+    ],
+    ids=["loss", "gradient"],
+)
+def test_what_is_not_finite_is_told_and_leaves_the_checkpoint(tmp_path, whole, broken, culprit):
+    def spiked(step):
+        x, y = batches(step)
+        spike = np.float32(np.inf if culprit != "loss" else 1e6)
+        return (np.where(np.arange(8) == 0, spike, x), y) if step == 13 else (x, y)
+
+    with pytest.raises(TrainingError) as told:
+        train(tmp_path, batches=spiked, objective=broken)
+    message = str(told.value)
+    assert isinstance(told.value, InputError)
+    assert "\n" not in message
+    assert message.startswith("step 13: ")
+    assert "of batch 13 is not finite at slope=" in message
+    assert f"the last good checkpoint is {tmp_path}/10;" in message
+    assert "offset=" not in message
+    assert same(train(tmp_path), whole)
+
+
+def test_a_step_to_infinity_and_a_validation_of_nan_are_told():
+    with pytest.raises(TrainingError, match=r"step 0: updated\..*batch 0 .*not finite.*no checkpoint"):
+        train(objective=lambda parameters, batch: 10 * objective(parameters, batch), optimizer=optax.sgd(1e38))
+    with pytest.raises(TrainingError, match=r"step 5: validation is not finite"):
+        train(validate=lambda parameters: np.nan if parameters["slope"] != 1 else 0.0)
+
+
+@pytest.mark.parametrize("wrong", [{"every": 0}, {"steps": -1}, {"patience": 0}, {"patience": 1, "validate": None}])
+def test_impossible_settings_are_refused(wrong):
+    with pytest.raises(ValueError, match=r"patience .*validate"):
+        train(**wrong)
+
+
+def test_progress_is_told():
+    told = []
+
+    def track(items, total):
+        for item in items:
+            told.append((item, total))
+            yield item
+
+    train(steps=7, track=track)
+    assert told == [(step, 7) for step in range(7)]

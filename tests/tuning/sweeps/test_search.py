@@ -1,0 +1,170 @@
+"""The search over a small path, against sweeps and loops over queries."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+import mfvpr
+from mfvpr import InputError
+from mfvpr.datasets.ground_truth import FrameTruth
+from mfvpr.evaluation import best_setting, hits, judge, statistics
+from mfvpr.report import sweeps
+from mfvpr.tuning import sweeps as sweeping
+from mfvpr.tuning.sweeps import Axes, search
+from tests.scorers import Wrapped
+from tests.tuning.learning.paths import QUERIES, TOLERANCES, split
+
+TRUTH = FrameTruth(tuple((row,) for row in range(QUERIES)), QUERIES)
+SUM = mfvpr.AggregatedScore()
+WEIGHTS = {"weight": ["fs", "unit"], "c": [0, "auto"]}
+
+
+@pytest.fixture(scope="module")
+def data():
+    path = split()
+    return path.match_set, path.candidates
+
+
+@pytest.fixture(scope="module")
+def outcome(data):
+    axes = Axes(SUM, WEIGHTS, {"weight": "dmf", "c": 2})
+    return sweeping.search_grid(axes, judge(TRUTH, TOLERANCES, "both"), *data, ks=[5, 1])
+
+
+def test_words_become_values():
+    axes = Axes(mfvpr.HistogramOfShifts(), {"weight": ["fs"], "truncate": [None, 2.0]}, {})
+    plain = {"weight": "dmf", "truncate": None, "max_distance": None, "c": "auto", "sigma": 3.0}
+    assert axes.setting(plain) == {
+        "weight": mfvpr.DescriptorDistanceWeight(), "truncate": math.inf, "max_distance": math.inf, "c": None,
+        "sigma": 3.0,
+    }  # fmt: skip
+    assert axes.setting({"max_distance": 0.5, "c": 2}) == {"max_distance": 0.5, "c": 2.0}
+    assert axes.size == 2
+    assert axes.grid() == [{"weight": "fs", "truncate": None}, {"weight": "fs", "truncate": 2.0}]
+    assert Axes(Wrapped(), {}, {}).setting({"inner.sigma": 9.0}) == {"inner.sigma": 9.0}  # declared nowhere
+
+
+def test_one_axis_less():
+    axes = Axes(SUM, WEIGHTS, {"weight": "dmf", "c": 2}).without("c")
+    assert axes == Axes(SUM, {"weight": ["fs", "unit"]}, {"weight": "dmf"})
+    assert axes.without("c") == axes
+
+
+def test_bins_that_do_not_fit_are_refused_before_any_work(data):
+    axes = Axes(mfvpr.HistogramOfShifts(), {"bin_size": [15.0, 0.01]}, {"bin_size": 15.0})
+    with pytest.raises(InputError, match=r"bin_size=0\.01: expected at most 1024 bins"):
+        sweeping.search_grid(axes, judge(TRUTH, TOLERANCES), *data, track=lambda _: pytest.fail("begun"))
+
+
+def test_what_is_no_word_or_has_no_own_value_is_refused(data):
+    words = Axes(SUM, {"weight": [mfvpr.UnitWeight()]}, {"weight": "fs"})
+    with pytest.raises(InputError, match=r"weight=UnitWeight\(\): .*fs, dmf, ratio, unit"):
+        sweeping.search_grid(words, judge(TRUTH, TOLERANCES), *data)
+    without = Axes(SUM, {"weight": ["fs"], "c": [0]}, {"weight": "fs"})
+    with pytest.raises(InputError, match=r"own: .*weight, c, got weight"):
+        sweeping.search_grid(without, judge(TRUTH, TOLERANCES), *data)
+
+
+def test_every_setting_of_the_grid_is_ranked_and_then_the_scorers_own(data, outcome):
+    assert outcome.settings == [*sweeping.grid(WEIGHTS), {"weight": "dmf", "c": 2}]
+    assert outcome.own == 4
+    assert outcome.ks == [1, 5]
+    weights = {"fs": mfvpr.FeatureScoreWeight(), "unit": mfvpr.UnitWeight(), "dmf": mfvpr.DescriptorDistanceWeight()}
+    settings = [
+        {"weight": weights[one["weight"]], "c": None if one["c"] == "auto" else one["c"]} for one in outcome.settings
+    ]
+    rows = sweeping.sweep(SUM, settings, *data, views=outcome.judge.views, depth=5)
+    np.testing.assert_array_equal(outcome.rows, rows)
+
+
+def test_own_values_that_the_grid_has_are_ranked_once(data):
+    axes = Axes(SUM, {"weight": ["fs", "dmf"]}, {"weight": "dmf"})
+    outcome = sweeping.search_grid(axes, judge(TRUTH, TOLERANCES), *data, ks=[1])
+    assert (len(outcome.settings), outcome.own) == (2, 1)
+    [chosen] = outcome.chosen
+    assert outcome.recall[chosen, 1] == outcome.recall[:, 1].max()
+    assert [verdict.own.recall for verdict in outcome.report] == pytest.approx(outcome.recall[1])
+    assert [verdict.chosen.recall for verdict in outcome.report] == pytest.approx(outcome.recall[chosen])
+
+
+def test_each_half_is_reported_by_what_was_chosen_on_the_other(outcome):
+    """The scorer's own values are beside the grid, and never chosen."""
+    right = outcome.judge.positives[1]
+    first, own = [], []
+    for view, half, chosen in zip((1, 2), outcome.judge.halves, outcome.chosen, strict=True):
+        tuned = hits(outcome.rows[view][:4, half.tune], right.take(half.tune)).mean(axis=1)
+        assert chosen == best_setting(tuned, WEIGHTS)
+        first += hits(outcome.rows[0][chosen], right)[half.report].tolist()
+        own += hits(outcome.rows[0][4], right)[half.report].tolist()
+    path = np.argsort(np.concatenate([half.report for half in outcome.judge.halves]))
+    first, own = np.array(first)[path], np.array(own)[path]
+    verdict = outcome.report[1]
+    assert (verdict.threshold, verdict.queries) == (TOLERANCES[1], QUERIES)
+    assert verdict.chosen == statistics.estimate(first) == (np.mean(first), verdict.chosen.interval)
+    assert verdict.chosen.interval == statistics.recall_interval(first)
+    assert verdict.mcnemar == statistics.mcnemar(first, own)
+    assert verdict.sign_flips == statistics.block_sign_flips(first, own)
+
+
+def test_optuna_draws_within_the_axes():
+    optuna = pytest.importorskip("optuna")
+    values = {"num_bins": [4, 9], "tolerance": [1.5, 4.0], "weight": ["fs", "unit"], "window": [6]}
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=1))
+    drawn = [search.suggest_setting(study.ask(), Axes(mfvpr.AnchorPoints(), values, {})) for _ in range(20)]
+    for setting in drawn:
+        assert type(setting["num_bins"]) is int
+        assert 4 <= setting["num_bins"] <= 9
+        assert 1.5 <= setting["tolerance"] <= 4
+        assert setting["weight"] in values["weight"]
+        assert setting["window"] == 6
+    assert len({setting["tolerance"] for setting in drawn}) == 20
+
+
+def test_optuna_proposes_as_many_as_asked_after_the_scorers_own(data):
+    pytest.importorskip("optuna")
+    axes = Axes(SUM, {"weight": ["fs", "unit"], "c": [0.5, 3.0]}, {"weight": "dmf", "c": 2})
+    outcome = sweeping.search_optuna(axes, judge(TRUTH, TOLERANCES), *data, trials=3, seed=1, ks=[1])
+    assert outcome.settings[0] == axes.own
+    assert outcome.rows.shape == (1, 4, QUERIES, 1)
+    assert outcome.chosen == [int(np.argmax(outcome.recall[:, 1]))]
+    assert sweeps.figures(outcome) == []
+    rows = sweeping.sweep(SUM, [axes.setting(one) for one in outcome.settings], *data, depth=1)
+    np.testing.assert_array_equal(outcome.rows, rows)
+
+
+def test_optuna_learns_from_the_queries_that_choose(data, monkeypatch):
+    optuna = pytest.importorskip("optuna")
+    values = []
+    monkeypatch.setattr(optuna.Study, "tell", lambda study, trial, value: values.append(value))
+    axes = Axes(SUM, {"weight": ["fs", "unit"], "c": [0.5, 3.0]}, {"weight": "dmf", "c": 2})
+    outcome = sweeping.search_optuna(axes, judge(TRUTH, TOLERANCES, "both"), *data, trials=3, seed=1, ks=[1])
+    tuning = outcome.judge.tuning(outcome.rows)[:, 1:, outcome.judge.main].mean(axis=0)
+    np.testing.assert_array_equal(values, tuning)
+    assert (tuning != outcome.recall[1:, outcome.judge.main]).all()  # of all queries, reported ones among them
+
+
+def test_what_people_read_is_what_was_measured(outcome):
+    table = sweeps.table(outcome)
+    assert table.header == ["weight", "c", "R@1 ±0", "R@1 ±1", "R@1 ±2", "R@5 ±1"]
+    for cells, setting, recall in zip(table.rows, outcome.settings, outcome.recall, strict=True):
+        assert cells[:2] == [str(value) for value in setting.values()]
+        assert cells[2:5] == [f"{100 * value:.1f}" for value in recall]
+    found = json.loads(json.dumps(sweeps.results(outcome)))
+    assert (found["split"], found["search"], found["ks"]) == ("both", "grid", [1, 5])
+    assert found["chosen"] == [outcome.settings[number] for number in outcome.chosen]
+    assert [entry["parameters"] for entry in found["settings"]] == outcome.settings
+    text = sweeps.text(outcome)
+    for half in ("first_half", "second_half"):
+        assert text.count(f"queries of {half}, reported on the 16 of the other half: weight = ") == 1
+    assert text.count("95 % intervals") == 1
+    assert [name for name, _ in sweeps.figures(outcome)] == ["weight_c.png"]
+
+
+def test_neighbors_of_the_best_are_shown_where_not_all_settings_are(data, monkeypatch):
+    axes = Axes(SUM, {"clamp": [False, True], "c": [0, 1, 2]}, {"clamp": False, "c": 0})
+    outcome = sweeping.search_grid(axes, judge(TRUTH, TOLERANCES), *data, ks=[1])
+    assert "neighbors" not in sweeps.text(outcome)
+    monkeypatch.setattr(sweeps, "TOP", 2)
+    assert "The best, and its neighbors in the grid:" in sweeps.text(outcome)
