@@ -4,7 +4,8 @@ from typing import Any
 
 from experiments import build
 from experiments.settings import SettingsError
-from mfvpr.matching.match_set import MatchSet, Scales, block_bytes, scales
+from mfvpr.matching import MatchSet, Scales
+from mfvpr.matching.match_set import block_bytes, scales
 from mfvpr.scoring import SCORERS
 from mfvpr.scoring.fields import declared
 from mfvpr.tuning import sweeps
@@ -12,7 +13,7 @@ from mfvpr.tuning.learning.parameters import can_learn
 from mfvpr.tuning.sweeps import Axes
 from mfvpr.tuning.sweeps.search import require_optuna
 from mfvpr.tuning.sweeps.sweep import SETTINGS_PER_BLOCK
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 from mfvpr.utils.numerics import free_host_bytes
 
 OF_MATCHES = ("max_distance", "c")  # what is no parameter of a scorer

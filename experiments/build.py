@@ -8,28 +8,31 @@ from typing import Any
 
 from experiments import console
 from experiments.settings import SettingsError
-from mfvpr.datasets.datasets import Dataset, folder_dataset, sequences_dataset
+from mfvpr.datasets import Dataset, folder_dataset, sequences_dataset
 from mfvpr.datasets.ground_truth import CHOICES
 from mfvpr.datasets.published import published_dataset
 from mfvpr.datasets.streets import seasons_folder, streets_folder
 from mfvpr.datasets.streets.seasons import CONDITIONS, TRUTH
-from mfvpr.features import Aggregated, Extractor
-from mfvpr.features.sift import Sift
-from mfvpr.features.vlad import VladFitting
-from mfvpr.matching.lightglue import LightGlueMatching
-from mfvpr.matching.matcher import Matcher, Matching
-from mfvpr.reranking.frame_correlation import FrameCorrelation
-from mfvpr.reranking.fusion import Fusion
-from mfvpr.retrieval.precomputed import DescriptorFiles, FeatureFiles, File, ShortlistFiles
-from mfvpr.retrieval.retriever import Filter, Retrieval
-from mfvpr.retrieval.search import ExactSearch, WhitenedSearch
+from mfvpr.features import Aggregated, Extractor, Sift, VladFitting
+from mfvpr.matching import LightGlueMatching, Matcher, Matching
+from mfvpr.reranking import FrameCorrelation, Fusion
+from mfvpr.retrieval import (
+    DescriptorFiles,
+    ExactSearch,
+    FeatureFiles,
+    Filter,
+    Retrieval,
+    ShortlistFiles,
+    WhitenedSearch,
+)
+from mfvpr.retrieval.precomputed import File
 from mfvpr.scoring import SCORERS, Scorer
 from mfvpr.scoring.fields import made
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS
 from mfvpr.scoring.weights import WEIGHTS
-from mfvpr.storage.feature_cache import Archive
-from mfvpr.storage.shards import Shard
-from mfvpr.utils.fingerprints import fingerprint, recipe_of
+from mfvpr.storage import Archive, Shard
+from mfvpr.utils import recipe_of
+from mfvpr.utils.fingerprints import fingerprint
 
 
 def expanded(path: str) -> Path:
@@ -81,11 +84,8 @@ def extractor(settings: dict[str, Any], data: Dataset | None) -> Extractor | Fea
             raise SettingsError(f"features.interpolation={kind}: gives fractions, but SIFT takes whole numbers")
         return Sift(**_only(options, Sift, "features=sift"))
     # Here, since Flax takes half a second.
-    from mfvpr.features.aliked import AlikedFeatures
-    from mfvpr.features.d2net import D2NetFeatures
-    from mfvpr.features.patch_netvlad import PatchNetVladFeatures
-    from mfvpr.features.selavpr import SelaVprFeatures
-    from mfvpr.features.ssm import STAGE2_FITTING, SsmCells
+    from mfvpr.features import AlikedFeatures, D2NetFeatures, PatchNetVladFeatures, SelaVprFeatures, SsmCells
+    from mfvpr.features.ssm import STAGE2_FITTING
 
     made = {
         "aliked": AlikedFeatures,
@@ -117,7 +117,8 @@ def filter(settings: dict[str, Any], local: Extractor | FeatureFiles, data: Data
         return Retrieval(Aggregated(local, VladFitting(**options)), search)
     if settings["name"] in ("netvlad", "gem", "dinov2"):
         return Retrieval(_described(settings["name"], options), search)
-    from mfvpr.features.mixvpr import IMAGE_SIZE, MixVprDescriptor
+    from mfvpr.features import MixVprDescriptor
+    from mfvpr.features.mixvpr import IMAGE_SIZE
 
     size = options.pop("image_size")
     if tuple(size) != IMAGE_SIZE:
@@ -133,7 +134,7 @@ def _with_vectors(local: Extractor | FeatureFiles) -> Extractor:
 
 
 def _described(name: str, options: dict[str, Any]) -> Extractor:
-    from mfvpr.features.global_descriptor import GlobalDescriptor
+    from mfvpr.features import GlobalDescriptor
 
     networks = ("netvlad", "patch_netvlad") if name == "netvlad" else (name,)
     model, size = _network("retrieval", networks, options.pop("weights")), tuple(options.pop("image_size"))
@@ -155,8 +156,9 @@ def matching(settings: dict[str, Any]) -> Matcher:
 
 
 def _voting(options: dict[str, Any]) -> Filter:
-    from mfvpr.features.ssm import STAGE1_FITTING, STAGE1_SIZE, SsmWindows
-    from mfvpr.retrieval.ssm_voting import SsmVoting
+    from mfvpr.features import SsmWindows
+    from mfvpr.features.ssm import STAGE1_FITTING, STAGE1_SIZE
+    from mfvpr.retrieval import SsmVoting
 
     size, weights, whitening = options.pop("image_size"), options.pop("weights"), _fitting(options, STAGE1_FITTING)
     if tuple(size) != STAGE1_SIZE:
@@ -228,8 +230,7 @@ def frames(settings: dict[str, Any]) -> FrameCorrelation | None:
 
 def _network(group: str, names: str | tuple[str, ...], weights: str | None) -> Any:
     """The network, one of these, with its weights, converted before."""
-    from mfvpr.checkpoints.files import load_model
-    from mfvpr.checkpoints.registry import REGISTRY
+    from mfvpr.checkpoints import REGISTRY, load_model
 
     names = (names,) if isinstance(names, str) else names
     known = [entry.name for entry in REGISTRY.values() if entry.network in names]

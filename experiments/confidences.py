@@ -8,7 +8,7 @@ from experiments.console import tell
 from experiments.settings import SettingsError
 from experiments.stages import Images, num_candidates
 from mfvpr.datasets.truth import middle
-from mfvpr.evaluation.calibration import Confidence, read_confidences
+from mfvpr.evaluation import Confidence, read_confidences
 from mfvpr.report.evaluations import Judged
 from mfvpr.utils.versions import versions
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from experiments.errors import Parser, refuse, run_command
 
 if TYPE_CHECKING:
+    from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
     from mfvpr.datasets.contents import Contents
-    from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
 
 # Functions import what they need: --help and wrong usage need not wait for JAX.
 DATA = "python -m experiments.data"
@@ -45,8 +45,8 @@ def _parser() -> Parser:
 def list_data(names: list[str]) -> None:
     """Print a table, or what is known of some."""
     from mfvpr.datasets.published import PUBLISHED
-    from mfvpr.report.tables import Table
-    from mfvpr.utils.errors import InputError
+    from mfvpr.report import Table
+    from mfvpr.utils import InputError
 
     for name in names:
         if name not in PUBLISHED and name not in _OTHERS:
@@ -72,9 +72,9 @@ def check(name: str, settings: list[str], sheet: Path | None) -> None:
     from experiments import data_sets
     from experiments.stages import dataset_of
     from mfvpr.datasets.published import differences
+    from mfvpr.report import Table
     from mfvpr.report.contact_sheets import contact_sheet
-    from mfvpr.report.tables import Table
-    from mfvpr.storage.feature_cache import Archive
+    from mfvpr.storage import Archive
 
     [chosen] = data_sets.composed("check", ":".join([name, *settings]))
     dataset = dataset_of(chosen)
@@ -112,7 +112,7 @@ def _counts(dataset: "Dataset") -> Iterator[list[str]]:
 def _unreadable(dataset: "Dataset") -> Iterator[list[str]]:
     """Why images of each side cannot be read, those that cannot."""
     from experiments import console
-    from mfvpr.utils.errors import InputError
+    from mfvpr.utils import InputError
     from mfvpr.utils.numerics import available_cpus
     from mfvpr.utils.threads import ordered_map
 

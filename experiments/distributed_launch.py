@@ -78,7 +78,7 @@ def _end_with_parent() -> None:
 def _join(settings: Mapping[str, Any]) -> None:
     import jax
 
-    from mfvpr.storage.shards import Shard
+    from mfvpr.storage import Shard
 
     shard = Shard.parse(settings["shard"])
     _keep_for_python(_log(settings))

@@ -52,7 +52,7 @@ def one_line() -> Iterator[None]:
     except OSError as error:
         refuse(f"{error.filename or 'input or output'}: {error.strerror or error}")
     except ValueError as error:
-        from mfvpr.utils.errors import InputError  # here, since it brings JAX along
+        from mfvpr.utils import InputError
 
         if not isinstance(error, InputError):
             raise
@@ -61,7 +61,7 @@ def one_line() -> Iterator[None]:
 
 def with_command(error: Exception) -> str:
     """The message, and where weights are to be installed, how."""
-    from mfvpr.checkpoints.files import WeightsError
+    from mfvpr.checkpoints import WeightsError
 
     return f"{error}: {how_to_install(error.entry)}" if isinstance(error, WeightsError) else str(error)
 

@@ -7,7 +7,7 @@ from typing import Any
 from experiments import build, confidences, distributed_launch, run_folder, sharding, stages, truth
 from experiments.settings import SettingsError
 from experiments.stages import Images, Tools
-from mfvpr.datasets.datasets import Dataset
+from mfvpr.datasets import Dataset
 from mfvpr.datasets.published import differences
 from mfvpr.datasets.truth import Unit
 from mfvpr.evaluation import evaluation
@@ -19,9 +19,9 @@ from mfvpr.report.evaluations import Figure, Judged, figures, recall_table, writ
 from mfvpr.report.shifts import write_shifts
 from mfvpr.reranking.results import COHORT, FILTER, FRAMES
 from mfvpr.scoring import HistogramOfShifts
+from mfvpr.storage import NotYet
 from mfvpr.storage.feature_writers import open_sinks
-from mfvpr.storage.shards import NotYet
-from mfvpr.utils.progress import Stopwatch
+from mfvpr.utils import Stopwatch
 from mfvpr.utils.versions import versions
 
 _THRESHOLDS: dict[Unit, str] = {"frames": "tolerance", "m": "radius"}  # their names in results

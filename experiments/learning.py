@@ -10,7 +10,7 @@ from experiments.axes import learnable, own_c
 from experiments.settings import SettingsError
 from experiments.stages import Images
 from mfvpr.datasets.sequences import own_rows
-from mfvpr.matching.match_set import Scales
+from mfvpr.matching import Scales
 from mfvpr.report import comparisons, runs
 from mfvpr.scoring import Scorer
 from mfvpr.scoring.learned_weight import ABSOLUTE, RELATIVE
@@ -18,9 +18,9 @@ from mfvpr.tuning.learning.comparison import Checkpoints, compare
 from mfvpr.tuning.learning.data_sets import Part, joined
 from mfvpr.tuning.learning.losses import LOSSES
 from mfvpr.tuning.learning.teaching import Options
+from mfvpr.utils import Stopwatch, recipe_of
 from mfvpr.utils.files import write_text
-from mfvpr.utils.fingerprints import fingerprint, recipe_of
-from mfvpr.utils.progress import Stopwatch
+from mfvpr.utils.fingerprints import fingerprint
 from mfvpr.utils.versions import versions
 
 _INPUTS = {"relative": RELATIVE, "absolute": ABSOLUTE}

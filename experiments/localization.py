@@ -12,11 +12,11 @@ from experiments.answer_figures import AnswerFigures
 from experiments.console import tell
 from experiments.query_images import images
 from experiments.settings import SettingsError
-from mfvpr.datasets.images import read_image
-from mfvpr.evaluation.calibration import Confidence, read_confidences
+from mfvpr.datasets import read_image
+from mfvpr.evaluation import Confidence, read_confidences
 from mfvpr.localization import Answer, Asked, Drive, Map, Route
 from mfvpr.storage.maps import Entry
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 from mfvpr.utils.files import printable
 
 

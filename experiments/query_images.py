@@ -11,7 +11,7 @@ import numpy as np
 from experiments import build
 from experiments.console import tell
 from experiments.settings import SettingsError
-from mfvpr.datasets.datasets import image_folder
+from mfvpr.datasets import image_folder
 from mfvpr.datasets.videos import VIDEO_SUFFIXES, frames
 from mfvpr.utils.files import IMAGE_SUFFIXES, canonical_name
 

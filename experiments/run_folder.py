@@ -10,7 +10,7 @@ from experiments.settings import SettingsError
 from mfvpr.report import runs
 from mfvpr.report.pages import one_run
 from mfvpr.report.runs import Figure
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 from mfvpr.utils.versions import versions
 
 _OF_THE_START = ("multirun", "command")  # what `command_line` adds to the settings

@@ -10,9 +10,9 @@ from mfvpr.report import runs, sweeps
 from mfvpr.tuning import sweeps as sweeping
 from mfvpr.tuning.sweeps import Outcome
 from mfvpr.types import Shortlist
+from mfvpr.utils import Stopwatch
 from mfvpr.utils.files import write_text
 from mfvpr.utils.fingerprints import fingerprint
-from mfvpr.utils.progress import Stopwatch
 from mfvpr.utils.versions import versions
 
 

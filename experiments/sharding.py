@@ -21,8 +21,8 @@ from experiments import build, truth
 from experiments.settings import SettingsError
 from experiments.stages import Images
 from mfvpr.report import runs
+from mfvpr.storage import NotYet, Shard
 from mfvpr.storage.disk import locked
-from mfvpr.storage.shards import NotYet, Shard
 from mfvpr.utils.files import write_text, written_once
 from mfvpr.utils.fingerprints import difference
 from mfvpr.utils.versions import versions

@@ -9,21 +9,20 @@ from tqdm import tqdm
 
 from experiments import build, truth
 from experiments.console import bar, tell
+from mfvpr.datasets import Dataset, QuerySequence
 from mfvpr.datasets.contents import Contents
-from mfvpr.datasets.datasets import Dataset, QuerySequence
 from mfvpr.datasets.published import differences
 from mfvpr.datasets.sequences import OwnRows, own_rows, without_neighbors
 from mfvpr.datasets.truth import threshold_words
-from mfvpr.evaluation.sequence_matching import match_sequence, matches_recipe
+from mfvpr.evaluation import match_sequence
+from mfvpr.evaluation.sequence_matching import matches_recipe
 from mfvpr.features import Extractor, Source
-from mfvpr.matching.match_set import MatchSet, Scales
-from mfvpr.matching.matcher import Matcher
-from mfvpr.retrieval.retriever import Filter, Retrieval
-from mfvpr.retrieval.search import ExactSearch
+from mfvpr.matching import Matcher, MatchSet, Scales
+from mfvpr.retrieval import ExactSearch, Filter, Retrieval
 from mfvpr.scoring.weight_registry import how_made
-from mfvpr.storage.feature_cache import Archive
+from mfvpr.storage import Archive
 from mfvpr.types import Shortlist
-from mfvpr.utils.progress import Stopwatch
+from mfvpr.utils import Stopwatch
 
 __all__ = ["Images", "Tools", "begun", "matched", "recipe"]
 

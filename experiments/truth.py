@@ -5,8 +5,7 @@ from typing import Any
 
 from experiments.settings import SettingsError
 from mfvpr import evaluation
-from mfvpr.datasets.datasets import Dataset
-from mfvpr.datasets.truth import Truth
+from mfvpr.datasets import Dataset, Truth
 from mfvpr.evaluation import Judge
 from mfvpr.utils import fingerprints
 

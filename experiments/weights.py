@@ -46,9 +46,8 @@ def _parser() -> Parser:
 
 def list_weights() -> None:
     """Print a table of the registry."""
-    from mfvpr.checkpoints.files import is_installed
-    from mfvpr.checkpoints.registry import REGISTRY
-    from mfvpr.report.tables import Table
+    from mfvpr.checkpoints import REGISTRY, is_installed
+    from mfvpr.report import Table
 
     header = ["name", "network", "official file", "license of code", "of weights", "installed", "MB"]
     rows = []
@@ -62,7 +61,8 @@ def list_weights() -> None:
 
 def convert(file: Path, name: str | None) -> None:
     """Install an official checkpoint."""
-    from mfvpr.checkpoints.files import install, read_manifest
+    from mfvpr.checkpoints import install
+    from mfvpr.checkpoints.files import read_manifest
 
     entry = _recognized(file, name)
     if file.is_file() and (megabytes := file.stat().st_size >> 20) > _LARGE:
@@ -75,9 +75,8 @@ def convert(file: Path, name: str | None) -> None:
 
 def verify(names: Iterable[str]) -> None:
     """Check runtime files against their manifests, and downloaded checkpoints against the published hashes."""
-    from mfvpr.checkpoints.files import weights_folder
-    from mfvpr.checkpoints.registry import REGISTRY, entry_of
-    from mfvpr.utils.errors import InputError
+    from mfvpr.checkpoints import REGISTRY, entry_of, weights_folder
+    from mfvpr.utils import InputError
 
     there = [entry for entry in REGISTRY.values() if _runtime_present(entry) or _original_present(entry)]
     entries = [entry_of(name) for name in names] or there
@@ -96,9 +95,9 @@ def verify(names: Iterable[str]) -> None:
 
 def download(name: str) -> None:
     """Fetch an official checkpoint into the weights folder; it gets its name once its hash is right."""
-    from mfvpr.checkpoints.files import file_sha256, weights_folder
-    from mfvpr.checkpoints.registry import entry_of
-    from mfvpr.utils.errors import InputError
+    from mfvpr.checkpoints import entry_of, weights_folder
+    from mfvpr.checkpoints.files import file_sha256
+    from mfvpr.utils import InputError
 
     entry = entry_of(name)
     if entry.sha256 is None:
@@ -123,7 +122,7 @@ def _fetch(entry: "Entry", target: Path) -> None:
     from tqdm import tqdm
 
     from mfvpr.checkpoints.files import check_sha256
-    from mfvpr.utils.errors import InputError
+    from mfvpr.utils import InputError
     from mfvpr.utils.files import replacing
 
     digest = hashlib.sha256()
@@ -147,8 +146,8 @@ def _fetch(entry: "Entry", target: Path) -> None:
 
 
 def _recognized(file: Path, name: str | None) -> "Entry":
-    from mfvpr.checkpoints.registry import REGISTRY, entry_of
-    from mfvpr.utils.errors import InputError
+    from mfvpr.checkpoints import REGISTRY, entry_of
+    from mfvpr.utils import InputError
 
     if name is not None:
         return entry_of(name)
@@ -161,13 +160,13 @@ def _recognized(file: Path, name: str | None) -> "Entry":
 
 
 def _runtime_present(entry: "Entry") -> bool:
-    from mfvpr.checkpoints.files import weights_folder
+    from mfvpr.checkpoints import weights_folder
 
     return any((weights_folder() / f"{entry.name}{suffix}").exists() for suffix in (".safetensors", ".json"))
 
 
 def _original_present(entry: "Entry") -> bool:
-    from mfvpr.checkpoints.files import weights_folder
+    from mfvpr.checkpoints import weights_folder
 
     return entry.sha256 is not None and (weights_folder() / entry.file).exists()
 
@@ -178,8 +177,9 @@ def _verified(entry: "Entry") -> str:
     Raises:
         InputError: what is not.
     """
-    from mfvpr.checkpoints.files import check_published, load_model, read_manifest, weights_folder
-    from mfvpr.utils.errors import InputError
+    from mfvpr.checkpoints import load_model, weights_folder
+    from mfvpr.checkpoints.files import check_published, read_manifest
+    from mfvpr.utils import InputError
 
     good = []
     original = weights_folder() / entry.file

@@ -32,7 +32,7 @@ WORDS = {
 @contextmanager
 def in_settings(settings: Mapping[str, Any]) -> Iterator[None]:
     """What the library refuses, told in words of the settings."""
-    from mfvpr.utils.errors import InputError  # here, since it brings JAX along
+    from mfvpr.utils import InputError
 
     try:
         yield

@@ -18,18 +18,22 @@ from mfvpr.matching.soft import soft_match
 from mfvpr.reranking.grids import score_grid
 from mfvpr.reranking.ranking import balancing_c, combine, rank, rerank, score_candidates
 from mfvpr.retrieval.search import retrieve
-from mfvpr.scoring.aggregate import AggregatedScore
-from mfvpr.scoring.anchor import AnchorPoints
-from mfvpr.scoring.counting import MatchCount
-from mfvpr.scoring.grid import GridAnchors
-from mfvpr.scoring.histogram import HistogramOfShifts, ShiftHistogram
-from mfvpr.scoring.homography import Homography
-from mfvpr.scoring.homography_opencv import OpenCvHomography
-from mfvpr.scoring.lost import LostScore
-from mfvpr.scoring.phrases import VisualPhrases
-from mfvpr.scoring.rapid import RapidSpatialScore
-from mfvpr.scoring.scorer import Scorer
-from mfvpr.scoring.shifts import image_sizes, match_shifts
+from mfvpr.scoring import (
+    AggregatedScore,
+    AnchorPoints,
+    GridAnchors,
+    HistogramOfShifts,
+    Homography,
+    LostScore,
+    MatchCount,
+    OpenCvHomography,
+    RapidSpatialScore,
+    Scorer,
+    ShiftHistogram,
+    VisualPhrases,
+    image_sizes,
+    match_shifts,
+)
 from mfvpr.scoring.weights import (
     DescriptorDistanceWeight,
     FeatureScoreWeight,
@@ -44,70 +48,41 @@ from mfvpr.utils.numerics import masked, masked_mean, masked_median, safe_sqrt
 
 if TYPE_CHECKING:
     from mfvpr.evaluation.evaluation import evaluate
-    from mfvpr.localization.map import Map
+    from mfvpr.localization import Map
 
 __version__ = "0.2.0"
 
-__all__ = [
-    "AggregatedScore",
-    "AnchorPoints",
-    "DescriptorDistanceWeight",
-    "FeatureScoreWeight",
-    "Features",
-    "GridAnchors",
-    "HistogramOfShifts",
-    "Homography",
-    "InputError",
-    "LightGlueMatching",
-    "LostScore",
-    "Map",
-    "MatchCount",
-    "Matcher",
-    "Matches",
-    "Matching",
-    "OpenCvHomography",
-    "Ranking",
-    "RapidSpatialScore",
-    "RatioWeight",
-    "Scorer",
-    "ShiftHistogram",
-    "Shortlist",
-    "UnitWeight",
-    "VisualPhrases",
-    "Weight",
-    "balancing_c",
-    "combine",
-    "compact",
-    "evaluate",
-    "filter_matches",
-    "frame_positives",
-    "image_sizes",
-    "masked",
-    "masked_mean",
-    "masked_median",
-    "match",
-    "match_candidates",
-    "match_pairs",
-    "match_shifts",
-    "match_weights",
-    "radius_positives",
-    "rank",
-    "recall_at_k",
-    "rerank",
+__all__ = [  # noqa: RUF022 (in the order of the stages)
+    # values that pass from stage to stage
+    "Features", "Matches", "Ranking", "Shortlist",
+    # shortlists from global descriptors
     "retrieve",
-    "safe_sqrt",
-    "score_candidates",
-    "score_grid",
-    "soft_match",
-    "value",
-]
+    # matches of two images, and of a query with its candidates
+    "match", "match_candidates", "match_pairs", "compact", "filter_matches", "soft_match",
+    "Matcher", "Matching", "LightGlueMatching",
+    # weights of matches
+    "DescriptorDistanceWeight", "FeatureScoreWeight", "RatioWeight", "UnitWeight", "Weight", "match_weights",
+    # scores of one pair
+    "AggregatedScore", "AnchorPoints", "GridAnchors", "HistogramOfShifts", "Homography", "LostScore", "MatchCount",
+    "OpenCvHomography", "RapidSpatialScore", "ShiftHistogram", "VisualPhrases",
+    # scores of all candidates, whole grids of parameters, fusion and ranking
+    "score_candidates", "score_grid", "balancing_c", "combine", "rank", "rerank",
+    # what is correct, and recall
+    "frame_positives", "radius_positives", "recall_at_k",
+    # a whole data set, and one image at a time
+    "evaluate", "Map",
+    # tools for a scorer of your own; see mfvpr.testing.check_scorer
+    "Scorer", "value", "image_sizes", "match_shifts", "masked", "masked_mean", "masked_median", "safe_sqrt",
+    # mistakes of a caller, in one line
+    "InputError",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
-    """`evaluate` and `Map`, once they are asked for: images take longer to import than arrays."""
+    """Import `evaluate` and `Map` at their first use: images take longer to import than arrays."""
     if name not in ("evaluate", "Map"):
         raise AttributeError(f"module 'mfvpr' has no attribute {name!r}")
     from mfvpr.evaluation.evaluation import evaluate
-    from mfvpr.localization.map import Map
+    from mfvpr.localization import Map
 
     return evaluate if name == "evaluate" else Map

@@ -11,10 +11,10 @@ import jax
 import pytest
 from hypothesis import settings
 
+from mfvpr.checkpoints import entry_of
 from mfvpr.checkpoints.conversion import convert
 from mfvpr.checkpoints.files import save
 from mfvpr.checkpoints.networks import blueprint, network_of
-from mfvpr.checkpoints.registry import entry_of
 from mfvpr.datasets.streets import streets_folder
 from tests import random_checkpoints
 

@@ -6,11 +6,10 @@ import numpy as np
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
+from mfvpr.report import Table, write_json
 from mfvpr.report.evaluations import ABOUT, sequence_folder
 from mfvpr.report.file_names import file_names
 from mfvpr.report.rankings import Rankings, write_csv, write_failures, write_predictions
-from mfvpr.report.runs import write_json
-from mfvpr.report.tables import Table
 from mfvpr.utils.files import printable
 
 HOSTILE = (

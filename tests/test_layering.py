@@ -1,6 +1,7 @@
 """Packages import only packages above them, and each library of others stays where it belongs."""
 
 import ast
+import importlib
 from pathlib import Path
 
 import pytest
@@ -90,3 +91,17 @@ def test_a_library_is_used_where_it_belongs_and_in_all_these_places(library):
 def test_libraries_of_programs_are_used_nowhere():
     used = {name.split(".")[0] for package in PERMISSIONS for name in imports_of(package)}
     assert not used & NOWHERE
+
+
+@pytest.mark.parametrize("package", [package for package in PERMISSIONS if (ROOT / package).is_dir()])
+def test_the_first_page_of_a_package_says_what_it_imports(package):
+    page = ast.get_docstring(ast.parse((ROOT / package / "__init__.py").read_text()))
+    words = page.partition("\nImports ")[2].replace(",", " ").replace(".", " ").split()
+    assert set(words) - {"nothing", "of", "mfvpr"} == PERMISSIONS[package]
+
+
+@pytest.mark.parametrize("package", [package for package in PERMISSIONS if (ROOT / package).is_dir()])
+def test_a_package_exports_what_it_names(package):
+    module = importlib.import_module(f"mfvpr.{package}")
+    assert all(hasattr(module, name) for name in module.__all__)
+    assert len(module.__all__) > 2

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from mfvpr import InputError, Shortlist, io
-from mfvpr.datasets import datasets, truth_files, videos
-from mfvpr.datasets.datasets import ImageFolder, folder_dataset, sequences_dataset
+from mfvpr.datasets import ImageFolder, datasets, folder_dataset, sequences_dataset, truth_files, videos
 from mfvpr.datasets.published import published_dataset
 from mfvpr.datasets.streets import draw_streets, streets_folder
-from mfvpr.evaluation import calibration
-from mfvpr.evaluation.calibration import Confidence, read_confidences, write_confidences
-from mfvpr.retrieval.precomputed import DescriptorFiles, FeatureFiles, File
+from mfvpr.evaluation import Confidence, calibration, read_confidences, write_confidences
+from mfvpr.retrieval import DescriptorFiles, FeatureFiles
+from mfvpr.retrieval.precomputed import File
 from mfvpr.scoring import weight_files
 from mfvpr.scoring.weight_files import read_weight
 from tests.builders import fill

@@ -13,10 +13,10 @@ import pytest
 from experiments import data_sets
 from experiments.quoting import as_typed
 from experiments.settings import CONF, RULES, check, scorer_rules
-from mfvpr.datasets.datasets import image_folder
-from mfvpr.features.sift import Sift
+from mfvpr.datasets import image_folder
+from mfvpr.features import Sift
 from mfvpr.io import write_features
-from mfvpr.storage.feature_cache import Archive
+from mfvpr.storage import Archive
 from tests import random_checkpoints
 from tests.builders import make_matches
 from tests.programs import QUICK, ROOT, composed, typed

@@ -15,7 +15,7 @@ from jax.extend.core import jaxpr_as_fun
 
 import mfvpr
 from mfvpr.evaluation.distributed import all_devices, score_program
-from mfvpr.matching.match_set import MatchSet
+from mfvpr.matching import MatchSet
 from mfvpr.tuning.sweeps.settings import groups
 from mfvpr.tuning.sweeps.sweep import group_program
 from mfvpr.types import per_match, per_pair

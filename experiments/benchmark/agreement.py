@@ -11,8 +11,8 @@ from experiments.benchmark.real import answered, extractors, matched_sets
 from experiments.console import track
 from mfvpr import Homography, OpenCvHomography
 from mfvpr.evaluation import stages
-from mfvpr.report.tables import Table
-from mfvpr.reranking.results import Matched
+from mfvpr.report import Table
+from mfvpr.reranking import Matched
 from mfvpr.scoring import Scorer
 from mfvpr.utils.files import write_text
 from mfvpr.utils.versions import versions

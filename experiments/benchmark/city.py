@@ -16,11 +16,11 @@ from experiments.benchmark.projection import ASSUMED, Plan, Rates, projected
 from experiments.benchmark.scale import CANDIDATES, MEMORY, Answer, Counted, peak_bytes, reranked
 from experiments.benchmark.synthetic_features import BATCH, GLOBAL, MadeUp
 from experiments.console import bar
-from mfvpr.datasets.positives import Positives
-from mfvpr.evaluation.recall import recall_at_k
-from mfvpr.features.feature_set import FeatureSet
-from mfvpr.report.tables import Table
-from mfvpr.reranking.ranking import rank
+from mfvpr.datasets import Positives
+from mfvpr.evaluation import recall_at_k
+from mfvpr.features import FeatureSet
+from mfvpr.report import Table
+from mfvpr.reranking import rank
 from mfvpr.retrieval.search import EXACT
 from mfvpr.storage.features import FeatureStore, forecast_bytes, open_store, require_space
 from mfvpr.storage.manifest import store_path

@@ -11,10 +11,10 @@ import numpy as np
 from experiments.benchmark.real import answered, extractors, matched_sets
 from mfvpr import AnchorPoints, HistogramOfShifts
 from mfvpr.evaluation import stages
-from mfvpr.report.tables import Table
-from mfvpr.reranking.fusion import Fusion
+from mfvpr.report import Table
+from mfvpr.reranking import Fusion, Matched
 from mfvpr.reranking.ranking import rank_shortlist
-from mfvpr.reranking.results import FILTER, Matched
+from mfvpr.reranking.results import FILTER
 from mfvpr.scoring.weights import WEIGHTS
 from mfvpr.types import Shortlist
 from mfvpr.utils.files import write_text

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from experiments.console import bar
-from mfvpr.report.tables import Table
+from mfvpr.report import Table
 from mfvpr.utils.files import write_text
 from mfvpr.utils.numerics import available_cpus
 from mfvpr.utils.versions import versions

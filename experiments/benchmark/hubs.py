@@ -12,16 +12,15 @@ import numpy as np
 
 from experiments.benchmark.real import answered, datasets, extractors, kept, street
 from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts
-from mfvpr.datasets.datasets import Dataset
-from mfvpr.evaluation import stages
-from mfvpr.evaluation.sequence_matching import match_cohort, match_sequence
-from mfvpr.evaluation.statistics import block_sign_flips, mcnemar
-from mfvpr.features import Aggregated, Extractor
-from mfvpr.features.vlad import VladFitting
-from mfvpr.report.tables import Table
+from mfvpr.datasets import Dataset
+from mfvpr.evaluation import match_sequence, mcnemar, stages
+from mfvpr.evaluation.sequence_matching import match_cohort
+from mfvpr.evaluation.statistics import block_sign_flips
+from mfvpr.features import Aggregated, Extractor, VladFitting
+from mfvpr.report import Table
+from mfvpr.reranking import Matched
 from mfvpr.reranking.cohort_normalization import by_hubness, hubness
-from mfvpr.reranking.results import Matched
-from mfvpr.retrieval.retriever import Retrieval
+from mfvpr.retrieval import Retrieval
 from mfvpr.scoring.weights import FeatureScoreWeight, RatioWeight
 from mfvpr.types import Shortlist
 from mfvpr.utils.files import write_text

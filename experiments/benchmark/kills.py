@@ -23,7 +23,7 @@ from experiments import sharding
 from experiments.console import bar
 from experiments.settings import SettingsError
 from mfvpr.datasets.streets import streets_folder
-from mfvpr.report.tables import Table
+from mfvpr.report import Table
 from mfvpr.utils.files import write_text
 from mfvpr.utils.versions import versions
 

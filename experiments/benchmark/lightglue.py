@@ -13,10 +13,10 @@ import numpy as np
 import mfvpr
 from experiments.benchmark.harness import Entry, Lineup, Results, Seconds, compete
 from mfvpr import Features, LightGlueMatching
+from mfvpr.checkpoints import entry_of
 from mfvpr.checkpoints.files import load
 from mfvpr.checkpoints.networks import blueprint, network_of
-from mfvpr.checkpoints.registry import entry_of
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 
 NAME, CANDIDATES, KEYPOINTS, SIZE = "aliked_lightglue", 50, 700, 320
 COMMON = 200  # keypoints of the query that a candidate has as well

@@ -13,14 +13,12 @@ import jax
 import numpy as np
 
 from experiments.console import bar
-from mfvpr.checkpoints.files import load_model
-from mfvpr.datasets.datasets import ImageFolder, image_folder
-from mfvpr.datasets.images import read_image, resize
+from mfvpr.checkpoints import load_model
+from mfvpr.datasets import ImageFolder, image_folder, read_image, resize
 from mfvpr.datasets.streets import streets_folder
-from mfvpr.features.sift import Sift
-from mfvpr.features.vlad import VladFitting
+from mfvpr.features import Sift, VladFitting
 from mfvpr.localization import Map
-from mfvpr.report.tables import Table
+from mfvpr.report import Table
 from mfvpr.storage.maps import Entry
 from mfvpr.types import Features
 from mfvpr.utils.files import write_text
@@ -48,9 +46,8 @@ def run(rounds: int | None, out: Path) -> None:
 
 def _extractors() -> Iterator[tuple[str, Any]]:
     yield "SIFT", Sift()
-    from mfvpr.checkpoints.files import is_installed
-    from mfvpr.checkpoints.registry import REGISTRY
-    from mfvpr.features.aliked import AlikedFeatures
+    from mfvpr.checkpoints import REGISTRY, is_installed
+    from mfvpr.features import AlikedFeatures
 
     if is_installed(REGISTRY["aliked-n16"]):
         model: Any = load_model("aliked-n16")

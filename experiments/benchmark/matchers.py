@@ -24,19 +24,15 @@ from mfvpr import (
     UnitWeight,
     value,
 )
-from mfvpr.checkpoints.files import load_model
-from mfvpr.datasets.datasets import Dataset
-from mfvpr.evaluation import stages
-from mfvpr.evaluation.sequence_matching import match_sequence
-from mfvpr.features import Aggregated, Extractor
-from mfvpr.features.aliked import AlikedFeatures
-from mfvpr.features.feature_set import FeatureSet
-from mfvpr.features.vlad import VladFitting
-from mfvpr.matching.matcher import Matcher
-from mfvpr.report.tables import Table
-from mfvpr.retrieval.retriever import Retrieval
+from mfvpr.checkpoints import load_model
+from mfvpr.datasets import Dataset
+from mfvpr.evaluation import match_sequence, stages
+from mfvpr.features import Aggregated, AlikedFeatures, Extractor, FeatureSet, VladFitting
+from mfvpr.matching import Matcher
+from mfvpr.report import Table
+from mfvpr.retrieval import Retrieval
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS
-from mfvpr.storage.feature_cache import Archive
+from mfvpr.storage import Archive
 from mfvpr.types import Shortlist
 from mfvpr.utils.files import write_text
 from mfvpr.utils.numerics import available_cpus

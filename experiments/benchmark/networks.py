@@ -13,19 +13,21 @@ import jax
 import numpy as np
 
 from experiments.benchmark.harness import Entry, Lineup, Results, Seconds, compete
-from mfvpr.checkpoints.files import is_installed, load
+from mfvpr.checkpoints import entry_of, is_installed
+from mfvpr.checkpoints.files import load
 from mfvpr.checkpoints.networks import blueprint, network_of
-from mfvpr.checkpoints.registry import entry_of
-from mfvpr.datasets.images import read_image, resize
+from mfvpr.datasets import read_image, resize
 from mfvpr.datasets.streets import draw_streets
-from mfvpr.features import Description
-from mfvpr.features.aliked import AlikedFeatures
-from mfvpr.features.d2net import D2NetFeatures
-from mfvpr.features.global_descriptor import GlobalDescriptor
-from mfvpr.features.mixvpr import MixVprDescriptor
+from mfvpr.features import (
+    AlikedFeatures,
+    D2NetFeatures,
+    Description,
+    GlobalDescriptor,
+    MixVprDescriptor,
+    PatchNetVladFeatures,
+    SelaVprFeatures,
+)
 from mfvpr.features.network import compiled
-from mfvpr.features.patch_netvlad import PatchNetVladFeatures
-from mfvpr.features.selavpr import SelaVprFeatures
 from mfvpr.networks.d2net import extract
 from mfvpr.networks.imagenet import preprocess
 

@@ -17,23 +17,20 @@ from experiments import stages as program_stages
 from experiments.console import tell, track
 from experiments.groups import defaults
 from experiments.settings import CONF
-from mfvpr.checkpoints.files import load_model
-from mfvpr.datasets.datasets import Dataset, folder_dataset
-from mfvpr.evaluation import hits, stages
-from mfvpr.evaluation.sequence_matching import match_sequence
-from mfvpr.evaluation.statistics import estimate
-from mfvpr.features import Aggregated, Extractor
-from mfvpr.features.aliked import AlikedFeatures
-from mfvpr.features.sift import Sift
-from mfvpr.features.vlad import VladFitting
-from mfvpr.matching.matcher import NEIGHBORS, Matcher
-from mfvpr.report.tables import Table
+from mfvpr.checkpoints import load_model
+from mfvpr.datasets import Dataset, folder_dataset
+from mfvpr.evaluation import estimate, hits, match_sequence, stages
+from mfvpr.features import Aggregated, AlikedFeatures, Extractor, Sift, VladFitting
+from mfvpr.matching import Matcher
+from mfvpr.matching.matcher import NEIGHBORS
+from mfvpr.report import Table
+from mfvpr.reranking import Matched
 from mfvpr.reranking.ranking import rank_shortlist
-from mfvpr.reranking.results import FILTER, Matched
-from mfvpr.retrieval.retriever import Retrieval
+from mfvpr.reranking.results import FILTER
+from mfvpr.retrieval import Retrieval
 from mfvpr.scoring import Scorer
-from mfvpr.storage.feature_cache import Archive
-from mfvpr.utils.errors import InputError
+from mfvpr.storage import Archive
+from mfvpr.utils import InputError
 from mfvpr.utils.files import write_text
 from mfvpr.utils.numerics import available_cpus
 from mfvpr.utils.versions import versions

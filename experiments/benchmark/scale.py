@@ -21,8 +21,8 @@ from experiments.benchmark.synthetic_features import MadeUp
 from experiments.console import bar
 from mfvpr import HistogramOfShifts
 from mfvpr.evaluation import stages
-from mfvpr.features.feature_set import FeatureSet, FeatureSource, InMemory
-from mfvpr.report.tables import Table
+from mfvpr.features import FeatureSet, FeatureSource, InMemory
+from mfvpr.report import Table
 from mfvpr.reranking.ranking import rank_shortlist
 from mfvpr.retrieval.search import EXACT
 from mfvpr.types import Features, Shortlist

@@ -14,13 +14,12 @@ import numpy as np
 from experiments import build
 from experiments.console import tell
 from mfvpr import HistogramOfShifts, Matches, RatioWeight, Shortlist
-from mfvpr.datasets.datasets import folder_dataset
+from mfvpr.datasets import folder_dataset
 from mfvpr.datasets.streets import streets_folder
 from mfvpr.evaluation import stages
-from mfvpr.features import Extractor
-from mfvpr.features.sift import Sift
-from mfvpr.report.tables import Table
-from mfvpr.storage.feature_cache import Archive
+from mfvpr.features import Extractor, Sift
+from mfvpr.report import Table
+from mfvpr.storage import Archive
 from mfvpr.utils.files import write_text
 from mfvpr.utils.versions import versions
 

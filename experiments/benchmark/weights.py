@@ -10,11 +10,11 @@ import numpy as np
 
 from experiments.benchmark.real import answered, extractors, matched_sets
 from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts
-from mfvpr.evaluation import stages
-from mfvpr.evaluation.statistics import block_sign_flips, mcnemar
-from mfvpr.report.tables import Table
+from mfvpr.evaluation import mcnemar, stages
+from mfvpr.evaluation.statistics import block_sign_flips
+from mfvpr.report import Table
+from mfvpr.reranking import Matched
 from mfvpr.reranking.ranking import fuse_shortlist
-from mfvpr.reranking.results import Matched
 from mfvpr.scoring.weights import WEIGHTS
 from mfvpr.utils.files import write_text
 from mfvpr.utils.versions import versions

@@ -11,8 +11,8 @@ import numpy as np
 from experiments.benchmark.real import answered, extractors, matched_sets
 from mfvpr import HistogramOfShifts
 from mfvpr.evaluation import stages
-from mfvpr.report.tables import Table
-from mfvpr.reranking.results import Matched
+from mfvpr.report import Table
+from mfvpr.reranking import Matched
 from mfvpr.scoring.weights import WEIGHTS
 from mfvpr.utils.files import write_text
 from mfvpr.utils.versions import versions

@@ -14,8 +14,7 @@ from matplotlib.figure import Figure
 from experiments.paper.printed import average, printed
 from experiments.paper.systems import Row
 from experiments.paper.tables import TOLERANCES, Found, listed
-from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
-from mfvpr.datasets.images import resize
+from mfvpr.datasets import Dataset, ImageFolder, QuerySequence, resize
 from mfvpr.report import runs
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.utils.files import clipped, printable, replacing

@@ -9,13 +9,13 @@ from experiments.paper.figures import mean_bars
 from experiments.paper.tables import Found, listed, thresholds_of
 from experiments.paper.timing import STEPS
 from mfvpr.datasets.truth import middle, threshold_words
+from mfvpr.report import Table
 from mfvpr.report.pages.charts import Bar, Chart, amounts, bars, lines
 from mfvpr.report.pages.one_run import PAGE
 from mfvpr.report.pages.pictures import MOST_PICTURES, Picture, pictures
 from mfvpr.report.pages.rendering import write_page
 from mfvpr.report.pages.sections import Gallery, Section, Sheet, flat
 from mfvpr.report.pages.several_runs import write_comparison
-from mfvpr.report.tables import Table
 from mfvpr.utils.versions import versions
 
 Tables = Mapping[str, tuple[str, Table]]  # heading and table by name

@@ -15,13 +15,13 @@ from experiments.paper.systems import Place, Row
 from experiments.paper.tables import Evaluated, Found, evaluated, tables
 from experiments.settings import SettingsError
 from experiments.stages import dataset_of
-from mfvpr.datasets.datasets import Dataset
+from mfvpr.datasets import Dataset
 from mfvpr.datasets.published import differences
+from mfvpr.report import Table
 from mfvpr.report import runs as run_folders
 from mfvpr.report.pages.one_run import PAGE
-from mfvpr.report.tables import Table
 from mfvpr.reranking.results import FILTER
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 
 _BEST = ("mix_hist_50", "aliked_hist_50", "sift_hist_50")  # whose failures are shown: the first that is here
 

@@ -17,8 +17,7 @@ from experiments import evaluation, run_folder
 from experiments.paper.sizes import bytes_of_an_image
 from experiments.paper.systems import Place, overrides
 from experiments.settings import CONF, SettingsError, check
-from mfvpr.checkpoints import files
-from mfvpr.checkpoints.registry import REGISTRY
+from mfvpr.checkpoints import REGISTRY, files
 from mfvpr.report import runs
 from mfvpr.report.pages.one_run import PAGE
 from mfvpr.utils.files import remove_leftovers

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 
 from experiments.stages import Tools
-from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.features.patch_netvlad import PatchNetVladFeatures
-from mfvpr.features.selavpr import SelaVprFeatures
+from mfvpr.datasets import ImageFolder
+from mfvpr.features import PatchNetVladFeatures, SelaVprFeatures
 from mfvpr.features.windows import WindowExtractor
-from mfvpr.retrieval.fitting import fitted
+from mfvpr.retrieval import fitted
 
 _FLOAT, _KEYPOINT = 4, 12  # bytes of a number, and of a keypoint with its score
 _GRIDS = (WindowExtractor, PatchNetVladFeatures, SelaVprFeatures)

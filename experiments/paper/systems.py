@@ -10,8 +10,8 @@ from typing import Any
 from experiments.build import expanded
 from experiments.quoting import as_typed
 from experiments.settings import RULES, SettingsError
-from mfvpr.checkpoints.files import is_installed
-from mfvpr.checkpoints.registry import REGISTRY, Entry
+from mfvpr.checkpoints import REGISTRY, is_installed
+from mfvpr.checkpoints.registry import Entry
 from mfvpr.datasets.published import PUBLISHED
 from mfvpr.reranking.results import FILTER
 

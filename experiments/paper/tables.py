@@ -9,10 +9,11 @@ import numpy as np
 
 from experiments.paper.printed import BERLIN, OTHERS, average, printed, printed_recall, printed_settings
 from experiments.paper.systems import Row
-from mfvpr.datasets.datasets import MEANS, Dataset
+from mfvpr.datasets import Dataset
+from mfvpr.datasets.datasets import MEANS
 from mfvpr.datasets.published import differences
 from mfvpr.datasets.truth import middle
-from mfvpr.report.tables import Table
+from mfvpr.report import Table
 
 INCOMPLETE = " (incomplete)"
 OVERALL = ""  # in place of a sequence: the only one, or the plain mean of several

@@ -11,12 +11,12 @@ import jax
 import numpy as np
 
 from experiments import build
-from mfvpr.datasets.datasets import Dataset, ImageFolder
+from mfvpr.datasets import Dataset, ImageFolder
 from mfvpr.evaluation import evaluation
 from mfvpr.localization.vectors import Vectors
-from mfvpr.storage.feature_cache import Archive
+from mfvpr.storage import Archive
+from mfvpr.utils import Stopwatch
 from mfvpr.utils.numerics import available_cpus
-from mfvpr.utils.progress import Stopwatch
 from mfvpr.utils.versions import versions
 
 QUERIES, DATABASE = 10, 60  # images; as many of the database as there are candidates, at least

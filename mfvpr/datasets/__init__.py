@@ -1,0 +1,12 @@
+"""Data sets: images, sequences of queries, and the ground truth.
+
+Read first: datasets (folders of images), ground_truth and positives (what is correct), images (decoding and
+resizing), contents (fingerprints of files), then published/ (layouts of known data sets) and streets/ (the synthetic
+street).
+
+Imports io, utils.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,14 +1,12 @@
-"""Rankings become recall: what is right, recall@K, and the protocol of choosing settings and reporting on them.
+"""A whole evaluation, and what it is worth: recall, precision, calibration, statistics.
 
-Intervals and tests of recall are in `mfvpr.evaluation.statistics`.
+Read first: evaluation (`evaluate`: all stages), sequence_matching and stages (its steps), results, recall, protocol
+and selection (choose settings on one half, report on the other), precision, calibration, statistics, distributed
+(many hosts).
+
+Imports datasets, features, matching, reranking, retrieval, scoring, storage, types, utils.
 """
 
-from mfvpr.datasets.positives import Positives, frame_positives, radius_positives, rows_within
-from mfvpr.datasets.truth import Truth, Unit, middle, threshold_words
-from mfvpr.evaluation.protocol import Judge, Split, judge
-from mfvpr.evaluation.recall import Tally, hits, recall_at_k
-from mfvpr.evaluation.selection import Half, best_setting, halves, neighbors, separated
+import lazy_loader
 
-__all__ = ["Half", "Judge", "Positives", "Split", "Tally", "Truth", "Unit", "best_setting", "frame_positives", "halves",
-           "hits", "judge", "middle", "neighbors", "radius_positives", "recall_at_k", "rows_within", "separated",
-           "threshold_words"]  # fmt: skip
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,10 +1,12 @@
-"""Images -> descriptions: what puts OpenCV or a network to work.
+"""Images -> keypoints, descriptors and global descriptors.
 
-An extractor takes a batch of images that were squashed to the size it asks for, so that whoever feeds it (threads that
-decode while the device works) need not know what it is. One pass may give a global descriptor of the image, local
-features, of one scale or of several, or both. What is computed from local features alone is an aggregation.
+Read first: extractor (the protocols), sift (the shortest extractor), network (what the extractors with a network
+share), then the others; vlad (global descriptors from local ones), feature_set (features on demand), extraction
+(threads and batches).
+
+Imports datasets, networks, types, utils.
 """
 
-from mfvpr.features.extractor import Aggregated, Aggregation, Description, Extractor, Fitting, Scale, Source
+import lazy_loader
 
-__all__ = ["Aggregated", "Aggregation", "Description", "Extractor", "Fitting", "Scale", "Source"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

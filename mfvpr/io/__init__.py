@@ -1,4 +1,10 @@
-"""Features, global descriptors and shortlists of other programs: read, checked, and written back."""
+"""Features, global descriptors and shortlists of other programs: read, checked and written.
+
+Read first: features and descriptors (what is read), names (which entry belongs to which image), then the formats:
+npz, h5, pairs, and formats/ (MATLAB files, pickles and NumPy objects, read as data).
+
+Imports types, utils.
+"""
 
 from mfvpr.io.descriptors import read_global_descriptors, write_global_descriptors
 from mfvpr.io.feature_files import write_features

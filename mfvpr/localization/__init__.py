@@ -7,6 +7,11 @@
     located = route(answer, known.there)   # the row that the images before, this one and the motion say together
 
 Other processes may ask a map while one process adds to it, and several threads may share one `Map`.
+
+Read first: map, answers, then what it uses: describing, vectors, matching, resident (features in memory), evidence (too
+few features or matches), shifts, route (a drive through a map).
+
+Imports datasets, evaluation, features, matching, reranking, scoring, storage, types, utils.
 """
 
 from mfvpr.localization.answers import Alternative, Answer, Asked

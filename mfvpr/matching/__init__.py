@@ -1,1 +1,11 @@
-"""matching"""
+"""Features of two images -> Matches; features of many images -> sets of matches.
+
+Read first: nearest_neighbors (one pair), matcher (matchers as values), similarity (the product), soft, lightglue;
+then batched (whole shortlists) and match_set (matches of many queries).
+
+Imports features, networks, types, utils.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,1 +1,10 @@
-"""Networks as Flax NNX modules, one file each: arrays in, arrays out; images are NHWC float32."""
+"""Networks as Flax NNX modules: arrays in, arrays out. Images are `[B, H, W, 3]` float32.
+
+Read first: d2net or mixvpr, then the parts that they share: vgg, resnet, vit, convolution, sampling, imagenet.
+
+Imports types, utils.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

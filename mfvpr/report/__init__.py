@@ -1,1 +1,11 @@
-"""Results for people: tables, figures, and the files of a run folder."""
+"""Results for people: tables, figures, pages, and the files of a run folder.
+
+Read first: runs (run folders), tables, evaluations (files of an evaluation), sweeps, comparisons (of learning),
+figures, then pages/ (HTML).
+
+Imports datasets, evaluation, features, localization, reranking, scoring, tuning, types, utils.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

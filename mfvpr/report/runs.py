@@ -17,7 +17,6 @@ from mfvpr.report.tables import Table
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import write_text
 
-PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "opencv-python-headless", "pillow")
 _UNFINISHED = ".unfinished"
 LAST = "results.json"  # of the files of a run
 

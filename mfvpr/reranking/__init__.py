@@ -1,1 +1,11 @@
-"""reranking"""
+"""Scores of all candidates of a query, their fusion, and the ranking.
+
+Read first: ranking (score, fuse, rank), grids (whole grids of parameters), fusion (several scores as one),
+batched_scoring (many queries), frame_correlation, cohort_normalization, results.
+
+Imports datasets, matching, scoring, types, utils.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

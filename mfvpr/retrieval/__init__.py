@@ -1,1 +1,11 @@
-"""retrieval"""
+"""Global descriptors -> a shortlist of candidates for every query.
+
+Read first: search (exact search), retriever (the protocol), fitting (vocabularies and whitenings of the database),
+ssm_voting, precomputed (shortlists and descriptors from files).
+
+Imports datasets, features, io, storage, types, utils.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

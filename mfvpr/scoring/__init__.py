@@ -1,4 +1,10 @@
-"""Scores of one pair of images from its matches alone: values that map Matches to a scalar, one method per file."""
+"""Scores of one pair of images from its matches alone, one score per file: Matches -> a number.
+
+Read first: scorer (the contract), aggregate (the shortest score), histogram, anchor, then the others; weights (of
+matches), fields (units, bounds and choices of settings), registry (scores by name).
+
+Imports types, utils.
+"""
 
 from mfvpr.scoring.aggregate import AggregatedScore
 from mfvpr.scoring.anchor import AnchorPoints

@@ -1,1 +1,11 @@
-"""storage"""
+"""The cache of features and matches on disk, its file formats, and shards.
+
+Read first: feature_cache (what is cached for a folder of images), rows (a store: one file per image), features,
+vectors, matches, scores and maps (formats of rows), manifest (what a store belongs to), shards.
+
+Imports datasets, features, matching, types, utils.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

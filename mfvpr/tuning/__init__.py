@@ -1,1 +1,11 @@
-"""tuning"""
+"""Parameters that are searched and learned.
+
+Read first: sweeps/ (grids and Optuna, over whole data sets in compiled calls), learning/ (losses, training, match
+weights).
+
+Imports datasets, evaluation, matching, reranking, scoring, types, utils.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,1 +1,11 @@
-"""utils"""
+"""Files, hashes, errors, progress and arithmetic that several packages need.
+
+Read first: errors, files, numerics, then what you need: fingerprints (recipes of results), code_hash (of users'
+classes), arrays and numbers (their files and texts), progress, threads, ragged (padding), whitening, versions.
+
+Imports nothing of mfvpr.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -13,7 +13,7 @@ import pytest
 
 from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.io.formats import pickles
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 from tests.checkpoints.conftest import SOURCE_SHAPES
 from tests.random_checkpoints import ALIKED, Call, Global, View, Writer, random_checkpoint, write_legacy, write_zip
 

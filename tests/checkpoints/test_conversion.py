@@ -5,11 +5,11 @@ import hashlib
 import numpy as np
 import pytest
 
+from mfvpr.checkpoints import REGISTRY, entry_of
 from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.checkpoints.conversion import Layout, Rule, Table, convert
 from mfvpr.checkpoints.networks import NETWORKS, blueprint, resemblance
-from mfvpr.checkpoints.registry import REGISTRY, entry_of
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 from tests.checkpoints.conftest import PARAMETERS, SHAPES, SOURCE_SHAPES, TABLE, tiny_entry
 from tests.random_checkpoints import (
     ALIKED,

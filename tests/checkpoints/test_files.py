@@ -9,19 +9,9 @@ import numpy as np
 import pytest
 from safetensors.numpy import save as serialized
 
-from mfvpr.checkpoints import files
-from mfvpr.checkpoints.files import (
-    WeightsError,
-    fingerprint,
-    install,
-    load,
-    load_model,
-    read_manifest,
-    save,
-    weights_folder,
-)
-from mfvpr.checkpoints.registry import REGISTRY
-from mfvpr.utils.errors import InputError
+from mfvpr.checkpoints import REGISTRY, WeightsError, files, install, load_model, weights_folder
+from mfvpr.checkpoints.files import fingerprint, load, read_manifest, save
+from mfvpr.utils import InputError
 from tests.checkpoints.conftest import PARAMETERS, SOURCE_SHAPES, tiny_entry
 from tests.random_checkpoints import d2net_shapes, random_checkpoint, write_legacy, write_zip
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mfvpr.checkpoints.checkpoint import read_checkpoint
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 from tests.checkpoints.test_checkpoint import Runs, assert_same, flipped, refused
 from tests.random_checkpoints import HEADER, Call, Global, Writer, layered, write_numpy
 

@@ -15,8 +15,8 @@ import pytest
 
 from experiments.errors import one_line
 from experiments.weights import main
-from mfvpr.checkpoints.files import file_sha256, load_model, save
-from mfvpr.checkpoints.registry import REGISTRY
+from mfvpr.checkpoints import REGISTRY, load_model
+from mfvpr.checkpoints.files import file_sha256, save
 from tests.checkpoints.conftest import PARAMETERS, SOURCE_SHAPES, tiny_entry
 from tests.random_checkpoints import (
     ALIKED,

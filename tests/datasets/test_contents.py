@@ -14,8 +14,8 @@ import pytest
 from PIL import Image
 
 from mfvpr.datasets import contents as module
+from mfvpr.datasets import image_folder
 from mfvpr.datasets.contents import Content, contents
-from mfvpr.datasets.datasets import image_folder
 
 SETTLED = 30_000_000  # ns; the real one would keep every test waiting for seconds
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from mfvpr import InputError
-from mfvpr.datasets.datasets import folder_dataset, image_folder
+from mfvpr.datasets import folder_dataset, image_folder
 from mfvpr.utils.files import printable, replacing, write_text
 from tests.builders import fill
 

@@ -12,9 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import InputError, frame_positives
-from mfvpr.datasets.datasets import folder_dataset
-from mfvpr.datasets.ground_truth import AllowedTruth, FrameTruth, LabelTruth, RadiusTruth
-from mfvpr.datasets.positives import Positives
+from mfvpr.datasets import AllowedTruth, FrameTruth, LabelTruth, Positives, RadiusTruth, folder_dataset
 from mfvpr.datasets.truth import threshold_words
 from mfvpr.datasets.truth_files import truth_from_labels
 from mfvpr.evaluation import judge

@@ -13,10 +13,10 @@ import pytest
 from PIL import Image
 
 from mfvpr import InputError
+from mfvpr.datasets import image_folder, read_image, resize
 from mfvpr.datasets.contents import contents
-from mfvpr.datasets.datasets import image_folder
-from mfvpr.datasets.images import MAX_PIXELS, Header, read_header, read_image, resize
-from mfvpr.features.sift import Sift
+from mfvpr.datasets.images import MAX_PIXELS, Header, read_header
+from mfvpr.features import Sift
 from mfvpr.utils.threads import ordered_map
 from tests.golden import make_resize
 

@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from mfvpr import InputError
-from mfvpr.datasets import positives
-from mfvpr.datasets.positives import Positives
+from mfvpr.datasets import Positives, positives
 from tests.oracles import radius_positives
 
 sizes = st.tuples(st.integers(0, 7), st.integers(0, 9))

@@ -12,7 +12,7 @@ import pytest
 from mfvpr.datasets.published import PUBLISHED, differences, published_dataset
 from mfvpr.datasets.published.lists import read_lines, read_names, read_rows
 from mfvpr.datasets.published.robotcar import CONDITIONS, REFERENCE, nearest_places
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 from tests.random_checkpoints import write_matlab
 
 IMAGE = cv2.imencode(".png", np.zeros((4, 6, 3), np.uint8))[1].tobytes()

@@ -7,12 +7,11 @@ import pytest
 from PIL import Image
 
 from mfvpr import InputError
+from mfvpr.datasets import Positives, folder_dataset
 from mfvpr.datasets.contents import contents
-from mfvpr.datasets.datasets import folder_dataset
-from mfvpr.datasets.positives import Positives
 from mfvpr.datasets.sequences import own_rows, without_neighbors
+from mfvpr.retrieval import ExactSearch
 from mfvpr.retrieval import search as retrieval
-from mfvpr.retrieval.search import ExactSearch
 from tests.builders import unit
 
 

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from scipy import special
 
-from mfvpr.datasets.positives import Positives
-from mfvpr.evaluation.calibration import confidence_inputs, fit_confidence, read_confidences, write_confidences
+from mfvpr.datasets import Positives
+from mfvpr.evaluation import confidence_inputs, fit_confidence, read_confidences, write_confidences
 from mfvpr.report.confidences import Assured, recall_by_share
-from mfvpr.reranking.results import Ranked
-from mfvpr.utils.errors import InputError
+from mfvpr.reranking import Ranked
+from mfvpr.utils import InputError
 
 NAMES = ("margin", "height", "filter", "score")
 

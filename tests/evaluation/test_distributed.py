@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr.datasets.positives import Positives
+from mfvpr.datasets import Positives
 from mfvpr.evaluation.distributed import all_devices, retrieve_spread, score_spread
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 from tests.builders import make_matches, unit
 from tests.experiments.test_shards_program import tables
 from tests.programs import ROOT, run, small

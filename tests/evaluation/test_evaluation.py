@@ -12,29 +12,21 @@ import pytest
 from PIL import Image
 
 import mfvpr
-from mfvpr.datasets.datasets import folder_dataset, sequences_dataset
-from mfvpr.datasets.positives import Positives
-from mfvpr.evaluation import halves, stages
-from mfvpr.evaluation.calibration import confidence_inputs, fit_confidence
-from mfvpr.evaluation.sequence_matching import match_sequence
+from mfvpr.datasets import Positives, folder_dataset, sequences_dataset
+from mfvpr.evaluation import confidence_inputs, fit_confidence, halves, match_sequence, stages
 from mfvpr.evaluation.statistics import block_sign_flips
-from mfvpr.features import Aggregated
+from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.features.extraction import described
-from mfvpr.features.sift import Sift
-from mfvpr.features.vlad import VladFitting
 from mfvpr.io import write_features, write_global_descriptors, write_shortlist
 from mfvpr.report.confidences import Assured
 from mfvpr.report.differences import differences, write_gains
 from mfvpr.report.evaluations import Judged, recall_table, write_rankings
-from mfvpr.reranking.frame_correlation import FrameCorrelation
-from mfvpr.reranking.fusion import Fusion, rank_sequence
-from mfvpr.retrieval.precomputed import DescriptorFiles, FeatureFiles, File, ShortlistFiles
-from mfvpr.retrieval.retriever import Retrieval
-from mfvpr.retrieval.search import WhitenedSearch
-from mfvpr.storage import feature_cache
-from mfvpr.storage.feature_cache import Archive
-from mfvpr.utils import progress
-from mfvpr.utils.errors import InputError
+from mfvpr.reranking import FrameCorrelation, Fusion
+from mfvpr.reranking.fusion import rank_sequence
+from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, ShortlistFiles, WhitenedSearch
+from mfvpr.retrieval.precomputed import File
+from mfvpr.storage import Archive, feature_cache
+from mfvpr.utils import InputError, progress
 from mfvpr.utils.fingerprints import fingerprint
 from mfvpr.utils.progress import untracked
 from tests.programs import typed

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mfvpr.datasets.positives import Positives
+from mfvpr.datasets import Positives
 from mfvpr.evaluation.paths import places_along_path
 from mfvpr.evaluation.statistics import block_sign_flips
 

@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from mfvpr.evaluation.precision import chance_calibration_error, precision_recall, reliability
-from mfvpr.utils.errors import InputError
+from mfvpr.evaluation import precision_recall, reliability
+from mfvpr.evaluation.precision import chance_calibration_error
+from mfvpr.utils import InputError
 
 
 def made_up(seed=0, queries=40):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mfvpr import InputError, Shortlist
-from mfvpr.datasets.ground_truth import FrameTruth, RadiusTruth
+from mfvpr.datasets import FrameTruth, RadiusTruth
 from mfvpr.datasets.truth import middle
 from mfvpr.evaluation import judge
 

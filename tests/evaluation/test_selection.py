@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from mfvpr import frame_positives
-from mfvpr.datasets.ground_truth import AllowedTruth, FrameTruth, LabelTruth
-from mfvpr.datasets.positives import Positives
+from mfvpr.datasets import AllowedTruth, FrameTruth, LabelTruth, Positives
 from mfvpr.evaluation import best_setting, halves, hits, neighbors
 from mfvpr.evaluation.selection import halves_of_map
 

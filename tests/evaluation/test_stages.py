@@ -10,22 +10,19 @@ import pytest
 from PIL import Image
 
 import mfvpr
-from mfvpr.datasets.datasets import folder_dataset, image_folder
+from mfvpr.datasets import folder_dataset, image_folder
 from mfvpr.evaluation import stages
-from mfvpr.features import Aggregated
-from mfvpr.features.sift import Sift
-from mfvpr.features.vlad import VladFitting
+from mfvpr.features import Aggregated, Sift, VladFitting
+from mfvpr.matching import Matching, MatchSet
 from mfvpr.matching import match_set as match_sets
-from mfvpr.matching.match_set import MatchSet
-from mfvpr.matching.matcher import Matching
 from mfvpr.reranking import ranking
-from mfvpr.retrieval.retriever import Retrieval
+from mfvpr.retrieval import Retrieval
 from mfvpr.retrieval.search import EXACT
-from mfvpr.storage.feature_cache import Archive
+from mfvpr.storage import Archive
 from mfvpr.storage.matches import StoredMatches, open_match_store
 from mfvpr.tuning.sweeps import sweep
 from mfvpr.types import Shortlist
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 from tests import oracles
 from tests.builders import of_query, random_matches, real
 from tests.scorers import FOREIGN, OWN, one_of_each_class, plain, title

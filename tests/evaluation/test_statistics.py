@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from scipy import signal, stats
 
-from mfvpr.evaluation.statistics import block_sign_flips, design_effect, mcnemar, recall_interval
-from mfvpr.utils.errors import InputError
+from mfvpr.evaluation import mcnemar
+from mfvpr.evaluation.statistics import block_sign_flips, design_effect, recall_interval
+from mfvpr.utils import InputError
 
 
 def paths(recall, correlation, queries, count=200, seed=0):

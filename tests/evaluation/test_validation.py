@@ -9,20 +9,16 @@ import pytest
 from PIL import Image
 
 import mfvpr
-from mfvpr.datasets.datasets import folder_dataset, image_folder
-from mfvpr.datasets.ground_truth import FrameTruth
+from mfvpr.datasets import FrameTruth, folder_dataset, image_folder
 from mfvpr.evaluation import stages
-from mfvpr.features import Aggregated, Description
-from mfvpr.features.sift import Sift
-from mfvpr.features.vlad import VladFitting
-from mfvpr.matching.matcher import Matching
-from mfvpr.reranking.frame_correlation import FrameCorrelation
-from mfvpr.reranking.fusion import Fusion
-from mfvpr.retrieval.retriever import Filtered, Retrieval
-from mfvpr.retrieval.search import EXACT, WhitenedSearch
-from mfvpr.storage.feature_cache import Archive
+from mfvpr.features import Aggregated, Description, Sift, VladFitting
+from mfvpr.matching import Matching
+from mfvpr.reranking import FrameCorrelation, Fusion
+from mfvpr.retrieval import Filtered, Retrieval, WhitenedSearch
+from mfvpr.retrieval.search import EXACT
+from mfvpr.storage import Archive
 from mfvpr.types import Shortlist
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 
 pytestmark = pytest.mark.thorough
 

@@ -11,19 +11,17 @@ import numpy as np
 import pytest
 
 from experiments.benchmark.__main__ import BENCHMARKS
+from mfvpr.checkpoints import entry_of
 from mfvpr.checkpoints.networks import NETWORKS, Network, blueprint, network_of
-from mfvpr.checkpoints.registry import entry_of
 from mfvpr.checkpoints.tables import SELAVPR
-from mfvpr.datasets.datasets import folder_dataset
-from mfvpr.evaluation.evaluation import evaluate
-from mfvpr.features import Aggregated, Description
-from mfvpr.features.sift import Sift
-from mfvpr.features.vlad import VladFitting
-from mfvpr.networks.selavpr import SelaVpr
-from mfvpr.retrieval.retriever import Retrieval
+from mfvpr.datasets import folder_dataset
+from mfvpr.evaluation import evaluate
+from mfvpr.features import Aggregated, Description, Sift, VladFitting
+from mfvpr.networks import SelaVpr
+from mfvpr.retrieval import Retrieval
 from mfvpr.scoring import MatchCount
 from mfvpr.types import Shortlist
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 from tests import random_checkpoints
 
 pytestmark = pytest.mark.slow

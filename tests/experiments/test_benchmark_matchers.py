@@ -6,13 +6,11 @@ import pytest
 
 from experiments.benchmark import matchers
 from mfvpr import MatchCount, Matching
-from mfvpr.checkpoints.files import load_model
-from mfvpr.datasets.datasets import folder_dataset
-from mfvpr.evaluation.evaluation import evaluate
-from mfvpr.features import Aggregated
-from mfvpr.features.aliked import AlikedFeatures
-from mfvpr.features.vlad import VladFitting
-from mfvpr.retrieval.retriever import Retrieval
+from mfvpr.checkpoints import load_model
+from mfvpr.datasets import folder_dataset
+from mfvpr.evaluation import evaluate
+from mfvpr.features import Aggregated, AlikedFeatures, VladFitting
+from mfvpr.retrieval import Retrieval
 from tests import random_checkpoints
 
 pytestmark = pytest.mark.slow

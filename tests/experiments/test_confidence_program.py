@@ -10,8 +10,7 @@ import pytest
 from PIL import Image
 
 import mfvpr
-from mfvpr.evaluation.calibration import read_confidences
-from mfvpr.evaluation.precision import precision_recall, reliability
+from mfvpr.evaluation import precision_recall, read_confidences, reliability
 from tests.programs import QUERIES, shared, small, typed
 
 pytestmark = pytest.mark.thorough

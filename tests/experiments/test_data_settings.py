@@ -15,7 +15,7 @@ from experiments import stages
 from experiments.evaluation import evaluate
 from experiments.launch import launch
 from mfvpr import InputError
-from mfvpr.datasets.images import read_image
+from mfvpr.datasets import read_image
 from tests.programs import composed, folder, matches_path
 
 pytestmark = pytest.mark.thorough

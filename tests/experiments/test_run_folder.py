@@ -20,15 +20,14 @@ import pytest
 
 from experiments import console, evaluation, run_folder
 from experiments.settings import SettingsError
-from mfvpr.datasets.ground_truth import AllowedTruth
-from mfvpr.datasets.images import read_image
-from mfvpr.datasets.positives import Positives
+from mfvpr.datasets import AllowedTruth, Positives, read_image
 from mfvpr.datasets.streets import streets_folder
-from mfvpr.evaluation.statistics import block_sign_flips, mcnemar
+from mfvpr.evaluation import mcnemar
+from mfvpr.evaluation.statistics import block_sign_flips
 from mfvpr.report import runs
 from mfvpr.report.evaluations import Page
 from mfvpr.scoring import HistogramOfShifts
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 from tests.programs import CANDIDATES, QUERIES, ROOT, composed, shared, small, typed
 
 pytestmark = pytest.mark.thorough

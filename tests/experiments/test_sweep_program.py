@@ -14,8 +14,8 @@ import pytest
 from PIL import Image
 
 from experiments import axes, evaluation, launch, search
+from mfvpr.storage import Archive
 from mfvpr.storage import matches as match_store
-from mfvpr.storage.feature_cache import Archive
 from tests.programs import CANDIDATES, QUERIES, ROOT, composed, matches_path, results, shared, small, snapshot, typed
 
 pytestmark = pytest.mark.thorough

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import Features, InputError
-from mfvpr.features.feature_set import KEPT, WRITTEN, FeatureSet, InMemory, Recent, Slots, memory_budget, stacked
+from mfvpr.features import FeatureSet, InMemory
+from mfvpr.features.feature_set import KEPT, WRITTEN, Recent, Slots, memory_budget, stacked
 from mfvpr.storage.features import open_store
 from tests.builders import make_features
 

@@ -5,10 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from mfvpr.checkpoints.files import load_model
-from mfvpr.datasets.datasets import image_folder
-from mfvpr.datasets.images import resize
-from mfvpr.features.global_descriptor import GlobalDescriptor
+from mfvpr.checkpoints import load_model
+from mfvpr.datasets import image_folder, resize
+from mfvpr.features import GlobalDescriptor
 from tests import random_checkpoints
 from tests.programs import ROOT, typed
 

@@ -13,14 +13,13 @@ from experiments import stages
 from mfvpr.checkpoints.conversion import convert
 from mfvpr.checkpoints.networks import planned
 from mfvpr.checkpoints.tables import NETVLAD
-from mfvpr.datasets.datasets import folder_dataset
-from mfvpr.features.patch_netvlad import PatchNetVladFeatures
-from mfvpr.networks.netvlad import VggNetVlad
-from mfvpr.reranking.ranking import fuse_scales
-from mfvpr.retrieval.retriever import Retrieval
-from mfvpr.storage import features, vectors
-from mfvpr.storage.feature_cache import Archive
-from mfvpr.utils.errors import InputError
+from mfvpr.datasets import folder_dataset
+from mfvpr.features import PatchNetVladFeatures
+from mfvpr.networks import VggNetVlad
+from mfvpr.reranking import fuse_scales
+from mfvpr.retrieval import Retrieval
+from mfvpr.storage import Archive, features, vectors
+from mfvpr.utils import InputError
 from tests.golden import make_patch_scores as patch_scores
 from tests.golden.make_netvlad import GOLDEN, POSITIONS, image, name
 from tests.programs import results, typed

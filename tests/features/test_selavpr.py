@@ -11,8 +11,7 @@ import pytest
 from experiments import weights
 from mfvpr.checkpoints import networks
 from mfvpr.checkpoints.tables import DINOV2, SELAVPR
-from mfvpr.networks.selavpr import SelaVpr
-from mfvpr.networks.vit import VisionTransformer
+from mfvpr.networks import SelaVpr, VisionTransformer
 from tests.programs import typed
 from tests.random_checkpoints import dinov2_shapes, selavpr_shapes, transformer_checkpoint, write_zip
 

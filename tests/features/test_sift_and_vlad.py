@@ -7,9 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import InputError
-from mfvpr.features.feature_set import FeatureSet
-from mfvpr.features.sift import Sift
-from mfvpr.features.vlad import Vlad, VladFitting
+from mfvpr.features import FeatureSet, Sift, Vlad, VladFitting
 from tests import oracles
 from tests.builders import make_features, unit
 

@@ -11,24 +11,20 @@ from flax import nnx
 
 import mfvpr
 from mfvpr import Features, Shortlist
-from mfvpr.datasets.datasets import ImageFolder, folder_dataset, sequences_dataset
-from mfvpr.evaluation import stages
-from mfvpr.evaluation.sequence_matching import match_sequence, matches_recipe
-from mfvpr.features import Aggregated, windows
-from mfvpr.features.feature_set import FeatureSet
-from mfvpr.features.sift import Sift
-from mfvpr.features.ssm import SsmCells, SsmMaps, SsmWindows
-from mfvpr.features.vlad import VladFitting
-from mfvpr.features.windows import WindowFitting, Windows, kernels, normalized, whitened
-from mfvpr.matching.matcher import Matching
-from mfvpr.networks.ssm import SsmVgg
-from mfvpr.retrieval.fitting import fitted, whitening_recipe
-from mfvpr.retrieval.retriever import Retrieval
-from mfvpr.retrieval.ssm_voting import SsmVoting
+from mfvpr.datasets import ImageFolder, folder_dataset, sequences_dataset
+from mfvpr.evaluation import match_sequence, stages
+from mfvpr.evaluation.sequence_matching import matches_recipe
+from mfvpr.features import Aggregated, FeatureSet, Sift, SsmCells, SsmWindows, VladFitting, WindowFitting, windows
+from mfvpr.features.ssm import SsmMaps
+from mfvpr.features.windows import Windows, kernels, normalized, whitened
+from mfvpr.matching import Matching
+from mfvpr.networks import SsmVgg
+from mfvpr.retrieval import Retrieval, SsmVoting, fitted
+from mfvpr.retrieval.fitting import whitening_recipe
 from mfvpr.scoring import GridAnchors
-from mfvpr.storage.feature_cache import Archive
+from mfvpr.storage import Archive
 from mfvpr.storage.features import forecast_bytes, pack_features
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 from mfvpr.utils.fingerprints import difference, fingerprint
 from mfvpr.utils.whitening import Whitening, fit_whitening
 from tests.builders import local

@@ -6,14 +6,15 @@ import pytest
 
 import mfvpr
 from mfvpr import Features, GridAnchors, Shortlist
+from mfvpr.checkpoints import entry_of
 from mfvpr.checkpoints.conversion import convert
 from mfvpr.checkpoints.networks import blueprint
-from mfvpr.checkpoints.registry import entry_of
 from mfvpr.checkpoints.tables import SSM
-from mfvpr.datasets.images import resize
+from mfvpr.datasets import resize
+from mfvpr.features import WindowFitting
 from mfvpr.features.ssm import SsmMaps
-from mfvpr.features.windows import WindowFitting, Windows, kernels, normalized, whitened
-from mfvpr.reranking.frame_correlation import FrameCorrelation
+from mfvpr.features.windows import Windows, kernels, normalized, whitened
+from mfvpr.reranking import FrameCorrelation
 from mfvpr.retrieval.ssm_voting import voted
 from tests.builders import make_matches
 from tests.golden.make_ssm import (

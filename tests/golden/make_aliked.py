@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mfvpr.checkpoints.checkpoint import read_checkpoint
-from mfvpr.datasets.images import read_image, resize
+from mfvpr.datasets import read_image, resize
 from tests.golden.make_d2net import projections, samples, texture
 from tests.random_checkpoints import random_checkpoint
 

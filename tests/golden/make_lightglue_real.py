@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from experiments.benchmark.real import FOLDERS, SIZE
+from mfvpr.checkpoints import load_model
 from mfvpr.checkpoints.checkpoint import read_checkpoint
-from mfvpr.checkpoints.files import load_model
-from mfvpr.datasets.images import read_image, resize
-from mfvpr.features.aliked import AlikedFeatures
+from mfvpr.datasets import read_image, resize
+from mfvpr.features import AlikedFeatures
 from mfvpr.types import Features
 from tests.golden.make_lightglue import as_tensors, public
 

@@ -9,17 +9,16 @@ from pathlib import Path
 import pytest
 
 from mfvpr.datasets.streets import streets_folder
-from mfvpr.features.sift import Sift
-from mfvpr.features.vlad import VladFitting
+from mfvpr.features import Sift, VladFitting
 from mfvpr.localization import Map
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 from tests.programs import ROOT
 from tests.small_disks import UNSHARE, mount, need_small_disks
 
 
 def fill(disk, street):
     """Add until the disk is full, ask, and go on when it has grown. Prints JSON."""
-    from mfvpr.datasets.datasets import image_folder
+    from mfvpr.datasets import image_folder
 
     images, told = image_folder(Path(street) / "database"), []
     mount(disk, "-o", "size=600k")

@@ -17,21 +17,19 @@ import pytest
 from PIL import Image
 
 import mfvpr
-from mfvpr.datasets.datasets import folder_dataset
-from mfvpr.evaluation.calibration import Confidence
+from mfvpr.datasets import folder_dataset
+from mfvpr.evaluation import Confidence
 from mfvpr.evaluation.stages import explain
-from mfvpr.features import Aggregated, Description, Scale
-from mfvpr.features.sift import Sift
-from mfvpr.features.vlad import VladFitting
+from mfvpr.features import Aggregated, Description, Scale, Sift, VladFitting
 from mfvpr.localization import Map
 from mfvpr.localization import matching as map_matching
 from mfvpr.localization.evidence import LEAST_MATCHES, MapStrength
 from mfvpr.localization.resident import Resident
-from mfvpr.retrieval.retriever import Retrieval
+from mfvpr.retrieval import Retrieval
+from mfvpr.storage import Archive
 from mfvpr.storage import maps as map_store
-from mfvpr.storage.feature_cache import Archive
 from mfvpr.types import Features
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 from tests import scorers
 from tests.programs import ROOT
 

@@ -15,11 +15,11 @@ from PIL import Image
 
 from experiments import build, maps, query_images
 from experiments.settings import SettingsError
-from mfvpr.datasets.images import read_image
+from mfvpr.datasets import read_image
 from mfvpr.datasets.videos import frames
-from mfvpr.evaluation.calibration import Confidence, write_confidences
+from mfvpr.evaluation import Confidence, write_confidences
 from mfvpr.storage.maps import hold_map
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 from tests.programs import ROOT, composed, typed
 
 pytestmark = pytest.mark.thorough

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from mfvpr.localization import Alternative, Answer, route
-from mfvpr.localization.route import Drive, Route, motion, shares, step
-from mfvpr.utils.errors import InputError
+from mfvpr.localization import Alternative, Answer, Drive, Route, route
+from mfvpr.localization.route import motion, shares, step
+from mfvpr.utils import InputError
 
 
 def answer(scores, p=None):

@@ -8,15 +8,14 @@ from dataclasses import dataclass, field, replace
 import pytest
 
 import mfvpr
-from mfvpr.datasets.datasets import image_folder
-from mfvpr.features.vlad import VladFitting
+from mfvpr.datasets import image_folder
+from mfvpr.features import VladFitting
 from mfvpr.localization import Map
 from mfvpr.localization.describing import Describing
 from mfvpr.storage import maps as map_store
 from mfvpr.storage.features import open_store
 from mfvpr.storage.rows import RowStore, open_rows
-from mfvpr.utils.errors import InputError
-from mfvpr.utils.fingerprints import recipe_of
+from mfvpr.utils import InputError, recipe_of
 from tests.localization.test_map import Constant
 from tests.storage.synthetic_features import file_of
 

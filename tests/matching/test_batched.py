@@ -15,12 +15,10 @@ import pytest
 import mfvpr
 from mfvpr import Matches
 from mfvpr.evaluation import stages
-from mfvpr.features.feature_set import FeatureSet, InMemory
-from mfvpr.matching import batched
+from mfvpr.features import FeatureSet, InMemory
+from mfvpr.matching import Matching, MatchSet, batched, filter_matches
 from mfvpr.matching.batched import QUERIES
-from mfvpr.matching.match_set import MatchSet, batches, compacted, shapes, slots
-from mfvpr.matching.matcher import Matching
-from mfvpr.matching.nearest_neighbors import filter_matches
+from mfvpr.matching.match_set import batches, compacted, shapes, slots
 from mfvpr.reranking.ranking import rank_shortlist
 from mfvpr.storage.features import open_store
 from mfvpr.types import Shortlist, per_match, per_pair

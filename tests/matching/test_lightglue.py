@@ -14,15 +14,13 @@ from mfvpr.checkpoints.networks import planned
 from mfvpr.checkpoints.tables import LIGHTGLUE
 from mfvpr.evaluation import stages
 from mfvpr.evaluation.validation import check_matching
-from mfvpr.features import Scale
-from mfvpr.features.feature_set import FeatureSet, stacked
-from mfvpr.features.sift import Sift
-from mfvpr.networks.lightglue import LightGlue
+from mfvpr.features import FeatureSet, Scale, Sift
+from mfvpr.features.feature_set import stacked
+from mfvpr.networks import LightGlue
 from mfvpr.networks.lightglue_assignment import assignment
 from mfvpr.storage.matches import open_match_store
 from mfvpr.types import per_keypoint, per_match
-from mfvpr.utils import ragged
-from mfvpr.utils.fingerprints import recipe_of
+from mfvpr.utils import ragged, recipe_of
 from tests.golden.make_lightglue import SIZES, SMALL, checkpoint, pair
 
 pytestmark = pytest.mark.thorough

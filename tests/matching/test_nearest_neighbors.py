@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import Features, compact, filter_matches, match, match_candidates, retrieve
-from mfvpr.matching import nearest_neighbors
-from mfvpr.matching.matcher import Matching, match_pairs
+from mfvpr.matching import Matching, match_pairs, nearest_neighbors
 from mfvpr.types import per_match, per_pair
 from tests import oracles
 from tests.builders import make_features, random_matches, unit

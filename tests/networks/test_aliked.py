@@ -9,12 +9,13 @@ import pytest
 from flax import nnx
 
 from mfvpr import InputError
+from mfvpr.checkpoints import entry_of
 from mfvpr.checkpoints.conversion import convert
 from mfvpr.checkpoints.networks import blueprint
-from mfvpr.checkpoints.registry import entry_of
 from mfvpr.checkpoints.tables import ALIKED
-from mfvpr.features.aliked import AlikedFeatures
-from mfvpr.networks.aliked import Aliked, DeformableConv
+from mfvpr.features import AlikedFeatures
+from mfvpr.networks import Aliked
+from mfvpr.networks.aliked import DeformableConv
 from mfvpr.networks.aliked_description import DescriptorHead, field
 from mfvpr.networks.aliked_detection import detect
 from mfvpr.networks.sampling import sample, upsample

@@ -7,14 +7,15 @@ import pytest
 from flax import nnx
 
 from mfvpr import InputError
+from mfvpr.checkpoints import entry_of
 from mfvpr.checkpoints.conversion import convert
 from mfvpr.checkpoints.networks import blueprint
-from mfvpr.checkpoints.registry import entry_of
 from mfvpr.checkpoints.tables import D2NET
+from mfvpr.features import D2NetFeatures
 from mfvpr.features import d2net as features_d2net
-from mfvpr.features.d2net import D2NetFeatures
 from mfvpr.features.network import compiled
-from mfvpr.networks.d2net import SCALES, D2Net, detect, extract, select, survey
+from mfvpr.networks import D2Net
+from mfvpr.networks.d2net import SCALES, detect, extract, select, survey
 from mfvpr.networks.imagenet import preprocess
 from tests.builders import local
 from tests.golden.make_d2net import CASES, GOLDEN, PLAIN, projections, samples, texture

@@ -8,16 +8,16 @@ import jax
 import numpy as np
 import pytest
 
+from mfvpr.checkpoints import entry_of
 from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.checkpoints.conversion import convert
 from mfvpr.checkpoints.networks import blueprint, planned
-from mfvpr.checkpoints.registry import entry_of
 from mfvpr.checkpoints.tables import LIGHTGLUE
-from mfvpr.matching.lightglue import LightGlueMatching
-from mfvpr.networks.lightglue import LightGlue
+from mfvpr.matching import LightGlueMatching
+from mfvpr.networks import LightGlue
 from mfvpr.networks.lightglue_assignment import assignment
 from mfvpr.types import per_keypoint
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 from tests import random_checkpoints
 from tests.golden import make_lightglue_real
 from tests.golden.make_lightglue import DEPTH, GOLDEN, REAL, SEEDS, SIZES, SMALL, SURE, checkpoint, pair

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from mfvpr.checkpoints import entry_of
 from mfvpr.checkpoints.conversion import convert
 from mfvpr.checkpoints.networks import blueprint
-from mfvpr.checkpoints.registry import entry_of
 from mfvpr.checkpoints.tables import MIXVPR
-from mfvpr.features.mixvpr import MixVprDescriptor
-from mfvpr.networks.mixvpr import MixVPR, preprocess
-from mfvpr.networks.resnet import ResNet50
-from mfvpr.utils.errors import InputError
+from mfvpr.features import MixVprDescriptor
+from mfvpr.networks import MixVPR, ResNet50
+from mfvpr.networks.mixvpr import preprocess
+from mfvpr.utils import InputError
 from tests.golden.make_mixvpr import GOLDEN, SIZES, faint_maps, images, samples
 from tests.random_checkpoints import mixvpr_shapes, random_checkpoint
 

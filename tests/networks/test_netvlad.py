@@ -7,15 +7,16 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from mfvpr.checkpoints import entry_of
 from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.checkpoints.conversion import convert
 from mfvpr.checkpoints.networks import network_of, planned
-from mfvpr.checkpoints.registry import entry_of
 from mfvpr.checkpoints.tables import NETVLAD, NETVLAD_MATLAB
-from mfvpr.features.global_descriptor import GlobalDescriptor
+from mfvpr.features import GlobalDescriptor
+from mfvpr.networks import NetVlad, VggNetVlad
 from mfvpr.networks.gem import GeneralizedMean
-from mfvpr.networks.netvlad import CHANNELS, NetVlad, VggNetVlad
-from mfvpr.utils.errors import InputError
+from mfvpr.networks.netvlad import CHANNELS
+from mfvpr.utils import InputError
 from tests.golden.make_netvlad import CASES, GEM, GOLDEN, MATLAB, PATCHES, image, name, samples
 from tests.random_checkpoints import gem_checkpoint, matlab_netvlad, netvlad_checkpoint, write_matlab
 

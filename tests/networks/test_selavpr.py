@@ -11,13 +11,13 @@ from flax import nnx
 
 import mfvpr
 from mfvpr.checkpoints.tables import DINOV2, SELAVPR
-from mfvpr.features.global_descriptor import GlobalDescriptor
-from mfvpr.features.selavpr import SelaVprFeatures
-from mfvpr.networks.selavpr import AdaptedBlock, SelaVpr, Upsampling
-from mfvpr.networks.vit import Block, TokenDescriptor, VisionTransformer
+from mfvpr.features import GlobalDescriptor, SelaVprFeatures
+from mfvpr.networks import SelaVpr, VisionTransformer
+from mfvpr.networks.selavpr import AdaptedBlock, Upsampling
+from mfvpr.networks.vit import Block, TokenDescriptor
 from mfvpr.storage import features, vectors
-from mfvpr.utils.errors import InputError
-from mfvpr.utils.fingerprints import fingerprint, recipe_of
+from mfvpr.utils import InputError, recipe_of
+from mfvpr.utils.fingerprints import fingerprint
 from tests.builders import make_matches
 from tests.golden.make_netvlad import image, name, samples
 from tests.golden.make_selavpr import BACKBONES, GOLDEN, MATCHES, NETWORKS, SIZE, WIDTH, maps

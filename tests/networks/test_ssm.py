@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from mfvpr.checkpoints import entry_of
 from mfvpr.checkpoints.conversion import convert
 from mfvpr.checkpoints.networks import blueprint
-from mfvpr.checkpoints.registry import entry_of
 from mfvpr.checkpoints.tables import SSM
-from mfvpr.networks import imagenet
-from mfvpr.networks.ssm import STAGE1_STRIDE, STAGE2_STRIDE, SsmVgg
+from mfvpr.networks import SsmVgg, imagenet
+from mfvpr.networks.ssm import STAGE1_STRIDE, STAGE2_STRIDE
 from tests.golden.make_d2net import samples
 from tests.golden.make_ssm_maps import CASES, GOLDEN, checkpoint
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from mfvpr.networks import Vgg16
 from mfvpr.networks.convolution import Conv3x3, winograd
-from mfvpr.networks.vgg import Vgg16
 
 pytestmark = pytest.mark.thorough
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mfvpr.evaluation.precision import precision_recall, reliability
+from mfvpr.evaluation import precision_recall, reliability
 from mfvpr.report import confidence_figures, figures
 from mfvpr.report.pages.charts import lines
 

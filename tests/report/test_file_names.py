@@ -3,7 +3,7 @@
 import pytest
 
 from mfvpr.report.file_names import file_names
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 
 HOSTILE = (
     "a/b", "a_b", "../up", "..", ".", "", "nul\0", "two\nlines", "a\\b", "c:d", "e*?", "not utf-8 \udcff", "\ud800",

@@ -12,13 +12,14 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from mfvpr.evaluation.statistics import block_sign_flips, mcnemar, recall_interval
+from mfvpr.evaluation import mcnemar
+from mfvpr.evaluation.statistics import block_sign_flips, recall_interval
+from mfvpr.report import write_json
 from mfvpr.report.pages import one_run, sections, several_runs
 from mfvpr.report.pages.files import read_run
 from mfvpr.report.pages.one_run import write_report
 from mfvpr.report.pages.several_runs import write_comparison
-from mfvpr.report.runs import write_json
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 from tests.programs import typed
 from tests.run_folders import HEADLINE, HOSTILE, RANKS, SYSTEMS, TOLERANCES, change_json, write_run
 

@@ -10,9 +10,9 @@ import pytest
 from experiments import evaluation, stages
 from mfvpr import HistogramOfShifts
 from mfvpr.evaluation.stages import dominant_shifts
-from mfvpr.matching.match_set import MatchSet
+from mfvpr.matching import MatchSet
 from mfvpr.report.shifts import HEADER
-from mfvpr.utils.progress import Stopwatch
+from mfvpr.utils import Stopwatch
 from tests.builders import make_matches, of_query
 from tests.programs import composed, shared, small
 

@@ -10,8 +10,8 @@ import pytest
 
 import mfvpr
 from mfvpr.evaluation import stages
+from mfvpr.matching import MatchSet, Scales
 from mfvpr.matching import match_set as match_sets
-from mfvpr.matching.match_set import MatchSet, Scales
 from mfvpr.reranking import ranking
 from mfvpr.tuning import sweeps
 from tests import oracles

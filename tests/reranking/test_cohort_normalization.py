@@ -7,20 +7,17 @@ import numpy as np
 import pytest
 
 import mfvpr
+from mfvpr.datasets import ImageFolder, folder_dataset
 from mfvpr.datasets.contents import Content, Contents
-from mfvpr.datasets.datasets import ImageFolder, folder_dataset
 from mfvpr.evaluation import stages
 from mfvpr.evaluation.sequence_matching import match_cohort
-from mfvpr.features import Aggregated
-from mfvpr.features.sift import Sift
-from mfvpr.features.vlad import VladFitting
+from mfvpr.features import Aggregated, Sift, VladFitting
+from mfvpr.reranking import FrameCorrelation, Fusion
 from mfvpr.reranking.cohort_normalization import PRIOR, by_hubness, cohort_sequence, hubness
-from mfvpr.reranking.frame_correlation import FrameCorrelation
-from mfvpr.reranking.fusion import Fusion
-from mfvpr.retrieval.retriever import Retrieval
-from mfvpr.storage.feature_cache import Archive
+from mfvpr.retrieval import Retrieval
+from mfvpr.storage import Archive
 from mfvpr.types import Shortlist
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 from tests.programs import QUERIES, composed, folder, shared, small, typed
 
 pytestmark = pytest.mark.thorough

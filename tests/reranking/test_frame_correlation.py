@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from mfvpr.reranking.frame_correlation import FrameCorrelation
+from mfvpr.reranking import FrameCorrelation
 from mfvpr.types import Shortlist
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 
 
 def by_loops(rows, scores, previous):

@@ -8,16 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import mfvpr
-from mfvpr.datasets.datasets import folder_dataset, sequences_dataset
-from mfvpr.evaluation import stages
-from mfvpr.evaluation.sequence_matching import match_sequence
-from mfvpr.features import Aggregated
-from mfvpr.features.sift import Sift
-from mfvpr.features.vlad import VladFitting
-from mfvpr.reranking.frame_correlation import FrameCorrelation
-from mfvpr.reranking.fusion import Fusion, rank_sequence
+from mfvpr.datasets import folder_dataset, sequences_dataset
+from mfvpr.evaluation import match_sequence, stages
+from mfvpr.features import Aggregated, Sift, VladFitting
+from mfvpr.reranking import FrameCorrelation, Fusion
+from mfvpr.reranking.fusion import rank_sequence
 from mfvpr.reranking.ranking import rank_shortlist
-from mfvpr.retrieval.retriever import Retrieval
+from mfvpr.retrieval import Retrieval
 from mfvpr.types import Shortlist
 from tests import oracles
 

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import Shortlist, balancing_c, combine, rank, rerank
-from mfvpr.reranking.ranking import filter_scores, fuse, fuse_scales, fuse_shortlist
+from mfvpr.reranking import fuse_scales
+from mfvpr.reranking.ranking import filter_scores, fuse, fuse_shortlist
 from tests import oracles
 
 pytestmark = pytest.mark.thorough

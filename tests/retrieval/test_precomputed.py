@@ -7,11 +7,12 @@ import pytest
 
 from experiments import build
 from experiments.settings import SettingsError
-from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
+from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.io import write_features, write_global_descriptors
-from mfvpr.retrieval.precomputed import DescriptorFiles, FeatureFiles, File, ShortlistFiles
-from mfvpr.storage.feature_cache import Archive
-from mfvpr.utils.errors import InputError
+from mfvpr.retrieval import DescriptorFiles, FeatureFiles, ShortlistFiles
+from mfvpr.retrieval.precomputed import File
+from mfvpr.storage import Archive
+from mfvpr.utils import InputError
 from tests.io.other_programs import feature
 
 

@@ -7,11 +7,12 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from mfvpr import frame_positives, radius_positives, recall_at_k, retrieve
-from mfvpr.datasets.positives import Positives
+from mfvpr.datasets import Positives
 from mfvpr.evaluation import Tally
+from mfvpr.retrieval import ExactSearch, WhitenedSearch
 from mfvpr.retrieval import search as retrieval
-from mfvpr.retrieval.search import EXACT, ExactSearch, WhitenedSearch
-from mfvpr.utils.errors import InputError
+from mfvpr.retrieval.search import EXACT
+from mfvpr.utils import InputError
 from tests import oracles
 from tests.builders import unit
 

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from mfvpr.datasets.positives import Positives
-from mfvpr.retrieval.search import ExactSearch
+from mfvpr.datasets import Positives
+from mfvpr.retrieval import ExactSearch
 from mfvpr.retrieval.ssm_voting import voted
 
 

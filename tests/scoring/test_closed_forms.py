@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mfvpr import AggregatedScore, AnchorPoints, DescriptorDistanceWeight, HistogramOfShifts, UnitWeight
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 from tests.builders import SIZE, make_matches, random_matches
 
 pytestmark = pytest.mark.thorough

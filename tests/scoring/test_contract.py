@@ -22,7 +22,7 @@ from mfvpr import (
     score_grid,
 )
 from mfvpr.scoring.parameters import fit
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 from mfvpr.utils.numerics import held
 from tests.builders import SIZE, per_match, random_matches
 from tests.scorers import FOREIGN, OWN, Wrapped, one_of_each_class, plain, title

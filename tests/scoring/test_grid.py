@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from mfvpr import score_candidates
-from mfvpr.scoring.grid import GridAnchors
+from mfvpr.scoring import GridAnchors
 from mfvpr.testing import check_scorer
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 from tests import oracles
 from tests.builders import make_matches, per_match
 

@@ -13,7 +13,7 @@ import mfvpr
 from mfvpr import Homography, score_candidates, score_grid
 from mfvpr.scoring import quads
 from mfvpr.types import per_match
-from mfvpr.utils.errors import NoGradientError
+from mfvpr.utils import NoGradientError
 from mfvpr.utils.numerics import masked
 from tests import ransac_oracle
 from tests.builders import SIZE, make_matches

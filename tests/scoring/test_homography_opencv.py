@@ -9,10 +9,10 @@ import pytest
 
 from mfvpr import OpenCvHomography, score_candidates, score_grid
 from mfvpr.evaluation import stages
-from mfvpr.matching.match_set import MatchSet
+from mfvpr.matching import MatchSet
 from mfvpr.tuning import sweeps
 from mfvpr.types import Shortlist, per_match
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 from tests.builders import make_matches
 from tests.scoring.test_homography import plane_points, stacked
 

@@ -10,19 +10,15 @@ import pytest
 from PIL import Image
 
 from mfvpr import match
-from mfvpr.datasets.datasets import image_folder
+from mfvpr.datasets import image_folder
 from mfvpr.evaluation import stages
-from mfvpr.features import Aggregated, Description, Scale
-from mfvpr.features.sift import Sift
-from mfvpr.features.vlad import VladFitting
+from mfvpr.features import Aggregated, Description, Scale, Sift, VladFitting
 from mfvpr.retrieval.search import EXACT
+from mfvpr.storage import Archive, vectors
 from mfvpr.storage import feature_cache as archive_module
-from mfvpr.storage import vectors
-from mfvpr.storage.feature_cache import Archive
 from mfvpr.storage.features import forecast_bytes, open_store
 from mfvpr.types import Features
-from mfvpr.utils.errors import InputError
-from mfvpr.utils.fingerprints import recipe_of
+from mfvpr.utils import InputError, recipe_of
 from tests.builders import make_features
 from tests.storage.synthetic_features import assert_same
 

@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mfvpr.storage.shards import NotYet, Shard, indices, shard_of, together
-from mfvpr.utils.errors import InputError
+from mfvpr.storage import NotYet, Shard
+from mfvpr.storage.shards import indices, shard_of, together
+from mfvpr.utils import InputError
 
 
 def test_patience():

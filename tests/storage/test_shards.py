@@ -12,21 +12,17 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr.datasets.datasets import folder_dataset, sequences_dataset
-from mfvpr.evaluation.sequence_matching import match_sequence
-from mfvpr.features import Aggregated, Description, Scale
-from mfvpr.features.sift import Sift
-from mfvpr.features.vlad import VladFitting
-from mfvpr.reranking.frame_correlation import FrameCorrelation
-from mfvpr.reranking.fusion import Fusion
-from mfvpr.retrieval.retriever import Filtered, Retrieval
-from mfvpr.storage.feature_cache import Archive
-from mfvpr.storage.shards import NotYet, Shard, shard_of
+from mfvpr.datasets import folder_dataset, sequences_dataset
+from mfvpr.evaluation import match_sequence
+from mfvpr.features import Aggregated, Description, Scale, Sift, VladFitting
+from mfvpr.reranking import FrameCorrelation, Fusion
+from mfvpr.retrieval import Filtered, Retrieval
+from mfvpr.storage import Archive, NotYet, Shard
+from mfvpr.storage.shards import shard_of
 from mfvpr.storage.vectors import open_vector_store
 from mfvpr.types import Shortlist
+from mfvpr.utils import InputError, recipe_of
 from mfvpr.utils.arrays import read_arrays, write_arrays
-from mfvpr.utils.errors import InputError
-from mfvpr.utils.fingerprints import recipe_of
 
 pytestmark = pytest.mark.thorough
 

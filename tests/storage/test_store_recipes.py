@@ -8,7 +8,7 @@ import pytest
 
 from mfvpr import InputError, Shortlist
 from mfvpr.evaluation import stages
-from mfvpr.features.feature_set import FeatureSet
+from mfvpr.features import FeatureSet
 from mfvpr.storage.matches import open_match_store
 from mfvpr.types import Matches
 from tests.programs import composed, matches_path

@@ -2,7 +2,7 @@
 
 import pytest
 
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 from mfvpr.utils.files import below
 
 

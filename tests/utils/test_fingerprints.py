@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from mfvpr.checkpoints import entry_of
 from mfvpr.checkpoints.networks import blueprint
-from mfvpr.checkpoints.registry import entry_of
-from mfvpr.features.aliked import AlikedFeatures
-from mfvpr.features.sift import Sift
-from mfvpr.features.vlad import Vlad, VladFitting
-from mfvpr.utils.fingerprints import fingerprint, recipe_of
+from mfvpr.features import AlikedFeatures, Sift, Vlad, VladFitting
+from mfvpr.utils import recipe_of
+from mfvpr.utils.fingerprints import fingerprint
 
 
 def test_other_numbers_make_another_recipe():

@@ -5,9 +5,8 @@ from dataclasses import astuple
 import numpy as np
 import pytest
 
-from mfvpr.retrieval.search import WhitenedSearch
-from mfvpr.utils import whitening
-from mfvpr.utils.errors import InputError
+from mfvpr.retrieval import WhitenedSearch
+from mfvpr.utils import InputError, whitening
 from mfvpr.utils.whitening import fit_bytes, fit_whitening
 
 

@@ -15,7 +15,7 @@ import pytest
 
 from experiments.paper import program, systems
 from experiments.paper.runs import held
-from mfvpr.report.tables import Table
+from mfvpr.report import Table
 from tests.programs import ROOT, composed, typed
 from tests.programs import run as run_program
 

@@ -12,8 +12,7 @@ from experiments.paper.systems import DRAWN, ROWS, Place, chosen_rows, missing_w
 from experiments.paper.tables import OVERALL, Evaluated, Found, beside, evaluated, tables
 from experiments.settings import SettingsError
 from experiments.truth import fingerprint
-from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
-from mfvpr.datasets.ground_truth import FrameTruth
+from mfvpr.datasets import Dataset, FrameTruth, ImageFolder, QuerySequence
 
 pytestmark = pytest.mark.thorough
 

@@ -7,12 +7,12 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
+from mfvpr.checkpoints import entry_of
 from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.checkpoints.conversion import convert
 from mfvpr.checkpoints.networks import network_of, planned
-from mfvpr.checkpoints.registry import entry_of
 from mfvpr.checkpoints.tables import NETVLAD_MATLAB
-from mfvpr.utils.errors import InputError
+from mfvpr.utils import InputError
 from tests.random_checkpoints import matlab_netvlad, matlab_shapes, random_checkpoint, write_matlab
 
 pytestmark = pytest.mark.thorough
@@ -58,7 +58,7 @@ def test_signs_and_axes(tmp_path):
     read = read_checkpoint(write_matlab(tmp_path / "a.mat", matlab_netvlad(4, 3)))
     with pytest.raises(InputError, match="of another shape"):
         convert(read, NETVLAD_MATLAB, planned(network_of(entry_of("netvlad_pitts30k")).builder()).shapes)
-    from mfvpr.networks.netvlad import VggNetVlad
+    from mfvpr.networks import VggNetVlad
 
     plan = planned(lambda rngs: VggNetVlad(4, 3, original=True, rngs=rngs))
     found = convert(read, NETVLAD_MATLAB, plan.shapes)

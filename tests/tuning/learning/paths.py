@@ -3,9 +3,9 @@
 import numpy as np
 
 from mfvpr import Shortlist
-from mfvpr.datasets.positives import Positives
+from mfvpr.datasets import Positives
 from mfvpr.evaluation import Judge, halves
-from mfvpr.matching.match_set import MatchSet
+from mfvpr.matching import MatchSet
 from mfvpr.tuning.learning.splits import training_splits
 from tests.builders import of_query, random_matches
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from mfvpr import HistogramOfShifts, InputError
-from mfvpr.datasets.positives import Positives, side_by_side
+from mfvpr.datasets import Positives
+from mfvpr.datasets.positives import side_by_side
 from mfvpr.tuning.learning import comparison
 from mfvpr.tuning.learning.data_sets import Part, joined
 from mfvpr.tuning.learning.splits import VALIDATION, training_splits

@@ -8,7 +8,7 @@ import pytest
 
 import mfvpr
 from mfvpr import InputError
-from mfvpr.datasets.ground_truth import FrameTruth
+from mfvpr.datasets import FrameTruth
 from mfvpr.evaluation import best_setting, hits, judge, statistics
 from mfvpr.report import sweeps
 from mfvpr.tuning import sweeps as sweeping

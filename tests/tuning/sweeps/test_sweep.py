@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr.matching.match_set import PROGRAM_SLOTS, MatchSet, block_bytes, shapes, slots
+from mfvpr.matching import MatchSet
+from mfvpr.matching.match_set import PROGRAM_SLOTS, block_bytes, shapes, slots
 from mfvpr.reranking import ranking
 from mfvpr.scoring.parameters import with_parameters
 from mfvpr.tuning import sweeps

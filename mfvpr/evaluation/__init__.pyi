@@ -1,0 +1,36 @@
+__all__ = [
+    "Confidence",
+    "Half",
+    "Judge",
+    "Recall",
+    "Result",
+    "Split",
+    "Tally",
+    "best_setting",
+    "confidence_inputs",
+    "estimate",
+    "evaluate",
+    "fit_confidence",
+    "halves",
+    "hits",
+    "judge",
+    "match_sequence",
+    "mcnemar",
+    "neighbors",
+    "precision_recall",
+    "read_confidences",
+    "recall_at_k",
+    "reliability",
+    "separated",
+    "write_confidences",
+]
+
+from .calibration import Confidence, confidence_inputs, fit_confidence, read_confidences, write_confidences
+from .evaluation import evaluate
+from .precision import precision_recall, reliability
+from .protocol import Judge, Split, judge
+from .recall import Tally, hits, recall_at_k
+from .results import Recall, Result
+from .selection import Half, best_setting, halves, neighbors, separated
+from .sequence_matching import match_sequence
+from .statistics import estimate, mcnemar

@@ -1,0 +1,19 @@
+__all__ = [
+    "FrameCorrelation",
+    "Fusion",
+    "Matched",
+    "Ranked",
+    "balancing_c",
+    "combine",
+    "fuse_scales",
+    "rank",
+    "rerank",
+    "score_candidates",
+    "score_grid",
+]
+
+from .frame_correlation import FrameCorrelation
+from .fusion import Fusion
+from .grids import score_grid
+from .ranking import balancing_c, combine, fuse_scales, rank, rerank, score_candidates
+from .results import Matched, Ranked

@@ -1,0 +1,19 @@
+__all__ = [
+    "DescriptorFiles",
+    "ExactSearch",
+    "FeatureFiles",
+    "Filter",
+    "Filtered",
+    "Retrieval",
+    "ShortlistFiles",
+    "SsmVoting",
+    "WhitenedSearch",
+    "fitted",
+    "retrieve",
+]
+
+from .fitting import fitted
+from .precomputed import DescriptorFiles, FeatureFiles, ShortlistFiles
+from .retriever import Filter, Filtered, Retrieval
+from .search import ExactSearch, WhitenedSearch, retrieve
+from .ssm_voting import SsmVoting
