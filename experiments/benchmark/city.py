@@ -1,8 +1,6 @@
-"""A city of 100,000 images: filter, features of the shortlists alone, re-ranking; and what 2.8 million would take."""
+"""Filter, extraction of shortlisted images and re-ranking among 100,000 images, with a forecast for 2.8 million."""
 
-import json
 import os
-import platform
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -12,8 +10,9 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from experiments.benchmark.projection import ASSUMED, Plan, Rates, projected
-from experiments.benchmark.scale import CANDIDATES, MEMORY, Answer, Counted, peak_bytes, reranked
+from experiments.benchmark.harness import write_report
+from experiments.benchmark.projection import ASSUMED, Rates, forecast
+from experiments.benchmark.scale import CANDIDATES, MEMORY, Answer, Counted, median_seconds, peak_bytes, rerank
 from experiments.benchmark.synthetic_features import BATCH, GLOBAL, MadeUp
 from experiments.console import bar
 from mfvpr.datasets import Positives
@@ -25,22 +24,18 @@ from mfvpr.retrieval.search import EXACT
 from mfvpr.storage.features import FeatureStore, forecast_bytes, open_store, require_space
 from mfvpr.storage.manifest import store_path
 from mfvpr.types import Shortlist
-from mfvpr.utils.files import write_text
-from mfvpr.utils.numerics import available_cpus
-from mfvpr.utils.versions import versions
 
-DATA = MadeUp(100_000, 200, 700, 128, views=1, likeness=0.18)  # so the filter often fails
+DATA = MadeUp(100_000, 200, 700, 128, views=1, likeness=0.18)  # so that the filter often fails
 ROUNDS = 3
-WHOLE, ASKED, MACHINES = 2_800_000, 1000, (1, 8, 64)  # images of San Francisco XL, and what is asked of them
-# Seconds of an image on 2 cores, from experiments/results.md: MixVPR one by one (its networks), and the features alone
-# of maps that are asked.
+WHOLE, ASKED, MACHINES = 2_800_000, 1000, (1, 8, 64)  # images of San Francisco XL, and queries of the forecast
+# Seconds per image on 2 cores from experiments/results.md: MixVPR one by one, and the local features of `localize`.
 DESCRIBING, EXTRACTING = 0.102, {"SIFT": 0.021, "ALIKED n16": 0.070}
 
 Result = TypeVar("Result")
 
 
 class Step(NamedTuple):
-    """Seconds by the clock, seconds of all threads together, and GB of resident memory at most until then."""
+    """Wall-clock seconds, CPU seconds of all threads, and peak resident memory until then in GB."""
 
     seconds: float
     cpu: float
@@ -48,104 +43,110 @@ class Step(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Found:
-    """What was measured.
+class Measurements:
+    """What `measure` measures."""
 
-    Attributes:
-        steps: by name; medians where they were repeated.
-        reranking: seconds of its parts.
-        made: images whose features were made.
-        written: bytes that their features take on disk.
-        rows_read: in a round.
-        read: bytes of these, just written: from the system's cache rather than the disk.
-        recall: of the filter, of its whole shortlist, and of the re-ranking.
-    """
-
-    steps: dict[str, Step]
-    reranking: dict[str, float]
-    made: int
-    written: int
-    rows_read: float
-    read: float
-    recall: dict[str, float]
+    steps: dict[str, Step]  # medians of repeated steps
+    reranking: dict[str, float]  # seconds of the parts of re-ranking
+    made: int  # images whose features were made
+    written: int  # bytes of these features on disk
+    rows_read: float  # in a round
+    read: float  # bytes of the rows read; just written, so they come from the system's cache rather than the disk
+    recall: dict[str, float]  # of the filter, of its whole shortlist, and after re-ranking
 
 
 def run(rounds: int | None, out: Path) -> None:
-    """Print tables and write them as JSON to `out`; the features that are made are deleted."""
+    """Measure in a temporary folder, and print the steps and the forecast."""
     load = os.getloadavg()[0]
     with tempfile.TemporaryDirectory(prefix="mfvpr-city-") as root:
-        found = walked(DATA, Path(root), rounds or ROUNDS)
-    report(DATA, found, load, out)
+        measured = measure(DATA, Path(root), rounds or ROUNDS)
+    rates = {name: rates_of(DATA, measured, seconds) for name, seconds in EXTRACTING.items()}
+    plans = [
+        {"features": name, "machines": machines, "answering": plan.answering} | asdict(plan)
+        for name, rate in rates.items()
+        for machines in MACHINES
+        for plan in [forecast(rate, WHOLE, ASKED, CANDIDATES, machines)]
+    ]
+    content = asdict(DATA) | {
+        "candidates": CANDIDATES, "memory": MEMORY, "whole": WHOLE, "asked": ASKED, "load_before": load,
+        "found": asdict(measured) | {"steps": {name: step._asdict() for name, step in measured.steps.items()}},
+        "assumed": ASSUMED, "rates": {name: asdict(rate) for name, rate in rates.items()}, "plans": plans,
+    }  # fmt: skip
+    title = f"{DATA.queries} queries with {CANDIDATES} candidates among {DATA.title}"
+    parts = [_steps_table(DATA, measured), *_remarks(DATA, measured),
+             f"\n{ASKED} queries among {WHOLE} images, forecast from these rates\n", _plans_table(plans),
+             *(f"assumed: {assumption}" for assumption in ASSUMED)]  # fmt: skip
+    write_report(out, title, parts, content)
 
 
-def walked(data: MadeUp, root: Path, rounds: int) -> Found:
-    """All steps for all queries, each once before it is timed, but for the features, which are made once."""
+def measure(data: MadeUp, root: Path, rounds: int) -> Measurements:
+    """Time all steps for all queries, each after a warm-up; features are made only once."""
     queries = FeatureSet.of([data.query(row) for row in bar("queries", data.queries, range(data.queries))])
-    asked, known = data.global_descriptors()
+    query_vectors, vectors = data.global_descriptors()
     steps: dict[str, Step] = {}
-    half = known[: data.images // 2]
-    _, steps["filter, half"] = repeated("filter, half", rounds, lambda: EXACT.shortlist(asked, half, CANDIDATES))
-    candidates, steps["filter"] = repeated("filter", rounds, lambda: EXACT.shortlist(asked, known, CANDIDATES))
-    _, steps["merging"] = repeated("merging", rounds, lambda: merged(candidates, max(MACHINES)))
-    store, making = extracted(data, root, np.unique(candidates.indices[candidates.mask]))
+
+    def shortlist(images: int) -> Shortlist:
+        return EXACT.shortlist(query_vectors, vectors[:images], CANDIDATES)
+
+    _, steps["filter, half"] = repeat("filter, half", rounds, lambda: shortlist(data.images // 2))
+    candidates, steps["filter"] = repeat("filter", rounds, lambda: shortlist(data.images))
+    _, steps["merging"] = repeat("merging", rounds, lambda: merge(candidates, max(MACHINES)))
+    store, making = make_features(data, root, np.unique(candidates.indices[candidates.mask]))
     source = Counted(store)
     database = FeatureSet(source, {})
     answers: list[Answer] = []
-    _, steps["re-ranking"] = repeated(
-        "re-ranking", rounds, lambda: answers.append(reranked(queries, database, candidates))
-    )
+    _, reranking = repeat("re-ranking", rounds, lambda: answers.append(rerank(queries, database, candidates)))
     made, written, rows_read = int(store.done.sum()), store.size_bytes, source.rows / len(answers)
-    right = Positives.from_rows(data.similar(), data.images)
-    depths = recall_at_k(candidates.indices, right, [1, CANDIDATES]).tolist()
-    return Found(
-        steps=steps | making,
-        reranking={
-            name: float(np.median([answer.seconds[name] for answer in answers[1:]])) for name in answers[0].seconds
-        },
+    positives = Positives.from_rows(data.similar(), data.images)
+    recall = [
+        *recall_at_k(candidates.indices, positives, [1, CANDIDATES]),
+        *recall_at_k(answers[0].rows, positives, [1]),
+    ]
+    return Measurements(
+        steps=steps | making | {"re-ranking": reranking},
+        reranking=median_seconds(answers[1:]),
         made=made,
         written=written,
         rows_read=rows_read,
         read=rows_read * written / made,
-        recall={
-            "filter": depths[0],
-            "shortlist": depths[1],
-            "re-ranking": float(recall_at_k(answers[0].rows, right, [1])[0]),
-        },
+        recall=dict(zip(("filter", "shortlist", "re-ranking"), map(float, recall), strict=True)),
     )
 
 
-def timed(call: Callable[[], Result]) -> tuple[Result, Step]:
-    """What a call gives, and what it takes."""
+def measure_step(call: Callable[[], Result]) -> tuple[Result, Step]:
+    """Result of a call and its cost."""
     start, cpu = time.perf_counter(), time.process_time()
     result = call()
     return result, Step(time.perf_counter() - start, time.process_time() - cpu, peak_bytes() / 1e9)
 
 
-def repeated(label: str, rounds: int, call: Callable[[], Result]) -> tuple[Result, Step]:
-    """What a call gives, and the medians of what it takes after a first one, which compiles."""
+def repeat(label: str, rounds: int, call: Callable[[], Result]) -> tuple[Result, Step]:
+    """Result of a first call, which compiles, and the median cost of `rounds` more."""
     result = call()
-    steps = [timed(call)[1] for _ in bar(label, rounds, range(rounds))]
+    steps = [measure_step(call)[1] for _ in bar(label, rounds, range(rounds))]
     return result, Step(*np.median(steps, axis=0).tolist())
 
 
-def merged(candidates: Shortlist, machines: int) -> np.ndarray:
-    """`[Q, C]` places of the best among as many machines' candidates, here the same ones."""
+def merge(candidates: Shortlist, machines: int) -> np.ndarray:
+    """Positions `[Q, C]` of the best candidates of all machines, which here all find the same ones."""
     return np.asarray(rank(np.tile(candidates.scores, machines)))[:, : candidates.scores.shape[1]]
 
 
-def extracted(data: MadeUp, root: Path, rows: np.ndarray) -> tuple[FeatureStore, dict[str, Step]]:
-    """A store below `root` of all images, in which there are those of some rows; and what making and storing takes."""
+def make_features(data: MadeUp, root: Path, rows: np.ndarray) -> tuple[FeatureStore, dict[str, Step]]:
+    """Store the features of some rows of the database below `root`; also the cost of making and of storing them."""
     recipe = {"made_up": "city"} | asdict(data)
     store = open_store(store_path(root, "city", recipe), recipe, num_images=data.images)
     require_space(root, forecast_bytes(len(rows), data.keypoints, data.dimension))
-    shown, made, stored = data.shown(), [], []
-    parts = np.split(rows, range(BATCH, len(rows), BATCH))
+    queries, making, storing = data.query_by_row(), [], []
+    batches = np.split(rows, range(BATCH, len(rows), BATCH))
     with store:
-        for part in bar("extraction", len(parts), parts):
-            features, step = timed(lambda part=part: {row: data.image(row, shown.get(row)) for row in part.tolist()})
-            made.append(step)
-            stored.append(timed(lambda features=features: store.write(features))[1])
-    return store, {"making": _sum(made), "storing": _sum(stored)}
+        for batch in bar("extraction", len(batches), batches):
+            features, step = measure_step(
+                lambda batch=batch: {row: data.image(row, queries.get(row)) for row in batch.tolist()}
+            )
+            making.append(step)
+            storing.append(measure_step(lambda features=features: store.write(features))[1])
+    return store, {"making": _sum(making), "storing": _sum(storing)}
 
 
 def _sum(steps: list[Step]) -> Step:
@@ -153,90 +154,54 @@ def _sum(steps: list[Step]) -> Step:
     return Step(sum(seconds), sum(cpu), max(peaks))
 
 
-def rates(data: MadeUp, found: Found, extracting: float) -> Rates:
-    """What one machine takes, where an image's local features take `extracting` seconds."""
+def rates_of(data: MadeUp, measured: Measurements, extracting: float) -> Rates:
+    """Rates of this machine, where the local features of an image take `extracting` seconds."""
     return Rates(
         describing=DESCRIBING,
-        comparing=found.steps["filter"].seconds / (data.queries * data.images),
-        merging=found.steps["merging"].seconds / (data.queries * CANDIDATES * max(MACHINES)),
+        comparing=measured.steps["filter"].seconds / (data.queries * data.images),
+        merging=measured.steps["merging"].seconds / (data.queries * CANDIDATES * max(MACHINES)),
         extracting=extracting,
-        storing=found.steps["storing"].seconds / found.made,
-        reranking=found.steps["re-ranking"].seconds / data.queries,
+        storing=measured.steps["storing"].seconds / measured.made,
+        reranking=measured.steps["re-ranking"].seconds / data.queries,
         vector_bytes=4 * GLOBAL,
-        row_bytes=found.written / found.made,
+        row_bytes=measured.written / measured.made,
     )
 
 
-def report(data: MadeUp, found: Found, load: float, out: Path) -> None:
-    """Print what was measured and what follows from it, and write both."""
-    machine = {"cores": available_cpus(), "processor": platform.machine(), "load_before": load}
-    setting = asdict(data) | {"candidates": CANDIDATES, "memory": MEMORY, "whole": WHOLE, "asked": ASKED}
-    remarks = list(_remarks(data, found))
-    measured = {name: rates(data, found, seconds) for name, seconds in EXTRACTING.items()}
-    plans = {
-        name: {machines: projected(one, WHOLE, ASKED, CANDIDATES, machines) for machines in MACHINES}
-        for name, one in measured.items()
-    }
-    content = setting | {
-        "machine": machine,
-        "versions": versions(),
-        "remarks": remarks,
-        "found": asdict(found) | {"steps": {name: step._asdict() for name, step in found.steps.items()}},
-        "assumed": ASSUMED,
-        "rates": {name: asdict(one) for name, one in measured.items()},
-        "plans": [
-            {"features": name, "machines": machines, "answering": plan.answering} | asdict(plan)
-            for name, by_machines in plans.items()
-            for machines, plan in by_machines.items()
-        ],
-    }
-    write_text(out, json.dumps(content, indent=1) + "\n")
-    title = f"{data.queries} queries with {CANDIDATES} candidates among {data.title}; {machine}"
-    print(f"\n{title}\n", _steps(data, found).text(), *remarks, sep="\n")
-    print(f"\n{ASKED} queries among {WHOLE} images, computed from these\n", _plans(plans).text(), sep="\n")
-    print("Assumed:", *(f"- {one}" for one in [*ASSUMED, *_constants()]), f"results: {out}", sep="\n")
+def _steps_table(data: MadeUp, measured: Measurements) -> Table:
+    images = {"making": measured.made, "storing": measured.made, "re-ranking": measured.rows_read}
+    sizes = {"storing": measured.written, "re-ranking": measured.read}
+    lines = [
+        [name, f"{step.seconds:.2f}", f"{step.cpu:.2f}", f"{1e3 * step.seconds / data.queries:.1f}",
+         f"{images[name]:.0f}" if name in images else "", f"{sizes[name] / 1e6:.0f}" if name in sizes else "",
+         f"{step.peak:.2f}"]
+        for name, step in measured.steps.items()
+    ]  # fmt: skip
+    return Table(["step", "seconds", "CPU s", "ms / query", "images", "MB", "peak GB"], lines)
 
 
-def _steps(data: MadeUp, found: Found) -> Table:
-    header = ["step", "seconds", "CPU s", "ms / query", "images", "MB", "peak GB"]
-    of_rows = {"making": (found.made, None), "storing": (found.made, found.written),
-               "re-ranking": (found.rows_read, found.read)}  # fmt: skip
-    lines = []
-    for name in ("filter, half", "filter", "merging", "making", "storing", "re-ranking"):
-        step, (images, size) = found.steps[name], of_rows.get(name, (None, None))
-        lines.append([name, f"{step.seconds:.2f}", f"{step.cpu:.2f}", f"{1e3 * step.seconds / data.queries:.1f}",
-                      "" if images is None else f"{images:.0f}", "" if size is None else f"{size / 1e6:.0f}",
-                      f"{step.peak:.2f}"])  # fmt: skip
-    return Table(header, lines)
-
-
-def _remarks(data: MadeUp, found: Found) -> Iterator[str]:
-    parts = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in found.reranking.items())
-    yield f"re-ranking: {parts}"
-    recall = found.recall
+def _remarks(data: MadeUp, measured: Measurements) -> Iterator[str]:
+    yield "re-ranking: " + ", ".join(f"{name} {seconds:.2f} s" for name, seconds in measured.reranking.items())
+    recall = measured.recall
     yield f"R@1: filter {recall['filter']:.3f}, re-ranking {recall['re-ranking']:.3f}; " + (
         f"R@{CANDIDATES} of the filter: {recall['shortlist']:.3f}"
     )
-    pairs = data.queries * CANDIDATES
-    yield f"images in the shortlists: {found.made} of {pairs} pairs, {100 * found.made / data.images:.1f} % of all"
-    double = found.steps["filter"].seconds / found.steps["filter, half"].seconds
-    yield f"filter, all / half of the images: {double:.2f} times as long"
-
-
-def _constants() -> Iterator[str]:
+    pairs, share = data.queries * CANDIDATES, 100 * measured.made / data.images
+    yield f"images in the shortlists: {measured.made} of {pairs} pairs, {share:.1f} % of all"
+    ratio = measured.steps["filter"].seconds / measured.steps["filter, half"].seconds
+    yield f"filter, all / half of the images: {ratio:.2f} times as long"
     yield f"global descriptor: {1e3 * DESCRIBING:g} ms an image (MixVPR one by one, experiments/results.md)"
-    yield "local features: " + ", ".join(f"{name} {1e3 * one:g} ms" for name, one in EXTRACTING.items()) + " an image"
+    yield "local features: " + ", ".join(f"{name} {1e3 * seconds:g} ms" for name, seconds in EXTRACTING.items())
 
 
-def _plans(plans: dict[str, dict[int, Plan]]) -> Table:
+def _plans_table(plans: list[dict]) -> Table:
     header = ["features", "machines", "database once, h", "queries, s", "filter, s", "(merging)", "extraction, s",
               "re-ranking, s", "in all, s", "memory, GB", "disk, GB"]  # fmt: skip
     lines = [
-        [name, str(machines), f"{plan.describing / 3600:.2f}"]
-        + [f"{seconds:.2f}" for seconds in (plan.asking, plan.filtering, plan.merging)]
-        + [f"{seconds:.1f}" for seconds in (plan.extracting, plan.reranking, plan.answering)]
-        + [f"{plan.memory / 1e9:.2f}", f"{plan.disk / 1e9:.2f}"]
-        for name, by_machines in plans.items()
-        for machines, plan in by_machines.items()
+        [plan["features"], str(plan["machines"]), f"{plan['describing'] / 3600:.2f}"]
+        + [f"{plan[name]:.2f}" for name in ("asking", "filtering", "merging")]
+        + [f"{plan[name]:.1f}" for name in ("extracting", "reranking", "answering")]
+        + [f"{plan[name] / 1e9:.2f}" for name in ("memory", "disk")]
+        for plan in plans
     ]
     return Table(header, lines)

@@ -1,4 +1,4 @@
-"""A contest: everyone is timed in turns, and one table says how many times as long as mfvpr each takes."""
+"""Turns for implementations that are timed together, and the one format of every benchmark's report."""
 
 import json
 import platform
@@ -17,55 +17,33 @@ from mfvpr.utils.files import write_text
 from mfvpr.utils.numerics import available_cpus
 from mfvpr.utils.versions import versions
 
-Entry = tuple[str, str, Callable[[], Any]]  # step, who, what is timed
-Seconds = Mapping[tuple[str, str], list[float]]  # of every call, by (step, who)
-Results = Mapping[tuple[str, str], Any]
+Entry = tuple[str, str, Callable[[], Any]]  # step, implementation, the call that is timed
+Seconds = Mapping[tuple[str, str], list[float]]  # (step, implementation) -> seconds of every call
+Results = Mapping[tuple[str, str], Any]  # (step, implementation) -> result of the first call
 
 QUICK = 0.05  # seconds
 
 
 @dataclass(frozen=True)
 class Lineup:
-    """Those who are timed together; each step has a contestant "mfvpr"."""
+    """Implementations that are timed together; each step has one called "mfvpr"."""
 
     title: str
     setting: dict[str, Any]  # for the JSON file
     entries: list[Entry]
-    rounds: int  # unless asked for others
-    remarks: Callable[[Seconds, Results], Iterable[str]]  # what the table does not say
+    rounds: int  # unless the command line sets another number
+    remarks: Callable[[Seconds, Results], Iterable[str]]
 
 
-def compete(lineup: Lineup, rounds: int | None, out: Path) -> None:
-    """Print the table and write it as JSON to `out`; `rounds` None = the lineup's own."""
-    report(lineup, *take_turns([run for _, _, run in lineup.entries], rounds or lineup.rounds), out)
-
-
-def take_turns(runs: list[Callable[[], Any]], rounds: int) -> tuple[list[list[float]], list[Any]]:
-    """Seconds of every call, after one that compiles and warms up; and what that one returned.
-
-    A contestant of a few milliseconds first gets untimed calls in each of its turns: others have just emptied the
-    caches, and their idle threads may still be spinning.
-    """
-    results = [run() for run in bar("warm-up", len(runs), runs)]
-    seconds: list[list[float]] = [[] for _ in runs]
-    for _ in bar("rounds", rounds, range(rounds)):
-        for run, taken in zip(runs, seconds, strict=True):
-            quick = bool(taken) and taken[-1] < QUICK
-            for _ in range(10 if quick else 0):
-                run()
-            start = time.perf_counter()
-            run()
-            taken.append(time.perf_counter() - start)
-    return seconds, results
-
-
-def report(lineup: Lineup, seconds: list[list[float]], results: list[Any], out: Path) -> None:
-    """One table: medians, quartiles, and multiples of mfvpr's time; steps as they are lined up, the fastest first."""
-    names = [(step, who) for step, who, _ in lineup.entries]
+def compete(lineup: Lineup, rounds: int | None, out: Path) -> Results:
+    """Time a lineup, print its table and write it as JSON to `out`; `rounds` None = the lineup's own number."""
+    names = [(step, implementation) for step, implementation, _ in lineup.entries]
+    times, outputs = take_turns([call for _, _, call in lineup.entries], rounds or lineup.rounds)
+    seconds, results = dict(zip(names, times, strict=True)), dict(zip(names, outputs, strict=True))
     rows = []
-    for (step, who), taken in zip(names, seconds, strict=True):
-        low, middle, high = (1e3 * float(q) for q in np.quantile(taken, (0.25, 0.5, 0.75)))
-        rows.append({"step": step, "name": who, "median_ms": middle, "quartiles_ms": [low, high]})
+    for (step, implementation), taken in seconds.items():
+        low, median, high = (1e3 * float(quantile) for quantile in np.quantile(taken, (0.25, 0.5, 0.75)))
+        rows.append({"step": step, "name": implementation, "median_ms": median, "quartiles_ms": [low, high]})
     ours = {row["step"]: row["median_ms"] for row in rows if row["name"] == "mfvpr"}
     rows.sort(key=lambda row: (list(ours).index(row["step"]), row["median_ms"]))
     lines = [
@@ -74,8 +52,41 @@ def report(lineup: Lineup, seconds: list[list[float]], results: list[Any], out: 
         for row in rows
     ]  # fmt: skip
     table = Table(["step", "who", "median, ms", "quartiles, ms", "/ mfvpr"], lines, text_columns=2)
-    remarks = list(lineup.remarks(dict(zip(names, seconds, strict=True)), dict(zip(names, results, strict=True))))
+    setting = lineup.setting | {"rounds": len(times[0])}
+    write_report(out, lineup.title, [table, *lineup.remarks(seconds, results)], setting | {"results": rows})
+    return results
+
+
+def take_turns(calls: list[Callable[[], Any]], rounds: int) -> tuple[list[list[float]], list[Any]]:
+    """Seconds of every call after an untimed first one, and the results of the first ones.
+
+    Calls of a few milliseconds are repeated untimed before each timed one: other implementations have just emptied the
+    caches, and their idle threads may still be spinning.
+    """
+    results = [call() for call in bar("warm-up", len(calls), calls)]
+    seconds: list[list[float]] = [[] for _ in calls]
+    for _ in bar("rounds", rounds, range(rounds)):
+        for call, taken in zip(calls, seconds, strict=True):
+            quick = bool(taken) and taken[-1] < QUICK
+            for _ in range(10 if quick else 0):
+                call()
+            taken.append(elapsed(call))
+    return seconds, results
+
+
+def elapsed(call: Callable[[], Any]) -> float:
+    """Seconds that a call takes."""
+    start = time.perf_counter()
+    call()
+    return time.perf_counter() - start
+
+
+def write_report(out: Path, title: str, parts: Iterable[Table | str], content: Mapping[str, Any]) -> None:
+    """Print tables and remarks below a title, and write the remarks and `content` as JSON to `out`."""
+    parts = list(parts)
     machine = {"device": jax.devices()[0].device_kind, "cores": available_cpus(), "processor": platform.machine()}
-    setting = lineup.setting | {"machine": machine, "versions": versions(), "rounds": len(seconds[0])}
-    write_text(out, json.dumps(setting | {"remarks": remarks, "results": rows}, indent=1) + "\n")
-    print(f"\n{lineup.title}; {machine}\n", table.text(), *remarks, f"results: {out}", sep="\n")
+    remarks = [part for part in parts if isinstance(part, str)]
+    common = {"machine": machine, "versions": versions(), "remarks": remarks}
+    write_text(out, json.dumps(common | dict(content), indent=1) + "\n")
+    texts = (part if isinstance(part, str) else part.text() for part in parts)
+    print(f"\n{title}; {machine}\n", *texts, f"results: {out}", sep="\n")

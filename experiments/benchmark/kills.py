@@ -1,158 +1,145 @@
-"""Shards of small evaluations that are killed (SIGKILL) at random moments: what is left, and whether it is the same.
+"""Kill the tasks of small sharded evaluations at random moments, and compare the results with undisturbed ones.
 
-Two tasks of an evaluation run beside each other, die at any moment between their start and their end, and those that
-are missing are started again, until the results are there. Then the stores' rows and the tables must be those of tasks
-that nobody disturbed, byte by byte, and no row may have been written twice.
+Two tasks of an evaluation run side by side and receive SIGKILL at any moment. Missing tasks are started again until the
+results are complete. Then the rows in the stores and the tables must equal those of undisturbed tasks byte by byte, and
+no row may have been written twice.
 """
 
 import hashlib
-import json
 import math
 import os
-import platform
 import random
 import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from experiments import sharding
+from experiments.benchmark.harness import elapsed, write_report
 from experiments.console import bar
 from experiments.settings import SettingsError
 from mfvpr.datasets.streets import streets_folder
 from mfvpr.report import Table
-from mfvpr.utils.files import write_text
-from mfvpr.utils.versions import versions
 
 KILLS, SHARDS = 200, 2
 FRAMES, IMAGE_SIZE = 40, (160, 120)
 POLL = 0.02  # seconds
 
-Rows = dict[str, tuple[int, int]]  # by path, the file itself: its inode and time
+FileStates = dict[str, tuple[int, int]]  # path -> inode and time of modification
 
 
 def run(rounds: int | None, out: Path) -> None:
-    """Print a table and write it as JSON to `out`; `rounds` is the number of kills."""
-    kills, wanted, runs, where = 0, rounds or KILLS, 0, Counter[str]()
-    with tempfile.TemporaryDirectory(prefix="mfvpr-kills-") as root:
-        place, rng = Path(root), random.Random(0)
-        street = streets_folder(place, num_frames=FRAMES, image_size=IMAGE_SIZE)
-        os.environ["JAX_COMPILATION_CACHE_DIR"] = f"{place}/programs"
-        _undisturbed(place / "first", street)  # whose programs the others take
-        expected = _undisturbed(place / "undisturbed", street)
-        start = time.perf_counter()
-        _task(place / "undisturbed", street, 0).wait()  # which finds that all is done
-        seconds = time.perf_counter() - start
-        shown = bar("kills", wanted)
-        while kills < wanted:
-            disturbed = _disturbed(place / f"{runs}", street, seconds, rng, wanted - kills)
-            if (found := content(place / f"{runs}")) != expected:
-                wrong = sorted(name for name in {*found, *expected} if found.get(name) != expected.get(name))
-                raise SettingsError(f"kills: {wrong[0]} and {len(wrong) - 1} more differ from an undisturbed run")
-            where += disturbed
-            shown.update(disturbed.total())
-            kills, runs = kills + disturbed.total(), runs + 1
-        shown.close()
-    report(where, runs, out)
+    """Kill `rounds` tasks, and count during which stage each was killed."""
+    total, evaluations, kills = rounds or KILLS, 0, Counter[str]()
+    with tempfile.TemporaryDirectory(prefix="mfvpr-kills-") as temporary:
+        root, rng = Path(temporary), random.Random(0)
+        street = streets_folder(root, num_frames=FRAMES, image_size=IMAGE_SIZE)
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = f"{root}/programs"
+        _run_undisturbed(root / "first", street)  # fills the compilation cache
+        expected = _run_undisturbed(root / "undisturbed", street)
+        seconds = elapsed(lambda: _start_task(root / "undisturbed", street, 0).wait())  # a task with nothing to do
+        progress = bar("kills", total)
+        while kills.total() < total:
+            folder = root / f"{evaluations}"
+            new_kills = _run_with_kills(folder, street, seconds, rng, total - kills.total())
+            hashes = file_hashes(folder)
+            differing = sorted(name for name in {*hashes, *expected} if hashes.get(name) != expected.get(name))
+            if differing:
+                raise SettingsError(
+                    f"kills: {len(differing)} files differ from an undisturbed run: {differing[0]} ..."
+                )
+            kills += new_kills
+            evaluations += 1
+            progress.update(new_kills.total())
+        progress.close()
+    lines = [[stage, str(count)] for stage, count in [*kills.items(), ("in all", kills.total())]]
+    title = f"{evaluations} evaluations in {SHARDS} shards: rows and tables equal undisturbed ones, rows written once"
+    content = {"evaluations": evaluations, "kills": dict(kills)}
+    write_report(out, title, [Table(["killed during", "times"], lines)], content)
 
 
-def _undisturbed(place: Path, street: Path) -> dict[str, str]:
-    while missing := _missing(place):
+def _run_undisturbed(folder: Path, street: Path) -> dict[str, str]:
+    while missing := _missing_tasks(folder):
         for index in missing:
-            if _task(place, street, index).wait():
+            if _start_task(folder, street, index).wait():
                 raise SettingsError(f"kills: the task {index}/{SHARDS} of an undisturbed run failed")
-    return content(place)
+    return file_hashes(folder)
 
 
-def _disturbed(place: Path, street: Path, seconds: float, rng: random.Random, most: int) -> Counter[str]:
-    """Kills, by what the task had said last, until the results are there; and that no row was written twice."""
-    where, rows = Counter[str](), {}
-    while missing := _missing(place):
-        tasks = {index: (_task(place, street, index), time.monotonic() + _delay(rng, seconds)) for index in missing}
+def _run_with_kills(folder: Path, street: Path, seconds: float, rng: random.Random, max_kills: int) -> Counter[str]:
+    """Run an evaluation whose tasks are killed, and count the kills by stage."""
+    kills, states = Counter[str](), {}
+    while missing := _missing_tasks(folder):
+        tasks = {
+            index: (_start_task(folder, street, index), time.monotonic() + _delay(rng, seconds)) for index in missing
+        }
         while tasks:
             time.sleep(POLL)
-            _check_rows(rows, place)
+            _check_rows(states, folder)
             for index, (task, end) in list(tasks.items()):
                 if task.poll() is not None:
                     if task.returncode:
-                        raise SettingsError(f"kills: the task {index}/{SHARDS} failed with {task.returncode}: "
-                                            f"{_said(place, index)}")  # fmt: skip
+                        log = (folder / f"{index}.log").read_text("utf-8").strip()
+                        error = f"failed with {task.returncode}: {log.splitlines()[-1:]}"
+                        raise SettingsError(f"kills: the task {index}/{SHARDS} {error}")
                     del tasks[index]
-                elif time.monotonic() > end and where.total() < most:
-                    stage = _stage(place)
+                elif time.monotonic() > end and kills.total() < max_kills:
+                    kills[_stage(folder)] += 1
                     task.kill()
                     task.wait()
-                    where[stage] += 1
                     del tasks[index]
-    _check_rows(rows, place)
-    return where
+    _check_rows(states, folder)
+    return kills
 
 
 def _delay(rng: random.Random, seconds: float) -> float:
-    """When a task is killed, from its start: about when it has found what is done; one of four is left alone."""
+    """Seconds from start to kill: about when the task has read the stores. One of four tasks is not killed."""
     return math.inf if rng.random() < 0.25 else rng.uniform(0.6, 1.8) * seconds
 
 
-def _task(place: Path, street: Path, index: int) -> subprocess.Popen[bytes]:
+def _start_task(folder: Path, street: Path, index: int) -> subprocess.Popen[bytes]:
     settings = [
         "dataset=folder", f"dataset.database={street}/database", f"dataset.queries={street}/queries",
         "dataset.ground_truth=index", f"dataset.index_file={street}/ground_truth.csv", "dataset.widen_index=true",
         "features.max_keypoints=200", f"features.image_size=[{IMAGE_SIZE[0]},{IMAGE_SIZE[1]}]", "retrieval.num_words=8",
-        "candidates=20", "figures=2", f"store={place}/store", f"out={place}/out", f"shard={index}/{SHARDS}",
+        "candidates=20", "figures=2", f"store={folder}/store", f"out={folder}/out", f"shard={index}/{SHARDS}",
     ]  # fmt: skip
-    command = [sys.executable, "-m", "experiments.evaluate", *settings]
-    place.mkdir(exist_ok=True)
-    with (place / f"{index}.log").open("w", encoding="utf-8") as log:
+    folder.mkdir(exist_ok=True)
+    with (folder / f"{index}.log").open("w", encoding="utf-8") as log:
+        command = [sys.executable, "-m", "experiments.evaluate", *settings]
         return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=log)
 
 
-def _said(place: Path, index: int) -> str:
-    """The last line of a task."""
-    return ([*(place / f"{index}.log").read_text("utf-8").splitlines()] or ["nothing"])[-1]
-
-
-def _missing(place: Path) -> list[int]:
-    if not (place / "out" / sharding.SHARDS / "run.json").exists():
+def _missing_tasks(folder: Path) -> list[int]:
+    if not (folder / "out" / sharding.SHARDS / "run.json").exists():
         return list(range(SHARDS))
-    return sharding.missing(place / "out")
+    return sharding.missing(folder / "out")
 
 
-def _rows(place: Path) -> dict[str, Path]:
-    return {str(path.relative_to(place)): path for path in (place / "store").glob("*/shards/*/[0-9]*-*.npz")}
+def _row_files(folder: Path) -> dict[str, Path]:
+    return {str(path.relative_to(folder)): path for path in (folder / "store").glob("*/shards/*/[0-9]*-*.npz")}
 
 
-def _check_rows(rows: Rows, place: Path) -> None:
-    """That the files of rows are those that were there before."""
-    for name, path in _rows(place).items():
+def _check_rows(states: FileStates, folder: Path) -> None:
+    """Add new files to `states`, and raise if a file was replaced."""
+    for name, path in _row_files(folder).items():
         state = path.stat()
-        if rows.setdefault(name, (state.st_ino, state.st_mtime_ns)) != (state.st_ino, state.st_mtime_ns):
+        if states.setdefault(name, (state.st_ino, state.st_mtime_ns)) != (state.st_ino, state.st_mtime_ns):
             raise SettingsError(f"kills: {name} was written twice")
 
 
-def _stage(place: Path) -> str:
-    """What is under way, as the stores tell."""
-    kinds = {path.relative_to(place / "store").parts[0].partition("-")[0] for path in _rows(place).values()}
-    queries = {path.name.partition("-")[0] for path in (place / "store").glob("scores-*/shards/*/[0-9]*-*.npz")}
+def _stage(folder: Path) -> str:
+    """Stage under way, judged by the files in the stores."""
+    kinds = {path.relative_to(folder / "store").parts[0].partition("-")[0] for path in _row_files(folder).values()}
+    queries = {path.name.partition("-")[0] for path in (folder / "store").glob("scores-*/shards/*/[0-9]*-*.npz")}
     if len(queries) == FRAMES:
         return "results and report"
     return "matching and scoring" if "matches" in kinds else "extraction" if kinds else "before the first row"
 
 
-def content(place: Path) -> dict[str, str]:
-    """SHA-256 of all rows of all stores, and of all tables, by name."""
-    tables = {path.name: path for path in (place / "out").glob("*.csv")}
-    files: Mapping[str, Path] = _rows(place) | tables
+def file_hashes(folder: Path) -> dict[str, str]:
+    """SHA-256 of all rows of all stores and of all tables, by name."""
+    files = _row_files(folder) | {path.name: path for path in (folder / "out").glob("*.csv")}
     return {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in files.items()}
-
-
-def report(where: Mapping[str, int], runs: int, out: Path) -> None:
-    """Print the table, and write everything as JSON."""
-    lines: Sequence[Sequence[str]] = [[stage, str(number)] for stage, number in where.items()]
-    print(Table(["killed during", "times"], [*lines, ["in all", str(sum(where.values()))]]).text())
-    print(f"{runs} evaluations in {SHARDS} shards: rows and tables as undisturbed, byte by byte; no row written twice")
-    found = {"machine": platform.machine(), "versions": versions(), "evaluations": runs, "kills": dict(where)}
-    write_text(out, json.dumps(found, indent=1) + "\n")
-    print(f"results: {out}")

@@ -1,68 +1,47 @@
-"""What a database of another size would take on several machines, from what one machine takes for one thing."""
+"""Forecast of the cost of a database of another size on several machines, from rates measured on one machine."""
 
 from dataclasses import dataclass
 
 ASSUMED = (
-    "each of the machines is as fast as the one that was measured, its disk too",
-    "global descriptors of the whole database are made once, before anybody asks; they stay in memory, in float32",
-    "the filter compares every query with every image, as fast whatever their numbers; the database's rows are divided "
-    "evenly over the machines",
-    "one machine sorts the candidates that all machines find, each of which takes as long",
-    "local features are made of shortlisted images alone, no two queries share one: an upper bound, divided evenly",
-    "local features of a query and its global descriptor are made when it is asked; queries are divided evenly",
-    "re-ranking takes a query as long as here, where hardly any candidate is shared, whatever the size of the database",
-    "network, waiting for the slowest machine, failures: nothing",
+    "all machines and their disks are as fast as the measured ones",
+    "global descriptors of the whole database are extracted once, before the queries; they stay in memory, in float32",
+    "the filter compares every query with every image in time proportional to their numbers; the database's rows are "
+    "divided evenly over the machines",
+    "one machine sorts the candidates of all machines in time proportional to their number",
+    "local features are extracted for shortlisted images alone, divided evenly; no two queries share an image, which "
+    "is an upper bound",
+    "local features and global descriptor of a query are extracted when it arrives; queries are divided evenly",
+    "re-ranking a query takes as long as here, where hardly any candidate is shared, whatever the size of the database",
+    "network, waiting for the slowest machine and failures cost nothing",
 )
 
 
 @dataclass(frozen=True)
 class Rates:
-    """What one machine takes.
+    """Seconds and bytes on one machine."""
 
-    Attributes:
-        describing: seconds for an image's global descriptor.
-        comparing: for one query and one image of the database.
-        merging: for one candidate of one machine.
-        extracting: for an image's local features.
-        storing: for writing these to disk.
-        reranking: for a query with all its candidates.
-        vector_bytes: of a global descriptor in memory.
-        row_bytes: of an image's local features on disk.
-    """
-
-    describing: float
-    comparing: float
-    merging: float
-    extracting: float
-    storing: float
-    reranking: float
-    vector_bytes: float
-    row_bytes: float
+    describing: float  # the global descriptor of an image
+    comparing: float  # a query with a database image
+    merging: float  # a candidate of a machine
+    extracting: float  # the local features of an image
+    storing: float  # writing the local features of an image
+    reranking: float  # a query with all its candidates
+    vector_bytes: float  # a global descriptor in memory
+    row_bytes: float  # the local features of an image on disk
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What each of some machines takes; seconds of all queries together.
+    """Seconds of all queries together, and bytes, on each machine."""
 
-    Attributes:
-        describing: seconds for the database's global descriptors, once.
-        asking: for the queries' descriptors and features.
-        filtering: for the shortlists, of which `merging` for making one of all machines'.
-        merging: see there.
-        extracting: for the features of the shortlisted images, made and written.
-        reranking: for the rest.
-        memory: bytes of global descriptors.
-        disk: bytes of features.
-    """
-
-    describing: float
-    asking: float
-    filtering: float
-    merging: float
-    extracting: float
+    describing: float  # global descriptors of the database, once
+    asking: float  # global descriptors and local features of the queries
+    filtering: float  # shortlists, including `merging`
+    merging: float  # one shortlist from those of all machines
+    extracting: float  # local features of the shortlisted images, extracted and written
     reranking: float
-    memory: float
-    disk: float
+    memory: float  # bytes of global descriptors
+    disk: float  # bytes of local features
 
     @property
     def answering(self) -> float:
@@ -70,8 +49,8 @@ class Plan:
         return self.asking + self.filtering + self.extracting + self.reranking
 
 
-def projected(rates: Rates, images: int, queries: int, candidates: int, machines: int) -> Plan:
-    """What it takes to find queries among the images of a database, under what is `ASSUMED`."""
+def forecast(rates: Rates, images: int, queries: int, candidates: int, machines: int) -> Plan:
+    """Cost of ranking queries among the images of a database, under the assumptions `ASSUMED`."""
     rows = min(images, queries * candidates)
     merging = rates.merging * queries * candidates * machines if machines > 1 else 0.0
     return Plan(

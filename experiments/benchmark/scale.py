@@ -1,22 +1,20 @@
-"""Databases of thousands of images: seconds per query and peak memory, each size in a process of its own."""
+"""Time per query and peak memory among thousands of images on disk, each database in a process of its own."""
 
-import json
 import multiprocessing
-import platform
 import re
 import resource
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from contextlib import ExitStack
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from experiments.benchmark.harness import write_report
 from experiments.benchmark.synthetic_features import MadeUp
 from experiments.console import bar
 from mfvpr import HistogramOfShifts
@@ -26,9 +24,6 @@ from mfvpr.report import Table
 from mfvpr.reranking.ranking import rank_shortlist
 from mfvpr.retrieval.search import EXACT
 from mfvpr.types import Features, Shortlist
-from mfvpr.utils.files import write_text
-from mfvpr.utils.numerics import available_cpus
-from mfvpr.utils.versions import versions
 
 QUERIES, KEYPOINTS = 100, 700
 SETS = tuple(
@@ -36,41 +31,14 @@ SETS = tuple(
     for images, dimension in ((1000, 128), (2000, 128), (4000, 128), (10_000, 128), (4000, 512))
 )
 CANDIDATES = 50
-MEMORY = 3.0  # GB asked for
-IN_MEMORY = 2000  # images, up to which all is ranked again with all features in memory
+MEMORY = 3.0  # GB that the evaluation may take
+IN_MEMORY = 2000  # images with 128 dimensions that fit into memory, where all features are ranked again for comparison
 ROUNDS = 3
 STEPS = ("filter", "matching", "scoring", "ranking")
 
 
-@dataclass(frozen=True)
-class Result:
-    """What a process measured; seconds are per query.
-
-    Attributes:
-        total: of each round.
-        steps: medians over the rounds, by step; rows are read while others are matched.
-        cpu: of all threads together.
-        reading: of the thread that reads.
-        rows: read per query.
-        peak: GB of resident memory, at most.
-        first: seconds from the start of the process to the first query's ranking.
-        recall: share of queries of which an image of the same place ranks first.
-        same: whether scores and rankings are those with all features in memory, bit for bit; None = not tried.
-    """
-
-    total: list[float]
-    steps: dict[str, float]
-    cpu: float
-    reading: float
-    rows: float
-    peak: float
-    first: float
-    recall: float
-    same: bool | None
-
-
 class Answer(NamedTuple):
-    """Rows of the database `[Q, C]`, best first; the candidates' scores `[Q, C]` in their order; seconds by step."""
+    """Ranking of all queries: database rows and their shortlist's scores `[Q, C]`, and seconds by step."""
 
     rows: np.ndarray
     scores: np.ndarray
@@ -78,7 +46,7 @@ class Answer(NamedTuple):
 
 
 class Counted:
-    """A source that counts the rows that are read of it, and the seconds that this takes."""
+    """A source that counts the rows that are read from it and the seconds that reading takes."""
 
     def __init__(self, source: FeatureSource) -> None:
         self._source, self.counts = source, source.counts
@@ -87,54 +55,49 @@ class Counted:
     def read(self, rows: Iterable[int] | None = None) -> Iterator[tuple[int, Features]]:
         """See `FeatureSource`."""
         start = time.perf_counter()
-        for item in self._source.read(rows):
+        for row_and_features in self._source.read(rows):
             self.rows, self.seconds = self.rows + 1, self.seconds + time.perf_counter() - start
-            yield item
+            yield row_and_features
             start = time.perf_counter()
 
 
 def run(rounds: int | None, out: Path, stores: Path | None = None) -> None:
-    """Print a table and write it as JSON to `out`; stores that are made are kept in `stores`, or else deleted."""
-    with _folder(stores) as root, ExitStack() as processes:
+    """Measure all databases in turns; their features are kept in `stores`, or deleted if it is None."""
+    with ExitStack() as stack:
+        root = stores or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="mfvpr-scale-")))
         for data in SETS:
             data.stores(root)
         pools = []
         for data in bar("first queries", len(SETS), SETS):
-            pools.append(processes.enter_context(ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))))
-            pools[-1].submit(_begin, data, root, time.monotonic()).result()
-        turns = [pool for _ in range(rounds or ROUNDS) for pool in pools]  # so a noisy machine disturbs all alike
+            pools.append(stack.enter_context(ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))))
+            pools[-1].submit(_start, data, root, time.monotonic()).result()
+        turns = [pool for _ in range(rounds or ROUNDS) for pool in pools]
         for pool in bar("rounds", len(turns), turns):
             pool.submit(_take_turn).result()
-        results = [pool.submit(_end).result() for pool in pools]
-    report(SETS, results, out)
+        results = {data.title: pool.submit(_measurements).result() for data, pool in zip(SETS, pools, strict=True)}
+    setting = {"queries": SETS[0].queries, "candidates": CANDIDATES, "keypoints": SETS[0].keypoints, "memory": MEMORY}
+    title = f"{setting['queries']} queries with {CANDIDATES} candidates, {MEMORY:g} GB of memory"
+    parts = [_table(results), *_remarks(results)]
+    write_report(out, title, parts, setting | {"results": [*results.values()]})
 
 
-@contextmanager
-def _folder(stores: Path | None) -> Iterator[Path]:
-    if stores is not None:
-        yield stores
-    else:
-        with tempfile.TemporaryDirectory(prefix="mfvpr-scale-") as root:
-            yield Path(root)
+_sessions: list["Session"] = []  # the only one of a process that `run` started
 
 
-_session: list["Session"] = []  # of a process that `run` started
-
-
-def _begin(data: MadeUp, root: Path, start: float) -> None:
-    _session.append(Session(data, root, start))
+def _start(data: MadeUp, root: Path, start: float) -> None:
+    _sessions.append(Session(data, root, start))
 
 
 def _take_turn() -> None:
-    _session[0].take_turn()
+    _sessions[0].take_turn()
 
 
-def _end() -> Result:
-    return _session[0].result()
+def _measurements() -> dict[str, Any]:
+    return _sessions[0].measurements()
 
 
 class Session:
-    """One size, in the process that calls, which was begun at `start` by `time.monotonic`."""
+    """One database in the process that calls, which started at `start` (`time.monotonic`)."""
 
     def __init__(self, data: MadeUp, root: Path, start: float) -> None:
         """Rank a first query."""
@@ -142,7 +105,7 @@ class Session:
         query_store, self.store = data.stores(root)
         self.source, self.queries = Counted(self.store), FeatureSet(query_store, {})
         self.database = FeatureSet(self.source, {})
-        ranked(FeatureSet.of([self.queries[0]]), self.database, (self.vectors[0][:1], self.vectors[1]))
+        rank_queries(FeatureSet.of([self.queries[0]]), self.database, (self.vectors[0][:1], self.vectors[1]))
         self.first = time.monotonic() - start
         self.source.rows, self.source.seconds = 0, 0.0
         self.answers: list[Answer] = []
@@ -151,61 +114,63 @@ class Session:
     def take_turn(self) -> None:
         """Rank all queries."""
         cpu = time.process_time()
-        self.answers.append(ranked(self.queries, self.database, self.vectors))
+        self.answers.append(rank_queries(self.queries, self.database, self.vectors))
         self.cpu += time.process_time() - cpu
 
-    def result(self) -> Result:
-        """Of all turns; only now is anything held in memory as a whole."""
-        peak = peak_bytes() / 1e9
-        data, answers, per_query = self.data, self.answers, len(self.answers) * self.data.queries
-        hits = [best in rows for best, rows in zip(answers[0].rows[:, 0], data.similar(), strict=True)]
-        return Result(
-            total=[sum(answer.seconds.values()) / data.queries for answer in answers],
-            steps={
-                name: float(np.median([answer.seconds[name] for answer in answers])) / data.queries for name in STEPS
-            },
-            cpu=self.cpu / per_query,
-            reading=self.source.seconds / per_query,
-            rows=self.source.rows / per_query,
-            peak=peak,
-            first=self.first,
-            recall=float(np.mean(hits)),
-            same=self._is_as_in_memory() if data.images * data.dimension <= IN_MEMORY * 128 else None,
-        )
+    def measurements(self) -> dict[str, Any]:
+        """The data set's numbers, and what all turns took; only now are all features of a database in memory.
 
-    def _is_as_in_memory(self) -> bool:
-        whole = FeatureSet(InMemory(dict(self.store.read()), self.data.images), {})
-        expected, answer = ranked(self.queries, whole, self.vectors, memory=None), self.answers[0]
-        return np.array_equal(answer.rows, expected.rows) and np.array_equal(answer.scores, expected.scores)
+        Seconds are per query: `total` of each round, medians of the `steps`, `cpu` of all threads, `reading` of the
+        thread that reads `rows` while others are matched. `peak` is in GB. `first` is seconds from the start of the
+        process to the first ranking. `same` says whether the ranking equals the one with all features in memory, bit
+        for bit; None = not compared.
+        """
+        peak = peak_bytes() / 1e9
+        data, first, count = self.data, self.answers[0], len(self.answers) * self.data.queries
+        correct = [best in rows for best, rows in zip(first.rows[:, 0], data.similar(), strict=True)]
+        medians = median_seconds(self.answers)
+        return vars(data) | {
+            "total": [sum(answer.seconds.values()) / data.queries for answer in self.answers],
+            "steps": {name: medians[name] / data.queries for name in STEPS},
+            "cpu": self.cpu / count,
+            "reading": self.source.seconds / count,
+            "rows": self.source.rows / count,
+            "peak": peak,
+            "first": self.first,
+            "recall": float(np.mean(correct)),
+            "same": self._equals_ranking_in_memory() if data.images * data.dimension <= IN_MEMORY * 128 else None,
+        }
+
+    def _equals_ranking_in_memory(self) -> bool:
+        database = FeatureSet(InMemory(dict(self.store.read()), self.data.images), {})
+        expected = rank_queries(self.queries, database, self.vectors, memory=None)
+        return all(np.array_equal(*arrays) for arrays in zip(self.answers[0][:2], expected[:2], strict=True))
 
 
 def peak_bytes() -> int:
-    """Resident memory at its most, of this process; where the system keeps no such count, not below its parent's."""
+    """Peak resident memory of this process; at least its parent's where the system does not tell them apart."""
     status = Path("/proc/self/status")
-    own = re.findall(r"VmHWM: *(\d+)", status.read_text()) if status.exists() else []
+    kilobytes = re.findall(r"VmHWM: *(\d+)", status.read_text()) if status.exists() else []
     unit = 1 if sys.platform == "darwin" else 1024
-    return 1024 * int(own[0]) if own else unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return 1024 * int(kilobytes[0]) if kilobytes else unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
-def ranked(
-    queries: FeatureSet,
-    database: FeatureSet,
-    vectors: tuple[np.ndarray, np.ndarray],
-    *,
-    memory: float | None = MEMORY,
-) -> Answer:
-    """All steps for all queries; `vectors` are the global descriptors of both sides."""
+def rank_queries(
+    queries: FeatureSet, database: FeatureSet, vectors: tuple[np.ndarray, np.ndarray],
+    *, memory: float | None = MEMORY,
+) -> Answer:  # fmt: skip
+    """Retrieve by the global descriptors `vectors` of both sides, and re-rank."""
     start = time.perf_counter()
     candidates = EXACT.shortlist(*vectors, CANDIDATES)
     filtering = {"filter": time.perf_counter() - start}
-    answer = reranked(queries, database, candidates, memory=memory)
+    answer = rerank(queries, database, candidates, memory=memory)
     return answer._replace(seconds=filtering | answer.seconds)
 
 
-def reranked(
+def rerank(
     queries: FeatureSet, database: FeatureSet, candidates: Shortlist, *, memory: float | None = MEMORY
 ) -> Answer:
-    """All steps after the filter."""
+    """Match, score and rank the candidates."""
     times = [time.perf_counter()]
     matches = stages.match(queries, database, candidates, memory=memory)
     times.append(time.perf_counter())
@@ -217,47 +182,34 @@ def reranked(
     return Answer(rows, scores, dict(zip(STEPS[1:], np.diff(times).tolist(), strict=True)))
 
 
-def report(sets: Sequence[MadeUp], results: Sequence[Result], out: Path) -> None:
-    """One table, and what it must show."""
+def median_seconds(answers: list[Answer]) -> dict[str, float]:
+    """Medians over the rounds, by step."""
+    return {name: float(np.median([answer.seconds[name] for answer in answers])) for name in answers[0].seconds}
+
+
+def _table(results: dict[str, dict[str, Any]]) -> Table:
     header = ["database", "ms / query", *STEPS, "(reading)", "rows read", "CPU ms", "peak GB", "first answer s", "R@1"]
-    lines = [
-        [data.title]
-        + [
-            f"{1e3 * value:.1f}"
-            for value in (np.median(result.total), *(result.steps[name] for name in STEPS), result.reading)
-        ]
-        + [
-            f"{result.rows:.1f}",
-            f"{1e3 * result.cpu:.1f}",
-            f"{result.peak:.2f}",
-            f"{result.first:.1f}",
-            f"{100 * result.recall:.0f}",
-        ]
-        for data, result in zip(sets, results, strict=True)
-    ]
-    table, remarks = Table(header, lines), list(_remarks(sets, results))
-    machine = {"cores": available_cpus(), "processor": platform.machine()}
-    setting = {"queries": sets[0].queries, "candidates": CANDIDATES, "keypoints": sets[0].keypoints, "memory": MEMORY}
-    rows = [vars(data) | vars(result) for data, result in zip(sets, results, strict=True)]
-    content = setting | {"machine": machine, "versions": versions(), "remarks": remarks, "results": rows}
-    write_text(out, json.dumps(content, indent=1) + "\n")
-    title = f"{setting['queries']} queries with {CANDIDATES} candidates, {MEMORY:g} GB asked for; {machine}"
-    print(f"\n{title}\n", table.text(), *remarks, f"results: {out}", sep="\n")
+    lines = []
+    for title, result in results.items():
+        seconds = [np.median(result["total"]), *result["steps"].values(), result["reading"]]
+        lines.append([
+            title, *(f"{1e3 * value:.1f}" for value in seconds), f"{result['rows']:.1f}", f"{1e3 * result['cpu']:.1f}",
+            f"{result['peak']:.2f}", f"{result['first']:.1f}", f"{100 * result['recall']:.0f}",
+        ])  # fmt: skip
+    return Table(header, lines)
 
 
-def _remarks(sets: Sequence[MadeUp], results: Sequence[Result]) -> Iterator[str]:
-    alike = [result for data, result in zip(sets, results, strict=True) if data.dimension == sets[0].dimension]
+def _remarks(results: dict[str, dict[str, Any]]) -> Iterator[str]:
+    alike = [result for result in results.values() if result["dimension"] == SETS[0].dimension]
     first, last = alike[0], alike[-1]
-    yield "seconds per query, largest / smallest: " + ", ".join(
-        f"{name} {of(last) / of(first):.2f}"
-        for name, of in (
-            ("median", lambda result: np.median(result.total)),
-            ("fastest round", lambda result: min(result.total)),
-            ("CPU", lambda result: result.cpu),
-        )
-    )
-    yield f"peak memory: {max(result.peak for result in results):.2f} GB at most"
-    tried = {data.title: result.same for data, result in zip(sets, results, strict=True) if result.same is not None}
-    yield "scores and rankings as with all features in memory, bit for bit: " + ", ".join(
-        f"{title}: {'yes' if same else 'NO'}" for title, same in tried.items()
-    )
+    ratios = {
+        "median": np.median(last["total"]) / np.median(first["total"]),
+        "fastest round": min(last["total"]) / min(first["total"]),
+        "CPU": last["cpu"] / first["cpu"],
+    }
+    text = ", ".join(f"{name} {ratio:.2f}" for name, ratio in ratios.items())
+    yield f"seconds per query, largest / smallest: {text}"
+    yield f"peak memory: {max(result['peak'] for result in results.values()):.2f} GB at most"
+    same = {title: result["same"] for title, result in results.items() if result["same"] is not None}
+    text = ", ".join(f"{title}: {'yes' if equal else 'NO'}" for title, equal in same.items())
+    yield f"scores and rankings as with all features in memory, bit for bit: {text}"

@@ -1,7 +1,8 @@
-"""Data sets of any size, made up: features in stores, a few images that show what a query shows, and descriptors."""
+"""Synthetic data sets of any size: local features in stores, global descriptors, and known correct images."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -13,45 +14,35 @@ from mfvpr.types import Features
 from mfvpr.utils.threads import ordered_map
 
 SIZE = 336  # px
-COMMON = 2 / 7  # of the keypoints they share with it
-SHIFT, JITTER = 60.0, 3.0  # px, of all of them at most, and of each
-NOISE = 0.5  # length of what is added to a descriptor
+COMMON = 2 / 7  # share of its keypoints that an image has in common with the query of the same place
+SHIFT, JITTER = 60.0, 3.0  # px: largest shift of the common keypoints together, deviation of each
+NOISE = 0.5  # length of the noise of a common descriptor
 GLOBAL = 512  # dimensions of a global descriptor
 BATCH = 50  # images that are stored at a time
 
 
 @dataclass(frozen=True)
 class MadeUp:
-    """A data set; the same numbers give the same one.
+    """A synthetic data set; equal fields give equal data."""
 
-    Attributes:
-        images: M of the database.
-        queries: Q.
-        keypoints: N of each image.
-        dimension: of its descriptors.
-        views: images of the database that show the place of a query.
-        likeness: cosine similarity of the global descriptors of images of one place; others': 0 +- 0.04.
-    """
-
-    images: int
-    queries: int
-    keypoints: int
-    dimension: int
-    views: int = 3
-    likeness: float = 0.25
+    images: int  # M, of the database
+    queries: int  # Q
+    keypoints: int  # N, of each image
+    dimension: int  # of local descriptors
+    views: int = 3  # database images that show the place of a query
+    likeness: float = 0.25  # cosine similarity of global descriptors of one place; of different places 0 +- 0.04
 
     @property
     def title(self) -> str:
-        """For people."""
         return f"{self.images} images, D = {self.dimension}"
 
     def similar(self) -> np.ndarray:
-        """`[Q, views]` rows of the database that show what a query shows, each of one query."""
+        """Rows `[Q, views]` of the database images that show the place of each query."""
         rows = np.random.default_rng([self.images, self.queries]).permutation(self.images)
         return rows[: self.queries * self.views].reshape(self.queries, self.views)
 
-    def shown(self) -> dict[int, int]:
-        """The query whose place an image of the database shows, by row; the others show none."""
+    def query_by_row(self) -> dict[int, int]:
+        """Row of a database image -> the query of the same place, if there is one."""
         return {row: query for query, rows in enumerate(self.similar().tolist()) for row in rows}
 
     def query(self, row: int) -> Features:
@@ -60,7 +51,7 @@ class MadeUp:
         return _features(rng, rng.uniform(0, SIZE, (self.keypoints, 2)), self._descriptors(rng, self.keypoints))
 
     def image(self, row: int, shows: int | None) -> Features:
-        """Features `[N, ...]` of an image of the database, which shows the place of a query, or of none."""
+        """Features `[N, ...]` of a database image that shows the place of the query `shows`; None = of no query."""
         rng = np.random.default_rng([1, row])
         points, descriptors = rng.uniform(0, SIZE, (self.keypoints, 2)), self._descriptors(rng, self.keypoints)
         if shows is not None:
@@ -72,7 +63,7 @@ class MadeUp:
         return _features(rng, points, descriptors)
 
     def global_descriptors(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of queries and database, `[Q, GLOBAL]` and `[M, GLOBAL]`, of unit length."""
+        """Unit vectors `[Q, GLOBAL]` of the queries and `[M, GLOBAL]` of the database."""
         rng = np.random.default_rng(2)
         queries, database = (_unit(_normal(rng, count, GLOBAL)) for count in (self.queries, self.images))
         rows = self.similar()
@@ -80,26 +71,23 @@ class MadeUp:
         return queries, database
 
     def stores(self, root: Path) -> tuple[FeatureStore, FeatureStore]:
-        """Those of queries and database below `root`, complete; what is missing there is made first."""
-        shown = self.shown()
+        """Complete stores of queries and database below `root`; missing features are made first."""
+        queries = self.query_by_row()
         return (
-            self._complete(root, "queries", self.queries, self.query),
-            self._complete(root, "database", self.images, lambda row: self.image(row, shown.get(row))),
+            self._complete_store(root, "queries", self.queries, self.query),
+            self._complete_store(root, "database", self.images, lambda row: self.image(row, queries.get(row))),
         )
 
-    def _complete(self, root: Path, side: str, total: int, make: Callable[[int], Features]) -> FeatureStore:
+    def _complete_store(self, root: Path, side: str, total: int, make: Callable[[int], Features]) -> FeatureStore:
         recipe = {"made_up": side} | asdict(self)
         store = open_store(store_path(root, side, recipe), recipe, num_images=total)
         with store:
-            todo = np.flatnonzero(~store.done)
-            require_space(store.folder, forecast_bytes(len(todo), self.keypoints, self.dimension))
-            made = zip(todo.tolist(), ordered_map(make, todo.tolist(), workers=2), strict=True)
-            batch: dict[int, Features] = {}
-            for row, features in bar(f"{side} of {self.title}", len(todo), made):
-                batch[row] = features
-                if len(batch) == BATCH or row == todo[-1]:
-                    store.write(batch)
-                    batch = {}
+            missing_rows = np.flatnonzero(~store.done)
+            require_space(store.folder, forecast_bytes(len(missing_rows), self.keypoints, self.dimension))
+            features = ordered_map(make, missing_rows.tolist(), workers=2)
+            batches = np.split(missing_rows, range(BATCH, len(missing_rows), BATCH))
+            for rows in bar(f"{side} of {self.title}", len(batches), batches):
+                store.write(dict(zip(rows.tolist(), islice(features, len(rows)), strict=True)))
         return store
 
     def _descriptors(self, rng: np.random.Generator, count: int) -> np.ndarray:

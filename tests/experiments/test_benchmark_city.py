@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.benchmark import city
-from experiments.benchmark.projection import Rates, projected
+from experiments.benchmark.projection import Rates, forecast
 from experiments.benchmark.synthetic_features import MadeUp
 from mfvpr.storage.features import open_store
 from mfvpr.storage.manifest import store_path
@@ -20,7 +20,7 @@ RATES = Rates(
 
 
 def test_one_machine_takes_what_its_parts_take():
-    plan = projected(RATES, images=1000, queries=10, candidates=5, machines=1)
+    plan = forecast(RATES, images=1000, queries=10, candidates=5, machines=1)
     assert plan.describing == 500
     assert plan.asking == 10 * 0.75
     assert (plan.filtering, plan.merging) == (pytest.approx(10), 0)
@@ -31,7 +31,7 @@ def test_one_machine_takes_what_its_parts_take():
 
 
 def test_machines_divide_all_but_the_merging():
-    one, four = (projected(RATES, images=1000, queries=10, candidates=5, machines=count) for count in (1, 4))
+    one, four = (forecast(RATES, images=1000, queries=10, candidates=5, machines=count) for count in (1, 4))
     assert four.merging == pytest.approx(1e-2 * 10 * 5 * 4)
     assert four.filtering == pytest.approx(one.filtering / 4 + four.merging)
     assert four.answering == pytest.approx(one.answering / 4 + four.merging)
@@ -40,7 +40,7 @@ def test_machines_divide_all_but_the_merging():
 
 
 def test_no_more_features_are_made_than_there_are_images():
-    plan = projected(RATES, images=30, queries=10, candidates=5, machines=1)
+    plan = forecast(RATES, images=30, queries=10, candidates=5, machines=1)
     assert plan.extracting == pytest.approx(30 * 0.375)
     assert plan.disk == 30 * 1000
 
@@ -48,7 +48,7 @@ def test_no_more_features_are_made_than_there_are_images():
 def test_features_are_made_of_the_images_that_are_asked_for(tmp_path):
     data = MadeUp(300, 4, 30, 16, views=1)
     rows = np.unique([*range(0, 120, 2), *data.similar()[:, 0]])
-    store, steps = city.extracted(data, tmp_path, rows)
+    store, steps = city.make_features(data, tmp_path, rows)
     np.testing.assert_array_equal(np.flatnonzero(store.done), rows)
     assert len(list(tmp_path.rglob("*.npz"))) == len(rows)
     assert min(steps["making"].seconds, steps["storing"].seconds) > 0
@@ -59,7 +59,7 @@ def test_features_are_made_of_the_images_that_are_asked_for(tmp_path):
         np.testing.assert_array_equal(features.keypoints, data.image(row, query).keypoints)
 
 
-def test_a_small_city_is_walked_through(tmp_path, monkeypatch, capsys):
+def test_a_small_city_is_measured(tmp_path, monkeypatch, capsys):
     data = MadeUp(400, 6, 60, 16, views=1, likeness=0.12)
     monkeypatch.setattr(city, "DATA", data)
     monkeypatch.setattr(city, "CANDIDATES", 8)
