@@ -47,9 +47,7 @@ def run(rounds: int | None, out: Path) -> None:
             hashes = file_hashes(folder)
             differing = sorted(name for name in {*hashes, *expected} if hashes.get(name) != expected.get(name))
             if differing:
-                raise SettingsError(
-                    f"kills: {len(differing)} files differ from an undisturbed run: {differing[0]} ..."
-                )
+                raise SettingsError(f"kills: {len(differing)} files differ from an undisturbed run: {differing[0]} ...")
             kills += new_kills
             evaluations += 1
             progress.update(new_kills.total())

@@ -1,13 +1,14 @@
-"""The networks: mfvpr's, and the same in torch, with the same weights and images."""
+"""Networks of mfvpr and the same networks in torch, with the same weights and images."""
 
 import math
 import tempfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -35,32 +36,48 @@ BATCHES = (1, 8)
 D2NET_SIZE, MIXVPR_SIZE, ALIKED_SIZE = 336, 320, 320  # px
 D2NET, MIXVPR, ALIKED = "d2_tf", "mixvpr_4096", ("aliked-n16", "aliked-n32")
 MAP, ON_DEVICE, FEATURES = "D2-Net dense map", "D2-Net features, left on the device", "D2-Net features"
-PLACES_SIZE, SELAVPR_SIZE = (640, 480), (224, 224)  # px: Patch-NetVLAD's, which NetVLAD and CosPlace share here
+PLACES_SIZE, SELAVPR_SIZE = (640, 480), (224, 224)  # px; NetVLAD and CosPlace take Patch-NetVLAD's size here
 PATCHES = {"patchnetvlad_mapillary_512": (5,), "patchnetvlad_mapillary_4096": (2, 5, 8)}  # speed, performance
 GEM, SELAVPR, BLOCKS = "cosplace_resnet50_2048", "selavpr_msls", 24
-THRESHOLD = 0.1  # of the detection score: the paper's
+THRESHOLD = 0.1  # of ALIKED's detection score, the paper's
 PAPER = "paper, RTX 2080 Ti: features 0.03 s (D2-Net at 320), matching and score of 50 candidates 0.07 s"
 
 
+class Contest(NamedTuple):
+    """A step of one network, timed in mfvpr and in torch."""
+
+    step: str
+    checkpoint: str
+    size: tuple[int, int]  # (width, height) px
+    extractor: Callable[..., Callable]  # takes the model and `batch_size`; the result takes a batch of images
+    peer: str | None  # torch's function: module.function
+    options: dict[str, Any] | None = None  # keyword arguments of torch's function
+    note: str = ""
+
+
 def run(rounds: int | None, out: Path) -> None:
-    """Everyone, on images of the drawn street."""
+    """Time all networks on images of the synthetic street."""
     compete(lineup(), rounds, out)
 
 
 def lineup() -> Lineup:
-    """mfvpr's networks and torch's, where it is installed."""
+    """Networks of mfvpr, and of torch where it is installed."""
     images = make_images(D2NET_SIZE)
-    entries = [*of_d2net(images), *of_mixvpr(_resized(images, (MIXVPR_SIZE, MIXVPR_SIZE)))]
-    for name in ALIKED:
-        entries += of_aliked(name, _resized(images, (ALIKED_SIZE, ALIKED_SIZE)))
-    entries += of_places(images)
-    width, height = PLACES_SIZE
+    entries: list[Entry] = []
+    for contest in contests():
+        model, arrays = make_network(contest.checkpoint)
+        batch = np.stack([resize(image, contest.size) for image in images])
+        for count in BATCHES:
+            extractor = contest.extractor(model, batch_size=count)
+            entries.append((f"{contest.step}, batch {count}", "mfvpr", partial(extractor, batch[:count])))
+        if contest.peer and find_spec("torch"):
+            entries += torch_entries(contest, arrays, batch)
     sizes = (f"D2-Net at {D2NET_SIZE} px, MixVPR at {MIXVPR_SIZE} px, ALIKED at {ALIKED_SIZE} px, SelaVPR at "
-             f"{SELAVPR_SIZE[0]} px, others at {width} x {height} px")  # fmt: skip
+             f"{SELAVPR_SIZE[0]} px, others at {PLACES_SIZE[0]} x {PLACES_SIZE[1]} px")  # fmt: skip
     published = [name for name in (D2NET, MIXVPR, *ALIKED, *PATCHES, GEM, SELAVPR) if is_installed(entry_of(name))]
     weights = f"published weights of {', '.join(published)}, others random" if published else "random weights"
     return Lineup(
-        title=f"images of the drawn street, {sizes}, {weights}",
+        title=f"images of the synthetic street, {sizes}, {weights}",
         setting={"batches": BATCHES, "sizes": sizes, "weights": weights},
         entries=entries,
         rounds=5,
@@ -68,8 +85,40 @@ def lineup() -> Lineup:
     )
 
 
+def contests() -> Iterator[Contest]:
+    """All steps; features and descriptors are timed from host to host."""
+    size = (D2NET_SIZE, D2NET_SIZE)
+    yield Contest(MAP, D2NET, size, partial(_program, lambda model, batch: model(preprocess(batch, "caffe"))),
+                  "torch_networks.d2net_map")  # fmt: skip
+    yield Contest(ON_DEVICE, D2NET, size, partial(_program, partial(extract, share=0.3)), None)
+    yield Contest(FEATURES, D2NET, size, partial(D2NetFeatures, image_size=size), "torch_networks.d2net")
+    size = (MIXVPR_SIZE, MIXVPR_SIZE)
+    yield Contest("MixVPR descriptor", MIXVPR, size, MixVprDescriptor, "torch_networks.mixvpr")
+    size = (ALIKED_SIZE, ALIKED_SIZE)
+    for name in ALIKED:
+        extractor = partial(AlikedFeatures, image_size=size, threshold=THRESHOLD)
+        yield Contest(f"{name} features", name, size, extractor, "torch_aliked.aliked", {"threshold": THRESHOLD},
+                      note=" (deformable convolution in Python)")  # fmt: skip
+    vector = partial(GlobalDescriptor, image_size=PLACES_SIZE)
+    yield Contest("NetVLAD descriptor", next(iter(PATCHES)), PLACES_SIZE, vector, "torch_places.netvlad")
+    for name, sizes in PATCHES.items():
+        step = f"Patch-NetVLAD features, sizes {', '.join(map(str, sizes))}, {name.rpartition('_')[2]} dimensions"
+        extractor = partial(PatchNetVladFeatures, patch_sizes=sizes, image_size=PLACES_SIZE)
+        yield Contest(step, name, PLACES_SIZE, extractor, "torch_places.patch_netvlad", {"sizes": sizes})
+    yield Contest("generalized mean of ResNet-50", GEM, PLACES_SIZE, vector, "torch_places.gem")
+    extractor = partial(SelaVprFeatures, image_size=SELAVPR_SIZE)
+    yield Contest("SelaVPR features", SELAVPR, SELAVPR_SIZE, extractor, "torch_places.selavpr", {"blocks": BLOCKS})
+
+
+def _program(function: Callable[[Any, Any], Any], model: Any, batch_size: int) -> Callable[[np.ndarray], Any]:
+    """Run a compiled function whose results stay on the device; images one by one on a CPU, as the extractors do."""
+    program, step = compiled(model, function), 1 if jax.default_backend() == "cpu" else batch_size
+    return lambda batch: jax.block_until_ready(
+        [program(batch[start : start + step]) for start in range(0, len(batch), step)]
+    )
+
+
 def _remarks(seconds: Seconds, results: Results) -> Iterator[str]:
-    """The share of D2-Net's detection, and how many keypoints each side finds."""
     for count in BATCHES:
         pairs = zip(*(seconds[f"{step}, batch {count}", "mfvpr"] for step in (ON_DEVICE, MAP)), strict=True)
         share = np.median([full / dense - 1 for full, dense in pairs])
@@ -77,7 +126,7 @@ def _remarks(seconds: Seconds, results: Results) -> Iterator[str]:
     counts: dict[str, list[str]] = {}
     for (step, name), result in results.items():
         local: list[Any] = [
-            one.features if isinstance(one, Description) and one.vector is None else one for one in result
+            image.features if isinstance(image, Description) and image.vector is None else image for image in result
         ]
         if hasattr(local[0], "keypoints"):
             mean = np.mean([len(features.keypoints) for features in local])
@@ -87,19 +136,15 @@ def _remarks(seconds: Seconds, results: Results) -> Iterator[str]:
 
 
 def make_images(size: int) -> np.ndarray:
-    """`[max(BATCHES), size, size, 3]` uint8 RGB: a street by day, at night and in snow."""
+    """RGB images `[max(BATCHES), size, size, 3]` uint8 of the synthetic street by day, at night and in snow."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "street"
         draw_streets(folder, num_frames=math.ceil(max(BATCHES) / 2), image_size=(size, size))
         return np.stack([read_image(path) for path in sorted(folder.rglob("*.png"))[: max(BATCHES)]])
 
 
-def _resized(images: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    return np.stack([resize(image, size) for image in images])
-
-
 def make_network(name: str) -> tuple[Any, dict[str, np.ndarray]]:
-    """mfvpr's, and its arrays by path: the published ones where they are installed, otherwise random."""
+    """A network of mfvpr and its arrays by path: the published ones if they are installed, otherwise random."""
     entry = entry_of(name)
     plan = blueprint(entry)
     arrays = load(name) if is_installed(entry) else {path: _random(path, shape) for path, shape in plan.shapes.items()}
@@ -107,7 +152,7 @@ def make_network(name: str) -> tuple[Any, dict[str, np.ndarray]]:
 
 
 def _random(path: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Kernels keep the variance through a ReLU (He et al., 2015); depends on path and shape alone."""
+    """Kernels that keep the variance through a ReLU (He et al., 2015); equal path and shape give equal numbers."""
     normal = np.random.default_rng(zlib.crc32(path.encode())).standard_normal(shape, np.float32)
     if path.endswith(".var"):
         return 1 + 0.5 * np.tanh(normal)
@@ -118,116 +163,27 @@ def _random(path: str, shape: tuple[int, ...]) -> np.ndarray:
     return normal * np.float32(math.sqrt(2 / math.prod(shape[:-1])))
 
 
-def of_d2net(images: np.ndarray) -> list[Entry]:
-    """The dense map, and keypoints from host to host; of mfvpr also those that stay on the device."""
-    model, arrays = make_network(D2NET)
-    dense = compiled(model, lambda model, batch: model(preprocess(batch, "caffe")))
-    on_device = compiled(model, partial(extract, share=0.3))
-    extractor = partial(D2NetFeatures, model, image_size=images.shape[2:0:-1])
-    steps = {
-        MAP: lambda _: partial(_on_device, dense),
-        ON_DEVICE: lambda _: partial(_on_device, on_device),
-        FEATURES: lambda count: extractor(batch_size=count),
-    }
-    entries = of_mfvpr(steps, images)
-    if find_spec("torch"):
-        from experiments.benchmark.torch_networks import d2net, d2net_map
-
-        entries += of_torch({MAP: d2net_map, FEATURES: d2net}, D2NET, arrays, images)
-    return entries
-
-
-def of_mixvpr(images: np.ndarray) -> list[Entry]:
-    """Descriptors on the host."""
-    model, arrays = make_network(MIXVPR)
-    step = "MixVPR descriptor"
-    entries = of_mfvpr({step: lambda count: MixVprDescriptor(model, batch_size=count)}, images)
-    if find_spec("torch"):
-        from experiments.benchmark.torch_networks import mixvpr
-
-        entries += of_torch({step: mixvpr}, MIXVPR, arrays, images)
-    return entries
-
-
-def of_aliked(name: str, images: np.ndarray) -> list[Entry]:
-    """Keypoints from host to host."""
-    model, arrays = make_network(name)
-    step = f"{name} features"
-    extractor = partial(AlikedFeatures, model, image_size=images.shape[2:0:-1], threshold=THRESHOLD)
-    entries = of_mfvpr({step: lambda count: extractor(batch_size=count)}, images)
-    if find_spec("torch"):
-        from experiments.benchmark.torch_aliked import aliked
-
-        note = " (deformable convolution in Python)"
-        entries += of_torch({step: partial(aliked, threshold=THRESHOLD)}, name, arrays, images, note)
-    return entries
-
-
-def of_places(images: np.ndarray) -> list[Entry]:
-    """NetVLAD, its patches, a generalized mean, and SelaVPR, from host to host."""
-    large, small = _resized(images, PLACES_SIZE), _resized(images, SELAVPR_SIZE)
-    speed, performance = PATCHES
-    lineup = [
-        ("NetVLAD descriptor", speed, large, "netvlad", {}, GlobalDescriptor),
-        *((f"Patch-NetVLAD features, {_sizes(name)}", name, large, "patch_netvlad", {"sizes": PATCHES[name]},
-           partial(PatchNetVladFeatures, patch_sizes=PATCHES[name])) for name in (speed, performance)),
-        ("generalized mean of ResNet-50", GEM, large, "gem", {}, GlobalDescriptor),
-        ("SelaVPR features", SELAVPR, small, "selavpr", {"blocks": BLOCKS}, SelaVprFeatures),
-    ]  # fmt: skip
-    entries = []
-    for step, name, batch, peer, options, extractor in lineup:
-        model, arrays = make_network(name)
-        made = partial(extractor, model, image_size=batch.shape[2:0:-1])
-        entries += of_mfvpr({step: lambda count, made=made: made(batch_size=count)}, batch)
-        if find_spec("torch"):
-            from experiments.benchmark import torch_places
-
-            network = partial(getattr(torch_places, peer), **options)
-            entries += of_torch({step: network}, name, arrays, batch)
-    return entries
-
-
-def _sizes(name: str) -> str:
-    return f"sizes {', '.join(map(str, PATCHES[name]))}, {name.rpartition('_')[2]} dimensions"
-
-
-def of_mfvpr(steps: Mapping[str, Callable[[int], Callable]], images: np.ndarray) -> list[Entry]:
-    """Each step of every batch; a step is given the batch's size, and returns what takes such a batch."""
-    return [
-        (f"{step}, batch {count}", "mfvpr", partial(make(count), images[:count]))
-        for count in BATCHES
-        for step, make in steps.items()
-    ]
-
-
-def _on_device(program: Callable[[Any], Any], batch: np.ndarray) -> Any:
-    """One by one on a CPU, as the extractors do it."""
-    size = 1 if jax.default_backend() == "cpu" else len(batch)
-    return jax.block_until_ready([program(batch[start : start + size]) for start in range(0, len(batch), size)])
-
-
-def of_torch(
-    steps: Mapping[str, Callable], name: str, arrays: Mapping[str, np.ndarray], images: np.ndarray, note: str = ""
-) -> list[Entry]:
-    """In both memory layouts; on a CPU one by one as well, as mfvpr does it. As precise as mfvpr on a GPU."""
+def torch_entries(contest: Contest, arrays: Mapping[str, np.ndarray], images: np.ndarray) -> list[Entry]:
+    """Torch in both memory layouts, in float32 on a GPU; on a CPU also one image after the other, as in mfvpr."""
     import torch
 
     from experiments.benchmark.torch_networks import each, published
 
     torch.backends.cudnn.allow_tf32 = False
     torch.backends.cudnn.benchmark = True
-    device, table = "cuda" if torch.cuda.is_available() else "cpu", network_of(entry_of(name)).table
+    module, _, function = str(contest.peer).partition(".")
+    network = partial(getattr(import_module(f"experiments.benchmark.{module}"), function), **(contest.options or {}))
+    device, table = "cuda" if torch.cuda.is_available() else "cpu", network_of(entry_of(contest.checkpoint)).table
     default, channels_last = (
-        partial(each, weights=published(arrays, table, device, layout), device=device, layout=layout)
+        partial(each, network, weights=published(arrays, table, device, layout), device=device, layout=layout)
         for layout in (torch.contiguous_format, torch.channels_last)
     )
     entries: list[Entry] = []
-    for step, network in steps.items():
-        for count in BATCHES:
-            batch, where = images[:count], f"{step}, batch {count}"
-            entries.append((where, f"torch{note}", partial(default, network, [batch])))
-            entries.append((where, f"torch, channels last{note}", partial(channels_last, network, [batch])))
-            if count > 1 and device == "cpu":
-                one_by_one = partial(channels_last, network, np.split(batch, count))
-                entries.append((where, f"torch, channels last, one by one{note}", one_by_one))
+    for count in BATCHES:
+        batch, step = images[:count], f"{contest.step}, batch {count}"
+        entries.append((step, f"torch{contest.note}", partial(default, [batch])))
+        entries.append((step, f"torch, channels last{contest.note}", partial(channels_last, [batch])))
+        if count > 1 and device == "cpu":
+            split = partial(channels_last, np.split(batch, count))
+            entries.append((step, f"torch, channels last, one by one{contest.note}", split))
     return entries

@@ -1,6 +1,6 @@
-"""Matching and scoring: mfvpr, and its peers written as their users would write them.
+"""Matching and scoring in mfvpr, and in other libraries as their users would write it.
 
-Each `of_` returns its contestants, none where its library is not installed.
+Each `*_entries` function returns the calls to time, none where its library is not installed.
 """
 
 from collections.abc import Callable, Iterable
@@ -25,35 +25,32 @@ SIZE, BIN, SIGMA = 336, 15.0, 22.5  # px
 MATCHING, HISTOGRAM, ANCHOR, SUM = "matching", "histogram", "anchor", "sum"
 SHIFT = "refined shift of a pair"
 BOTH = "matching + histogram"
-SLOTS = 384  # of 700: `compact` to what these pairs need
+SLOTS = 384  # of 700; these pairs need no more
 CENTERS = np.arange(-SIZE + BIN / 2, SIZE, BIN, dtype=np.float32)
 BIN_X, BIN_Y = np.meshgrid(CENTERS, CENTERS)
 
 
 @dataclass(frozen=True)
 class Data:
-    """One query and its candidates, non-negative descriptors as D2-Net's; and the pairs' matches."""
+    """One query, its candidates, and their matches; descriptors are non-negative like those of D2-Net."""
 
     query: Features  # [N, ...]
     candidates: Features  # [C, N, ...]
     matches: Matches  # [C, SLOTS, ...]
 
-    def arrays(self, convert: Callable[[Any], Any] = np.asarray) -> tuple[Features, Features]:
-        """Query and candidates as another library's arrays."""
-        return jax.tree.map(convert, self.query), jax.tree.map(convert, self.candidates)
-
 
 def run(rounds: int | None, out: Path) -> None:
-    """Everyone, on one query and its candidates."""
+    """Time all libraries on one query and its candidates."""
     data = make_data()
     matches = float(np.asarray(data.matches.mask).sum(1).mean())
     sizes = f"1 query x {CANDIDATES} candidates, {KEYPOINTS} features of {DIMENSION} dimensions"
+    libraries = (mfvpr_entries, opencv_entries, faiss_entries, torch_entries, numpy_entries)
     lineup = Lineup(
         title=f"{sizes}, {matches:.0f} matches a pair",
         setting={
             "candidates": CANDIDATES, "keypoints": KEYPOINTS, "dimension": DIMENSION, "matches_per_pair": matches,
         },
-        entries=[entry for make in (of_mfvpr, of_opencv, of_faiss, of_torch, of_numpy) for entry in make(data)],
+        entries=[entry for entries in libraries for entry in entries(data)],
         rounds=15,
         remarks=_remarks,
     )  # fmt: skip
@@ -66,9 +63,8 @@ def _remarks(seconds: Seconds, _: Results) -> list[str]:
 
 
 def make_data(seed: int = 0) -> Data:
-    """COMMON keypoints of the query reappear in every candidate, shifted and noisy; the others are its own."""
+    """Candidates show COMMON keypoints of the query, shifted and with noise; their other keypoints are random."""
     rng = np.random.default_rng(seed)
-    own = KEYPOINTS - COMMON
 
     def descriptors(count: int) -> np.ndarray:
         return np.maximum(rng.normal(size=(count, DIMENSION)), 0)
@@ -87,52 +83,53 @@ def make_data(seed: int = 0) -> Data:
         moved = points[common] + rng.uniform(-30, 30, 2) + rng.normal(0, 5, (COMMON, 2))
         noisy = values[common] + 0.3 * rng.normal(size=(COMMON, DIMENSION))
         order = rng.permutation(KEYPOINTS)
-        all_points = np.concatenate([moved, rng.uniform(0, SIZE, (own, 2))])
-        candidates.append(features(all_points[order], np.concatenate([noisy, descriptors(own)])[order]))
+        all_points = np.concatenate([moved, rng.uniform(0, SIZE, (KEYPOINTS - COMMON, 2))])
+        all_values = np.concatenate([noisy, descriptors(KEYPOINTS - COMMON)])
+        candidates.append(features(all_points[order], all_values[order]))
     query = jax.device_put(features(points, values))
     batch = jax.device_put(jax.tree.map(lambda *leaves: np.stack(leaves), *candidates))
-    return Data(query, batch, jax.jit(_matched)(query, batch))
+    return Data(query, batch, jax.jit(_match)(query, batch))
 
 
-def _matched(query: Features, candidates: Features) -> Matches:
+def _match(query: Features, candidates: Features) -> Matches:
     return jax.vmap(partial(mfvpr.compact, capacity=SLOTS))(mfvpr.match_candidates(query, candidates))
 
 
-def of_mfvpr(data: Data) -> list[Entry]:
-    """This library as its users call it, and under a `jit` of theirs; the bare matrix product of its matching."""
+def mfvpr_entries(data: Data) -> list[Entry]:
+    """Calls of mfvpr as they are and below `jit`, and the matrix product of its matching alone."""
     histogram, images = mfvpr.HistogramOfShifts(max_bins=len(CENTERS)), (data.query, data.candidates)
     pair = jax.tree.map(lambda leaf: leaf[0], data.matches)
 
     def product(query: Features, candidates: Features) -> jax.Array:
         return jax.lax.map(lambda descriptors: query.descriptors @ descriptors.T, candidates.descriptors)
 
-    def product_summed(query: Features, candidates: Features) -> jax.Array:
+    def sum_of_product(query: Features, candidates: Features) -> jax.Array:
         return jax.lax.map(lambda descriptors: (query.descriptors @ descriptors.T).sum(0), candidates.descriptors)
 
     def both(query: Features, candidates: Features) -> jax.Array:
-        return mfvpr.score_candidates(histogram, _matched(query, candidates))
+        return mfvpr.score_candidates(histogram, _match(query, candidates))
 
-    def done(function: Callable, *inputs: Any, **options: Any) -> Callable[[], Any]:
+    def wait(function: Callable, *inputs: Any, **options: Any) -> Callable[[], Any]:
         return lambda: jax.block_until_ready(function(*inputs, **options))
 
     score = mfvpr.score_candidates
     return [
-        (MATCHING, "bare product (JAX)", done(jax.jit(product), *images)),
-        (MATCHING, "bare product (JAX), not stored", done(jax.jit(product_summed), *images)),
-        (MATCHING, "mfvpr", done(mfvpr.match_candidates, *images)),
-        (MATCHING, "mfvpr, under jit", done(jax.jit(mfvpr.match_candidates), *images)),
-        (MATCHING, "mfvpr, with ratio", done(mfvpr.match_candidates, *images, with_ratio=True)),
-        (BOTH, "mfvpr", done(jax.jit(both), *images)),
-        (HISTOGRAM, "mfvpr", done(score, mfvpr.HistogramOfShifts(), data.matches)),
-        (ANCHOR, "mfvpr", done(score, mfvpr.AnchorPoints(), data.matches)),
-        (SUM, "mfvpr", done(score, mfvpr.AggregatedScore(), data.matches)),
-        (SHIFT, "mfvpr", done(mfvpr.HistogramOfShifts().dominant_shift, pair, refine=True)),
+        (MATCHING, "bare product (JAX)", wait(jax.jit(product), *images)),
+        (MATCHING, "bare product (JAX), not stored", wait(jax.jit(sum_of_product), *images)),
+        (MATCHING, "mfvpr", wait(mfvpr.match_candidates, *images)),
+        (MATCHING, "mfvpr, under jit", wait(jax.jit(mfvpr.match_candidates), *images)),
+        (MATCHING, "mfvpr, with ratio", wait(mfvpr.match_candidates, *images, with_ratio=True)),
+        (BOTH, "mfvpr", wait(jax.jit(both), *images)),
+        (HISTOGRAM, "mfvpr", wait(score, mfvpr.HistogramOfShifts(), data.matches)),
+        (ANCHOR, "mfvpr", wait(score, mfvpr.AnchorPoints(), data.matches)),
+        (SUM, "mfvpr", wait(score, mfvpr.AggregatedScore(), data.matches)),
+        (SHIFT, "mfvpr", wait(mfvpr.HistogramOfShifts().dominant_shift, pair, refine=True)),
     ]
 
 
-def of_opencv(data: Data) -> list[Entry]:
-    """BFMatcher with cross-check, one pair at a time; the score in NumPy, one match at a time."""
-    query, candidates = data.arrays()
+def opencv_entries(data: Data) -> list[Entry]:
+    """BFMatcher with cross-check, pair by pair; the score in NumPy, match by match."""
+    query, candidates = jax.tree.map(np.asarray, (data.query, data.candidates))
     matcher = cv2.BFMatcher(cv2.NORM_L2, crossCheck=True)
 
     def match() -> list:
@@ -145,26 +142,26 @@ def of_opencv(data: Data) -> list[Entry]:
     return [(MATCHING, "OpenCV BFMatcher(crossCheck)", match), (BOTH, "OpenCV + NumPy loop", both)]
 
 
-def of_faiss(data: Data) -> list[Entry]:
-    """Exact search both ways, one pair at a time; the score in NumPy, all bins and matches of a pair at once."""
+def faiss_entries(data: Data) -> list[Entry]:
+    """Exact search both ways, pair by pair; the score in NumPy, all bins and matches of a pair at once."""
     if find_spec("faiss") is None:
         return []
     import faiss
 
-    query, candidates = data.arrays()
+    query, candidates = jax.tree.map(np.asarray, (data.query, data.candidates))
 
-    def index(descriptors: np.ndarray) -> Any:
-        built = faiss.IndexFlatIP(DIMENSION)
-        built.add(descriptors)  # pyright: ignore[reportCallIssue]
-        return built
+    def make_index(descriptors: np.ndarray) -> Any:
+        index = faiss.IndexFlatIP(DIMENSION)
+        index.add(descriptors)  # pyright: ignore[reportCallIssue]
+        return index
 
-    of_query = index(query.descriptors)
+    query_index = make_index(query.descriptors)
 
     def match() -> list[tuple[np.ndarray, np.ndarray]]:
         pairs = []
         for descriptors in candidates.descriptors:
-            nearest1 = index(descriptors).search(query.descriptors, 1)[1][:, 0]
-            nearest0 = of_query.search(descriptors, 1)[1][:, 0]
+            nearest1 = make_index(descriptors).search(query.descriptors, 1)[1][:, 0]
+            nearest0 = query_index.search(descriptors, 1)[1][:, 0]
             i = np.flatnonzero(nearest0[nearest1] == np.arange(KEYPOINTS))
             pairs.append((i, nearest1[i]))
         return pairs
@@ -175,15 +172,15 @@ def of_faiss(data: Data) -> list[Entry]:
     return [(MATCHING, "FAISS both ways", match), (BOTH, "FAISS + NumPy", both)]
 
 
-def of_torch(data: Data) -> list[Entry]:
-    """All candidates in one batch; the histogram separable, as here."""
+def torch_entries(data: Data) -> list[Entry]:
+    """All candidates in one batch; the histogram with separable Gaussians, like mfvpr's."""
     if find_spec("torch") is None:
         return []
     import torch
     from torch import Tensor
 
-    # Far bins get votes too small for normal floats, which makes torch four times as slow. XLA flushes them to zero,
-    # so torch may too: its threads inherit the flag from the one that starts them. NumPy has no such switch.
+    # Votes for far bins are denormal floats, which make torch four times as slow. XLA flushes them to zero, so torch
+    # does too: its threads inherit the flag from the thread that starts them. NumPy has no such switch.
     torch.set_flush_denormal(True)
     torch.ones(10**7).exp()
     torch.set_flush_denormal(False)
@@ -191,7 +188,7 @@ def of_torch(data: Data) -> list[Entry]:
     def tensor(array: Any) -> Tensor:
         return torch.from_numpy(np.array(array))
 
-    query, candidates = data.arrays(tensor)
+    query, candidates = jax.tree.map(tensor, (data.query, data.candidates))
     m, centers, rows = data.matches, tensor(CENTERS), torch.arange(KEYPOINTS)
     weights = torch.where(tensor(m.mask), tensor(m.scores0) + tensor(m.scores1), 0.0)
     shifts = tensor(jnp.nan_to_num(m.points1 - m.points0))
@@ -215,8 +212,8 @@ def of_torch(data: Data) -> list[Entry]:
     def both() -> Tensor:
         nearest1, mutual = match()
         moved = torch.gather(candidates.keypoints, 1, nearest1[..., None].expand(-1, -1, 2)) - query.keypoints
-        summed = query.scores + torch.gather(candidates.scores, 1, nearest1)
-        return histogram(moved, torch.where(mutual, summed, 0.0))
+        sums = query.scores + torch.gather(candidates.scores, 1, nearest1)
+        return histogram(moved, torch.where(mutual, sums, 0.0))
 
     return [
         (MATCHING, "torch, batched", match),
@@ -225,8 +222,8 @@ def of_torch(data: Data) -> list[Entry]:
     ]
 
 
-def of_numpy(data: Data) -> list[Entry]:
-    """Scores of one pair after the other, without padding."""
+def numpy_entries(data: Data) -> list[Entry]:
+    """Scores pair by pair, without padding."""
     m = jax.tree.map(np.asarray, data.matches)
     shifts, weights = m.points1 - m.points0, m.scores0 + m.scores1
     pairs = [(shifts[k][mask], weights[k][mask]) for k, mask in enumerate(m.mask)]
@@ -237,7 +234,7 @@ def of_numpy(data: Data) -> list[Entry]:
 
 
 def _scores(score: Callable, query: Features, candidates: Features, pairs: Iterable[Any]) -> list[float]:
-    """Of each candidate, from its pairs of features (i of the query, j of the candidate)."""
+    """Score each candidate by its pairs of features (i of the query, j of the candidate)."""
     return [
         score(candidates.keypoints[k][j] - query.keypoints[i], query.scores[i] + candidates.scores[k][j])
         for k, (i, j) in enumerate(pairs)
