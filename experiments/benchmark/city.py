@@ -3,15 +3,14 @@
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from experiments.benchmark.harness import write_report
-from experiments.benchmark.projection import ASSUMED, Rates, forecast
 from experiments.benchmark.scale import CANDIDATES, MEMORY, Answer, Counted, median_seconds, peak_bytes, rerank
 from experiments.benchmark.synthetic_features import BATCH, GLOBAL, MadeUp
 from experiments.console import bar
@@ -30,6 +29,18 @@ ROUNDS = 3
 WHOLE, ASKED, MACHINES = 2_800_000, 1000, (1, 8, 64)  # images of San Francisco XL, and queries of the forecast
 # Seconds per image on 2 cores from experiments/results.md: MixVPR one by one, and the local features of `localize`.
 DESCRIBING, EXTRACTING = 0.102, {"SIFT": 0.021, "ALIKED n16": 0.070}
+ASSUMED = (
+    "all machines and their disks are as fast as the measured ones",
+    "global descriptors of the whole database are extracted once, before the queries; they stay in memory, in float32",
+    "the filter compares every query with every image in time proportional to their numbers; the database's rows are "
+    "divided evenly over the machines",
+    "one machine sorts the candidates of all machines in time proportional to their number",
+    "local features are extracted for shortlisted images alone, divided evenly; no two queries share an image, which "
+    "is an upper bound",
+    "local features and global descriptor of a query are extracted when it arrives; queries are divided evenly",
+    "re-ranking a query takes as long as here, where hardly any candidate is shared, whatever the size of the database",
+    "network, waiting for the slowest machine and failures cost nothing",
+)
 
 Result = TypeVar("Result")
 
@@ -42,19 +53,6 @@ class Step(NamedTuple):
     peak: float
 
 
-@dataclass(frozen=True)
-class Measurements:
-    """What `measure` measures."""
-
-    steps: dict[str, Step]  # medians of repeated steps
-    reranking: dict[str, float]  # seconds of the parts of re-ranking
-    made: int  # images whose features were made
-    written: int  # bytes of these features on disk
-    rows_read: float  # in a round
-    read: float  # bytes of the rows read; just written, so they come from the system's cache rather than the disk
-    recall: dict[str, float]  # of the filter, of its whole shortlist, and after re-ranking
-
-
 def run(rounds: int | None, out: Path) -> None:
     """Measure in a temporary folder, and print the steps and the forecast."""
     load = os.getloadavg()[0]
@@ -62,25 +60,29 @@ def run(rounds: int | None, out: Path) -> None:
         measured = measure(DATA, Path(root), rounds or ROUNDS)
     rates = {name: rates_of(DATA, measured, seconds) for name, seconds in EXTRACTING.items()}
     plans = [
-        {"features": name, "machines": machines, "answering": plan.answering} | asdict(plan)
+        {"features": name, "machines": machines} | forecast(rate, WHOLE, ASKED, CANDIDATES, machines)
         for name, rate in rates.items()
         for machines in MACHINES
-        for plan in [forecast(rate, WHOLE, ASKED, CANDIDATES, machines)]
     ]
     content = asdict(DATA) | {
         "candidates": CANDIDATES, "memory": MEMORY, "whole": WHOLE, "asked": ASKED, "load_before": load,
-        "found": asdict(measured) | {"steps": {name: step._asdict() for name, step in measured.steps.items()}},
-        "assumed": ASSUMED, "rates": {name: asdict(rate) for name, rate in rates.items()}, "plans": plans,
+        "found": measured | {"steps": {name: step._asdict() for name, step in measured["steps"].items()}},
+        "assumed": ASSUMED, "rates": rates, "plans": plans,
     }  # fmt: skip
     title = f"{DATA.queries} queries with {CANDIDATES} candidates among {DATA.title}"
     parts = [_steps_table(DATA, measured), *_remarks(DATA, measured),
-             f"\n{ASKED} queries among {WHOLE} images, forecast from these rates\n", _plans_table(plans),
+             f"{ASKED} queries among {WHOLE} images, forecast from these rates:\n", _plans_table(plans),
              *(f"assumed: {assumption}" for assumption in ASSUMED)]  # fmt: skip
     write_report(out, title, parts, content)
 
 
-def measure(data: MadeUp, root: Path, rounds: int) -> Measurements:
-    """Time all steps for all queries, each after a warm-up; features are made only once."""
+def measure(data: MadeUp, root: Path, rounds: int) -> dict[str, Any]:
+    """Cost of all steps for all queries: medians after a warm-up, except for the features, which are made once.
+
+    `steps` has a `Step` by name, `reranking` the seconds of its parts. `made` is the number of images whose features
+    were made, `written` their bytes on disk. A round reads `rows_read` rows of `read` bytes: just written, so they come
+    from the system's cache rather than the disk. `recall` is that of the filter, its shortlist, and the re-ranking.
+    """
     queries = FeatureSet.of([data.query(row) for row in bar("queries", data.queries, range(data.queries))])
     query_vectors, vectors = data.global_descriptors()
     steps: dict[str, Step] = {}
@@ -96,21 +98,21 @@ def measure(data: MadeUp, root: Path, rounds: int) -> Measurements:
     database = FeatureSet(source, {})
     answers: list[Answer] = []
     _, reranking = repeat("re-ranking", rounds, lambda: answers.append(rerank(queries, database, candidates)))
-    made, written, rows_read = int(store.done.sum()), store.size_bytes, source.rows / len(answers)
+    num_images, written, rows_read = int(store.done.sum()), store.size_bytes, source.rows / len(answers)
     positives = Positives.from_rows(data.similar(), data.images)
     recall = [
         *recall_at_k(candidates.indices, positives, [1, CANDIDATES]),
         *recall_at_k(answers[0].rows, positives, [1]),
     ]
-    return Measurements(
-        steps=steps | making | {"re-ranking": reranking},
-        reranking=median_seconds(answers[1:]),
-        made=made,
-        written=written,
-        rows_read=rows_read,
-        read=rows_read * written / made,
-        recall=dict(zip(("filter", "shortlist", "re-ranking"), map(float, recall), strict=True)),
-    )
+    return {
+        "steps": steps | making | {"re-ranking": reranking},
+        "reranking": median_seconds(answers[1:]),
+        "made": num_images,
+        "written": written,
+        "rows_read": rows_read,
+        "read": rows_read * written / num_images,
+        "recall": dict(zip(("filter", "shortlist", "re-ranking"), map(float, recall), strict=True)),
+    }
 
 
 def measure_step(call: Callable[[], Result]) -> tuple[Result, Step]:
@@ -154,41 +156,61 @@ def _sum(steps: list[Step]) -> Step:
     return Step(sum(seconds), sum(cpu), max(peaks))
 
 
-def rates_of(data: MadeUp, measured: Measurements, extracting: float) -> Rates:
-    """Rates of this machine, where the local features of an image take `extracting` seconds."""
-    return Rates(
-        describing=DESCRIBING,
-        comparing=measured.steps["filter"].seconds / (data.queries * data.images),
-        merging=measured.steps["merging"].seconds / (data.queries * CANDIDATES * max(MACHINES)),
-        extracting=extracting,
-        storing=measured.steps["storing"].seconds / measured.made,
-        reranking=measured.steps["re-ranking"].seconds / data.queries,
-        vector_bytes=4 * GLOBAL,
-        row_bytes=measured.written / measured.made,
-    )
+def rates_of(data: MadeUp, measured: Mapping[str, Any], extracting: float) -> dict[str, float]:
+    """Seconds and bytes on this machine, where the local features of an image take `extracting` seconds."""
+    steps = measured["steps"]
+    return {
+        "describing": DESCRIBING,  # the global descriptor of an image
+        "comparing": steps["filter"].seconds / (data.queries * data.images),  # a query with a database image
+        "merging": steps["merging"].seconds / (data.queries * CANDIDATES * max(MACHINES)),  # a candidate of a machine
+        "extracting": extracting,
+        "storing": steps["storing"].seconds / measured["made"],  # the local features of an image
+        "reranking": steps["re-ranking"].seconds / data.queries,  # all candidates of a query
+        "vector_bytes": 4 * GLOBAL,  # a global descriptor in memory
+        "row_bytes": measured["written"] / measured["made"],  # the local features of an image on disk
+    }
 
 
-def _steps_table(data: MadeUp, measured: Measurements) -> Table:
-    images = {"making": measured.made, "storing": measured.made, "re-ranking": measured.rows_read}
-    sizes = {"storing": measured.written, "re-ranking": measured.read}
+def forecast(rates: Mapping[str, float], images: int, queries: int, candidates: int, machines: int) -> dict[str, float]:
+    """Seconds of all queries together, and bytes, on each machine, under the assumptions `ASSUMED`."""
+    rows = min(images, queries * candidates)
+    merging = rates["merging"] * queries * candidates * machines if machines > 1 else 0.0
+    answering = {
+        "asking": (rates["describing"] + rates["extracting"]) * queries / machines,
+        "filtering": rates["comparing"] * queries * images / machines + merging,
+        "extracting": (rates["extracting"] + rates["storing"]) * rows / machines,
+        "reranking": rates["reranking"] * queries / machines,
+    }
+    return answering | {
+        "answering": sum(answering.values()),  # from the queries' images to their rankings
+        "describing": rates["describing"] * images / machines,  # the database, once
+        "merging": merging,  # included in `filtering`
+        "memory": rates["vector_bytes"] * images / machines,
+        "disk": rates["row_bytes"] * rows / machines,
+    }
+
+
+def _steps_table(data: MadeUp, measured: Mapping[str, Any]) -> Table:
+    images = {"making": measured["made"], "storing": measured["made"], "re-ranking": measured["rows_read"]}
+    sizes = {"storing": measured["written"], "re-ranking": measured["read"]}
     lines = [
         [name, f"{step.seconds:.2f}", f"{step.cpu:.2f}", f"{1e3 * step.seconds / data.queries:.1f}",
          f"{images[name]:.0f}" if name in images else "", f"{sizes[name] / 1e6:.0f}" if name in sizes else "",
          f"{step.peak:.2f}"]
-        for name, step in measured.steps.items()
+        for name, step in measured["steps"].items()
     ]  # fmt: skip
     return Table(["step", "seconds", "CPU s", "ms / query", "images", "MB", "peak GB"], lines)
 
 
-def _remarks(data: MadeUp, measured: Measurements) -> Iterator[str]:
-    yield "re-ranking: " + ", ".join(f"{name} {seconds:.2f} s" for name, seconds in measured.reranking.items())
-    recall = measured.recall
+def _remarks(data: MadeUp, measured: Mapping[str, Any]) -> Iterator[str]:
+    yield "re-ranking: " + ", ".join(f"{name} {seconds:.2f} s" for name, seconds in measured["reranking"].items())
+    recall = measured["recall"]
     yield f"R@1: filter {recall['filter']:.3f}, re-ranking {recall['re-ranking']:.3f}; " + (
         f"R@{CANDIDATES} of the filter: {recall['shortlist']:.3f}"
     )
-    pairs, share = data.queries * CANDIDATES, 100 * measured.made / data.images
-    yield f"images in the shortlists: {measured.made} of {pairs} pairs, {share:.1f} % of all"
-    ratio = measured.steps["filter"].seconds / measured.steps["filter, half"].seconds
+    pairs, share = data.queries * CANDIDATES, 100 * measured["made"] / data.images
+    yield f"images in the shortlists: {measured['made']} of {pairs} pairs, {share:.1f} % of all"
+    ratio = measured["steps"]["filter"].seconds / measured["steps"]["filter, half"].seconds
     yield f"filter, all / half of the images: {ratio:.2f} times as long"
     yield f"global descriptor: {1e3 * DESCRIBING:g} ms an image (MixVPR one by one, experiments/results.md)"
     yield "local features: " + ", ".join(f"{name} {1e3 * seconds:g} ms" for name, seconds in EXTRACTING.items())

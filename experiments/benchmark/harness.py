@@ -4,7 +4,6 @@ import json
 import platform
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,21 +23,16 @@ Results = Mapping[tuple[str, str], Any]  # (step, implementation) -> result of t
 QUICK = 0.05  # seconds
 
 
-@dataclass(frozen=True)
-class Lineup:
-    """Implementations that are timed together; each step has one called "mfvpr"."""
+def compete(
+    entries: list[Entry], rounds: int, out: Path, *,
+    title: str, setting: Mapping[str, Any], remarks: Callable[[Seconds, Results], Iterable[str]],
+) -> Results:  # fmt: skip
+    """Time entries in turns, print a table below the title, and write it with the setting as JSON to `out`.
 
-    title: str
-    setting: dict[str, Any]  # for the JSON file
-    entries: list[Entry]
-    rounds: int  # unless the command line sets another number
-    remarks: Callable[[Seconds, Results], Iterable[str]]
-
-
-def compete(lineup: Lineup, rounds: int | None, out: Path) -> Results:
-    """Time a lineup, print its table and write it as JSON to `out`; `rounds` None = the lineup's own number."""
-    names = [(step, implementation) for step, implementation, _ in lineup.entries]
-    times, outputs = take_turns([call for _, _, call in lineup.entries], rounds or lineup.rounds)
+    Each step has an implementation called "mfvpr"; the table shows how many times as long the others take.
+    """
+    names = [(step, implementation) for step, implementation, _ in entries]
+    times, outputs = take_turns([call for _, _, call in entries], rounds)
     seconds, results = dict(zip(names, times, strict=True)), dict(zip(names, outputs, strict=True))
     rows = []
     for (step, implementation), taken in seconds.items():
@@ -52,8 +46,8 @@ def compete(lineup: Lineup, rounds: int | None, out: Path) -> Results:
         for row in rows
     ]  # fmt: skip
     table = Table(["step", "who", "median, ms", "quartiles, ms", "/ mfvpr"], lines, text_columns=2)
-    setting = lineup.setting | {"rounds": len(times[0])}
-    write_report(out, lineup.title, [table, *lineup.remarks(seconds, results)], setting | {"results": rows})
+    parts = [table, *remarks(seconds, results)]
+    write_report(out, title, parts, {**setting, "rounds": rounds, "results": rows})
     return results
 
 
@@ -70,11 +64,11 @@ def take_turns(calls: list[Callable[[], Any]], rounds: int) -> tuple[list[list[f
             quick = bool(taken) and taken[-1] < QUICK
             for _ in range(10 if quick else 0):
                 call()
-            taken.append(elapsed(call))
+            taken.append(duration(call))
     return seconds, results
 
 
-def elapsed(call: Callable[[], Any]) -> float:
+def duration(call: Callable[[], Any]) -> float:
     """Seconds that a call takes."""
     start = time.perf_counter()
     call()

@@ -17,7 +17,7 @@ from collections import Counter
 from pathlib import Path
 
 from experiments import sharding
-from experiments.benchmark.harness import elapsed, write_report
+from experiments.benchmark.harness import duration, write_report
 from experiments.console import bar
 from experiments.settings import SettingsError
 from mfvpr.datasets.streets import streets_folder
@@ -37,9 +37,9 @@ def run(rounds: int | None, out: Path) -> None:
         root, rng = Path(temporary), random.Random(0)
         street = streets_folder(root, num_frames=FRAMES, image_size=IMAGE_SIZE)
         os.environ["JAX_COMPILATION_CACHE_DIR"] = f"{root}/programs"
-        _run_undisturbed(root / "first", street)  # fills the compilation cache
-        expected = _run_undisturbed(root / "undisturbed", street)
-        seconds = elapsed(lambda: _start_task(root / "undisturbed", street, 0).wait())  # a task with nothing to do
+        _run_to_end(root / "first", street)  # fills the compilation cache
+        expected = _run_to_end(root / "undisturbed", street)
+        seconds = duration(lambda: _start_task(root / "undisturbed", street, 0).wait())  # a task with nothing to do
         progress = bar("kills", total)
         while kills.total() < total:
             folder = root / f"{evaluations}"
@@ -58,7 +58,7 @@ def run(rounds: int | None, out: Path) -> None:
     write_report(out, title, [Table(["killed during", "times"], lines)], content)
 
 
-def _run_undisturbed(folder: Path, street: Path) -> dict[str, str]:
+def _run_to_end(folder: Path, street: Path) -> dict[str, str]:
     while missing := _missing_tasks(folder):
         for index in missing:
             if _start_task(folder, street, index).wait():

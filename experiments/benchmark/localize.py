@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments.benchmark.harness import elapsed, write_report
+from experiments.benchmark.harness import duration, write_report
 from experiments.console import bar
 from mfvpr.checkpoints import REGISTRY, is_installed, load_model
 from mfvpr.datasets import ImageFolder, image_folder, read_image, resize
@@ -75,10 +75,10 @@ def _percentiles(street_map: Map, queries: ImageFolder, rounds: int) -> dict[str
     """Milliseconds with candidates in memory, with candidates that are read from disk, and of the features alone."""
     extractor = street_map.extractor
     street_map.localize(queries.paths[0])
-    cold = [elapsed(partial(street_map.localize, path)) for path in queries.paths[1:]]
-    warm = [elapsed(partial(street_map.localize, path)) for _ in range(rounds) for path in queries.paths]
+    cold = [duration(partial(street_map.localize, path)) for path in queries.paths[1:]]
+    warm = [duration(partial(street_map.localize, path)) for _ in range(rounds) for path in queries.paths]
     pixels = [resize(read_image(path), extractor.image_size, extractor.interpolation) for path in queries.paths[:20]]
-    features = [elapsed(lambda image=image: jax.block_until_ready(extractor(image[None]))) for image in pixels]
+    features = [duration(lambda image=image: jax.block_until_ready(extractor(image[None]))) for image in pixels]
     shares = {"p50": (warm, 50), "p95": (warm, 95), "p50 read": (cold, 50), "p95 read": (cold, 95),
               "features alone": (features, 50)}  # fmt: skip
     return {name: float(1e3 * np.percentile(seconds, share)) for name, (seconds, share) in shares.items()}

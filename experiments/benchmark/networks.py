@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from experiments.benchmark.harness import Entry, Lineup, Results, Seconds, compete
+from experiments.benchmark.harness import Entry, Results, Seconds, compete
 from mfvpr.checkpoints import entry_of, is_installed
 from mfvpr.checkpoints.files import load
 from mfvpr.checkpoints.networks import blueprint, network_of
@@ -55,13 +55,8 @@ class Contest(NamedTuple):
     note: str = ""
 
 
-def run(rounds: int | None, out: Path) -> None:
-    """Time all networks on images of the synthetic street."""
-    compete(lineup(), rounds, out)
-
-
-def lineup() -> Lineup:
-    """Networks of mfvpr, and of torch where it is installed."""
+def run(rounds: int | None, out: Path) -> Results:
+    """Time all networks of mfvpr, and of torch where it is installed, on images of the synthetic street."""
     images = make_images(D2NET_SIZE)
     entries: list[Entry] = []
     for contest in contests():
@@ -76,13 +71,9 @@ def lineup() -> Lineup:
              f"{SELAVPR_SIZE[0]} px, others at {PLACES_SIZE[0]} x {PLACES_SIZE[1]} px")  # fmt: skip
     published = [name for name in (D2NET, MIXVPR, *ALIKED, *PATCHES, GEM, SELAVPR) if is_installed(entry_of(name))]
     weights = f"published weights of {', '.join(published)}, others random" if published else "random weights"
-    return Lineup(
-        title=f"images of the synthetic street, {sizes}, {weights}",
-        setting={"batches": BATCHES, "sizes": sizes, "weights": weights},
-        entries=entries,
-        rounds=5,
-        remarks=_remarks,
-    )
+    title = f"images of the synthetic street, {sizes}, {weights}"
+    setting = {"batches": BATCHES, "sizes": sizes, "weights": weights}
+    return compete(entries, rounds or 5, out, title=title, setting=setting, remarks=_remarks)
 
 
 def contests() -> Iterator[Contest]:
@@ -167,7 +158,7 @@ def torch_entries(contest: Contest, arrays: Mapping[str, np.ndarray], images: np
     """Torch in both memory layouts, in float32 on a GPU; on a CPU also one image after the other, as in mfvpr."""
     import torch
 
-    from experiments.benchmark.torch_networks import each, published
+    from experiments.benchmark.torch_networks import run_network, torch_weights
 
     torch.backends.cudnn.allow_tf32 = False
     torch.backends.cudnn.benchmark = True
@@ -175,7 +166,9 @@ def torch_entries(contest: Contest, arrays: Mapping[str, np.ndarray], images: np
     network = partial(getattr(import_module(f"experiments.benchmark.{module}"), function), **(contest.options or {}))
     device, table = "cuda" if torch.cuda.is_available() else "cpu", network_of(entry_of(contest.checkpoint)).table
     default, channels_last = (
-        partial(each, network, weights=published(arrays, table, device, layout), device=device, layout=layout)
+        partial(
+            run_network, network, weights=torch_weights(arrays, table, device, layout), device=device, layout=layout
+        )
         for layout in (torch.contiguous_format, torch.channels_last)
     )
     entries: list[Entry] = []

@@ -9,7 +9,7 @@ import numpy as np
 import yaml
 
 from experiments import build
-from experiments.benchmark.harness import elapsed, write_report
+from experiments.benchmark.harness import duration, write_report
 from experiments.console import tell, track
 from experiments.groups import defaults
 from experiments.settings import CONF
@@ -68,9 +68,9 @@ def measure(matched: Matched, score: str, scorers: Mapping[str, Scorer], rounds:
     assert truth is not None  # the ground truth is the order
     scores, milliseconds = candidates.scores, None
     if score != FILTER:
-        one = {score: scorers[score]}
-        [scores] = stages.score(one, matched.by_scale, candidates).values()
-        seconds = [elapsed(lambda: stages.score(one, matched.by_scale, candidates)) for _ in range(rounds)]
+        scorer = {score: scorers[score]}
+        [scores] = stages.score(scorer, matched.by_scale, candidates).values()
+        seconds = [duration(lambda: stages.score(scorer, matched.by_scale, candidates)) for _ in range(rounds)]
         milliseconds = 1e3 * float(np.median(seconds)) / len(scores)
     rows = np.take_along_axis(candidates.indices, rank_shortlist(candidates, scores), axis=1)
     recall = {tolerance: estimate(hits(rows, truth.positives(tolerance)))._asdict() for tolerance in TOLERANCES}

@@ -73,8 +73,10 @@ def run(rounds: int | None, out: Path, stores: Path | None = None) -> None:
             pools[-1].submit(_start, data, root, time.monotonic()).result()
         turns = [pool for _ in range(rounds or ROUNDS) for pool in pools]
         for pool in bar("rounds", len(turns), turns):
-            pool.submit(_take_turn).result()
-        results = {data.title: pool.submit(_measurements).result() for data, pool in zip(SETS, pools, strict=True)}
+            pool.submit(_call, "take_turn").result()
+        results = {
+            data.title: pool.submit(_call, "measurements").result() for data, pool in zip(SETS, pools, strict=True)
+        }
     setting = {"queries": SETS[0].queries, "candidates": CANDIDATES, "keypoints": SETS[0].keypoints, "memory": MEMORY}
     title = f"{setting['queries']} queries with {CANDIDATES} candidates, {MEMORY:g} GB of memory"
     parts = [_table(results), *_remarks(results)]
@@ -88,12 +90,8 @@ def _start(data: MadeUp, root: Path, start: float) -> None:
     _sessions.append(Session(data, root, start))
 
 
-def _take_turn() -> None:
-    _sessions[0].take_turn()
-
-
-def _measurements() -> dict[str, Any]:
-    return _sessions[0].measurements()
+def _call(method: str) -> Any:
+    return getattr(_sessions[0], method)()
 
 
 class Session:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import mfvpr
-from experiments.benchmark.harness import Entry, Lineup, Results, Seconds, compete
+from experiments.benchmark.harness import Entry, Results, Seconds, compete
 from mfvpr.types import Features, Matches
 
 CANDIDATES, KEYPOINTS, DIMENSION = 50, 700, 512
@@ -45,16 +45,14 @@ def run(rounds: int | None, out: Path) -> None:
     matches = float(np.asarray(data.matches.mask).sum(1).mean())
     sizes = f"1 query x {CANDIDATES} candidates, {KEYPOINTS} features of {DIMENSION} dimensions"
     libraries = (mfvpr_entries, opencv_entries, faiss_entries, torch_entries, numpy_entries)
-    lineup = Lineup(
+    compete(
+        [entry for entries in libraries for entry in entries(data)], rounds or 15, out,
         title=f"{sizes}, {matches:.0f} matches a pair",
         setting={
             "candidates": CANDIDATES, "keypoints": KEYPOINTS, "dimension": DIMENSION, "matches_per_pair": matches,
         },
-        entries=[entry for entries in libraries for entry in entries(data)],
-        rounds=15,
         remarks=_remarks,
     )  # fmt: skip
-    compete(lineup, rounds, out)
 
 
 def _remarks(seconds: Seconds, _: Results) -> list[str]:

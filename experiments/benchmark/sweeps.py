@@ -1,4 +1,4 @@
-"""Grids of the scores' parameters: mfvpr's, and NumPy's in processes of its own."""
+"""Grids of the scores' parameters in mfvpr, and in NumPy on one process and on several."""
 
 import multiprocessing
 import os
@@ -15,41 +15,36 @@ import jax.numpy as jnp
 import numpy as np
 
 import mfvpr
-from experiments.benchmark import scores
-from experiments.benchmark.harness import Entry, Lineup, Results, Seconds, compete
-from experiments.benchmark.scores import CANDIDATES, SIZE
+from experiments.benchmark.harness import Entry, Results, Seconds, compete
+from experiments.benchmark.scores import CANDIDATES, SIZE, make_data
 from mfvpr.scoring.weights import match_weights
 from mfvpr.types import Matches
 from mfvpr.utils.numerics import available_cpus
 
 SIGMAS, BIN_SIZES = (5.0, 10.0, 15.0, 22.5, 30.0, 45.0), (5.0, 10.0, 15.0, 20.0)  # px
 WEIGHTS = (mfvpr.FeatureScoreWeight(), mfvpr.DescriptorDistanceWeight(), mfvpr.UnitWeight())
-DISTANCE_SHARES = (0.25, 0.5, 0.75, 1.0)  # of the matches are nearer than the four distances
+DISTANCE_SHARES = (0.25, 0.5, 0.75, 1.0)  # shares of the matches that are nearer than the four distances
 WINDOWS, TOLERANCES = (4.0, 6.0, 8.0, 10.0, 12.0), (1.0, 2.0, 3.0, 4.0, 5.0)  # cells
 SLOTS = 256
 HISTOGRAM, WEIGHTED, ANCHOR = "6 x 4 histograms", "6 x 4 x 3 weights x 4 distances", "5 x 5 anchors"
 
-Team = Callable[[np.ndarray, np.ndarray], np.ndarray]  # does what `tallest_bins` does
+Team = Callable[[np.ndarray, np.ndarray], np.ndarray]  # `tallest_bins` in some processes
 
 
 def run(rounds: int | None, out: Path) -> None:
-    """Everyone, on the same pairs."""
-    teams = {f"NumPy, {count} process{'es' * (count > 1)}": team(count) for count in sorted({1, available_cpus()})}
-    same = _matches()
-    places = {"same place": same, "other place": _shuffled(same)}  # nearly all matches agree, none do
+    """Time all grids on the same pairs."""
+    teams = {f"NumPy, {count} process{'es' * (count > 1)}": make_team(count) for count in sorted({1, available_cpus()})}
+    same = _full_matches()
     flushed = "flushed for all" if flush_denormals() else "flushed for mfvpr only (NumPy needs torch for it)"
-    lineup = Lineup(
-        title=f"{CANDIDATES} pairs with {SLOTS} matches each; denormal floats {flushed}",
-        setting={
-            "pairs": CANDIDATES, "matches_per_pair": SLOTS, "sigma": SIGMAS, "bin_size": BIN_SIZES,
-            "denormals": flushed,
-        },
-        entries=[entry for place, pairs in places.items() for entry in _histograms(place, pairs, teams)]
-        + _anchors(same),
-        rounds=7,
-        remarks=_remarks,
-    )  # fmt: skip
-    compete(lineup, rounds, out)
+    entries = [
+        *_histogram_entries("same place", same, teams),  # nearly all matches agree
+        *_histogram_entries("other place", _shuffle(same), teams),  # none agree
+        *_anchor_entries(same),
+    ]
+    setting = {"pairs": CANDIDATES, "matches_per_pair": SLOTS, "sigma": SIGMAS, "bin_size": BIN_SIZES,
+               "denormals": flushed}  # fmt: skip
+    title = f"{CANDIDATES} pairs with {SLOTS} matches each; denormal floats {flushed}"
+    compete(entries, rounds or 7, out, title=title, setting=setting, remarks=_remarks)
 
 
 def _remarks(seconds: Seconds, results: Results) -> Iterable[str]:
@@ -60,62 +55,62 @@ def _remarks(seconds: Seconds, results: Results) -> Iterable[str]:
         yield rate if name == "mfvpr" else f"{rate}, scores differ by {np.max(abs(theirs / ours - 1)):.1e} at most"
 
 
-def _matches() -> Matches:
-    """All slots full: the first real matches of the pairs of `scores`."""
-    matches = jax.vmap(lambda pair: mfvpr.compact(pair, SLOTS))(scores.make_data().matches)
+def _full_matches() -> Matches:
+    """The first matches of the pairs of `scores`, which fill all slots."""
+    matches = jax.vmap(lambda pair: mfvpr.compact(pair, SLOTS))(make_data().matches)
     return jax.device_put(replace(matches, mask=jnp.ones_like(matches.mask)))
 
 
-def _shuffled(matches: Matches) -> Matches:
-    """As between images of different places, which is what most pairs of a sweep are: points that do not correspond."""
+def _shuffle(matches: Matches) -> Matches:
+    """Points that do not correspond, as in images of different places, which most pairs of a sweep show."""
     order = np.random.default_rng(0).permuted(np.tile(np.arange(SLOTS), (CANDIDATES, 1)), axis=1)
     return replace(matches, points1=jnp.take_along_axis(matches.points1, order[..., None], axis=1))
 
 
-def _histograms(place: str, matches: Matches, teams: dict[str, Team]) -> list[Entry]:
+def _histogram_entries(place: str, matches: Matches, teams: dict[str, Team]) -> list[Entry]:
     distances = np.quantile(np.asarray(matches.distance), DISTANCE_SHARES).astype(np.float32)
     near = (np.asarray(matches.distance)[:, None] <= distances[:, None]).astype(np.float32)  # [C, 4, K]
-    kinds = [np.asarray(jax.vmap(partial(match_weights, weight))(matches)) for weight in WEIGHTS]
-    every = np.concatenate([kind[:, None] * near for kind in kinds], axis=1)
+    weights = [np.asarray(jax.vmap(partial(match_weights, weight))(matches)) for weight in WEIGHTS]
+    near_weights = np.concatenate([weight[:, None] * near for weight in weights], axis=1)
     shifts = np.asarray(matches.points1 - matches.points0)
     entries = []
-    for name, axes, weights in (
-        (HISTOGRAM, {}, kinds[0][:, None]),
-        (WEIGHTED, {"weight": WEIGHTS, "max_distance": distances}, every),
+    for name, axes, team_weights in (
+        (HISTOGRAM, {}, weights[0][:, None]),
+        (WEIGHTED, {"weight": WEIGHTS, "max_distance": distances}, near_weights),
     ):
         step, axes = f"{name}, {place}", {"sigma": SIGMAS, "bin_size": BIN_SIZES} | axes
-        entries.append((step, "mfvpr", _grid(mfvpr.HistogramOfShifts(), matches, **axes)))
-        entries += [(step, who, partial(numpy_grid, shifts, weights)) for who, numpy_grid in teams.items()]
+        entries.append((step, "mfvpr", _grid_call(mfvpr.HistogramOfShifts(), matches, **axes)))
+        entries += [(step, title, partial(team, shifts, team_weights)) for title, team in teams.items()]
     return entries
 
 
-def _anchors(matches: Matches) -> list[Entry]:
+def _anchor_entries(matches: Matches) -> list[Entry]:
     axes = {"window": WINDOWS, "tolerance": TOLERANCES}
     return [
-        (f"{ANCHOR}, {cells} cells a side", "mfvpr", _grid(mfvpr.AnchorPoints(num_bins=cells), matches, **axes))
+        (f"{ANCHOR}, {cells} cells a side", "mfvpr", _grid_call(mfvpr.AnchorPoints(num_bins=cells), matches, **axes))
         for cells in (10, 15, 20)
     ]
 
 
-def _grid(scorer: Any, matches: Matches, **axes: Any) -> Callable[[], Any]:
+def _grid_call(scorer: Any, matches: Matches, **axes: Any) -> Callable[[], Any]:
     return lambda: jax.block_until_ready(mfvpr.score_grid(scorer, matches, **axes))
 
 
-def team(count: int) -> Team:
-    """`tallest_bins` in `count` processes, each a part of the pairs and a single thread."""
-    # Their BLAS reads it when it is loaded, which here was long ago.
+def make_team(count: int) -> Team:
+    """Run `tallest_bins` in `count` processes of one thread each, every process on its share of the pairs."""
+    # BLAS reads these variables when it is loaded: in the new processes, no longer in this one.
     os.environ |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"), "1")
     pool = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), initializer=flush_denormals)
 
-    def in_parts(shifts: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    def team(shifts: np.ndarray, weights: np.ndarray) -> np.ndarray:
         parts = pool.map(tallest_bins, np.array_split(shifts, count), np.array_split(weights, count))
         return np.concatenate(list(parts), axis=-1)
 
-    return in_parts
+    return team
 
 
 def flush_denormals() -> bool:
-    """Whether this thread's denormal floats now count as zero, as in XLA's; NumPy itself has no such switch."""
+    """Count denormal floats of this thread as zero, as XLA does; False without torch, since NumPy has no switch."""
     if find_spec("torch") is None:
         return False
     import torch
@@ -124,7 +119,7 @@ def flush_denormals() -> bool:
 
 
 def tallest_bins(shifts: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Scores `[sigmas, bin sizes, W, C]` as NumPy's users would write it, one pair and setting after the other.
+    """Scores `[sigmas, bin sizes, W, C]` as users of NumPy would write it, one pair and setting after the other.
 
     The Gaussians are separable, and the same for all weights, which are one matrix product.
 

@@ -1,25 +1,25 @@
-"""ALIKED in plain torch, with the keys of the published weights: what mfvpr's is timed against.
+"""ALIKED in plain torch, with the keys of the published weights.
 
-torchvision's compiled deformable convolution is not used; here it samples with `grid_sample` and multiplies.
+The deformable convolution samples with `grid_sample`; torchvision's compiled one is not used.
 """
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from experiments.benchmark.torch_networks import LocalFeatures, Weights, batch_norm, conv, on_host, sampled
+from experiments.benchmark.torch_networks import LocalFeatures, Weights, batch_norm, conv, on_host, sample
 
 RADIUS = 2  # of the detector, px
-LEVELS = ((1, 1), (2, 2), (4, 8), (4, 32))  # pooled before each block, and how much smaller than the image it is then
+LEVELS = ((1, 1), (2, 2), (4, 8), (4, 32))  # before each block: pooling, and size of the image / size of the map
 
 
 def aliked(w: Weights, images: Tensor, threshold: float) -> list[LocalFeatures]:
-    """Keypoints with sub-pixel positions and their descriptors, of images `[B, 3, H, W]`; sides divisible by 32."""
+    """Keypoints with sub-pixel positions, and their descriptors; sides of images are divisible by 32."""
     features, scores = dense_features(w, images)
     corner = torch.tensor(scores.shape[:1:-1], device=scores.device) - 1  # (width, height) - 1
     extracted = []
     for dense, score, peaks in zip(features, scores, _maxima(scores) > threshold, strict=True):
-        points = _refined(score[0], *peaks[0].nonzero(as_tuple=True)) / corner * 2 - 1  # and back, rounded as published
+        points = _refine(score[0], *peaks[0].nonzero(as_tuple=True)) / corner * 2 - 1  # and back, rounded as published
         values = F.grid_sample(score[None], points[None, None], align_corners=True)[0, 0, 0]
         descriptors = _descriptors(w, dense, (points / 2 + 0.5) * corner)
         extracted.append(on_host((points + 1) / 2 * corner, descriptors, values))
@@ -27,7 +27,7 @@ def aliked(w: Weights, images: Tensor, threshold: float) -> list[LocalFeatures]:
 
 
 def dense_features(w: Weights, images: Tensor) -> tuple[Tensor, Tensor]:
-    """Features `[B, D, H, W]` of unit length, and scores `[B, 1, H, W]`."""
+    """Unit features `[B, D, H, W]` and scores `[B, 1, H, W]`."""
     x, levels = images / 255, []
     for place, (pooled, factor) in enumerate(LEVELS, start=1):
         x = x if pooled == 1 else F.avg_pool2d(x, pooled)
@@ -43,19 +43,19 @@ def dense_features(w: Weights, images: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _block(w: Weights, name: str, x: Tensor, *, deformable: bool, shortcut: bool) -> Tensor:
-    """Two 3 x 3 convolutions; a shortcut, if any, is added before the last SELU."""
+    """Two 3 x 3 convolutions; the shortcut is added before the last SELU."""
 
-    def convolved(place: int, x: Tensor) -> Tensor:
+    def normalized_conv(place: int, x: Tensor) -> Tensor:
         of_place = f"{name}.conv{place}"
         out = _deformable(w, of_place, x) if deformable else conv(w, of_place, x, padding=1)
         return batch_norm(w, f"{name}.bn{place}", out)
 
-    out = convolved(2, F.selu(convolved(1, x), inplace=True))
+    out = normalized_conv(2, F.selu(normalized_conv(1, x), inplace=True))
     return F.selu(out.add_(conv(w, f"{name}.downsample", x, bias=True)) if shortcut else out, inplace=True)
 
 
 def _deformable(w: Weights, name: str, x: Tensor) -> Tensor:
-    """3 x 3 convolution whose nine taps move by what another convolution says; zeros outside."""
+    """3 x 3 convolution whose nine taps move by the offsets of another convolution; zeros outside."""
     height, width = x.shape[2:]
     limit = max(height, width) / 4
     offsets = conv(w, f"{name}.offset_conv", x, bias=True, padding=1).clamp(-limit, limit).unflatten(1, (9, 2))
@@ -63,28 +63,28 @@ def _deformable(w: Weights, name: str, x: Tensor) -> Tensor:
     down, right = (step.reshape(9, 1, 1) for step in _neighborhood(1, x.device))
     vertical = offsets[:, :, 0] + (rows[:, None] + down)  # [B, 9, h, w]
     horizontal = offsets[:, :, 1] + (columns + right)
-    taps = sampled(x, torch.stack([horizontal, vertical], -1).flatten(1, 2)).unflatten(2, (9, height))
+    taps = sample(x, torch.stack([horizontal, vertical], -1).flatten(1, 2)).unflatten(2, (9, height))
     products = w(f"{name}.regular_conv.weight").flatten(1) @ taps.flatten(3).flatten(1, 2)
     return products.unflatten(2, (height, width))
 
 
 def _maxima(scores: Tensor) -> Tensor:
-    """The scores at maxima of their neighborhoods, in three rounds; 0 elsewhere and along the border."""
+    """Scores at maxima of their neighborhoods, in three rounds; 0 elsewhere and along the border."""
 
-    def spread(values: Tensor) -> Tensor:
+    def local_max(values: Tensor) -> Tensor:
         return F.max_pool2d(values, 2 * RADIUS + 1, stride=1, padding=RADIUS)
 
-    peaks = scores == spread(scores)
+    peaks = scores == local_max(scores)
     for _ in range(2):
-        suppressed = spread(peaks.float()) > 0
-        others = scores.masked_fill(suppressed, 0)
-        peaks |= (others == spread(others)) & ~suppressed
+        suppressed = local_max(peaks.float()) > 0
+        remaining = scores.masked_fill(suppressed, 0)
+        peaks |= (remaining == local_max(remaining)) & ~suppressed
     inside = F.pad(torch.ones_like(scores[..., 2 * RADIUS :, 2 * RADIUS :]), (RADIUS,) * 4)
     return scores * peaks * inside
 
 
-def _refined(score: Tensor, row: Tensor, column: Tensor) -> Tensor:
-    """(x, y) px of peaks `[n]`, moved by a soft-argmax of their neighborhoods."""
+def _refine(score: Tensor, row: Tensor, column: Tensor) -> Tensor:
+    """Positions `[n, 2]` (x, y) px of peaks, moved by a soft-argmax of their neighborhoods."""
     down, right = _neighborhood(RADIUS, score.device)
     patches = F.pad(score, (RADIUS,) * 4)[row[:, None] + RADIUS + down, column[:, None] + RADIUS + right]
     weights = ((patches - patches.amax(1, keepdim=True)) / 0.1).exp()
@@ -93,7 +93,7 @@ def _refined(score: Tensor, row: Tensor, column: Tensor) -> Tensor:
 
 
 def _descriptors(w: Weights, features: Tensor, points: Tensor) -> Tensor:
-    """`[n, D]` from `[D, H, W]` at `[n, 2]` (x, y) px: the neighborhood of a keypoint says where to sample."""
+    """Descriptors `[n, D]` of points `[n, 2]` (x, y) px, sampled where the neighborhood of each point says."""
     reach = torch.arange(3, device=points.device)
     column, row = points.long().T
     padded = F.pad(features, (1, 1, 1, 1))
@@ -102,12 +102,12 @@ def _descriptors(w: Weights, features: Tensor, points: Tensor) -> Tensor:
     offsets = F.selu(conv(w, "desc_head.offset_conv.0", patches.transpose(0, 1), bias=True), inplace=True)
     offsets = conv(w, "desc_head.offset_conv.2", offsets, bias=True).clamp(-limit, limit)
     places = points[:, None] + offsets.flatten(1).unflatten(1, (2, -1)).transpose(1, 2)  # [n, M, 2]
-    mixed = conv(w, "desc_head.sf_conv", sampled(features[None], places[None]))[0]  # [D, n, M]
+    mixed = conv(w, "desc_head.sf_conv", sample(features[None], places[None]))[0]  # [D, n, M]
     return F.normalize(torch.einsum("cnp,pcd->nd", F.selu(mixed, inplace=True), w("desc_head.agg_weights")))
 
 
 def _neighborhood(radius: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Steps down and to the right, row by row."""
+    """Offsets down and to the right, row by row."""
     reach = torch.arange(-radius, radius + 1, device=device)
     down, right = torch.meshgrid(reach, reach, indexing="ij")
     return down.flatten(), right.flatten()

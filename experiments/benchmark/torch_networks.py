@@ -1,6 +1,6 @@
-"""D2-Net and MixVPR in plain torch, with the keys of the published weights: what mfvpr's are timed against.
+"""D2-Net and MixVPR in plain torch, with the keys of the published weights.
 
-A network is a function of its weights and of images `[B, 3, H, W]`, RGB, 0 .. 255.
+A network is a function of its weights and of RGB images `[B, 3, H, W]`, 0 .. 255. Results are on the host.
 """
 
 import re
@@ -16,11 +16,11 @@ from torch import Tensor
 from mfvpr.checkpoints.conversion import Table
 from mfvpr.networks.imagenet import DEVIATION, MEAN
 
-Weights = Callable[[str], Tensor]  # by published keys
+Weights = Callable[[str], Tensor]  # published key -> weight
 
 
-def published(arrays: Mapping[str, np.ndarray], table: Table, device: str, layout: torch.memory_format) -> Weights:
-    """Our arrays by their published keys, conversion backwards."""
+def torch_weights(arrays: Mapping[str, np.ndarray], table: Table, device: str, layout: torch.memory_format) -> Weights:
+    """Convert arrays of mfvpr back to torch's, by their published keys."""
 
     @cache
     def weight(key: str) -> Tensor:
@@ -33,10 +33,10 @@ def published(arrays: Mapping[str, np.ndarray], table: Table, device: str, layou
     return weight
 
 
-def each(
+def run_network(
     network: Callable, batches: Iterable[np.ndarray], *, weights: Weights, device: str, layout: torch.memory_format
 ) -> list[Any]:
-    """What the network gives for each image of batches `[B, H, W, 3]` uint8 RGB."""
+    """Results of a network for each image of RGB batches `[B, H, W, 3]` uint8."""
     results = []
     with torch.inference_mode():
         for batch in batches:
@@ -48,7 +48,7 @@ def each(
 
 
 class LocalFeatures(NamedTuple):
-    """Of one image, on the host."""
+    """Features of one image."""
 
     keypoints: np.ndarray  # [n, 2] (x, y), px
     descriptors: np.ndarray  # [n, D]
@@ -56,29 +56,30 @@ class LocalFeatures(NamedTuple):
 
 
 def on_host(*tensors: Tensor) -> LocalFeatures:
-    """Keypoints, descriptors and scores as arrays."""
+    """Copy keypoints, descriptors and scores of an image to the host."""
     return LocalFeatures(*(tensor.cpu().numpy() for tensor in tensors))
 
 
 def conv(w: Weights, name: str, x: Tensor, *, bias: bool = False, **options: int) -> Tensor:
-    """Convolution with the weights of this name."""
+    """Convolution by name."""
     return F.conv2d(x, w(f"{name}.weight"), w(f"{name}.bias") if bias else None, **options)
 
 
 def batch_norm(w: Weights, name: str, x: Tensor) -> Tensor:
-    """By the running statistics."""
+    """Batch normalization by name, with the running statistics."""
     mean, variance, weight, bias = (w(f"{name}.{key}") for key in ("running_mean", "running_var", "weight", "bias"))
     return F.batch_norm(x, mean, variance, weight, bias)
 
 
-def sampled(x: Tensor, points: Tensor) -> Tensor:
-    """`[B, C, h, w]` of maps `[B, C, H, W]` at `[B, h, w, 2]` (x, y) px, zeros outside."""
+def sample(x: Tensor, points: Tensor) -> Tensor:
+    """Maps `[B, C, H, W]` at points `[B, h, w, 2]` (x, y) px, zeros outside -> `[B, C, h, w]`."""
     height, width = x.shape[2:]
     grid = 2 * points / torch.tensor([width - 1, height - 1], device=x.device) - 1
     return F.grid_sample(x, grid, align_corners=True)
 
 
-def _linear(w: Weights, name: str, x: Tensor) -> Tensor:
+def linear(w: Weights, name: str, x: Tensor) -> Tensor:
+    """Linear layer by name."""
     return F.linear(x, w(f"{name}.weight"), w(f"{name}.bias"))
 
 
@@ -111,43 +112,43 @@ def d2net(w: Weights, images: Tensor) -> list[LocalFeatures]:
     highest = dense == F.max_pool2d(dense, 3, stride=1, padding=1)
     detected = strongest & highest & (det > 0) & (trace * trace / det <= _EDGE)
     steps = torch.stack([(dij * dj - djj * di) / det, (dij * di - dii * dj) / det], -1)
-    return [_described(*image) for image in zip(dense, detected, steps, strict=True)]
+    return [_local_features(*image) for image in zip(dense, detected, steps, strict=True)]
 
 
 def _derivatives(dense: Tensor) -> tuple[Tensor, ...]:
-    """(di, dj, dii, djj, dij) of maps `[B, C, h, w]`, zeros outside: shifted maps are faster than convolutions."""
+    """Derivatives di, dj, dii, djj, dij of maps, zeros outside; shifted maps are faster than convolutions."""
     wide = F.pad(dense, (1, 1, 1, 1))
     up, down, left, right = wide[..., :-2, 1:-1], wide[..., 2:, 1:-1], wide[..., 1:-1, :-2], wide[..., 1:-1, 2:]
     corners = wide[..., 2:, 2:] - wide[..., 2:, :-2] - wide[..., :-2, 2:] + wide[..., :-2, :-2]
     return (down - up) / 2, (right - left) / 2, up - 2 * dense + down, left - 2 * dense + right, corners / 4
 
 
-def _described(dense: Tensor, detected: Tensor, steps: Tensor) -> LocalFeatures:
-    """Features of one map `[C, h, w]`: refined positions, and the map interpolated there."""
+def _local_features(dense: Tensor, detected: Tensor, steps: Tensor) -> LocalFeatures:
+    """Refine the positions of one map `[C, h, w]`, and interpolate its descriptors there."""
     channel, row, column = detected.nonzero(as_tuple=True)
     step = steps[channel, row, column]
     position = torch.stack([row, column], 1) + step
     last = torch.tensor(dense.shape[1:], device=dense.device) - 1
-    kept = ((step.abs() < 0.5) & (position >= 0) & (position <= last)).all(1)
-    position, scores = position[kept].flip(1), dense[channel, row, column][kept]
-    descriptors = sampled(dense[None], position[None, None])[0, :, 0]
+    inside = ((step.abs() < 0.5) & (position >= 0) & (position <= last)).all(1)
+    position, scores = position[inside].flip(1), dense[channel, row, column][inside]
+    descriptors = sample(dense[None], position[None, None])[0, :, 0]
     return on_host(4 * position + 1.5, F.normalize(descriptors, dim=0).T, scores)
 
 
 def mixvpr(w: Weights, images: Tensor) -> np.ndarray:
-    """Descriptors `[B, D]` of unit length, on the host: four mixers over the positions, two projections."""
+    """Unit descriptors `[B, D]`: four mixers over the positions, two projections."""
     layers = tuple(f"backbone.model.layer{place}" for place in (1, 2, 3))
     x = resnet(w, images, "backbone.model.conv1", "backbone.model.bn1", layers).flatten(2)  # [B, 1024, positions]
     for place in range(4):
         name = f"aggregator.mix.{place}.mix"
         normal = F.layer_norm(x, x.shape[2:], w(f"{name}.0.weight"), w(f"{name}.0.bias"))
-        x = x + _linear(w, f"{name}.3", F.relu(_linear(w, f"{name}.1", normal)))
-    x = _linear(w, "aggregator.channel_proj", x.transpose(1, 2)).transpose(1, 2)
-    return F.normalize(_linear(w, "aggregator.row_proj", x).flatten(1)).cpu().numpy()
+        x = x + linear(w, f"{name}.3", F.relu(linear(w, f"{name}.1", normal)))
+    x = linear(w, "aggregator.channel_proj", x.transpose(1, 2)).transpose(1, 2)
+    return F.normalize(linear(w, "aggregator.row_proj", x).flatten(1)).cpu().numpy()
 
 
-def normalized(images: Tensor) -> Tensor:
-    """As networks trained on ImageNet take them."""
+def normalize(images: Tensor) -> Tensor:
+    """Normalize images as networks trained on ImageNet expect them."""
     mean, deviation = (torch.tensor(values, device=images.device)[:, None, None] for values in (MEAN, DEVIATION))
     return (images / 255 - mean) / deviation
 
@@ -156,8 +157,8 @@ _BLOCKS = (3, 4, 6, 3)  # of ResNet-50's layers
 
 
 def resnet(w: Weights, images: Tensor, first: str, norm: str, layers: tuple[str, ...]) -> Tensor:
-    """Maps `[B, C, h, w]` of ResNet-50 to the last of the layers, which are given by their names."""
-    x = conv(w, first, normalized(images), stride=2, padding=3)
+    """Maps `[B, C, h, w]` of ResNet-50 after the last of the named layers."""
+    x = conv(w, first, normalize(images), stride=2, padding=3)
     x = F.max_pool2d(F.relu(batch_norm(w, norm, x), inplace=True), 3, stride=2, padding=1)
     for place, (layer, blocks) in enumerate(zip(layers, _BLOCKS, strict=False)):
         for block in range(blocks):

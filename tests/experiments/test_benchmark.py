@@ -24,9 +24,9 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture(scope="module")
 def contest(tmp_path_factory):
-    """Small images and random weights; everyone's results after one round."""
+    """Results of all networks after one round on small images with random weights, and the report."""
     torch = pytest.importorskip("torch", reason="torch is what the networks are compared with")
-    from experiments.benchmark import harness, networks
+    from experiments.benchmark import networks
 
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # several wait for each other when other processes take their cores
@@ -39,7 +39,7 @@ def contest(tmp_path_factory):
         for name, value in small.items():
             patch.setattr(networks, name, value)
         out = tmp_path_factory.mktemp("benchmark") / "networks.json"
-        results = harness.compete(networks.lineup(), 1, out)
+        results = networks.run(1, out)
     torch.set_num_threads(threads)
     by_step = {}
     for (step, name), result in results.items():
@@ -48,49 +48,43 @@ def contest(tmp_path_factory):
 
 
 def peers(results):
-    """mfvpr's result, and each peer's."""
-    others = dict(results)
-    ours = others.pop("mfvpr")
+    """Result of mfvpr, and those of torch."""
+    theirs = dict(results)
+    ours = theirs.pop("mfvpr")
     if isinstance(ours[0], Description):
-        ours = [one.features if one.local else one.vector for one in ours]
-    assert len(others) == 3  # two memory layouts, and one by one
-    return ours, others.values()
+        ours = [image.features if image.local else image.vector for image in ours]
+    assert len(theirs) == 3  # two memory layouts, and one by one
+    return ours, theirs.values()
 
 
 @pytest.mark.parametrize("step", ["D2-Net", "aliked-n16"])
 def test_keypoints_are_the_same(contest, step):
-    ours, others = peers(contest[0][f"{step} features, batch 2"])
+    ours, all_theirs = peers(contest[0][f"{step} features, batch 2"])
     assert len(ours) == 2
-    for theirs in others:
-        for one, other in zip(ours, theirs, strict=True):
-            assert len(one.keypoints) > 10
-            assert abs(len(one.keypoints) - len(other.keypoints)) <= 0.02 * len(one.keypoints)
-            distance = np.linalg.norm(one.keypoints[:, None] - other.keypoints, axis=2)
+    for theirs in all_theirs:
+        for features, expected in zip(ours, theirs, strict=True):
+            assert len(features.keypoints) > 10
+            assert abs(len(features.keypoints) - len(expected.keypoints)) <= 0.02 * len(features.keypoints)
+            distance = np.linalg.norm(features.keypoints[:, None] - expected.keypoints, axis=2)
             nearest = distance.argmin(1)
             same = distance.min(1) < 0.05  # px; rounding moves a few maxima
             assert same.mean() >= 0.98
-            found = other.descriptors[nearest][same], other.scores[nearest][same]
-            np.testing.assert_allclose(one.descriptors[same], found[0], atol=2e-3)
-            np.testing.assert_allclose(one.scores[same], found[1], rtol=1e-3, atol=1e-4)
+            descriptors, scores = expected.descriptors[nearest][same], expected.scores[nearest][same]
+            np.testing.assert_allclose(features.descriptors[same], descriptors, atol=2e-3)
+            np.testing.assert_allclose(features.scores[same], scores, rtol=1e-3, atol=1e-4)
 
 
 def test_dense_maps_are_the_same(contest):
-    ours, others = peers(contest[0]["D2-Net dense map, batch 2"])
-    ours = np.concatenate([np.asarray(one) for one in ours]).transpose(0, 3, 1, 2)
-    for theirs in others:
-        np.testing.assert_allclose(ours, np.stack([np.asarray(one) for one in theirs]), atol=1e-4 * ours.max())
+    ours, all_theirs = peers(contest[0]["D2-Net dense map, batch 2"])
+    ours = np.concatenate([np.asarray(dense) for dense in ours]).transpose(0, 3, 1, 2)
+    for theirs in all_theirs:
+        np.testing.assert_allclose(ours, np.stack([np.asarray(dense) for dense in theirs]), atol=1e-4 * ours.max())
 
 
-def test_descriptors_are_the_same(contest):
-    ours, others = peers(contest[0]["MixVPR descriptor, batch 2"])
-    for theirs in others:
-        np.testing.assert_allclose(ours, theirs, atol=1e-5)
-
-
-@pytest.mark.parametrize("step", ["NetVLAD descriptor", "generalized mean of ResNet-50"])
+@pytest.mark.parametrize("step", ["MixVPR descriptor", "NetVLAD descriptor", "generalized mean of ResNet-50"])
 def test_global_descriptors_are_the_same(contest, step):
-    ours, others = peers(contest[0][f"{step}, batch 2"])
-    for theirs in others:
+    ours, all_theirs = peers(contest[0][f"{step}, batch 2"])
+    for theirs in all_theirs:
         np.testing.assert_allclose(ours, theirs, atol=1e-5)
 
 
@@ -103,9 +97,9 @@ def test_local_descriptors_are_the_same(contest, step):
     ours = results.pop("mfvpr")
     assert len(results) == 3
     for theirs in results.values():
-        for one, (whole, *local) in zip(ours, theirs, strict=True):
-            np.testing.assert_allclose(one.vector, whole, atol=1e-5)
-            for features, expected in zip(one.local, local, strict=True):
+        for description, (vector, *local) in zip(ours, theirs, strict=True):
+            np.testing.assert_allclose(description.vector, vector, atol=1e-5)
+            for features, expected in zip(description.local, local, strict=True):
                 np.testing.assert_allclose(features.descriptors.ravel(), expected.ravel(), atol=2e-5)
 
 
