@@ -1,6 +1,6 @@
-"""Reads torch's checkpoints, of both formats and without torch, as plain data.
+"""Read PyTorch checkpoints of both formats as plain data, without PyTorch.
 
-Ordered dictionaries, tensors and parameters are known by their names, a training's notes beside them are left unread.
+Only ordered dictionaries, tensors, parameters and the notes of a training may be called by name; notes are skipped.
 """
 
 import io
@@ -14,7 +14,7 @@ from typing import Any, BinaryIO, Literal
 
 import numpy as np
 
-from mfvpr.io.formats.pickles import MEND, Name, excerpt, file_size, natural, of_type, read_pickle, refused
+from mfvpr.io.formats.pickles import MEND, DataUnpickler, Name, excerpt, file_size, name_error, natural_number, of_type
 from mfvpr.utils.errors import InputError
 
 Order = Literal["little", "big"]
@@ -31,8 +31,8 @@ _DTYPES = {
     "ByteStorage": np.dtype("u1"),
     "BoolStorage": np.dtype("?"),
 }
-_MAGIC, _PROTOCOL = 0x1950A86A20F9469CFC6C, 1001  # with which files begin that are no zip, those before torch 1.6
-_NOTES = {  # the command line and the losses, as D2-Net's training keeps them
+_MAGIC, _PROTOCOL = 0x1950A86A20F9469CFC6C, 1001  # the start of files from before torch 1.6, which are not zip files
+_NOTES = {  # the command line and the losses, in checkpoints of D2-Net's training
     "argparse.Namespace",
     "_codecs.encode",
     "numpy.dtype",
@@ -42,7 +42,7 @@ _NOTES = {  # the command line and the losses, as D2-Net's training keeps them
 
 @dataclass(frozen=True)
 class Storage:
-    """Where a tensor's values lie."""
+    """Values that tensors share."""
 
     kind: str  # torch's name of its type: FloatStorage, ...
     key: str
@@ -60,57 +60,52 @@ class Tensor:
 
 
 class Unread:
-    """A note that nobody asks for."""
+    """A note of a training."""
 
 
-class _Names:
-    """The vocabulary; storages gather by key."""
-
-    def __init__(self) -> None:
+class _TensorUnpickler(DataUnpickler):
+    def __init__(self, file: BinaryIO) -> None:
+        super().__init__(file)
         self.storages: dict[str, Storage] = {}
 
-    def called(self, name: Name, arguments: tuple) -> Any:
+    def call(self, name: Name, arguments: tuple) -> Any:
         match str(name), arguments:
             case "collections.OrderedDict", ():
                 return {}
             case "torch._utils._rebuild_tensor_v2", (Storage() as storage, offset, shape, strides, _, _):
-                return Tensor(storage, natural(offset), _counts(shape), _counts(strides))
+                return Tensor(storage, natural_number(offset), _natural_numbers(shape), _natural_numbers(strides))
             case "torch._utils._rebuild_parameter", (Tensor() as tensor, _, _):
                 return tensor
             case note, _ if note in _NOTES:
                 return Unread()
-        raise _refused(name)
+        raise name_error(name, "plain dense tensors")
 
-    def built(self, instance: Any, state: Any) -> None:
-        """Fills a note, or adds one to an ordered dictionary."""
+    def build(self, instance: Any, state: Any) -> None:
+        """Skip the content of a note, and the attributes of an ordered dictionary."""
         if type(instance) not in (dict, Unread):
-            raise TypeError
+            raise TypeError("expected a note or an ordered dictionary")
 
-    def stored(self, identity: Any) -> Storage:
-        match identity:
+    def persistent_load(self, pid: Any) -> Storage:
+        match pid:
             case ("storage", Name("torch" | "torch.storage", kind), str(key), _, count, *rest):
                 if rest not in ([], [None]):  # of older files: a view of another storage
                     raise InputError(f"expected plain dense tensors, got one in a part of another's storage; {MEND}")
-                storage = Storage(kind, key, natural(count))
+                storage = Storage(kind, key, natural_number(count))
             case ("module", Name() as name, *_):
-                raise _refused(name)
+                raise name_error(name, "plain dense tensors")
             case _:
-                raise TypeError
+                raise TypeError("expected the identity of a storage")
         if self.storages.setdefault(key, storage) != storage:
-            raise ValueError
+            raise ValueError("two storages of one key")
         return storage
 
 
-def _refused(name: Name) -> InputError:
-    return refused(name, "plain dense tensors")
-
-
-def _counts(values: Any) -> tuple[int, ...]:
-    return tuple(natural(value) for value in of_type(tuple, values))
+def _natural_numbers(values: Any) -> tuple[int, ...]:
+    return tuple(natural_number(value) for value in of_type(tuple, values))
 
 
 def read_zip(file: BinaryIO) -> dict[str, np.ndarray]:
-    """A pickle, and one entry for the values of each storage; uncompressed, with checksums."""
+    """Read a zip file: a pickle, and one entry for the values of each storage, uncompressed, with checksums."""
     with zipfile.ZipFile(file) as archive:
         entries = archive.infolist()
         names = [entry.filename for entry in entries]
@@ -122,39 +117,39 @@ def read_zip(file: BinaryIO) -> dict[str, np.ndarray]:
         (pickle,) = (name for name in names if name.split("/")[1:] == ["data.pkl"])
         folder = pickle.removesuffix("data.pkl")
         order = _ORDERS[archive.read(f"{folder}byteorder") if f"{folder}byteorder" in names else b"little"]
-        content = read_pickle(io.BytesIO(archive.read(pickle)), _Names())
+        content = _TensorUnpickler(io.BytesIO(archive.read(pickle))).load()
         return _arrays(content, order, lambda storage: archive.read(f"{folder}data/{storage.key}"))
 
 
 def read_legacy(file: BinaryIO) -> dict[str, np.ndarray]:
-    """Five pickles: two numbers, the byte order, the content, the keys of its storages; then their values."""
-    names = _Names()
-    if (read_pickle(file, names), read_pickle(file, names)) != (_MAGIC, _PROTOCOL):
+    """Read five pickles (two numbers, byte order, content, keys of the storages), then the values of each storage."""
+    unpickler = _TensorUnpickler(file)
+    if (unpickler.load(), unpickler.load()) != (_MAGIC, _PROTOCOL):
         raise InputError("expected a torch checkpoint, got another pickle; use the official file")
-    order: Order = "little" if read_pickle(file, names)["little_endian"] else "big"
-    content, keys = read_pickle(file, names), read_pickle(file, names)
-    places = {}
+    order: Order = "little" if unpickler.load()["little_endian"] else "big"
+    content, keys = unpickler.load(), unpickler.load()
+    ranges = {}
     for key in keys:
-        storage = names.storages[key]
+        storage = unpickler.storages[key]
         size = storage.count * _dtype(storage).itemsize
         if int.from_bytes(file.read(8), order) != storage.count or file.tell() + size > file_size(file):
-            raise ValueError
-        places[key] = file.tell(), size
+            raise ValueError("a storage of another size")
+        ranges[key] = file.tell(), size
         file.seek(size, os.SEEK_CUR)
     if file.tell() != file_size(file):
-        raise ValueError
+        raise ValueError("bytes after the last storage")
 
-    def values(storage: Storage) -> bytes:
-        place, size = places[storage.key]
-        file.seek(place)
+    def read_values(storage: Storage) -> bytes:
+        start, size = ranges[storage.key]
+        file.seek(start)
         return file.read(size)
 
-    return _arrays(content, order, values)
+    return _arrays(content, order, read_values)
 
 
-def _arrays(content: Any, order: Order, values: Callable[[Storage], bytes]) -> dict[str, np.ndarray]:
-    """Tensors of a pickle's content as arrays; `order` is that of their bytes."""
-    values = cache(values)
+def _arrays(content: Any, order: Order, read_values: Callable[[Storage], bytes]) -> dict[str, np.ndarray]:
+    """Arrays of the tensors in a pickle's content; `order` is the byte order of their values."""
+    read_values = cache(read_values)
     for key in _WRAPPERS:
         if isinstance(content, dict) and isinstance(content.get(key), dict):
             content = content[key]
@@ -171,9 +166,9 @@ def _arrays(content: Any, order: Order, values: Callable[[Storage], bytes]) -> d
         if not isinstance(tensor, Tensor):
             raise InputError(f"expected tensors only, got {type(tensor).__name__}{where}")
         dtype = _dtype(tensor.storage, where).newbyteorder(order)
-        raw = values(tensor.storage)
+        raw = read_values(tensor.storage)
         if len(raw) != tensor.storage.count * dtype.itemsize:
-            raise ValueError
+            raise ValueError("a storage of another size")
         if math.prod(tensor.shape) > tensor.storage.count:
             raise InputError(f"expected no more values than the file stores{where}; use the official file")
         strides = [step * dtype.itemsize for step in tensor.strides]
@@ -183,11 +178,7 @@ def _arrays(content: Any, order: Order, values: Callable[[Storage], bytes]) -> d
 
 
 def _dtype(storage: Storage, where: str = "") -> np.dtype:
-    """Of a storage's values; `where` ends the message.
-
-    Raises:
-        InputError: neither float32 nor float64 nor an integer.
-    """
+    """Type of a storage's values; `where` ends the message of an error."""
     if storage.kind not in _DTYPES:
         kind = excerpt(storage.kind.removesuffix("Storage"))
         raise InputError(f"expected tensors of float32 or float64, got {kind}{where}; use the official file")

@@ -255,7 +255,7 @@ def test_nothing_grows_beyond_the_file(path, monkeypatch):
         assert tracemalloc.get_traced_memory()[1] < 20e6
     finally:
         tracemalloc.stop()
-    monkeypatch.setattr(pickles, "_MOST", 1000)
+    monkeypatch.setattr(pickles, "MAX_INSTRUCTIONS", 1000)
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("file/data.pkl", Writer().pickled(b"](" + 1000 * b"N" + b"e"))
     assert "its pickle has more than 1,000 instructions" in refused(path)

@@ -302,7 +302,7 @@ def test_arrays_are_filled_once(path):
         (outer({"conv": {"weights": array()}}) + b"\0", "damaged"),
         (b"", "damaged"),
         (b"\x80\x02S'text'\n.", "its pickle is more than data (STRING)"),
-        (b"\x80\x02S'\\d'\n.", "damaged"),  # which Python's own reader of strings warns of
+        (b"\x80\x02S'\\d'\n.", "its pickle is more than data (STRING)"),  # Python's reader of strings warns of it
         (b"\x80\x05\x96" + struct.pack("<Q", 4) + b"abcd.", "its pickle is more than data (BYTEARRAY8)"),
         (b"\x80\x04\x8c\x02os\x8c\x05mkdir\x93)R.", "it asks for os.mkdir"),
         (b"\x80\x02X\x02\0\0\0osQ.", "damaged"),

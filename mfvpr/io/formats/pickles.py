@@ -1,25 +1,33 @@
-"""Reads pickles as data: an interpreter of the instructions that hold data, which calls nothing.
+"""Read pickles as data: Python's unpickler without the instructions that import or call.
 
-Python's own unpickler looks up and calls whatever a file names. Here a name stays a name: a reader of one kind of file
-says what the few that it knows stand for, and all else is refused.
+A name in a pickle becomes a `Name` and is never looked up. A subclass of `DataUnpickler` for one kind of file says
+which names may be called, and builds plain data in their place.
 """
 
 import os
+import pickle
 import pickletools
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO
 
 from mfvpr.utils.errors import InputError
 
-_MOST = 1 << 20  # instructions, of which each makes one object; strings hold as much as the file at most
 MEND = "nothing was executed, use the official file"
+MAX_INSTRUCTIONS = 1 << 20  # each makes at most one object; strings are no longer than the file
+_STANDARD = """
+PROTO STOP MARK NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 FLOAT BINFLOAT
+UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8 BINSTRING SHORT_BINSTRING BINBYTES SHORT_BINBYTES BINBYTES8
+EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 EMPTY_LIST LIST APPEND APPENDS EMPTY_DICT
+PUT BINPUT LONG_BINPUT MEMOIZE GET BINGET LONG_BINGET GLOBAL STACK_GLOBAL BINPERSID
+"""
+_Unpickler: Any = pickle._Unpickler  # type: ignore[attr-defined]  # in Python
 
 
 @dataclass(frozen=True)
 class Name:
-    """What a pickle asks for."""
+    """Name of a class or function in a pickle."""
 
     module: str
     name: str
@@ -28,158 +36,138 @@ class Name:
         return f"{self.module}.{self.name}"
 
 
-class Vocabulary(Protocol):
-    """What the names of one kind of file stand for.
+class DataUnpickler(_Unpickler):
+    """Unpickler of plain data, protocols 0 to 4, without the strings of Python 2's protocol 0.
 
-    Each method raises InputError for what has no place there, and TypeError or ValueError for what is damaged.
+    Other strings of Python 2, which may be text or bytes, become text in which each character is a byte.
+
+    The base class is the unpickler in Python. The one in C allocates its memo up to the largest index that a file
+    states, and hashes any key of a dictionary, which takes years for tuples of tuples.
     """
 
-    def called(self, name: Name, arguments: tuple) -> Any:
-        """What a call of this name gives."""
-        ...
+    def __init__(self, file: BinaryIO) -> None:
+        super().__init__(_bounded(file), encoding="latin-1")
 
-    def built(self, instance: Any, state: Any) -> None:
-        """Fill what a call gave, in place."""
-        ...
+    def load(self) -> Any:
+        """Content of the next pickle of the file; the file then stands behind it.
 
-    def stored(self, identity: Any) -> Any:
-        """What lies outside of the pickle under this identity."""
-        ...
+        Raises:
+            InputError: the pickle holds other than the expected data, or is too large.
+            ValueError: the pickle is damaged.
+        """
+        self.memo = {}
+        self.dispatch = _Instructions(_HANDLERS)
+        try:
+            return super().load()
+        except InputError:
+            raise
+        except Exception as error:  # the unpickler raises what its lists, `struct` and codecs raise
+            raise ValueError("damaged pickle") from error
 
+    def find_class(self, module: str, name: str) -> Name:
+        return Name(module, name)
 
-def excerpt(text: str) -> str:
-    """What a file says, short and on one line, for a message."""
-    return repr(text if len(text) <= 60 else f"{text[:57]}...")[1:-1]
+    def call(self, name: Name, arguments: tuple) -> Any:
+        """Return what stands for the result of this call.
 
+        Raises:
+            InputError: the name may not be called.
+        """
+        raise NotImplementedError
 
-def refused(name: Name, expected: str) -> InputError:
-    """That a pickle asks for this name where something else is expected."""
-    return InputError(f"it asks for {excerpt(str(name))}, where {expected} are expected; {MEND}")
+    def build(self, instance: Any, state: Any) -> None:
+        """Fill the result of a call, in place."""
+        raise NotImplementedError
 
+    def load_frame(self) -> None:
+        self.read(8)  # the length of the frame, which would be read at once
 
-def file_size(file: BinaryIO) -> int:
-    """Bytes of an open file, which stays where it is."""
-    place = file.tell()
-    size = file.seek(0, os.SEEK_END)
-    file.seek(place)
-    return size
+    def load_call(self) -> None:
+        arguments, name = self.stack.pop(), self.stack.pop()
+        self.append(self.call(of_type(Name, name), of_type(tuple, arguments)))
 
+    def load_build(self) -> None:
+        state = self.stack.pop()
+        self.build(self.stack[-1], state)
 
-def read_pickle(file: BinaryIO, vocabulary: Vocabulary) -> Any:
-    """What the next pickle of a file holds; the file then stands behind it.
+    def load_dict(self) -> None:
+        keys_and_values = self.pop_mark()  # which replaces self.append
+        self.append(_dictionary(keys_and_values))
 
-    Protocols 0 to 4, without the strings of Python 2's protocol 0. Those of its other protocols, which may be text or
-    bytes, become text in which each character is a byte.
+    def load_setitem(self) -> None:
+        value, key = self.stack.pop(), self.stack.pop()
+        of_type(dict, self.stack[-1]).update(_dictionary([key, value]))
 
-    Raises:
-        InputError: it asks for anything else, or is too large.
-        LookupError, TypeError, ValueError: it is damaged.
-    """
-    stack: list[Any] = []
-    marks: list[int] = []
-    memo: dict[int, Any] = {}
-
-    def popped(count: int) -> list[Any]:
-        start = len(stack) - count
-        if start < (marks[-1] if marks else 0):
-            raise IndexError
-        items = stack[start:]
-        del stack[start:]
-        return items
-
-    def above_mark() -> list[Any]:
-        return popped(len(stack) - marks.pop())
-
-    instructions: Iterator[tuple[Any, Any, Any]] = pickletools.genops(_bounded(file))
-    for count, (instruction, argument, _) in enumerate(instructions):
-        if count >= _MOST:
-            raise InputError(f"its pickle has more than {_MOST:,} instructions; {MEND}")
-        match instruction.name:
-            case "PROTO" | "FRAME":
-                pass
-            case "INT" | "BININT" | "BININT1" | "BININT2" | "LONG" | "LONG1" | "FLOAT" | "BINFLOAT":
-                stack.append(argument)
-            case "UNICODE" | "BINUNICODE" | "SHORT_BINUNICODE" | "BINUNICODE8" | "BINSTRING" | "SHORT_BINSTRING":
-                stack.append(argument)
-            case "BINBYTES" | "SHORT_BINBYTES" | "BINBYTES8":
-                stack.append(argument)
-            case "NONE" | "NEWTRUE" | "NEWFALSE":
-                stack.append({"NONE": None, "NEWTRUE": True, "NEWFALSE": False}[instruction.name])
-            case "EMPTY_DICT" | "EMPTY_LIST" | "EMPTY_TUPLE":
-                stack.append({"EMPTY_DICT": dict, "EMPTY_LIST": list, "EMPTY_TUPLE": tuple}[instruction.name]())
-            case "MARK":
-                marks.append(len(stack))
-            case "TUPLE":
-                stack.append(tuple(above_mark()))
-            case "TUPLE1" | "TUPLE2" | "TUPLE3":
-                stack.append(tuple(popped(int(instruction.name[-1]))))
-            case "LIST":
-                stack.append(above_mark())
-            case "DICT":
-                stack.append(_entries(above_mark()))
-            case "APPEND" | "APPENDS":
-                items = popped(1) if instruction.name == "APPEND" else above_mark()
-                of_type(list, stack[-1]).extend(items)
-            case "SETITEM" | "SETITEMS":
-                items = popped(2) if instruction.name == "SETITEM" else above_mark()
-                of_type(dict, stack[-1]).update(_entries(items))
-            case "PUT" | "BINPUT" | "LONG_BINPUT":
-                memo[argument] = stack[-1]
-            case "MEMOIZE":
-                memo[len(memo)] = stack[-1]
-            case "GET" | "BINGET" | "LONG_BINGET":
-                stack.append(memo[argument])
-            case "GLOBAL":
-                stack.append(Name(*argument.split(" ")))
-            case "STACK_GLOBAL":
-                stack.append(Name(*(of_type(str, part) for part in popped(2))))
-            case "BINPERSID":
-                stack.append(vocabulary.stored(*popped(1)))
-            case "REDUCE" | "NEWOBJ":
-                name, arguments = popped(2)
-                stack.append(vocabulary.called(of_type(Name, name), of_type(tuple, arguments)))
-            case "BUILD":
-                (state,) = popped(1)
-                vocabulary.built(stack[-1], state)
-            case "STOP":
-                (value,) = popped(1)
-                return value
-            case name:
-                raise InputError(f"its pickle is more than data ({name}); {MEND}")
-    raise EOFError
+    def load_setitems(self) -> None:
+        keys_and_values = self.pop_mark()
+        of_type(dict, self.stack[-1]).update(_dictionary(keys_and_values))
 
 
-def of_type(kind: type, value: Any) -> Any:
-    """The value, where it is of this type and no other.
+class _Instructions(dict[int, Callable]):
+    """Handlers of one pickle's instructions; refuses other instructions, and too many."""
 
-    Raises:
-        TypeError: it is not.
-    """
-    if type(value) is not kind:
-        raise TypeError
-    return value
+    count = 0
 
-
-def natural(value: Any) -> int:
-    """The value, where it is a number of things.
-
-    Raises:
-        TypeError, ValueError: it is not.
-    """
-    if of_type(int, value) < 0:
-        raise ValueError
-    return value
+    def __getitem__(self, code: int) -> Callable:
+        self.count += 1
+        if self.count > MAX_INSTRUCTIONS:
+            raise InputError(f"its pickle has more than {MAX_INSTRUCTIONS:,} instructions; {MEND}")
+        if code not in self:
+            name = next(opcode.name for opcode in pickletools.opcodes if ord(opcode.code) == code)
+            raise InputError(f"its pickle is more than data ({name}); {MEND}")
+        return super().__getitem__(code)
 
 
-def _entries(items: list[Any]) -> dict[int | str, Any]:
-    """A dictionary of alternating keys and values."""
-    keys = [key if type(key) is int else of_type(str, key) for key in items[::2]]
-    return dict(zip(keys, items[1::2], strict=True))
+_HANDLERS = {
+    **{code: _Unpickler.dispatch[code] for code in (getattr(pickle, name)[0] for name in _STANDARD.split())},
+    pickle.FRAME[0]: DataUnpickler.load_frame,
+    pickle.REDUCE[0]: DataUnpickler.load_call,
+    pickle.NEWOBJ[0]: DataUnpickler.load_call,
+    pickle.BUILD[0]: DataUnpickler.load_build,
+    pickle.DICT[0]: DataUnpickler.load_dict,
+    pickle.SETITEM[0]: DataUnpickler.load_setitem,
+    pickle.SETITEMS[0]: DataUnpickler.load_setitems,
+}
+
+
+def _dictionary(keys_and_values: list[Any]) -> dict[int | str, Any]:
+    keys = [key if type(key) is int else of_type(str, key) for key in keys_and_values[::2]]
+    return dict(zip(keys, keys_and_values[1::2], strict=True))
 
 
 def _bounded(file: BinaryIO) -> Any:
-    """The file as `pickletools` reads it; a length that the pickle states takes no more memory than the file has."""
+    """The file, without reserving memory for more bytes than it has."""
     end = file_size(file)
-    return SimpleNamespace(
-        read=lambda count: file.read(min(count, end - file.tell())), readline=file.readline, tell=file.tell
-    )
+    return SimpleNamespace(read=lambda count: file.read(min(count, end - file.tell())), readline=file.readline)
+
+
+def file_size(file: BinaryIO) -> int:
+    """Bytes of an open file; its position does not change."""
+    position = file.tell()
+    size = file.seek(0, os.SEEK_END)
+    file.seek(position)
+    return size
+
+
+def excerpt(text: str) -> str:
+    """Text of a file on one line of at most 60 characters, for messages."""
+    return repr(text if len(text) <= 60 else f"{text[:57]}...")[1:-1]
+
+
+def name_error(name: Name, expected: str) -> InputError:
+    """Error for a pickle that asks for this name."""
+    return InputError(f"it asks for {excerpt(str(name))}, where {expected} are expected; {MEND}")
+
+
+def of_type(kind: type, value: Any) -> Any:
+    """The value, if its type is exactly this one; raises TypeError otherwise."""
+    if type(value) is not kind:
+        raise TypeError(f"expected {kind.__name__}, got {type(value).__name__}")
+    return value
+
+
+def natural_number(value: Any) -> int:
+    """The value, if it is an int of at least 0; raises TypeError or ValueError otherwise."""
+    if of_type(int, value) < 0:
+        raise ValueError(f"expected at least 0, got {value}")
+    return value
