@@ -1,6 +1,6 @@
-"""Features, global descriptors and shortlists of other programs: read, checked and written.
+"""Read, check and write features, global descriptors and shortlists of other programs.
 
-Read first: features and descriptors (what is read), names (which entry belongs to which image), then the formats:
+Read first: features and descriptors (the formats), names (matches entries of a file to images), then the readers:
 npz, h5, pairs, and formats/ (MATLAB files, pickles and NumPy objects, read as data).
 
 Imports types, utils.

@@ -1,4 +1,4 @@
-"""What arrays of other programs must be before they are used."""
+"""Checks of arrays from other programs."""
 
 from typing import Literal
 
@@ -8,21 +8,21 @@ from mfvpr.utils.errors import InputError
 
 Lengths = Literal["unit", "normalize", "keep"]
 LENGTHS = ("unit", "normalize", "keep")
-TOLERANCE = 0.01  # of unit length, relative: float16 loses 5e-4
-EXACT = 1e-6  # what float32 loses
+TOLERANCE = 0.01  # of unit length, relative; the error of float16 is 5e-4
+EXACT = 1e-6  # the error of float32
 
 
 def require_lengths(lengths: str) -> None:
-    """Refuse a word that says nothing about lengths."""
+    """Raise an InputError unless `lengths` is one of `LENGTHS`."""
     if lengths not in LENGTHS:
         raise InputError(f"lengths={lengths}: expected one of {', '.join(LENGTHS)}")
 
 
 def as_float32(where: str, array: np.ndarray, kinds: str = "f") -> np.ndarray:
-    """Finite float32 from an array of these kinds of numbers (`numpy.dtype.kind`).
+    """Convert an array of these kinds of numbers (`numpy.dtype.kind`) to float32.
 
     Raises:
-        InputError: of another type, or not finite.
+        InputError: the array has another type, or values that are not finite.
     """
     if array.dtype.kind not in kinds:
         raise InputError(f"{where}: expected {'floating-point ' if kinds == 'f' else ''}numbers, got {array.dtype}")
@@ -35,16 +35,16 @@ def as_float32(where: str, array: np.ndarray, kinds: str = "f") -> np.ndarray:
 
 
 def with_length(where: str, descriptors: np.ndarray, lengths: Lengths) -> np.ndarray:
-    """Descriptors `[N, D]` float32 of the length that was asked for.
+    """Check or scale the lengths of descriptors `[N, D]`; the result is float32.
 
     Args:
-        where: for messages.
+        where: place of the descriptors, for messages.
         descriptors: finite.
-        lengths: `unit`: they have unit length but for rounding, which is mended; `normalize`: give them unit length;
-            `keep`: as they are.
+        lengths: `unit`: require unit length, and correct its rounding; `normalize`: scale to unit length; `keep`: do
+            not change the descriptors.
 
     Raises:
-        InputError: off unit length by more than 1 %, or of no length to normalize.
+        InputError: a length differs from 1 by more than 1 % (`unit`), or is 0 (`normalize`).
     """
     if lengths == "keep" or not len(descriptors):
         return descriptors
@@ -58,5 +58,5 @@ def with_length(where: str, descriptors: np.ndarray, lengths: Lengths) -> np.nda
             )
     elif not norms.all():
         raise InputError(f"{where}: expected descriptors with a direction, got zeros at {int(norms.argmin())}")
-    scale = np.where(np.abs(norms - 1) > EXACT, norms, 1.0)  # what is of unit length comes back bit by bit
+    scale = np.where(np.abs(norms - 1) > EXACT, norms, 1.0)  # unit length in float32: no bit changes
     return (descriptors / scale[:, None]).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Arrays by image and name in files of other programs: hloc's h5, npz, folders of npz. Read as data, never executed."""
+"""Common interface of files with arrays by image: hloc's h5, npz, folders of npz."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
@@ -11,7 +11,7 @@ from mfvpr.utils.errors import InputError
 
 
 class Contents(NamedTuple):
-    """What there is of an image: the names of its arrays, and the shapes of some."""
+    """Names of an image's arrays, and shapes of the requested ones."""
 
     names: Set[str]
     shapes: Mapping[str, tuple[int, ...]]
@@ -21,8 +21,8 @@ class FileEntry(NamedTuple):
     """Place of an image's arrays.
 
     Attributes:
-        file: that holds the arrays.
-        name: of the image in the file; "" = the file holds one image.
+        file: file with the arrays.
+        name: name of the image in the file; "" = the file holds one image.
     """
 
     file: Path
@@ -30,12 +30,12 @@ class FileEntry(NamedTuple):
 
 
 class Container(Protocol):
-    """Arrays of several images; only what is asked for is read.
+    """Arrays of several images; reads only the requested arrays.
 
     Attributes:
         path: file or folder, for messages.
-        images: what the file calls its images.
-        transposed: whether descriptors are `[D, N]` where their shape cannot tell.
+        images: names of the images in the file.
+        transposed: whether descriptors are `[D, N]` if their shapes fit both layouts.
     """
 
     path: Path
@@ -43,11 +43,11 @@ class Container(Protocol):
     transposed: bool
 
     def contents(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Contents]:
-        """For each image, what there is, and the shapes of those of its `parts` that are there; no values are read."""
+        """For each image, the names of all arrays and the shapes of those in `parts`; reads no values."""
         ...
 
     def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:
-        """For each image, those of its `parts` that are there."""
+        """For each image, its arrays among `parts`."""
         ...
 
     def entry(self, image: str) -> FileEntry:
@@ -57,24 +57,24 @@ class Container(Protocol):
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Whatever goes wrong with a foreign file is one line."""
+    """Turn any error of a reader into an InputError of one line."""
     try:
         yield
     except InputError:
         raise
-    except Exception as error:  # what damaged bytes can raise in zipfile, zlib, NumPy and HDF5 has no common class
+    except Exception as error:  # zipfile, zlib, NumPy and HDF5 share no class of errors
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{path}: cannot be read ({shortened(reason, 160)}); is it whole, and of this kind?") from None
+        raise InputError(f"{path}: cannot be read ({shorten(reason, 160)}); is it whole, and of this kind?") from None
 
 
-def shortened(text: str, limit: int = 60) -> str:
-    """Foreign text, for a message of one line."""
+def shorten(text: str, limit: int = 60) -> str:
+    """Text of a file in at most `limit` printable characters, for messages."""
     text = text.encode("unicode_escape").decode("ascii") if not text.isprintable() else text
     return text if len(text) <= limit else f"{text[: limit - 20]}... ({len(text)} characters)"
 
 
 def require_plain(where: str, dtype: np.dtype) -> None:
-    """Refuse arrays of Python objects, which only a pickle could bring, and of records."""
+    """Raise an InputError for arrays of Python objects, which need a pickle, and of records."""
     if dtype.hasobject or dtype.kind in "OV":
         raise InputError(
             f"{where}: expected an array of numbers or text, got objects or records; they are never loaded"

@@ -1,4 +1,4 @@
-"""Global descriptors from other programs, and for them."""
+"""Read and write global descriptors of other programs."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 
 from mfvpr.io.checks import Lengths, as_float32, require_lengths, with_length
-from mfvpr.io.containers import FileEntry, reading, shortened
-from mfvpr.io.feature_files import as_written
+from mfvpr.io.containers import FileEntry, reading, shorten
+from mfvpr.io.feature_files import as_float
 from mfvpr.io.h5 import H5File, write_h5
 from mfvpr.io.names import match_names, require_all, require_different
 from mfvpr.io.npz import parse_npy, read_npz, write_npz
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import printable, replacing, require_file
 
-PART = "global_descriptor"  # what hloc calls it
+PART = "global_descriptor"  # hloc's name
 
 
 def read_global_descriptors(path: Path | str, names: Sequence[str], *, lengths: Lengths = "unit") -> np.ndarray:
@@ -22,7 +22,7 @@ def read_global_descriptors(path: Path | str, names: Sequence[str], *, lengths: 
 
     Args:
         path: `.npy`: `[M, D]`, in the order of the names as Python sorts them (image10 before image2);
-            `.npz`: `descriptors` `[M, D]`, with `names` `[M]`, or without in the order of `.npy`;
+            `.npz`: `descriptors` `[M, D]` and `names` `[M]`; without `names`, the order of `.npy`;
             `.h5` or `.hdf5`: as hloc, a `global_descriptor` `[D]` for each image.
         names: `[M]` relative POSIX paths, matched as in `names.match_names`.
         lengths: as in `open_features`.
@@ -31,8 +31,8 @@ def read_global_descriptors(path: Path | str, names: Sequence[str], *, lengths: 
         `[M, D]` float32 in the order of `names`.
 
     Raises:
-        InputError: no such file, damaged, images that are missing or could be several, values that are not finite, or
-            not of unit length.
+        InputError: the file is missing or damaged; images are missing or ambiguous; values are not finite; or lengths
+            are not 1.
     """
     return read_with_entries(path, names, lengths=lengths)[0]
 
@@ -67,7 +67,7 @@ def write_global_descriptors(
     """
     path = Path(path)
     require_different(path, names)
-    values = as_written(str(path), np.asarray(descriptors), half)
+    values = as_float(str(path), np.asarray(descriptors), half)
     if values.ndim != 2 or len(values) != len(names):
         raise InputError(f"{path}: expected descriptors [{len(names)}, D] to write, got {list(values.shape)}")
     suffix = path.suffix.lower()
@@ -82,29 +82,29 @@ def write_global_descriptors(
         raise InputError(f"{path}: expected a name that ends with .npy, .npz, .h5 or .hdf5")
 
 
-Rows = tuple[list[str], np.ndarray]  # the entry of each image, and its descriptor
+Rows = tuple[list[str], np.ndarray]  # entries [M] of the images and their descriptors [M, D]
 
 
 def _from_npy(path: Path, names: Sequence[str]) -> Rows:
     with reading(path):
-        return _from_sorted(path, names, parse_npy(str(path), path.read_bytes()))
+        return _from_name_order(path, names, parse_npy(str(path), path.read_bytes()))
 
 
 def _from_npz(path: Path, names: Sequence[str]) -> Rows:
     arrays = read_npz(path, ("descriptors", "names"))
     if "descriptors" not in arrays:
         raise InputError(f"{path}: expected an array descriptors [M, D], and names [M]; got no descriptors")
-    descriptors, foreign = arrays["descriptors"], arrays.get("names")
-    if foreign is None:
-        return _from_sorted(path, names, descriptors)
-    if foreign.dtype.kind != "U" or foreign.shape != descriptors.shape[:1]:
+    descriptors, file_names = arrays["descriptors"], arrays.get("names")
+    if file_names is None:
+        return _from_name_order(path, names, descriptors)
+    if file_names.dtype.kind != "U" or file_names.shape != descriptors.shape[:1]:
         raise InputError(
-            f"{path}: expected names as text [M] and descriptors [M, D], got {foreign.dtype}{list(foreign.shape)} and "
-            f"{list(descriptors.shape)}"
+            f"{path}: expected names as text [M] and descriptors [M, D], got {file_names.dtype}"
+            f"{list(file_names.shape)} and {list(descriptors.shape)}"
         )
-    rows = {name: row for row, name in enumerate(foreign.tolist())}
-    if len(rows) < len(foreign):
-        raise InputError(f"{path}: expected different names, got {len(foreign) - len(rows)} again; keep one of each")
+    rows = {name: row for row, name in enumerate(file_names.tolist())}
+    if len(rows) < len(file_names):
+        raise InputError(f"{path}: expected different names, got {len(file_names) - len(rows)} again; keep one of each")
     matched = match_names(path, names, rows)
     require_all(path, names, matched, "descriptors")
     images = [image for image in matched if image is not None]
@@ -120,18 +120,18 @@ def _from_h5(path: Path, names: Sequence[str]) -> Rows:
     for image, parts in zip(images, file.arrays(images, (PART,)), strict=True):
         if PART not in parts or parts[PART].shape != (rows[0] if rows else parts[PART].reshape(-1)).shape:
             got = list(parts[PART].shape) if PART in parts else "none"
-            raise InputError(f"{path}: {shortened(image)}: expected {PART} [D], the same D for all, got {got}")
+            raise InputError(f"{path}: {shorten(image)}: expected {PART} [D], the same D for all, got {got}")
         rows.append(parts[PART])
     return images, np.stack(rows) if rows else np.zeros((0, 0), np.float32)
 
 
-def _from_sorted(path: Path, names: Sequence[str], descriptors: np.ndarray) -> Rows:
+def _from_name_order(path: Path, names: Sequence[str], descriptors: np.ndarray) -> Rows:
     if descriptors.ndim != 2 or len(descriptors) != len(names):
         raise InputError(f"{path}: expected descriptors [{len(names)}, D] of the images, got {list(descriptors.shape)}")
-    places = np.argsort(_sorted_rows(names))
-    return [f"row {place}" for place in places.tolist()], descriptors[places]
+    rows = np.argsort(_sorted_rows(names))
+    return [f"row {row}" for row in rows.tolist()], descriptors[rows]
 
 
 def _sorted_rows(names: Sequence[str]) -> np.ndarray:
-    """`[M]` rows of the names in the order in which Python sorts them."""
+    """`[M]` rows that sort the names."""
     return np.array(sorted(range(len(names)), key=names.__getitem__), np.int64)

@@ -1,11 +1,11 @@
-"""Features written as other programs read them."""
+"""Write features for other programs."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from mfvpr.io.containers import shortened
+from mfvpr.io.containers import shorten
 from mfvpr.io.h5 import write_h5
 from mfvpr.io.names import require_different
 from mfvpr.io.npz import write_npz
@@ -16,19 +16,19 @@ from mfvpr.utils.errors import InputError
 def write_features(
     path: Path | str, names: Sequence[str], rows: Iterable[tuple[int, Features]], *, half: bool = False
 ) -> None:
-    """Write features, which `open_features` reads back, one image after the other; padding is left out.
+    """Write features without padding, one image after the other; `open_features` reads them back.
 
-    A file is there whole or not at all.
+    Each file is written completely or not at all.
 
     Args:
-        path: `.h5` or `.hdf5`: as hloc, descriptors `[D, N]`; `.npz`: all images in one, arrays named `image/part`,
-            descriptors `[N, D]`; another name: a folder, with `image.npz` for each, the arrays named by their part.
-        names: `[M]` of the images; hloc looks for paths below its own image folder.
-        rows: of images and their features, as the `read` of a source gives them.
+        path: `.h5` or `.hdf5`: as hloc, descriptors `[D, N]`; `.npz`: one file with arrays named `image/part`,
+            descriptors `[N, D]`; another name: a folder with `image.npz` for each image, arrays named by their part.
+        names: `[M]` names of the images; hloc expects paths below its image folder.
+        rows: (row, features) pairs, as from `ImportedFeatures.read`.
         half: float16 instead of float32, as hloc by default. Positions lose up to 0.5 px beyond 1024 px.
 
     Raises:
-        InputError: values that float16 cannot hold, names that no file can have, or two images with one name.
+        InputError: a value is too large for float16, a name is no path below a folder, or two images share a name.
     """
     path = Path(path)
     require_different(path, names)
@@ -42,11 +42,11 @@ def write_features(
             write_npz(path / f"{_below(name)}.npz", arrays.items())
 
 
-def as_written(where: str, values: np.ndarray, half: bool) -> np.ndarray:
-    """Float32, or float16 where that holds them.
+def as_float(where: str, values: np.ndarray, half: bool) -> np.ndarray:
+    """Convert to float32, or to float16 if `half`.
 
     Raises:
-        InputError: finite values become infinite.
+        InputError: a value is not finite in float16.
     """
     if not half:
         return np.asarray(values, np.float32)
@@ -60,15 +60,15 @@ def as_written(where: str, values: np.ndarray, half: bool) -> np.ndarray:
 def _parts(name: str, features: Features, half: bool) -> dict[str, np.ndarray]:
     mask, size = np.asarray(features.mask), np.asarray(features.image_size)
     arrays = {
-        part: as_written(f"{shortened(name)}: {part}", np.asarray(getattr(features, part))[mask], half)
+        part: as_float(f"{shorten(name)}: {part}", np.asarray(getattr(features, part))[mask], half)
         for part in ("keypoints", "descriptors", "scores")
     }
     return arrays | {"image_size": size.astype(np.int64) if (size == np.round(size)).all() else size}
 
 
 def _below(name: str) -> str:
-    """The name, as long as it stays in the folder."""
+    """The name, if it is a path below the folder; raises an InputError otherwise."""
     parts = PurePosixPath(name).parts
     if not parts or PurePosixPath(name).is_absolute() or ".." in parts:
-        raise InputError(f"{shortened(name)}: expected a path below the folder of images; rename it")
+        raise InputError(f"{shorten(name)}: expected a path below the folder of images; rename it")
     return name

@@ -1,17 +1,20 @@
-"""Local features that other programs extracted, read when they are asked for.
+"""Read local features that other programs extracted.
 
     features = open_features(Path("feats-d2net-ss.h5"), dataset.database.names)
-    for row, found in features.read([3, 14]):
+    for row, image_features in features.read([3, 14]):
         ...
 
-What is read: hloc's h5; an npz for all images, with arrays named `image/part`; a folder with an npz for each image,
-D2-Net's own `.d2-net` among them. Parts are `keypoints` `[N, 2]` (x, y), px, or with up to two more columns (scale,
-angle), which are not used; `descriptors` `[D, N]` (hloc) or `[N, D]`; `scores` or `keypoint_scores` `[N]`, larger =
-better; `image_size` `[2]` (width, height), px, of the image that the keypoints are in. Pixel centers are at whole
-numbers, as in hloc and OpenCV; hloc gives keypoints in the original image, whatever size it was reduced to.
+Formats: hloc's h5; an npz for all images, with arrays named `image/part`; a folder with an npz or a `.d2-net` (of
+D2-Net's code) for each image. Parts of an image:
 
-Where the file has no scores, every keypoint has the score 1. float16 becomes float32; positions that hloc rounded to
-float16 are off by up to 0.25 px beyond 512 px and 0.5 px beyond 1024 px.
+- `keypoints` `[N, 2]` (x, y), px; up to two more columns (scale, angle) are ignored;
+- `descriptors` `[D, N]` (hloc) or `[N, D]`;
+- `scores` or `keypoint_scores` `[N]`, larger = better; without them, every keypoint has the score 1;
+- `image_size` `[2]` (width, height), px, of the image that the keypoints are in.
+
+Pixel centers are at whole numbers, as in hloc and OpenCV. hloc gives keypoints in the original image, even if it
+extracts them from a smaller one. float16 becomes float32; positions that hloc rounded to float16 are off by up to
+0.25 px beyond 512 px and 0.5 px beyond 1024 px.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -22,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from mfvpr.io.checks import Lengths, as_float32, require_lengths, with_length
-from mfvpr.io.containers import Container, Contents, FileEntry, shortened
+from mfvpr.io.containers import Container, Contents, FileEntry, shorten
 from mfvpr.io.h5 import H5File
 from mfvpr.io.names import match_names, require_all
 from mfvpr.io.npz import NpzFile, NpzFolder
@@ -40,9 +43,9 @@ class ImportedFeatures:
 
     Attributes:
         path: file or folder.
-        paths: the files that hold the images.
-        counts: `[M]` int32, keypoints of each image, -1 = not there.
-        dimension: D; 0 where no image has a keypoint.
+        paths: files with the images.
+        counts: `[M]` int32, keypoints of each image, -1 = missing image.
+        dimension: D; 0 if no image has a keypoint.
         scored: whether the files have scores; if not, all are 1.
     """
 
@@ -62,23 +65,23 @@ class ImportedFeatures:
 
     @property
     def entries(self) -> list[FileEntry | None]:
-        """`[M]` place of each image's arrays; None = not there."""
+        """`[M]` place of each image's arrays; None = missing image."""
         return [None if image is None else self._container.entry(image) for image in self._images]
 
     def read(self, rows: Iterable[int] | None = None) -> Iterator[tuple[int, Features]]:
-        """Row and features, unpadded NumPy float32 with a full mask, in the order of `rows`; nothing else is read.
+        """Read the row and features of each image: unpadded NumPy float32 with a full mask.
 
         Args:
-            rows: None = all that are there.
+            rows: rows of images, in the order to read them; None = all images in the files.
 
         Raises:
-            InputError: an image that is not there, or whose arrays are damaged or not what they should be.
+            InputError: an image is missing, or its arrays are damaged or do not fit each other.
         """
-        wanted = np.flatnonzero(self.counts >= 0).tolist() if rows is None else [int(row) for row in rows]
-        images = [self._image(row) for row in wanted]
+        rows = np.flatnonzero(self.counts >= 0).tolist() if rows is None else [int(row) for row in rows]
+        images = [self._image(row) for row in rows]
         arrays = self._container.arrays(images, PARTS)
-        for row, image, parts in zip(wanted, images, arrays, strict=True):
-            yield row, self._features(row, f"{self.path}: {shortened(image)}", parts)
+        for row, image, parts in zip(rows, images, arrays, strict=True):
+            yield row, self._features(row, f"{self.path}: {shorten(image)}", parts)
 
     def _image(self, row: int) -> str:
         image = self._images[row] if 0 <= row < len(self) else None
@@ -95,8 +98,8 @@ class ImportedFeatures:
         scores = np.ones(count, np.float32)
         if part := _score_part(parts):
             scores = as_float32(f"{where}: {part}", parts[part]).reshape(-1)
-        fit = descriptors.shape == shape if count else not descriptors.size  # [D, 0], [0, D], [0]: all are none
-        if len(keypoints) != count or len(scores) != count or not fit or self.scored != (part is not None):
+        has_shape = descriptors.shape == shape if count else not descriptors.size  # [D, 0], [0, D] or [0] if count = 0
+        if len(keypoints) != count or len(scores) != count or not has_shape or self.scored != (part is not None):
             raise InputError(
                 f"{where}: expected {count} keypoints with scores and descriptors of "
                 f"{self.dimension} numbers, got {len(keypoints)}, {len(scores)} and {list(descriptors.shape)}; is the "
@@ -123,41 +126,41 @@ def open_features(
     lengths: Lengths = "unit",
     partial: bool = False,
 ) -> ImportedFeatures:
-    """Features of the images `names`. Only the headers of their arrays are read here.
+    """Open the features of the images `names`; reads only the headers of their arrays.
 
     Args:
         path: `.h5` or `.hdf5` of hloc, `.npz` of all images, or a folder of `.npz` and `.d2-net`.
-        names: `[M]` relative POSIX paths, as `ImageFolder.names`; see `names.match_names`. Where hloc saw the folder of
-            the images from above (`database/1.jpg`), give them so.
-        image_size: `[2]` or `[M, 2]` (width, height), px, of images whose size the files do not tell.
-        lengths: of descriptors. `unit`: they must be of unit length within 1 %, and rounding is mended; `normalize`:
-            they are given unit length; `keep`: they are taken as they are.
+        names: `[M]` relative POSIX paths, as `ImageFolder.names`; see `names.match_names`. Use hloc's paths if they
+            begin at a parent folder (`database/1.jpg`).
+        image_size: `[2]` or `[M, 2]` (width, height), px, if the files have no `image_size`.
+        lengths: of descriptors. `unit`: require unit length within 1 %, and correct rounding; `normalize`: scale to
+            unit length; `keep`: do not change them.
         partial: whether images may be missing (their count is -1).
 
     Raises:
-        InputError: no such file, not of this kind, damaged; images that are missing or could be several; arrays that do
-            not fit each other.
+        InputError: the file is missing, damaged or has another format; images are missing or ambiguous; arrays do not
+            fit each other.
     """
     path = Path(path)
     require_lengths(lengths)
-    sizes = None if image_size is None else _given_sizes(image_size, len(names))
+    sizes = None if image_size is None else _explicit_sizes(image_size, len(names))
     container = open_container(path)
     images = match_names(path, names, container.images)
     if not partial or not any(images):
         require_all(path, names, images, "features")
-    there = [row for row, image in enumerate(images) if image is not None]
+    matched_rows = [row for row, image in enumerate(images) if image is not None]
     matched = [image for image in images if image is not None]
     contents = dict(zip(matched, container.contents(matched, ("keypoints", "descriptors")), strict=True))
     counts = np.full(len(names), -1, np.int32)
-    for row, (image, held) in zip(there, contents.items(), strict=True):
-        counts[row] = _count(f"{path}: {shortened(image)}", held, given_size=sizes is not None)
+    for row, (image, image_contents) in zip(matched_rows, contents.items(), strict=True):
+        counts[row] = _count(f"{path}: {shorten(image)}", image_contents, needs_size=sizes is None)
     transposed, dimension = _layout(path, contents, container.transposed)
     return ImportedFeatures(
         path=path,
         paths=tuple(dict.fromkeys(container.entry(image).file for image in matched)),
         counts=counts,
         dimension=dimension,
-        scored=_scored(path, contents),
+        scored=_has_scores(path, contents),
         _container=container,
         _images=tuple(images),
         _transposed=transposed,
@@ -167,7 +170,7 @@ def open_features(
 
 
 def open_container(path: Path) -> Container:
-    """Whatever holds arrays by image: chosen by the name of the file, or a folder."""
+    """Open a folder, or a file by its suffix."""
     if path.is_dir():
         return NpzFolder(path)
     require_file(path)
@@ -182,47 +185,50 @@ def _require_parts(where: str, parts: Collection[str]) -> None:
         raise InputError(f"{where}: expected keypoints and descriptors, got no {' and no '.join(missing)}")
 
 
-def _count(where: str, held: Contents, *, given_size: bool) -> int:
-    """How many keypoints there are."""
-    _require_parts(where, held.names)
-    shape = held.shapes["keypoints"]
+def _count(where: str, contents: Contents, *, needs_size: bool) -> int:
+    """Number of an image's keypoints."""
+    _require_parts(where, contents.names)
+    shape = contents.shapes["keypoints"]
     if len(shape) != 2 or not 2 <= shape[1] <= 4 or shape[0] > np.iinfo(np.int32).max:
         raise InputError(
             f"{where}: keypoints: expected [N, 2], (x, y), with at most scale and angle, got {list(shape)}"
         )
-    if "image_size" not in held.names and not given_size:
+    if needs_size and "image_size" not in contents.names:
         raise InputError(f"{where}: expected image_size (width, height) in the file, got none; give it as image_size=")
     return shape[0]
 
 
 def _layout(path: Path, contents: Mapping[str, Contents], default: bool) -> tuple[bool, int]:
-    """Whether descriptors are `[D, N]`, and D: the same for all images.
+    """Whether descriptors are `[D, N]`, and D, both the same for all images.
 
-    An image with N = D could be read both ways; the others of its file decide, or what the program is known to write.
+    An image with N = D fits both layouts: other images of the file decide, or the program's usual layout `default`.
     """
     votes: dict[bool, str] = {}
-    shapes = {image: (held.shapes["keypoints"][0], held.shapes["descriptors"]) for image, held in contents.items()}
-    shapes = {image: (count, shape) for image, (count, shape) in shapes.items() if count}
+    shapes = {
+        image: (parts.shapes["keypoints"][0], parts.shapes["descriptors"])
+        for image, parts in contents.items()
+        if parts.shapes["keypoints"][0]
+    }
     for image, (count, shape) in shapes.items():
         if len(shape) != 2 or count not in shape:
             raise InputError(
-                f"{path}: {shortened(image)}: descriptors: expected [{count}, D] or [D, {count}] as there are "
+                f"{path}: {shorten(image)}: descriptors: expected [{count}, D] or [D, {count}] as there are "
                 f"keypoints, got {list(shape)}"
             )
         if shape[0] != shape[1]:
             votes.setdefault(shape[1] == count, image)
     if len(votes) == 2:
         raise InputError(
-            f"{path}: expected descriptors of one layout, got [D, N] for {shortened(votes[True])} and [N, D] for "
-            f"{shortened(votes[False])}"
+            f"{path}: expected descriptors of one layout, got [D, N] for {shorten(votes[True])} and [N, D] for "
+            f"{shorten(votes[False])}"
         )
     transposed = next(iter(votes), default)
     dimension = 0
     for image, (_, shape) in shapes.items():
-        own = shape[0 if transposed else 1]
-        dimension = dimension or own
-        if own != dimension:
-            raise InputError(f"{path}: {shortened(image)}: descriptors: expected {dimension} numbers each, got {own}")
+        numbers = shape[0 if transposed else 1]
+        dimension = dimension or numbers
+        if numbers != dimension:
+            raise InputError(f"{path}: {shorten(image)}: descriptors: expected {dimension} numbers each, got {numbers}")
     return transposed, dimension
 
 
@@ -230,15 +236,15 @@ def _score_part(parts: Collection[str]) -> str | None:
     return next((part for part in SCORES if part in parts), None)
 
 
-def _scored(path: Path, contents: Mapping[str, Contents]) -> bool:
-    """Whether the images have scores: all or none, as scores of 1 beside others would mean something."""
-    without = [image for image, held in contents.items() if _score_part(held.names) is None]
+def _has_scores(path: Path, contents: Mapping[str, Contents]) -> bool:
+    """Whether all images have scores; some only is an error, since a missing score becomes 1."""
+    without = [image for image, parts in contents.items() if _score_part(parts.names) is None]
     if without and len(without) < len(contents):
-        raise InputError(f"{path}: expected scores of all images or of none, got none of {shortened(without[0])}")
+        raise InputError(f"{path}: expected scores of all images or of none, got none of {shorten(without[0])}")
     return not without
 
 
-def _given_sizes(image_size: Any, count: int) -> np.ndarray:
+def _explicit_sizes(image_size: Any, count: int) -> np.ndarray:
     """`[M, 2]`."""
     sizes = np.asarray(image_size, np.float32)
     if sizes.shape not in ((2,), (count, 2)) or not (np.isfinite(sizes) & (sizes > 0)).all():
@@ -249,22 +255,23 @@ def _given_sizes(image_size: Any, count: int) -> np.ndarray:
     return np.broadcast_to(sizes, (count, 2))
 
 
-def _image_size(where: str, own: np.ndarray | None, given: np.ndarray | None) -> np.ndarray:
-    """`[2]` from the file, or what was given."""
-    if own is None:
-        if given is None:
+def _image_size(where: str, stored_size: np.ndarray | None, explicit_size: np.ndarray | None) -> np.ndarray:
+    """`[2]` size in the file, or the one that the caller states."""
+    if stored_size is None:
+        if explicit_size is None:
             raise InputError(f"{where}: expected image_size, got none; has the file changed since it was opened?")
-        return given.copy()
-    size = as_float32(f"{where}: image_size", own, "fiu").reshape(-1)
+        return explicit_size.copy()
+    size = as_float32(f"{where}: image_size", stored_size, "fiu").reshape(-1)
     if size.shape != (2,) or not (size > 0).all():
-        raise InputError(f"{where}: image_size: expected (width, height) in pixels, got {own.tolist()}")
-    if given is not None and (size != given).any():
-        raise InputError(f"{where}: expected the image_size that was given, {given.tolist()}, got {size.tolist()}")
+        raise InputError(f"{where}: image_size: expected (width, height) in pixels, got {stored_size.tolist()}")
+    if explicit_size is not None and (size != explicit_size).any():
+        expected = explicit_size.tolist()
+        raise InputError(f"{where}: expected the image_size that was given, {expected}, got {size.tolist()}")
     return size
 
 
 def _require_inside(where: str, keypoints: np.ndarray, size: np.ndarray) -> None:
-    """Refuse keypoints of another image size, or as (y, x): they give wrong scores. float16 may round outwards."""
+    """Raise an InputError for keypoints in another image size, or as (y, x); float16 may round outwards."""
     margin = np.maximum(2.0, 0.01 * size)
     outside = ((keypoints < -margin) | (keypoints > size - 1 + margin)).any(axis=1)
     if outside.any():

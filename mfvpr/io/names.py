@@ -1,30 +1,30 @@
-"""Which image of a file of another program is which image of the data set."""
+"""Match the names in a file of another program to the images of a data set."""
 
 import os
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
-from mfvpr.io.containers import FileEntry, shortened
+from mfvpr.io.containers import FileEntry, shorten
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import IMAGE_SUFFIXES, printable
 
-Prefix = tuple[tuple[str, ...], tuple[str, ...]]  # folders that only the file's names have, only the images' names
-ImageOfEntry = dict[tuple[int, int, str], Path]  # image of an entry, by the device, inode and name of the entry
+Prefix = tuple[tuple[str, ...], tuple[str, ...]]  # folders only in the file's names, only in the images' names
+ImageOfEntry = dict[tuple[int, int, str], Path]  # device, inode and name of an entry -> image
 _NO_PREFIX: Prefix = ((), ())
 
 
 def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> list[str | None]:
-    """The name that a file has for each image.
+    """Find the name of each image in a file.
 
-    A name is the relative path of an image, as in hloc; else a path that is the end of the image's path or ends in it
-    (a file name alone, or a path from another root); else the same without the suffixes of images. One prefix holds
-    for all images: where `1.jpg` is `db/1.jpg`, `2.jpg` is never `query/2.jpg`.
+    A name matches if it is the relative path of the image, as in hloc; else if one of the two paths is the end of the
+    other (a file name alone, or a path from another root); else if this holds without the suffixes of images. All
+    images have the same prefix: if `1.jpg` is `db/1.jpg`, `2.jpg` is never `query/2.jpg`.
 
     Args:
         path: file, for messages.
         names: `[M]` relative POSIX paths of the data set's images.
-        foreign: all names of the file; names of images of other data sets are ignored.
+        foreign: all names in the file; names of other images are ignored.
 
     Returns:
         `[M]` names in the file; None = the file lacks the image.
@@ -45,20 +45,20 @@ def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> lis
 
 
 def require_different(path: Path, names: Sequence[str]) -> None:
-    """Refuse images whose names are the same, or become the same where a file holds them as text."""
+    """Raise an InputError if two images have the same name, or the same name as text in a file."""
     if twice := [name for name, count in Counter(map(printable, names)).items() if count > 1]:
         raise InputError(
-            f"{path}: expected images with different names, got {shortened(twice[0])} twice; rename one of the images"
+            f"{path}: expected images with different names, got {shorten(twice[0])} twice; rename one of the images"
         )
 
 
 def require_all(path: Path, names: Sequence[str], matched: Sequence[str | None], what: str) -> None:
-    """Refuse a file that lacks images."""
+    """Raise an InputError if a file lacks images."""
     missing = [name for name, match in zip(names, matched, strict=True) if match is None]
     if missing:
         raise InputError(
             f"{path}: expected {what} of all {len(names)} images, got {len(names) - len(missing)}; the first without "
-            f"is {shortened(missing[0])} (images are called by their paths below their folder)"
+            f"is {shorten(missing[0])} (images are called by their paths below their folder)"
         )
 
 
@@ -68,13 +68,13 @@ Variants = Callable[[str], list[str]]
 def require_one_image(
     path: Path, images: Sequence[Path], entries: Sequence[FileEntry | None], known: ImageOfEntry
 ) -> None:
-    """Refuse an entry that stands for images of two folders.
+    """Raise an InputError if an entry stands for images of two folders.
 
     Args:
         path: file or folder, for messages.
         images: `[M]` paths of a folder's images.
         entries: `[M]` their entries; None = the file lacks the image.
-        known: images of entries so far. The images of this folder are added.
+        known: images of the entries of earlier folders; the images of this folder are added.
 
     Raises:
         InputError: an entry has another image in `known`, unless both paths lead to one file.
@@ -82,11 +82,11 @@ def require_one_image(
     for image, entry in zip(images, entries, strict=True):
         if entry is None:
             continue
-        status = entry.file.stat()  # one file may have several paths
+        status = entry.file.stat()  # identifies the file, which may have several paths
         other = known.setdefault((status.st_dev, status.st_ino, entry.name), image)
         if other != image and os.path.realpath(other) != os.path.realpath(image):
-            name = shortened(entry.name or entry.file.name)
-            first, second = (shortened(str(file), 300) for file in (other, image))
+            name = shorten(entry.name or entry.file.name)
+            first, second = (shorten(str(file), 300) for file in (other, image))
             raise InputError(
                 f"{path}: expected one image for each entry, got {name} for {first} and for {second}; "
                 "give names with their folders as the file has them, or a file for each folder"
@@ -94,12 +94,12 @@ def require_one_image(
 
 
 def adds_folders(name: str, match: str) -> bool:
-    """Whether a matched name has folders before the part that it shares with the image's name."""
+    """Whether the name in a file has folders before the part that it shares with the image's name."""
     return bool(_prefix(name, match)[0])
 
 
 class _Ends:
-    """Foreign names by what they are, and by every end of them."""
+    """Index of foreign names by the whole name and by every end of it."""
 
     def __init__(self, foreign: Iterable[str], variants: Variants) -> None:
         self.variants = variants
@@ -113,15 +113,16 @@ class _Ends:
 
     def candidates(self, name: str) -> set[str]:
         """Foreign names that may mean this image."""
-        wanted = self.variants(printable(name))[0]
-        shorter = (self.by_variant.get(end, set()) for end in _ends(wanted))
-        return set().union(self.by_end.get(wanted, set()), *shorter)
+        variant = self.variants(printable(name))[0]
+        shorter = (self.by_variant.get(end, set()) for end in _ends(variant))
+        return set().union(self.by_end.get(variant, set()), *shorter)
 
 
 def _match_ends(path: Path, names: Sequence[str], rows: list[int], ends: _Ends, matched: list[str | None]) -> None:
-    """Fill `matched` where one foreign name and one image mean each other alone, with the prefix of earlier matches.
+    """Fill `matched` for pairs of an image and a foreign name that have no other candidates.
 
-    A name at the image's own path contradicts another prefix of earlier matches: it is not ignored.
+    Candidates have the prefix of earlier matches, or none: a name at the image's own path contradicts an earlier prefix
+    and is an error.
     """
     examples: dict[Prefix, tuple[str, str]] = {}  # an image and its name in the file
     for name, match in zip(names, matched, strict=True):
@@ -132,20 +133,20 @@ def _match_ends(path: Path, names: Sequence[str], rows: list[int], ends: _Ends, 
         row: {match for match in ends.candidates(names[row]) if not examples or _prefix(names[row], match) in prefixes}
         for row in rows
     }
-    claims = Counter(name for possible in candidates.values() for name in possible)
-    for row, possible in candidates.items():
-        if not possible:
+    num_images = Counter(name for row_candidates in candidates.values() for name in row_candidates)
+    for row, row_candidates in candidates.items():
+        if not row_candidates:
             continue
-        if len(possible) > 1 or claims[next(iter(possible))] > 1:
-            several = " and ".join(shortened(name) for name in sorted(possible)[:2])
+        if len(row_candidates) > 1 or num_images[next(iter(row_candidates))] > 1:
+            several = " and ".join(shorten(name) for name in sorted(row_candidates)[:2])
             raise InputError(
-                f"{path}: {shortened(names[row])}: expected its relative path in the file, got {several}, which may "
+                f"{path}: {shorten(names[row])}: expected its relative path in the file, got {several}, which may "
                 "mean other images as well; give names with their folders as the file has them"
             )
-        matched[row] = match = next(iter(possible))
+        matched[row] = match = next(iter(row_candidates))
         examples.setdefault(_prefix(names[row], match), (names[row], match))
     if len(examples) > 1:
-        pairs = " but ".join(f"{shortened(match)} for {shortened(name)}" for name, match in [*examples.values()][:2])
+        pairs = " but ".join(f"{shorten(match)} for {shorten(name)}" for name, match in [*examples.values()][:2])
         raise InputError(
             f"{path}: expected names with one prefix for all images of a folder, got {pairs}; give the prefix of the "
             "folder, or name the images by their relative paths"
@@ -153,7 +154,7 @@ def _match_ends(path: Path, names: Sequence[str], rows: list[int], ends: _Ends, 
 
 
 def _prefix(name: str, match: str) -> Prefix:
-    """Folders before the part that both names share."""
+    """Folders before the shared end of both names."""
     ours, theirs = (tuple(_parts(text)) for text in (name, match))
     shared = min(len(ours), len(theirs))
     return theirs[: len(theirs) - shared], ours[: len(ours) - shared]
@@ -164,13 +165,13 @@ def _whole(name: str) -> list[str]:
 
 
 def _stems(name: str) -> list[str]:
-    """Without the suffix of an image, or as it is: files named by stems have none, and stems may hold dots."""
+    """The name without the suffix of an image, and itself, since a stem in a file may contain dots."""
     path = PurePosixPath(name)
     return [path.with_suffix("").as_posix(), name] if path.suffix.lower() in IMAGE_SUFFIXES else [name]
 
 
 def _ends(name: str) -> Iterator[str]:
-    """The path and every end of it: a/b/c, b/c, c."""
+    """The path and its shorter ends: a/b/c, b/c, c."""
     parts = _parts(name)
     return ("/".join(parts[start:]) for start in range(len(parts)))
 

@@ -1,4 +1,4 @@
-"""Features and descriptors in NumPy's archives: one file for all images, or one for each in a folder."""
+"""Read and write NumPy archives: one file for all images, or a folder with one for each image."""
 
 import io
 import math
@@ -12,17 +12,17 @@ from typing import IO
 
 import numpy as np
 
-from mfvpr.io.containers import Contents, FileEntry, reading, require_plain, shortened
+from mfvpr.io.containers import Contents, FileEntry, reading, require_plain, shorten
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import printable, replacing, require_file
 
-SUFFIXES = (".npz", ".d2-net")  # of the files of images; D2-Net names its own so
+SUFFIXES = (".npz", ".d2-net")  # of files in a folder; D2-Net's code writes `.d2-net`
 
 
 class NpzFile:
-    """One archive for all images, with arrays named `image/part`: `a/1.jpg/keypoints`.
+    """Reader of one archive for all images, with arrays named `image/part`: `a/1.jpg/keypoints`.
 
-    Its directory is read by every call, which takes half a second for 10,000 images: ask for many rows in one.
+    Every call reads the directory, which takes half a second for 10,000 images: request many images at once.
     """
 
     transposed = False
@@ -33,7 +33,7 @@ class NpzFile:
             members = [name.removesuffix(".npy") for name in archive.namelist()]
         self.images = tuple(dict.fromkeys(name.rpartition("/")[0] for name in members if "/" in name))
         if not self.images:
-            got = shortened(", ".join(members)) or "none"
+            got = shorten(", ".join(members)) or "none"
             raise InputError(
                 f"{path}: expected arrays named by images (a.jpg/keypoints), got {got}; where every image has a file "
                 "of its own, give their folder"
@@ -59,7 +59,7 @@ class NpzFile:
 
 
 class NpzFolder:
-    """An archive for each image, named as the image with `.npz` or `.d2-net` behind: `a/1.jpg.npz`."""
+    """Reader of a folder with an archive for each image: `a/1.jpg.npz` or `a/1.jpg.d2-net`."""
 
     transposed = False
 
@@ -91,17 +91,17 @@ class NpzFolder:
 
 
 def read_npz(path: Path, parts: Sequence[str]) -> dict[str, np.ndarray]:
-    """Those of the arrays that are there.
+    """Read the arrays among `parts` that the archive has.
 
     Raises:
-        InputError: no archive, a damaged one, or an array of objects.
+        InputError: the file is no archive or damaged, or an array holds objects.
     """
     with _open_archive(path) as archive:
         return {part: _array(archive, name) for part, name in _members(set(archive.namelist()), "", parts)}
 
 
 def write_npz(path: Path, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
-    """Arrays by name, one after the other, atomically."""
+    """Write named arrays, one after the other, atomically."""
     with replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         for name, array in arrays:
             with archive.open(f"{printable(name)}.npy", "w", force_zip64=True) as member:
@@ -110,11 +110,11 @@ def write_npz(path: Path, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
 
 @contextmanager
 def _open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
-    """An archive whose members have different names: of several, readers take the first or the last."""
+    """Open an archive; raise an InputError if two members share a name, since readers choose either."""
     require_file(path)
     with reading(path), zipfile.ZipFile(path) as archive:
         if twice := [name for name, count in Counter(archive.namelist()).items() if count > 1]:
-            raise InputError(f"{path}: expected every array once, got {shortened(twice[0])} again; write the file anew")
+            raise InputError(f"{path}: expected every array once, got {shorten(twice[0])} again; write the file anew")
         yield archive
 
 
@@ -129,7 +129,7 @@ def _contents(archive: zipfile.ZipFile, members: set[str], prefix: str, parts: S
 
 def _shape(archive: zipfile.ZipFile, member: str) -> tuple[int, ...]:
     with archive.open(member) as file:
-        return _read_header(f"{archive.filename}: {shortened(member)}", file)[0]
+        return _read_header(f"{archive.filename}: {shorten(member)}", file)[0]
 
 
 def _read_header(where: str, file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
@@ -143,12 +143,12 @@ def _read_header(where: str, file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype
 
 
 def _array(archive: zipfile.ZipFile, member: str) -> np.ndarray:
-    content = archive.read(member)  # the whole member, so that its checksum is compared
-    return parse_npy(f"{archive.filename}: {shortened(member)}", content)
+    content = archive.read(member)  # completely, which verifies the checksum
+    return parse_npy(f"{archive.filename}: {shorten(member)}", content)
 
 
 def parse_npy(where: str, content: bytes) -> np.ndarray:
-    """The array in the bytes of a `.npy`; there must be all of it, and nothing else."""
+    """The array in the bytes of a `.npy`; raise an InputError if bytes are missing or left over."""
     file = io.BytesIO(content)
     shape, dtype = _read_header(where, file)
     expected = math.prod(shape) * dtype.itemsize

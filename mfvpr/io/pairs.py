@@ -1,11 +1,11 @@
-"""Lists of image pairs as text: hloc's `query database` and kapture's `query, reference, score`."""
+"""Read lists of image pairs: hloc's `query database` and kapture's `query, reference, score`."""
 
 import re
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
-from mfvpr.io.containers import shortened
+from mfvpr.io.containers import shorten
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import printable
 from mfvpr.utils.numbers import parse_number
@@ -15,7 +15,7 @@ _SCORED = re.compile(r"(.*?)\s*,\s*([-+.\w]+)")
 
 
 class Pair(NamedTuple):
-    """Names in a line, and the score if it has one."""
+    """Names of an image pair, and its score if the line has one."""
 
     query: str
     database: str
@@ -23,7 +23,7 @@ class Pair(NamedTuple):
 
 
 class _Names:
-    """What may be the name of an image of one side."""
+    """Names of the query or database images, and the file names and stems that may stand for them."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self.whole = {printable(name) for name in names}
@@ -35,13 +35,13 @@ class _Names:
 
 
 def read_pairs(path: Path, query_names: Sequence[str], database_names: Sequence[str]) -> list[Pair]:
-    """The pairs of a file in its order.
+    """Read the pairs of a file, in its order.
 
-    Names with spaces or commas are told apart by the names that there are: hloc itself splits at every space. Lines
-    that begin with # and hold no known pair are comments.
+    Names may contain spaces or commas: of all splits of a line, the one with known names counts. (hloc splits at every
+    space.) Lines that begin with # and hold no known pair are comments.
 
     Raises:
-        InputError: a line that is no pair of names, or may be several.
+        InputError: a line has no split with known names, or several.
     """
     try:
         text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")
@@ -59,20 +59,20 @@ def read_pairs(path: Path, query_names: Sequence[str], database_names: Sequence[
 def _pair(where: str, line: str, queries: _Names, database: _Names) -> Pair | None:
     words = line.split()
     if len(words) == 2 and words[0] in queries.whole and words[1] in database.whole:
-        return Pair(words[0], words[1])  # nearly every line of hloc's
-    possible = list(_splits(line))
-    likely = [pair for pair in possible if pair.query in queries.whole and pair.database in database.whole]
-    likely = likely or [pair for pair in possible if queries.ends_of(pair.query) and database.ends_of(pair.database)]
-    if len(likely) == 1:
-        return likely[0]
-    if not likely and line.startswith("#"):
+        return Pair(words[0], words[1])  # nearly every line of hloc
+    splits = list(_splits(line))
+    pairs = [pair for pair in splits if pair.query in queries.whole and pair.database in database.whole]
+    pairs = pairs or [pair for pair in splits if queries.ends_of(pair.query) and database.ends_of(pair.database)]
+    if len(pairs) == 1:
+        return pairs[0]
+    if not pairs and line.startswith("#"):
         return None
-    got = "several ways to read" if likely else "names of none in"
-    raise InputError(f"{where}: expected the names of a query and a database image, got {got} {shortened(line)!r}")
+    got = "several ways to read" if pairs else "names of none in"
+    raise InputError(f"{where}: expected the names of a query and a database image, got {got} {shorten(line)!r}")
 
 
 def _splits(line: str) -> Iterator[Pair]:
-    """Every way to read a line."""
+    """All pairs that a line may mean."""
     for separator in _SEPARATOR.finditer(line):
         query, database = line[: separator.start()], line[separator.end() :]
         yield Pair(query, database)
@@ -88,7 +88,7 @@ def _number(text: str) -> float | None:
 
 
 def require_lines(path: Path, names: Collection[str]) -> None:
-    """Refuse names that would end a line, or look like the end of one."""
+    """Raise an InputError for names with line breaks, or with spaces at an end."""
     for name in names:
         if name != name.strip() or "\n" in name or "\r" in name:
             raise InputError(f"{path}: expected names of one line without spaces around, got {name!r}; write .npz")

@@ -1,4 +1,4 @@
-"""Shortlists and rankings of other programs, and for them."""
+"""Read and write shortlists and rankings of other programs."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from mfvpr.io.containers import FileEntry, shortened
+from mfvpr.io.containers import FileEntry, shorten
 from mfvpr.io.names import adds_folders, match_names, require_different
 from mfvpr.io.npz import read_npz, write_npz
 from mfvpr.io.pairs import Pair, read_pairs, require_lines
@@ -15,30 +15,30 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_file, write_text
 
 PairLayout = Literal["hloc", "kapture"]
-Candidates = list[tuple[int, float | None]]  # of one query: database rows and their scores, best first
+Candidates = list[tuple[int, float | None]]  # database rows and scores of one query, best first
 
 
 def read_shortlist(
     path: Path | str, query_names: Sequence[str], database_names: Sequence[str], *, num_candidates: int | None = None
 ) -> Shortlist:
-    """The candidates that another program chose.
+    """Read the candidates that another program chose.
 
     Args:
-        path: `.npz`: `predictions` `[Q, K]`, rows of the database, -1 = none, and maybe `scores` `[Q, K]`, both sides
-            in the order of the names given here; else lines of text: `query database` as hloc, or
-            `query, reference[, score]` as kapture and Patch-NetVLAD's predictions, # before comments. A query's best
+        path: `.npz`: `predictions` `[Q, K]`, rows of the database, -1 = none, and optional `scores` `[Q, K]`, in the
+            order of `query_names` and `database_names`. Other suffixes: lines of text, `query database` as hloc, or
+            `query, reference[, score]` as kapture and Patch-NetVLAD's predictions; # begins a comment. A query's best
             candidate comes first.
         query_names: `[Q]` relative POSIX paths, matched as in `names.match_names`.
         database_names: `[N]` likewise.
-        num_candidates: C; None = those of the query with the most.
+        num_candidates: C; None = the largest number of a query's candidates.
 
     Returns:
-        Shortlist `[Q, C]`, NumPy, -1 where a query has fewer (it may have none). A candidate that a query has twice
-        counts where it comes first. Scores are those of the file; without, C for the first candidate, then C - 1, ...
+        Shortlist `[Q, C]`, NumPy, -1 if a query has fewer candidates (it may have none). If a query has a candidate
+        twice, the first counts. Scores are those of the file, or C for the first candidate, then C - 1, ...
 
     Raises:
-        InputError: no such file, damaged, unknown or ambiguous names, rows out of range, scores of some pairs only, not
-            finite, or ascending.
+        InputError: the file is missing or damaged; names are unknown or ambiguous; rows are out of range; scores are
+            not finite, ascending, or those of some pairs only.
     """
     return read_with_entries(path, query_names, database_names, num_candidates=num_candidates)[0]
 
@@ -48,7 +48,7 @@ def read_with_entries(
 ) -> tuple[Shortlist, list[FileEntry | None], list[FileEntry | None]]:
     """Shortlist as `read_shortlist` returns it, and the entries of queries `[Q]` and database images `[N]`.
 
-    Only names with additional folders are entries. A file name alone may mean an image on either side.
+    Only names with additional folders are entries: a file name alone may mean a query and a database image.
     """
     path = Path(path)
     require_file(path)
@@ -64,7 +64,7 @@ def read_with_entries(
         candidates = _from_pairs(pairs, queries, database, len(query_names))
     if not any(candidates):
         raise InputError(f"{path}: expected candidates of {len(query_names)} queries, got none at all")
-    shortlist = _shortlist(path, [_first_of_each(own) for own in candidates], query_names, num_candidates)
+    shortlist = _shortlist(path, [_without_repetitions(rows) for rows in candidates], query_names, num_candidates)
     return shortlist, _entries(path, query_names, queries), _entries(path, database_names, database)
 
 
@@ -79,14 +79,14 @@ def write_shortlist(
     """Write a shortlist as `read_shortlist` reads it, atomically.
 
     Args:
-        path: `.npz`: `predictions` int32 and `scores` float32 `[Q, C]`; another name: a line for each pair.
+        path: `.npz`: `predictions` int32 and `scores` float32 `[Q, C]`; other suffixes: a line for each pair.
         shortlist: `[Q, C]`.
         query_names: `[Q]`.
         database_names: `[N]`.
-        layout: of lines. `hloc`: no scores; `kapture`: with them, to float32's last digit.
+        layout: of lines. `hloc`: no scores; `kapture`: scores with all digits of float32.
 
     Raises:
-        InputError: names that are missing or no line can have; scores to write that are not finite, or ascending.
+        InputError: names are missing or do not fit a line; written scores are not finite, or ascending.
     """
     path = Path(path)
     if layout not in ("hloc", "kapture"):
@@ -96,10 +96,10 @@ def write_shortlist(
         raise InputError(f"{path}: expected the names of {len(indices)} queries, got {len(query_names)}")
     if indices.max(initial=-1) >= len(database_names):
         raise InputError(f"{path}: expected database rows below {len(database_names)}, got {indices.max()}")
-    packed = path.suffix.lower() == ".npz"
-    for query in range(len(indices)) if packed or layout == "kapture" else ():
-        _descending(f"{path}: {shortened(query_names[query])}", scores[query][mask[query]])
-    if packed:
+    is_npz = path.suffix.lower() == ".npz"
+    for query in range(len(indices)) if is_npz or layout == "kapture" else ():
+        _descending(f"{path}: {shorten(query_names[query])}", scores[query][mask[query]])
+    if is_npz:
         predictions = np.where(mask, indices, -1).astype(np.int32)
         write_npz(path, {"predictions": predictions, "scores": np.where(mask, scores, 0).astype(np.float32)}.items())
         return
@@ -144,8 +144,8 @@ def _from_npz(path: Path, num_queries: int, num_database: int) -> list[Candidate
         )
     values = [[None] * predictions.shape[1]] * num_queries if scores is None else scores.tolist()
     return [
-        [(row, score) for row, score in zip(rows, own, strict=True) if row >= 0]
-        for rows, own in zip(predictions.tolist(), values, strict=True)
+        [(row, score) for row, score in zip(rows, row_scores, strict=True) if row >= 0]
+        for rows, row_scores in zip(predictions.tolist(), values, strict=True)
     ]
 
 
@@ -159,12 +159,12 @@ def _from_pairs(
 
 
 def _rows(path: Path, names: Sequence[str], foreign: dict[str, None], side: str) -> dict[str, int]:
-    """Row of each foreign name; all must be known."""
+    """Row of each foreign name; raises an InputError for unknown names."""
     rows = {name: row for row, name in enumerate(match_names(path, names, foreign)) if name is not None}
     for name in foreign:
         if name not in rows:
             raise InputError(
-                f"{path}: expected the relative path of a {side} image, got {shortened(name)!r}, which none of the "
+                f"{path}: expected the relative path of a {side} image, got {shorten(name)!r}, which none of the "
                 f"{len(names)} has, or one has by its full path; give names with their folders as the file has them"
             )
     return rows
@@ -178,35 +178,33 @@ def _entries(path: Path, names: Sequence[str], rows: dict[str, int]) -> list[Fil
     return entries
 
 
-def _first_of_each(candidates: Candidates) -> Candidates:
-    """A candidate counts where it comes first."""
-    first: dict[int, float | None] = {}
+def _without_repetitions(candidates: Candidates) -> Candidates:
+    first_scores: dict[int, float | None] = {}
     for row, score in candidates:
-        first.setdefault(row, score)
-    return list(first.items())
+        first_scores.setdefault(row, score)
+    return list(first_scores.items())
 
 
 def _shortlist(path: Path, candidates: list[Candidates], names: Sequence[str], num_candidates: int | None) -> Shortlist:
     depth = num_candidates or max(map(len, candidates))
     indices = np.full((len(candidates), depth), -1, np.int32)
     scores = np.zeros((len(candidates), depth), np.float32)
-    scored = {score is not None for own in candidates for _, score in own}
-    if len(scored) == 2:
+    has_score = {score is not None for rows in candidates for _, score in rows}
+    if len(has_score) == 2:
         raise InputError(f"{path}: expected scores of all pairs or of none, got some without")
-    for query, own in enumerate(candidates):
-        count = min(len(own), depth)
-        indices[query, :count] = [row for row, _ in own[:count]]
-        if scored == {True}:
-            scores[query, :count] = _descending(f"{path}: {shortened(names[query])}", [score for _, score in own])[
-                :count
-            ]
+    for query, rows in enumerate(candidates):
+        count = min(len(rows), depth)
+        indices[query, :count] = [row for row, _ in rows[:count]]
+        if has_score == {True}:
+            values = _descending(f"{path}: {shorten(names[query])}", [score for _, score in rows])
+            scores[query, :count] = values[:count]
         else:
             scores[query, :count] = np.arange(depth, depth - count, -1)
     return Shortlist(indices=indices, scores=scores, mask=indices >= 0)
 
 
 def _descending(where: str, scores: Any) -> np.ndarray:
-    """Finite float32, best first: distances would turn the ranking around without a word."""
+    """Scores as float32; raises an InputError unless they are finite and descend, as distances do not."""
     with np.errstate(over="ignore"):
         values = np.array(scores, np.float32)
     if not np.isfinite(values).all():

@@ -46,7 +46,7 @@ class DataUnpickler(_Unpickler):
     """
 
     def __init__(self, file: BinaryIO) -> None:
-        super().__init__(_bounded(file), encoding="latin-1")
+        super().__init__(_bounded_file(file), encoding="latin-1")
 
     def load(self) -> Any:
         """Content of the next pickle of the file; the file then stands behind it.
@@ -135,7 +135,7 @@ def _dictionary(keys_and_values: list[Any]) -> dict[int | str, Any]:
     return dict(zip(keys, keys_and_values[1::2], strict=True))
 
 
-def _bounded(file: BinaryIO) -> Any:
+def _bounded_file(file: BinaryIO) -> Any:
     """The file, without reserving memory for more bytes than it has."""
     end = file_size(file)
     return SimpleNamespace(read=lambda count: file.read(min(count, end - file.tell())), readline=file.readline)
