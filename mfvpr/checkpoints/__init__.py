@@ -1,7 +1,7 @@
-"""Published network weights: where they are, their conversion to runtime files, and networks filled with them.
+"""Published network weights: their sources, their conversion to runtime files, and networks with these weights.
 
-Read first: registry (what there is), files (install, save, load), conversion (layouts), networks (which network an
-entry fills), then the readers: torch_files, numpy_files.
+Read first: registry (published files), files (install, save, load), conversion (layouts), networks (network of each
+file), then the readers: torch_files, numpy_files.
 
 Imports io, networks, utils.
 """

@@ -1,4 +1,4 @@
-"""Reads published checkpoints as plain data: nothing in the file is executed."""
+"""Read published checkpoints as plain data; no code in a file is executed."""
 
 import zipfile
 from pathlib import Path
@@ -12,19 +12,19 @@ from mfvpr.io.formats.matlab_files import read_matlab
 from mfvpr.utils.errors import InputError
 
 _DAMAGE = (ArithmeticError, LookupError, TypeError, ValueError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile)
-_DAMAGE += (Warning,)  # raised where warnings are errors
-# By the first bytes; the last is that of every binary pickle.
+_DAMAGE += (Warning,)  # such as NumPy's for NaN among integers, if warnings are errors
+# First bytes of a file -> reader; every binary pickle begins with the last ones.
 _READERS = {b"PK": read_zip, numpy_objects.MAGIC: read_layers, matlab_files.MAGIC: read_matlab, b"\x80": read_legacy}
 
 
 def read_checkpoint(path: Path | str) -> dict[str, np.ndarray]:
-    """Arrays by key, read-only, in the file's own types.
+    """Read arrays by key, read-only, in the file's own types.
 
-    Of torch's files the tensors, those below `model`, `state_dict` or `model_state_dict` if nested; of NumPy's
-    dictionaries of layers `layer.name`; of MATLAB's structures and cells `variable.field.0`.
+    Keys are those of the tensors in PyTorch's files (below `model`, `state_dict` or `model_state_dict`, if nested),
+    `layer.name` in NumPy's dictionaries of layers, and `variable.field.0` in MATLAB's structures and cells.
 
     Raises:
-        InputError: the file is no checkpoint, is damaged, or holds anything but float32, float64 and integer arrays.
+        InputError: the file is no checkpoint, is damaged, or holds other arrays than float32, float64 and integers.
     """
     path = Path(path)
     start = require_checkpoint(path)
@@ -41,13 +41,13 @@ def read_checkpoint(path: Path | str) -> dict[str, np.ndarray]:
 
 
 def require_checkpoint(path: Path) -> bytes:
-    """The first bytes, which are those of a checkpoint.
+    """Read the first bytes, which must be those of a checkpoint.
 
     Raises:
-        InputError: they are not.
+        InputError: the file cannot be read or is no checkpoint.
     """
     again = "download it again"
-    if path.exists() and not path.is_file():  # a pipe would be waited for
+    if path.exists() and not path.is_file():  # opening a pipe would block
         raise InputError(f"{path}: expected a checkpoint file, got {'a folder' if path.is_dir() else 'no plain file'}")
     try:
         with path.open("rb") as file:

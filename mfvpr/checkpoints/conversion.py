@@ -1,7 +1,7 @@
-"""Foreign checkpoints -> our parameters: one table per network, one converter for all.
+"""Convert the tensors of published checkpoints to the parameters of our networks, by one table per network.
 
-Nothing is guessed and nothing is left over: every source key is used once or listed as ignored, every target is filled
-once, every type and shape is checked. What is wrong is counted by kind, with an example of each.
+The conversion is strict: each key is used once or listed as ignored, each parameter is set once, and all types and
+shapes are checked. The error counts the problems by kind, with an example of each.
 """
 
 import re
@@ -18,13 +18,13 @@ from mfvpr.utils.errors import InputError
 
 class _Change(NamedTuple):
     axes: tuple[int, ...] | None = None  # of the source, in our order
-    squeezed: bool = False  # whether axes of length 1 mean nothing, there and here
+    squeezed: bool = False  # whether to ignore axes of length 1 in both shapes
     sign: int = 1
-    first_pixel: bool = False  # of an image that is alike everywhere
+    first_pixel: bool = False  # of an image with equal pixels
 
 
 class Layout(Enum):
-    """How arrays are changed from their file's convention to ours."""
+    """Change of an array from its file's convention to ours."""
 
     COPY = _Change()
     CONV = _Change((2, 3, 1, 0))  # OIHW -> HWIO
@@ -37,7 +37,7 @@ class Layout(Enum):
 
 
 class Rule(NamedTuple):
-    """Source keys that match `source` (whole, a regular expression) go to `target`, a dotted path with its groups."""
+    """Assign keys that fully match `source`, a regular expression, to `target`, a dotted path with its groups."""
 
     source: str
     target: str
@@ -46,12 +46,12 @@ class Rule(NamedTuple):
 
 @dataclass(frozen=True)
 class Table:
-    """All keys of a network's checkpoint.
+    """Rules for all keys of a network's checkpoint.
 
     Args:
-        rules: where they go.
+        rules: targets of the keys.
         ignored: patterns of keys that the network does not need.
-        expected: patterns of those among them whose shape tells whether it is this network's checkpoint.
+        expected: pattern -> required shape of ignored keys that identify this network's checkpoint.
     """
 
     rules: tuple[Rule, ...]
@@ -62,67 +62,68 @@ class Table:
 def convert(
     source: Mapping[str, np.ndarray], table: Table, shapes: Mapping[str, tuple[int, ...]]
 ) -> dict[str, np.ndarray]:
-    """Parameters by dotted path, float32 (float64 is rounded), from a checkpoint's tensors.
+    """Convert a checkpoint's tensors to parameters by dotted path, float32 (float64 is rounded).
 
     Args:
         source: tensors by their keys in the checkpoint.
-        table: of the network.
-        shapes: what the network expects, by dotted path.
+        table: table of the network.
+        shapes: shapes of the network's parameters, by dotted path.
 
     Raises:
-        InputError: keys are missing, left over, or of another shape or type.
+        InputError: keys are missing or unknown, or a tensor has another shape or type.
     """
-    found: dict[str, np.ndarray] = {}
+    parameters: dict[str, np.ndarray] = {}
     origin: dict[str, str] = {}
     problems: dict[str, list[str]] = {}
 
-    def wrong(kind: str, example: str) -> None:
+    def add_problem(kind: str, example: str) -> None:
         problems.setdefault(kind, []).append(example)
 
     for key, value in source.items():
         if is_ignored(key, table):
             for pattern, shape in table.expected.items():
                 if re.fullmatch(pattern, key) and value.shape != shape:
-                    wrong("of another shape", f"{key}: expected {shape}, got {value.shape}")
+                    add_problem("of another shape", f"{key}: expected {shape}, got {value.shape}")
             continue
         targets = _targets(key, table)
         if len(targets) > 1:
-            wrong("with several rules", excerpt(key))
+            add_problem("with several rules", excerpt(key))
             continue
         if not targets or targets[0][0] not in shapes:
-            wrong("unknown", excerpt(key))
+            add_problem("unknown", excerpt(key))
             continue
         target, layout = targets[0]
         if target in origin:
-            wrong("twice", f"{key} and {origin[target]}")
+            add_problem("twice", f"{key} and {origin[target]}")
             continue
         origin[target] = key
         if layout.value.first_pixel and value.ndim:
             value = value[(0,) * (value.ndim - 1)]
         expected = _source_shape(shapes[target], layout)
-        if _compared(value.shape, layout) != expected:
-            wrong("of another shape", f"{key}: expected {expected}, got {value.shape}")
+        if _significant_shape(value.shape, layout) != expected:
+            add_problem("of another shape", f"{key}: expected {expected}, got {value.shape}")
         elif value.dtype not in (np.float32, np.float64):
-            wrong("of another type", f"{key}: expected float32 or float64, got {value.dtype}")
+            add_problem("of another type", f"{key}: expected float32 or float64, got {value.dtype}")
         else:
-            found[target] = _laid_out(value.reshape(expected), layout).reshape(shapes[target])
+            parameters[target] = _to_layout(value.reshape(expected), layout).reshape(shapes[target])
     for target in shapes:
         if target not in origin:
-            wrong("missing", target)
+            add_problem("missing", target)
     if problems:
         kinds = (f"{len(examples)} {kind} ({examples[0]})" for kind, examples in problems.items())
         raise InputError(f"keys do not fit the network: {', '.join(kinds)}")
-    return found
+    return parameters
 
 
-def share_known(keys: Sequence[str], table: Table) -> float:
-    """How many of the keys the table names, from 0 to 1; 0 where all of these are ignored."""
-    used, ignored = ([test(key, table) for key in keys] for test in (_targets, is_ignored))
-    return sum(map(any, zip(used, ignored, strict=True))) / len(used) if any(used) else 0.0
+def known_share(keys: Sequence[str], table: Table) -> float:
+    """Share of the keys that the table names, from 0 to 1; 0 if the table ignores all of them."""
+    used = [bool(_targets(key, table)) for key in keys]
+    known = [key_used or is_ignored(key, table) for key, key_used in zip(keys, used, strict=True)]
+    return sum(known) / len(known) if any(used) else 0.0
 
 
 def is_ignored(key: str, table: Table) -> bool:
-    """Whether the network does not need this tensor of its checkpoint."""
+    """Whether the network does not need the tensor of this key."""
     return any(re.fullmatch(pattern, key) for pattern in table.ignored)
 
 
@@ -131,19 +132,17 @@ def _targets(key: str, table: Table) -> list[tuple[str, Layout]]:
     return [(match.expand(rule.target), rule.layout) for match, rule in matches if match]
 
 
-def _laid_out(array: np.ndarray, layout: Layout) -> np.ndarray:
-    """The array in our layout, contiguous float32."""
+def _to_layout(array: np.ndarray, layout: Layout) -> np.ndarray:
     axes, sign = layout.value.axes, layout.value.sign
     ordered = np.array(array if axes is None else array.transpose(axes), np.float32, order="C")
     return ordered if sign == 1 else np.negative(ordered)
 
 
-def _compared(shape: tuple[int, ...], layout: Layout) -> tuple[int, ...]:
-    """The shape, without axes of length 1 where they mean nothing."""
+def _significant_shape(shape: tuple[int, ...], layout: Layout) -> tuple[int, ...]:
     return tuple(side for side in shape if side != 1) if layout.value.squeezed else shape
 
 
 def _source_shape(shape: tuple[int, ...], layout: Layout) -> tuple[int, ...]:
-    """The checkpoint's shape of what is `shape` here."""
-    shape, axes = _compared(shape, layout), layout.value.axes
+    """Shape in the checkpoint of a parameter of this shape."""
+    shape, axes = _significant_shape(shape, layout), layout.value.axes
     return shape if axes is None else tuple(shape[axes.index(axis)] for axis in range(len(shape)))

@@ -1,4 +1,4 @@
-"""Runtime files of weights: `<name>.safetensors` and its manifest `<name>.json`, whole and verified or refused."""
+"""Runtime files of weights: `<name>.safetensors` and its manifest `<name>.json`, verified when they are loaded."""
 
 import hashlib
 import json
@@ -25,7 +25,7 @@ _MEND = "install it again"
 
 @dataclass(frozen=True)
 class Manifest:
-    """What a runtime file must be, and what it was made from."""
+    """Name, hash and size of a runtime file, and the checkpoint it comes from."""
 
     name: str
     sha256: str
@@ -34,11 +34,11 @@ class Manifest:
     source_file: str
     source_sha256: str
     format: int = FORMAT
-    rounded: int = 0  # of the tensors taken from the source, from float64 to float32
+    rounded: int = 0  # tensors of the source that were rounded from float64 to float32
 
 
 class WeightsError(InputError):
-    """Weights that are not installed, or no longer as they were; `entry` says which to install."""
+    """Weights are not installed, or their file has changed; `entry` is the one to install."""
 
     def __init__(self, message: str, entry: Entry) -> None:
         super().__init__(message, entry)
@@ -49,21 +49,21 @@ class WeightsError(InputError):
 
 
 def weights_folder() -> Path:
-    """Where runtime files live: the environment variable MFVPR_WEIGHTS, or ~/.cache/mfvpr/weights."""
+    """Folder of the runtime files: the environment variable MFVPR_WEIGHTS, or ~/.cache/mfvpr/weights."""
     return Path(os.path.expanduser(os.environ.get("MFVPR_WEIGHTS") or "~/.cache/mfvpr/weights"))
 
 
 def install(checkpoint: Path, name: str, folder: Path | None = None) -> Path:
-    """Convert an official checkpoint to the runtime file of this name; the checkpoint stays as it is.
+    """Convert an official checkpoint to the runtime file of this name; the checkpoint does not change.
 
     Raises:
-        InputError: unknown name, not the published file, no checkpoint, or keys that do not fit.
+        InputError: the name is unknown, or the file is no checkpoint, not the published one, or of another network.
     """
     from mfvpr.checkpoints.networks import blueprint, network_of, resemblance
 
     entry = entry_of(name)
     network = network_of(entry)
-    require_checkpoint(checkpoint)  # a web page is told before its hash is
+    require_checkpoint(checkpoint)  # first, since "a web page" helps more than another hash
     check_published(checkpoint, entry)
     tensors = read_checkpoint(checkpoint)
     plan = blueprint(entry)
@@ -78,10 +78,10 @@ def install(checkpoint: Path, name: str, folder: Path | None = None) -> Path:
 
 
 def check_published(checkpoint: Path, entry: Entry) -> None:
-    """Whether a file is the published one, where a hash is published.
+    """Compare a file with the published hash, if there is one.
 
     Raises:
-        InputError: it is not, or cannot be read.
+        InputError: the hash differs, or the file cannot be read.
     """
     if entry.sha256 is None:
         return
@@ -93,14 +93,14 @@ def check_published(checkpoint: Path, entry: Entry) -> None:
 
 
 def check_sha256(sha256: str, entry: Entry, origin: object) -> None:
-    """Whether this is the published hash; `origin` begins the message.
+    """Compare a hash with the published one; `origin` begins the message.
 
     Raises:
-        InputError: it is not.
+        InputError: the hash differs.
     """
     if sha256 != entry.sha256:
-        others = [other.name for other in REGISTRY.values() if other.sha256 == sha256]
-        got = f"that of {others[0]}" if others else f"{sha256[:12]}...: damaged, or another file"
+        names = [other.name for other in REGISTRY.values() if other.sha256 == sha256]
+        got = f"that of {names[0]}" if names else f"{sha256[:12]}...: damaged, or another file"
         raise InputError(f"{origin}: expected the sha256 of {entry.name}, {str(entry.sha256)[:12]}..., got {got}")
 
 
@@ -113,18 +113,18 @@ def save(
     rounded: int = 0,
     folder: Path | None = None,
 ) -> Path:
-    """Write the arrays and, last, the manifest: until then, and if it never comes, `load` refuses the file.
+    """Write the arrays, then the manifest; `load` raises an error for a file without a manifest.
 
     Args:
-        name: of the registry's entry.
-        arrays: by dotted path.
-        source: the checkpoint they came from.
-        parameters: how many the network has.
-        rounded: how many of the source's tensors were rounded from float64.
+        name: name of the registry's entry.
+        arrays: arrays by dotted path.
+        source: the checkpoint of the arrays.
+        parameters: number of the network's parameters.
+        rounded: number of the source's tensors that were rounded from float64.
         folder: `weights_folder()` by default.
 
     Raises:
-        InputError: unknown name, or values that are not finite.
+        InputError: the name is unknown, or values are not finite.
     """
     from safetensors.numpy import save as serialized
 
@@ -143,11 +143,11 @@ def save(
 
 
 def load(name: str, folder: Path | None = None) -> dict[str, np.ndarray]:
-    """Arrays by dotted path, from a file that is byte for byte what was saved.
+    """Read arrays by dotted path, from a file whose hash is that of its manifest.
 
     Raises:
-        InputError: unknown name.
-        WeightsError: not installed; no manifest, another's, or a damaged file.
+        InputError: the name is unknown.
+        WeightsError: the weights are not installed, the manifest is missing or of other weights, or a file is damaged.
     """
     from safetensors import SafetensorError
     from safetensors.numpy import load as deserialized
@@ -167,11 +167,11 @@ def load(name: str, folder: Path | None = None) -> dict[str, np.ndarray]:
 
 
 def load_model(name: str, folder: Path | None = None) -> "nnx.Module":
-    """The network of this name with its weights, ready for inference.
+    """Load the network of this name with its weights, ready for inference.
 
     Raises:
-        InputError: unknown name.
-        WeightsError: as `load`; or the file's arrays are not this network's.
+        InputError: the name is unknown.
+        WeightsError: as `load`; or the arrays do not fit the network.
     """
     from mfvpr.checkpoints.networks import blueprint
 
@@ -179,24 +179,24 @@ def load_model(name: str, folder: Path | None = None) -> "nnx.Module":
     arrays = load(name, folder)
     try:
         return blueprint(entry).filled(arrays)
-    except InputError as error:  # written by another version of the network
+    except InputError as error:  # the file comes from another version of the network
         raise WeightsError(f"{_path(entry, folder)}: {error}; {_MEND}", entry) from error
 
 
 def fingerprint(name: str, folder: Path | None = None) -> str:
-    """The sha256 of the runtime file, as its manifest has it.
+    """The sha256 of the runtime file, from its manifest.
 
     Raises:
-        WeightsError: not installed, or no manifest.
+        WeightsError: the weights are not installed, or have no manifest.
     """
     return read_manifest(name, folder).sha256
 
 
 def read_manifest(name: str, folder: Path | None = None) -> Manifest:
-    """The manifest of an installed runtime file; the file itself is not read.
+    """Read the manifest of an installed runtime file, but not the file.
 
     Raises:
-        WeightsError: not installed, or no manifest of this name and format.
+        WeightsError: the weights are not installed, or have no manifest of this name and format.
     """
     entry = entry_of(name)
     path = _path(entry, folder).with_suffix(".json")
@@ -223,13 +223,13 @@ def read_manifest(name: str, folder: Path | None = None) -> Manifest:
 
 
 def is_installed(entry: Entry, folder: Path | None = None) -> bool:
-    """Whether the runtime file and its manifest are there; `load` says whether they are good."""
+    """Whether the runtime file and its manifest exist; `load` verifies them."""
     path = _path(entry, folder)
     return path.is_file() and path.with_suffix(".json").is_file()
 
 
 def file_sha256(path: Path) -> str:
-    """Of a file of any size."""
+    """The sha256 of a file of any size."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

@@ -1,4 +1,4 @@
-"""Which network each published file fills, and how."""
+"""Networks of the published files, and their blueprints, which take the weights."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from mfvpr.checkpoints.conversion import Rule, Table, convert, share_known
+from mfvpr.checkpoints.conversion import Rule, Table, convert, known_share
 from mfvpr.checkpoints.registry import REGISTRY, Entry
 from mfvpr.checkpoints.tables import (
     ALIKED,
@@ -31,13 +31,13 @@ if TYPE_CHECKING:
 
     from mfvpr.networks.gem import Backbone
 
-_OURS = Table((Rule("(.*)", r"\1"),))  # runtime files have our own paths
+_RUNTIME = Table((Rule("(.*)", r"\1"),))  # runtime files have the networks' paths
 
 
 class Network(NamedTuple):
-    """A network of the package: what makes it, and how its published checkpoints are laid out."""
+    """A network of the package, and the table of its published checkpoints."""
 
-    builder: Callable[[], Callable[..., "nnx.Module"]]  # imports the model, and returns what takes `rngs`
+    builder: Callable[[], Callable[..., "nnx.Module"]]  # imports the model, returns its constructor
     table: Table
 
 
@@ -97,10 +97,10 @@ def _selavpr(registers: int) -> Callable[..., "nnx.Module"]:
 
 _ALIKED = ("aliked-t16", "aliked-n16", "aliked-n16rot", "aliked-n32")
 
-_MOST = 0.5  # of the keys tell whose they are
-_LONGEST_PREFIX = 4  # parts between dots
+_LIKELY_SHARE = 0.5  # of keys that a table knows, if the checkpoint is its network's
+_MAX_PREFIX = 4  # parts between dots
 
-# By the registry's names.
+# Names in the registry -> networks.
 NETWORKS: dict[str, Network] = {
     **{name: Network(_d2net, D2NET) for name in ("d2_tf", "d2_ots", "d2_tf_no_phototourism")},
     "mixvpr_4096": Network(partial(_mixvpr, 1024, 4), MIXVPR),
@@ -133,7 +133,7 @@ NETWORKS: dict[str, Network] = {
 
 @dataclass(frozen=True)
 class Blueprint:
-    """A network without values: nothing was computed to make it."""
+    """A network without values, made without computing any."""
 
     shapes: Mapping[str, tuple[int, ...]]  # by dotted path; parameters and running statistics
     parameters: int  # without running statistics
@@ -141,7 +141,7 @@ class Blueprint:
     _state: Any
 
     def filled(self, arrays: Mapping[str, np.ndarray]) -> "nnx.Module":
-        """The network with these values, in evaluation mode.
+        """Build the network with these values, in evaluation mode.
 
         Raises:
             InputError: a path is missing or unknown, or a shape differs.
@@ -149,40 +149,40 @@ class Blueprint:
         import jax
         from flax import nnx
 
-        arrays = convert(arrays, _OURS, self.shapes)
-        state = jax.tree.map(lambda leaf: leaf, self._state)  # a copy, since the next line changes it
-        nnx.replace_by_pure_dict(state, _nested({path: jax.numpy.asarray(array) for path, array in arrays.items()}))
+        arrays = convert(arrays, _RUNTIME, self.shapes)
+        state = jax.tree.map(lambda leaf: leaf, self._state)  # a copy, which the next line changes
+        nnx.replace_by_pure_dict(state, _nest({path: jax.numpy.asarray(array) for path, array in arrays.items()}))
         module = nnx.merge(self._graph, state)
         module.eval()
         return module
 
 
 def network_of(entry: Entry) -> Network:
-    """How the entry's network is built and converted."""
+    """Network of an entry."""
     return NETWORKS[entry.name]
 
 
 def resemblance(keys: Sequence[str], expected: Network) -> str | None:
-    """Why the keys are not those of the expected network, where another's or a prefix before them explains it."""
-    if share_known(keys, expected.table) > _MOST:
+    """Reason why keys do not fit: they are another network's, or have a prefix; None = neither."""
+    if known_share(keys, expected.table) > _LIKELY_SHARE:
         return None
     for name, network in NETWORKS.items():
-        if network.table is not expected.table and share_known(keys, network.table) > _MOST:
+        if network.table is not expected.table and known_share(keys, network.table) > _LIKELY_SHARE:
             return f"expected the keys of another network, got those of {REGISTRY[name].network}"
-    *parts, _ = keys[0].split(".", maxsplit=_LONGEST_PREFIX)
+    *parts, _ = keys[0].split(".", maxsplit=_MAX_PREFIX)
     for prefix in accumulate(f"{part}." for part in parts):
-        if share_known([key.removeprefix(prefix) for key in keys], expected.table) > _MOST:
+        if known_share([key.removeprefix(prefix) for key in keys], expected.table) > _LIKELY_SHARE:
             return f"its keys begin with {excerpt(prefix)}, which the official file's do not"
     return None
 
 
 def blueprint(entry: Entry) -> Blueprint:
-    """The shapes of the entry's network."""
-    return planned(network_of(entry).builder())  # imported before tracing, or the module's constants would be traced
+    """Blueprint of the entry's network."""
+    return planned(network_of(entry).builder())  # imports before tracing, which would trace the module's constants
 
 
 def planned(build: Callable[..., "nnx.Module"]) -> Blueprint:
-    """The shapes of the network that `build` makes of `rngs`."""
+    """Blueprint of the network that `build(rngs=...)` makes."""
     import jax
     from flax import nnx
 
@@ -202,8 +202,8 @@ def _leaves(tree: Mapping[Any, Any], prefix: str) -> Iterator[tuple[str, Any]]:
             yield f"{prefix}{key}", value
 
 
-def _nested(flat: Mapping[str, Any]) -> dict[Any, Any]:
-    """Of dotted paths; digits are places of a list."""
+def _nest(flat: Mapping[str, Any]) -> dict[Any, Any]:
+    """Nested dictionaries of values by dotted path; digits are positions in a list."""
     tree: dict[Any, Any] = {}
     for path, value in flat.items():
         *parents, last = (int(part) if part.isdigit() else part for part in path.split("."))

@@ -1,4 +1,4 @@
-"""Reads the one kind of .npy file that holds a network: layers by name, of arrays by name, pickled, as plain data."""
+"""Read .npy files of networks as plain data: a pickled dictionary of layers, each a dictionary of arrays."""
 
 from typing import Any, BinaryIO
 
@@ -8,17 +8,17 @@ from mfvpr.io.formats.numpy_objects import Array, read_objects
 from mfvpr.io.formats.pickles import MEND, excerpt, file_size, of_type
 from mfvpr.utils.errors import InputError
 
-_LONGEST_NAME = 100  # characters
-_ENTRY = 16  # bytes that an array takes in the file at least, besides its values
+_MAX_NAME = 100  # characters of layer and name
+_ENTRY = 16  # least bytes of an array in the file, besides its values
 _EXPECTED = "a dictionary of layers"
 
 
 def read_layers(file: BinaryIO) -> dict[str, np.ndarray]:
-    """Arrays by `layer.name`, read-only, in the file's own types.
+    """Read arrays by `layer.name`, read-only, in the file's own types.
 
     Raises:
-        InputError: it holds anything else.
-        LookupError, TypeError, ValueError: it is damaged.
+        InputError: the file holds other content.
+        LookupError, TypeError, ValueError: the file is damaged.
     """
     match read_objects(file, _EXPECTED):
         case [dict() as layers] if layers:
@@ -27,14 +27,14 @@ def read_layers(file: BinaryIO) -> dict[str, np.ndarray]:
 
 
 def _arrays(layers: dict[Any, Any], room: int) -> dict[str, np.ndarray]:
-    """The layers' arrays, which together take at most `room` bytes: in the file, many names may share a few of them."""
+    """Arrays of at most `room` bytes in total; many names may share an array of a hostile file."""
     arrays = {}
     for layer, parts in layers.items():
         if not isinstance(parts, dict):
             raise InputError(f"expected arrays by layer, got {type(parts).__name__} at {excerpt(str(layer))}; {MEND}")
         for name, array in parts.items():
-            if len(of_type(str, layer)) + len(of_type(str, name)) > _LONGEST_NAME:
-                raise ValueError
+            if len(of_type(str, layer)) + len(of_type(str, name)) > _MAX_NAME:
+                raise ValueError("a name of too many characters")
             key = f"{layer}.{name}"
             where = f" at {excerpt(key)}"
             if not isinstance(array, Array):
@@ -43,6 +43,6 @@ def _arrays(layers: dict[Any, Any], room: int) -> dict[str, np.ndarray]:
             if room < 0:
                 raise InputError(f"expected no more values than the file stores{where}; use the official file")
             if key in arrays:
-                raise ValueError
+                raise ValueError("two arrays of one name")
             arrays[key] = array.numbers(where)
     return arrays

@@ -1,4 +1,4 @@
-"""The published weights: what they are called, where they are, what may be done with them. No weights are in here."""
+"""Registry of published weights: names, sources, sizes, hashes and licenses. It contains no weights."""
 
 import difflib
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ class Entry:
     name: str
     network: str
     file: str  # the official file name
-    source: str  # where its authors put it
+    source: str  # its authors' address
     size: int | None  # bytes; None where not published
     sha256: str | None  # None where not published
     code_license: str
@@ -23,7 +23,7 @@ class Entry:
 
     @property
     def license(self) -> str:
-        """Of the code and of the weights, as their authors state it."""
+        """Licenses of the code and of the weights, as their authors state them."""
         return f"code {self.code_license}, weights {self.weights_license}"
 
 
@@ -233,7 +233,7 @@ def entry_of(name: str) -> Entry:
     """The entry called `name`.
 
     Raises:
-        InputError: there is none; the message names the nearest, or all.
+        InputError: the name is unknown; the message suggests the nearest name, or lists all.
     """
     if name in REGISTRY:
         return REGISTRY[name]

@@ -1,4 +1,4 @@
-"""Keys of the published checkpoints -> paths of our networks."""
+"""Tables from the keys of published checkpoints to the parameters of our networks."""
 
 from collections.abc import Mapping
 
@@ -37,7 +37,7 @@ def _vgg(source: str, target: str = "vgg") -> tuple[Rule, ...]:
 
 D2NET = Table(_vgg(r"dense_feature_extraction\.model"))
 
-# SSM-VPR's own file and torch files of the same Caffe model, with Caffe's names or with torchvision's.
+# SSM-VPR's file, and torch files of the same Caffe model with the names of Caffe or torchvision.
 SSM = Table(
     (
         Rule(r"(conv\d_\d)\.weights?", r"vgg.\1.kernel", Layout.CONV),
@@ -53,7 +53,7 @@ SSM = Table(
 
 
 def _resnet(conv1: str, bn1: str, layers: Mapping[str, str]) -> tuple[Rule, ...]:
-    """Of a backbone; what the file calls its layers, and what we do."""
+    """Rules of a backbone; `layers` maps the file's names of layers to ours."""
     rules = [Rule(rf"{conv1}\.weight", "backbone.conv1.kernel", Layout.CONV), *_batch_norm(bn1, "backbone.bn1")]
     for source, layer in layers.items():
         block, ours = rf"{source}\.(\d)", rf"backbone.{layer}.\1"
@@ -108,7 +108,7 @@ ALIKED = Table(
     ignored=(_COUNTERS,),
 )
 
-_LAYER = r"(?:transformers\.(\d)\.{0}_attn|{0}_attn\.(\d))"  # the latter in older files; the other group is empty
+_LAYER = r"(?:transformers\.(\d)\.{0}_attn|{0}_attn\.(\d))"  # the second form in older files; one group is empty
 
 
 def _attention(source: str, target: str, parts: dict[str, str]) -> tuple[Rule, ...]:
@@ -133,10 +133,10 @@ LIGHTGLUE = Table(
         *_linear(r"log_assignment\.(\d)\.matchability", r"layers.\1.matchability"),
         *_linear(r"token_confidence\.(\d)\.token\.0", r"confidences.\1"),
     ),
-    ignored=("confidence_thresholds",),  # follow from the number of layers
+    ignored=("confidence_thresholds",),  # computed from the number of layers
 )
 
-# Patch-NetVLAD's, and pytorch-NetVlad's without the projection, where several devices trained it below `module`.
+# Patch-NetVLAD, and pytorch-NetVlad without the projection; training on several devices adds `module`.
 NETVLAD = Table(
     (
         *_vgg(r"encoder(?:\.module)?"),
@@ -147,7 +147,7 @@ NETVLAD = Table(
     )
 )
 
-# The original's layers, MATLAB's axes: height, width, inputs, outputs. The centers are stored with the other sign.
+# Layers of the original, with MATLAB's axes: height, width, inputs, outputs. The centers have the opposite sign.
 NETVLAD_MATLAB = Table(
     (
         *(
@@ -161,7 +161,7 @@ NETVLAD_MATLAB = Table(
         Rule(r"net\.layers\.33\.weights\.1", "projection.bias", Layout.SQUEEZED),
         Rule(r"net\.meta\.normalization\.averageImage", "average", Layout.PIXEL),
     ),
-    ignored=(r"net\.(?!layers\.\d+\.weights|meta\.normalization\.averageImage).*",),  # how it was trained
+    ignored=(r"net\.(?!layers\.\d+\.weights|meta\.normalization\.averageImage).*",),  # settings of the training
 )
 
 _GEM = (
@@ -203,7 +203,7 @@ _MASK = "mask_token"  # of the training
 
 DINOV2 = Table(_transformer("", ""), ignored=(_MASK,))
 
-# Its training on several devices puts `module` before all keys.
+# Training on several devices puts `module` before all keys.
 _SELA, _BLOCK = r"(?:module\.)?", r"backbone\.blocks\.(\d+)"
 SELAVPR = Table(
     (
