@@ -1,6 +1,6 @@
 """Networks as Flax NNX modules: arrays in, arrays out. Images are `[B, H, W, 3]` float32.
 
-Read first: d2net or mixvpr, then the parts that they share: vgg, resnet, vit, convolution, sampling, imagenet.
+Read first: d2net or mixvpr, then the shared parts: vgg, resnet, vit, convolution, sampling, imagenet.
 
 Imports types, utils.
 """

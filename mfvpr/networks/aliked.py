@@ -1,8 +1,8 @@
 """ALIKED (Zhao et al., IEEE TIM 2023): keypoints and descriptors from a light network with deformable convolutions.
 
-Four blocks at full, 1/2, 1/8 and 1/32 resolution are brought to a common width, enlarged and laid side by side: a
-feature for every pixel. Scaled to unit length, it is what descriptors are sampled from (`aliked_description`); four
-small convolutions make a score of it, whose peaks are the keypoints (`aliked_detection`).
+The outputs of four blocks at full, 1/2, 1/8 and 1/32 resolution are reduced to a common width, enlarged and
+concatenated: a feature for each pixel. Descriptors are sampled from the features of unit length (`aliked_description`).
+Four small convolutions turn the features into a score map, whose peaks are the keypoints (`aliked_detection`).
 """
 
 from typing import NamedTuple
@@ -19,12 +19,12 @@ from mfvpr.networks.sampling import sample, upsample
 from mfvpr.utils.errors import InputError
 
 STRIDE = 32  # px, of the coarsest map
-_POOLED = (1, 2, 4, 4)  # before each block
-_TOGETHER = 4  # pixels, which divides STRIDE
+_POOLING = (1, 2, 4, 4)  # factors before the blocks
+_PIXELS = 4  # per step of `_narrow`; divides STRIDE
 
 
 class Variant(NamedTuple):
-    """Widths of a published network, and how many positions each descriptor is gathered from."""
+    """Sizes of a published network: widths of its blocks, numbers and sampling positions of a descriptor."""
 
     widths: tuple[int, int, int, int]
     dimension: int
@@ -40,7 +40,7 @@ VARIANTS = {
 
 
 class DeformableConv(nnx.Module):
-    """3 x 3 convolution whose nine taps move by what another convolution proposes; zeros outside, no bias."""
+    """3 x 3 convolution with offsets of its nine taps from another convolution; zeros outside, no bias."""
 
     def __init__(self, inputs: int, outputs: int, *, precision: str, rngs: nnx.Rngs) -> None:
         init = nnx.initializers.lecun_normal()
@@ -51,7 +51,7 @@ class DeformableConv(nnx.Module):
     def __call__(self, x: Array) -> Array:
         """`[B, h, w, inputs]` -> `[B, h, w, outputs]`. Taps move by a quarter of the longer side at most.
 
-        One tap after the other: laying them side by side first costs several times the product.
+        Adds one tap after the other: concatenating the samples of all taps takes several times longer.
         """
         height, width, inputs = x.shape[1:]
         limit = max(height, width) / 4
@@ -70,7 +70,7 @@ class DeformableConv(nnx.Module):
 
 
 class Block(nnx.Module):
-    """Two 3 x 3 convolutions, each with batch normalization and SELU; a shortcut, if any, is added before the last."""
+    """Two 3 x 3 convolutions with batch normalization and SELU; an optional shortcut before the last SELU."""
 
     def __init__(
         self, inputs: int, outputs: int, *, deformable: bool, shortcut: bool, precision: str, rngs: nnx.Rngs
@@ -91,11 +91,11 @@ class Block(nnx.Module):
 
 
 class Aliked(nnx.Module):
-    """The network without its detector, which has no weights.
+    """ALIKED's network. The detector has no weights and is not part of it.
 
     Args:
         variant: "aliked-t16", "aliked-n16", "aliked-n16rot" or "aliked-n32".
-        precision: of the products where the hardware offers less than float32, which moves keypoints.
+        precision: of products on hardware with less than float32; a lower one moves keypoints.
 
     Raises:
         InputError: there is no such variant.
@@ -117,7 +117,7 @@ class Aliked(nnx.Module):
         self.desc_head = DescriptorHead(self.dimension, positions, precision=precision, rngs=rngs)
 
     def __call__(self, images: Array) -> tuple[Array, Array]:
-        """Features `[B, H, W, dimension]` of unit length, and scores `[B, H, W]` in (0, 1), of all pixels.
+        """Features `[B, H, W, dimension]` of unit length and scores `[B, H, W]` in (0, 1) of all pixels.
 
         Args:
             images: `[B, H, W, 3]` float32 RGB, 0 .. 1. Border pixels are repeated to make the sides multiples of 32.
@@ -126,60 +126,64 @@ class Aliked(nnx.Module):
         return jax.vmap(lambda levels: field(levels, *_inside(images)).dense())(levels), scores
 
     def levels(self, images: Array) -> tuple[list[Array], Array]:
-        """What features are made of, `[B, h, w, dimension / 4]` at each resolution of the padded images; and scores."""
+        """Parts of the features at each resolution of the padded images, and scores `[B, H, W]`.
+
+        Each part is `[B, h, w, dimension / 4]`.
+        """
         (top, bottom), (left, right) = (_margins(size) for size in images.shape[1:3])
         x = jnp.pad(images, ((0, 0), (top, bottom), (left, right), (0, 0)), mode="edge")
         levels = []
-        for place, pooled in enumerate(_POOLED, start=1):
-            x = getattr(self, f"block{place}")(_average_pool(x, pooled))
+        for place, factor in enumerate(_POOLING, start=1):
+            x = getattr(self, f"block{place}")(_average_pool(x, factor))
             levels.append(nnx.selu(getattr(self, f"conv{place}")(x)))
         return levels, self._scores(levels)[:, *_inside(images)]
 
     def extract(self, images: Array, threshold: Array | float, capacity: int) -> tuple[Detections, Array]:
-        """Keypoints of `images` as above, and their descriptors `[B, N, dimension]` of unit length."""
+        """Keypoints of images `[B, H, W, 3]`, and their descriptors `[B, N, dimension]` of unit length."""
         levels, scores = self.levels(images)
 
-        def of_one(levels: list[Array], scores: Array) -> tuple[Detections, Array]:
-            found = detect(scores, threshold, capacity)
-            return found, self.desc_head(field(levels, *_inside(images)), found.keypoints, found.count)
+        def extract_one(levels: list[Array], scores: Array) -> tuple[Detections, Array]:
+            detections = detect(scores, threshold, capacity)
+            return detections, self.desc_head(field(levels, *_inside(images)), detections.keypoints, detections.count)
 
-        return jax.vmap(of_one)(levels, scores)
+        return jax.vmap(extract_one)(levels, scores)
 
     def _scores(self, levels: list[Array]) -> Array:
-        """`[B, H, W]`.
+        """Scores `[B, H, W]` of the padded images.
 
-        The first convolution, of single pixels, and the enlargement are linear: in this order, 8 channels are enlarged
-        instead of all.
+        The first convolution (1 x 1) and the enlargement are linear, so the convolution runs first: 8 channels are
+        enlarged instead of all.
         """
-        first, *others = self.score_head
+        first, *convolutions = self.score_head
         parts = jnp.split(first.kernel[0, 0], len(levels))
         total = jnp.zeros((), levels[0].dtype)
         for level, part in zip(levels, parts, strict=True):
             product = jnp.matmul(level, part, precision=first.precision)
             total += upsample(product, levels[0].shape[1] // level.shape[1])
-        for conv in others:
+        for conv in convolutions:
             total = _narrow(conv, nnx.selu(total))
         return nnx.sigmoid(total[..., 0])
 
 
 def _conv(inputs: int, outputs: int, size: int = 3, *, precision: str, rngs: nnx.Rngs) -> nnx.Conv:
-    """Keeps the map's size; no bias."""
+    """Convolution without bias that keeps the size of a map."""
     return nnx.Conv(inputs, outputs, (size, size), padding=size // 2, use_bias=False, precision=precision, rngs=rngs)
 
 
 def _narrow(conv: nnx.Conv, x: Array) -> Array:
-    """`conv(x)`, 3 x 3 from few channels to few: `_TOGETHER` pixels of a row become one of many channels.
+    """`conv(x)` for a 3 x 3 convolution with few channels, computed on groups of `_PIXELS` pixels of a row.
 
-    The kernel grows with them, by zeros too. A CPU, which works on many channels at once, takes half of the time.
+    The pixels of a group become channels, and the kernel is padded with zeros. A CPU processes many channels at once,
+    so this takes half of the time.
     """
     batch, height, width, inputs = x.shape
-    block, source, target = np.indices((3, _TOGETHER, _TOGETHER))
-    column = (block - 1) * _TOGETHER + source - target + 1  # of the kernel, from a pixel of a block to a pixel of ours
-    chosen = (column[..., None] == np.arange(3)).astype(np.float32)
-    kernel = jnp.einsum("bstx,yxio->ybsito", chosen, conv.kernel[...], precision=conv.precision)
+    group, source, target = np.indices((3, _PIXELS, _PIXELS))
+    column = (group - 1) * _PIXELS + source - target + 1  # of the kernel, from pixel `source` of a group to `target`
+    selection = (column[..., None] == np.arange(3)).astype(np.float32)
+    kernel = jnp.einsum("bstx,yxio->ybsito", selection, conv.kernel[...], precision=conv.precision)
     out = jax.lax.conv_general_dilated(
-        x.reshape(batch, height, width // _TOGETHER, _TOGETHER * inputs),
-        kernel.reshape(3, 3, _TOGETHER * inputs, -1),
+        x.reshape(batch, height, width // _PIXELS, _PIXELS * inputs),
+        kernel.reshape(3, 3, _PIXELS * inputs, -1),
         window_strides=(1, 1),
         padding="SAME",
         dimension_numbers=("NHWC", "HWIO", "NHWC"),
@@ -189,13 +193,13 @@ def _narrow(conv: nnx.Conv, x: Array) -> Array:
 
 
 def _inside(images: Array) -> tuple[slice, slice]:
-    """Where images `[B, H, W, 3]` lie within the padded ones."""
+    """Rows and columns of images `[B, H, W, 3]` within the padded images."""
     (top, _), (left, _) = (_margins(size) for size in images.shape[1:3])
     return slice(top, top + images.shape[1]), slice(left, left + images.shape[2])
 
 
 def _margins(size: int) -> tuple[int, int]:
-    """Pixels to add before and after."""
+    """Pixels of padding before and after a side of this size."""
     missing = -size % STRIDE
     return missing // 2, missing - missing // 2
 

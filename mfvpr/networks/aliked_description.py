@@ -1,4 +1,4 @@
-"""ALIKED's descriptors, gathered around keypoints. For one image; `vmap` is the caller's."""
+"""ALIKED's descriptors of the keypoints of one image."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,76 +11,77 @@ from jax import Array
 from mfvpr.networks.lengths import EPSILON, of_unit_length
 from mfvpr.networks.sampling import Neighbors, around, between, neighbors
 
-_CHUNK = 256  # keypoints described at a time
+_CHUNK = 256  # keypoints per step
 
 
 class Level(NamedTuple):
-    """One of the maps that a field is made of: enlarged in height, and how to enlarge it in width."""
+    """One map of a field, already enlarged in height; `columns` enlarge it in width."""
 
     rows: Array  # [H, w, C]
-    columns: Neighbors | None  # [W]; None where w = W
+    columns: Neighbors | None  # [W]; None if w = W
 
 
 class Field(NamedTuple):
-    """Features `[H, W, D]` of unit length, which are computed where they are asked for.
+    """Features `[H, W, D]` of unit length, computed only at requested pixels.
 
-    Descriptors look at about half of the pixels, and the features of 320 x 320 px take 52 MB.
+    Descriptors need about half of the pixels, and the features of 320 x 320 px take 52 MB.
     """
 
     levels: tuple[Level, ...]
     inverse_norm: Array  # [H, W]
 
     def at(self, y: Array, x: Array) -> Array:
-        """`[N, D]` of pixels `[N]`; 0 outside."""
+        """Features `[N, D]` of pixels `[N]`; 0 outside."""
         height, width = self.inverse_norm.shape
         inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
         weight = jnp.where(inside, jnp.ones((), self.inverse_norm.dtype), 0)
-        return jnp.concatenate(self._weighted(jnp.clip(y, 0, height - 1), jnp.clip(x, 0, width - 1), weight), axis=-1)
+        y, x = jnp.clip(y, 0, height - 1), jnp.clip(x, 0, width - 1)
+        return jnp.concatenate(self._weighted_parts(y, x, weight), axis=-1)
 
     def sample(self, points: Array) -> Array:
-        """`[N, D]` at positions `[N, 2]` (x, y) px, bilinear; 0 outside."""
-        corners = [self._weighted(*corner) for corner in around(points, *self.inverse_norm.shape)]
+        """Features `[N, D]` at positions `[N, 2]` (x, y) px, bilinear; 0 outside."""
+        corners = [self._weighted_parts(*corner) for corner in around(points, *self.inverse_norm.shape)]
         return jnp.concatenate([sum(parts[1:], start=parts[0]) for parts in zip(*corners, strict=True)], axis=-1)
 
-    def _weighted(self, y: Array, x: Array, weight: Array) -> list[Array]:
-        """What each level adds, `[N, C]`, to the features of pixels `[N]`, which lie inside, times `weight` `[N]`.
+    def _weighted_parts(self, y: Array, x: Array, weight: Array) -> list[Array]:
+        """Parts `[N, C]` of each level for the features of pixels `[N]` inside the image, times `weight` `[N]`.
 
-        Not yet laid side by side: what is done with it until then is several times faster.
+        Sums of separate parts are several times faster than sums of concatenated features.
         """
-        weight *= _fetched(self.inverse_norm.reshape(-1), y * self.inverse_norm.shape[1] + x)
+        weight *= _rows_at(self.inverse_norm.reshape(-1), y * self.inverse_norm.shape[1] + x)
         parts = []
         for rows, columns in self.levels:
             flat, start = rows.reshape(-1, rows.shape[-1]), y * rows.shape[1]
             if columns is None:
-                parts.append(weight[:, None] * _fetched(flat, start + x))
+                parts.append(weight[:, None] * _rows_at(flat, start + x))
             else:
                 lower, upper, part = (jnp.asarray(values)[x] for values in columns)
-                before, after = _fetched(flat, start + lower), _fetched(flat, start + upper)
+                before, after = _rows_at(flat, start + lower), _rows_at(flat, start + upper)
                 parts.append((weight * (1 - part))[:, None] * before + (weight * part)[:, None] * after)
         return parts
 
     def dense(self) -> Array:
         """All features."""
-        return jnp.concatenate(_enlarged(self.levels), axis=-1) * self.inverse_norm[..., None]
+        return jnp.concatenate(_enlarge(self.levels), axis=-1) * self.inverse_norm[..., None]
 
 
 def field(levels: Sequence[Array], rows: slice, columns: slice) -> Field:
-    """What levels `[h, w, C]`, the first of full size, become: enlarged, cropped, side by side, of unit length."""
+    """Field of levels `[h, w, C]`, the first of full size, cropped to `rows` and `columns`."""
     height, width = levels[0].shape[:2]
     parts = [Level(levels[0][rows, columns], None)]
     for level in levels[1:]:
         down, right = neighbors(level.shape[0], height, rows), neighbors(level.shape[1], width, columns)
         parts.append(Level(between(level, down, -3), right))
-    squares = [jnp.sum(part * part, axis=-1) for part in _enlarged(parts)]
+    squares = [jnp.sum(part * part, axis=-1) for part in _enlarge(parts)]
     return Field(tuple(parts), 1 / jnp.maximum(jnp.sqrt(sum(squares[1:], start=squares[0])), EPSILON))
 
 
-def _enlarged(levels: Sequence[Level]) -> list[Array]:
+def _enlarge(levels: Sequence[Level]) -> list[Array]:
     return [rows if columns is None else between(rows, columns, -2) for rows, columns in levels]
 
 
 class DescriptorHead(nnx.Module):
-    """Gathers each descriptor from `positions` places, which the 3 x 3 neighborhood of the keypoint proposes."""
+    """Samples features at `positions` places per keypoint, which depend on its 3 x 3 neighborhood."""
 
     def __init__(self, dimension: int, positions: int, *, precision: str, rngs: nnx.Rngs) -> None:
         moves = 2 * positions
@@ -92,26 +93,26 @@ class DescriptorHead(nnx.Module):
         self.precision = precision
 
     def __call__(self, features: Field, keypoints: Array, count: Array | int) -> Array:
-        """`[N, D]` of unit length, at the first `count` of keypoints `[N, 2]` (x, y) px; anything at the others.
+        """Descriptors `[N, D]` of unit length of keypoints `[N, 2]` (x, y) px; only the first `count` are valid.
 
-        Chunk by chunk, so that slots which are not used cost nothing.
+        Runs chunk by chunk, so that unused slots cost nothing.
         """
         slots, dimension = len(keypoints), self.agg_weights.shape[-1]
         keypoints = jnp.pad(keypoints, ((0, -slots % _CHUNK), (0, 0)))
 
         def describe(chunk: Array, descriptors: Array) -> Array:
             start = chunk * _CHUNK
-            described = self._described(features, jax.lax.dynamic_slice_in_dim(keypoints, start, _CHUNK))
-            return jax.lax.dynamic_update_slice_in_dim(descriptors, described, start, axis=0)
+            new = self._describe(features, jax.lax.dynamic_slice_in_dim(keypoints, start, _CHUNK))
+            return jax.lax.dynamic_update_slice_in_dim(descriptors, new, start, axis=0)
 
         chunks = -(-jnp.minimum(count, slots) // _CHUNK)
         start = jnp.zeros((len(keypoints), dimension), keypoints.dtype)
         return jax.lax.fori_loop(0, chunks, describe, start)[:slots]
 
-    def _described(self, features: Field, keypoints: Array) -> Array:
+    def _describe(self, features: Field, keypoints: Array) -> Array:
         """Descriptors of all keypoints `[N, 2]`.
 
-        One place after the other, for all keypoints, so that intermediate values stay in the caches.
+        Adds one place after the other, so that intermediate values stay in the CPU's caches.
         """
 
         def add(total: Array, place: tuple[Array, Array]) -> tuple[Array, None]:
@@ -124,10 +125,10 @@ class DescriptorHead(nnx.Module):
         return of_unit_length(descriptors)
 
     def _moves(self, features: Field, keypoints: Array) -> Array:
-        """`[positions, N, 2]` (x, y) px, a quarter of the longer side at most.
+        """Offsets `[positions, N, 2]` (x, y) px of the places, a quarter of the longer side at most.
 
-        Neighborhoods reach over the border into zeros, as in the original's compiled operator; where that is not
-        built, the original moves them inside instead.
+        Neighborhoods beyond the border are zero, as in the original's compiled operator. (The original's fallback in
+        Python moves them inside instead.)
         """
         column, row = keypoints.astype(int).T  # truncated
         reach = jnp.arange(-1, 2)
@@ -153,5 +154,5 @@ def _bias(conv: nnx.Conv) -> Array:
     return conv.bias[...][None]
 
 
-def _fetched(rows: Array, places: Array) -> Array:
+def _rows_at(rows: Array, places: Array) -> Array:
     return rows.at[places].get(mode="promise_in_bounds")

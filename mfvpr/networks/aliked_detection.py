@@ -1,4 +1,4 @@
-"""ALIKED's detector: peaks of a score map, refined to fractions of a pixel. For one image; `vmap` is the caller's."""
+"""ALIKED's detector: peaks of one image's score map, refined to fractions of a pixel."""
 
 from typing import NamedTuple
 
@@ -8,23 +8,24 @@ from jax import Array
 
 from mfvpr.networks.sampling import sample
 
-RADIUS = 2  # px: of the suppression, of the refinement, and of the border, which has no keypoints
+RADIUS = 2  # px, of the suppression, the refinement and the border without keypoints
 _TEMPERATURE = 0.1
 
 
 class Detections(NamedTuple):
-    """Keypoints of one image in N slots: row by row, or by falling score where there are more than slots."""
+    """Keypoints of one image in N slots, ordered by row, or by score if there are more than N."""
 
     keypoints: Array  # [N, 2] (x, y) px
     scores: Array  # [N]
     mask: Array  # [N] bool, True on the first ones
-    count: Array  # [] how many were found; where it exceeds N, those of the lowest scores are missing
+    count: Array  # [] number of peaks; if above N, those with the lowest scores are missing
 
 
 def detect(score_map: Array, threshold: Array | float, capacity: int) -> Detections:
-    """Peaks of a map `[H, W]` above `threshold`; above the map's mean where none is, or where `threshold` is 0.
+    """Peaks of a map `[H, W]` above `threshold`, in min(capacity, H W) slots.
 
-    There are min(capacity, H W) slots. (The original takes the mean where none is in the whole batch.)
+    If no peak is above it, or `threshold` is 0, the map's mean is the threshold. (The original takes the mean if the
+    whole batch has no peak.)
     """
     width = score_map.shape[1]
     scores, peaks = score_map.reshape(-1), _peaks(score_map).reshape(-1)
@@ -32,25 +33,25 @@ def detect(score_map: Array, threshold: Array | float, capacity: int) -> Detecti
     valid = jnp.where(jnp.any(above), above, peaks & (scores > jnp.mean(scores)))
     count = jnp.sum(valid)
     capacity = min(capacity, valid.size)
-    in_order = -jnp.arange(valid.size, dtype=scores.dtype)
-    key, place = jax.lax.top_k(jnp.where(valid, jnp.where(count > capacity, scores, in_order), -jnp.inf), capacity)
-    keypoints = _refined(score_map, place // width, place % width)
+    row_order = -jnp.arange(valid.size, dtype=scores.dtype)
+    key, place = jax.lax.top_k(jnp.where(valid, jnp.where(count > capacity, scores, row_order), -jnp.inf), capacity)
+    keypoints = _refine(score_map, place // width, place % width)
     return Detections(keypoints, sample(score_map[..., None], keypoints)[..., 0], key > -jnp.inf, count)
 
 
 def _peaks(scores: Array) -> Array:
-    """`[H, W]` bool: maxima of their neighborhoods, and twice more those of what maxima left standing; no border."""
-    found = scores == _spread(scores)
+    """`[H, W]` bool: local maxima, and in two more rounds those outside the neighborhoods of maxima; no border."""
+    is_peak = scores == _local_maximum(scores)
     for _ in range(2):
-        suppressed = _spread(found)
-        others = jnp.where(suppressed, 0, scores)
-        found |= (others == _spread(others)) & ~suppressed
+        suppressed = _local_maximum(is_peak)
+        remaining = jnp.where(suppressed, 0, scores)
+        is_peak |= (remaining == _local_maximum(remaining)) & ~suppressed
     inside = [(jnp.arange(size) >= RADIUS) & (jnp.arange(size) < size - RADIUS) for size in scores.shape]
-    return found & inside[0][:, None] & inside[1][None, :]
+    return is_peak & inside[0][:, None] & inside[1][None, :]
 
 
-def _spread(values: Array) -> Array:
-    """The maximum around each pixel, of columns and then of rows: slices, which are faster than a window reduction."""
+def _local_maximum(values: Array) -> Array:
+    """Maximum around each pixel. Slices along each axis are faster than a window reduction."""
     lowest = False if values.dtype == bool else -jnp.inf
     for axis, size in enumerate(values.shape):
         margin = [(0, 0), (0, 0)]
@@ -61,8 +62,8 @@ def _spread(values: Array) -> Array:
     return values
 
 
-def _refined(score_map: Array, row: Array, column: Array) -> Array:
-    """`[N, 2]` (x, y) px: the mean position around each peak, weighted by a softmax of the scores."""
+def _refine(score_map: Array, row: Array, column: Array) -> Array:
+    """Mean position `[N, 2]` (x, y) px around each peak, weighted by a softmax of the scores."""
     height, width = score_map.shape
     reach = jnp.arange(2 * RADIUS + 1)
     padded = jnp.pad(score_map, RADIUS)
@@ -76,11 +77,11 @@ def _refined(score_map: Array, row: Array, column: Array) -> Array:
 
 
 def _there_and_back(position: Array, size: int, total: Array) -> Array:
-    """Through [-1, 1], as the original goes, to the last bit.
+    """Scale a position to [-1, 1] and back, with the rounding of the original.
 
-    Whole numbers may come out a little smaller, and the descriptor truncates. XLA would multiply by the reciprocal of a
-    number that all positions share, which rounds otherwise, so each has its own: `total` is 1 or more, which XLA does
-    not know.
+    Whole numbers may become a little smaller, and the descriptor truncates them. For a divisor that all positions
+    share, XLA multiplies by the reciprocal, which rounds differently. A divisor that depends on `total` prevents this:
+    `total` is always positive, which XLA cannot know.
     """
     last = jnp.where(total > 0, jnp.asarray(size - 1, position.dtype), 1)
     return ((position / last * 2 - 1) / 2 + 0.5) * last

@@ -1,9 +1,9 @@
-"""3 x 3 convolutions, on a CPU with half the products.
+"""3 x 3 convolutions with half of the products on a CPU.
 
 Winograd's F(4, 3) (Lavin & Gray, CVPR 2016) along the rows: four rows of the result come from six rows of the input by
-six convolutions with 1 x 3 kernels, where the definition takes twelve. VGG16's rounding errors grow by half, and depend
-on which of the four rows it is: where the input repeats itself, the result differs in its last bits. Whoever compares
-neighbors there asks for the definition. Libraries of other processors choose for themselves.
+six convolutions with 1 x 3 kernels, instead of twelve. The rounding errors of VGG16 grow by half, and differ between
+the four rows: equal neighborhoods give results that differ in the last bits. `uniform=True` avoids this by the direct
+method. On other processors, the library of the device chooses a method.
 """
 
 from collections.abc import Sequence
@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from flax import nnx
 from jax import Array, lax
 
-_WIDE = 128  # input channels from which on fewer products outweigh more memory traffic
-# Evaluation at 0, 1, -1, 2, -2 and infinity of the polynomials whose product the convolution is, and its inverse.
+_WIDE = 128  # least input channels for which fewer products outweigh more memory traffic
+# The convolution is a product of polynomials: their values at 0, 1, -1, 2, -2 and infinity, and the inverse.
 _INPUT = (
     (4, 0, -5, 0, 1, 0),
     (0, -4, -4, 1, 1, 0),
@@ -61,11 +61,11 @@ class Conv3x3(nnx.Module):
 
         Args:
             x: the input.
-            uniform: `[]` bool, whether equal neighborhoods must give equal bits, which takes half as long again.
+            uniform: `[]` bool, whether equal neighborhoods must give equal bits, which takes 1.5 times as long.
         """
 
         def direct(x: Array, kernel: Array) -> Array:
-            return _convolved(x, kernel, self.dilation, self.dilation, self.precision)
+            return _convolve(x, kernel, self.dilation, self.dilation, self.precision)
 
         def fast(x: Array, kernel: Array) -> Array:
             return lax.cond(
@@ -79,7 +79,7 @@ class Conv3x3(nnx.Module):
 
 
 def winograd(x: Array, kernel: Array, dilation: int, precision: str) -> Array:
-    """`[B, H, W, C]` with `[3, 3, C, D]` -> `[B, H, W, D]`, zeros outside."""
+    """Convolve `[B, H, W, C]` with `[3, 3, C, D]` -> `[B, H, W, D]`, zeros outside."""
     batch, height, width, channels = x.shape
     tiles = -(-height // (4 * dilation))
     below = dilation * (4 * tiles + 3) - height
@@ -87,14 +87,14 @@ def winograd(x: Array, kernel: Array, dilation: int, precision: str) -> Array:
     x = x.reshape(batch, tiles + 1, 4, dilation, width, channels)  # row = 4 d tile + d place + phase
     rows = [x[:, :-1, place] for place in range(4)] + [x[:, 1:, place] for place in range(2)]
     products = [
-        _convolved(evaluated.reshape(batch, -1, width, channels), column[None], 0, dilation, precision)
-        for evaluated, column in zip(_combined(_INPUT, rows), _combined(_KERNEL, list(kernel)), strict=True)
+        _convolve(evaluated.reshape(batch, -1, width, channels), column[None], 0, dilation, precision)
+        for evaluated, column in zip(_combine(_INPUT, rows), _combine(_KERNEL, list(kernel)), strict=True)
     ]
-    result = _combined(_OUTPUT, [product.reshape(batch, tiles, dilation, width, -1) for product in products])
+    result = _combine(_OUTPUT, [product.reshape(batch, tiles, dilation, width, -1) for product in products])
     return jnp.stack(result, axis=2).reshape(batch, 4 * tiles * dilation, width, -1)[:, :height]
 
 
-def _convolved(x: Array, kernel: Array, above: int, dilation: int, precision: str) -> Array:
+def _convolve(x: Array, kernel: Array, above: int, dilation: int, precision: str) -> Array:
     return lax.conv_general_dilated(
         x,
         kernel,
@@ -106,7 +106,7 @@ def _convolved(x: Array, kernel: Array, above: int, dilation: int, precision: st
     )
 
 
-def _combined(matrix: Sequence[Sequence[float]], parts: Sequence[Array]) -> list[Array]:
-    """The matrix times the column of parts."""
+def _combine(matrix: Sequence[Sequence[float]], parts: Sequence[Array]) -> list[Array]:
+    """Product of a matrix and the column of parts."""
     products = [[weight * part for weight, part in zip(row, parts, strict=True) if weight] for row in matrix]
-    return [sum(others, start=first) for first, *others in products]
+    return [sum(terms[1:], start=terms[0]) for terms in products]

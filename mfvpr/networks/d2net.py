@@ -1,8 +1,8 @@
 """D2-Net (Dusmanu et al., CVPR 2019): one dense map serves as detector and as descriptor.
 
-The network ends in a map `[h, w, C]`. A keypoint lies where a channel is the strongest of its position, a maximum of
-its own 3 x 3 neighborhood, and no edge; a Newton step refines the position, and the map, interpolated there, is the
-descriptor. Positions of the map are (row, column); those of the image are (x, y) = 4 p + 1.5 px.
+The network returns a map `[h, w, C]`. A position is a keypoint if its strongest channel has a maximum in its 3 x 3
+neighborhood there that is no edge. A Newton step refines the position, and the descriptor is the map, interpolated at
+the refined position. Positions in the map are (row, column); in the image, position p is (x, y) = 4 p + 1.5 px.
 """
 
 import math
@@ -22,17 +22,16 @@ from mfvpr.networks.vgg import Vgg16
 
 STRIDE = 4  # px between positions of the map
 SCALES = (0.5, 1.0, 2.0)  # of the multi-scale detection, in this order
-# Cells of 4 x 4 px that lie within what a position of the map sees (92 x 92 px), from its own cell on.
-_FIELD = (-10, 11)
+_FIELD = (-10, 11)  # receptive field (92 x 92 px) of a position, in cells of 4 x 4 px relative to its own
 _EDGE_THRESHOLD = 5  # largest ratio of the principal curvatures
 
 
 class D2Net(nnx.Module):
-    """VGG16 to `conv4_3`; the third pooling is a smoothing, which keeps stride 4, and block 4 is dilated instead.
+    """VGG16 to `conv4_3`. The third pooling only smooths, so the stride stays 4, and block 4 is dilated instead.
 
     Args:
         relu: end with a ReLU, as published.
-        precision: of the products where the hardware offers less than float32, which moves keypoints.
+        precision: of products on hardware with less than float32; a lower one moves keypoints.
     """
 
     def __init__(self, *, relu: bool = True, precision: str = "highest", rngs: nnx.Rngs) -> None:
@@ -47,16 +46,16 @@ class D2Net(nnx.Module):
 
 
 def _repeats(images: Array) -> Array:
-    """Whether in any of the images `[B, H, W, 3]` two neighbors in the map see the same, as in a white sky; `[]` bool.
+    """Whether two neighbors in a map have equal receptive fields, as in a white sky; `[]` bool for all images.
 
-    The map is level there, unless the rounding makes peaks. Beyond the border all is taken to be the same.
+    The map is constant there, but rounding can create peaks. Pixels outside the images `[B, H, W, 3]` count as equal.
     """
     batch, height, width, _ = images.shape
     rows, columns = -(-height // STRIDE), -(-width // STRIDE)
     before, after = _FIELD
-    found = jnp.zeros((), bool)
-    for shifted in (images[:, STRIDE:] == images[:, :-STRIDE], images[:, :, STRIDE:] == images[:, :, :-STRIDE]):
-        same = jnp.all(shifted, axis=-1)
+    repeats = jnp.zeros((), bool)
+    for equal in (images[:, STRIDE:] == images[:, :-STRIDE], images[:, :, STRIDE:] == images[:, :, :-STRIDE]):
+        same = jnp.all(equal, axis=-1)
         missing = (STRIDE * rows - same.shape[1], STRIDE * columns - same.shape[2])
         same = jnp.pad(same, ((0, 0), (0, missing[0]), (0, missing[1])), constant_values=True)
         same = jnp.all(same.reshape(batch, rows, STRIDE, columns, STRIDE), axis=(2, 4))
@@ -64,31 +63,31 @@ def _repeats(images: Array) -> Array:
             padding = [(-before, after) if axis == other else (0, 0) for other in range(3)]
             window = [after - before + 1 if axis == other else 1 for other in range(3)]
             same = lax.reduce_window(same, True, lax.bitwise_and, window, (1, 1, 1), padding)
-        found |= jnp.any(same)
-    return found
+        repeats |= jnp.any(same)
+    return repeats
 
 
 class Detections(NamedTuple):
-    """Keypoints of one map in N slots, ordered by channel, then row, then column; then padding."""
+    """Keypoints of one map in N slots, ordered by channel, then row, then column; padding is last."""
 
-    keypoints: Array  # [N, 2] (x, y), px of the image that the map was made of
+    keypoints: Array  # [N, 2] (x, y), px of the map's image
     descriptors: Array  # [N, C], unit Euclidean length
     scores: Array  # [N] the map's value at the integer position
     mask: Array  # [N] bool
-    count: Array  # [] how many were found; where it exceeds N, those of the lowest scores are missing
+    count: Array  # [] number of keypoints; if above N, those with the lowest scores are missing
 
 
 class Survey(NamedTuple):
-    """What the detector sees at each position of a map, in the strongest channel there."""
+    """Properties of each position of a map, in its strongest channel."""
 
     channel: Array  # [h, w] int32
     score: Array  # [h, w]
     detected: Array  # [h, w] bool
-    step: Array  # [h, w, 2] (row, column), from the position to the maximum of a parabola
+    step: Array  # [h, w, 2] (row, column), from the position to the maximum of its parabola
 
 
 def map_size(pixels: int) -> int:
-    """Length of the map's side along an image's side."""
+    """Positions of the map along an image's side."""
     return pixels // STRIDE - 1
 
 
@@ -105,14 +104,14 @@ def extract(
     Args:
         model: the network.
         images: RGB, 0 .. 255, at least 12 px high and wide at every scale.
-        preprocessing: of the pixels; "caffe" is what the published weights want.
+        preprocessing: of the pixels; the published weights expect "caffe".
         scales: of the images, see `detect`; `SCALES` are the original's.
-        share: slots per position of a map; 1 holds whatever is found.
+        share: slots per position of a map; 1 has room for all keypoints.
     """
     pixels = preprocess(images, preprocessing)
     height, width = images.shape[1:3]
     sizes = [(int(height * scale), int(width * scale)) for scale in scales]
-    maps = [model(_stretched(_stretched(pixels, columns, axis=2), rows, axis=1)) for rows, columns in sizes]
+    maps = [model(_stretch(_stretch(pixels, columns, axis=2), rows, axis=1)) for rows, columns in sizes]
     ratios = [(width / columns, height / rows) for rows, columns in sizes]
     return jax.vmap(lambda levels: detect(levels, ratios, share))(maps)
 
@@ -120,39 +119,39 @@ def extract(
 def detect(
     maps: Sequence[Array], ratios: Sequence[tuple[float, float]] = ((1.0, 1.0),), share: float = 1.0
 ) -> tuple[Detections, ...]:
-    """Keypoints of one image from its dense maps `[h, w, C]`, one of each scale, the smallest first.
+    """Keypoints of one image from its dense maps `[h, w, C]`, one for each scale, the smallest first.
 
-    A map is added to the next, where there were keypoints in it; where it has detections, the next has none; and scores
+    A map with keypoints is added to the next map. Positions that one map detects are not detected in later maps. Scores
     of the n-th map are divided by n.
 
     Args:
-        maps: of the scales.
-        ratios: (width, height) of the image over those of each scale's.
-        share: slots per position of a map; 1 holds whatever is found.
+        maps: maps of the scales.
+        ratios: (width, height) of the image, divided by those of each scale.
+        share: slots per position of a map; 1 has room for all keypoints.
     """
-    found: list[Detections] = []
-    coarser = banned = None
+    detections: list[Detections] = []
+    coarser = detected = None
     for dense, ratio in zip(maps, ratios, strict=True):
         rows, columns, _ = dense.shape
         if coarser is not None:
-            dense = dense + _stretched(_stretched(coarser, columns, axis=1), rows, axis=0)
+            dense = dense + _stretch(_stretch(coarser, columns, axis=1), rows, axis=0)
         seen = survey(dense)
-        if banned is not None:
-            banned = banned[_nearest(len(banned), rows)][:, _nearest(banned.shape[1], columns)]
-            seen = seen._replace(detected=seen.detected & ~banned)
+        if detected is not None:
+            detected = detected[_nearest(len(detected), rows)][:, _nearest(detected.shape[1], columns)]
+            seen = seen._replace(detected=seen.detected & ~detected)
         level = select(dense, seen, math.ceil(share * rows * columns))
         coarser = jnp.where(level.count > 0, dense, 0)
-        banned = seen.detected if banned is None else banned | seen.detected
+        detected = seen.detected if detected is None else detected | seen.detected
         scaled = level.keypoints * jnp.array(ratio, jnp.float32)[None]
-        found.append(level._replace(keypoints=scaled, scores=level.scores / (len(found) + 1)))
-    return tuple(found)
+        detections.append(level._replace(keypoints=scaled, scores=level.scores / (len(detections) + 1)))
+    return tuple(detections)
 
 
 def survey(dense: Array) -> Survey:
-    """What the detector sees in one dense map `[h, w, C]`.
+    """Find the strongest channel and the local maxima of one dense map `[h, w, C]`.
 
-    Where several channels share a position's maximum exactly, the first alone is looked at (the original looks at each,
-    and reports the position once for each that passes). Positions where all channels are zero are not detected.
+    If several channels share a position's maximum exactly, only the first counts. (The original reports the position
+    once for each of them that is a maximum.) Positions with zeros in all channels are not detected.
     """
     height, width, channels = dense.shape
     score = jnp.max(dense, axis=-1)
@@ -172,7 +171,10 @@ def survey(dense: Array) -> Survey:
 
 
 def _parabola(around: dict[tuple[int, int], Array]) -> tuple[Array, Array]:
-    """Whether it is no edge `[h, w]`, and the step to its maximum `[h, w, 2]`, from values at (down, right)."""
+    """Whether a position is no edge `[h, w]`, and the step to the maximum `[h, w, 2]`.
+
+    `around` holds the values at (down, right) of the position.
+    """
     center = around[0, 0]
     ii = around[-1, 0] - 2 * center + around[1, 0]
     jj = around[0, -1] - 2 * center + around[0, 1]
@@ -187,9 +189,9 @@ def _parabola(around: dict[tuple[int, int], Array]) -> tuple[Array, Array]:
 
 
 def select(dense: Array, seen: Survey, capacity: int) -> Detections:
-    """The keypoints among what was detected in a map `[h, w, C]`, in min(capacity, h w) slots.
+    """Keypoints among the detected positions of a map `[h, w, C]`, in min(capacity, h w) slots.
 
-    Kept are those that lie at most half a position from where they were detected, and on the map.
+    Keypoints lie on the map after the refinement, less than half a position from the detected one.
     """
     height, width, _ = dense.shape
     grid = jnp.stack(jnp.meshgrid(jnp.arange(height), jnp.arange(width), indexing="ij"), axis=-1)
@@ -204,15 +206,15 @@ def select(dense: Array, seen: Survey, capacity: int) -> Detections:
     position = position.reshape(-1, 2)[place]
     return Detections(
         keypoints=position[:, ::-1] * STRIDE + 1.5,
-        descriptors=_interpolated(dense, position),
+        descriptors=_interpolate(dense, position),
         scores=seen.score.reshape(-1)[place],
         mask=order < jnp.iinfo(order.dtype).max,
         count=jnp.sum(valid),
     )
 
 
-def _interpolated(dense: Array, position: Array) -> Array:
-    """The map `[h, w, C]` at positions `[N, 2]`, bilinear, scaled to unit length `[N, C]`."""
+def _interpolate(dense: Array, position: Array) -> Array:
+    """Vectors `[N, C]` of unit length of a map `[h, w, C]` at positions `[N, 2]`, bilinear."""
     low, high = jnp.floor(position), jnp.ceil(position)
     after = position - low
     before = 1 - after
@@ -226,13 +228,13 @@ def _interpolated(dense: Array, position: Array) -> Array:
     return of_unit_length(vectors)
 
 
-def _stretched(values: Array, size: int, *, axis: int) -> Array:
-    """Linear interpolation along an axis, so that its ends stay the ends."""
+def _stretch(values: Array, size: int, *, axis: int) -> Array:
+    """Linear interpolation to `size` values along an axis; the first and last values stay."""
     length = values.shape[axis]
     return values if size == length else between(values, neighbors(length, size), axis)
 
 
 def _nearest(length: int, size: int) -> np.ndarray:
-    """Which of `length` entries each of `size` takes, rounded down."""
+    """`[size]` indices below `length`, evenly spread and rounded down."""
     position = np.arange(size, dtype=np.float32) * (np.float32(length) / np.float32(size))
     return np.minimum(np.floor(position).astype(int), length - 1)

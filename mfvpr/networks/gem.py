@@ -1,4 +1,4 @@
-"""Generalized mean pooling (Radenovic et al., TPAMI 2019) on VGG16 and ResNet-50, as CosPlace (CVPR 2022) trains it."""
+"""Generalized mean pooling (Radenovic et al., TPAMI 2019) on VGG16 or ResNet-50, as in CosPlace (CVPR 2022)."""
 
 from typing import Literal
 
@@ -14,37 +14,37 @@ from mfvpr.networks.vgg import Vgg16, require_position
 Backbone = Literal["vgg16", "resnet50"]
 
 _CHANNELS = {"vgg16": 512, "resnet50": 2048}
-_SMALLEST = 1e-6  # of what is pooled, as published
+_MIN_VALUE = 1e-6  # before pooling, as published
 
 
 class GeneralizedMean(nnx.Module):
-    """(mean_p max(x_p, 1e-6)^power)^(1 / power) of every channel: from the mean, power 1, towards the maximum."""
+    """(mean_p max(x_p, 1e-6)^power)^(1 / power) of each channel: power 1 is the mean, infinity the maximum."""
 
     def __init__(self, power: float = 3.0) -> None:
         self.power = nnx.Param(jnp.full(1, power, jnp.float32))
 
     def __call__(self, maps: Array) -> Array:
         """`[B, h, w, C]` -> `[B, C]`."""
-        power, values = self.power[...][0], jnp.maximum(maps, _SMALLEST)
-        largest = jnp.max(values, axis=(1, 2), keepdims=True)  # relative to it, no power of small values is lost
+        power, values = self.power[...][0], jnp.maximum(maps, _MIN_VALUE)
+        largest = jnp.max(values, axis=(1, 2), keepdims=True)  # a divisor, so that powers of small values do not vanish
         means = jnp.mean((values / largest) ** power, axis=(1, 2))
         return largest[:, 0, 0] * means ** (1 / power)
 
 
 class Gem(nnx.Module):
-    """A backbone's last map, of unit length at every position, its generalized mean, and a projection.
+    """Generalized mean of a backbone's last map, of unit length at each position, and a projection.
 
     Args:
         backbone: VGG16 to `conv5_3`, before its ReLU, or ResNet-50 without its classifier.
         outputs: numbers of a descriptor.
-        precision: of the products where the hardware offers less than float32.
+        precision: of products on hardware with less than float32.
     """
 
     def __init__(
         self, backbone: Backbone = "resnet50", outputs: int = 2048, *, precision: str = "highest", rngs: nnx.Rngs
     ) -> None:
-        made = {"vgg16": Vgg16, "resnet50": ResNet50}[backbone]
-        self.backbone = made(precision=precision, rngs=rngs)
+        backbone_class = {"vgg16": Vgg16, "resnet50": ResNet50}[backbone]
+        self.backbone = backbone_class(precision=precision, rngs=rngs)
         self.pool = GeneralizedMean()
         self.projection = nnx.Linear(_CHANNELS[backbone], outputs, precision=precision, rngs=rngs)
         self.dimension = outputs
@@ -54,7 +54,7 @@ class Gem(nnx.Module):
 
     @staticmethod
     def preprocess(images: Array) -> Array:
-        """`[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32 -> what the network takes, float32."""
+        """Images `[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32 -> inputs of the network, float32."""
         return preprocess(images, "torch")
 
     def __call__(self, images: Array) -> Array:

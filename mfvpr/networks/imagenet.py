@@ -1,4 +1,4 @@
-"""What networks trained on ImageNet's images, or from such networks, take for pixels."""
+"""Preprocessing of images for networks that were trained on ImageNet."""
 
 from typing import Literal
 
@@ -13,9 +13,10 @@ DEVIATION = (0.229, 0.224, 0.225)
 
 
 def preprocess(images: Array, preprocessing: Preprocessing) -> Array:
-    """RGB images `[B, H, W, 3]` from 0 to 255 -> what the network takes, float32.
+    """RGB images `[B, H, W, 3]` from 0 to 255 -> inputs of the network, float32.
 
-    "caffe" is BGR minus the mean. "torch" is RGB in [0, 1], minus the mean, over the deviation. Bytes are rounded once.
+    "caffe" is BGR minus the mean. "torch" is RGB in [0, 1], minus the mean, divided by the standard deviation. Results
+    for bytes are rounded once.
     """
     ordered = images[..., ::-1] if preprocessing == "caffe" else images
     if images.dtype == jnp.uint8:
@@ -33,7 +34,7 @@ _STATISTICS = {
 
 
 def _table(scale: float, mean: np.ndarray, deviation: np.ndarray) -> np.ndarray:
-    """`[3, 256]` of all bytes: subtracted in float64 and rounded, as D2-Net's code does; a device has no float64."""
+    """Results `[3, 256]` for all bytes, computed in float64 as in D2-Net's code; a device has no float64."""
     byte = np.arange(256, dtype=np.float32) / np.float32(scale)
     return ((byte[None] - mean[:, None]) / deviation[:, None]).astype(np.float32)
 

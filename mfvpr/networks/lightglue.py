@@ -1,8 +1,8 @@
-"""LightGlue (Lindenberger et al., ICCV 2023): which keypoints of two images are the same points, by attention.
+"""LightGlue (Lindenberger et al., ICCV 2023): match the keypoints of two images by attention.
 
-Each layer lets the keypoints of an image see each other, then those of the other image. After every layer the
-assignment of all pairs of keypoints may be read. The module holds the published weights; `packed` lays them out, once,
-for `lightglue_assignment.assignment`, which is for one pair of images.
+Each layer has self-attention among the keypoints of an image, then cross-attention to those of the other image. An
+assignment of the keypoints can be computed after each layer. The module has the published weights; `packed` arranges
+them once for `lightglue_assignment.assignment`, which matches one pair of images.
 """
 
 import jax
@@ -15,7 +15,7 @@ from mfvpr.networks.lightglue_attention import Affine, Block, product
 
 
 class FeedForward(nnx.Module):
-    """Of a keypoint's state and the message for it, side by side: Linear, LayerNorm, GELU, Linear."""
+    """Linear, LayerNorm, GELU, Linear on a keypoint's state and its message, concatenated."""
 
     def __init__(self, width: int, *, rngs: nnx.Rngs) -> None:
         self.hidden = nnx.Linear(2 * width, 2 * width, rngs=rngs)
@@ -24,7 +24,7 @@ class FeedForward(nnx.Module):
 
 
 class SelfAttention(nnx.Module):
-    """Within an image. Outputs of `qkv` are numbered by head, number of the head, and query, key or value."""
+    """Attention within an image. The outputs of `qkv` have the axes head, number, and query, key or value."""
 
     def __init__(self, width: int, *, rngs: nnx.Rngs) -> None:
         self.qkv = nnx.Linear(width, 3 * width, rngs=rngs)
@@ -33,7 +33,7 @@ class SelfAttention(nnx.Module):
 
 
 class CrossAttention(nnx.Module):
-    """Between the images: one side's queries are the other's keys."""
+    """Attention between the images: the queries of one image are the keys of the other."""
 
     def __init__(self, width: int, *, rngs: nnx.Rngs) -> None:
         self.key = nnx.Linear(width, width, rngs=rngs)
@@ -43,7 +43,7 @@ class CrossAttention(nnx.Module):
 
 
 class Layer(nnx.Module):
-    """Both kinds of attention, and what reads the assignment after them."""
+    """Both kinds of attention, and the linear maps of the assignment after them."""
 
     def __init__(self, width: int, *, rngs: nnx.Rngs) -> None:
         self.self_attention = SelfAttention(width, rngs=rngs)
@@ -53,13 +53,13 @@ class Layer(nnx.Module):
 
 
 class LightGlue(nnx.Module):
-    """The published weights, or others of this form.
+    """LightGlue's weights.
 
     Args:
         inputs: D, numbers of a descriptor.
-        width: of a keypoint's state.
+        width: numbers of a keypoint's state.
         num_layers: L.
-        num_heads: which share the width.
+        num_heads: heads of the attention, which share the width.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class LightGlue(nnx.Module):
         self.confidences = nnx.List([nnx.Linear(width, 1, rngs=rngs) for _ in range(num_layers - 1)])
 
     def packed(self) -> Packed:
-        """The weights as `assignment` takes them."""
+        """Weights for `assignment`."""
         layers = [_packed_layer(layer, 2 * self.position.out_features) for layer in self.layers]
         confidences = [_affine(confidence) for confidence in self.confidences]
         return Packed(
@@ -83,7 +83,7 @@ class LightGlue(nnx.Module):
 
 
 def _affine(linear: nnx.Linear) -> Affine:
-    assert linear.bias is not None  # Flax's own type allows for it
+    assert linear.bias is not None  # Flax's annotation allows None
     return Affine(linear.kernel[...], linear.bias[...])
 
 
@@ -98,35 +98,38 @@ def _packed_layer(layer: Layer, head: int) -> PackedLayer:
 
 
 def _packed_block(attention: SelfAttention | CrossAttention, inputs: Affine) -> Block:
-    """The message is linear, and so is what the feed-forward does with it first: one product for both."""
+    """Weights of a block. The message and the first layer of the feed-forward are linear, so one product does both."""
     message, feed_forward = _affine(attention.message), attention.feed_forward
     hidden, scale, shift = _affine(feed_forward.hidden), feed_forward.norm.scale, feed_forward.norm.bias
-    assert scale is not None  # as of a bias
+    assert scale is not None
     assert shift is not None
-    own, others = jnp.split(hidden.kernel, 2)
-    kernel = jnp.concatenate([own, product(message.kernel, others)])
-    bias = hidden.bias + product(message.bias, others)
+    state_kernel, message_kernel = jnp.split(hidden.kernel, 2)
+    kernel = jnp.concatenate([state_kernel, product(message.kernel, message_kernel)])
+    bias = hidden.bias + product(message.bias, message_kernel)
     return Block(inputs, Affine(kernel, bias), scale[...], shift[...], _affine(feed_forward.update))
 
 
 def _self_inputs(attention: SelfAttention, head: int) -> Affine:
-    """Queries (divided by the root of a head's width), keys, values. Neighbors turn together: now half a head apart."""
+    """Queries (divided by the square root of a head's width), keys and values.
 
-    def in_order(outputs: Array) -> Array:
+    The rotation turns pairs of numbers: neighbors in the published weights, half a head apart here.
+    """
+
+    def arrange(outputs: Array) -> Array:
         queries, keys, values = jnp.moveaxis(outputs.reshape(*outputs.shape[:-1], -1, head, 3), -1, 0)  # [..., H, d]
-        parts = [_apart(queries) / head**0.5, _apart(keys), values]
+        parts = [_separate(queries) / head**0.5, _separate(keys), values]
         return jnp.stack(parts, axis=-3).reshape(outputs.shape)
 
-    return Affine(*map(in_order, _affine(attention.qkv)))
+    return Affine(*map(arrange, _affine(attention.qkv)))
 
 
-def _apart(values: Array) -> Array:
-    """The even entries of the last axis, then the odd ones."""
+def _separate(values: Array) -> Array:
+    """Even entries of the last axis, then the odd ones."""
     return jnp.concatenate([values[..., ::2], values[..., 1::2]], axis=-1)
 
 
 def _cross_inputs(attention: CrossAttention, head: int) -> Affine:
-    """Keys (divided by the fourth root of a head's width, as they meet each other), values."""
+    """Keys (divided by the fourth root of a head's width, since keys meet keys) and values."""
     keys, values = _affine(attention.key), _affine(attention.value)
     return Affine(
         *(jnp.concatenate([key / head**0.25, value], axis=-1) for key, value in zip(keys, values, strict=True))

@@ -1,4 +1,4 @@
-"""LightGlue's assignment of the keypoints of two images to each other, see `mfvpr.networks.lightglue`; without Flax."""
+"""LightGlue's assignment of the keypoints of two images, see `mfvpr.networks.lightglue`; without Flax."""
 
 from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
@@ -15,7 +15,7 @@ Tree = TypeVar("Tree")
 
 
 class PackedLayer(NamedTuple):
-    """What a layer computes with; the projection is divided by the fourth root of the width."""
+    """Weights of a layer; the projection is divided by the fourth root of the width."""
 
     within: Block
     across: Block
@@ -24,10 +24,10 @@ class PackedLayer(NamedTuple):
 
 
 class Packed(NamedTuple):
-    """All weights, those of the layers with a leading axis L; the last of the confidences fills up and is not used."""
+    """All weights; those of layers have a leading axis L. The last entry of `confidences` is unused padding."""
 
     input: Affine
-    frequencies: Array  # [2, d / 2], d numbers of a head
+    frequencies: Array  # [2, d / 2]; a head has d numbers
     layers: PackedLayer
     confidences: Affine
 
@@ -35,44 +35,46 @@ class Packed(NamedTuple):
 def assignment(
     weights: Packed, features0: Features, features1: Features, *, depth_confidence: Array | float | None = None
 ) -> Array:
-    """How surely each keypoint of one image is the same point as each of the other, as a logarithm.
+    """Logarithm of the confidence that two keypoints match, for all pairs of keypoints of two images.
 
     Args:
-        weights: of the network.
-        features0: of one image, keypoints `[N0, 2]`; padding may hold anything.
-        features1: of the other, keypoints `[N1, 2]`.
-        depth_confidence: where after some layer more than this share of both images' keypoints is sure, the layers
-            behind it are left out (published: 0.95). None = never.
+        weights: weights of the network.
+        features0: features of one image, keypoints `[N0, 2]`; values of the padding are ignored.
+        features1: features of the other image, keypoints `[N1, 2]`.
+        depth_confidence: skip the remaining layers if more than this share of both images' keypoints is confident
+            (published: 0.95). None = never.
 
     Returns:
-        `[N0, N1]`, at most 0; -inf where either keypoint is padding, or its descriptor or position is not finite.
+        `[N0, N1]`, at most 0; -inf if either keypoint is padding, or its descriptor or position is not finite.
     """
     sides = _finite(features0), _finite(features1)
     masks = [side.mask for side in sides]
-    turns = [Rotation.of(_normalized(side), weights.frequencies) for side in sides]
+    rotations = [Rotation.of(_normalize(side), weights.frequencies) for side in sides]
     num_layers, head = len(weights.layers.projection.bias), 2 * weights.frequencies.shape[1]
 
-    def after_another(progress: _Progress) -> _Progress:
+    def run_layer(progress: _Progress) -> _Progress:
         layer = _at(weights.layers, progress.layers)
-        seen = [within(layer.within, *side) for side in zip(progress.states, masks, turns, strict=True)]
-        states = across(layer.across, (seen[0], seen[1]), (masks[0], masks[1]), head)
+        states0, states1 = (within(layer.within, *side) for side in zip(progress.states, masks, rotations, strict=True))
+        states = across(layer.across, (states0, states1), (masks[0], masks[1]), head)
         done = jnp.zeros((), bool)
         if depth_confidence is not None:
             threshold = 0.8 + 0.1 * jnp.exp(-4 * progress.layers.astype(states[0].dtype) / num_layers)
-            done = _share_sure(_at(weights.confidences, progress.layers), states, masks, threshold) > depth_confidence
+            done = (
+                _confident_share(_at(weights.confidences, progress.layers), states, masks, threshold) > depth_confidence
+            )
         return _Progress(progress.layers + 1, states, done)
 
-    def is_more(progress: _Progress) -> Array:
+    def is_running(progress: _Progress) -> Array:
         return (progress.layers < num_layers) & ~progress.done
 
     inputs = weights.input(sides[0].descriptors), weights.input(sides[1].descriptors)
     start = _Progress(jnp.zeros((), jnp.int32), inputs, jnp.zeros((), bool))
-    layers, states, _ = jax.lax.while_loop(is_more, after_another, start)
-    return _read(_at(weights.layers, layers - 1), *states, *masks)
+    layers, states, _ = jax.lax.while_loop(is_running, run_layer, start)
+    return _assignment(_at(weights.layers, layers - 1), *states, *masks)
 
 
 class _Progress(NamedTuple):
-    """How many layers both sides' states have gone through, and whether the others are left out."""
+    """States of both sides after some layers; `done` skips the remaining layers."""
 
     layers: Array
     states: tuple[Array, Array]
@@ -83,8 +85,8 @@ def _at(stacked: Tree, layer: Array) -> Tree:
     return jax.tree.map(lambda leaf: leaf[layer], stacked)
 
 
-def _share_sure(confidence: Affine, states: Sequence[Array], masks: Sequence[Array], threshold: Array) -> Array:
-    """Of the keypoints of both sides."""
+def _confident_share(confidence: Affine, states: Sequence[Array], masks: Sequence[Array], threshold: Array) -> Array:
+    """Share of both sides' keypoints with a confidence above the threshold."""
     unsure = [
         jnp.sum(mask & (jax.nn.sigmoid(confidence(side)[:, 0]) < threshold))
         for side, mask in zip(states, masks, strict=True)
@@ -92,18 +94,18 @@ def _share_sure(confidence: Affine, states: Sequence[Array], masks: Sequence[Arr
     return 1 - sum(unsure[1:], start=unsure[0]) / jnp.maximum(jnp.sum(masks[0]) + jnp.sum(masks[1]), 1)
 
 
-def _read(layer: PackedLayer, states0: Array, states1: Array, mask0: Array, mask1: Array) -> Array:
-    """The assignment after a layer."""
+def _assignment(layer: PackedLayer, states0: Array, states1: Array, mask0: Array, mask1: Array) -> Array:
+    """Assignment after a layer."""
     similarity = product(layer.projection(states0), layer.projection(states1).T)
     real = mask0[:, None] & mask1[None]
-    similarity = jnp.where(real, similarity, jnp.finfo(similarity.dtype).min)  # -inf gives NaN where none is real
+    similarity = jnp.where(real, similarity, jnp.finfo(similarity.dtype).min)  # -inf gives NaN if none is real
     matchable0, matchable1 = (jax.nn.log_sigmoid(layer.matchability(states)[:, 0]) for states in (states0, states1))
     both = jax.nn.log_softmax(similarity, axis=0) + jax.nn.log_softmax(similarity, axis=1)
     return masked(both + matchable0[:, None] + matchable1[None], real, -jnp.inf)
 
 
 def _finite(features: Features) -> Features:
-    """Without what is not finite, and zeros in the padding."""
+    """Mask features with values that are not finite, and set masked values to zero."""
     finite = [jnp.all(jnp.isfinite(values), axis=-1) for values in (features.descriptors, features.keypoints)]
     mask = features.mask & finite[0] & finite[1]
     return Features(
@@ -111,7 +113,7 @@ def _finite(features: Features) -> Features:
     )
 
 
-def _normalized(features: Features) -> Array:
+def _normalize(features: Features) -> Array:
     """Keypoints in units of half of the image's longer side, from its center."""
     size = features.image_size
     return (features.keypoints - size[None] / 2) / (jnp.max(size) / 2)

@@ -1,7 +1,7 @@
-"""MixVPR (Ali-bey et al., WACV 2023): one descriptor of a whole image, from feature maps mixed by small perceptrons.
+"""MixVPR (Ali-bey et al., WACV 2023): a global descriptor from feature maps that small perceptrons mix.
 
-Each of the backbone's 1024 feature maps is a vector of 20 x 20 positions; four mixers add to it what a perceptron makes
-of it, the same for all maps; then two projections reduce the number of maps and the number of positions.
+Each of the backbone's 1024 feature maps is a vector of 20 x 20 positions. Four mixers add the output of a perceptron,
+which all maps share. Two projections then reduce the number of maps and the number of positions.
 """
 
 import jax.numpy as jnp
@@ -12,13 +12,13 @@ from mfvpr.networks.imagenet import DEVIATION, MEAN
 from mfvpr.networks.lengths import of_unit_length
 from mfvpr.networks.resnet import ResNet50
 
-IMAGE_SIZE = (320, 320)  # px, width and height, to which the mixers' weights belong
+IMAGE_SIZE = (320, 320)  # px, width and height; the mixers' weights depend on it
 _CHANNELS, _POSITIONS = 1024, 20 * 20  # of the backbone's maps
-_NORM_EPSILON = 1e-5  # the published weights'; Flax's default of 1e-6 changes descriptors where maps are faint
+_NORM_EPSILON = 1e-5  # as published; Flax's default of 1e-6 changes descriptors if maps are faint
 
 
 class FeatureMixer(nnx.Module):
-    """Adds to each map a perceptron's answer to its positions: LayerNorm, Linear, ReLU, Linear."""
+    """Perceptron on the positions of each map, with a shortcut: LayerNorm, Linear, ReLU, Linear."""
 
     def __init__(self, size: int, *, precision: str, rngs: nnx.Rngs) -> None:
         self.norm = nnx.LayerNorm(size, epsilon=_NORM_EPSILON, use_fast_variance=False, rngs=rngs)
@@ -36,7 +36,7 @@ class MixVPR(nnx.Module):
     Args:
         out_channels: maps after the projection; published: 1024, 256, 64.
         out_rows: values per map after the projection; published: 4, 2, 2.
-        precision: of the products where the hardware offers less than float32.
+        precision: of products on hardware with less than float32.
     """
 
     def __init__(
@@ -65,14 +65,14 @@ class MixVPR(nnx.Module):
         maps = maps.reshape(len(maps), _POSITIONS, _CHANNELS).swapaxes(1, 2)
         for mixer in self.mix:
             maps = mixer(maps)
-        descriptors = self._projected(maps).reshape(len(maps), self.dimension)
+        descriptors = self._project(maps).reshape(len(maps), self.dimension)
         return of_unit_length(descriptors)
 
-    def _projected(self, maps: Array) -> Array:
+    def _project(self, maps: Array) -> Array:
         """Channel projection, then row projection: `[B, 1024, positions]` -> `[B, channels, rows]`.
 
-        Both are linear and act on different axes, so the rows, of which few remain, may be projected first: 1/6 of the
-        mixers' and projections' time less. The channels' bias is then summed over the rows' kernel.
+        Both are linear and act on different axes, so the rows, of which few remain, can be projected first. This saves
+        1/6 of the mixers' and projections' time. The channels' bias is then summed over the rows' kernel.
         """
         channels, rows = self.channel_proj, self.row_proj
         kernel = rows.kernel[...]
@@ -83,6 +83,6 @@ class MixVPR(nnx.Module):
 
 
 def preprocess(images: Array) -> Array:
-    """`[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32 -> what the network takes, float32."""
+    """Images `[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32 -> inputs of the network, float32."""
     mean, deviation = (jnp.array(values, jnp.float32)[None, None, None] for values in (MEAN, DEVIATION))
     return (images.astype(jnp.float32) / 255 - mean) / deviation

@@ -1,6 +1,6 @@
-"""NetVLAD (Arandjelovic et al., CVPR 2016): how a map's vectors differ from the centers of clusters, summed.
+"""NetVLAD (Arandjelovic et al., CVPR 2016): sums of differences between a map's vectors and cluster centers.
 
-Patch-NetVLAD (Hausler et al., CVPR 2021) sums over every square of the map as well, which gives features of patches.
+Patch-NetVLAD (Hausler et al., CVPR 2021) also sums over each square of the map, which gives descriptors of patches.
 """
 
 from typing import Literal
@@ -16,11 +16,11 @@ from mfvpr.networks.resnet import PointwiseConv
 from mfvpr.networks.vgg import Vgg16, require_position
 
 CHANNELS = 512  # of VGG16's conv5_3
-Order = Literal["clusters", "channels"]  # whose numbers stand together in a descriptor
+Order = Literal["clusters", "channels"]  # the outer axis of a descriptor
 
 
 class Statistic(nnx.Variable):
-    """What belongs to a network's images and is no parameter of it."""
+    """Statistic of a network's training images, which is no parameter."""
 
 
 class NetVlad(nnx.Module):
@@ -30,8 +30,8 @@ class NetVlad(nnx.Module):
 
     Args:
         clusters: K.
-        order: "clusters" gives V as `[K, D]`, as PyTorch's codes do, "channels" as `[D, K]`, as the original.
-        precision: of the products where the hardware offers less than float32.
+        order: "clusters" gives V as `[K, D]`, as PyTorch's codes, "channels" as `[D, K]`, as the original.
+        precision: of products on hardware with less than float32.
     """
 
     def __init__(self, clusters: int, order: Order = "clusters", *, precision: str, rngs: nnx.Rngs) -> None:
@@ -48,18 +48,21 @@ class NetVlad(nnx.Module):
         return self._descriptors(sums - jnp.sum(share, axis=1)[..., None] * self.centers[...][None])
 
     def patches(self, maps: Array, size: int) -> Array:
-        """`[B, h, w, D]` -> `[B, (h - size + 1) (w - size + 1), K D]`, of every square of `size` positions, by rows."""
+        """Descriptors of all squares of `size` positions, by rows.
+
+        `[B, h, w, D]` -> `[B, (h - size + 1) (w - size + 1), K D]`.
+        """
         x = of_unit_length(maps)
         residuals = self._shares(x)[..., None] * (x[..., None, :] - self.centers[...][None, None, None])
         sums = residuals
-        for axis in (1, 2):  # a matrix of ones and zeros, since sums of the whole map, subtracted, would round more
+        for axis in (1, 2):  # a product with ones and zeros; differences of cumulative sums round more
             inside = np.subtract.outer(np.arange(sums.shape[axis]), np.arange(sums.shape[axis] - size + 1))
             band = jnp.asarray((inside >= 0) & (inside < size), sums.dtype)
             sums = jnp.moveaxis(jnp.tensordot(band, sums, axes=(0, axis), precision=self.precision), 0, axis)
         return self._descriptors(sums.reshape(len(maps), -1, *sums.shape[3:]))
 
     def _shares(self, x: Array) -> Array:
-        """`[..., K]` of vectors of unit length."""
+        """Shares `[..., K]` of the clusters for vectors of unit length."""
         return nnx.softmax(jnp.matmul(x, self.assignment.kernel[0, 0], precision=self.precision), axis=-1)
 
     def _descriptors(self, sums: Array) -> Array:
@@ -74,10 +77,10 @@ class VggNetVlad(nnx.Module):
 
     Args:
         clusters: of NetVLAD; 16 or 64 are published.
-        outputs: numbers of a descriptor; None = all of NetVLAD's, without projection.
-        original: preprocess as the original code, minus the average image that comes with its weights; otherwise as
-            PyTorch's networks. Its descriptors have the order of the channels.
-        precision: of the products where the hardware offers less than float32.
+        outputs: numbers of a descriptor; None = NetVLAD's, without projection.
+        original: preprocess as the original code, which subtracts the average image of its weights, and order
+            descriptors by channels; otherwise as PyTorch's networks.
+        precision: of products on hardware with less than float32.
     """
 
     def __init__(
@@ -97,21 +100,21 @@ class VggNetVlad(nnx.Module):
     require = staticmethod(require_position)
 
     def preprocess(self, images: Array) -> Array:
-        """`[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32 -> what the network takes, float32."""
+        """Images `[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32 -> inputs of the network, float32."""
         if self.original:
             return images.astype(jnp.float32) - self.average[...][None, None, None]
         return preprocess(images, "torch")
 
     def __call__(self, images: Array) -> Array:
         """Descriptors `[B, dimension]` of unit length of preprocessed images `[B, H, W, 3]`."""
-        return self.projected(self.pool(self.vgg(images)))
+        return self._project(self.pool(self.vgg(images)))
 
     def with_patches(self, images: Array, sizes: tuple[int, ...]) -> tuple[Array, tuple[Array, ...]]:
-        """The same, and of every size the descriptors `[B, P, dimension]` of all patches, by rows."""
+        """Descriptors of images, and for each size those `[B, P, dimension]` of all patches, by rows."""
         maps = self.vgg(images)
         patches = (self.pool.patches(maps, size) for size in sizes)
-        return self.projected(self.pool(maps)), tuple(map(self.projected, patches))
+        return self._project(self.pool(maps)), tuple(map(self._project, patches))
 
-    def projected(self, descriptors: Array) -> Array:
+    def _project(self, descriptors: Array) -> Array:
         """`[..., K D]` -> `[..., dimension]` of unit length."""
         return of_unit_length(self.projection(descriptors)) if self.has_components else descriptors

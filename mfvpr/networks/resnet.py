@@ -1,6 +1,6 @@
-"""ResNet-50 (He et al., CVPR 2016), up to a named layer; the variant whose 3 x 3 convolutions take the strides, "v1.5".
+"""ResNet-50 (He et al., CVPR 2016) "v1.5", with strides in the 3 x 3 convolutions, up to a named layer.
 
-Batch normalization uses its running statistics: the network is a feature extractor here.
+Batch normalization uses its running statistics, since the network only extracts features.
 """
 
 import jax.numpy as jnp
@@ -12,9 +12,9 @@ _LAYERS = {"layer1": (3, 64), "layer2": (4, 128), "layer3": (6, 256), "layer4": 
 
 
 class PointwiseConv(nnx.Module):
-    """1 x 1 convolution without bias, `kernel` `[1, 1, C, D]`, as the matrix product that it is.
+    """1 x 1 convolution without bias, `kernel` `[1, 1, C, D]`, as a matrix product.
 
-    On a CPU up to twice as fast as XLA's convolution, 1.07 times in the whole network. A stride drops pixels first.
+    It is up to twice as fast as XLA's convolution on a CPU, and 1.07 times in the whole network.
     """
 
     def __init__(self, inputs: int, outputs: int, *, stride: int = 1, precision: str, rngs: nnx.Rngs) -> None:
@@ -29,7 +29,7 @@ class PointwiseConv(nnx.Module):
 
 
 class Bottleneck(nnx.Module):
-    """1 x 1, 3 x 3, 1 x 1 convolutions beside a shortcut, which is a 1 x 1 convolution itself where shapes change."""
+    """1 x 1, 3 x 3 and 1 x 1 convolutions with a shortcut, which is a 1 x 1 convolution if the width changes."""
 
     def __init__(self, inputs: int, width: int, *, stride: int, precision: str, rngs: nnx.Rngs) -> None:
         outputs = _EXPANSION * width
@@ -49,15 +49,15 @@ class Bottleneck(nnx.Module):
         shortcut = self.shortcut_bn(self.shortcut(x)) if self.has_projection else x
         x = nnx.relu(self.bn1(self.conv1(x)))
         x = nnx.relu(self.bn2(self.conv2(x)))
-        return _stored(nnx.relu(self.bn3(self.conv3(x)) + shortcut))
+        return _compute_once(nnx.relu(self.bn3(self.conv3(x)) + shortcut))
 
 
 class ResNet50(nnx.Module):
-    """`conv1`, `bn1`, a max pooling, then `layer1`, `layer2`, ...: lists of bottlenecks.
+    """ResNet-50: `conv1`, `bn1`, a max pooling, then `layer1`, `layer2`, ..., which are lists of bottlenecks.
 
     Args:
         last: the last layer: "layer1" to "layer4", of 256, 512, 1024, 2048 channels and stride 4, 8, 16, 32.
-        precision: of the products where the hardware offers less than float32.
+        precision: of products on hardware with less than float32.
     """
 
     def __init__(self, last: str = "layer4", *, precision: str = "highest", rngs: nnx.Rngs) -> None:
@@ -78,7 +78,7 @@ class ResNet50(nnx.Module):
     def __call__(self, images: Array) -> Array:
         """`[B, H, W, 3]` float32 -> `[B, h, w, C]`."""
         x = nnx.relu(self.bn1(self.conv1(images)))
-        around = ((1, 1), (1, 1))  # one pixel of minus infinity; Flax's annotation knows names only
+        around = ((1, 1), (1, 1))  # one pixel of minus infinity; Flax's annotation allows names only
         x = nnx.max_pool(x, (3, 3), strides=(2, 2), padding=around)  # pyright: ignore[reportArgumentType]
         for name in self.layers:
             for block in getattr(self, name):
@@ -87,7 +87,7 @@ class ResNet50(nnx.Module):
 
 
 def _conv(inputs: int, outputs: int, size: int, *, stride: int, precision: str, rngs: nnx.Rngs) -> nnx.Conv:
-    """As many zeros on each side: "SAME" would put one row and one column fewer before the image where it strides."""
+    """Convolution with equal padding on all sides; with a stride, "SAME" pads one row and column fewer before."""
     return nnx.Conv(
         inputs, outputs, (size, size), strides=stride, padding=size // 2, use_bias=False, precision=precision, rngs=rngs
     )
@@ -97,12 +97,12 @@ def _norm(channels: int, *, rngs: nnx.Rngs) -> nnx.BatchNorm:
     return nnx.BatchNorm(channels, use_running_average=True, epsilon=1e-5, rngs=rngs)
 
 
-def _stored(x: Array) -> Array:
-    """`x`, computed once, however many read it.
+def _compute_once(x: Array) -> Array:
+    """`x`, computed only once on a CPU.
 
-    XLA's CPU compiler computes a cheap sum again for each reader, and so a chain of residuals from its first link on,
-    which doubles MixVPR's time; it drops `optimization_barrier` before it comes to that, but does not look through a
-    condition, here one that holds for every number and for NaN. Other platforms' compilers weigh it well.
+    XLA's CPU compiler recomputes a cheap sum for each of its uses, and thus the whole chain of residuals, which doubles
+    MixVPR's time. It removes `optimization_barrier` before this step, but keeps a condition, here one that is true for
+    every number and for NaN. The compilers of other platforms do not need it.
     """
     return lax.platform_dependent(x, cpu=_behind_condition, default=lambda x: x)
 

@@ -1,4 +1,4 @@
-"""Values of maps between their pixels, bilinear: at any position, or on a finer grid. Pixels lie at integers."""
+"""Bilinear interpolation of maps, at any positions or on a finer grid. Pixel centers are at integers."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -9,7 +9,7 @@ from jax import Array
 
 
 class Neighbors(NamedTuple):
-    """For each of n positions on a line the pixels before and after it, and how far between the two it is."""
+    """Pixels before and after each of n positions on a line, and the position between them."""
 
     lower: np.ndarray  # [n] int
     upper: np.ndarray  # [n] int
@@ -17,10 +17,10 @@ class Neighbors(NamedTuple):
 
 
 def sample(dense: Array, points: Array) -> Array:
-    """A map `[H, W, C]` at positions `[..., 2]` (x, y) px -> `[..., C]`.
+    """Sample a map `[H, W, C]` at positions `[..., 2]` (x, y) px -> `[..., C]`.
 
-    Outside of the map are zeros: each of the four pixels around a position counts by itself, so that values fade out
-    within one pixel of the border (as `grid_sample` with corners aligned has it, and deformable convolutions).
+    Pixels outside the map are zero, so values fade out within one pixel of the border, as in `grid_sample` with aligned
+    corners and in deformable convolutions.
     """
     height, width, channels = dense.shape
     flat = dense.reshape(height * width, channels)  # one index is faster than two
@@ -31,7 +31,10 @@ def sample(dense: Array, points: Array) -> Array:
 
 
 def around(points: Array, height: int, width: int) -> Iterator[tuple[Array, Array, Array]]:
-    """The four pixels around positions `[..., 2]` (x, y) px: y, x, weight. Those outside are moved in, and weigh 0."""
+    """Yield y, x and weight of the four pixels around positions `[..., 2]` (x, y) px.
+
+    Pixels outside are moved inside, with weight 0.
+    """
     low = jnp.floor(points)
     part, pixel = points - low, low.astype(int)
     for down in (0, 1):
@@ -44,7 +47,7 @@ def around(points: Array, height: int, width: int) -> Iterator[tuple[Array, Arra
 
 
 def upsample(dense: Array, factor: int) -> Array:
-    """Maps `[..., h, w, C]` -> `[..., factor * h, factor * w, C]`, the centers of the corner pixels aligned."""
+    """Enlarge maps `[..., h, w, C]` -> `[..., factor * h, factor * w, C]`, with aligned corner pixels."""
     if factor == 1:
         return dense
     for axis in (-3, -2):
@@ -53,7 +56,7 @@ def upsample(dense: Array, factor: int) -> Array:
 
 
 def neighbors(size: int, count: int, window: slice = slice(None)) -> Neighbors:
-    """Where `count` positions lie among `size` pixels, first on first and last on last; of these the window's."""
+    """Neighbors of `count` evenly spaced positions, from the first to the last of `size` pixels, in a window."""
     step = np.float32((size - 1) / max(count - 1, 1))
     position = step * np.arange(count, dtype=np.float32)[window]  # rounded as torch rounds it
     lower = np.minimum(position.astype(int), size - 1)
@@ -61,10 +64,9 @@ def neighbors(size: int, count: int, window: slice = slice(None)) -> Neighbors:
 
 
 def between(dense: Array, places: Neighbors, axis: int) -> Array:
-    """`dense` at these places along one axis.
+    """Interpolate `dense` at these places along one axis.
 
-    Fetching two neighbors is several times faster than a product with the matrix of the interpolation, which is zero
-    almost everywhere.
+    Reading two neighbors is several times faster than a product with the sparse matrix of the interpolation.
     """
     part = jnp.expand_dims(places.part, [other for other in range(dense.ndim) if other != axis % dense.ndim])
     return (1 - part) * jnp.take(dense, places.lower, axis) + part * jnp.take(dense, places.upper, axis)

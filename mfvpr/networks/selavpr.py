@@ -8,8 +8,8 @@ from mfvpr.networks.gem import GeneralizedMean
 from mfvpr.networks.lengths import of_unit_length
 from mfvpr.networks.vit import Block, VisionTransformer
 
-_PARALLEL = 0.2  # how much the parallel adapter counts
-_BOTTLENECK = 2  # how many times fewer hidden values an adapter has
+_PARALLEL = 0.2  # weight of the parallel adapter
+_BOTTLENECK = 2  # width of a token over hidden values of an adapter
 _HIDDEN, LOCAL = 256, 128  # channels of the two upsampled maps
 
 
@@ -32,20 +32,20 @@ class AdaptedBlock(Block):
         super().__init__(width, heads, precision=precision, rngs=rngs)
         self.serial, self.parallel = (Adapter(width, precision=precision, rngs=rngs) for _ in range(2))
 
-    def attended(self, x: Array) -> Array:
-        """The attention z, and what the adapter makes of it: z + adapter(z)."""
-        seen = super().attended(x)
-        return seen + self.serial(seen)
+    def attention_update(self, x: Array) -> Array:
+        """z + adapter(z), with the attention's output z."""
+        output = super().attention_update(x)
+        return output + self.serial(output)
 
-    def transformed(self, x: Array) -> Array:
-        """The perceptron and a fifth of the adapter, both of x."""
-        return super().transformed(x) + _PARALLEL * self.parallel(x)
+    def perceptron_update(self, x: Array) -> Array:
+        """perceptron(x) + 0.2 adapter(x)."""
+        return super().perceptron_update(x) + _PARALLEL * self.parallel(x)
 
 
 class Upsampling(nnx.Module):
     """Transposed 3 x 3 convolution, stride 2, padding 1: `[B, h, w, C]` -> `[B, 2 h - 1, 2 w - 1, D]`.
 
-    `kernel` `[3, 3, C, D]`: what position (i, j) adds to the position (2 i + row - 1, 2 j + column - 1); `bias` `[D]`.
+    `kernel` `[3, 3, C, D]` adds position (i, j) of the input to (2 i + row - 1, 2 j + column - 1); `bias` is `[D]`.
     """
 
     def __init__(self, inputs: int, outputs: int, *, precision: str, rngs: nnx.Rngs) -> None:
@@ -55,14 +55,14 @@ class Upsampling(nnx.Module):
         self.precision = precision
 
     def __call__(self, x: Array) -> Array:
-        """One product with all of the kernel, then sums of neighbors: no zeros between positions are multiplied."""
+        """Multiply by the whole kernel at once, then add neighbors, which avoids products with zeros."""
         parts = jnp.tensordot(x, self.kernel[...], axes=(3, 2), precision=self.precision)  # [B, h, w, 3, 3, D]
-        rows = _interleaved(parts, axis=1, kernel_axis=3)
-        return _interleaved(rows, axis=2, kernel_axis=3) + self.bias[...][None, None, None]
+        rows = _interleave(parts, axis=1, kernel_axis=3)
+        return _interleave(rows, axis=2, kernel_axis=3) + self.bias[...][None, None, None]
 
 
-def _interleaved(parts: Array, axis: int, kernel_axis: int) -> Array:
-    """n positions, each with what it adds to the three around it -> 2 n - 1."""
+def _interleave(parts: Array, axis: int, kernel_axis: int) -> Array:
+    """Sum the parts of n positions along an axis, each for three outputs, to 2 n - 1 outputs."""
     before, here, after = (jnp.take(parts, place, axis=kernel_axis) for place in range(3))
     last = here.shape[axis] - 1
     between = _part(after, 0, last, axis) + _part(before, 1, last + 1, axis)
@@ -76,14 +76,14 @@ def _part(values: Array, start: int, stop: int, axis: int) -> Array:
 
 
 class SelaVpr(nnx.Module):
-    """What the public code extracts: a global descriptor, and local ones four to a patch, less at the edges.
+    """SelaVPR's global descriptor, and local descriptors on a grid four times as fine as the patches.
 
     Args:
-        width: of the transformer, see `VisionTransformer`; that of ViT-L is published.
-        depth: its blocks.
-        heads: of its attention.
-        registers: its further tokens; 4 in the variant with registers.
-        precision: of the products where the hardware offers less than float32.
+        width: of the transformer, see `VisionTransformer`; ViT-L is published.
+        depth: blocks of the transformer.
+        heads: heads of its attention.
+        registers: additional tokens; 4 in the variant with registers.
+        precision: of products on hardware with less than float32.
     """
 
     def __init__(
@@ -101,9 +101,10 @@ class SelaVpr(nnx.Module):
     preprocess = staticmethod(VisionTransformer.preprocess)
 
     def __call__(self, images: Array) -> tuple[Array, Array]:
-        """Of preprocessed images `[B, 14 h, 14 w, 3]`: descriptors `[B, D]`, and `[B, 4 h - 3, 4 w - 3, 128]`.
+        """Global descriptors `[B, D]` and local descriptors `[B, 4 h - 3, 4 w - 3, 128]` of unit length.
 
-        All are of unit length.
+        Args:
+            images: preprocessed, `[B, 14 h, 14 w, 3]`.
         """
         maps = self.backbone(images).maps
         local = self.upsampling2(nnx.relu(self.upsampling1(maps)))

@@ -1,7 +1,7 @@
 """The networks of SSM-VPR (Camara et al., ICRA 2020): two maps of one VGG16, trained on Places365.
 
-The first stage, which makes the shortlist, looks at `conv5_2`, the second, which ranks it, at `conv4_2`; both before
-their ReLU. Pooling rounds sizes up, so that a map has ceil(H / stride) x ceil(W / stride) positions.
+The first stage, which chooses the shortlist, uses `conv5_2`; the second stage, which ranks it, uses `conv4_2`; both
+before their ReLU. Pooling rounds sizes up, so a map has ceil(H / stride) x ceil(W / stride) positions.
 """
 
 from flax import nnx
@@ -18,7 +18,7 @@ class SsmVgg(nnx.Module):
     """VGG16 to `conv5_2`.
 
     Args:
-        precision: of the products where the hardware offers less than float32.
+        precision: of products on hardware with less than float32.
     """
 
     def __init__(self, *, precision: str = "highest", rngs: nnx.Rngs) -> None:
@@ -40,8 +40,8 @@ class SsmVgg(nnx.Module):
 
     @staticmethod
     def preprocess(images: Array, preprocessing: Preprocessing = "torch") -> Array:
-        """RGB images `[B, H, W, 3]` from 0 to 255 -> what the stages take, float32; see `mfvpr.networks.imagenet`.
+        """RGB images `[B, H, W, 3]` from 0 to 255 -> inputs of the stages, float32; see `mfvpr.networks.imagenet`.
 
-        "torch" is what the published code does, although its weights, trained by Caffe, want "caffe".
+        The published code uses "torch", although its weights were trained with "caffe".
         """
         return preprocess(images, preprocessing)

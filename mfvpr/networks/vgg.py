@@ -1,4 +1,4 @@
-"""VGG16's convolutions (Simonyan & Zisserman, ICLR 2015) up to a named one: a backbone that several networks share."""
+"""VGG16 (Simonyan & Zisserman, ICLR 2015) up to a named convolution: a backbone of several networks."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -22,15 +22,15 @@ LAYERS = {
 
 
 class Vgg16(nnx.Module):
-    """3 x 3 convolutions `conv1_1`, `conv1_2`, `conv2_1`, ... that keep the size, ReLU between, pooling between blocks.
+    """3 x 3 convolutions `conv1_1`, `conv1_2`, `conv2_1`, ... that keep the size, with ReLU and pooling.
 
     Args:
-        last: the last convolution, whose output is returned before its ReLU.
-        pools: after block 1, 2, ...: "max" halves the map (2 x 2, stride 2, an odd last row or column is dropped);
-            "max_ceil" as well, and an odd last row or column is pooled by itself;
-            "average" smooths it (2 x 2, stride 1, no padding: one row and one column fewer).
+        last: the last convolution; the output is before its ReLU.
+        pools: after block 1, 2, ...: "max" halves the map (2 x 2, stride 2, drops an odd last row or column);
+            "max_ceil" also pools an odd last row or column; "average" smooths the map (2 x 2, stride 1, no padding:
+            one row and one column fewer).
         dilations: of the convolutions of block 1, 2, ...
-        precision: of the products where the hardware offers less than float32.
+        precision: of products on hardware with less than float32.
     """
 
     def __init__(
@@ -52,15 +52,15 @@ class Vgg16(nnx.Module):
             inputs = LAYERS[name]
 
     def __call__(self, images: jax.Array, uniform: jax.Array | bool = False) -> jax.Array:
-        """`[B, H, W, 3]` float32 -> `[B, h, w, D]`, before the last layer's ReLU; `uniform` as of `Conv3x3`."""
+        """`[B, H, W, 3]` float32 -> `[B, h, w, D]`, before the last layer's ReLU; `uniform` as in `Conv3x3`."""
         (last,) = self.maps(images, self.layers[-1:], uniform)
         return last
 
     def maps(
         self, images: jax.Array, layers: Sequence[str], uniform: jax.Array | bool = False
     ) -> tuple[jax.Array, ...]:
-        """What these layers give before their ReLU, each `[B, h, w, D]`; layers behind the last of them do not run."""
-        found = {}
+        """Outputs `[B, h, w, D]` of these layers before their ReLU; later layers do not run."""
+        outputs = {}
         x = images
         for name in self.layers:
             if name != self.layers[0]:
@@ -68,14 +68,14 @@ class Vgg16(nnx.Module):
                 x = _POOLS[self.pools[_block(name) - 2]](x) if starts_block else nnx.relu(x)
             x = getattr(self, name)(x, uniform)
             if name in layers:
-                found[name] = x
-            if len(found) == len(layers):
+                outputs[name] = x
+            if len(outputs) == len(layers):
                 break
-        return tuple(found[name] for name in layers)
+        return tuple(outputs[name] for name in layers)
 
 
 def require_position(size: tuple[int, int]) -> None:
-    """Raise an InputError unless the last block has a position of images of this (width, height) px."""
+    """Raise an InputError if images of this (width, height) px are too small for the last block."""
     if min(size) < STRIDE:
         raise InputError(f"image_size={list(size)}: expected {STRIDE} x {STRIDE} px or more")
 
@@ -85,9 +85,9 @@ def _block(name: str) -> int:
 
 
 def _max_pool(x: jax.Array) -> jax.Array:
-    """Maximum, then ReLU: the same in either order, and a quarter of the work in this one.
+    """Maximum, then ReLU, which equals the other order with a quarter of the work.
 
-    Four slices, because a window reduction does not fuse with its neighbors on a CPU.
+    Slices are used because a window reduction does not fuse with its neighbors on a CPU.
     """
     height, width = x.shape[1] // 2 * 2, x.shape[2] // 2 * 2
     top, bottom = x[:, 0:height:2, :width], x[:, 1:height:2, :width]
@@ -96,7 +96,7 @@ def _max_pool(x: jax.Array) -> jax.Array:
 
 
 def _max_pool_ceil(x: jax.Array) -> jax.Array:
-    """As `_max_pool`; an odd last row or column is its own maximum."""
+    """As `_max_pool`, but keep an odd last row or column."""
     odd = ((0, 0), (0, x.shape[1] % 2), (0, x.shape[2] % 2), (0, 0))
     return _max_pool(jnp.pad(x, odd, mode="edge"))
 

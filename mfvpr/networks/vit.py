@@ -1,4 +1,4 @@
-"""Vision transformers (Dosovitskiy et al., ICLR 2021) as DINOv2 (Oquab et al., TMLR 2024) has them."""
+"""Vision transformers (Dosovitskiy et al., ICLR 2021) as in DINOv2 (Oquab et al., TMLR 2024)."""
 
 from typing import Literal, NamedTuple
 
@@ -16,22 +16,22 @@ from mfvpr.utils.errors import InputError
 Pooling = Literal["cls", "gem"]
 
 PATCH = 14  # px a side
-_TRAINED = 37  # patches a side of the images that the positions were learned on, of 518 px
-_OFFSET = 0.1  # patches that are added before the positions' scale is computed, as published
+_TRAINED = 37  # patches per side of the training images (518 px), which the positions fit
+_OFFSET = 0.1  # added to the number of patches for the positions' scale, as published
 _EPSILON = 1e-6  # of the normalization
 _EXPANSION = 4  # of the hidden values
 _CUBIC = -0.75  # torch's parameter of bicubic interpolation
 
 
 class Tokens(NamedTuple):
-    """What a transformer makes of images."""
+    """Output of a transformer."""
 
-    whole: Array  # [B, D], of the class token
-    maps: Array  # [B, h, w, D], of the patches
+    class_token: Array  # [B, D]
+    maps: Array  # [B, h, w, D], tokens of the patches
 
 
 class Patches(nnx.Module):
-    """A linear map of every patch: `kernel` `[14, 14, 3, D]`, `bias` `[D]`."""
+    """Linear map of each patch: `kernel` `[14, 14, 3, D]`, `bias` `[D]`."""
 
     def __init__(self, width: int, *, precision: str, rngs: nnx.Rngs) -> None:
         initial = nnx.initializers.lecun_normal()
@@ -49,7 +49,7 @@ class Patches(nnx.Module):
 
 
 class Attention(nnx.Module):
-    """Every token's sum of all values, by the softmax of its query's products with their keys, head by head."""
+    """Multi-head self-attention of tokens."""
 
     def __init__(self, width: int, heads: int, *, precision: str, rngs: nnx.Rngs) -> None:
         self.qkv = nnx.Linear(width, 3 * width, precision=precision, rngs=rngs)
@@ -64,12 +64,12 @@ class Attention(nnx.Module):
         queries = queries * (width // self.heads) ** -0.5
         logits = jnp.matmul(queries, keys.swapaxes(2, 3), precision=self.precision)
         weights = jnp.exp(logits - jnp.max(logits, axis=-1, keepdims=True))
-        seen = jnp.matmul(weights, values, precision=self.precision) / jnp.sum(weights, axis=-1, keepdims=True)
-        return self.output(jnp.moveaxis(seen, 1, 2).reshape(x.shape))
+        context = jnp.matmul(weights, values, precision=self.precision) / jnp.sum(weights, axis=-1, keepdims=True)
+        return self.output(jnp.moveaxis(context, 1, 2).reshape(x.shape))
 
 
 class Perceptron(nnx.Module):
-    """Two linear layers, GELU between."""
+    """Two linear layers with GELU between them."""
 
     def __init__(self, width: int, *, precision: str, rngs: nnx.Rngs) -> None:
         self.hidden = nnx.Linear(width, _EXPANSION * width, precision=precision, rngs=rngs)
@@ -81,7 +81,7 @@ class Perceptron(nnx.Module):
 
 
 class Block(nnx.Module):
-    """x + scale1 attention(norm1(x)), then x + scale2 perceptron(norm2(x)); who adapts it overrides what is added."""
+    """x + scale1 attention(norm1(x)), then x + scale2 perceptron(norm2(x)); subclasses may override both terms."""
 
     def __init__(self, width: int, heads: int, *, precision: str, rngs: nnx.Rngs) -> None:
         self.norm1, self.norm2 = (_norm(width, rngs) for _ in range(2))
@@ -91,28 +91,30 @@ class Block(nnx.Module):
 
     def __call__(self, x: Array) -> Array:
         """`[B, N, D]` -> `[B, N, D]`."""
-        x = x + self.scale1[...][None, None] * self.attended(self.norm1(x))
-        return x + self.scale2[...][None, None] * self.transformed(self.norm2(x))
+        x = x + self.scale1[...][None, None] * self.attention_update(self.norm1(x))
+        return x + self.scale2[...][None, None] * self.perceptron_update(self.norm2(x))
 
-    def attended(self, x: Array) -> Array:
-        """Of normalized tokens, what their attention adds, before its scale."""
+    def attention_update(self, x: Array) -> Array:
+        """Attention of normalized tokens, before the scale."""
         return self.attention(x)
 
-    def transformed(self, x: Array) -> Array:
-        """Of normalized tokens, what the perceptron adds, before its scale."""
+    def perceptron_update(self, x: Array) -> Array:
+        """Perceptron of normalized tokens, before the scale."""
         return self.perceptron(x)
 
 
 class VisionTransformer(nnx.Module):
-    """Tokens of patches of 14 x 14 px, of the whole image, and of registers, which nobody looks at afterwards.
+    """Transformer with a class token, optional registers, and tokens of patches of 14 x 14 px.
+
+    DINOv2's small, base and large networks have widths 384, 768, 1024, depths 12, 12, 24 and heads 6, 12, 16.
 
     Args:
-        width: numbers D of a token; 384, 768 and 1024 are DINOv2's small, base and large networks.
-        depth: blocks; theirs 12, 12 and 24.
-        heads: of the attention; theirs 6, 12 and 16.
-        registers: tokens besides; 4 or none are published.
-        block: what the blocks are.
-        precision: of the products where the hardware offers less than float32.
+        width: numbers D of a token.
+        depth: number of blocks.
+        heads: heads of the attention.
+        registers: additional tokens, which are not returned; 4 or none are published.
+        block: class of the blocks.
+        precision: of products on hardware with less than float32.
     """
 
     def __init__(
@@ -133,7 +135,7 @@ class VisionTransformer(nnx.Module):
 
     @staticmethod
     def preprocess(images: Array) -> Array:
-        """`[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32 -> what the network takes, float32."""
+        """Images `[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32 -> inputs of the network, float32."""
         return preprocess(images, "torch")
 
     def __call__(self, images: Array) -> Tokens:
@@ -141,15 +143,15 @@ class VisionTransformer(nnx.Module):
         batch, rows, columns = len(images), images.shape[1] // PATCH, images.shape[2] // PATCH
         maps = self.patches(images) + self._positions(rows, columns)[None]
         first = (self.first[...] + self.positions[...][0])[None]
-        others = jnp.concatenate([first, self.registers[...]]) if self.has_registers else first
-        x = jnp.concatenate([jnp.broadcast_to(others, (batch, *others.shape)), maps], axis=1)
+        extra = jnp.concatenate([first, self.registers[...]]) if self.has_registers else first
+        x = jnp.concatenate([jnp.broadcast_to(extra, (batch, *extra.shape)), maps], axis=1)
         for block in self.blocks:
             x = block(x)
         x = self.norm(x)
-        return Tokens(x[:, 0], x[:, len(others) :].reshape(batch, rows, columns, self.width))
+        return Tokens(x[:, 0], x[:, len(extra) :].reshape(batch, rows, columns, self.width))
 
     def _positions(self, rows: int, columns: int) -> Array:
-        """`[h w, D]` what is added to the patches' tokens: the learned ones, resized without antialiasing."""
+        """Position encodings `[h w, D]` of the patches: the learned ones, resized without antialiasing."""
         learned = self.positions[...][1:]
         if rows == columns == _TRAINED:
             return learned
@@ -161,12 +163,12 @@ class VisionTransformer(nnx.Module):
 
 
 class TokenDescriptor(nnx.Module):
-    """Images' descriptors of a transformer's tokens.
+    """Global descriptor of a transformer's tokens.
 
     Args:
-        network: with its weights.
-        pooling: "cls" takes the class token, "gem" the generalized mean of the patches' tokens of unit length.
-        power: of that mean.
+        network: the transformer with its weights.
+        pooling: "cls" uses the class token, "gem" the generalized mean of the patches' tokens of unit length.
+        power: power of the generalized mean.
     """
 
     def __init__(self, network: VisionTransformer, pooling: Pooling = "cls", power: float = 3.0) -> None:
@@ -180,17 +182,17 @@ class TokenDescriptor(nnx.Module):
 
     @staticmethod
     def require(size: tuple[int, int]) -> None:
-        """Raise an InputError unless images of this (width, height) px are made of patches."""
+        """Raise an InputError unless width and height (px) are multiples of a patch's side."""
         require_patches(size)
 
     def __call__(self, images: Array) -> Array:
-        """`[B, D]` of unit length of preprocessed images `[B, 14 h, 14 w, 3]`."""
-        whole, maps = self.network(images)
-        return of_unit_length(whole if self.pooling == "cls" else self.pool(of_unit_length(maps)))
+        """Descriptors `[B, D]` of unit length of preprocessed images `[B, 14 h, 14 w, 3]`."""
+        class_token, maps = self.network(images)
+        return of_unit_length(class_token if self.pooling == "cls" else self.pool(of_unit_length(maps)))
 
 
 def require_patches(size: tuple[int, int]) -> None:
-    """Raise an InputError unless images of this (width, height) px are made of patches."""
+    """Raise an InputError unless width and height (px) are multiples of a patch's side."""
     if any(side < PATCH or side % PATCH for side in size):
         raise InputError(f"image_size={list(size)}: expected multiples of {PATCH}, the side of a patch in px")
 
@@ -200,7 +202,7 @@ def _norm(width: int, rngs: nnx.Rngs) -> nnx.LayerNorm:
 
 
 def _bicubic(size: int, count: int) -> Array:
-    """`[count, size]` of the interpolation at `count` places, which lie `size / (count + 0.1)` apart; edges repeat."""
+    """Matrix `[count, size]` of the interpolation at `count` places, `size / (count + 0.1)` apart; edges repeat."""
     places = (np.arange(count) + 0.5) * size / (count + _OFFSET) - 0.5
     before, matrix = np.floor(places).astype(int), np.zeros((count, size))
     for step in (-1, 0, 1, 2):
