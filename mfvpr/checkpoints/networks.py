@@ -29,8 +29,6 @@ from mfvpr.io.formats.pickles import excerpt
 if TYPE_CHECKING:
     from flax import nnx
 
-    from mfvpr.networks.gem import Backbone
-
 _RUNTIME = Table((Rule("(.*)", r"\1"),))  # runtime files have the networks' paths
 
 
@@ -41,58 +39,14 @@ class Network(NamedTuple):
     table: Table
 
 
-def _d2net() -> Callable[..., "nnx.Module"]:
-    from mfvpr.networks.d2net import D2Net
+def _constructor(name: str, *arguments: Any, **options: Any) -> Callable[..., "nnx.Module"]:
+    from mfvpr import networks
 
-    return D2Net
-
-
-def _mixvpr(out_channels: int, out_rows: int) -> Callable[..., "nnx.Module"]:
-    from mfvpr.networks.mixvpr import MixVPR
-
-    return partial(MixVPR, out_channels=out_channels, out_rows=out_rows)
+    return partial(getattr(networks, name), *arguments, **options)
 
 
-def _ssm() -> Callable[..., "nnx.Module"]:
-    from mfvpr.networks.ssm import SsmVgg
-
-    return SsmVgg
-
-
-def _aliked(variant: str) -> Callable[..., "nnx.Module"]:
-    from mfvpr.networks.aliked import Aliked
-
-    return partial(Aliked, variant)
-
-
-def _lightglue() -> Callable[..., "nnx.Module"]:
-    from mfvpr.networks.lightglue import LightGlue
-
-    return LightGlue
-
-
-def _netvlad(clusters: int, outputs: int | None, original: bool = False) -> Callable[..., "nnx.Module"]:
-    from mfvpr.networks.netvlad import VggNetVlad
-
-    return partial(VggNetVlad, clusters, outputs, original=original)
-
-
-def _gem(backbone: "Backbone", outputs: int) -> Callable[..., "nnx.Module"]:
-    from mfvpr.networks.gem import Gem
-
-    return partial(Gem, backbone, outputs)
-
-
-def _dinov2(width: int, depth: int, heads: int) -> Callable[..., "nnx.Module"]:
-    from mfvpr.networks.vit import VisionTransformer
-
-    return partial(VisionTransformer, width, depth, heads)
-
-
-def _selavpr(registers: int) -> Callable[..., "nnx.Module"]:
-    from mfvpr.networks.selavpr import SelaVpr
-
-    return partial(SelaVpr, registers=registers)
+def _network(table: Table, name: str, *arguments: Any, **options: Any) -> Network:
+    return Network(partial(_constructor, name, *arguments, **options), table)
 
 
 _ALIKED = ("aliked-t16", "aliked-n16", "aliked-n16rot", "aliked-n32")
@@ -102,32 +56,30 @@ _MAX_PREFIX = 4  # parts between dots
 
 # Names in the registry -> networks.
 NETWORKS: dict[str, Network] = {
-    **{name: Network(_d2net, D2NET) for name in ("d2_tf", "d2_ots", "d2_tf_no_phototourism")},
-    "mixvpr_4096": Network(partial(_mixvpr, 1024, 4), MIXVPR),
-    "mixvpr_512": Network(partial(_mixvpr, 256, 2), MIXVPR),
-    "mixvpr_128": Network(partial(_mixvpr, 64, 2), MIXVPR),
-    "vgg16_places365": Network(_ssm, SSM),
-    **{name: Network(partial(_aliked, name), ALIKED) for name in _ALIKED},
-    "aliked_lightglue": Network(_lightglue, LIGHTGLUE),
-    "netvlad_pitts30k": Network(partial(_netvlad, 64, 4096, original=True), NETVLAD_MATLAB),
-    "netvlad_tokyotm": Network(partial(_netvlad, 64, 4096, original=True), NETVLAD_MATLAB),
-    "netvlad_pytorch": Network(partial(_netvlad, 64, None), NETVLAD),
+    **{name: _network(D2NET, "D2Net") for name in ("d2_tf", "d2_ots", "d2_tf_no_phototourism")},
+    "mixvpr_4096": _network(MIXVPR, "MixVPR", out_channels=1024, out_rows=4),
+    "mixvpr_512": _network(MIXVPR, "MixVPR", out_channels=256, out_rows=2),
+    "mixvpr_128": _network(MIXVPR, "MixVPR", out_channels=64, out_rows=2),
+    "vgg16_places365": _network(SSM, "SsmVgg"),
+    **{name: _network(ALIKED, "Aliked", name) for name in _ALIKED},
+    "aliked_lightglue": _network(LIGHTGLUE, "LightGlue"),
+    "netvlad_pitts30k": _network(NETVLAD_MATLAB, "VggNetVlad", 64, 4096, original=True),
+    "netvlad_tokyotm": _network(NETVLAD_MATLAB, "VggNetVlad", 64, 4096, original=True),
+    "netvlad_pytorch": _network(NETVLAD, "VggNetVlad", 64, None),
     **{
-        f"patchnetvlad_{training}_{outputs}": Network(partial(_netvlad, clusters, outputs), NETVLAD)
+        f"patchnetvlad_{training}_{outputs}": _network(NETVLAD, "VggNetVlad", clusters, outputs)
         for training, clusters in (("mapillary", 16), ("pitts", 64), ("landmarks", 64))
         for outputs in ((4096,) if training == "landmarks" else (128, 512, 4096))
     },
-    "cosplace_vgg16_512": Network(partial(_gem, "vgg16", 512), GEM_VGG16),
-    **{
-        f"cosplace_resnet50_{outputs}": Network(partial(_gem, "resnet50", outputs), GEM_RESNET50)
-        for outputs in (512, 2048)
-    },
-    "dinov2_vits14": Network(partial(_dinov2, 384, 12, 6), DINOV2),
-    "dinov2_vitb14": Network(partial(_dinov2, 768, 12, 12), DINOV2),
-    "dinov2_vitl14": Network(partial(_dinov2, 1024, 24, 16), DINOV2),
-    "selavpr_pitts30k": Network(partial(_selavpr, 0), SELAVPR),
-    "selavpr_msls": Network(partial(_selavpr, 0), SELAVPR),
-    "selavpr_msls_registers": Network(partial(_selavpr, 4), SELAVPR),
+    "cosplace_vgg16_512": _network(GEM_VGG16, "Gem", "vgg16", 512),
+    "cosplace_resnet50_512": _network(GEM_RESNET50, "Gem", "resnet50", 512),
+    "cosplace_resnet50_2048": _network(GEM_RESNET50, "Gem", "resnet50", 2048),
+    "dinov2_vits14": _network(DINOV2, "VisionTransformer", 384, 12, 6),
+    "dinov2_vitb14": _network(DINOV2, "VisionTransformer", 768, 12, 12),
+    "dinov2_vitl14": _network(DINOV2, "VisionTransformer", 1024, 24, 16),
+    "selavpr_pitts30k": _network(SELAVPR, "SelaVpr", registers=0),
+    "selavpr_msls": _network(SELAVPR, "SelaVpr", registers=0),
+    "selavpr_msls_registers": _network(SELAVPR, "SelaVpr", registers=4),
 }
 
 

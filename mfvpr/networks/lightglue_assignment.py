@@ -59,9 +59,8 @@ def assignment(
         done = jnp.zeros((), bool)
         if depth_confidence is not None:
             threshold = 0.8 + 0.1 * jnp.exp(-4 * progress.layers.astype(states[0].dtype) / num_layers)
-            done = (
-                _confident_share(_at(weights.confidences, progress.layers), states, masks, threshold) > depth_confidence
-            )
+            confidence = _at(weights.confidences, progress.layers)
+            done = _confident_share(confidence, states, masks, threshold) > depth_confidence
         return _Progress(progress.layers + 1, states, done)
 
     def is_running(progress: _Progress) -> Array:
