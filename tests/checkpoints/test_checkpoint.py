@@ -220,7 +220,15 @@ MKDIR = b"cos\nmkdir\n"
         MKDIR + b"}b",  # BUILD on what is no dictionary
         b"}" + MKDIR + b"K\x01s",  # a name as a key
         b"}" + 60 * b"2\x86" + b"K\x01s",  # a tuple of tuples of ..., whose hash takes years
+        b"K\x01q\0" + 60 * b"h\0h\0\x86q\0" + b"}h\0K\x01s",  # the same by the memo
+        b"K\x01q\0" + 60 * b"h\0h\0\x86q\0" + b"(h\0K\x01d",  # and in DICT
         b"\x82\x01",  # the registry of extensions
+        MKDIR + b")}\x92",  # NEWOBJ_EX
+        b"\x8b\xff\xff\xff\x7f",  # LONG4, a number of 2 GB
+        b"\x97",  # NEXT_BUFFER
+        MKDIR + b"]R",  # arguments that are no tuple
+        b"X\x02\0\0\0os)R",  # a call of text
+        MKDIR + b"Na",  # APPEND to what is no list
         b"\x8c\x02os\x8c\x05mkdir\x93)R",  # names by the stack
         b"Pos.mkdir\n",  # an identity in text
         b"X\x02\0\0\0osQ",  # an identity that is no storage
@@ -252,6 +260,7 @@ def test_nothing_grows_beyond_the_file(path, monkeypatch):
         refused(write_zip(path, {"a": View(array, 0, (10**12, 10**12), (0, 0))}))
         refused(write_legacy(path, {"a": View(array, count=2**31 - 1)}))
         refused(write_legacy(path, b"X\xff\xff\xff\x7f"))  # a string of 2 GB
+        refused(write_legacy(path, b"\x95" + 8 * b"\x7f" + b"}"))  # a frame of 9 EB
         assert tracemalloc.get_traced_memory()[1] < 20e6
     finally:
         tracemalloc.stop()

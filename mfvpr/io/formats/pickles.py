@@ -59,7 +59,7 @@ class DataUnpickler(_Unpickler):
         self.dispatch = _Instructions(_HANDLERS)
         try:
             return super().load()
-        except InputError:
+        except (InputError, OSError):
             raise
         except Exception as error:  # the unpickler raises what its lists, `struct` and codecs raise
             raise ValueError("damaged pickle") from error
