@@ -8,9 +8,7 @@
 What is computed lies in the stores; the results are in DIR, when the last task has left them there.
 """
 
-import fcntl
 import json
-import os
 import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -25,6 +23,7 @@ from mfvpr.storage import NotYet, Shard
 from mfvpr.storage.disk import locked
 from mfvpr.utils.files import write_text, written_once
 from mfvpr.utils.fingerprints import difference
+from mfvpr.utils.locks import is_locked
 from mfvpr.utils.versions import versions
 
 SHARDS = "shards"
@@ -169,7 +168,7 @@ def missing(out: Path) -> list[int]:
 
 
 def _state(task: Path) -> str:
-    if _is_held(task / "lock"):
+    if is_locked(task / "lock"):
         return "at work"
     try:
         return str(json.loads((task / _STATE).read_text(encoding="utf-8"))["state"])
@@ -177,17 +176,3 @@ def _state(task: Path) -> str:
         return "interrupted" if task.exists() else "not begun"
     except (OSError, ValueError, LookupError, TypeError):
         return "interrupted"
-
-
-def _is_held(lock: Path) -> bool:
-    try:
-        handle = os.open(lock, os.O_RDONLY)
-    except OSError:
-        return False
-    try:
-        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError:
-        return True
-    finally:
-        os.close(handle)
-    return False

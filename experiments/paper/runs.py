@@ -1,10 +1,8 @@
 """The evaluations, each in a run folder of its own; what is finished is not done again."""
 
-import fcntl
 import json
-import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +20,7 @@ from mfvpr.report import runs
 from mfvpr.report.pages.one_run import PAGE
 from mfvpr.utils.files import remove_leftovers
 from mfvpr.utils.fingerprints import fingerprint
+from mfvpr.utils.locks import lock_folder
 from mfvpr.utils.versions import versions
 
 FIGURES = 2  # queries that each run draws
@@ -37,21 +36,15 @@ def held(out: Path) -> Iterator[None]:
     Raises:
         SettingsError: another process does, or the folder cannot be made.
     """
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        handle = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
-    except OSError as error:
-        raise SettingsError(f"out={out}: cannot be made ({error.strerror}); name another folder") from error
-    try:
+    in_use = SettingsError(f"out={out}: another process evaluates into it; wait until it ends, or name another folder")
+    with ExitStack() as stack:
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise SettingsError(f"out={out}: another process evaluates into it; wait until it ends, or name another "
-                                "folder") from None  # fmt: skip
+            out.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(lock_folder(out, in_use))
+        except OSError as error:
+            raise SettingsError(f"out={out}: cannot be made ({error.strerror}); name another folder") from error
         remove_leftovers(out)
         yield
-    finally:
-        os.close(handle)
 
 
 def settings_of(run: str, place: Place, settings: Mapping[str, Any]) -> dict[str, Any]:

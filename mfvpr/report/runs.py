@@ -1,6 +1,5 @@
 """A run folder: of one run alone, and its files appear together."""
 
-import fcntl
 import json
 import os
 import re
@@ -8,7 +7,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from typing import Any
 from mfvpr.report.tables import Table
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import write_text
+from mfvpr.utils.locks import lock_folder
 
 _UNFINISHED = ".unfinished"
 LAST = "results.json"  # of the files of a run
@@ -46,18 +46,17 @@ def claimed(folder: Path, *, numbered: bool = False, own: bool = False, beside: 
     above = [parent for parent in folder.absolute().parents if not parent.exists()]
     with _telling_why(folder):
         folder = _made(folder, numbered)
-    with _telling_why(folder):
-        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        _take(handle, folder, own, {*beside})  # until then it may be another's, and must stay
+    error = InputError(f"{folder}: another run is using this folder; wait until it ends, or name another")
+    with ExitStack() as stack:
+        with suppress(OSError):  # a file system without locks of folders, such as NFS
+            stack.enter_context(lock_folder(folder, error))
+        _clear(folder, own, {*beside})  # until then it may be another's, and must stay
         try:
             yield folder
         finally:
             with suppress(OSError):  # not empty
-                for one in (folder, *above):
-                    one.rmdir()
-    finally:
-        os.close(handle)
+                for path in (folder, *above):
+                    path.rmdir()
 
 
 def _made(folder: Path, numbered: bool) -> Path:
@@ -73,14 +72,8 @@ def _made(folder: Path, numbered: bool) -> Path:
             wanted = folder.with_name(f"{folder.name}-{number}")
 
 
-def _take(handle: int, folder: Path, own: bool, beside: set[str]) -> None:
-    """Lock an open folder, and check that a run can be written into it."""
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise InputError(f"{folder}: another run is using this folder; wait until it ends, or name another") from None
-    except OSError:
-        pass  # a file system without locks of folders, such as NFS
+def _clear(folder: Path, own: bool, beside: set[str]) -> None:
+    """Remove leftovers of killed runs, and check that a run can be written into the folder."""
     with _telling_why(folder):
         found = {path.name for path in folder.iterdir()} - beside
         if own and LAST not in found:

@@ -1,14 +1,14 @@
 """What goes wrong with a store on disk, each told in one line, and its lock."""
 
 import errno
-import fcntl
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.locks import lock
 
 
 @contextmanager
@@ -20,30 +20,22 @@ def locked(folder: Path, content: str, waiting: Callable[[str], None] | None = N
         content: what it holds.
         waiting: is told, in one line, whom this waits for; None = refuse a store that is in use.
     """
-    with told(folder, content):
-        handle = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o644)
-    try:
+
+    def on_conflict(handle: int) -> None:
+        holder = os.pread(handle, 20, 0).decode(errors="replace") or "unknown"
+        if waiting is None:
+            raise InputError(f"{folder}: in use by process {holder}; wait until it ends, or stop it")
+        waiting(f"{folder}: in use by process {holder}; waiting until it is free")
+
+    with ExitStack() as stack:
         with told(folder, content):
-            _take(handle, folder, waiting)
-        with suppress(OSError):  # a full disk; the lock holds without its owner's name
+            handle = stack.enter_context(lock(folder / "lock", os.O_RDWR | os.O_CREAT, on_conflict))
+        with suppress(OSError):  # a full disk; the lock holds without the number of its process
             os.ftruncate(handle, 0)
             os.write(handle, str(os.getpid()).encode())
         yield
         with suppress(OSError):
             os.ftruncate(handle, 0)
-    finally:
-        os.close(handle)
-
-
-def _take(handle: int, folder: Path, waiting: Callable[[str], None] | None) -> None:
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        holder = os.pread(handle, 20, 0).decode(errors="replace") or "unknown"
-        if waiting is None:
-            raise InputError(f"{folder}: in use by process {holder}; wait until it ends, or stop it") from None
-        waiting(f"{folder}: in use by process {holder}; waiting until it is free")
-        fcntl.flock(handle, fcntl.LOCK_EX)
 
 
 @contextmanager

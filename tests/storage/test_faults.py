@@ -46,7 +46,7 @@ def hold(folder: str) -> None:
 
 
 def test_a_second_process_is_told_and_a_killed_one_leaves_no_lock(tmp_path):
-    call = f"from tests.stores.test_faults import *; hold({str(tmp_path / 's')!r})"
+    call = f"from tests.storage.test_faults import *; hold({str(tmp_path / 's')!r})"
     with subprocess.Popen([sys.executable, "-c", call], cwd=ROOT, stdout=subprocess.PIPE) as holder:
         try:
             assert holder.stdout is not None
@@ -88,7 +88,7 @@ def test_a_complete_store_is_read_by_any_number_at_the_same_time(tmp_path, subje
 
 def test_a_store_is_read_while_another_process_writes_it(tmp_path):
     """And what that has done meanwhile is done for whoever opens the store again, or enters it."""
-    call = f"from tests.stores.test_faults import *; hold({str(tmp_path / 's')!r})"
+    call = f"from tests.storage.test_faults import *; hold({str(tmp_path / 's')!r})"
     before = open_store(tmp_path / "s", RECIPE, num_images=3)
     with subprocess.Popen([sys.executable, "-c", call], cwd=ROOT, stdout=subprocess.PIPE) as holder:
         try:

@@ -4,14 +4,12 @@ Every checkpoint carries the recipe of what is trained, and the shapes of its ar
 expected before anything in the folder changes. The last two are kept.
 """
 
-import fcntl
 import json
 import logging
-import os
 import warnings
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +19,7 @@ import orbax.checkpoint as ocp
 
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import difference
+from mfvpr.utils.locks import lock_folder
 
 FORMAT = "mfvpr training 2"
 _KEPT = 2
@@ -34,22 +33,17 @@ def held(folder: Path) -> Iterator[None]:
         InputError: another process holds it, it holds something else, or it cannot be made.
     """
     _holds_checkpoints(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        handle = os.open(folder, os.O_RDONLY)
-    except OSError as error:
-        raise InputError(
-            f"{folder}: no checkpoint can be kept here ({_reason(error)}); check the path, its permissions and its disk"
-        ) from None
-    try:
+    in_use = InputError(f"{folder}: another process trains here; wait until it ends, or choose another folder")
+    with ExitStack() as stack:
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            message = f"{folder}: another process trains here; wait until it ends, or choose another folder"
-            raise InputError(message) from None
+            folder.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(lock_folder(folder, in_use))
+        except OSError as error:
+            raise InputError(
+                f"{folder}: no checkpoint can be kept here ({_reason(error)}); "
+                "check the path, its permissions and its disk"
+            ) from None
         yield
-    finally:
-        os.close(handle)
 
 
 def save(folder: Path, step: int, recipe: Mapping[str, Any], state: Any, progress: Any) -> None:

@@ -1,0 +1,56 @@
+"""Locks of files and folders, which end with the process that holds them, however it ends.
+
+They are `flock` locks of a handle: two blocks of one process exclude each other as two processes do.
+"""
+
+import fcntl
+import os
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+
+from filelock import lock_descriptor
+
+
+@contextmanager
+def lock(path: Path, flags: int, on_conflict: Callable[[int], None]) -> Iterator[int]:
+    """Open a file or folder and hold its lock; yields the handle.
+
+    Args:
+        path: of the file or folder.
+        flags: of `os.open`.
+        on_conflict: called with the handle when the lock is held elsewhere: raises, or returns to wait for the lock.
+    """
+    handle = os.open(path, flags, 0o644)
+    try:
+        if not lock_descriptor(handle, blocking=False):
+            on_conflict(handle)
+            lock_descriptor(handle)
+        yield handle
+    finally:
+        os.close(handle)
+
+
+def lock_folder(folder: Path, error: Exception) -> AbstractContextManager[int]:
+    """Hold the lock of an existing folder, without a file in it; raises `error` when it is held elsewhere."""
+
+    def refuse(_: int) -> None:
+        raise error
+
+    return lock(folder, os.O_RDONLY | os.O_DIRECTORY, refuse)
+
+
+def is_locked(path: Path) -> bool:
+    """Whether a lock file exists and is held."""
+    try:
+        handle = os.open(path, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        # A shared lock, which `filelock` does not have: two processes that ask must not take each other for the holder.
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(handle)
+    return False
