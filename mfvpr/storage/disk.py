@@ -1,4 +1,4 @@
-"""What goes wrong with a store on disk, each told in one line, and its lock."""
+"""The lock of a store on disk, its size, and errors of the file system as one line."""
 
 import errno
 import os
@@ -13,12 +13,12 @@ from mfvpr.utils.locks import lock
 
 @contextmanager
 def locked(folder: Path, content: str, waiting: Callable[[str], None] | None = None) -> Iterator[None]:
-    """Hold the store's lock, which ends with the process, however that ends.
+    """Hold the lock of a store, see `mfvpr.utils.locks`.
 
     Args:
-        folder: the store's.
+        folder: of the store.
         content: what it holds.
-        waiting: is told, in one line, whom this waits for; None = refuse a store that is in use.
+        waiting: called with one line that names the process that this waits for; None = refuse a store in use.
     """
 
     def on_conflict(handle: int) -> None:
@@ -40,12 +40,12 @@ def locked(folder: Path, content: str, waiting: Callable[[str], None] | None = N
 
 @contextmanager
 def told(folder: Path, content: str, needed: Callable[[], int] = lambda: 10**6) -> Iterator[None]:
-    """What the file system raises, as one line.
+    """Raise errors of the file system as an InputError of one line.
 
     Args:
-        folder: the store's.
+        folder: of the store.
         content: what it holds.
-        needed: bytes that are still to be written when the disk is full.
+        needed: gives the bytes that are still to be written when the disk is full.
     """
     try:
         yield
@@ -58,7 +58,7 @@ def told(folder: Path, content: str, needed: Callable[[], int] = lambda: 10**6) 
 
 
 def used_bytes(folder: Path) -> int:
-    """Bytes on disk of all that is below a folder; nothing for what others remove or rename meanwhile."""
+    """Bytes on disk of all files below a folder, except those that another process removes meanwhile."""
     total = 0
     for parent, folders, files in os.walk(folder):
         for name in (*folders, *files):

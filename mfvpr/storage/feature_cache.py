@@ -1,11 +1,11 @@
-"""What was taken from images, kept by their content: asked for again, by anybody, it is there.
+"""A cache of the features and global descriptors of images, on disk or in memory.
 
     archive = Archive(Path("~/.cache/mfvpr/features").expanduser())
     [features] = archive.local(folder, Sift())
     vectors = archive.vectors(folder, MixVprDescriptor(model))
 
-Stores are found by what they hold (the images' content and the extractor's recipe), never by a data set's name, so that
-a database which several data sets share is extracted once.
+The content of the images and the recipe of the extractor name a store, not the data set, so that a database which
+several data sets share is extracted once.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -22,7 +22,7 @@ from mfvpr.features.extraction import described
 from mfvpr.features.extractor import Aggregated, Aggregation, Extractor, Source
 from mfvpr.features.feature_set import FeatureSet, FeatureSource, InMemory
 from mfvpr.storage import matches as match_stores
-from mfvpr.storage.feature_writers import Sink, Taken, account, open_sinks
+from mfvpr.storage.feature_writers import ExtractionState, Sink, open_sinks, size_lines
 from mfvpr.storage.manifest import MATCHES, store_path
 from mfvpr.storage.rows import require_space
 from mfvpr.storage.shards import Shard
@@ -44,7 +44,7 @@ class Vectors:
 
     Attributes:
         values: `[M, D]` float32; NaN for bad images, which no shortlist contains.
-        bad: reason by row, for images that gave no usable descriptor.
+        bad: row -> reason, for images without a usable descriptor.
     """
 
     values: np.ndarray
@@ -53,17 +53,18 @@ class Vectors:
 
 @dataclass
 class Archive:
-    """What was taken from images, in stores below a folder, or for the time of this process.
+    """Features, global descriptors and matches in stores below a folder, or in the memory of this process.
 
     Attributes:
-        root: folder of all stores; None = nothing is kept on disk.
+        root: folder of all stores; None = in memory.
         skip_bad: list images that cannot be read as bad, and go on, instead of raising.
-        track: label -> progress of what follows.
-        tell: is told, in one line, what is to be done and how much space that takes, and what is wrong with images.
-        wait: for other processes that are making the same, instead of refusing.
-        shard: takes from its own images alone, and the others' of their stores, for which it waits `patience` seconds
-            before it says `mfvpr.storage.shards.NotYet`; it needs a root.
-        watch: counts the extraction of local features as the stage `features`, whoever asks for them.
+        track: label -> progress bar of the next loop.
+        tell: called with one line: the work to be done and the disk space it takes, or a warning about images.
+        wait: wait for another process that writes the same store, instead of raising.
+        shard: extracts its own images alone, and reads the rest from the stores of other shards. It waits `patience`
+            seconds for them before it raises `mfvpr.storage.shards.NotYet`. It needs a root.
+        patience: seconds, see `shard`.
+        watch: counts the extraction of local features as the stage `features`.
     """
 
     root: Path | None = None
@@ -83,18 +84,18 @@ class Archive:
             raise InputError(f"shard={self.shard}: expected a root as well, the folder of the stores of all shards")
 
     def contents(self, folder: ImageFolder) -> Contents:
-        """What the files of a folder hold; remembered below the root from run to run."""
+        """Hashes of the files of a folder; with a root, later runs read them from there."""
         cache = None if self.root is None else self.root / "contents"
         return self.once("contents", lambda: contents(folder, cache), folder, None)
 
     def once(self, name: str, compute: Callable[[], Value], folder: ImageFolder, by: Any) -> Value:
-        """What is computed of a folder by an extractor or a filter: once in this process, while both are what they are.
+        """The result of `compute`, called once in this process while the files and the recipe of `by` stay the same.
 
         Args:
             name: of the result.
             compute: gives it.
             folder: of images.
-            by: what computes it; where that has no recipe, the object counts.
+            by: extractor or retrieval that computes it; without a recipe, its `id` counts.
         """
         try:
             recipe = fingerprint(recipe_of(by, lambda path: [str(path), *map(state_of, files_of(path).paths)]))
@@ -102,21 +103,21 @@ class Archive:
             recipe = id(by)
         key = name, folder, hash(tuple(str(state_of(f"{folder.root}/{image}")) for image in folder.names)), recipe
         if key not in self._computed:
-            self._computed[key] = compute(), by  # which lives as long, so that its id is no other's
+            self._computed[key] = compute(), by  # kept alive, so that no other object gets its id
         return self._computed[key][0]
 
     def recipe_of(self, value: Any) -> Any:
         """See `fingerprints.recipe_of`, with the content of files and folders of files in place of their paths."""
-        return recipe_of(value, self._told_by_content)
+        return recipe_of(value, self._content_of)
 
     def warn(self, line: str) -> None:
-        """Tell what is wrong; once, whoever finds it again (the next sequence that asks the same database)."""
+        """Tell a warning, once: several sequences may share a database."""
         if line not in self._warned:
             self._warned.add(line)
             self.tell(f"warning: {line}")
 
     def recipe(self, folder: ImageFolder, extractor: Extractor | Aggregated | Source) -> dict[str, Any]:
-        """All that changes what an extractor takes from a folder's images."""
+        """Everything that changes the features of a folder's images: extractor, images, versions of decoders."""
         decoders = {name: versions()[name] for name in DECODERS}
         return {
             "extractor": self.recipe_of(extractor),
@@ -136,23 +137,23 @@ class Archive:
 
         Args:
             folder: the images.
-            extractor: what takes them.
-            rows: images whose features will be asked for; those that are not there are extracted. None = all.
-            label: whose they are, for people.
+            extractor: gives the features, or has them already.
+            rows: images that are needed; those that are missing are extracted. None = all.
+            label: of the images in messages.
 
         Raises:
             InputError: an image cannot be read (unless `skip_bad`), or none can; or a store cannot be used.
-            NotYet: other shards have not taken theirs.
+            NotYet: other shards have not extracted their images.
         """
         if isinstance(extractor, Source):
-            opened = self.once("opened", lambda: self._opened(folder, extractor, label), folder, extractor)
-            missing = np.flatnonzero(np.asarray(opened.counts) < 0).tolist()
-            return (FeatureSet(opened, {row: f"{folder.paths[row]}: no features were imported" for row in missing}),)
+            source = self.once("opened", lambda: self._open_source(folder, extractor, label), folder, extractor)
+            missing = np.flatnonzero(np.asarray(source.counts) < 0).tolist()
+            return (FeatureSet(source, {row: f"{folder.paths[row]}: no features were imported" for row in missing}),)
         rows = range(len(folder)) if rows is None else [*rows]
-        taken = self._extract(folder, extractor, rows, f"{label} features")
+        state = self._extract(folder, extractor, rows, f"{label} features")
         return tuple(
-            FeatureSet(InMemory(sink.items, len(folder)) if sink.store is None else sink.store, dict(taken.bad))
-            for sink in taken.sinks[bool(extractor.vector_size) :]
+            FeatureSet(InMemory(sink.items, len(folder)) if sink.store is None else sink.store, dict(state.bad))
+            for sink in state.sinks[bool(extractor.vector_size) :]
         )
 
     def vectors(self, folder: ImageFolder, describer: Extractor | Aggregated, database: ImageFolder, *,
@@ -161,9 +162,9 @@ class Archive:
 
         Args:
             folder: the images.
-            describer: what describes them.
+            describer: gives the descriptors.
             database: images that an aggregation is fitted on.
-            label: whose they are, for people.
+            label: of the images in messages.
 
         Raises:
             InputError: as `local`.
@@ -179,22 +180,22 @@ class Archive:
     def matches(
         self, recipe: Mapping[str, Any], names: Sequence[str], num_candidates: int, *, typical: int, label: str
     ) -> Iterator[match_stores.MatchStore]:
-        """The store of matches that are made so, where there is a root, held while it lacks some.
+        """The store of the matches of a recipe, locked while queries are missing; needs a root.
 
         Args:
             recipe: of the matches.
             names: of Q queries.
             num_candidates: C.
             typical: matches of a pair, about.
-            label: for people.
+            label: of the images in messages.
         """
         if self.root is None:
             raise ValueError("nothing is kept on disk: this archive has no root")
         path = store_path(self.root, "matches", recipe, MATCHES)
         sizes = {"num_queries": len(names), "num_candidates": num_candidates}
-        own = range(len(names)) if self.shard is None else self.shard.rows(names)
+        rows = range(len(names)) if self.shard is None else self.shard.rows(names)
         with match_stores.open_match_store(path, recipe, **sizes, **self.store_options) as store:
-            if missing := sum(not store.done[row] for row in own):
+            if missing := sum(not store.done[row] for row in rows):
                 needed = match_stores.forecast_bytes(missing, num_candidates, typical)
                 require_space(store.folder, needed)
                 self.tell(f"{label}: {missing} of {len(names)} queries to match with {num_candidates} candidates: "
@@ -207,69 +208,68 @@ class Archive:
 
     @property
     def store_options(self) -> dict[str, Any]:
-        """Of `stores.rows.open_rows`."""
+        """The arguments `waiting` and `shard` of `storage.rows.open_rows`."""
         return {"waiting": self.tell if self.wait else None, "shard": self.shard}
 
-    def _told_by_content(self, path: PurePath) -> Any:
+    def _content_of(self, path: PurePath) -> Any:
         path = Path(path)
         if not path.exists():
             return str(path)
-        found = self.contents(files_of(path))
-        return found.fingerprint if path.is_dir() else found.sha256
+        content = self.contents(files_of(path))
+        return content.fingerprint if path.is_dir() else content.sha256
 
-    def _opened(self, folder: ImageFolder, source: Source, label: str) -> FeatureSource:
+    def _open_source(self, folder: ImageFolder, source: Source, label: str) -> FeatureSource:
         opened = source.opened(folder, partial=self.skip_bad)
         counts = np.asarray(opened.counts)
         number, typical = int((counts >= 0).sum()), np.mean(counts[counts >= 0]) if (counts >= 0).any() else 0
         self.tell(f"{label} features: {number} of {len(folder)} images imported, about {typical:.0f} features each")
         return opened
 
-    def _extract(self, folder: ImageFolder, extractor: Extractor, rows: Sequence[int], label: str) -> Taken:
-        """Run the extractor on those of the rows that lack something."""
-        taken = self.once("taken", lambda: Taken(self._sinks(folder, extractor)), folder, extractor)
-        with ExitStack() as held:
+    def _extract(self, folder: ImageFolder, extractor: Extractor, rows: Sequence[int], label: str) -> ExtractionState:
+        """Run the extractor on the rows that are missing."""
+        state = self.once("state", lambda: ExtractionState(self._sinks(folder, extractor)), folder, extractor)
+        with ExitStack() as stack:
             if self.watch is not None and extractor.scales:
-                held.enter_context(self.watch("features"))
-            if any(sink.lacks(rows) for sink in taken.sinks):
-                for sink in taken.sinks:
+                stack.enter_context(self.watch("features"))
+            if any(sink.missing(rows) for sink in state.sinks):
+                for sink in state.sinks:
                     if sink.store is not None:
-                        held.enter_context(sink.store)
-            taken.know_bad()
-            own = rows if self.shard is None else self.shard.rows(folder.names, rows)
-            missing = taken.lacks(own)
-            self._announce(extractor, taken, missing, len(rows), len(folder), label)
-            batches = described(folder, extractor, missing, taken.bad, skip_bad=self.skip_bad, track=self.track(label))
+                        stack.enter_context(sink.store)
+            state.read_bad()
+            missing = state.missing(rows if self.shard is None else self.shard.rows(folder.names, rows))
+            self._announce(extractor, state, missing, len(rows), len(folder), label)
+            batches = described(folder, extractor, missing, state.bad, skip_bad=self.skip_bad, track=self.track(label))
             for batch in batches:
-                for sink in taken.sinks:
+                for sink in state.sinks:
                     sink.keep({row: sink.pick(description) for row, description in batch.items()})
             if missing:
-                taken.leave_bad()
-                for line in account(taken.sinks[bool(extractor.vector_size) :], extractor.scales):
+                state.write_bad()
+                for line in size_lines(state.sinks[bool(extractor.vector_size) :], extractor.scales):
                     self.tell(f"{label}: {line}")
         if self.shard is not None:
-            self.shard.wait(lambda: taken.look(rows), folder.names, label, patience=self.patience)
-        if len(taken.bad) == len(folder):
+            self.shard.wait(lambda: state.look(rows), folder.names, label, patience=self.patience)
+        if len(state.bad) == len(folder):
             raise InputError(f"{folder.root}: none of {len(folder)} images can be used; the first: "
-                             f"{taken.bad[min(taken.bad)]}")  # fmt: skip
-        return taken
+                             f"{state.bad[min(state.bad)]}")  # fmt: skip
+        return state
 
     def _sinks(self, folder: ImageFolder, extractor: Extractor) -> list[Sink]:
         recipe = self.recipe(folder, extractor) if self.root is not None else {}
         return open_sinks(self.root, extractor, recipe, num_images=len(folder), **self.store_options)
 
     def _announce(
-        self, extractor: Extractor, taken: Taken, missing: Sequence[int], asked: int, total: int, label: str
+        self, extractor: Extractor, state: ExtractionState, missing: Sequence[int], count: int, total: int, label: str
     ) -> None:
-        """What is to be done; that nothing is, only once."""
-        stores = [sink.store for sink in taken.sinks if sink.store is not None]
-        if not stores or not asked or (taken.announced and not missing):
+        """Tell how many of `count` images are missing; if none, only once."""
+        stores = [sink.store for sink in state.sinks if sink.store is not None]
+        if not stores or not count or (state.is_announced and not missing):
             return
-        where, taken.announced = ", ".join(str(store.folder) for store in stores), True
+        where, state.is_announced = ", ".join(str(store.folder) for store in stores), True
         if not missing:
-            some = f"all {total}" if asked == total else f"the {asked} of {total}"
-            self.tell(f"{label}: {some} images from {where}")
+            number = f"all {total}" if count == total else f"the {count} of {total}"
+            self.tell(f"{label}: {number} images from {where}")
             return
-        needed = sum(sink.forecast(len(missing)) for sink in taken.sinks)
+        needed = sum(sink.forecast(len(missing)) for sink in state.sinks)
         require_space(stores[0].folder, needed)
         each = ", ".join(f"about {scale.typical_count} features of {scale.dimension} dimensions each"
                          for scale in extractor.scales)  # fmt: skip
@@ -280,16 +280,16 @@ class Archive:
         self, folder: ImageFolder, describer: Extractor | Aggregated, database: ImageFolder, label: str
     ) -> Vectors:
         if isinstance(describer, Aggregated):
-            return self._aggregated(folder, describer, database, label)
-        taken = self._extract(folder, describer, range(len(folder)), f"{label} descriptors")
-        values, sink = np.full((len(folder), describer.vector_size), np.nan, np.float32), taken.sinks[0]
+            return self._aggregate(folder, describer, database, label)
+        state = self._extract(folder, describer, range(len(folder)), f"{label} descriptors")
+        values, sink = np.full((len(folder), describer.vector_size), np.nan, np.float32), state.sinks[0]
         for row, vector in sink.items.items() if sink.store is None else sink.store.read():
             values[row] = vector
-        return Vectors(values, dict(taken.bad))
+        return Vectors(values, dict(state.bad))
 
-    def _aggregated(self, folder: ImageFolder, describer: Aggregated, database: ImageFolder, label: str) -> Vectors:
+    def _aggregate(self, folder: ImageFolder, describer: Aggregated, database: ImageFolder, label: str) -> Vectors:
         [features] = self.local(folder, describer.extractor, label=label)
-        aggregation = self.once("fitted", lambda: self._fitted(describer, database), database, describer)
+        aggregation = self.once("aggregation", lambda: self._fit(describer, database), database, describer)
         values = np.zeros((len(folder), aggregation.vector_size), np.float32)
         rows = range(len(folder))
         for start in self.track(f"{label} descriptors")(range(0, len(rows), AGGREGATED), -(-len(rows) // AGGREGATED)):
@@ -299,6 +299,6 @@ class Archive:
         values[list(features.bad)] = np.nan
         return Vectors(values, features.bad)
 
-    def _fitted(self, describer: Aggregated, database: ImageFolder) -> Aggregation:
+    def _fit(self, describer: Aggregated, database: ImageFolder) -> Aggregation:
         [features] = self.local(database, describer.extractor, label="database")
         return describer.fitting.fit(features)

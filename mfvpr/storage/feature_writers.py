@@ -1,5 +1,6 @@
-"""Where what an extractor gives is kept: a store, or the memory of this process, for each part of a description."""
+"""Writers of an extractor's features: each part of a description to a store, or to memory."""
 
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -7,22 +8,26 @@ from typing import Any
 
 from mfvpr.features.extractor import Extractor, Scale
 from mfvpr.storage import features, vectors
-from mfvpr.storage.bad import known_bad, leave_bad
+from mfvpr.storage.disk import told
 from mfvpr.storage.manifest import VECTORS, store_path
+from mfvpr.storage.row_files import SHARDS
 from mfvpr.storage.rows import RowStore
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import write_text
 
+_BAD = "bad.json"  # images that gave a shard nothing, with reasons, so that other shards do not wait for them
 _MB = 1e6
 
 
 @dataclass
 class Sink:
-    """Where one part of the descriptions of a folder's images is kept: in a store, or in memory.
+    """One part of the descriptions of a folder's images, in a store or in memory.
 
     Attributes:
         pick: the part of a description.
         store: None = in memory.
-        items: by row, where there is no store.
-        forecast: bytes on disk of so many images.
+        items: by row, without a store.
+        forecast: number of images -> bytes on disk.
     """
 
     pick: Callable[[Any], Any]
@@ -30,57 +35,69 @@ class Sink:
     forecast: Callable[[int], int]
     items: dict[int, Any] = field(default_factory=dict)
 
-    def lacks(self, rows: Sequence[int]) -> list[int]:
-        """Those of some rows that are not here."""
+    def missing(self, rows: Sequence[int]) -> list[int]:
+        """The rows that are not here."""
         if self.store is None:
             return [row for row in rows if row not in self.items]
         return [row for row in rows if not self.store.done[row]]
 
     def keep(self, batch: Mapping[int, Any]) -> None:
-        """A batch of rows; where there is a store, they are on disk when this returns."""
+        """Keep a batch of rows; with a store, they are on disk when this returns."""
         if self.store is None:
             self.items |= batch
         else:
-            self.store.write({row: batch[row] for row in self.lacks([*batch])})
+            self.store.write({row: batch[row] for row in self.missing([*batch])})
 
 
 @dataclass
-class Taken:
-    """What an extractor takes from a folder's images.
+class ExtractionState:
+    """The state of one extractor on one folder of images.
 
     Attributes:
-        sinks: where that is kept.
-        bad: why some gave nothing, by row.
-        announced: whether people know.
+        sinks: of the parts of its descriptions.
+        bad: row -> reason, for images without features.
+        is_announced: whether the user was told where the features are.
     """
 
     sinks: list[Sink]
     bad: dict[int, str] = field(default_factory=dict)
-    announced: bool = False
+    is_announced: bool = False
 
-    def lacks(self, rows: Sequence[int]) -> list[int]:
-        """Those of some rows that are not here, though they are not bad."""
-        return sorted({row for sink in self.sinks for row in sink.lacks(rows)} - self.bad.keys())
+    def missing(self, rows: Sequence[int]) -> list[int]:
+        """The rows that a sink lacks, without bad ones."""
+        return sorted({row for sink in self.sinks for row in sink.missing(rows)} - self.bad.keys())
 
     def look(self, rows: Sequence[int]) -> list[int]:
-        """Those of some rows that no shard has taken by now."""
-        for sink in self.sinks if self.lacks(rows) else ():
+        """The rows that no shard has extracted by now."""
+        for sink in self.sinks if self.missing(rows) else ():
             if sink.store is not None:
                 sink.store.look()
-        self.know_bad()
-        return self.lacks(rows)
+        self.read_bad()
+        return self.missing(rows)
 
-    def know_bad(self) -> None:
-        """What shards said is bad stays so, or each would have its own data set."""
+    def read_bad(self) -> None:
+        """Add the bad images of all shards, which stay bad: all shards evaluate the same images.
+
+        Raises:
+            InputError: a file is damaged.
+        """
         store = self.sinks[0].store
-        if store is not None and store.shard is not None:
-            self.bad |= known_bad(store)
+        if store is None or store.shard is None:
+            return
+        with told(store.folder, store.kind.content):
+            for path in sorted((store.folder / SHARDS).glob(f"*-of-*/{_BAD}")):
+                try:
+                    self.bad |= {int(row): str(reason) for row, reason in json.loads(path.read_text("utf-8")).items()}
+                except (ValueError, AttributeError):
+                    raise InputError(f"{path}: expected reasons by row, got something else; delete this file, and run "
+                                     "again") from None  # fmt: skip
 
-    def leave_bad(self) -> None:
-        """Tell other shards which images are."""
+    def write_bad(self) -> None:
+        """Leave the bad images for other shards."""
         store = self.sinks[0].store
         if store is not None and store.shard is not None and self.bad:
-            leave_bad(store, self.bad)
+            with told(store.folder, store.kind.content):
+                write_text(store.own / _BAD, json.dumps({str(row): why for row, why in sorted(self.bad.items())}))
 
 
 def open_sinks(
@@ -91,14 +108,14 @@ def open_sinks(
     num_images: int,
     **how: Any,
 ) -> list[Sink]:
-    """Those of an extractor: of its global descriptor, where it gives one, then of every scale.
+    """Open the sinks of an extractor: of its global descriptor, if it gives one, then of each scale.
 
     Args:
         root: folder of stores; None = in memory.
-        extractor: whose.
-        recipe: of what it takes from these images.
+        extractor: gives the descriptions.
+        recipe: of its features of these images.
         num_images: M.
-        **how: `waiting` and `shard` of `stores.rows.open_rows`.
+        **how: `waiting` and `shard` of `storage.rows.open_rows`.
     """
     name, size = type(extractor).__name__, extractor.vector_size
     options: dict[str, Any] = {"num_images": num_images} | how
@@ -108,8 +125,8 @@ def open_sinks(
         store = None if path is None else vectors.open_vector_store(path, recipe, **options)
         sinks.append(Sink(lambda description: description.vector, store, lambda n: vectors.forecast_bytes(n, size)))
     for number, scale in enumerate(extractor.scales):
-        own = {**recipe, "scale": number} if len(extractor.scales) > 1 else recipe
-        store = None if root is None else features.open_store(store_path(root, name, own), own, **options)
+        of_scale = {**recipe, "scale": number} if len(extractor.scales) > 1 else recipe
+        store = None if root is None else features.open_store(store_path(root, name, of_scale), of_scale, **options)
         sinks.append(Sink(
             lambda description, number=number: description.local[number], store,
             lambda n, scale=scale: features.forecast_bytes(n, scale.typical_count, scale.dimension),
@@ -117,8 +134,8 @@ def open_sinks(
     return sinks
 
 
-def account(sinks: Sequence[Sink], scales: Sequence[Scale]) -> Iterator[str]:
-    """What the local features of each scale take on disk, beside what they would as the paper keeps them."""
+def size_lines(sinks: Sequence[Sink], scales: Sequence[Scale]) -> Iterator[str]:
+    """One line per scale: size of the local features on disk, and as float32, as the paper stores them."""
     for scale, sink in zip(scales, sinks, strict=True):
         if sink.store is not None:
             size, features = sink.store.size_bytes, int(sink.store.counts.clip(0).sum())

@@ -1,14 +1,14 @@
-"""Local features of the images of one folder on disk: extracted once, read by every later run.
+"""Local features of the images of one folder on disk, read by every later run.
 
     with open_store(store_path(root, "sift", recipe), recipe, num_images=len(folder)) as store:
         store.write({row: features})  # batch by batch, the rows that are not done
         for row, features in store.read():
             ...
 
-A row store (`mfvpr.storage.rows`), whose rows are `keypoints` float32 `[N, 2]` (px), `descriptors` float16 `[N, D]`,
-all of unit length but for rounding, `scales` float32 `[N]` that give them back the lengths that they had, `scores`
-float32 `[N]` and `image_size` float32 `[2]` (px). Padding is left out. What comes back is float32; a descriptor has its
-length, and its direction to 5e-4, all else is as it was.
+A row store (`mfvpr.storage.rows`). A row holds `keypoints` float32 `[N, 2]` (px), `descriptors` float16 `[N, D]` of
+unit length but for rounding, `scales` float32 `[N]` that restore their lengths, `scores` float32 `[N]` and `image_size`
+float32 `[2]` (px). Padding is left out. Features are read as float32: the directions of descriptors change by up to
+5e-4, everything else is unchanged.
 """
 
 from collections.abc import Mapping
@@ -30,13 +30,13 @@ _NUM_ARRAYS = 5
 def open_store(
     folder: Path, recipe: Mapping[str, Any], *, num_images: int, kind: Kind = FEATURES, **options: Any
 ) -> FeatureStore:
-    """The store in `folder`; `with` it, rows are written, and while it lacks images no other process can do so.
+    """The store in `folder`. `with store:` locks it for writing, unless it is complete.
 
     Args:
         folder: see `manifest.store_path`.
-        recipe: what the features are made from (JSON values only): weights, settings, images. Kept in plain text.
+        recipe: of the features (JSON values only): weights, settings, images. Kept in plain text.
         num_images: M.
-        kind: with messages of its own, where the store is part of something else.
+        kind: with other messages, for a store that is part of a map.
         **options: `waiting`, `shard` and `tokens` of `rows.open_rows`.
 
     Raises:
@@ -46,7 +46,7 @@ def open_store(
 
 
 def forecast_bytes(num_images: int, features_per_image: float, dimension: int) -> int:
-    """Bytes on disk that images with so many features of D = `dimension` take at most."""
+    """Bytes on disk, at most, of images with so many features of D = `dimension`."""
     return num_images * row_bytes(features_per_image * (2 * dimension + 16) + 8, _NUM_ARRAYS)
 
 

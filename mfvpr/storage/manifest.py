@@ -1,6 +1,6 @@
-"""What the rows of a store were made from, in plain text beside them: never mixed, never reused by mistake.
+"""The manifest of a store: the recipe of its rows in plain text, so that no other recipe reuses them.
 
-The manifest is written before anything else and compared, ingredient by ingredient, whenever the store is opened.
+It is written before anything else, and compared, part by part, whenever the store is opened.
 """
 
 import json
@@ -17,23 +17,22 @@ from mfvpr.utils.fingerprints import difference, fingerprint, shortened
 
 MANIFEST = "manifest.json"
 _OLD_MANIFEST = "zarr.json"  # of format 1
-_LEFTOVER = re.compile(
-    r"\.(manifest|images|bad|shortlist|vocabulary|\d+-\d+)-\w+\.(json|npz)"
-)  # was being written when its process was killed
+# Temporary files of a process that was killed while it wrote.
+_LEFTOVER = re.compile(r"\.(manifest|images|bad|shortlist|vocabulary|\d+-\d+)-\w+\.(json|npz)")
 
 
 @dataclass(frozen=True)
 class Kind:
-    """What a store holds, in the words of its manifest and of its messages.
+    """A kind of store, in the words of its manifest and of its messages.
 
     Attributes:
-        store: what it is called.
+        store: its name.
         version: of its arrays on disk.
-        content: what a row is made of.
-        rows: what a row belongs to.
-        remake: what the next run does with a row that is not done; None = nothing can make it again, so that nothing is
-            removed, and nobody is advised to.
-        compress: whether that is worth its time.
+        content: of a row.
+        rows: the things that rows belong to.
+        remake: verb for making a row again; None = no run can make it again, so that nothing is removed, and no
+            message advises it.
+        compress: whether files are compressed.
     """
 
     store: str
@@ -45,11 +44,11 @@ class Kind:
 
     @property
     def format(self) -> str:
-        """What the manifest says of the arrays on disk."""
+        """The version of the arrays on disk, as it stands in the manifest."""
         return f"mfvpr {self.store} {self.version}"
 
     def advice(self, irreplaceable: str) -> str:
-        """How to mend a store that cannot be used as it is; `irreplaceable` where no run can make it again."""
+        """Advice for a store that cannot be used as it is; `irreplaceable` if no run can make it again."""
         return "choose another path, or delete this folder" if self.remake else irreplaceable
 
 
@@ -60,7 +59,7 @@ MATCHES = Kind("match store", 3, "matches", "queries", "matches", compress=True)
 
 
 def recipe_fingerprint(recipe: Mapping[str, Any], kind: Kind = FEATURES) -> str:
-    """SHA-256 over the store's format and the recipe (JSON values only); the first 16 hexadecimal digits."""
+    """`fingerprint` of the store's format and the recipe (JSON values only)."""
     return fingerprint({"format": kind.format, "recipe": recipe})
 
 
@@ -70,10 +69,10 @@ def store_path(root: Path, name: str, recipe: Mapping[str, Any], kind: Kind = FE
 
 
 def check_owned(folder: Path, kind: Kind) -> None:
-    """Refuse to make a store of anything but a new or empty folder, or what an interrupted start left.
+    """Refuse a folder that is neither new or empty, nor a store, nor left by an interrupted start.
 
     Raises:
-        InputError: `folder` is a file, or holds other things than a store.
+        InputError: `folder` is a file, or holds something else than a store.
         OSError: it cannot be read.
     """
     if folder.exists() and not folder.is_dir():
@@ -85,7 +84,7 @@ def check_owned(folder: Path, kind: Kind) -> None:
                 "delete this folder"
             )
         foreign = sorted(path.name for path in folder.iterdir() if path.name != "lock" and not _is_leftover(path))
-        if foreign and not (folder / MANIFEST).exists():  # another process may just have written it
+        if foreign and not (folder / MANIFEST).exists():  # it may have appeared since
             raise InputError(
                 f"{folder}: expected a folder of {kind.content}, got one without {MANIFEST} that holds "
                 f"{shortened(foreign[0])}; choose another path"
@@ -93,11 +92,11 @@ def check_owned(folder: Path, kind: Kind) -> None:
 
 
 def manifest_of(kind: Kind, recipe: Mapping[str, Any], sizes: Mapping[str, int]) -> dict[str, Any]:
-    """What a manifest says (JSON).
+    """The content of a manifest (JSON values).
 
     Args:
-        kind: what the store holds.
-        recipe: what that is made from.
+        kind: of the store.
+        recipe: of its rows.
         sizes: lengths of its axes by name.
     """
     content = {"format": kind.format, **sizes, "recipe": recipe, "fingerprint": recipe_fingerprint(recipe, kind)}
@@ -108,7 +107,7 @@ def is_settled(folder: Path, kind: Kind, manifest: Mapping[str, Any]) -> bool:
     """Whether the store has its manifest.
 
     Raises:
-        InputError: the store was made from something else, or its manifest cannot be understood.
+        InputError: the store has another recipe, or a damaged manifest.
         OSError: it cannot be read.
     """
     path = folder / MANIFEST
@@ -121,7 +120,7 @@ def is_settled(folder: Path, kind: Kind, manifest: Mapping[str, Any]) -> bool:
 
 
 def settle_manifest(folder: Path, kind: Kind, manifest: Mapping[str, Any]) -> None:
-    """Clear away what a killed process left, and write the manifest if it is not there. Whoever calls holds the lock.
+    """Remove temporary files of a killed process, and write the manifest if it is not there. The caller has the lock.
 
     Raises:
         InputError: as `is_settled`.
@@ -133,25 +132,21 @@ def settle_manifest(folder: Path, kind: Kind, manifest: Mapping[str, Any]) -> No
 
 
 def leave_manifest(folder: Path, kind: Kind, manifest: Mapping[str, Any]) -> None:
-    """Write the manifest if it is not there; several may, of one store.
+    """Write the manifest if it is not there; several processes may do so.
 
     Raises:
         InputError: as `is_settled`.
         OSError: it cannot be read or written.
     """
     if not is_settled(folder, kind, manifest):
-        _write(folder / MANIFEST, manifest)
+        with replacing(folder / MANIFEST) as temporary, temporary.open("w", encoding="utf-8") as file:
+            file.write(json.dumps(manifest, indent=1, sort_keys=True, allow_nan=False))
+            file.flush()
+            os.fsync(file.fileno())  # rows must not be on disk before
 
 
 def _is_leftover(path: Path) -> bool:
     return _LEFTOVER.fullmatch(path.name) is not None
-
-
-def _write(path: Path, manifest: Mapping[str, Any]) -> None:
-    with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
-        file.write(json.dumps(manifest, indent=1, sort_keys=True, allow_nan=False))
-        file.flush()
-        os.fsync(file.fileno())  # what comes later is on disk when it is written; so must this be
 
 
 def _read(path: Path, kind: Kind) -> Any:

@@ -1,4 +1,4 @@
-"""The rows of a map on disk: of every image its features, and behind them its descriptor, its name and its place.
+"""The rows of a map on disk: for every image its features, its global descriptor, its name and its place.
 
     rows = MapRows(folder, recipe)
     with hold_map(folder):
@@ -8,11 +8,11 @@
     for row, entry in rows.new():  # since the last time, whoever added them
         ...
 
-One process adds at a time, any number read. Rows lie in segments of `SEGMENT`, each of two row stores
-(`mfvpr.storage.rows`), so that no folder holds too many files, and of a file of tokens: a random number of each row,
-which the files of both stores know as well. So features and entries that were not written together, here, are noticed.
-A row is there when its token is, which is written last: nobody sees half of one, and a file that is removed later is
-missed. A process that is killed leaves out some numbers.
+One process adds at a time, any number read. Rows lie in segments of `SEGMENT`, so that no folder holds too many files.
+A segment has two row stores (`mfvpr.storage.rows`) and a file of tokens: a random number of each row, which the files
+of both stores know as well. So features and entries that were not written together are noticed. A row exists when its
+token does, which is written last: no process sees half a row, and a file that is removed later is missed. A process
+that is killed leaves out row numbers.
 
 The file of tokens grows before the files of a row are written: a row beyond its end shows that the file was cut. Until
 the tokens are written it lacks one byte: its size changes with every new row, even where the clock stands still.
@@ -46,10 +46,10 @@ _TOKENS, _TOKEN = "tokens", np.dtype("<u8")
 
 
 class Entry(NamedTuple):
-    """What a map knows of an image beside its features.
+    """The data of an image in a map, without its features.
 
     name: of the image.
-    place: where it was taken: any JSON value.
+    place: of the image: any JSON value.
     vector: `[D]` global descriptor, float32.
     """
 
@@ -59,13 +59,13 @@ class Entry(NamedTuple):
 
 
 def check_name(name: Any) -> None:
-    """Refuse a name that is no text: JSON would give back another one, or none."""
+    """Refuse a name that is no text: JSON would return something else, or fail."""
     if not isinstance(name, str):
         raise InputError(f"name: expected text, got {clipped(repr(name), 80)}. Use `str(name)`.")
 
 
 def check_place(name: str, place: Any) -> None:
-    """Refuse a place that is None, or that JSON would not give back as it is: a tuple comes back as a list."""
+    """Refuse None, and a place that JSON would change: it returns a tuple as a list."""
     try:
         text = json.dumps(place, allow_nan=False)
         if place is None or json.loads(text) != place:
@@ -82,17 +82,17 @@ def check_place(name: str, place: Any) -> None:
 
 
 def _levels(place: Any) -> int:
-    """Number of lists and dictionaries within each other."""
+    """Depth of nested lists and dictionaries."""
     parts = place.values() if isinstance(place, dict) else place if isinstance(place, list) else None
     return 0 if parts is None else 1 + max(map(_levels, parts), default=0)
 
 
 @contextmanager
 def hold_map(folder: Path) -> Iterator[None]:
-    """Hold a map, which need not be there yet, so that nobody else learns its vocabulary or adds to it.
+    """Lock a map, which may be missing: no other process learns its vocabulary or adds images.
 
     Raises:
-        InputError: another process does, or the folder cannot be written.
+        InputError: another process has the lock, or the folder cannot be written.
     """
     with told(folder, MAP.content):
         folder.mkdir(parents=True, exist_ok=True)
@@ -101,10 +101,10 @@ def hold_map(folder: Path) -> Iterator[None]:
 
 
 def settle_map(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Write down what a map is made with, where that is not there; within `hold_map`.
+    """Write the settings of a map, unless they are there; within `hold_map`.
 
     Raises:
-        InputError: it is made with something else, or of format 1, or the folder cannot be written.
+        InputError: the map has other settings, or format 1, or the folder cannot be written.
     """
     if _is_old(folder):
         raise InputError(f"{folder}: expected {MAP.format!r}, got {_MAP_1.format!r}, which can only be read. Build the "
@@ -114,10 +114,10 @@ def settle_map(folder: Path, settings: Mapping[str, Any]) -> None:
 
 
 def is_map_settled(folder: Path, settings: Mapping[str, Any]) -> bool:
-    """Whether it is written down what a map is made with.
+    """Whether the settings of a map are written.
 
     Raises:
-        InputError: it is made with something else.
+        InputError: the map has other settings.
     """
     with told(folder, MAP.content):
         return is_settled(folder, MAP, manifest_of(MAP, settings, {}))
@@ -139,12 +139,12 @@ def _segment_folder(folder: Path, number: int) -> Path:
 
 @dataclass
 class _Segment:
-    """Both stores of some rows, and their tokens, as they were when they were opened.
+    """Both stores of a segment, and its tokens, when they were opened.
 
     Attributes:
-        features: local ones.
-        entries: all else.
-        tokens: `[SEGMENT]` of the rows that are there; 0 = there is none.
+        features: local features.
+        entries: names, places and global descriptors.
+        tokens: `[SEGMENT]` of the rows that exist; 0 = no row.
         stamp: `file_stamp` of the file of tokens.
         is_held: rows may be added.
     """
@@ -161,21 +161,21 @@ class _Segment:
 
     @property
     def done(self) -> np.ndarray:
-        """`[SEGMENT]` bool, rows that are there."""
+        """`[SEGMENT]` bool, rows that exist."""
         return (self.tokens > 0) & self.entries.done
 
     @property
     def taken(self) -> np.ndarray:
-        """`[SEGMENT]` bool, rows that are there, or were begun, or are gone."""
+        """`[SEGMENT]` bool, rows that exist, or were begun, or are gone."""
         return (self.tokens > 0) | self.features.done | self.entries.done
 
     @property
     def is_current(self) -> bool:
-        """Whether nothing was added or replaced since: the file of tokens would have grown, or be another."""
+        """Whether nothing was added or replaced since: that changes the file of tokens."""
         return self.is_held or self.stamp == file_stamp(self.folder / _TOKENS)
 
     def add(self, first: int, items: Sequence[tuple[Features, Entry]]) -> range:
-        """Rows of images that are now on disk, from the first on."""
+        """Write images to disk, from row `first` on; returns their rows."""
         rows = range(first, first + len(items))
         new = np.random.default_rng().integers(1, 2**64 - 1, len(items), np.uint64)
         self.tokens[first : rows.stop] = new
@@ -198,17 +198,17 @@ class _Segment:
         return rows
 
     def check(self) -> None:
-        """Compare the files that are there with the tokens.
+        """Compare the files with the tokens.
 
         Raises:
-            InputError: one of the two files of a row is gone, or that of the tokens is gone or was cut.
+            InputError: one of the two files of a row is gone, or the file of tokens is gone or was cut.
         """
         path = self.folder / _TOKENS
         stamp = file_stamp(path)  # the rows were listed earlier, and an add grows this file before it writes rows
         if self.entries.done.any() and stamp is None:
             raise InputError(f"{path}: expected a file, got none. Put it back.")
-        whole = np.flatnonzero(self.features.done & self.entries.done)
-        if stamp and len(lost := whole[(whole + 1) * _TOKEN.itemsize - 1 > stamp[0]]):
+        rows = np.flatnonzero(self.features.done & self.entries.done)
+        if stamp and len(lost := rows[(rows + 1) * _TOKEN.itemsize - 1 > stamp[0]]):
             raise InputError(f"{path}: expected tokens of rows up to {lost[-1]}, got a file that was cut to {stamp[0]} "
                              f"bytes. Put it back, or delete the files of {len(lost)} rows from {lost[0]} on in "
                              f"{self.features.folder} and {self.entries.folder}, which leaves them out.")  # fmt: skip
@@ -224,32 +224,30 @@ class _Segment:
 
 @dataclass(eq=False)
 class MapRows:
-    """The rows of the map in a folder, which need not be there before the first is added.
+    """The rows of the map in a folder, which may be missing until the first is added, within `hold_map`.
 
     Attributes:
         folder: of the map.
-        recipe: what its rows are made with (JSON values): another is refused.
-
-    Rows are added within `hold_map`.
+        recipe: of its rows (JSON values): a map with another recipe is refused.
     """
 
     folder: Path
     recipe: Mapping[str, Any]
     _segments: list[_Segment] = field(default_factory=list, repr=False)
     _known: list[np.ndarray] = field(default_factory=list, repr=False)  # by segment, the rows that `new` gave
-    _held: ExitStack | None = field(default=None, repr=False)
+    _stack: ExitStack | None = field(default=None, repr=False)  # of stores that are entered, within `adding`
 
     def __post_init__(self) -> None:
         self.folder = self.folder.absolute()  # the working directory may change
 
     def new(self) -> Iterator[tuple[int, Entry]]:
-        """(row, entry) of all rows that were not given before, in their order.
+        """(row, entry) of all rows since the last call, in their order.
 
         Raises:
-            InputError: they were made with something else, or are damaged, or rows that were given are others now.
+            InputError: the map has another recipe, is damaged, or was replaced.
         """
         if self._segments:
-            self._open(0)  # full or not: all maps have this one, so it tells whether the map was replaced
+            self._open(0)  # all maps have this segment: it shows whether the map was replaced
         number = next((number for number, known in enumerate(self._known) if not known.all()), len(self._known))
         while self._open(number):
             segment, known = self._segments[number], self._known[number]
@@ -261,7 +259,7 @@ class MapRows:
             number += 1
 
     def counts(self, rows: Iterable[int]) -> np.ndarray:
-        """`[n]` keypoints of rows, -1 = a row is not there."""
+        """`[n]` numbers of keypoints of rows, -1 = no such row."""
         row_numbers = np.fromiter(rows, int)
         counts = np.full(len(row_numbers), -1)
         for number in np.unique(row_numbers // SEGMENT):
@@ -270,43 +268,42 @@ class MapRows:
         return counts
 
     def features(self, rows: Sequence[int]) -> Iterator[tuple[int, Features]]:
-        """(row, features) of rows that are there, in no order.
+        """(row, features) of existing rows, in no order.
 
         Raises:
-            InputError: they are damaged, or were and are gone.
+            InputError: rows are damaged, or were removed.
         """
         segments: dict[int, list[int]] = {}
         for row in rows:
             segments.setdefault(row // SEGMENT, []).append(row % SEGMENT)
-        for number, own in segments.items():
-            if gone := [row for row in own if not self._segments[number].done[row]]:
+        for number, segment_rows in segments.items():
+            if gone := [row for row in segment_rows if not self._segments[number].done[row]]:
                 raise InputError(f"{self.folder}: expected features of row {number * SEGMENT + gone[0]}, got none. "
                                  "Open the map again, without rows that were deleted.")  # fmt: skip
-            for row, features in self._segments[number].features.read(own):
+            for row, features in self._segments[number].features.read(segment_rows):
                 yield number * SEGMENT + row, features
 
     @contextmanager
     def adding(self) -> Iterator[None]:
-        """Hold the rows, so that nobody else adds any.
+        """Lock the rows for `add`.
 
         Raises:
-            InputError: another process does, the map is of something else, or its folder cannot be written.
+            InputError: another process has the lock, the map has another recipe, or its folder cannot be written.
         """
-        with ExitStack() as held:
-            self._held = held
+        with ExitStack() as self._stack:
             try:
                 self._hold_last()
                 yield
             finally:
-                self._held = None
+                self._stack = None
                 for segment in self._segments:
                     segment.is_held = False
 
     def add(self, items: Sequence[tuple[Features, Entry]]) -> list[int]:
-        """Rows of images that are now on disk; within `adding`.
+        """Write images to disk, within `adding`; returns their rows.
 
         Raises:
-            InputError: the disk is full, or cannot be written. Rows from before stay.
+            InputError: the disk is full, or cannot be written. Earlier rows stay.
         """
         rows: list[int] = []
         while len(rows) < len(items):
@@ -316,15 +313,15 @@ class MapRows:
         return rows
 
     def _hold_last(self) -> tuple[int, int]:
-        """The last segment, held, and its first free row."""
-        if self._held is None:
+        """Lock the last segment; returns its number and its first free row."""
+        if self._stack is None:
             raise ValueError(f"{self.folder}: rows are added within `adding`")
         number = max(0, len(self._segments) - 1)
         while True:
-            segment = self._opened(number)
+            segment = self._reopen(number)
             if not segment.is_held and not segment.taken[-1]:
                 for store in (segment.features, segment.entries):
-                    self._held.enter_context(store)
+                    self._stack.enter_context(store)
                 with told(segment.folder, MAP.content):
                     (segment.folder / _TOKENS).touch()
                 segment.is_held = True
@@ -333,17 +330,16 @@ class MapRows:
             number += 1
 
     def _open(self, number: int) -> bool:
-        """Have a segment as it is on disk; False where there never was one."""
+        """Open a segment, unless it is current; False if there never was one."""
         is_open = number < len(self._segments)
         if is_open and self._segments[number].is_current:
             return True
-        there = is_open or _segment_folder(self.folder, number).is_dir()
-        if there:
-            self._opened(number)
-        return there
+        if exists := is_open or _segment_folder(self.folder, number).is_dir():
+            self._reopen(number)
+        return exists
 
-    def _opened(self, number: int) -> _Segment:
-        """A segment as it is on disk."""
+    def _reopen(self, number: int) -> _Segment:
+        """Read the state of a segment on disk."""
         before = self._segments[number] if number < len(self._segments) else None
         if before is not None and before.is_held:
             return before
@@ -370,7 +366,7 @@ class MapRows:
 
 
 def file_stamp(path: Path) -> tuple[int, ...] | None:
-    """Size of a file in bytes, and what else differs where another file replaces it; None = there is no file."""
+    """Size in bytes, inode and time of a file, which change when the file is replaced; None = no file."""
     with told(path.parent, MAP.content):
         try:
             status = path.stat()
@@ -380,8 +376,8 @@ def file_stamp(path: Path) -> tuple[int, ...] | None:
 
 
 def _read_tokens(path: Path) -> tuple[np.ndarray, tuple[int, ...] | None]:
-    """`[SEGMENT]`, 0 beyond the end of the file, and the `file_stamp` of the file."""
-    tokens, stamp = np.zeros(SEGMENT, _TOKEN), file_stamp(path)  # first the stamp: what comes later is noticed
+    """`[SEGMENT]` tokens, 0 beyond the end of the file, and the `file_stamp` of the file."""
+    tokens, stamp = np.zeros(SEGMENT, _TOKEN), file_stamp(path)  # the stamp first: later changes are noticed
     with told(path.parent, MAP.content):
         content = path.read_bytes() if stamp else b""
     stored = np.frombuffer(content, _TOKEN, len(content) // _TOKEN.itemsize)

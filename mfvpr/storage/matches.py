@@ -1,13 +1,13 @@
-"""Matches of all queries with their candidates on disk: matched once, read by every sweep of parameters.
+"""Matches of all queries with their candidates on disk, read by every sweep of parameters.
 
     with open_match_store(path, recipe, num_queries=Q, num_candidates=C) as store:
         store.write({row: query_matches})  # batch by batch, the rows that are not done
         for row, query_matches in store.read():
             ...
 
-A row store (`mfvpr.storage.rows`) that gives back the very same bits. Its rows are the fields of QueryMatches, and
-those of its Matches that are there, by their names. They are compressed, since points of the query come again with
-every candidate: a match takes about 23 bytes of the 32 that it has.
+A row store (`mfvpr.storage.rows`) that gives back the same bits. A row holds the fields of QueryMatches and of its
+Matches by name, except fields that are None. Files are compressed, since every candidate repeats points of the query: a
+match takes about 23 bytes instead of 32.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,7 +27,6 @@ _OF_QUERY = ("counts", "indices", "filter_scores")
 _OF_MATCHES = tuple(part.name for part in fields(Matches) if part.name != "mask")  # there is no padding
 _NUM_ARRAYS = len(_OF_QUERY + _OF_MATCHES)
 
-
 MatchStore = RowStore[QueryMatches]
 
 
@@ -39,11 +38,11 @@ def open_match_store(
     num_candidates: int,
     **options: Any,
 ) -> MatchStore:
-    """The store in `folder`; `with` it, rows are written, and while it lacks queries no other process can do so.
+    """The store in `folder`. `with store:` locks it for writing, unless it is complete.
 
     Args:
         folder: see `manifest.store_path`, with the kind `MATCHES`.
-        recipe: what the matches are made from (JSON values only): features, shortlist, settings. Kept in plain text.
+        recipe: of the matches (JSON values only): features, shortlist, settings. Kept in plain text.
         num_queries: Q.
         num_candidates: C.
         **options: `waiting` and `shard` of `rows.open_rows`.
@@ -56,26 +55,26 @@ def open_match_store(
 
 
 class StoredMatches(Sequence[Matches]):
-    """Matches of some queries of a store, as in QueryMatches: read whenever they are asked for."""
+    """Matches of queries of a store, as in QueryMatches: every access reads them."""
 
     def __init__(self, store: MatchStore, rows: Sequence[int]) -> None:
-        """Of rows that are done."""
+        """Take the rows, which are done, of the queries."""
         self._store, self._rows = store, rows
 
     def __len__(self) -> int:
         return len(self._rows)
 
     def __getitem__(self, query: Any) -> Matches:
-        """Of one query; there are no slices."""
-        [(_, found)] = self._store.read([self._rows[query]])
-        return found.matches
+        """Matches of one query; slices are not supported."""
+        [(_, query_matches)] = self._store.read([self._rows[query]])
+        return query_matches.matches
 
     def __iter__(self) -> Iterator[Matches]:
-        return (found.matches for _, found in self._store.read(self._rows))
+        return (query_matches.matches for _, query_matches in self._store.read(self._rows))
 
 
 def forecast_bytes(num_queries: int, num_candidates: int, matches_per_candidate: float) -> int:
-    """Bytes on disk that queries with so many matches take at most."""
+    """Bytes on disk, at most, of the matches of queries."""
     return num_queries * row_bytes(num_candidates * (40 * matches_per_candidate + 24) + 8, _NUM_ARRAYS)
 
 
@@ -85,8 +84,8 @@ def _pack(num_candidates: int, query: QueryMatches) -> dict[str, np.ndarray]:
         raise ValueError("expected real matches, as many as counted")
     if not query.counts.shape == query.indices.shape == query.filter_scores.shape == (num_candidates,):
         raise ValueError(f"expected {num_candidates} candidates")
-    found = {name: getattr(flat, name) for name in _OF_MATCHES} | {name: getattr(query, name) for name in _OF_QUERY}
-    return {name: np.asarray(values) for name, values in found.items() if values is not None}
+    parts = {name: getattr(flat, name) for name in _OF_MATCHES} | {name: getattr(query, name) for name in _OF_QUERY}
+    return {name: np.asarray(values) for name, values in parts.items() if values is not None}
 
 
 def _unpack(parts: Mapping[str, np.ndarray]) -> QueryMatches:

@@ -1,9 +1,9 @@
-"""Rows of arrays on disk, for whoever makes them slowly and reads them often: the common part of all stores.
+"""Rows of arrays on disk, written once and read often: the common part of all stores.
 
-A store is a folder with a manifest, which says what the rows were made from, and one file for each row that is done:
-`<row>-<entries>.npz` (`mfvpr.utils.arrays`). A file appears as a whole, when it is on disk, so a process may be killed
-at any moment, and the next one goes on. A file knows its store and its row: exchanged ones are noticed like damaged
-ones. Shards write stores of their own in the folder `shards` of a store, and whoever reads sees one.
+A store is a folder with a manifest, which holds the recipe of the rows, and one file for each row that is done:
+`<row>-<entries>.npz` (`mfvpr.utils.arrays`). A file appears when all of it is on disk, so a process may be killed at
+any moment, and the next one goes on. A file knows its store and its row: exchanged files are noticed like damaged ones.
+Shards write stores of their own in the folder `shards` of a store; readers see one store.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -17,7 +17,7 @@ import numpy as np
 
 from mfvpr.storage.disk import free_bytes, locked, told, too_full, used_bytes
 from mfvpr.storage.manifest import Kind, check_owned, is_settled, leave_manifest, manifest_of, settle_manifest
-from mfvpr.storage.places import SHARDS, Places, places
+from mfvpr.storage.row_files import SHARDS, RowFiles, list_rows
 from mfvpr.storage.shards import Shard
 from mfvpr.utils.arrays import read_arrays, write_arrays
 from mfvpr.utils.errors import InputError
@@ -34,16 +34,16 @@ Parts = Mapping[str, np.ndarray]
 
 @dataclass(eq=False)
 class RowStore(Generic[Item]):
-    """A store; made by `open_rows`.
+    """A store, see `open_rows`.
 
-    Anybody reads it, also while another process adds to it. Rows are written `with store:`, which holds it alone where
-    some are not done.
+    Any process may read it, also while another one writes. Rows are written `with store:`, which locks a store that is
+    not complete.
 
     Attributes:
-        folder: where it is, absolute.
-        kind: what it holds.
+        folder: absolute path.
+        kind: of its content.
         sizes: lengths of axes by name, first M.
-        shard: which writes, into a folder of its own; None = whoever alone makes the store.
+        shard: that writes, into a folder of its own; None = one process writes the whole store.
         tokens: `[M]` a number of each row that its file knows as well: a file of the same name that was written with
             another number is a damaged one. None = names alone tell rows apart.
     """
@@ -57,55 +57,54 @@ class RowStore(Generic[Item]):
     _pack: Callable[[Item], Parts] = field(repr=False)
     _unpack: Callable[[Parts], Item] = field(repr=False)
     tokens: np.ndarray | None = field(default=None, repr=False)
-    _places: Places = field(init=False, repr=False)
+    _files: RowFiles = field(init=False, repr=False)
     _layout: dict[str, str] | None = field(default=None, repr=False)
     _is_writable: bool = field(default=False, repr=False)
-    _held: list[ExitStack] = field(default_factory=list, repr=False)  # of the blocks that are entered
+    _blocks: list[ExitStack] = field(default_factory=list, repr=False)  # that are entered
 
     def __enter__(self) -> Self:
-        """Hold the store alone, unless all rows are done; what another process made meanwhile is done as well.
+        """Lock the store, unless all rows are done, and find the rows that were written meanwhile.
 
         Raises:
             InputError: in use by another process, or the folder cannot be written.
         """
-        with ExitStack() as held, told(self.folder, self.kind.content):
-            if not self._held:
+        with ExitStack() as stack, told(self.folder, self.kind.content):
+            if not self._blocks:
                 self.look()
             if not self._is_writable and not self.done.all():
                 if self.shard is not None:
                     leave_manifest(self.folder, self.kind, self._manifest)
                 self.own.mkdir(parents=True, exist_ok=True)
-                held.enter_context(locked(self.own, self.kind.content, self._waiting))
+                stack.enter_context(locked(self.own, self.kind.content, self._waiting))
                 settle_manifest(self.own, self.kind, self._manifest)
                 self.look()
-                held.callback(setattr, self, "_is_writable", False)
+                stack.callback(setattr, self, "_is_writable", False)
                 self._is_writable = True
-            self._held.append(held.pop_all())
+            self._blocks.append(stack.pop_all())
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._held.pop().close()
+        self._blocks.pop().close()
 
     @property
     def own(self) -> Path:
-        """Where rows are written."""
+        """The folder in which rows are written."""
         return self.folder if self.shard is None else self.folder / SHARDS / self.shard.folder
 
     @property
     def counts(self) -> np.ndarray:
-        """`[M]` int32 entries of each row, -1 = not done, as they were when the store was opened, last entered, or
-        looked at. To be read only."""
-        return self._places.counts
+        """`[M]` int32 entries of each row, -1 = not done, when the store was last opened, entered or looked at."""
+        return self._files.counts
 
     def look(self) -> None:
-        """See what is done by now, as the names of the files tell.
+        """Find the rows that are done by now.
 
         Raises:
             InputError: made from something else.
         """
         with told(self.folder, self.kind.content):
-            known = is_settled(self.folder, self.kind, self._manifest)
-            self._places = places(self.folder, next(iter(self.sizes.values())), own=self.own, known=known)
+            num_rows, is_known = next(iter(self.sizes.values())), is_settled(self.folder, self.kind, self._manifest)
+            self._files = list_rows(self.folder, num_rows, write_folder=self.own, is_known=is_known)
 
     @property
     def done(self) -> np.ndarray:
@@ -125,8 +124,8 @@ class RowStore(Generic[Item]):
 
         Raises:
             InputError: the disk is full, or cannot be written: rows done before stay intact. Or a row has other arrays
-                than those before it.
-            ValueError: a row that is done or does not exist, what cannot be stored, or a store that is not held.
+                than the rows before it.
+            ValueError: a row is done or does not exist, an item cannot be stored, or the store is not entered.
         """
         if items:
             self.write_packed(self.pack(items))
@@ -137,12 +136,12 @@ class RowStore(Generic[Item]):
             raise ValueError(f"{self.folder}: row {refused[0]} is done or does not exist")
         if not self._is_writable:
             raise ValueError(f"{self.folder}: is read only, or was complete; write `with store:`")
-        rows = {row: self._packed(row, item) for row, item in items.items()}
+        rows = {row: self._pack_row(row, item) for row, item in items.items()}
         self._check_layouts(rows)
         return rows
 
     def write_packed(self, rows: Mapping[int, Parts]) -> None:
-        """Store what `pack` gave, as `write` does."""
+        """Store the result of `pack`, as `write` does."""
         sizes = {row: row_bytes(sum(part.nbytes for part in parts.values()), len(parts)) for row, parts in rows.items()}
         missing = partial(self._missing_bytes, sizes)
         with told(self.folder, self.kind.content, missing):
@@ -150,12 +149,13 @@ class RowStore(Generic[Item]):
                 pass
 
     def read(self, rows: Iterable[int] | None = None) -> Iterator[tuple[int, Item]]:
-        """(row, item) of rows that are done, by default of all; some are read ahead on threads.
+        """(row, item) of rows that are done, by default of all; threads read ahead.
 
         Raises:
-            InputError: some are damaged on disk; all that are asked for are looked at, none is given after the first,
-                and they are removed, so that the next run makes them anew, where it can. Or the disk cannot be read.
-            ValueError: a row that is not done.
+            InputError: rows are damaged on disk, or the disk cannot be read. All rows are read before the error is
+                raised, but none is yielded after the first damaged one. Damaged rows are removed if a run can make
+                them again.
+            ValueError: a row is not done.
         """
         rows = np.flatnonzero(self.done).tolist() if rows is None else list(rows)
         if missing := [row for row in rows if self.counts[row] < 0]:
@@ -163,7 +163,7 @@ class RowStore(Generic[Item]):
         damaged: dict[int, Path] = {}
         for row, item in zip(rows, ordered_map(self._read_item, rows, workers=THREADS), strict=True):
             if item is None:
-                damaged[row] = self._places.path(row)
+                damaged[row] = self._files.path(row)
             elif not damaged:
                 yield row, item
         if damaged:
@@ -173,7 +173,7 @@ class RowStore(Generic[Item]):
         token = "" if self.tokens is None else f" {self.tokens[row]:x}"
         return f"{self._manifest['fingerprint']} {path.name}{token}"
 
-    def _packed(self, row: int, item: Item) -> Parts:
+    def _pack_row(self, row: int, item: Item) -> Parts:
         try:
             return self._pack(item)
         except ValueError as error:
@@ -185,7 +185,7 @@ class RowStore(Generic[Item]):
     def _write_row(self, row_parts: tuple[int, Parts]) -> None:
         row, parts = row_parts
         count = len(next(iter(parts.values())))
-        path = self._places.add(row, count, self.own)
+        path = self._files.add(row, count, self.own)
         write_arrays(path, parts, self._about(row, path), compress=self.kind.compress)
         self.counts[row] = count
 
@@ -194,8 +194,8 @@ class RowStore(Generic[Item]):
         return None if parts is None else self._unpack(parts)
 
     def _read_parts(self, row: int) -> Parts | None:
-        """None where the file is damaged, or another's, or gone."""
-        path = self._places.path(row)
+        """Arrays by name; None if the file is damaged, or of another row, or gone."""
+        path = self._files.path(row)
         with told(self.folder, self.kind.content):
             try:
                 return read_arrays(path, self._about(row, path))
@@ -203,7 +203,7 @@ class RowStore(Generic[Item]):
                 return None
 
     def _check_layouts(self, rows: Mapping[int, Parts]) -> None:
-        """What one row has, all have: nothing is lost, or made up, where rows are put together."""
+        """Refuse rows whose arrays differ from the other rows: they could not be put together."""
         layouts = {row: _layout_of(parts) for row, parts in rows.items()}
         expected = self._layout or self._stored_layout() or next(iter(layouts.values()))
         for row, layout in layouts.items():
@@ -213,11 +213,11 @@ class RowStore(Generic[Item]):
         self._layout = expected
 
     def _stored_layout(self) -> dict[str, str] | None:
-        found = (self._read_parts(row) for row in np.flatnonzero(self.done).tolist())
-        return next((_layout_of(parts) for parts in found if parts), None)
+        rows = map(self._read_parts, np.flatnonzero(self.done).tolist())
+        return next((_layout_of(parts) for parts in rows if parts), None)
 
     def _remove(self, damaged: Mapping[int, Path]) -> str:
-        """What is told of damaged rows, which are no longer done where they can be made anew."""
+        """Remove damaged rows if a run can make them again; returns the message."""
         row, path = next(iter(damaged.items()))
         if self.kind.remake is None:
             mend = "put back the files that were written here, or delete these to leave the rows out"
@@ -247,17 +247,17 @@ def open_rows(
     shard: Shard | None = None,
     tokens: np.ndarray | None = None,
 ) -> RowStore[Item]:
-    """The store in `folder`, which need not be there before the first row is written, nor be writable when all are.
+    """The store in `folder`, which may be missing until the first row is written, and read-only when all are.
 
     Args:
         folder: see `manifest.store_path`.
-        kind: what it holds.
-        recipe: what the rows are made from (JSON values only). Kept in plain text.
-        sizes: lengths of axes by name, first that of the rows.
-        pack: what is stored of an item, arrays by name; the first has a value for each of the row's entries.
-        unpack: the item again.
-        waiting: whoever writes waits for a process that does, and is told, in one line, for which; None = refuses.
-        shard: which writes, beside others.
+        kind: of its content.
+        recipe: of the rows (JSON values only). Kept in plain text.
+        sizes: lengths of axes by name, the first is the number of rows.
+        pack: item -> arrays by name; the first has a value for each of the row's entries.
+        unpack: arrays by name -> item.
+        waiting: called with one line that names the process that a writer waits for; None = refuse a store in use.
+        shard: that writes, beside others.
         tokens: see `RowStore`.
 
     Raises:
@@ -272,15 +272,15 @@ def open_rows(
 
 
 def row_bytes(num_bytes: float, num_arrays: int) -> int:
-    """Bytes on disk that a row takes at most whose values take `num_bytes`."""
+    """Bytes on disk, at most, of a row with values of `num_bytes`."""
     return -(-int(num_bytes + num_arrays * ARRAY_OVERHEAD) // BLOCK) * BLOCK
 
 
 def require_space(folder: Path, num_bytes: int) -> None:
-    """Refuse to start what will not fit.
+    """Refuse to start a write that will not fit.
 
     Raises:
-        InputError: less than `num_bytes` are free where `folder` is, or will be.
+        InputError: less than `num_bytes` are free on the disk of `folder`.
     """
     free = free_bytes(folder)
     if free < num_bytes:
@@ -288,5 +288,5 @@ def require_space(folder: Path, num_bytes: int) -> None:
 
 
 def _layout_of(parts: Parts) -> dict[str, str]:
-    """What rows have in common: names, types and lengths of axes but for the first."""
+    """Names, types and all but the first lengths of arrays: they are the same in all rows."""
     return {name: f"{part.dtype}{list(part.shape[1:])}" for name, part in parts.items()}

@@ -1,7 +1,7 @@
-"""Scores of all queries' candidates on disk, of shards: computed once, read by whichever comes last.
+"""Scores of all queries' candidates on disk: shards compute them, the last shard reads them all.
 
-A row store (`mfvpr.storage.rows`), whose rows are the `scores` float32 `[S, C]` of a query's candidates by S scorers,
-to the bit, and the `indices` int32 `[C]` of these.
+A row store (`mfvpr.storage.rows`). A row holds the `scores` float32 `[S, C]` of a query's candidates by S scorers, to
+the bit, and the `indices` int32 `[C]` of the candidates.
 """
 
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from mfvpr.storage.rows import RowStore, open_rows
 
 
 class QueryScores(NamedTuple):
-    """Of one query; see above."""
+    """The scores and candidates of one query: `[S, C]` and `[C]`."""
 
     scores: np.ndarray
     indices: np.ndarray

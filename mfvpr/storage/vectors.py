@@ -1,6 +1,6 @@
-"""Global descriptors of the images of one folder on disk: described once, read by every later run.
+"""Global descriptors of the images of one folder on disk, read by every later run.
 
-A row store (`mfvpr.storage.rows`), whose rows are a `vector` float32 `[D]` or several `[V, D]`, to the bit.
+A row store (`mfvpr.storage.rows`). A row holds one `vector` float32 `[D]`, or several `[V, D]`, to the bit.
 """
 
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ def open_vector_store(folder: Path, recipe: Mapping[str, Any], *, num_images: in
 
 
 def forecast_bytes(num_images: int, size: int) -> int:
-    """Bytes on disk that vectors of so many numbers take at most."""
+    """Bytes on disk, at most, of one vector of `size` numbers per image."""
     return num_images * row_bytes(4 * size, 1)
 
 
