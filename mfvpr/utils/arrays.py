@@ -1,6 +1,6 @@
-"""Arrays in one file that is whole, unchanged and the one that was meant; or an error.
+"""Files of arrays that notice damage and exchange.
 
-The file is NumPy's own `.npz` (`numpy.load` reads it) that ends with a digest of what it holds and of what it is about.
+The file is NumPy's own `.npz` (`numpy.load` reads it) that ends with a digest of its content and of a label.
 """
 
 import hashlib
@@ -18,23 +18,23 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import replacing
 
 _DIGEST = hashlib.sha256().digest_size
-# NumPy reads the headers of arrays by `ast.parse`, which fails now and then where several threads call it at the same
-# time (SystemError: AST constructor recursion depth mismatch; Python 3.11).
+# NumPy reads the headers of arrays by `ast.parse`, which sometimes fails when several threads call it at the same time
+# (SystemError: AST constructor recursion depth mismatch; Python 3.11).
 _PARSING = threading.Lock()
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: str = "", *, compress: bool = False) -> None:
-    """Write arrays by name. When this returns they are on disk; until then, whatever was there before.
+    """Write arrays by name. When this returns they are on disk; until then, the file before stays.
 
     Args:
         path: `.npz`.
         arrays: of numbers, flags or text.
-        about: what the arrays are of; who reads them must say the same, so exchanged files are noticed.
-        compress: worth its time where values come again; numbers that look random shrink by a tenth.
+        about: label of the arrays; `read_arrays` must get the same, so exchanged files are noticed.
+        compress: for values that repeat; numbers that look random shrink by a tenth only.
 
     Raises:
         OSError: the disk is full, or cannot be written.
-        ValueError: an array of Python objects.
+        ValueError: there is an array of Python objects.
     """
     buffer = io.BytesIO()
     kind = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
@@ -52,29 +52,30 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: str = "", 
 
 
 def read_arrays(path: Path, about: str = "") -> dict[str, np.ndarray]:
-    """What `write_arrays` wrote.
+    """Read the arrays of `write_arrays`.
 
     Raises:
-        InputError: any bit differs, or the arrays are about something else.
+        InputError: any bit differs, or the arrays have another label.
         OSError: there is no such file, or it cannot be read.
     """
     content = path.read_bytes()
-    whole = memoryview(content)
-    if whole[-_DIGEST:] != _digest(whole[:-_DIGEST], about):
+    view = memoryview(content)
+    if view[-_DIGEST:] != _digest(view[:-_DIGEST], about):
         raise InputError(f"{path}: expected arrays as they were written here, got others or damaged ones; delete it")
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         return {
-            member.filename.removesuffix(".npy"): _array(_values(archive, member, whole)) for member in archive.filelist
+            member.filename.removesuffix(".npy"): _array(_bytes_of(archive, member, view))
+            for member in archive.filelist
         }
 
 
-def _values(archive: zipfile.ZipFile, member: zipfile.ZipInfo, whole: memoryview) -> bytes | memoryview:
-    """What a member holds; where it is as it stands in the file, without another checksum and two copies."""
+def _bytes_of(archive: zipfile.ZipFile, member: zipfile.ZipInfo, view: memoryview) -> bytes | memoryview:
+    """The bytes of a member; uncompressed ones straight from the view, without another checksum and two copies."""
     if member.compress_type != zipfile.ZIP_STORED:
         return archive.read(member)
-    name, extra = (int.from_bytes(whole[member.header_offset + at :][:2], "little") for at in (26, 28))
+    name, extra = (int.from_bytes(view[member.header_offset + at :][:2], "little") for at in (26, 28))
     start = member.header_offset + 30 + name + extra
-    return whole[start : start + member.file_size]
+    return view[start : start + member.file_size]
 
 
 def _array(member: bytes | memoryview) -> np.ndarray:
@@ -85,7 +86,7 @@ def _array(member: bytes | memoryview) -> np.ndarray:
 
 @lru_cache(256)
 def _header(header: bytes) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """What stands before an array's values: rows of one store have few different ones, and NumPy is slow to read them.
+    """The header of an array, cached: rows of one store have few different ones, and NumPy reads them slowly.
 
     Raises:
         ValueError: another version of the format, or an array of Python objects.

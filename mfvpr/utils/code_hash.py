@@ -1,14 +1,14 @@
-"""What the methods of a class do, as far as they say it themselves: so that changed code is not taken for the old.
+"""The code of a user's class as JSON values, so that results of changed code are not reused.
 
-It is what runs that counts (instructions, constants, names, defaults, and what a function closes over), and the text
-of the class where there is one: a file may have been edited since it was read. What methods call is not looked at.
-Class attributes count as well. Private attributes count if they hold values and no name says `cache`.
+Compiled functions count (instructions, constants, names, defaults, closures), and the source text of the class if there
+is one. Both are needed: a file may have been edited since it was imported, and closures are not in the text. Functions
+that methods call do not count. Class attributes count, private ones if they are values and not named `cache`.
 """
 
 import functools
 import inspect
 from collections.abc import Callable
-from types import CodeType, FunctionType
+from types import CellType, CodeType, FunctionType
 from typing import Any
 
 import jax
@@ -19,11 +19,11 @@ _CONSTANTS = (*_PLAIN, np.ndarray, np.generic, jax.Array, tuple, list, dict, set
 
 
 def behavior_of(kind: type, recipe_of: Callable[[Any], Any]) -> list[Any]:
-    """In JSON's terms.
+    """The code of a class without its bases.
 
     Args:
-        kind: a class, without its bases.
-        recipe_of: what stands for an array.
+        kind: the class.
+        recipe_of: array -> JSON values.
     """
     parts = [[name, _part(part, recipe_of, ())] for name, part in sorted(vars(kind).items()) if _counts(name, part)]
     return [kind.__qualname__, _text(kind), parts]
@@ -32,20 +32,20 @@ def behavior_of(kind: type, recipe_of: Callable[[Any], Any]) -> list[Any]:
 def _text(kind: type) -> str:
     try:
         return inspect.getsource(kind)
-    except (OSError, TypeError):  # typed into a terminal, or made by a program
+    except (OSError, TypeError):  # typed into a terminal, or created by `type`
         return ""
 
 
 def _counts(name: str, part: Any) -> bool:
-    """Functions and attributes, except Python's notes (`__doc__`), and private caches and objects."""
+    """True for functions and attributes, except names like `__doc__`, private caches and private objects."""
     if _functions(part) or isinstance(part, functools.partial) or not name.startswith("_"):
         return True
-    is_note = name.startswith("__") and name.endswith("__")
-    return isinstance(part, _CONSTANTS) and not is_note and "cache" not in name.lower()
+    is_dunder = name.startswith("__") and name.endswith("__")
+    return isinstance(part, _CONSTANTS) and not is_dunder and "cache" not in name.lower()
 
 
 def _functions(part: Any) -> list[Any]:
-    """Those of a method, a property, or of what wraps one."""
+    """The functions of a method, of a property, or inside a wrapper."""
     if isinstance(part, property):
         return [function for function in (part.fget, part.fset, part.fdel) if function is not None]
     inner = getattr(part, "func", None) if isinstance(part, functools.cached_property) else None
@@ -58,9 +58,9 @@ def _part(part: Any, recipe_of: Callable[[Any], Any], seen: tuple[int, ...]) -> 
         return "itself"
     seen = (*seen, id(part))
     if isinstance(part, FunctionType):
-        closure = [cell.cell_contents for cell in part.__closure__ or () if _is_filled(cell)]
-        held = [part.__defaults__ or (), part.__kwdefaults__ or {}, *closure]
-        return [_part(value, recipe_of, seen) for value in (part.__code__, *held)]
+        closure = [cell.cell_contents for cell in part.__closure__ or () if cell != CellType()]  # an empty cell
+        values = [part.__code__, part.__defaults__ or (), part.__kwdefaults__ or {}, *closure]
+        return [_part(value, recipe_of, seen) for value in values]
     if isinstance(part, CodeType):
         constants = [_part(value, recipe_of, seen) for value in part.co_consts]
         return [part.co_code.hex(), list(part.co_names), list(part.co_varnames), constants]
@@ -79,11 +79,3 @@ def _part(part: Any, recipe_of: Callable[[Any], Any], seen: tuple[int, ...]) -> 
     if isinstance(part, np.ndarray | np.generic | jax.Array):
         return recipe_of(part)
     return part.__qualname__ if isinstance(part, type) else type(part).__qualname__
-
-
-def _is_filled(cell: Any) -> bool:
-    try:
-        _ = cell.cell_contents
-    except ValueError:  # not yet
-        return False
-    return True

@@ -1,17 +1,17 @@
-"""What a user got wrong, as opposed to what we did."""
+"""Errors of the user's input, as opposed to errors of this library."""
 
 from typing import Any, get_args
 
 
 class InputError(ValueError):
-    """Input that cannot be used. The message is one line: what, expected, got, and the mend."""
+    """Input that cannot be used. The message is one line: argument, expected, got, and how to fix it."""
 
 
 class NoGradientError(InputError):
-    """A derivative of what has none was asked for."""
+    """A derivative of a function that has none."""
 
 
 def require_word(name: str, word: Any, words: Any) -> None:
-    """Refuse an argument that is none of the words of a `Literal`."""
+    """Refuse an argument that is not among the words of a `Literal`."""
     if word not in get_args(words):
         raise InputError(f"{name}={word!r}: expected one of {', '.join(get_args(words))}")

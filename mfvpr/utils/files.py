@@ -1,4 +1,4 @@
-"""Files that are whole or not there at all."""
+"""Atomic writes, and checks of paths and names of files."""
 
 import os
 import re
@@ -24,7 +24,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def placing(path: Path) -> Iterator[Path]:
-    """As `replacing`, but what is there stays: of several that try at the same time, the first counts."""
+    """As `replacing`, but an existing file stays: of several processes at the same time, the first counts."""
     with _beside(path) as temporary:
         yield temporary
         temporary.chmod(0o644)
@@ -48,7 +48,7 @@ def require_file(path: Path, expected: str = "a file") -> None:
     """Refuse a path that is no regular file: a pipe would block its reader forever.
 
     Raises:
-        InputError: the path is something else, or there is nothing.
+        InputError: the path is something else, or does not exist.
     """
     if not path.is_file():
         got = "a folder" if path.is_dir() else "a pipe or device" if path.exists() else "nothing"
@@ -56,29 +56,28 @@ def require_file(path: Path, expected: str = "a file") -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove what `replacing` left below a folder when its process was killed; nobody may be writing there."""
+    """Remove temporary files of killed processes below a folder; no process may be writing there."""
     for path in folder.rglob(".*"):
         if _TEMPORARY.fullmatch(path.name) and path.is_file():
             path.unlink()
 
 
 def printable(text: str) -> str:
-    """`text` that any stream, figure or file of UTF-8 takes: what no UTF-8 stands for is written as \\udcXX.
+    """`text` for a stream, figure or file of UTF-8: characters that UTF-8 lacks are written as \\udcXX.
 
-    Such characters are how Python gives the bytes of a file name that is not UTF-8; in JSON, \\udcXX reads back as the
-    same name.
+    Python has these characters in file names that are not UTF-8; in JSON, \\udcXX reads back as the same name.
     """
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def clipped(text: str, most: int) -> str:
-    """`text` of at most so many characters, the middle left out."""
+    """`text` of at most `most` characters, without its middle."""
     half = (most - 1) // 2
     return text if len(text) <= most else f"{text[:half]}\N{HORIZONTAL ELLIPSIS}{text[-half:]}"
 
 
 def written_once(path: Path, text: str) -> str:
-    """What `path` holds: this `printable` text, where it was not there."""
+    """Write `printable` text unless the file exists; returns the text of the file."""
     with placing(path) as temporary:
         temporary.write_text(printable(text), encoding="utf-8")
     return path.read_text(encoding="utf-8")
@@ -91,16 +90,16 @@ def write_text(path: Path, text: str) -> None:
 
 
 def canonical_name(path: Path | str) -> str:
-    """Absolute path that is the same for every spelling: links to folders are followed, a link to a file is not."""
+    """Absolute path, the same for every spelling: links to folders are followed, a link to a file is not."""
     path = Path(path)
     return str(path.parent.resolve() / path.name)
 
 
 def below(root: Path, name: str) -> Path:
-    """The file of a folder that a name from elsewhere stands for, which may not be there; its links are followed.
+    """The path of a name from elsewhere below a folder; the file may be missing, links are followed.
 
     Raises:
-        InputError: a name that leads out of the folder: from another root, with "..", or by a link.
+        InputError: the name leads out of the folder: absolute, with "..", or by a link.
     """
     try:
         path = (root / name).resolve()

@@ -1,6 +1,6 @@
-"""What a result was made from, in words that JSON takes, and its hash: the only fingerprints there are.
+"""Recipes: everything that determines a result, as JSON values; and their hashes, the fingerprints.
 
-Stores, checkpoints and blocks are keyed by the recipe of what they hold, and compared with it, part by part.
+Stores and checkpoints are named by the fingerprint of their recipe, and compared with the recipe, part by part.
 """
 
 import functools
@@ -21,24 +21,23 @@ import numpy as np
 from mfvpr.utils.code_hash import behavior_of
 
 _ABSENT = object()
-_ADDRESS = re.compile(" at 0x[0-9a-f]+")  # of a network's functions, which every process has elsewhere
+_ADDRESS = re.compile(" at 0x[0-9a-f]+")  # of a network's functions: another one in every process
 
 
 def recipe_of(value: Any, of_path: Callable[[PurePath], Any] = str) -> Any:
-    """A value in JSON's terms, arrays by their content: what makes an extractor, a filter or a scorer what it is.
+    """The recipe of an extractor, a retrieval or a scorer: JSON values, with hashes of arrays.
 
-    Dataclasses are told by their class and fields, networks by their class and arrays; classes of one's own by their
-    code as well, see `mfvpr.utils.code_hash`, but neither by what that calls nor by attributes that are no fields.
-    Fields with the metadata `recipe` False (how many images go at a time, seconds) change nothing, and are left out.
+    A dataclass gives its class and fields, a network its class and arrays. Classes of users give their code as well
+    (`mfvpr.utils.code_hash`), but neither the functions that it calls nor attributes that are no fields. Fields with
+    the metadata `recipe` False (batch sizes, seconds) change no result and are left out.
 
     Args:
-        value: dataclasses, mappings, lists, arrays, networks, texts, numbers, paths, and what has a property `recipe`,
-            which then says all but the name of the class.
-        of_path: what stands for a path; keys of mappings are always told by their names.
+        value: dataclasses, mappings, lists, arrays, networks, texts, numbers, paths, and objects with a property
+            `recipe`, which gives everything but the name of the class.
+        of_path: path -> JSON values; paths that are keys of mappings stay texts.
 
     Raises:
-        TypeError: a part is none of these, such as a function: nobody knows what it does. A property `recipe` of its
-            class would say.
+        TypeError: a part is none of these, such as a function. Give its class a property `recipe`.
     """
     value = value.item() if isinstance(value, np.number) else value
     if value is None or isinstance(value, bool | int | float | str):
@@ -58,22 +57,22 @@ def recipe_of(value: Any, of_path: Callable[[PurePath], Any] = str) -> Any:
     arrays = leaves and all(isinstance(leaf, np.ndarray | np.generic | jax.Array) for leaf in leaves)
     if not arrays or isinstance(value, functools.partial):
         raise TypeError(f"{type(value).__name__}: expected a dataclass, arrays, or a property `recipe` that JSON takes")
-    own = {} if jax.tree_util.all_leaves([value]) else _class(type(value), of_path)
-    return own | {"sha256": content_hash(_ADDRESS.sub("", str(structure)), leaves)}
+    network = {} if jax.tree_util.all_leaves([value]) else _class(type(value), of_path)
+    return network | {"sha256": content_hash(_ADDRESS.sub("", str(structure)), leaves)}
 
 
 def _name(kind: type) -> str:
-    """Ours may move from module to module; two of others may have one name."""
+    """The name of a class, with its module unless the class is ours, which may move."""
     return kind.__qualname__ if _is_ours(kind) else f"{kind.__module__}.{kind.__qualname__}"
 
 
 def _class(kind: type, of_path: Callable[[PurePath], Any]) -> dict[str, Any]:
-    """Ours by its name; that of others by its behavior as well."""
+    """The recipe of a class: its name, and its code unless the class is ours."""
     if _is_ours(kind):
         return {"class": _name(kind)}
     bases = [base for base in kind.__mro__ if not _is_ours(base) and base is not object]
-    behavior = [behavior_of(base, lambda part: recipe_of(part, of_path)) for base in bases]
-    return {"class": _name(kind), "code": fingerprint(behavior)}
+    code = [behavior_of(base, lambda part: recipe_of(part, of_path)) for base in bases]
+    return {"class": _name(kind), "code": fingerprint(code)}
 
 
 def _is_ours(kind: type) -> bool:
@@ -96,21 +95,19 @@ def content_hash(*parts: Any) -> str:
     return digest.hexdigest()[:24]
 
 
-def difference(found: Any, expected: Any, name: str = "") -> str | None:
-    """What differs first in two JSON values, as `name=found, expected ...`; the names of `expected` come first."""
-    if isinstance(found, dict) and isinstance(expected, dict):
-        parts = [
-            (f"{name}.{key}".lstrip("."), found.get(key, _ABSENT), expected.get(key, _ABSENT))
-            for key in {**expected, **found}
-        ]
-    elif isinstance(found, list) and isinstance(expected, list):
-        pairs = itertools.zip_longest(found, expected, fillvalue=_ABSENT)
-        parts = [(f"{name}[{place}]", *pair) for place, pair in enumerate(pairs)]
-    elif type(found) is type(expected) and found == expected:
+def difference(value: Any, expected: Any, name: str = "") -> str | None:
+    """The first difference of two JSON values as `name=value, expected ...`; names in `expected` come first."""
+    if isinstance(value, dict) and isinstance(expected, dict):
+        keys = {**expected, **value}
+        parts = [(f"{name}.{key}".lstrip("."), value.get(key, _ABSENT), expected.get(key, _ABSENT)) for key in keys]
+    elif isinstance(value, list) and isinstance(expected, list):
+        pairs = itertools.zip_longest(value, expected, fillvalue=_ABSENT)
+        parts = [(f"{name}[{index}]", *pair) for index, pair in enumerate(pairs)]
+    elif type(value) is type(expected) and value == expected:
         return None
     else:
-        return f"{name}={shortened(found)}, expected {shortened(expected)}"
-    differences = (difference(one, other, part) for part, one, other in parts)
+        return f"{name}={shortened(value)}, expected {shortened(expected)}"
+    differences = (difference(part, expected_part, part_name) for part_name, part, expected_part in parts)
     return next(filter(None, differences), None)
 
 

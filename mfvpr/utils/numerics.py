@@ -1,4 +1,4 @@
-"""The few array idioms that every room shares: masked reductions, safe roots, capacities, and where `jit` begins."""
+"""Array helpers of all packages: masked reductions, safe roots, `compiled`, and properties of devices."""
 
 import os
 import re
@@ -18,7 +18,7 @@ from jax.typing import ArrayLike
 
 from mfvpr.utils.errors import NoGradientError
 
-if TYPE_CHECKING:  # which of jax's names is a class for whoever checks types
+if TYPE_CHECKING:  # type checkers do not see that `jax.Device` is a class
     from jaxlib._jax import Device
 else:
     Device = jax.Device
@@ -37,9 +37,9 @@ def masked(values: Array, mask: Array, fill: ArrayLike = 0.0) -> Array:
 
 
 def or_nan(values: Array, mask: Array) -> Array:
-    """`values` where `mask`, NaN elsewhere: there is no value.
+    """`values` where `mask`, NaN elsewhere.
 
-    Where nothing is traced the host makes the NaN, as `jax_debug_nans` stops at those that a program makes.
+    Without tracing, NumPy makes the NaN: `jax_debug_nans` would stop at a NaN from a compiled program.
     """
     if is_concrete((values, mask)):
         return jax.device_put(np.where(mask, values, np.nan))
@@ -47,7 +47,7 @@ def or_nan(values: Array, mask: Array) -> Array:
 
 
 def as_float(values: ArrayLike) -> Array:
-    """`values` themselves where they are floating point, else in the default float type."""
+    """`values` of floating point unchanged, other values in the default float type."""
     values = jnp.asarray(values)
     return values if jnp.issubdtype(values.dtype, jnp.floating) else values.astype(float)
 
@@ -59,7 +59,7 @@ def at_least_single(values: ArrayLike) -> Array:
 
 
 def positive(value: ArrayLike | None, dtype: Any) -> Array:
-    """A width or a temperature where it is above 0, NaN elsewhere: without one there is no score."""
+    """A width or a temperature if it is above 0, else NaN, which makes the score NaN."""
     value = jnp.asarray(value, dtype=dtype)
     return jnp.where(value > 0, value, jnp.nan)
 
@@ -83,7 +83,7 @@ def masked_median(values: Array, mask: Array) -> Array:
 
 
 def where_finite(score: Array, *inputs: Array) -> Array:
-    """`score` where all inputs are finite, else NaN, which ranks last: of NaN or infinity no score says anything."""
+    """`score` if all inputs are finite, else NaN, which ranks last."""
     return jnp.where(jnp.all(jnp.stack([jnp.all(jnp.isfinite(values)) for values in inputs])), score, jnp.nan)
 
 
@@ -94,10 +94,10 @@ def safe_sqrt(squared: Array) -> Array:
 
 
 def without_gradient(why: str, values: Tree) -> Tree:
-    """The values, of which nobody can ask for a derivative.
+    """The values, without a derivative.
 
     Raises:
-        NoGradientError: somebody does; `why` is what he is told.
+        NoGradientError: with the message `why`, at a derivative.
     """
 
     @jax.custom_jvp
@@ -112,7 +112,7 @@ def without_gradient(why: str, values: Tree) -> Tree:
 
 
 def round_up(size: int, multiple: int) -> int:
-    """The smallest multiple of `multiple` that is at least `size` (and at least one `multiple`)."""
+    """The smallest multiple of `multiple` that is at least `size`, and at least one `multiple`."""
     return max(1, -(-size // multiple)) * multiple
 
 
@@ -123,13 +123,13 @@ def masked_std(values: Array, mask: Array) -> Array:
 
 
 def compiled(function: Function, **options: Any) -> Function:
-    """`jax.jit` of what is plural, where it is defined; under a caller's `jit` it is inlined.
+    """`jax.jit` for functions of many pairs; under a caller's `jit` they are inlined.
 
-    The classes of all nodes of the arguments choose the program as well, whoever registered them.
+    The classes of all nodes of the arguments choose the program as well, even if two classes were registered alike.
 
-    With a plain function among the arguments, such as a user's scorer, or the weight of one, it runs op by op: a kept
-    program would go on with what the function's closure held at the first call (as it does where a function stands in a
-    static field). `held` is for many calls in a row.
+    With a plain function among the arguments, such as a user's scorer, it runs op by op: a cached program would keep
+    the values of the function's closure from the first call (as it does for a function in a static field). For many
+    calls in a row, `held` allows compilation.
     """
     programs: dict[tuple[type, ...], Any] = {}
 
@@ -151,67 +151,67 @@ def leaves_and_classes(tree: Any) -> tuple[list[Any], tuple[type, ...]]:
     Up to jaxlib 0.10 tree structures are equal whatever the classes that `jax.tree_util.register_dataclass` registered.
     """
     seen: list[Any] = []
-    leaves = jax.tree.leaves(tree, is_leaf=lambda node: bool(seen.append(node)))  # asked of every node; never a leaf
+    leaves = jax.tree.leaves(tree, is_leaf=lambda node: bool(seen.append(node)))  # called for every node; never true
     of_leaves = set(map(type, leaves))
     return leaves, tuple([cls for cls in map(type, seen) if cls not in of_leaves])
 
 
 def holds_function(tree: Any) -> bool:
-    """Whether a leaf is a plain function, as a user's scorer may be, or the weight of one."""
+    """Whether a leaf is a plain function, such as a user's scorer."""
     return any(map(callable, jax.tree.leaves(tree)))
 
 
 def held(tree: Tree) -> Tree:
-    """`tree` whose plain functions are static parts, new ones at each call: what `compiled` keeps serves until then."""
+    """`tree` with plain functions as static parts, new ones at each call: `compiled` reuses its programs for them."""
     return jax.tree.map(lambda leaf: Partial(partial(leaf)) if callable(leaf) else leaf, tree)
 
 
 def is_concrete(tree: Any) -> bool:
-    """True where no leaf is traced, so that Python may look at the values."""
+    """True if no leaf is traced, so that Python may look at the values."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def knows_own_context() -> bool:
-    """Whether other threads compute as this one: not below `with jax.enable_x64(True)` and its like."""
+    """Whether a new thread has the settings of this one: not within `with jax.enable_x64(True)` and its like."""
     with ThreadPoolExecutor(1) as fresh:
         return dict(jax.config.values) == fresh.submit(lambda: dict(jax.config.values)).result()
 
 
 def available_cpus() -> int:
-    """Processors that this process may run on: fewer than the machine has where a scheduler or container says so."""
+    """Processors that this process may use: a scheduler or container may give fewer than the machine has."""
     if hasattr(os, "sched_getaffinity"):  # Linux
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def device_bytes(tree: Any) -> int | None:
-    """Memory of the device where the first array is; None where it has none of its own, but a processor's caches."""
+    """Memory of the device of the first array; None for a processor, which has no memory of its own."""
     stats = device_of(tree).memory_stats()
     return stats["bytes_limit"] if stats else None
 
 
 def free_bytes(device: Device) -> int:
-    """Bytes that may still be taken where a device keeps its arrays: its own memory, or the machine's."""
+    """Free bytes in the memory of a device: its own, or the machine's."""
     if stats := device.memory_stats():
         return stats["bytes_limit"] - stats["bytes_in_use"]
     return free_host_bytes()
 
 
 def free_host_bytes() -> int:
-    """Bytes that a program may still take of the machine's memory; all of it where the system is silent."""
-    try:  # what caches of files take is free
+    """Free bytes of the machine's memory, caches of files included; all of it if the system does not say."""
+    try:
         return 1024 * int(re.findall(r"MemAvailable: *(\d+)", Path("/proc/meminfo").read_text())[0])
     except (OSError, IndexError):
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def platform(tree: Any) -> str:
-    """Where the first array on a device is, "cpu" or "gpu"; where there is none, JAX's default."""
+    """Platform of the first array, "cpu" or "gpu"; without arrays, JAX's default."""
     return device_of(tree).platform
 
 
 def device_of(tree: Any) -> Device:
-    """That of the first array that is on one; where there is none, JAX's default."""
+    """Device of the first array; without arrays, JAX's default."""
     for leaf in jax.tree.leaves(tree):
         if isinstance(leaf, Array) and not isinstance(leaf, Tracer):
             return next(iter(leaf.devices()))

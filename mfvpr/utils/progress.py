@@ -1,4 +1,4 @@
-"""How far a long work is: whoever calls may wrap what is iterated over, in a progress bar for instance."""
+"""Progress of long loops, and a stopwatch. A caller may wrap each loop, for instance in a progress bar."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 Item = TypeVar("Item")
-Track = Callable[[Iterable[Any], int], Iterable[Any]]  # of items, and how many there are
+Track = Callable[[Iterable[Any], int], Iterable[Any]]  # (items, their number) -> the same items
 
 
 def untracked(items: Iterable[Item], total: int) -> Iterable[Item]:
@@ -17,7 +17,7 @@ def untracked(items: Iterable[Item], total: int) -> Iterable[Item]:
 
 @dataclass
 class Stopwatch:
-    """Seconds by stage. A stage inside another one counts only for itself."""
+    """Seconds by stage. A stage excludes the stages inside it."""
 
     seconds: dict[str, float] = field(default_factory=dict)
     _inside: list[float] = field(default_factory=list, repr=False)  # seconds of other stages inside each open one
@@ -29,7 +29,7 @@ class Stopwatch:
         try:
             yield
         finally:
-            spent, inside = time.perf_counter() - start, self._inside.pop()
+            total, inside = time.perf_counter() - start, self._inside.pop()
             if self._inside:
-                self._inside[-1] += spent
-            self.seconds[stage] = round(self.seconds.get(stage, 0) + spent - inside, 3)
+                self._inside[-1] += total
+            self.seconds[stage] = round(self.seconds.get(stage, 0) + total - inside, 3)

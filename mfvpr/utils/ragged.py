@@ -1,7 +1,7 @@
-"""Ragged rows <-> padded arrays and a mask: the only padding there is.
+"""Ragged rows <-> padded arrays and a mask.
 
-Images have as many keypoints, and pairs as many matches, as they happen to have. On the host these are rows of their
-own length, arrays by name; what is compiled takes them in arrays of few shapes, zeros where a row has ended.
+Images have different numbers of keypoints, and pairs of matches. On the host they are rows of different lengths, arrays
+by name. Compiled functions take padded arrays of few shapes, with zeros beyond the end of a row.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ def padded(rows: Sequence[Row], capacity: int, *, total: int | None = None) -> t
     Args:
         rows: at least one, of the same names; none longer than `capacity`.
         capacity: slots of a row.
-        total: R; those beyond `rows` are empty. By default as many as there are.
+        total: R, with empty rows beyond `rows`. By default the number of rows.
     """
     total = len(rows) if total is None else total
     arrays = {name: np.empty((total, capacity, *values.shape[1:]), values.dtype) for name, values in rows[0].items()}
@@ -37,7 +37,7 @@ def padded(rows: Sequence[Row], capacity: int, *, total: int | None = None) -> t
 
 
 def split(flat: Row, counts: np.ndarray) -> list[dict[str, np.ndarray]]:
-    """Rows of lengths `counts` `[R]`, views of arrays in which they stand one after the other."""
+    """Rows of lengths `counts` `[R]`, as views of arrays that hold one row after the other."""
     ends = np.cumsum(counts)
     return [
         {name: values[end - count : end] for name, values in flat.items()}
@@ -51,22 +51,21 @@ def joined(rows: Sequence[Row]) -> dict[str, np.ndarray]:
 
 
 def sizes(counts: np.ndarray, quantiles: Sequence[float], step: int) -> np.ndarray:
-    """Few capacities, ascending multiples of `step`, that rows of lengths `counts` fit into with little padding.
+    """Few capacities, ascending multiples of `step`, that hold rows of lengths `counts` with little padding.
 
-    They are quantiles over all rows that are not empty, so that neither a row's company nor the part of the rows that
-    is worked on changes the shape it is computed in.
+    They are quantiles over all rows that are not empty, so that the shape of a row does not depend on its batch.
     """
-    some = counts[counts > 0]
-    if not some.size:
+    lengths = counts[counts > 0]
+    if not lengths.size:
         return np.array([step])
-    return np.unique(np.ceil(np.quantile(some, quantiles) / step).astype(int) * step)
+    return np.unique(np.ceil(np.quantile(lengths, quantiles) / step).astype(int) * step)
 
 
 def worthwhile(capacities: np.ndarray, counts: np.ndarray, saving: float) -> np.ndarray:
-    """Those of ascending `capacities` without which there would be at least `saving` slots more; the largest always."""
-    some = counts[counts > 0]
+    """The largest of ascending `capacities`, and each that saves at least `saving` slots of padding."""
+    lengths = counts[counts > 0]
     while len(capacities) > 1:
-        rows = np.bincount(np.searchsorted(capacities, some), minlength=len(capacities))
+        rows = np.bincount(np.searchsorted(capacities, lengths), minlength=len(capacities))
         saved = rows[:-1] * np.diff(capacities)
         if saved.min() >= saving:
             break
@@ -80,19 +79,19 @@ def fitting(capacities: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
 
 def filled(values: np.ndarray, total: int) -> np.ndarray:
-    """`values` `[n, ...]`, n > 0, with its last entry again and again until there are `total`."""
+    """`values` `[n, ...]`, n > 0, with its last entry repeated up to `total` entries."""
     return np.concatenate([values, np.repeat(values[-1:], total - len(values), axis=0)])
 
 
 def at_least_one(tree: Tree) -> Tree:
-    """Arrays `[n, ...]` with n = 0 as one entry of zeros, so that there is something to index. Traced or not."""
+    """Arrays `[n, ...]`; those with n = 0 become one entry of zeros, which can be indexed. Traced or not."""
     return jax.tree.map(lambda leaf: leaf if len(leaf) else jnp.zeros((1, *leaf.shape[1:]), leaf.dtype), tree)
 
 
 def in_front(tree: Tree, mask: jax.Array, capacity: int) -> Tree:
     """Entries of arrays `[n, ...]` where `mask` `[n]` is set, in their order, in `capacity` slots. Traced or not.
 
-    Entries beyond the capacity are dropped; what stands in slots beyond those that are set means nothing.
+    Entries beyond the capacity are dropped; the values of unused slots are arbitrary.
     """
     slots = jnp.nonzero(mask, size=capacity, fill_value=0)[0]
     return jax.tree.map(lambda leaf: at_least_one(jnp.asarray(leaf))[slots], tree)

@@ -1,4 +1,4 @@
-"""Work on threads, while others go on."""
+"""Work on threads."""
 
 import itertools
 from collections import deque
@@ -11,22 +11,21 @@ Result = TypeVar("Result")
 
 
 def ordered_map(function: Callable[[Item], Result], items: Iterable[Item], *, workers: int) -> Iterator[Result]:
-    """`map` on threads, results in order, at most 2 x `workers` of them waiting.
+    """`map` on threads: results in order, computed at most 2 x `workers` ahead.
 
-    Decoding, reading and compiled programs release the interpreter lock, so this overlaps them with whatever consumes
-    the results.
+    Decoding, reading and compiled programs release the interpreter lock, so they overlap with the caller's work.
     """
     remaining = iter(items)
     with ThreadPoolExecutor(workers) as pool:
-        waiting: deque[Future[Result]] = deque(
+        futures: deque[Future[Result]] = deque(
             pool.submit(function, item) for item in itertools.islice(remaining, 2 * workers)
         )
         try:
-            while waiting:
-                result = waiting.popleft().result()
+            while futures:
+                result = futures.popleft().result()
                 for item in itertools.islice(remaining, 1):
-                    waiting.append(pool.submit(function, item))
+                    futures.append(pool.submit(function, item))
                 yield result
         finally:
-            for future in waiting:
+            for future in futures:
                 future.cancel()

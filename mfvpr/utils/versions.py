@@ -9,7 +9,7 @@ PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "opencv-python-headless", "pillow
 
 @cache
 def versions() -> dict[str, str]:
-    """Versions of what computed the results."""
+    """Versions of Python, of mfvpr and of the packages, by name."""
     return {
         "mfvpr": version("mfvpr"),
         "python": platform.python_version(),

@@ -1,4 +1,4 @@
-"""Principal components of unit variance, out of the smaller of two matrices: covariance, or Gram matrix."""
+"""Principal components of unit variance, from the covariance or the Gram matrix, whichever is smaller."""
 
 from collections.abc import Iterator
 from contextlib import suppress
@@ -10,8 +10,8 @@ from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 
 from mfvpr.utils.errors import InputError
 
-FEW = 10  # times as many dimensions there must be as components for Lanczos' method
-SMALLEST = 1e-6  # of the largest standard deviation, below which there is but rounding
+FEW = 10  # Lanczos' method is used if there are this many times more dimensions than components
+SMALLEST = 1e-6  # of the largest standard deviation; smaller ones are rounding errors
 _BLOCK = 2**25  # numbers in double precision at a time
 
 
@@ -21,8 +21,8 @@ class Whitening:
 
     Attributes:
         mean: `[D]`.
-        components: `[D', D]`, most variance first; 0 where there is none.
-        origin: hash of what makes such vectors, which no other may be whitened with; "" = any of as many numbers may.
+        components: `[D', D]`, most variance first; 0 without variance.
+        origin: fingerprint of the vectors' recipe, the only one that may be whitened with it; "" = any of D numbers.
     """
 
     mean: np.ndarray
@@ -36,10 +36,10 @@ class Whitening:
 
 
 def fit_whitening(sample: np.ndarray, dimension: int) -> Whitening:
-    """The components of a sample `[n, D]` float32 or float64, which is summed in double precision.
+    """Fit a whitening to a sample `[n, D]` float32 or float64, in double precision.
 
-    As PCA(whiten=True, svd_solver="full") of scikit-learn; a component's entry of the largest magnitude, the first of
-    several, is positive.
+    As PCA(whiten=True, svd_solver="full") of scikit-learn, with signs that make the entry of the largest magnitude of
+    each component (the first of several) positive.
 
     Args:
         sample: finite.
@@ -49,7 +49,7 @@ def fit_whitening(sample: np.ndarray, dimension: int) -> Whitening:
         Arrays of the sample's type.
 
     Raises:
-        InputError: there are not more vectors than components, fewer numbers in each, or all are alike.
+        InputError: the sample has too few vectors or too few dimensions, or all its vectors are equal.
     """
     count, size = sample.shape
     if not 1 <= dimension < count or dimension > size:
@@ -58,43 +58,43 @@ def fit_whitening(sample: np.ndarray, dimension: int) -> Whitening:
     mean = sample.mean(axis=0, dtype=np.float64)
     by_rows = size <= count
     products = np.zeros((min(count, size),) * 2)
-    for part in _centered(sample, mean, by_rows=by_rows):
+    for part in _center_blocks(sample, mean, by_rows=by_rows):
         products += part.T @ part if by_rows else part @ part.T
     squares, vectors = _largest(products, dimension)
     if squares[0] <= count * (SMALLEST**2 * 1e-4) * (mean @ mean):
         raise InputError(f"whitening: expected descriptors that differ, got {count} that are alike; use other images")
     if not by_rows:
-        vectors = np.concatenate([part.T @ vectors for part in _centered(sample, mean, by_rows=False)])
-    some = squares > SMALLEST**2 * squares[0]
+        vectors = np.concatenate([part.T @ vectors for part in _center_blocks(sample, mean, by_rows=False)])
+    has_variance = squares > SMALLEST**2 * squares[0]
     lengths = np.linalg.norm(vectors, axis=0)
     largest = np.take_along_axis(vectors, np.abs(vectors).argmax(axis=0)[None], axis=0)[0]
-    spread = np.sqrt(np.where(some, squares, 1) / (count - 1))
-    scale = np.where(some, np.sign(largest) / np.where(some, lengths * spread, 1), 0)
+    deviations = np.sqrt(np.where(has_variance, squares, 1) / (count - 1))
+    scale = np.where(has_variance, np.sign(largest) / np.where(has_variance, lengths * deviations, 1), 0)
     return Whitening(mean.astype(sample.dtype), (vectors * scale).T.astype(sample.dtype))
 
 
 def fit_bytes(count: int, size: int, itemsize: int) -> int:
-    """Memory that a sample of `count` vectors and their fit take, about."""
+    """Memory of a sample of `count` vectors and of their fit, about, in bytes."""
     matrix = 8 * min(count, size) ** 2
     return itemsize * count * size + 2 * matrix + 2 * 8 * min(_BLOCK, count * size)
 
 
 def _largest(products: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
-    """The largest eigenvalues `[number]` of a symmetric matrix, the largest first, and their vectors in columns."""
+    """The largest eigenvalues `[number]` of a symmetric matrix, descending, and their vectors in columns."""
     order = len(products)
-    if FEW * number < order:  # to the last bits as well, in a small part of the time
+    if FEW * number < order:  # as exact, and much faster
         with suppress(ArpackNoConvergence):
             start = np.random.default_rng(0).normal(size=order)
             squares, vectors = eigsh(products, k=number, which="LA", v0=start)
             descending = np.argsort(-squares)
             return squares[descending], vectors[:, descending]
-    kept = (order - number, order - 1)
-    squares, vectors = eigh(products, subset_by_index=kept, overwrite_a=True, check_finite=False)
+    interval = (order - number, order - 1)
+    squares, vectors = eigh(products, subset_by_index=interval, overwrite_a=True, check_finite=False)
     return squares[::-1], vectors[:, ::-1]
 
 
-def _centered(sample: np.ndarray, mean: np.ndarray, *, by_rows: bool) -> Iterator[np.ndarray]:
-    """The sample without its mean in double precision, some rows or some columns at a time."""
+def _center_blocks(sample: np.ndarray, mean: np.ndarray, *, by_rows: bool) -> Iterator[np.ndarray]:
+    """The sample minus its mean in double precision, in blocks of rows or of columns."""
     count, size = sample.shape
     step = max(1, _BLOCK // (size if by_rows else count))
     for start in range(0, count if by_rows else size, step):
