@@ -1,11 +1,11 @@
-"""A run that several tasks share, on one machine or many: its folder knows its settings, and how far each task is.
+"""The folder of a run that is split into shards: its settings, and the state of each task.
 
-    DIR/shards/run.json          settings and number of the shards: made once, compared by every task
-    DIR/shards/data.json         what the images hold, likewise
-    DIR/shards/2-of-8/state.json what a task said last
-    DIR/shards/2-of-8/lock       held while it works
+    DIR/shards/run.json          settings and number of shards: written once, compared by every task
+    DIR/shards/data.json         fingerprints of images and ground truth, versions: likewise
+    DIR/shards/2-of-8/state.json state that a task wrote last
+    DIR/shards/2-of-8/lock       locked while the task works
 
-What is computed lies in the stores; the results are in DIR, when the last task has left them there.
+Features, matches and scores are in the stores; the last task writes the results to DIR.
 """
 
 import json
@@ -30,24 +30,24 @@ SHARDS = "shards"
 COMPLETE = "complete"
 _FORMAT = "mfvpr shards 1"
 _STATE = "state.json"
-# What may differ from machine to machine. Images are compared by what they hold.
-_OWN = ("shard", "wait", "coordinator", "out", "store", "memory", "devices", "dataset", "multirun", "command")
+# Settings that may differ from machine to machine. Images are compared by their content.
+_LOCAL = ("shard", "wait", "coordinator", "out", "store", "memory", "devices", "dataset", "multirun", "command")
 
 
 @contextmanager
 def joined(settings: Mapping[str, Any]) -> Iterator[None]:
-    """A task of a run, which no other process does meanwhile.
+    """Take part in a run as the task of `shard`, and lock the task.
 
     Raises:
-        SettingsError: the folder is of a run with other settings, or of another number of shards.
-        InputError: the same shard is at work.
+        SettingsError: the folder belongs to a run with other settings, or with another number of shards.
+        InputError: another process works on the same shard.
     """
     shard, folder = Shard.parse(settings["shard"]), task_folder(settings).parent
-    own = {name: value for name, value in settings.items() if name not in _OWN}
+    shared = {name: value for name, value in settings.items() if name not in _LOCAL}
     _check_empty(folder)
-    about = {"shards": shard.count, "dataset": settings["dataset"]["name"], "settings": own}
-    about["store"] = _identity(build.expanded(settings["store"]))
-    _agreed(folder / "run.json", about, f"shard={shard}")
+    content = {"shards": shard.count, "dataset": settings["dataset"]["name"], "settings": shared}
+    content["store"] = _identity(build.expanded(settings["store"]))
+    _compare(folder / "run.json", content, f"shard={shard}")
     task = task_folder(settings)
     task.mkdir(parents=True, exist_ok=True)
     with locked(task, "the part of a run"):
@@ -55,16 +55,16 @@ def joined(settings: Mapping[str, Any]) -> Iterator[None]:
 
 
 def _check_empty(folder: Path) -> None:
-    """That the first task finds nothing of others."""
+    """Refuse a folder that is neither empty nor of a run with shards."""
     if (folder / "run.json").exists() or not folder.parent.is_dir():
         return
-    if found := sorted(path.name for path in folder.parent.iterdir() if path.name != SHARDS):
+    if names := sorted(path.name for path in folder.parent.iterdir() if path.name != SHARDS):
         raise SettingsError(f"out={folder.parent}: expected a new or empty folder, or that of other shards of this "
-                            f"run, got one that holds {found[0]}; name another")  # fmt: skip
+                            f"run, got one that holds {names[0]}; name another")  # fmt: skip
 
 
 def _identity(store: Path) -> str:
-    """What tells a folder of stores from one of the same path on another machine, whose rows nobody else would see."""
+    """A number that tells a folder of stores from a folder of the same path on another machine."""
     try:
         return written_once(store / "identity", uuid.uuid4().hex)
     except OSError as error:
@@ -72,44 +72,44 @@ def _identity(store: Path) -> str:
 
 
 def task_folder(settings: Mapping[str, Any]) -> Path:
-    """What a task keeps of itself."""
+    """The folder of a task: its state and its lock."""
     return _folder(build.expanded(settings["out"])) / Shard.parse(settings["shard"]).folder
 
 
 def wait(settings: Mapping[str, Any], needs: NotYet) -> None:
-    """Keep what this task waits for; others that were complete, and are needed again (damaged rows go), are not."""
-    own = task_folder(settings)
-    write_text(own / _STATE, json.dumps({"state": COMPLETE if needs.is_complete else f"ended, waiting for {needs}"}))
+    """Write that this task waits; complete tasks that it waits for, because of damaged rows, are no longer complete."""
+    folder = task_folder(settings)
+    write_text(folder / _STATE, json.dumps({"state": COMPLETE if needs.is_complete else f"ended, waiting for {needs}"}))
     shard = Shard.parse(settings["shard"])
     for index in needs.shards:
-        other = own.parent / Shard(index, shard.count).folder
+        other = folder.parent / Shard(index, shard.count).folder
         if _state(other) == COMPLETE:
             write_text(other / _STATE, json.dumps({"state": f"something is missing again, says {shard}"}))
 
 
 def complete(settings: Mapping[str, Any]) -> None:
-    """Keep that this task has nothing left to do."""
+    """Write that this task has nothing left to do."""
     write_text(task_folder(settings) / _STATE, json.dumps({"state": COMPLETE}))
 
 
 def check_data(settings: Mapping[str, Any], images: Images) -> None:
-    """That all tasks see the same images and the same ground truth, with the same versions.
+    """Check that all tasks have the same images, ground truth and versions.
 
     Raises:
-        SettingsError: another task has seen others.
+        SettingsError: another task has different ones.
     """
     if settings.get("shard") is None:
         return
-    known = images.dataset.sequences[0].truth
-    right = truth.fingerprint(images.dataset, truth.thresholds(settings, known))
-    about = {"images": images.fingerprints, "ground truth": right, "versions": versions()}
+    thresholds = truth.thresholds(settings, images.dataset.sequences[0].truth)
+    ground_truth = truth.fingerprint(images.dataset, thresholds)
+    content = {"images": images.fingerprints, "ground truth": ground_truth, "versions": versions()}
     folder = _folder(build.expanded(settings["out"]))
-    _agreed(folder / "data.json", about, f"shard={settings['shard']}")
+    _compare(folder / "data.json", content, f"shard={settings['shard']}")
 
 
 @contextmanager
 def last(settings: Mapping[str, Any]) -> Iterator[bool]:
-    """Whether the results are still to be written; for one task at a time."""
+    """Whether the results are still to be written, for one task at a time."""
     folder = build.expanded(settings["out"])
     with locked(_folder(folder), "a run", lambda line: None):
         yield not (folder / runs.LAST).exists()
@@ -119,52 +119,54 @@ def _folder(out: Path) -> Path:
     return out / SHARDS
 
 
-def _agreed(path: Path, about: Mapping[str, Any], who: str) -> None:
-    """That this is what the first task wrote."""
-    about = {"format": _FORMAT, **about}
+def _compare(path: Path, content: Mapping[str, Any], task: str) -> None:
+    """Write a file of a run, or compare its content with the file that the first task wrote."""
+    content = {"format": _FORMAT, **content}
     try:
-        found = read(path, written_once(path, json.dumps(about, indent=1, ensure_ascii=True, allow_nan=False)))
+        first = read(path, written_once(path, json.dumps(content, indent=1, ensure_ascii=True, allow_nan=False)))
     except OSError as error:
         raise SettingsError(f"{path}: cannot be written or read ({error.strerror}); name another out=DIR") from error
-    if (own := about.get("store")) != found.get("store"):
-        raise SettingsError(f"{who}: expected the store= of the task that came first, got another folder ({own}); all "
-                            "tasks share one, on whatever machine")  # fmt: skip
-    if differs := difference(json.loads(json.dumps(about)), found):
-        raise SettingsError(f"{who}: {differs} by the task that came first ({path}); set that, or name another out=DIR")
+    if (store := content.get("store")) != first.get("store"):
+        raise SettingsError(f"{task}: expected the store= of the task that came first, got another folder ({store}); "
+                            "all tasks share one, on whatever machine")  # fmt: skip
+    if differs := difference(json.loads(json.dumps(content)), first):
+        raise SettingsError(
+            f"{task}: {differs} by the task that came first ({path}); set that, or name another out=DIR"
+        )
 
 
 def read(path: Path, text: str | None = None) -> dict[str, Any]:
-    """What a file of a run's shards says.
+    """The content of a file of a run with shards.
 
     Raises:
-        SettingsError: it is none.
+        SettingsError: it is another file.
     """
     try:
-        found = json.loads(path.read_text(encoding="utf-8") if text is None else text)
-        if found["format"] == _FORMAT:
-            Shard(0, int(found.get("shards", 1)))
-            return found
+        content = json.loads(path.read_text(encoding="utf-8") if text is None else text)
+        if content["format"] == _FORMAT:
+            Shard(0, int(content.get("shards", 1)))
+            return content
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         pass
     raise SettingsError(f"{path}: expected a file of a run with shard=i/n and out=DIR, got none, or something else")
 
 
 def states(out: Path) -> list[str]:
-    """What each task of a run says of itself, by number.
+    """The state of each task of a run, by index.
 
     Raises:
         SettingsError: there is no such run.
     """
-    about = read(_folder(out) / "run.json")
-    return [_state(_folder(out) / Shard(index, about["shards"]).folder) for index in range(about["shards"])]
+    count = read(_folder(out) / "run.json")["shards"]
+    return [_state(_folder(out) / Shard(index, count).folder) for index in range(count)]
 
 
 def missing(out: Path) -> list[int]:
-    """Numbers of the tasks that are to be started; the first of all where only the results are missing."""
-    found = states(out)
+    """Indices of the tasks that are to be started; the first task if only the results are missing."""
+    task_states = states(out)
     if (out / runs.LAST).exists():
         return []
-    return [index for index, state in enumerate(found) if state != COMPLETE] or [0]
+    return [index for index, state in enumerate(task_states) if state != COMPLETE] or [0]
 
 
 def _state(task: Path) -> str:

@@ -1,4 +1,4 @@
-"""The evaluations, each in a run folder of its own; what is finished is not done again."""
+"""The evaluations, each in a run folder of its own; finished runs are not repeated."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -26,15 +26,15 @@ from mfvpr.utils.versions import versions
 FIGURES = 2  # queries that each run draws
 _MADE_OF, _SIZES = "made_of.json", "sizes.json"
 _SHARED = ("store", "memory", "devices")  # settings of both programs
-_FREE = {"out", "store", "memory", "devices", "command"}  # of which no number depends
+_FREE = {"out", "store", "memory", "devices", "command"}  # settings that change no number
 
 
 @contextmanager
 def held(out: Path) -> Iterator[None]:
-    """Keep others from evaluating into a folder, and remove what was being written there by one that was killed.
+    """Lock a folder for evaluations, and remove temporary files of a killed process.
 
     Raises:
-        SettingsError: another process does, or the folder cannot be made.
+        SettingsError: another process has the lock, or the folder cannot be made.
     """
     in_use = SettingsError(f"out={out}: another process evaluates into it; wait until it ends, or name another folder")
     with ExitStack() as stack:
@@ -60,34 +60,34 @@ def settings_of(run: str, place: Place, settings: Mapping[str, Any]) -> dict[str
 
 
 def folder_of(run: str, place: Place, settings: Mapping[str, Any]) -> Path:
-    """Its run folder."""
+    """The run folder of an evaluation."""
     return Path(settings["out"]).expanduser() / "runs" / place.name / run
 
 
 def made_of(settings: Mapping[str, Any], images: Mapping[str, str], truth: str | None) -> dict[str, str]:
-    """What an evaluation follows from, each as a hash: settings, images, truth, weights, and the code's version."""
-    free = {name: value for name, value in settings.items() if name not in _FREE}
-    free["dataset"] = {name: value for name, value in settings["dataset"].items() if name not in ("root", "cache")}
-    free["dataset"] |= {name: None for name in ("database", "queries") if name in free["dataset"]}  # folders
+    """Fingerprints of the inputs of an evaluation: settings, images, truth, weights; and the version of the code."""
+    fixed = {name: value for name, value in settings.items() if name not in _FREE}
+    fixed["dataset"] = {name: value for name, value in settings["dataset"].items() if name not in ("root", "cache")}
+    fixed["dataset"] |= {name: None for name in ("database", "queries") if name in fixed["dataset"]}  # folders
     names = [settings[group].get("weights") for group in ("features", "retrieval", "matching")]
     weights = {name: files.fingerprint(name) for name in names if name in REGISTRY}
     return {
-        "settings": fingerprint(free), "images": fingerprint(dict(images)),
+        "settings": fingerprint(fixed), "images": fingerprint(dict(images)),
         "ground truth": truth or "none", "weights": fingerprint(weights),
         "version": versions()["mfvpr"],
     }  # fmt: skip
 
 
 def is_finished(folder: Path) -> bool:
-    """Whether a run is finished there, whatever it is of."""
+    """Whether a run is finished there, with any settings."""
     return (folder / "results.json").is_file()
 
 
 def is_done(folder: Path, expected: Mapping[str, str]) -> bool:
-    """Whether a run is finished there.
+    """Whether the expected run is finished there.
 
     Raises:
-        SettingsError: one of other settings, images, weights or of another version is, or a damaged one.
+        SettingsError: the finished run has other settings, images, weights or another version, or is damaged.
     """
     if not is_finished(folder):
         return False
@@ -98,18 +98,17 @@ def is_done(folder: Path, expected: Mapping[str, str]) -> bool:
             raise SettingsError(f"{folder}/{name}: is damaged, or missing; remove the folder, and run this again, or "
                                 "name another with out=DIR") from None  # fmt: skip
     try:
-        found = json.loads((folder / _MADE_OF).read_text(encoding="utf-8"))
+        inputs = json.loads((folder / _MADE_OF).read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        found = {}
-    other = [name for name, value in expected.items() if not isinstance(found, dict) or found.get(name) != value]
-    if other:
+        inputs = {}
+    if other := [name for name, value in expected.items() if not isinstance(inputs, dict) or inputs.get(name) != value]:
         raise SettingsError(f"{folder}: a finished run of other {' and '.join(other)} is there; remove it, or name "
                             "another folder with out=DIR")  # fmt: skip
     return True
 
 
 def evaluate(settings: Mapping[str, Any], made_of: Mapping[str, str]) -> None:
-    """One evaluation into its run folder; its table goes to no terminal."""
+    """Evaluate into the run folder, without a table in the terminal."""
     with run_folder.claimed(settings, own=True) as folder:
         outcome = evaluation.evaluated(dict(settings))
 
@@ -117,33 +116,33 @@ def evaluate(settings: Mapping[str, Any], made_of: Mapping[str, str]) -> None:
             evaluation.write(new, outcome)
             runs.write_json(new / _MADE_OF, dict(made_of))
             runs.write_json(new / _SIZES, bytes_of_an_image(outcome.tools, outcome.images.dataset.database))
-            run_folder.draw(new, outcome.figures)  # before results.json is there, as nothing is done again behind it
+            run_folder.draw(new, outcome.figures)  # before results.json, after which the run counts as finished
 
         run_folder.keep(folder, settings, evaluation.ground_truth(outcome), write)
-    jax.clear_caches()  # compiled programs of one data set are of no use to another, and each takes maps of memory
+    jax.clear_caches()  # other data sets need other programs, and each program takes memory maps
 
 
 def sizes(folder: Path) -> dict[str, float]:
-    """Of a finished run, see `bytes_of_an_image`."""
+    """Sizes of a finished run, see `bytes_of_an_image`."""
     return json.loads((folder / _SIZES).read_text(encoding="utf-8"))
 
 
 def page(folder: Path) -> None:
-    """The page of a finished run, unless it is there."""
+    """Write the page of a finished run, unless it is there."""
     if not (folder / PAGE).is_file():
         run_folder.report_page(folder)
 
 
 def results(folder: Path) -> list[dict[str, Any]]:
-    """Rows of a finished run."""
+    """Rows of results.json of a finished run."""
     return json.loads((folder / "results.json").read_text(encoding="utf-8"))
 
 
 def asked(folder: Path) -> int | str:
-    """Candidates that a finished run's settings ask for."""
+    """The setting `candidates` of a finished run."""
     return json.loads((folder / "run.json").read_text(encoding="utf-8"))["settings"]["candidates"]
 
 
 def origin(folder: Path) -> Any:
-    """What a finished run follows from, see `made_of`."""
+    """Fingerprints of the inputs of a finished run, see `made_of`."""
     return json.loads((folder / _MADE_OF).read_text(encoding="utf-8"))

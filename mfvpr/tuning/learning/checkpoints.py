@@ -1,7 +1,7 @@
-"""Checkpoints of a training in a folder: whole or not there at all, and never mistaken for those of another one.
+"""Checkpoints of a training in a folder, written atomically.
 
-Every checkpoint carries the recipe of what is trained, and the shapes of its arrays, and is compared with what is
-expected before anything in the folder changes. The last two are kept.
+Every checkpoint has the recipe of the training and the shapes of its arrays. Both are compared before anything in the
+folder changes, so that another training cannot use it. The last two checkpoints are kept.
 """
 
 import json
@@ -27,10 +27,10 @@ _KEPT = 2
 
 @contextmanager
 def held(folder: Path) -> Iterator[None]:
-    """Keep other processes from training in a folder, which is made where it is not there; ends with the process.
+    """Lock a folder of checkpoints, which is made if it is missing.
 
     Raises:
-        InputError: another process holds it, it holds something else, or it cannot be made.
+        InputError: another process trains in it, it is no folder of checkpoints, or it cannot be made.
     """
     _holds_checkpoints(folder)
     in_use = InputError(f"{folder}: another process trains here; wait until it ends, or choose another folder")
@@ -47,21 +47,21 @@ def held(folder: Path) -> Iterator[None]:
 
 
 def save(folder: Path, step: int, recipe: Mapping[str, Any], state: Any, progress: Any) -> None:
-    """Write the checkpoint of a step, the newest, and drop all but the last two.
+    """Write the checkpoint of a step, and remove all but the last two.
 
     Args:
-        folder: is made where it is not there.
-        step: above that of every checkpoint there.
-        recipe: what is trained, JSON values.
+        folder: of checkpoints; made if it is missing.
+        step: above the steps of earlier checkpoints.
+        recipe: of the training, JSON values.
         state: pytree of arrays.
-        progress: JSON values that come back with the state.
+        progress: JSON values that `restore` returns with the state.
 
     Raises:
         InputError: the disk is full, or cannot be written. Earlier checkpoints stay.
     """
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(state)]
     arrays = {str(place): leaf for place, leaf in enumerate(leaves)}
-    record = {**_expected(recipe, state), "progress": progress, "checksum": _checksum(leaves, progress)}
+    record = {**_description(recipe, state), "progress": progress, "checksum": _checksum(leaves, progress)}
     items = ocp.args.Composite(arrays=ocp.args.StandardSave(arrays), record=ocp.args.JsonSave(record))
     try:
         with _manager(folder) as manager:
@@ -74,15 +74,15 @@ def save(folder: Path, step: int, recipe: Mapping[str, Any], state: Any, progres
 
 
 def restore(folder: Path, recipe: Mapping[str, Any], state: Any) -> tuple[Any, Any] | None:
-    """The newest checkpoint's state and progress; None where there is none. Nothing in the folder is changed.
+    """State and progress of the newest checkpoint, None without one. Nothing in the folder is changed.
 
     Args:
         folder: of `save`, may be missing.
-        recipe: what is trained.
-        state: pytree like the one that was saved.
+        recipe: of the training.
+        state: pytree of the same structure and shapes.
 
     Raises:
-        InputError: the folder holds something else, the checkpoint is of something else, or it is damaged.
+        InputError: the folder is no folder of checkpoints, the checkpoint has another recipe, or it is damaged.
     """
     if not _holds_checkpoints(folder):
         return None
@@ -94,17 +94,17 @@ def restore(folder: Path, recipe: Mapping[str, Any], state: Any) -> tuple[Any, A
         if not (where / "record").exists():
             raise InputError(f"{where}: expected a checkpoint of mfvpr, got another; choose another folder")
         record = _read(manager, where, record=ocp.args.JsonRestore())
-        if differs := _difference(record, _expected(recipe, state)):
+        if differs := _difference(record, _description(recipe, state)):
             raise InputError(f"{folder}: this checkpoint is of {differs}; choose another folder, or delete this one")
         arrays = _read(manager, where, arrays=ocp.args.StandardRestore())
     leaves = [arrays[str(place)] for place in range(len(arrays))]
     if _checksum(leaves, record.get("progress")) != record.get("checksum"):
-        raise _damaged(where, "another checksum")
+        raise _damage_error(where, "another checksum")
     return jax.tree.unflatten(jax.tree.structure(state), leaves), record["progress"]
 
 
 def newest(folder: Path) -> Path | None:
-    """The newest checkpoint, None where there is none."""
+    """The folder of the newest checkpoint, None without one."""
     steps = [int(path.name) for path in folder.iterdir() if path.name.isdecimal()]
     return folder / str(max(steps)) if steps else None
 
@@ -117,7 +117,7 @@ def named(tree: Any) -> dict[str, Any]:
 
 @contextmanager
 def _manager(folder: Path, read_only: bool = False) -> Iterator[ocp.CheckpointManager]:
-    """Orbax, which says nothing of its own to the user."""
+    """Orbax's manager, without its logs and warnings."""
     logger = logging.getLogger("absl")
     level = logger.level
     logger.setLevel(logging.CRITICAL)
@@ -125,7 +125,7 @@ def _manager(folder: Path, read_only: bool = False) -> Iterator[ocp.CheckpointMa
         with warnings.catch_warnings(action="ignore"):
             options = ocp.CheckpointManagerOptions(
                 max_to_keep=None if read_only else _KEPT,
-                enable_async_checkpointing=False,  # a checkpoint that is announced is there
+                enable_async_checkpointing=False,  # `save` returns when the checkpoint is on disk
                 cleanup_tmp_directories=not read_only,
                 save_root_metadata=False,
                 read_only=read_only,
@@ -141,10 +141,10 @@ def _read(manager: ocp.CheckpointManager, where: Path, **item: Any) -> Any:
     try:
         return manager.restore(int(where.name), args=ocp.args.Composite(**item))[next(iter(item))]
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
-        raise _damaged(where, _reason(error)) from None
+        raise _damage_error(where, _reason(error)) from None
 
 
-def _damaged(where: Path, why: str) -> InputError:
+def _damage_error(where: Path, why: str) -> InputError:
     return InputError(f"{where}: damaged ({why}); delete it to go on from the checkpoint before")
 
 
@@ -156,7 +156,7 @@ def _checksum(leaves: Sequence[np.ndarray], progress: Any) -> int:
 
 
 def _holds_checkpoints(folder: Path) -> bool:
-    """Whether there is something to restore; refuses to make anything but a new or empty folder one of checkpoints."""
+    """Whether there is a checkpoint; raises for a folder that holds something else."""
     if not folder.exists():
         return False
     if not folder.is_dir():
@@ -169,16 +169,16 @@ def _holds_checkpoints(folder: Path) -> bool:
     return bool(names)
 
 
-def _expected(recipe: Mapping[str, Any], state: Any) -> dict[str, Any]:
-    """What a checkpoint says that it is of."""
+def _description(recipe: Mapping[str, Any], state: Any) -> dict[str, Any]:
+    """Format, recipe and shapes of arrays of a checkpoint, JSON values."""
     arrays = {name: f"{leaf.dtype}{list(leaf.shape)}" for name, leaf in named(state).items()}
     return json.loads(json.dumps({"format": FORMAT, "recipe": recipe or {}, "arrays": arrays}))  # tuples become lists
 
 
-def _difference(found: Mapping[str, Any], expected: Mapping[str, Any]) -> str | None:
-    """The first thing that differs, see `fingerprints.difference`; the recipe before the arrays."""
+def _difference(record: Mapping[str, Any], expected: Mapping[str, Any]) -> str | None:
+    """The first difference, see `fingerprints.difference`; the recipe before the arrays."""
     parts = (("format", "format"), ("recipe", ""), ("arrays", ""))
-    differences = (difference(found.get(part, {}), expected[part], name) for part, name in parts)
+    differences = (difference(record.get(part, {}), expected[part], name) for part, name in parts)
     return next(filter(None, differences), None)
 
 
