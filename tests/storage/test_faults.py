@@ -96,9 +96,9 @@ def test_a_store_is_read_while_another_process_writes_it(tmp_path):
             assert holder.stdout.readline() == b"open\n"
             store = open_store(tmp_path / "s", RECIPE, num_images=3)
             assert store.counts.tolist() == [40, -1, -1]
-            [(row, found)] = store.read()
+            [(row, features)] = store.read()
             assert row == 0
-            np.testing.assert_array_equal(found.keypoints, features_of(0).keypoints)
+            np.testing.assert_array_equal(features.keypoints, features_of(0).keypoints)
             with pytest.raises(ValueError, match="row 1 is not done"):
                 list(store.read([1]))
             with pytest.raises(ValueError, match="write `with store:`"):
@@ -139,12 +139,12 @@ def test_a_damaged_row_is_told_and_made_anew(tmp_path, subject, damage):
     DAMAGE[damage](file_of(folder))
     with subject.open(folder, 3) as store:
         assert store.done.all()
-        found = store.read()
-        assert next(found)[0] == 0
+        rows = store.read()
+        assert next(rows)[0] == 0
         expected = rf"s: {words.content} of 1 {words.rows} are damaged.*row 1 \(1-.*\); run again, which {words.remake}"
-        with pytest.raises(InputError, match=expected) as told:
-            next(found)
-        assert "\n" not in str(told.value)
+        with pytest.raises(InputError, match=expected) as error:
+            next(rows)
+        assert "\n" not in str(error.value)
         assert store.done.tolist() == [True, False, True]
     assert fill(folder, subject=subject) == [1]
     assert digests(folder) == before
@@ -168,10 +168,10 @@ def test_exchanged_rows_are_noticed(tmp_path, subject):
     folder = tmp_path / "s"
     fill(folder, subject=subject)
     before = digests(folder)
-    one, other = file_of(folder, 0), file_of(folder, 2)
-    content = one.read_bytes(), other.read_bytes()
-    one.write_bytes(content[1])
-    other.write_bytes(content[0])
+    first, second = file_of(folder, 0), file_of(folder, 2)
+    content = first.read_bytes(), second.read_bytes()
+    first.write_bytes(content[1])
+    second.write_bytes(content[0])
     with pytest.raises(InputError, match=r"of 2 \w+ are damaged.*row 0"):
         read_all(folder, subject=subject)
     assert fill(folder, subject=subject) == [0, 2]
@@ -247,35 +247,35 @@ def kill_rounds(root: str, kind: str, rounds: int) -> None:
     Forks, which saves a second of imports per round.
     """
     rng, subject = np.random.default_rng(0), LARGER[kind]
-    told = {"killed": 0, "torn": 0, "twice": 0, "failed": 0, "stores": 0, "different": 0}
+    counts = {"killed": 0, "torn": 0, "twice": 0, "failed": 0, "stores": 0, "different": 0}
     _child(subject, Path(root, "whole"), Path(root, "log"), None, from_first_write=False)
     expected = digests(Path(root, "whole"))
-    while told["killed"] < rounds:
-        folder, told["stores"] = Path(root, str(told["stores"])), told["stores"] + 1
+    while counts["killed"] < rounds:
+        folder, counts["stores"] = Path(root, str(counts["stores"])), counts["stores"] + 1
         while len(_rows(folder)) < NUM_ROWS:
             done, log = _rows(folder), Path(root, "log")
             log.write_text("")
-            finish = told["killed"] == rounds
+            finish = counts["killed"] == rounds
             early = rng.random() < 0.3  # while the store is made or opened
             delay = None if finish else rng.uniform(0, 0.02 if early else 0.03)
             status = _child(subject, folder, log, delay, from_first_write=not early)
-            told["killed"] += status == signal.SIGKILL
-            told["failed"] += status not in (0, signal.SIGKILL)
-            told["twice"] += len(done.intersection(map(int, log.read_text().split())))
-            told["torn"] += any(folder.glob(".*"))
+            counts["killed"] += status == signal.SIGKILL
+            counts["failed"] += status not in (0, signal.SIGKILL)
+            counts["twice"] += len(done.intersection(map(int, log.read_text().split())))
+            counts["torn"] += any(folder.glob(".*"))
             for name, digest in digests(folder).items():  # what is there is whole, at any moment
-                told["different"] += not name.startswith(".") and digest != expected[name]
-        told["different"] += digests(folder) != expected
-    print(json.dumps(told))
+                counts["different"] += not name.startswith(".") and digest != expected[name]
+        counts["different"] += digests(folder) != expected
+    print(json.dumps(counts))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "rounds"), [("features", 50), ("matches", 30)])
 def test_killed_processes_end_in_the_same_files(tmp_path, kind, rounds):
-    told = json.loads(run_here(f"kill_rounds({str(tmp_path)!r}, {kind!r}, {rounds})"))
-    assert told["killed"] == rounds
-    assert told["torn"] > 0  # kills in the middle of writing, as the files show
-    assert (told["failed"], told["twice"], told["different"]) == (0, 0, 0)
+    counts = json.loads(run_here(f"kill_rounds({str(tmp_path)!r}, {kind!r}, {rounds})"))
+    assert counts["killed"] == rounds
+    assert counts["torn"] > 0  # kills in the middle of writing, as the files show
+    assert (counts["failed"], counts["twice"], counts["different"]) == (0, 0, 0)
 
 
 # Disks
@@ -283,7 +283,7 @@ def test_killed_processes_end_in_the_same_files(tmp_path, kind, rounds):
 
 def full_disk(root: str) -> None:
     """A store on a disk of 5 MB, which then grows: what is told, and what is left. Prints JSON."""
-    disk, told = Path(root), {}
+    disk, report = Path(root), {}
     mount(disk, "-o", "size=5m")
 
     def extract() -> list[int]:
@@ -297,40 +297,42 @@ def full_disk(root: str) -> None:
         try:
             extract()
         except InputError as error:
-            told[name] = str(error)
-    kept = read_all(disk / "s", 12)
-    told["kept"] = [row for row, found in kept.items() if (found.scores == features_of(row, 700, 512).scores).all()]
+            report[name] = str(error)
+    rows = read_all(disk / "s", 12)
+    report["kept"] = [
+        row for row, features in rows.items() if (features.scores == features_of(row, 700, 512).scores).all()
+    ]
     mount(disk, "-o", "remount,size=12m")
-    told["resumed"] = extract()
-    told["all"] = len(read_all(disk / "s", 12))
+    report["resumed"] = extract()
+    report["all"] = len(read_all(disk / "s", 12))
     (disk / "ballast").write_bytes(bytes(shutil.disk_usage(disk).free))
-    told["read_when_full"] = len(read_all(disk / "s", 12))
+    report["read_when_full"] = len(read_all(disk / "s", 12))
     mount(disk, "-o", "remount,ro")
-    told["read_when_read_only"] = len(read_all(disk / "s", 12))
+    report["read_when_read_only"] = len(read_all(disk / "s", 12))
     try:
         read_all(disk / "new", 12)
     except InputError as error:
-        told["new"] = str(error)
+        report["new"] = str(error)
     mount(disk, "-o", "remount,rw")
     DAMAGE["flipped"](file_of(disk / "s", 3))
     mount(disk, "-o", "remount,ro")
     try:
         read_all(disk / "s", 12)
     except InputError as error:
-        told["damaged"] = str(error)
-    print(json.dumps(told))
+        report["damaged"] = str(error)
+    print(json.dumps(report))
 
 
 def test_a_full_disk_is_told_and_extraction_goes_on_when_it_is_not(tmp_path):
     need_small_disks(tmp_path)
-    told = json.loads(run_here(f"full_disk({str(tmp_path)!r})", prefix=UNSHARE))
-    done = told["kept"]
+    report = json.loads(run_here(f"full_disk({str(tmp_path)!r})", prefix=UNSHARE))
+    done = report["kept"]
     assert 5 <= len(done) <= 8
     for name in ("first", "second"):
         needed = forecast_bytes(1, 700, 512) / 1e6  # of the row that was being written
-        assert told[name].startswith(f"{tmp_path}/s: expected about {needed:.1f} MB of free disk space, got 0.")
-        assert "MB; free some space" in told[name]
-    assert told["resumed"] == [row for row in range(12) if row not in done]
-    assert told["all"] == told["read_when_full"] == told["read_when_read_only"] == 12
-    assert f"{tmp_path}/new: cannot hold features (Read-only file system)" in told["new"]
-    assert "row 3 (3-700.npz); " in told["damaged"]
+        assert report[name].startswith(f"{tmp_path}/s: expected about {needed:.1f} MB of free disk space, got 0.")
+        assert "MB; free some space" in report[name]
+    assert report["resumed"] == [row for row in range(12) if row not in done]
+    assert report["all"] == report["read_when_full"] == report["read_when_read_only"] == 12
+    assert f"{tmp_path}/new: cannot hold features (Read-only file system)" in report["new"]
+    assert "row 3 (3-700.npz); " in report["damaged"]

@@ -1,4 +1,4 @@
-"""What is taken from the images of a folder: extracted once, whatever happens in between."""
+"""The cache of features extracts every image once, and again when the image or the extractor changed."""
 
 import shutil
 from dataclasses import dataclass, replace
@@ -71,8 +71,8 @@ class Both:
         self.seen += len(images)
         local = SIFT(images)
         return [
-            Description(np.full(3, row, np.float32), (one.features, jax.tree.map(half, one.features)))
-            for row, one in enumerate(local)
+            Description(np.full(3, row, np.float32), (description.features, jax.tree.map(half, description.features)))
+            for row, description in enumerate(local)
         ]
 
 
@@ -90,35 +90,35 @@ def all_of(features):
 
 
 def assert_same_features(got, expected):
-    for one, other in zip(all_of(got), all_of(expected), strict=True):
-        assert_same(one, other)
+    for features, other in zip(all_of(got), all_of(expected), strict=True):
+        assert_same(features, other)
 
 
 def test_what_was_extracted_is_read_ever_after(folder, tmp_path):
     [plain] = Archive().local(folder, SIFT)
-    extractor, found = Counted(), []
+    extractor, feature_sets = Counted(), []
     for _ in range(2):
         [features] = Archive(tmp_path).local(folder, extractor)
-        found.append(features)
+        feature_sets.append(features)
     assert extractor.seen == len(folder)
-    assert_same_features(*found)
-    for first, exact in zip(all_of(found[0]), all_of(plain), strict=True):
+    assert_same_features(*feature_sets)
+    for first, exact in zip(all_of(feature_sets[0]), all_of(plain), strict=True):
         for name in ("keypoints", "descriptors", "scores", "mask", "image_size"):
             tolerance = 2e-4 if name == "descriptors" else 0
             np.testing.assert_allclose(getattr(first, name), getattr(exact, name), atol=tolerance)
 
 
-@pytest.mark.parametrize("kept", [True, False])
-def test_only_what_is_asked_for_is_extracted_and_nothing_twice(folder, tmp_path, kept):
-    extractor, archive = Counted(), Archive(tmp_path if kept else None)
+@pytest.mark.parametrize("on_disk", [True, False])
+def test_only_what_is_asked_for_is_extracted_and_nothing_twice(folder, tmp_path, on_disk):
+    extractor, archive = Counted(), Archive(tmp_path if on_disk else None)
     for rows, seen in (([7, 2], 2), ([2], 2), ([2, 3, 7], 3), ([], 3)):
         [features] = archive.local(folder, extractor, rows)
         assert extractor.seen == seen
         assert len(features) == len(folder)
     assert sorted(np.flatnonzero(features.counts).tolist()) == [2, 3, 7]
-    [whole] = archive.local(folder, extractor)
+    [all_features] = archive.local(folder, extractor)
     assert extractor.seen == len(folder)
-    assert_same_features(whole, Archive(tmp_path if kept else None).local(folder, SIFT)[0])
+    assert_same_features(all_features, Archive(tmp_path if on_disk else None).local(folder, SIFT)[0])
 
 
 @dataclass
@@ -130,15 +130,15 @@ class Fewer:
     vector_size, scales = SIFT.vector_size, SIFT.scales
 
     def __call__(self, images):
-        return [Description(None, (jax.tree.map(self.first, one.features),)) for one in SIFT(images)]
+        return [Description(None, (jax.tree.map(self.first, description.features),)) for description in SIFT(images)]
 
     def first(self, values):
         return values if values.shape == (2,) else values[: self.number]
 
 
-@pytest.mark.parametrize("kept", [True, False])
-def test_an_extractor_that_was_changed_is_another_one(folder, tmp_path, kept):
-    extractor, archive = Fewer(5), Archive(tmp_path if kept else None)
+@pytest.mark.parametrize("on_disk", [True, False])
+def test_an_extractor_that_was_changed_is_another_one(folder, tmp_path, on_disk):
+    extractor, archive = Fewer(5), Archive(tmp_path if on_disk else None)
     for number in (5, 9, 5):
         extractor.number = number
         [features] = archive.local(folder, extractor)
@@ -152,17 +152,17 @@ def test_what_another_version_decodes_are_other_images(folder, monkeypatch):
         assert Archive().recipe(folder, SIFT) != recipe
 
 
-@pytest.mark.parametrize("kept", [True, False])
-def test_files_that_were_changed_are_looked_at_again(tmp_path, kept, small_street, monkeypatch):
+@pytest.mark.parametrize("on_disk", [True, False])
+def test_files_that_were_changed_are_looked_at_again(tmp_path, on_disk, small_street, monkeypatch):
     root = tmp_path / "images"
     shutil.copytree(small_street / "database", root)
-    archive, folder = Archive(tmp_path / "s" if kept else None), image_folder(root)
+    archive, folder = Archive(tmp_path / "s" if on_disk else None), image_folder(root)
     [before] = archive.local(folder, SIFT, [0, 1])
     before = before[1]
     for row in range(len(folder)):
         shutil.copy(small_street / "queries" / f"{9 - row:04d}.png", root / f"{row:04d}.png")
     [after] = archive.local(folder, SIFT)
-    [expected] = Archive(tmp_path / "other" if kept else None).local(folder, SIFT)
+    [expected] = Archive(tmp_path / "other" if on_disk else None).local(folder, SIFT)
     assert_same_features(after, expected)
     assert not np.array_equal(before.keypoints, after[1].keypoints)
     monkeypatch.chdir(small_street)
@@ -193,11 +193,11 @@ def test_an_interrupted_extraction_goes_on_where_it_was(folder, tmp_path):
     interrupted, resumed = Counted(limit=7), Counted()
     with pytest.raises(KeyboardInterrupt):
         Archive(tmp_path).local(folder, interrupted)
-    [found] = Archive(tmp_path).local(folder, resumed)
+    [features] = Archive(tmp_path).local(folder, resumed)
     assert interrupted.seen == 6
     assert resumed.seen == len(folder) - 6
     [expected] = Archive(tmp_path / "uninterrupted").local(folder, SIFT)
-    assert_same_features(found, expected)
+    assert_same_features(features, expected)
 
 
 def test_bad_images_are_tried_again_by_the_next_run(tmp_path):
@@ -211,9 +211,9 @@ def test_bad_images_are_tried_again_by_the_next_run(tmp_path):
     for _ in range(2):
         assert list(archive.local(folder, SIFT)[0].bad) == [1]
     (images / "b.png").write_bytes(good)
-    [found] = Archive(tmp_path / "s", skip_bad=True).local(folder, SIFT)
-    assert found.bad == {}
-    assert found.counts.all()
+    [features] = Archive(tmp_path / "s", skip_bad=True).local(folder, SIFT)
+    assert features.bad == {}
+    assert features.counts.all()
 
 
 def test_bad_images_fail_by_default_with_the_mend(tmp_path):
@@ -238,11 +238,11 @@ def colors(tmp_path):
 def test_global_descriptors_are_stored_as_well(colors, tmp_path):
     mean = Mean()
     plain = Archive(skip_bad=True).vectors(colors, mean, colors)
-    found = [Archive(tmp_path / "s", skip_bad=True).vectors(colors, mean, colors) for _ in range(2)]
+    runs = [Archive(tmp_path / "s", skip_bad=True).vectors(colors, mean, colors) for _ in range(2)]
     assert mean.seen == 3 + 3
-    for one in found:
-        np.testing.assert_array_equal(one.values, plain.values)
-        assert list(one.bad) == [2]
+    for descriptors in runs:
+        np.testing.assert_array_equal(descriptors.values, plain.values)
+        assert list(descriptors.bad) == [2]
     assert np.isnan(plain.values[2]).all()
     np.testing.assert_allclose(np.linalg.norm(plain.values[[0, 1, 3]], axis=1), 1, rtol=1e-5)
 
@@ -257,12 +257,12 @@ class Dark(Mean):
             return [Description(vector) for vector in (1 / images.mean((1, 2))).astype(np.float32)]
 
 
-@pytest.mark.parametrize("kept", [True, False])
-def test_images_without_a_global_descriptor_are_listed(colors, tmp_path, kept):
-    found = Archive(tmp_path / "s" if kept else None, skip_bad=True).vectors(colors, Dark(), colors)
-    assert sorted(found.bad) == [1, 2]
-    assert "b.png: features are not finite" in found.bad[1]
-    assert np.isnan(found.values).any(axis=1).tolist() == [False, True, True, False]
+@pytest.mark.parametrize("on_disk", [True, False])
+def test_images_without_a_global_descriptor_are_listed(colors, tmp_path, on_disk):
+    descriptors = Archive(tmp_path / "s" if on_disk else None, skip_bad=True).vectors(colors, Dark(), colors)
+    assert sorted(descriptors.bad) == [1, 2]
+    assert "b.png: features are not finite" in descriptors.bad[1]
+    assert np.isnan(descriptors.values).any(axis=1).tolist() == [False, True, True, False]
 
 
 def test_stores_are_found_by_content_whatever_folders_are_called(folder, tmp_path, small_street):
@@ -287,10 +287,10 @@ def test_aggregations_are_fitted_on_the_database(folder, small_street, tmp_path)
     [local] = archive.local(folder, SIFT)
     expected = VladFitting(num_words=4).fit(local)(all_of(local))
     np.testing.assert_allclose(archive.vectors(folder, describer, folder).values, expected, atol=1e-6)
-    [others] = archive.local(queries, SIFT)
+    [query_features] = archive.local(queries, SIFT)
     np.testing.assert_allclose(
         archive.vectors(queries, describer, folder).values,
-        VladFitting(num_words=4).fit(local)(all_of(others)), atol=1e-6,
+        VladFitting(num_words=4).fit(local)(all_of(query_features)), atol=1e-6,
     )  # fmt: skip
 
 
@@ -321,11 +321,11 @@ def test_features_of_ones_own_are_matched_as_they_are():
     rng = np.random.default_rng(0)
     images = [make_features(rng, count, capacity=40) for count in (7, 0, 40, 33)]
     images[2] = replace(images[2], descriptors=images[2].descriptors.astype(np.float16).astype(np.float32))
-    found = stages.FeatureSet.of(images)
-    assert len(found) == 4
-    assert found.counts.tolist() == [7, 0, 40, 33]
+    feature_set = stages.FeatureSet.of(images)
+    assert len(feature_set) == 4
+    assert feature_set.counts.tolist() == [7, 0, 40, 33]
     candidates = EXACT.shortlist(np.eye(4, dtype=np.float32), np.ones((4, 4), np.float32) / 2, 4)
-    matches = stages.match(found, found, candidates)
+    matches = stages.match(feature_set, feature_set, candidates)
     for query, row in ((0, 2), (2, 3), (3, 0), (1, 2)):
         alone = match(images[query], images[row])
         place = candidates.indices[query].tolist().index(row)
@@ -351,5 +351,5 @@ def test_features_of_ones_own_that_do_not_fit_are_told(change, words):
 def test_descriptors_are_of_unit_length_only_where_that_is_asked():
     image = make_features(np.random.default_rng(0), 5)
     longer = replace(image, descriptors=3 * image.descriptors)
-    found = stages.FeatureSet.of([longer], unit_length=False)
-    np.testing.assert_array_equal(found[0].descriptors, longer.descriptors)
+    feature_set = stages.FeatureSet.of([longer], unit_length=False)
+    np.testing.assert_array_equal(feature_set[0].descriptors, longer.descriptors)

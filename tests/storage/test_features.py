@@ -26,13 +26,13 @@ def test_all_but_the_descriptors_is_exact(tmp_path, count):
         store.write({1: original})
         assert store.counts.tolist() == [-1, count, -1]
     with open_store(tmp_path / "s", RECIPE, num_images=3) as store:
-        [(row, found)] = store.read()
+        [(row, features)] = store.read()
     assert row == 1
     for name in ("keypoints", "scores", "mask", "image_size"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(original, name))
-    assert {getattr(found, part.name).dtype.name for part in fields(Features)} == {"float32", "bool"}
-    np.testing.assert_allclose(np.linalg.norm(found.descriptors, axis=1), 1, atol=2e-7)
-    assert np.linalg.norm(found.descriptors - original.descriptors, axis=1).max(initial=0) < 5e-4
+        np.testing.assert_array_equal(getattr(features, name), getattr(original, name))
+    assert {getattr(features, part.name).dtype.name for part in fields(Features)} == {"float32", "bool"}
+    np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1, atol=2e-7)
+    assert np.linalg.norm(features.descriptors - original.descriptors, axis=1).max(initial=0) < 5e-4
 
 
 def test_first_and_later_runs_read_the_same_bits(tmp_path):
@@ -52,9 +52,9 @@ def test_descriptors_keep_their_length(tmp_path):
     original.descriptors[:] *= lengths[:, None]
     with open_store(tmp_path / "s", RECIPE, num_images=1) as store:
         store.write({0: original})
-        [(_, found)] = store.read()
-    np.testing.assert_allclose(np.linalg.norm(found.descriptors, axis=1), lengths, rtol=3e-7)
-    assert (np.linalg.norm(found.descriptors - original.descriptors, axis=1) < 5e-4 * lengths).all()
+        [(_, features)] = store.read()
+    np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), lengths, rtol=3e-7)
+    assert (np.linalg.norm(features.descriptors - original.descriptors, axis=1) < 5e-4 * lengths).all()
 
 
 def test_zero_descriptors_stay_zero_and_padding_is_left_out(tmp_path):
@@ -63,10 +63,10 @@ def test_zero_descriptors_stay_zero_and_padding_is_left_out(tmp_path):
     padded.scores[:5] = 0
     with open_store(tmp_path / "s", RECIPE, num_images=1) as store:
         store.write({0: padded})
-        [(_, found)] = store.read()
-    assert found.mask.shape == (5,)
-    np.testing.assert_array_equal(found.descriptors[2], 0)
-    np.testing.assert_array_equal(found.scores, 0)
+        [(_, features)] = store.read()
+    assert features.mask.shape == (5,)
+    np.testing.assert_array_equal(features.descriptors[2], 0)
+    np.testing.assert_array_equal(features.scores, 0)
 
 
 def test_rows_come_in_the_order_asked_for(tmp_path):
@@ -74,8 +74,8 @@ def test_rows_come_in_the_order_asked_for(tmp_path):
     with open_store(tmp_path / "s", RECIPE, num_images=40) as store:
         assert [row for row, _ in store.read([39, 0, 17])] == [39, 0, 17]
         assert [row for row, _ in store.read()] == list(range(40))
-        for row, found in store.read(reversed(range(40))):
-            np.testing.assert_array_equal(found.keypoints, features_of(row).keypoints)
+        for row, features in store.read(reversed(range(40))):
+            np.testing.assert_array_equal(features.keypoints, features_of(row).keypoints)
 
 
 def test_the_working_directory_may_change(tmp_path, monkeypatch):
@@ -215,11 +215,11 @@ def _changed(**extractor):
 def test_features_made_from_something_else_are_refused(tmp_path, recipe, num_images, difference):
     fill(tmp_path / "s")
     with (
-        pytest.raises(InputError, match=rf"s/manifest\.json: .*{difference}; .*delete") as told,
+        pytest.raises(InputError, match=rf"s/manifest\.json: .*{difference}; .*delete") as error,
         open_store(tmp_path / "s", recipe, num_images=num_images),
     ):
         pass
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(error.value)
     assert fill(tmp_path / "s") == []
 
 
@@ -251,8 +251,8 @@ def test_rows_are_files_that_numpy_reads(tmp_path):
     assert {path.name for path in (tmp_path / "s").iterdir()} == {
         "lock", "manifest.json", "0-40.npz", "1-40.npz", "2-40.npz",
     }  # fmt: skip
-    with np.load(tmp_path / "s" / "2-40.npz") as found:
-        np.testing.assert_array_equal(found["keypoints"], features_of(2).keypoints)
+    with np.load(tmp_path / "s" / "2-40.npz") as arrays:
+        np.testing.assert_array_equal(arrays["keypoints"], features_of(2).keypoints)
 
 
 def _file(folder):
@@ -305,11 +305,11 @@ def test_what_is_no_store_is_refused_and_left_alone(tmp_path, spoil, message):
     (tmp_path / "below").mkdir()
     spoil(tmp_path / "below" / "s")
     with (
-        pytest.raises(InputError, match=rf"below/s.*{message}.*; \w+") as told,
+        pytest.raises(InputError, match=rf"below/s.*{message}.*; \w+") as error,
         open_store(tmp_path / "below" / "s", RECIPE, num_images=3),
     ):
         pass
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(error.value)
     assert {path.name for path in tmp_path.rglob("*")} <= {"below", "s", "holiday.jpg", "manifest.json", "zarr.json"}
 
 

@@ -25,11 +25,11 @@ def assert_same_bits(got, expected):
         *((getattr(got.matches, part.name), getattr(expected.matches, part.name)) for part in fields(Matches)),
         *((getattr(got, name), getattr(expected, name)) for name in ("counts", "indices", "filter_scores")),
     ]
-    for one, other in pairs:
-        assert (one is None) == (other is None)
-        if one is not None:
-            assert (one.shape, one.dtype) == (other.shape, other.dtype)
-            assert one.tobytes() == other.tobytes()
+    for values, expected_values in pairs:
+        assert (values is None) == (expected_values is None)
+        if values is not None:
+            assert (values.shape, values.dtype) == (expected_values.shape, expected_values.dtype)
+            assert values.tobytes() == expected_values.tobytes()
 
 
 # What comes back
@@ -71,8 +71,8 @@ def test_rows_come_in_the_order_asked_for(tmp_path):
     fill(tmp_path / "s", 40, batch=20, subject=MATCHES)
     with MATCHES.open(tmp_path / "s", 40) as store:
         assert [row for row, _ in store.read()] == list(range(40))
-        for row, found in store.read(reversed(range(40))):
-            assert_same_bits(found, matches_of(row))
+        for row, matches in store.read(reversed(range(40))):
+            assert_same_bits(matches, matches_of(row))
         with pytest.raises(ValueError, match="row 3 is done"):
             store.write({3: matches_of(3)})
 
@@ -92,9 +92,9 @@ def test_matches_that_tell_other_things_are_told_apart(tmp_path, stored, other, 
             if not store.done[0]:
                 store.write({0: stored})
             before = digests(folder)
-            with pytest.raises(InputError, match=rf"s: row 1: {message} .*delete") as told:
+            with pytest.raises(InputError, match=rf"s: row 1: {message} .*delete") as error:
                 store.write({1: other})
-            assert "\n" not in str(told.value)
+            assert "\n" not in str(error.value)
             assert digests(folder) == before
     with MATCHES.open(tmp_path / "t", 3) as store:
         with pytest.raises(InputError, match="as in the other queries"):
@@ -162,11 +162,11 @@ def test_a_match_store_has_a_path_of_its_own(tmp_path):
 def test_matches_made_from_something_else_are_refused(tmp_path, recipe, num_queries, num_candidates, difference):
     fill(tmp_path / "s", subject=MATCHES)
     with (
-        pytest.raises(InputError, match=rf"s/manifest\.json: .*{difference}; .*delete") as told,
+        pytest.raises(InputError, match=rf"s/manifest\.json: .*{difference}; .*delete") as error,
         open_match_store(tmp_path / "s", recipe, num_queries=num_queries, num_candidates=num_candidates),
     ):
         pass
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(error.value)
     assert fill(tmp_path / "s", subject=MATCHES) == []
 
 

@@ -1,4 +1,4 @@
-"""Whose a name is, for ever, and who waits for whom."""
+"""Shards of names, which never change, and how shards wait for each other."""
 
 import hashlib
 from functools import partial
@@ -14,7 +14,7 @@ from mfvpr.utils import InputError
 
 
 def test_patience():
-    """Who waits goes on as soon as others have done theirs."""
+    """A shard that waits goes on as soon as no row is missing."""
     calls = []
 
     def missing():
@@ -76,8 +76,8 @@ def test_what_waits_does_not_keep_the_rest():
 @pytest.mark.parametrize("complete", [(True, True), (True, False), (False, True), (False, False)])
 def test_a_shard_is_complete_if_all_that_waits_for_others_is(complete):
     shards = [Shard(0, 2), Shard(1, 2)]
-    waits = [partial(shard.wait, lambda: [0, 1], ["a", "b"], "scores", is_complete=one)
-             for shard, one in zip(shards, complete, strict=True)]  # fmt: skip
+    waits = [partial(shard.wait, lambda: [0, 1], ["a", "b"], "scores", is_complete=is_complete)
+             for shard, is_complete in zip(shards, complete, strict=True)]  # fmt: skip
     with pytest.raises(NotYet) as error:
         together(*waits)
     assert error.value.is_complete == all(complete)

@@ -82,14 +82,14 @@ def shared(root, count, run, seed=0):
     return results, waits
 
 
-def assert_same(found, expected):
+def assert_same(report, expected):
     for name, ranked in expected.systems.items():
-        for one, other in zip(found.systems[name], ranked, strict=True):
-            np.testing.assert_array_equal(one.rows, other.rows, err_msg=name)
-            np.testing.assert_array_equal(one.scores, other.scores, err_msg=name)
+        for ranking, expected_ranking in zip(report.systems[name], ranked, strict=True):
+            np.testing.assert_array_equal(ranking.rows, expected_ranking.rows, err_msg=name)
+            np.testing.assert_array_equal(ranking.scores, expected_ranking.scores, err_msg=name)
     for threshold in (0, 1):
         for name, recall in expected.recall([threshold]).items():
-            np.testing.assert_array_equal(found.recall([threshold])[name].by_sequence, recall.by_sequence)
+            np.testing.assert_array_equal(report.recall([threshold])[name].by_sequence, recall.by_sequence)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
@@ -114,8 +114,8 @@ def test_shards_give_what_one_machine_gives(dataset, plain, tmp_path, count):
 
 def test_local_features_are_those_of_candidates_only(dataset, tmp_path):
     """With a filter of its own descriptors, as for a single machine."""
-    filter, kept = Retrieval(Mean()), tmp_path / "plain"
-    expected = mfvpr.evaluate(dataset, SIFT, filter, SCORERS, candidates=2, archive=Archive(kept))
+    filter, plain_root = Retrieval(Mean()), tmp_path / "plain"
+    expected = mfvpr.evaluate(dataset, SIFT, filter, SCORERS, candidates=2, archive=Archive(plain_root))
     results, _ = shared(
         tmp_path / "s", 3, lambda archive: mfvpr.evaluate(dataset, SIFT, filter, SCORERS, candidates=2, archive=archive)
     )
@@ -124,7 +124,7 @@ def test_local_features_are_those_of_candidates_only(dataset, tmp_path):
     def files(root):
         return sorted(path.name for path in root.rglob("*-*.npz") if path.name[0].isdigit() and "Sift" in str(path))
 
-    assert files(tmp_path / "s") == files(kept)
+    assert files(tmp_path / "s") == files(plain_root)
 
 
 class TwoScales:
@@ -134,9 +134,11 @@ class TwoScales:
     scales, recipe = (Scale(128, 60), Scale(128, 30, weight=0.5)), "two scales"
 
     def __call__(self, images):
-        vectors = [one.vector for one in Mean()(images)]
-        every = [one.features for one in SIFT(images)]
-        halves = [jax.tree.map(lambda field: field if field.shape == (2,) else field[::2], one) for one in every]
+        vectors = [description.vector for description in Mean()(images)]
+        every = [description.features for description in SIFT(images)]
+        halves = [
+            jax.tree.map(lambda field: field if field.shape == (2,) else field[::2], features) for features in every
+        ]
         return [Description(*parts) for parts in zip(vectors, zip(every, halves, strict=True), strict=True)]
 
 
@@ -163,10 +165,10 @@ def test_damaged_rows_of_any_shard_are_made_again(dataset, tmp_path, store):
         try:
             return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, archive=archive)
         except InputError as error:  # the row is removed, and its shard makes it again
-            told.append(str(error))
+            messages.append(str(error))
             raise NotYet(str(error)) from None
 
-    told = []
+    messages = []
     expected = run(Archive(tmp_path / "plain"))
     shared(tmp_path / "s", 2, run)
     rows = [path for path in (tmp_path / "s").glob(f"{store}-*/shards/*/[0-9]*-*.npz") if "-0.npz" not in path.name]
@@ -179,29 +181,29 @@ def test_damaged_rows_of_any_shard_are_made_again(dataset, tmp_path, store):
         row.unlink()
     results, _ = shared(tmp_path / "s", 2, run)
     assert_same(results[0], expected)
-    assert len(told) == 1
-    assert "are damaged on disk, the first in row" in told[0]
+    assert len(messages) == 1
+    assert "are damaged on disk, the first in row" in messages[0]
 
 
 def test_scores_are_known_by_their_scorers_and_candidates(dataset, split, small_street, tmp_path):
     """Whatever the order of the scorers, and the weights of the scales, which no feature depends on."""
-    one = Archive(tmp_path, shard=Shard(0, 1))
-    first = mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, archive=one)
-    turned = mfvpr.evaluate(dataset, SIFT, VLAD, dict(reversed(SCORERS.items())), candidates=3, archive=one)
+    archive = Archive(tmp_path, shard=Shard(0, 1))
+    first = mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, archive=archive)
+    turned = mfvpr.evaluate(dataset, SIFT, VLAD, dict(reversed(SCORERS.items())), candidates=3, archive=archive)
     assert [*turned.systems] == ["filter", "count", "histogram"]
     assert_same(turned, first)
     for weight in (1.0, 5.0):
         extractor = TwoScales()
         extractor.scales = (Scale(128, 60), Scale(128, 30, weight=weight))
         how = (dataset, extractor, Retrieval(extractor), SCORERS)
-        assert_same(mfvpr.evaluate(*how, archive=one), mfvpr.evaluate(*how, archive=Archive(tmp_path / "plain")))
+        assert_same(mfvpr.evaluate(*how, archive=archive), mfvpr.evaluate(*how, archive=Archive(tmp_path / "plain")))
     for path in tmp_path.glob("matches-*/shortlist.npz"):
-        kept = read_arrays(path, path.parent.name)
-        write_arrays(path, kept | {"indices": np.roll(kept["indices"], 1, axis=0)}, path.parent.name)
+        arrays = read_arrays(path, path.parent.name)
+        write_arrays(path, arrays | {"indices": np.roll(arrays["indices"], 1, axis=0)}, path.parent.name)
     for path in tmp_path.glob("matches-*/shards/*/*.npz"):
         path.unlink()
     with pytest.raises(InputError, match=r"scores .*candidates.*shortlist"):
-        mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, archive=one)
+        mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, archive=archive)
 
 
 class Drawn:
@@ -219,8 +221,8 @@ def test_candidates_are_those_of_the_first_shard(dataset, tmp_path):
     results, _ = shared(
         tmp_path, 3, lambda archive: mfvpr.evaluate(dataset, SIFT, Drawn(), SCORERS, candidates=3, archive=archive)
     )
-    kept = [path for path in tmp_path.glob("matches-*/shortlist.npz")]
-    indices = read_arrays(kept[0], kept[0].parent.name)["indices"]
+    paths = [path for path in tmp_path.glob("matches-*/shortlist.npz")]
+    indices = read_arrays(paths[0], paths[0].parent.name)["indices"]
     np.testing.assert_array_equal(results[0].matched[0].candidates.indices, indices)
 
 

@@ -39,9 +39,9 @@ def opened(tmp_path):
 
 def assert_same(got, expected):
     np.testing.assert_array_equal(got.counts, expected.counts)
-    for one, other in zip(got.matches, expected.matches, strict=True):
+    for matches, expected_matches in zip(got.matches, expected.matches, strict=True):
         for part in fields(Matches):
-            np.testing.assert_array_equal(getattr(one, part.name), getattr(other, part.name))
+            np.testing.assert_array_equal(getattr(matches, part.name), getattr(expected_matches, part.name))
 
 
 class Interrupted(Exception):
@@ -62,18 +62,18 @@ def test_another_shortlist_is_refused_before_anything_is_written(drawn, candidat
     monkeypatch.setattr(stages, "STORE_BATCH", 2)
     with opened() as store, pytest.raises(Interrupted):
         stages.match(drawn, drawn, candidates, store=store, track=_interrupting(5))
-    others = [
+    shortlists = [
         replace(candidates, indices=candidates.indices[:, ::-1]),
         replace(candidates, indices=np.where(np.arange(QUERIES)[:, None] == 3, 0, candidates.indices)),
         Shortlist(*(values[:, :3] for values in (candidates.indices, candidates.scores, candidates.mask))),
         Shortlist(*(values[:2] for values in (candidates.indices, candidates.scores, candidates.mask))),
     ]
-    for other in others:
+    for shortlist in shortlists:
         with opened() as store:
             assert store.done.tolist() == [True] * 4 + [False] * 2
             before = digests(store.folder)
             with pytest.raises(InputError, match=r"s: .*candidates.*shortlist"):
-                stages.match(drawn, drawn, other, store=store)
+                stages.match(drawn, drawn, shortlist, store=store)
             assert digests(store.folder) == before
     with opened() as store:
         assert_same(
@@ -89,8 +89,8 @@ def test_matching_without_a_store_is_the_same(drawn, candidates, opened):
     assert plain.matches[0].ratio is not None
     for _ in range(2):
         with opened() as store:
-            kept = stages.match(drawn, drawn, candidates, store=store)
-        assert_same(kept, plain)
+            stored = stages.match(drawn, drawn, candidates, store=store)
+        assert_same(stored, plain)
 
 
 # The programs' stores
@@ -119,7 +119,7 @@ def test_matches_belong_to_images_whatever_their_data_set_is_called(small_street
      "matching.max_distance=1", "dataset.exclude_neighbors=0"],
 )  # fmt: skip
 def test_matches_of_other_settings_are_kept_apart(small_street, tmp_path, change):
-    """Of those that skip bad images too: else a run that stops at one would find all matches, and not stop."""
+    """`skip_bad` counts: else a run that stops at a bad image would find all matches, and not stop."""
     street = tmp_path / "street"  # whose queries are database images
     for side in ("database", "queries"):
         shutil.copytree(small_street / "database", street / side)

@@ -28,15 +28,15 @@ def test_the_same_arrays_come_back(tmp_path, compress):
     path = tmp_path / "below" / "a.npz"
     for _ in range(2):  # the second replaces the first
         write_arrays(path, ARRAYS, "this", compress=compress)
-    found = read_arrays(path, "this")
+    arrays = read_arrays(path, "this")
     with np.load(path) as archive:
         plain = dict(archive)
-    assert list(found) == list(plain) == list(ARRAYS)
+    assert list(arrays) == list(plain) == list(ARRAYS)
     for name, expected in ARRAYS.items():
-        for one in (found[name], plain[name]):
-            assert (one.dtype, one.shape) == (expected.dtype, expected.shape)
-            np.testing.assert_array_equal(one, expected)
-    assert [one.name for one in path.parent.iterdir()] == ["a.npz"]
+        for values in (arrays[name], plain[name]):
+            assert (values.dtype, values.shape) == (expected.dtype, expected.shape)
+            np.testing.assert_array_equal(values, expected)
+    assert [file.name for file in path.parent.iterdir()] == ["a.npz"]
 
 
 def test_equal_arrays_are_equal_files(tmp_path):
@@ -49,9 +49,9 @@ def test_equal_arrays_are_equal_files(tmp_path):
 def test_every_flipped_bit_and_every_missing_byte_is_noticed(tmp_path, compress):
     path = tmp_path / "a.npz"
     write_arrays(path, {"scores": ARRAYS["scores"]}, compress=compress)
-    whole = path.read_bytes()
+    content = path.read_bytes()
     with path.open("r+b") as file:
-        for position, byte in enumerate(whole):
+        for position, byte in enumerate(content):
             for written in (byte ^ 1 << position % 8, byte):
                 file.seek(position)
                 file.write(bytes([written]))
@@ -60,7 +60,7 @@ def test_every_flipped_bit_and_every_missing_byte_is_noticed(tmp_path, compress)
                     with pytest.raises(InputError, match=r"a\.npz: expected .* damaged ones; delete it$"):
                         read_arrays(path)
     np.testing.assert_array_equal(read_arrays(path)["scores"], ARRAYS["scores"])
-    for length in reversed(range(len(whole))):
+    for length in reversed(range(len(content))):
         os.truncate(path, length)
         with pytest.raises(InputError, match="damaged"):
             read_arrays(path)
@@ -80,7 +80,7 @@ def test_what_fails_leaves_what_was_there(tmp_path):
     with pytest.raises(ValueError, match="Object arrays"):
         write_arrays(path, {"one": np.array([{}, None], object)})
     np.testing.assert_array_equal(read_arrays(path)["one"], [1, 1])
-    assert [one.name for one in tmp_path.iterdir()] == ["a.npz"]
+    assert [file.name for file in tmp_path.iterdir()] == ["a.npz"]
     with pytest.raises(FileNotFoundError):
         read_arrays(tmp_path / "b.npz")
 
@@ -106,8 +106,8 @@ def test_any_number_of_threads_read_at_the_same_time(tmp_path):
         sys.setswitchinterval(1e-6)
         gc.set_threshold(1)
         with ThreadPoolExecutor(8) as pool:
-            found = list(pool.map(read, np.arange(300) % 20))
+            files = list(pool.map(read, np.arange(300) % 20))
     finally:
         sys.setswitchinterval(interval)
         gc.set_threshold(*threshold)
-    assert all(one.keys() == set("abcdef") for one in found)
+    assert all(arrays.keys() == set("abcdef") for arrays in files)

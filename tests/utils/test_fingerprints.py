@@ -23,17 +23,19 @@ def test_other_numbers_make_another_recipe():
     """Batch sizes do not."""
     keys = [recipe_of(Sift(max_keypoints=60, batch_size=size)) for size in (1, 8)]
     assert keys[0] == keys[1]
-    others = [recipe_of(Sift(max_keypoints=61)), recipe_of(Sift(max_keypoints=60, image_size=(320, 336)))]
-    others += [recipe_of(VladFitting(seed=1)), recipe_of(Vlad(np.ones((2, 3), np.float32)))]
-    others += [recipe_of(Vlad(np.ones((3, 2), np.float32))), recipe_of(Vlad(np.zeros((2, 3), np.float32)))]
-    assert len({json.dumps(one, sort_keys=True) for one in (*keys, *others)}) == 7
+    recipes = [recipe_of(Sift(max_keypoints=61)), recipe_of(Sift(max_keypoints=60, image_size=(320, 336)))]
+    recipes += [recipe_of(VladFitting(seed=1)), recipe_of(Vlad(np.ones((2, 3), np.float32)))]
+    recipes += [recipe_of(Vlad(np.ones((3, 2), np.float32))), recipe_of(Vlad(np.zeros((2, 3), np.float32)))]
+    assert len({json.dumps(recipe, sort_keys=True) for recipe in (*keys, *recipes)}) == 7
     with pytest.raises(TypeError, match=r"dataclass, arrays, .*`recipe`"):
         recipe_of(lambda images: images)
 
 
 def test_classes_of_one_name_are_told_apart():
-    made = [dataclass(type("Sift", (), {"__module__": name})) for name in ("theirs", "theirs.newer", "mfvpr.features")]
-    assert [recipe_of(one())["class"] for one in made] == ["theirs.Sift", "theirs.newer.Sift", "Sift"]
+    classes = [
+        dataclass(type("Sift", (), {"__module__": name})) for name in ("theirs", "theirs.newer", "mfvpr.features")
+    ]
+    assert [recipe_of(kind())["class"] for kind in classes] == ["theirs.Sift", "theirs.newer.Sift", "Sift"]
     assert recipe_of(Sift())["class"] == "Sift"
 
 
@@ -66,8 +68,8 @@ def test_code_of_ones_own_is_part_of_the_recipe():
     used = made_by(1)()
     assert used.table
     assert recipe_of(used) == same[0]
-    others = [made_by(2)(), made_by(1, gain=7)(), made_by(1, default=4)(), made_by(1)(size=3), Inner()]
-    assert len({fingerprint(one) for one in (same[0], *map(recipe_of, others))}) == 1 + len(others)
+    scorers = [made_by(2)(), made_by(1, gain=7)(), made_by(1, default=4)(), made_by(1)(size=3), Inner()]
+    assert len({fingerprint(recipe) for recipe in (same[0], *map(recipe_of, scorers))}) == 1 + len(scorers)
     assert recipe_of(Inner()) == recipe_of(Inner())
 
 
@@ -122,7 +124,7 @@ def test_what_runs_counts_and_not_the_text_of_a_file_alone(tmp_path, monkeypatch
     linecache.clearcache()
     edited = recipe_of(module.Mine())  # the old code still runs
     importlib.reload(module)
-    assert len({fingerprint(one) for one in (before, edited, recipe_of(module.Mine()))}) == 3
+    assert len({fingerprint(recipe) for recipe in (before, edited, recipe_of(module.Mine()))}) == 3
     del sys.modules["of_ones_own"]
 
 

@@ -1,4 +1,4 @@
-"""What the machine has."""
+"""The processors and the memory of the machine."""
 
 from pathlib import Path
 

@@ -61,7 +61,7 @@ def test_capacities_are_few_and_hold_every_row(counts, step):
     assert capacities[0] > 0
     fitting = ragged.fitting(capacities, counts)
     for count, capacity in zip(counts, fitting, strict=True):
-        assert capacity == min(one for one in capacities if one >= count)
+        assert capacity == min(size for size in capacities if size >= count)
     if counts.any():
         assert capacities[-1] < counts.max() + step
 

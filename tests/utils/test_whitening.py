@@ -44,7 +44,7 @@ def test_both_matrices_give_the_components_of_the_sample(shape, block, dtype, to
 
 @pytest.mark.parametrize("shape", [(60, 25), (25, 60), (90, 100), (110, 90)], ids=str)
 def test_a_component_without_variance_is_zero(shape):
-    """Where a division by its standard deviation would make rounding as large as all else."""
+    """Divided by its standard deviation, rounding errors would be as large as the other components."""
     fitted = fit_whitening(samples(*shape, np.float32, rank=5), 8)
     assert np.isfinite(fitted.components).all()
     assert fitted.components[:5].any(axis=1).all()
@@ -65,7 +65,9 @@ def test_too_few_vectors_are_refused(count, size, dimension, line):
 def test_a_descriptor_that_is_not_finite_teaches_nothing():
     sample = samples(40, 6, np.float32)
     broken = np.insert(sample, [0, 20], [[np.nan, 1, 1, 1, 1, 1], [1, 1, 1, 1, 1, np.inf]], axis=0)
-    for got, expected in zip(*(astuple(WhitenedSearch(3).fit(one).whitening) for one in (broken, sample)), strict=True):
+    for got, expected in zip(
+        *(astuple(WhitenedSearch(3).fit(vectors).whitening) for vectors in (broken, sample)), strict=True
+    ):
         np.testing.assert_array_equal(got, expected)
 
 
@@ -78,13 +80,13 @@ def test_vectors_that_are_alike_are_refused(value, shape):
 
 
 def test_memory_is_that_of_the_sample_and_of_the_smaller_matrix():
-    """Of 250 images: 9000 windows of the first stage, 10000 of the second."""
+    """For 250 images: 9000 windows of the first stage, 10000 of the second."""
     gigabytes = [fit_bytes(9000, 41472, 4) / 1e9, fit_bytes(10000, 4608, 8) / 1e9]
     np.testing.assert_allclose(gigabytes, [1.493 + 1.296 + 0.537, 0.369 + 0.340 + 0.537], rtol=0.01)
 
 
 def test_a_flat_spectrum_is_solved_as_well():
-    """Where Lanczos' method gains little, or does not converge."""
+    """Lanczos' method gains little there, or does not converge."""
     sample = np.random.default_rng(0).normal(size=(400, 120))
     fitted, (_, components) = fit_whitening(sample, 11), by_decomposition(sample, 11)
     np.testing.assert_allclose(fitted.components, components, atol=1e-9 * np.abs(components).max())
