@@ -1,7 +1,4 @@
-"""Scores of one query x C candidates by whole grids of a scorer's parameters.
-
-Here is `lax.map` over the grid, around `vmap` over candidates.
-"""
+"""Scores of one query x C candidates for whole grids of a scorer's parameters: `lax.map` around `vmap`."""
 
 import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -31,22 +28,22 @@ from mfvpr.utils.numerics import (
     platform,
 )
 
-WEIGHTINGS = ("weight", "max_distance")  # what only changes how much a match counts
+WEIGHTINGS = ("weight", "max_distance")  # axes that only change how much a match counts
 
 
 def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> Array:
     """Scores of every combination of parameter values, `[len(axis1), len(axis2), ..., C]`.
 
-    The grid is one traced computation for each capacity of bins that its values ask for, so that fine bins do not
-    slow coarse ones down: other values cost no compilation within them, other lengths do. With a plain function as the
-    scorer, or in it, every call compiles.
+    The grid is one traced computation for each capacity of bins that its values need, so that fine bins do not slow
+    coarse bins down. Other values within the same capacities cost no compilation, other lengths do. If the scorer is
+    or holds a plain function, every call compiles.
 
     Args:
-        scorer: the scorer whose other parameters stay.
+        scorer: its other parameters stay.
         matches: `[C, K, ...]`.
-        **axes: values of the scorer's numbers, e.g. `sigma=[10., 22.5], bin_size=[10., 15.]`, or of those of its
-            parts, `**{"inner.sigma": [10., 22.5]}`; of `max_distance`, beyond which matches do not count; and of
-            `weight`, e.g. `weight=[UnitWeight(), ...]`.
+        **axes: values of the scorer's numbers, e.g. `sigma=[10., 22.5], bin_size=[10., 15.]`; of numbers of its parts,
+            `**{"inner.sigma": [10., 22.5]}`; of `max_distance`, beyond which matches do not count; and of `weight`,
+            e.g. `weight=[UnitWeight(), ...]`.
 
     Raises:
         ValueError: an axis is empty, not one-dimensional, or names no numeric parameter of the scorer.
@@ -68,17 +65,17 @@ def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> 
     groups = by_capacity(scorer, settings, rows, *matched_sizes(matches))
 
     def score(matches: Matches) -> list[Array]:
-        # One after the other: programs side by side would share the cache.
+        # One after the other, because programs that run at the same time would share the cache.
         scores = (
             score_settings(fitted, matches, {name: axis[part] for name, axis in settings.items()}, weightings)
             for fitted, part in groups
         )
         return [jax.block_until_ready(group_scores) for group_scores in scores]
 
-    # What a plain function closes over may be traced, which only its own thread understands.
-    elsewhere = is_concrete((scorer, matches, values)) and not plain
-    scores = _on_every_core(score, matches) if elsewhere else score(matches)
-    xp: Any = np if is_concrete(scores) else jnp  # what JAX does one by one waits for its own turn
+    # A plain function may close over traced values, which only the thread that traces them can use.
+    use_threads = is_concrete((scorer, matches, values)) and not plain
+    scores = _on_every_core(score, matches) if use_threads else score(matches)
+    xp: Any = np if is_concrete(scores) else jnp  # single operations of JAX would wait for its queue
     order = np.argsort(np.concatenate([part for _, part in groups]))
     names = outer + inner
     scores = xp.concatenate(scores)[order].reshape(*(len(values[name]) for name in names), -1)
@@ -86,7 +83,7 @@ def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> 
 
 
 def refuse_own_names(scorer: Any, names: Iterable[str], reserved: Iterable[str] = WEIGHTINGS) -> None:
-    """Raise a ValueError where a number of the scorer is called as what is varied beside its parameters."""
+    """Raise a ValueError if a number of the scorer has the name of an axis with another meaning."""
     for name in {*names} & {*numbers(scorer)} & {*reserved}:
         raise ValueError(f"{type(scorer).__name__}.{name}: a grid means something else by {name}; rename the field")
 
@@ -94,19 +91,19 @@ def refuse_own_names(scorer: Any, names: Iterable[str], reserved: Iterable[str] 
 def by_capacity(
     scorer: Any, settings: Mapping[str, Array], num_settings: int, image_size0: Array, image_size1: Array
 ) -> list[tuple[Any, np.ndarray]]:
-    """The scorer in each of the capacities that settings `[G]` ask for, with the rows of those settings.
+    """Group settings `[G]` by the capacity of bins that they need: (scorer with the capacity, rows of the settings).
 
-    One that needs none, has its own, or is traced, serves all. Capacities are multiples of 8 bins: few programs,
-    and little padding.
+    There is one group if the scorer needs no capacity or has one, or if settings are traced. Capacities are multiples
+    of 8 bins, which keeps programs few and padding small.
     """
     if not is_concrete(settings):
-        chosen = with_parameters(scorer, {name: values[0] for name, values in settings.items()})
-        return [(fit(chosen, image_size0, image_size1, multiple=BIN_STEP), np.arange(num_settings))]
+        first = with_parameters(scorer, {name: values[0] for name, values in settings.items()})
+        return [(fit(first, image_size0, image_size1, multiple=BIN_STEP), np.arange(num_settings))]
     settings = jax.tree.map(np.asarray, settings)
     groups: dict[Any, tuple[Any, list[int]]] = {}
     for row in range(num_settings):
-        chosen = with_parameters(scorer, {name: values[row] for name, values in settings.items()})
-        fitted = fit(chosen, image_size0, image_size1, multiple=BIN_STEP)
+        varied = with_parameters(scorer, {name: values[row] for name, values in settings.items()})
+        fitted = fit(varied, image_size0, image_size1, multiple=BIN_STEP)
         groups.setdefault(jax.tree.structure(fitted), (fitted, []))[1].append(row)
     return [(fitted, np.array(rows)) for fitted, rows in groups.values()]
 
@@ -114,17 +111,17 @@ def by_capacity(
 def score_settings(
     scorer: Any, matches: Matches, settings: Mapping[str, Array], weightings: Mapping[str, Array]
 ) -> Array:
-    """Scores `[G, W, C]` of matches `[C, K, ...]` by one scorer with every pair of G settings and W weightings.
+    """Scores `[G, W, C]` of candidates, by one scorer with every combination of G settings and W weightings.
 
-    One after the other, since all at once would leave the cache; one traced computation, so that other values cost no
-    compilation.
+    Settings are scored one after the other, because all at once would leave the cache, and in one traced computation,
+    so that other values cost no compilation.
 
     Args:
-        scorer: the scorer whose other parameters stay; a histogram with a capacity that serves every `bin_size`.
+        scorer: its other parameters stay; a histogram needs a capacity that suffices for every `bin_size`.
         matches: `[C, K, ...]`.
         settings: `[G]` values of the scorer's numeric parameters; none: G = 1.
-        weightings: `[W]` values of what only says how much a match counts, which is cheap to vary: `max_distance`
-            (matches further apart do not count) and `weight` (an option of the scorer's `ChosenWeight`); none: W = 1.
+        weightings: `[W]` values that only change how much a match counts, which are cheap to vary: `max_distance`
+            (larger distances do not count) and `weight` (the index of the scorer's `ChosenWeight`); none: W = 1.
     """
     scores = (_on_host if on_host(scorer) else _in_jax)(scorer, matches, settings, weightings)
     require_real("scorer", scores)
@@ -134,46 +131,50 @@ def score_settings(
 def _on_host(
     scorer: Any, matches: Matches, settings: Mapping[str, Array], weightings: Mapping[str, Array]
 ) -> np.ndarray:
-    """The same by a scorer that JAX cannot look into."""
+    """`score_settings` by a scorer that runs outside of JAX."""
 
     def rows(values: Mapping[str, Array]) -> list[dict[str, Any]]:
         columns = [np.asarray(axis) for axis in values.values()]
         return [dict(zip(values, row, strict=True)) for row in zip(*columns, strict=True)] if columns else [{}]
 
     def score(setting: dict[str, Any], weighting: dict[str, Any]) -> np.ndarray:
-        return score_pairs(*_weighted(with_parameters(scorer, setting), matches, weighting))
+        return score_pairs(*_apply_weighting(with_parameters(scorer, setting), matches, weighting))
 
     return np.array([[score(setting, weighting) for weighting in rows(weightings)] for setting in rows(settings)])
 
 
 @compiled
 def _in_jax(scorer: Any, matches: Matches, settings: Mapping[str, Array], weightings: Mapping[str, Array]) -> Array:
-    own = isinstance(scorer, HistogramOfShifts) and type(scorer).__call__ is HistogramOfShifts.__call__
-    if own:  # its Gaussians are the same for all weightings; a class on top of it may score otherwise
-        weights = jax.vmap(partial(_weights_of, scorer, weightings))(matches)
-        return _map(lambda setting: with_parameters(scorer, setting).all_reweighted(matches, weights).T, settings)
+    # The Gaussians of a histogram are the same for all weightings. A subclass may score in another way.
+    if isinstance(scorer, HistogramOfShifts) and type(scorer).__call__ is HistogramOfShifts.__call__:
+        weights = jax.vmap(partial(_weights_of_pair, scorer, weightings))(matches)
 
-    def score_setting(setting: dict[str, Array]) -> Array:
-        chosen = with_parameters(scorer, setting)
-        return jax.vmap(partial(_score_weightings, chosen, weightings), out_axes=-1)(matches)
+        def score_setting(setting: dict[str, Array]) -> Array:
+            return with_parameters(scorer, setting).batch_scores_by_weights(matches, weights).T
+
+    else:
+
+        def score_setting(setting: dict[str, Array]) -> Array:
+            varied = with_parameters(scorer, setting)
+            return jax.vmap(partial(_score_weightings, varied, weightings), out_axes=-1)(matches)
 
     return _map(score_setting, settings)
 
 
-def _weighted(scorer: Any, matches: Matches, weighting: Mapping[str, Array]) -> tuple[Any, Matches]:
-    """A scorer with its weight, and the matches that count."""
+def _apply_weighting(scorer: Any, matches: Matches, weighting: Mapping[str, Array]) -> tuple[Any, Matches]:
+    """The scorer with the weight, and the matches within the distance, of one weighting."""
     near = filter_matches(matches, max_distance=weighting.get("max_distance"))
     if "weight" not in weighting:
         return scorer, near
     return replace(scorer, weight=replace(scorer.weight, index=weighting["weight"])), near
 
 
-def _weights_of(scorer: Any, weightings: Mapping[str, Array], matches: Matches) -> Array:
+def _weights_of_pair(scorer: Any, weightings: Mapping[str, Array], matches: Matches) -> Array:
     """Weights `[W, K]` of one pair's matches."""
 
     def weigh(weighting: dict[str, Array]) -> Array:
-        chosen, near = _weighted(scorer, matches, weighting)
-        return match_weights(chosen.weight, near)
+        varied, near = _apply_weighting(scorer, matches, weighting)
+        return match_weights(varied.weight, near)
 
     return jax.vmap(weigh)(dict(weightings)) if weightings else weigh({})[None]
 
@@ -182,50 +183,51 @@ def _score_weightings(scorer: Any, weightings: Mapping[str, Array], matches: Mat
     """Scores `[W]` of one pair."""
 
     def score_weighting(weighting: dict[str, Array]) -> Array:
-        chosen, near = _weighted(scorer, matches, weighting)
-        return chosen(near)
+        varied, near = _apply_weighting(scorer, matches, weighting)
+        return varied(near)
 
     return _map(score_weighting, weightings)
 
 
 def _map(function: Callable[[dict[str, Array]], Array], values: Mapping[str, Array]) -> Array:
-    """`function` of every row of `values`, one at a time; of no values, once."""
+    """`function` of every row of `values`, one at a time; once if there are no values."""
     return jax.lax.map(function, dict(values)) if values else function({})[None]
 
 
 def _on_every_core(function: Callable[[Matches], Any], matches: Matches) -> Any:
-    """`function` of matches `[C, K, ...]`, a part of them on every core; candidates are the last axis of what it gives.
+    """`function` of matches `[C, K, ...]`, split over the cores; candidates are the last axis of its results.
 
-    Elsewhere than on a CPU, with settings of JAX's that other threads would not know, or few candidates: at once.
+    There is a single call for few candidates, on accelerators, and with settings of JAX that threads do not inherit.
     """
     cores, count = available_cpus(), len(matches.mask)
     if cores == 1 or count < 4 * cores or platform(matches) != "cpu" or not knows_own_context():
         return function(matches)
     size = -(-count // cores)
-    starts = [min(core * size, count - size) for core in range(cores)]  # of one size, hence one program: some overlap
+    starts = [min(core * size, count - size) for core in range(cores)]  # one size, one program; parts may overlap
     host = jax.tree.map(np.asarray, matches)
 
     def score_part(start: int) -> Any:
         return jax.tree.map(np.asarray, function(jax.tree.map(lambda leaf: leaf[start : start + size], host)))
 
     with ThreadPoolExecutor(cores) as pool:
-        scored = list(pool.map(score_part, starts))
-    new = [core * size - start for core, start in enumerate(starts)]
-    return jax.tree.map(
-        lambda *parts: np.concatenate([scores[..., skip:] for scores, skip in zip(parts, new, strict=True)], axis=-1),
-        *scored,
-    )
+        parts = list(pool.map(score_part, starts))
+    overlaps = [core * size - start for core, start in enumerate(starts)]
+
+    def join(*leaves: np.ndarray) -> np.ndarray:
+        return np.concatenate([leaf[..., skip:] for leaf, skip in zip(leaves, overlaps, strict=True)], axis=-1)
+
+    return jax.tree.map(join, *parts)
 
 
 def _product(values: Mapping[str, Array], names: Sequence[str]) -> dict[str, Array]:
-    """Every combination of some axes' values, by axis."""
+    """Every combination of the values of the named axes: `[G]` by axis."""
     xp = np if is_concrete(dict(values)) else jnp
     points = xp.meshgrid(*(values[name] for name in names), indexing="ij")
     return {name: point.reshape(-1) for name, point in zip(names, points, strict=True)}
 
 
 def _weights(scorer: Any, axes: Mapping[str, Any]) -> tuple[Weight, ...]:
-    """The axis of weights, where there is one."""
+    """Weights of the `weight` axis; none without the axis."""
     if "weight" not in axes or not hasattr(scorer, "weight"):
         return ()
     if not all(map(callable, axes["weight"])):

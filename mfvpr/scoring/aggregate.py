@@ -13,15 +13,18 @@ from mfvpr.utils.numerics import masked, masked_mean, masked_median, positive, s
 
 @value
 class AggregatedScore:
-    """s = sum_k w_k ((W - |x_k - mean x|)^2 + (H - |y_k - mean y|)^2) over the shifts, in weight x px^2.
+    """s = sum_k w_k ((W - |x_k - mean x|)^2 + (H - |y_k - mean y|)^2), equation 3, in weight x px^2.
+
+    (x_k, y_k) is the shift of match k, w_k its weight, and (W, H) the image size, the paper's (x_im, y_im).
 
     Attributes:
         weight: match weight, DMF by default as in the paper.
         mean: center of the shifts: `unweighted` mean (as printed), `weighted` mean or `median`. A mean counts every
             match with its confidence.
-        clamp: let a shift further from the center than the image is wide count 0 instead of growing again.
-        temperature: px; T > 0 makes |x| a hyperbola, sqrt(x^2 + T^2) - T, and the clamp T log(1 + e^(z / T)), so that
-            the score is smooth in the points but for the median's. None is the paper's; not above 0 scores NaN.
+        clamp: a shift that is further from the center than the image is wide counts 0 instead of growing again.
+        temperature: px; T > 0 replaces |x| by the hyperbola sqrt(x^2 + T^2) - T, and the clamp of z by
+            T log(1 + e^(z / T)), so that the score is smooth in the points (except for `median`). None is the paper's;
+            not above 0 scores NaN.
     """
 
     weight: Weight = named(NAMED_WEIGHTS, "dmf", file=SUFFIX)
@@ -46,7 +49,7 @@ class AggregatedScore:
         return where_finite(score, weights, shifts)
 
     def _closeness(self, offsets: Array, size: Array) -> Array:
-        """`[K, 2]` how much closer to the center than the image is wide and high, px."""
+        """`[K, 2]` image size minus the distance of the shift from the center, px."""
         if self.temperature is None:
             closeness = size - jnp.abs(offsets)
             return jnp.maximum(closeness, 0.0) if self.clamp else closeness

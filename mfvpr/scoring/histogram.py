@@ -1,7 +1,8 @@
 """Histogram of shifts (paper, section III-A): the tallest bin of a Gaussian-voted histogram of points1 - points0.
 
-The two-dimensional Gaussian is a product of one along x and one along y, so all bins of a pair are one small matrix
-product, `votes_y [By, K] @ votes_x [Bx, K]^T`, instead of K x By x Bx exponentials. Lengths are pixels.
+A match k votes for the bin (i, j) by equation 1 of the paper, and the score is the maximum over all bins. The Gaussian
+is a product of one along x and one along y, so all bins s_ij of a pair are one small matrix product,
+`(w * votes_y) [By, K] @ votes_x [Bx, K]^T`, instead of K x By x Bx exponentials. Lengths are pixels.
 """
 
 import math
@@ -15,8 +16,8 @@ import numpy as np
 
 from mfvpr.scoring.fields import SCORE, check_choices, choice, flag, named, number, numbers, several, whole
 from mfvpr.scoring.intervals import mass_interval
-from mfvpr.scoring.lattice import Lattice, bins, climb, mapped, of_all_bins, smooth_tallest, tallest, votes
-from mfvpr.scoring.shifts import are_numbers, image_sizes, match_shifts, where_usable, zoomed
+from mfvpr.scoring.lattice import Lattice, bin_scores, climb, map_rows, pool_bins, smooth_tallest, tallest, votes
+from mfvpr.scoring.shifts import are_finite, compensate_scale, image_sizes, match_shifts, where_usable
 from mfvpr.scoring.tallest import tallest_bins
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, SUFFIX
 from mfvpr.scoring.weights import Weight, match_weights
@@ -24,13 +25,13 @@ from mfvpr.types import Array, Matches, value
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import compiled, is_concrete, positive, round_up
 
-MAX_BINS = 1024  # per axis, where nobody asks for more: the histograms of 50 pairs then take 200 MB
+MAX_BINS = 1024  # per axis unless `max_bins` is larger: the histograms of 50 pairs then take 200 MB
 
 
 class ShiftHistogram(NamedTuple):
-    """Bin scores and where the bins are.
+    """Bin scores and bin centers.
 
-    scores: `[By, Bx]`; -inf in bins beyond the range of shifts (present only where the capacity exceeds the bins).
+    scores: `[By, Bx]` s_ij; -inf in bins beyond the range of shifts (present only if the capacity exceeds the bins).
     centers_x: `[Bx]` px.  centers_y: `[By]` px.
     """
 
@@ -41,30 +42,31 @@ class ShiftHistogram(NamedTuple):
 
 @value
 class HistogramOfShifts:
-    """s_ij = sum_k w_k exp(-((x_k - x_ij)^2 + (y_k - y_ij)^2) / (2 sigma^2)); the score is the maximum over bins.
+    """Maximum over bins of s_ij = sum_k w_k exp(-((x_k - x_ij)^2 + (y_k - y_ij)^2) / (2 sigma^2)), equation 1.
 
-    Numbers are pytree leaves and may be traced or batched; `max_bins` and the choices are static. The score does not
-    change with the order of the matches, nor with a translation of all points of one image by a multiple of
-    `bin_size` while the peak stays in range.
+    (x_k, y_k) is the shift of match k, w_k its weight, (x_ij, y_ij) the center of bin (i, j). The score does not change
+    with the order of the matches, nor with a translation of all points of one image by a multiple of `bin_size` while
+    the peak stays in range. Numbers are pytree leaves and may be traced or batched; `max_bins` and the choices are
+    static.
 
     Attributes:
         bin_size: width of the square bins, px.
         sigma: standard deviation of the vote, px; the paper's 22.5 is read as 1.5 bins.
         weight: match weight, FS by default as in the paper.
-        truncate: a match votes only for bins within this many sigmas along each axis (the paper: for all).
+        truncate: a match votes only for bins within this many sigmas along each axis (in the paper: for all bins).
         shift_range: (x, y): bins cover [-x, x] and [-y, y] px instead of all possible shifts.
         align: `min_edge` starts the first bin at the smallest possible shift; `zero_center` centers a bin on shift
             0; `zero_edge` puts an edge there.
         sigma_is_variance: read `sigma` as the variance, px^2.
         direction: shift of a match, candidate minus query point or the reverse.
-        max_bins: capacity of bins per axis; by default as many as concrete values ask for, at most 1024. Where image
-            sizes or bins are traced it must be set before `jit` or `vmap`, as `with_capacity` does; a histogram that
-            then needs more scores NaN, never a wrong number.
-        scales: how many times as large the candidate may show the place as the query, a vote for each: the score is
-            the largest of their tallest bins. Where a camera drives along its way, the right image differs in scale;
-            the paper has 1 alone.
-        scale_deviation: octaves; the votes at scale z count exp(-(log2 z)^2 / (2 scale_deviation^2)), since with more
-            scales the wrong pairs have more chances as well.
+        max_bins: capacity of bins per axis; by default as many as concrete values need, at most 1024. If image sizes
+            or `bin_size` are traced, set it before `jit` or `vmap`, for instance by `with_capacity`; a histogram that
+            then needs more bins scores NaN, never a wrong number.
+        scales: sizes of the place in the candidate relative to the query. Each scale has its own histogram, and the
+            score is the largest of their tallest bins. Useful for a camera that moves forward, because the correct
+            image then differs in scale. The paper has scale 1 only.
+        scale_deviation: octaves; the votes at scale z count exp(-(log2 z)^2 / (2 scale_deviation^2)), because more
+            scales give incorrect pairs more chances as well.
         temperature: in units of the score; T > 0 scores T log(mean over bins of e^(s_ij / T)), at most the maximum
             and smooth in everything but the number of bins. None is the paper's maximum; not above 0 scores NaN.
     """
@@ -95,106 +97,111 @@ class HistogramOfShifts:
 
     def __call__(self, matches: Matches) -> Array:
         """Score of one pair, `[]` float32: the (smooth) maximum over bins, 0 without matches."""
-        return self.reweighted(matches, match_weights(self.weight, matches)[None])[0]
+        return self.scores_by_weights(matches, match_weights(self.weight, matches)[None])[0]
 
-    def reweighted(self, matches: Matches, weights: Array) -> Array:
-        """Scores `[W]` of one pair by several weights `[W, K]` of its matches (0 on padding)."""
-        shifts, lattice, capacity = self._planes(matches), self._lattice_of(matches), self._capacity(matches)
+    def scores_by_weights(self, matches: Matches, weights: Array) -> Array:
+        """Scores `[W]` of one pair with several weights `[W, K]` of its matches (0 on padding)."""
+        shifts, lattice, capacity = self._shifts_by_scale(matches), self._lattice(matches), self._capacity(matches)
         pool = tallest
         if self.temperature is not None:
             pool = partial(smooth_tallest, temperature=positive(self.temperature, shifts.dtype))
-        found = mapped(lambda shifts: of_all_bins(shifts, weights, lattice, capacity, pool), shifts)
-        found = jax.vmap(lambda of_scales: pool(of_scales, jnp.ones_like(of_scales, bool)))(self._expected(found).T)
-        return where_usable(found, matches, shifts, weights, lattice.usable(capacity))
+        scores = map_rows(lambda shifts: pool_bins(shifts, weights, lattice, capacity, pool), shifts)
+        scores = self._weigh_scales(scores)
+        scores = jax.vmap(lambda by_scale: pool(by_scale, jnp.ones_like(by_scale, bool)))(scores.T)
+        return where_usable(scores, matches, shifts, weights, lattice.usable(capacity))
 
-    def all_reweighted(self, matches: Matches, weights: Array) -> Array:
-        """`reweighted` of pairs `[C, K, ...]` by weights `[C, W, K]`: scores `[C, W]`, quick where there are many.
+    def batch_scores_by_weights(self, matches: Matches, weights: Array) -> Array:
+        """`scores_by_weights` of many pairs: matches `[C, K, ...]` and weights `[C, W, K]` -> scores `[C, W]`.
 
-        On a CPU pair by pair, which keeps what is worked on in the cache, and by branch and bound where that pays:
-        the largest of all bins either way, but how long it takes depends on the data.
+        On a CPU it scores pair by pair, which stays in the cache, and skips most bins by branch and bound where that
+        pays. The scores are the same; the time depends on the data.
         """
-        every = jax.vmap(self.reweighted)
+        score_all_bins = jax.vmap(self.scores_by_weights)
         if self.temperature is not None:
-            return every(matches, weights)
-        return jax.lax.platform_dependent(matches, weights, cpu=self._pair_by_pair, default=every)
+            return score_all_bins(matches, weights)
+        return jax.lax.platform_dependent(matches, weights, cpu=self._score_pair_by_pair, default=score_all_bins)
 
-    def _pair_by_pair(self, matches: Matches, weights: Array) -> Array:
-        capacity, shifts = self._capacity(matches), jax.vmap(self._planes)(matches)
-        lattice = jax.vmap(self._lattice_of)(matches)
+    def _score_pair_by_pair(self, matches: Matches, weights: Array) -> Array:
+        capacity, shifts = self._capacity(matches), jax.vmap(self._shifts_by_scale)(matches)
+        lattice = jax.vmap(self._lattice)(matches)
         by_scale = jnp.swapaxes(shifts, 0, 1)
-        found = mapped(lambda shifts: tallest_bins(shifts, weights, lattice, capacity), by_scale)
-        found = jnp.max(self._expected(found), axis=0)
+        scores = map_rows(lambda shifts: tallest_bins(shifts, weights, lattice, capacity), by_scale)
+        scores = jnp.max(self._weigh_scales(scores), axis=0)
         usable = jax.vmap(lambda lattice: lattice.usable(capacity))(lattice)
-        return jax.vmap(where_usable)(found, matches, shifts, weights, usable)
+        return jax.vmap(where_usable)(scores, matches, shifts, weights, usable)
 
     def histogram(self, matches: Matches) -> ShiftHistogram:
-        """All bins of one pair with their centers, at the scale of the tallest."""
+        """All bins of one pair with their centers, at the scale that has the tallest bin."""
         scores, lattice, usable, _ = self._vote(matches)
         x, y = (lattice.centers(axis, jnp.arange(len(scores), dtype=scores.dtype)) for axis in (0, 1))
         return ShiftHistogram(jnp.where(usable, scores, jnp.nan), x, y)
 
     def dominant_shift(self, matches: Matches, *, refine: bool = False) -> Array:
-        """`[2]` (x, y) px: where the query's points lie in the candidate; (0, 0) where nothing votes.
+        """Shift of the tallest bin, `[2]` (x, y) px, candidate minus query; (0, 0) without votes.
 
-        The center of the tallest bin, the first in row-major order on a tie. With `refine` the peak between bin
-        centers: the maximum of the same sum of Gaussians over all shifts that is uphill from that bin, to 1e-4 sigma,
-        within `shift_range`. Its derivatives do not depend on the bins. With several scales z, the dominant one among
-        them, a point p of the query lies at c1 + z (p - c0) + sqrt(z) (shift - c1 + c0) in the candidate, of centers c0
-        and c1.
+        It is the center of the tallest bin, the first in row-major order on a tie. With `refine` it is the peak
+        between bin centers: the maximum of the same sum of Gaussians over all shifts that is uphill from that bin, to
+        1e-4 sigma, within `shift_range`. The derivatives of the peak do not depend on the bins. With several `scales`,
+        let z be the dominant one and c0, c1 the centers of query and candidate: a point p of the query lies at
+        c1 + z (p - c0) + sqrt(z) (shift - c1 + c0) in the candidate.
         """
-        return _dominant_shift(self._for(matches), matches, refine=refine)
+        return _dominant_shift(self._fit_to(matches), matches, refine=refine)
 
     def dominant_scale(self, matches: Matches) -> Array:
-        """`[]` that of the `scales` which has the tallest bin, the first on a tie; 1 where nothing votes."""
-        return _dominant_scale(self._for(matches), matches)
+        """The one of the `scales` that has the tallest bin, `[]`: the first on a tie, 1 without votes."""
+        return _dominant_scale(self._fit_to(matches), matches)
 
     def shift_interval(self, matches: Matches, *, level: float = 0.95, sharpness: float = 24.0) -> Array:
-        """`[2, 2]` (low, high) of (x, y) px: the middle part of the mass of s_ij^sharpness along each axis.
+        """Interval of the dominant shift, `[2, 2]` (low, high) of (x, y) px.
 
-        Wide where other bins are nearly as tall, never narrower than `level` bins; where nothing votes that part of
-        all possible shifts. On three drawn streets it holds the true shift of the same place in 95 to 100 % at a level
-        of 95 %, in 90 to 99 % at 68 %; by bins of 5 px and sigma 10 in 72 to 100 % and 53 to 98 %.
+        The interval holds the central `level` of the mass s_ij^sharpness along each axis. It is wide if other bins are
+        nearly as tall, and never narrower than `level` bins; without votes it is that part of all possible shifts. On
+        three synthetic streets it contains the true shift of the same place in 95 to 100 % of pairs at level 0.95, in
+        90 to 99 % at 0.68; with bins of 5 px and sigma 10 in 72 to 100 % and 53 to 98 %.
+
+        Raises:
+            InputError: `level` is not between 0 and 1.
         """
         if not 0 < level < 1:
             raise InputError(f"level={level}: expected a number between 0 and 1")
-        return _shift_interval(self._for(matches), matches, level, sharpness)
+        return _shift_interval(self._fit_to(matches), matches, level, sharpness)
 
     def agrees(self, matches: Matches, shift: Array) -> Array:
-        """`[K]` bool: real matches whose shift lies within two standard deviations of `shift` `[2]` along both axes."""
-        shifts = self._planes(matches)[self._vote(matches)[-1] if len(self.scales) > 1 else 0].T
+        """Real matches with a shift within two standard deviations of `shift` `[2]` along both axes, `[K]` bool."""
+        shifts = self._shifts_by_scale(matches)[self._vote(matches)[-1] if len(self.scales) > 1 else 0].T
         near = jnp.all(jnp.abs(shifts - shift[None]) <= 2 * self._deviation(shifts.dtype), axis=-1)
         return near & matches.mask
 
     def with_capacity(self, image_size0: Array, image_size1: Array, *, multiple: int = 1) -> "HistogramOfShifts":
-        """This scorer with `max_bins` set to what its concrete values need, rounded up to a `multiple`.
+        """This scorer with `max_bins` set to the bins that its concrete values need, rounded up to a `multiple`.
 
-        `bin_size` and the sizes may be batched: the capacity serves all of them.
+        `bin_size` and the sizes may be batched: the capacity suffices for all of them.
 
         Raises:
             InputError: `bin_size` is not above 0, or so small that more than 1024 bins are needed.
         """
-        return replace(self, max_bins=round_up(self._needed(image_size0, image_size1, most=MAX_BINS), multiple))
+        return replace(self, max_bins=round_up(self._count_bins(image_size0, image_size1, most=MAX_BINS), multiple))
 
-    def fitted(self, image_size0: Array, image_size1: Array, multiple: int = 1) -> "HistogramOfShifts":
-        """`with_capacity` where there is none; as it is where values are traced.
+    def fit_capacity(self, image_size0: Array, image_size1: Array, multiple: int = 1) -> "HistogramOfShifts":
+        """`with_capacity` if `max_bins` is not set; unchanged if values are traced.
 
         Raises:
-            InputError: as there, or there is one that is too small.
+            InputError: see `with_capacity`, or `max_bins` is too small.
         """
         if not is_concrete((self.bin_size, self.shift_range, image_size0, image_size1)):
             return self
         if self.max_bins is None:
             return self.with_capacity(image_size0, image_size1, multiple=multiple)
-        if self.max_bins < (needed := self._needed(image_size0, image_size1)):
+        if self.max_bins < (needed := self._count_bins(image_size0, image_size1)):
             raise InputError(f"max_bins={self.max_bins}: expected at least {needed}, which images of this size need")
         return self
 
-    def _needed(self, image_size0: Array, image_size1: Array, most: float = math.inf) -> int:
-        """Bins along an axis that concrete values need."""
+    def _count_bins(self, image_size0: Array, image_size1: Array, most: float = math.inf) -> int:
+        """Bins per axis that concrete values need."""
         finest = replace(self, bin_size=np.min(self.bin_size))
         if not finest.bin_size > 0:
             raise InputError(f"HistogramOfShifts(bin_size={finest.bin_size}): expected a number above 0")
-        _, num_bins = finest._lattice(image_size0, image_size1, float, np)
+        _, num_bins = finest._bin_range(image_size0, image_size1, float, np)
         needed = int(np.max(num_bins, where=np.isfinite(num_bins), initial=1))  # padding pairs may have any size
         if needed > most:
             raise InputError(
@@ -203,36 +210,41 @@ class HistogramOfShifts:
             )
         return needed
 
-    def _for(self, matches: Matches) -> "HistogramOfShifts":
-        """With the capacity that one pair needs."""
+    def _fit_to(self, matches: Matches) -> "HistogramOfShifts":
+        """This scorer with the capacity that one pair needs."""
         if is_concrete(matches) and not np.any(matches.mask):  # the sizes may be anything
-            return replace(self, max_bins=self.max_bins or min(self._needed(*image_sizes(matches)), MAX_BINS))
-        return self.fitted(matches.image_size0, matches.image_size1)
+            return replace(self, max_bins=self.max_bins or min(self._count_bins(*image_sizes(matches)), MAX_BINS))
+        return self.fit_capacity(matches.image_size0, matches.image_size1)
 
     def _vote(self, matches: Matches) -> tuple[Array, Lattice, Array, Array]:
-        """Scores `[B, B]` (y, x), -inf of bins that there are not; the lattice, whether they are usable `[]`, and the
-        number of the scale `[]` that has the tallest."""
-        lattice, capacity = self._lattice_of(matches), self._capacity(matches)
-        shifts, weights = self._planes(matches), match_weights(self.weight, matches)
-        scores = self._expected(mapped(lambda shifts: bins(*votes(shifts, lattice, capacity), weights), shifts))
+        """Histogram of the scale that has the tallest bin.
+
+        Returns:
+            Bin scores `[B, B]` (y, x), -inf beyond the range of shifts; the bins; whether the scores are usable, `[]`;
+            the index of the scale, `[]`.
+        """
+        lattice, capacity = self._lattice(matches), self._capacity(matches)
+        shifts, weights = self._shifts_by_scale(matches), match_weights(self.weight, matches)
+        scores = map_rows(lambda shifts: bin_scores(*votes(shifts, lattice, capacity), weights), shifts)
+        scores = self._weigh_scales(scores)
         scores = jnp.where(lattice.inside(capacity)[None], scores, -jnp.inf)
         scale = jnp.argmax(jnp.max(scores, axis=(1, 2)))
-        usable = lattice.usable(capacity) & are_numbers(shifts, weights[None])[0]
+        usable = lattice.usable(capacity) & are_finite(shifts, weights[None])[0]
         return scores[scale], lattice, usable, scale
 
-    def _expected(self, found: Array) -> Array:
-        """What was found at every scale `[S, ...]`, by how likely the scale is."""
-        octaves = jnp.log2(jnp.asarray(self.scales, found.dtype)) / positive(self.scale_deviation, found.dtype)
-        return found * jnp.exp(-0.5 * octaves**2).reshape(-1, *(1,) * (found.ndim - 1))
+    def _weigh_scales(self, scores: Array) -> Array:
+        """Scores `[S, ...]` times the prior of each scale."""
+        octaves = jnp.log2(jnp.asarray(self.scales, scores.dtype)) / positive(self.scale_deviation, scores.dtype)
+        return scores * jnp.exp(-0.5 * octaves**2).reshape(-1, *(1,) * (scores.ndim - 1))
 
-    def _lattice_of(self, matches: Matches) -> Lattice:
-        """Of one pair."""
+    def _lattice(self, matches: Matches) -> Lattice:
         dtype = self._shifts(matches).dtype
         bin_size, truncate = (jnp.asarray(number, dtype=dtype) for number in (self.bin_size, self.truncate))
-        return Lattice(*self._lattice(*image_sizes(matches), dtype, jnp), bin_size, self._deviation(dtype), truncate)
+        first, num_bins = self._bin_range(*image_sizes(matches), dtype, jnp)
+        return Lattice(first, num_bins, bin_size, self._deviation(dtype), truncate)
 
     def _capacity(self, matches: Matches) -> int:
-        capacity = self._for(matches).max_bins
+        capacity = self._fit_to(matches).max_bins
         if capacity is None:
             raise ValueError(
                 "HistogramOfShifts: the number of bins must be known before image sizes or bin_size are traced; set "
@@ -240,7 +252,7 @@ class HistogramOfShifts:
             )
         return capacity
 
-    def _lattice(self, image_size0: Array, image_size1: Array, dtype: Any, xp: Any) -> tuple[Array, Array]:
+    def _bin_range(self, image_size0: Array, image_size1: Array, dtype: Any, xp: Any) -> tuple[Array, Array]:
         """Center of the first bin and number of bins, both `[..., 2]` along (x, y); in NumPy or JAX (`xp`)."""
         lower, upper = -xp.asarray(image_size0, dtype=dtype), xp.asarray(image_size1, dtype=dtype)
         if self.direction == "query_minus_candidate":
@@ -249,7 +261,7 @@ class HistogramOfShifts:
             upper = xp.asarray(self.shift_range, dtype=dtype)
             lower = -upper
         bin_size = xp.asarray(self.bin_size, dtype=dtype)[..., None]
-        slack = 1e-4  # of a bin: rounding must not add one that holds nothing
+        slack = 1e-4  # bins: rounding must not add an empty bin
         if self.align == "min_edge":
             edge = lower
         elif self.align == "zero_center":
@@ -263,23 +275,23 @@ class HistogramOfShifts:
         shifts = match_shifts(matches)
         return shifts if self.direction == "candidate_minus_query" else -shifts
 
-    def _planes(self, matches: Matches) -> Array:
+    def _shifts_by_scale(self, matches: Matches) -> Array:
         """`[S, 2, K]` shifts along x and along y, at every scale."""
-        planes = [self._shifts(zoomed(matches, scale)).T for scale in self.scales]
-        # Contiguous for good: strided coordinates would keep the exponentials from being vectorized.
-        return jax.lax.optimization_barrier(jnp.stack(planes))
+        shifts = [self._shifts(compensate_scale(matches, scale)).T for scale in self.scales]
+        # The barrier keeps the copy: strided coordinates would keep the exponentials from being vectorized.
+        return jax.lax.optimization_barrier(jnp.stack(shifts))
 
     def _deviation(self, dtype: Any) -> Array:
         sigma = positive(self.sigma, dtype)
         return jnp.sqrt(sigma) if self.sigma_is_variance else sigma
 
 
-@partial(compiled, static_argnames="refine")  # or the loop would be compiled at every call
+@partial(compiled, static_argnames="refine")  # uncompiled, the loop of `climb` would be compiled at every call
 def _dominant_shift(scorer: HistogramOfShifts, matches: Matches, *, refine: bool) -> Array:
     scores, lattice, usable, scale = scorer._vote(matches)
     row, column = jnp.unravel_index(jnp.argmax(scores), scores.shape)
     shift = jnp.stack([lattice.centers(axis, bin.astype(scores.dtype)) for axis, bin in enumerate((column, row))])
-    shifts, weights = scorer._planes(matches)[scale].T, match_weights(scorer.weight, matches)
+    shifts, weights = scorer._shifts_by_scale(matches)[scale].T, match_weights(scorer.weight, matches)
     if refine:
         shift = climb(shift, shifts, weights, scorer._deviation(shifts.dtype))
         if scorer.shift_range is not None:
@@ -292,8 +304,8 @@ def _dominant_shift(scorer: HistogramOfShifts, matches: Matches, *, refine: bool
 @compiled
 def _dominant_scale(scorer: HistogramOfShifts, matches: Matches) -> Array:
     scores, _, usable, scale = scorer._vote(matches)
-    voted = jnp.where(jnp.max(scores) > 0, jnp.asarray(scorer.scales, scores.dtype)[scale], 1.0)
-    return jnp.where(usable | ~jnp.any(matches.mask), voted, jnp.nan)
+    dominant = jnp.where(jnp.max(scores) > 0, jnp.asarray(scorer.scales, scores.dtype)[scale], 1.0)
+    return jnp.where(usable | ~jnp.any(matches.mask), dominant, jnp.nan)
 
 
 @compiled

@@ -13,17 +13,17 @@ from mfvpr.utils.numerics import available_cpus, is_concrete
 
 @value
 class OpenCvHomography:
-    """s = number of inliers that cv2.findHomography says, from the candidate's points to the query's.
+    """s = number of inliers of cv2.findHomography, from the candidate's points to the query's.
 
-    A score of the host: everything of the library takes it that takes scores, but `jit`, `vmap` and gradients do not.
-    (JAX's callbacks may wait for each other forever.) Matches are taken in the order of the query's keypoints where
-    they say their numbers, else of their coordinates, since OpenCV's samples depend on it. A match of confidence 0 is
-    none, others count fully. OpenCV 4 counts the inliers before its last least squares, version 5 after it.
+    The score runs on the host: all functions of the library accept it, but `jit`, `vmap` and gradients do not. (JAX's
+    callbacks may deadlock.) OpenCV's samples depend on the order of the matches, so that matches are sorted by
+    `index0`, or by their coordinates without it. A match of confidence 0 is ignored, all others count fully. OpenCV 4
+    counts the inliers before its last least squares, version 5 after it.
 
     Attributes:
-        threshold: of an inlier, px of the query's image; the paper's are 8 and 24.
-        max_iterations: of RANSAC; a whole number.
-        confidence: when it stops.
+        threshold: largest error of an inlier, px of the query; 8 and 24 in the paper.
+        max_iterations: maximum number of samples; rounded to an integer.
+        confidence: RANSAC stops once a sample of inliers only was drawn with this probability.
         estimator: `ransac`, the paper's, or `magsac` (USAC_MAGSAC; Barath et al., CVPR 2020).
         few: score of less than 4 matches, `count` (re-ranking-for-VPR) or `zero` (Patch-NetVLAD).
     """
@@ -41,12 +41,12 @@ class OpenCvHomography:
         """Score of one pair, `[]` float32.
 
         Raises:
-            InputError: something is traced, or a number is beyond its bounds.
+            InputError: the scorer or the matches are traced, or a number is out of bounds.
         """
         if not is_concrete((self, matches)):
             raise InputError("homography_opencv: expected matches that neither jit nor vmap nor grad traces, since "
                              "OpenCV runs outside of JAX; call score_candidates, or take Homography")  # fmt: skip
-        check_bounds(self)  # OpenCV takes 3 px for a threshold of 0
+        check_bounds(self)  # OpenCV replaces a threshold of 0 by 3 px
         points = np.concatenate([matches.points1, matches.points0], axis=-1, dtype=np.float32, casting="unsafe")
         real = np.asarray(matches.mask)
         if matches.confidence is not None:
@@ -61,12 +61,12 @@ class OpenCvHomography:
         """Scores `[P]` float32 of pairs `[P, K, ...]`."""
         host, count = jax.tree.map(np.asarray, matches), len(matches.mask)
         pairs = (jax.tree.map(lambda leaf, pair=pair: leaf[pair], host) for pair in range(count))
-        with ThreadPoolExecutor(available_cpus()) as pool:  # OpenCV lets go of Python's lock
+        with ThreadPoolExecutor(available_cpus()) as pool:  # OpenCV releases Python's lock
             return np.fromiter(pool.map(self, pairs), np.float32, count)
 
     def _score(self, points: np.ndarray) -> float:
-        """Of real matches `[n, 4]`, the candidate's points first."""
-        import cv2  # here, since whoever imports the library need not wait for it
+        """Score of real matches `[n, 4]` (x1, y1, x0, y0)."""
+        import cv2  # here, because it slows down the import of the library
 
         if not np.isfinite(points).all():
             return np.nan

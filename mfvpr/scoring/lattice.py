@@ -9,14 +9,15 @@ import jax.numpy as jnp
 from mfvpr.types import Array
 from mfvpr.utils.numerics import masked, safe_sqrt
 
-_MOST_STEPS = 100  # of which hardly any pair takes 10
+_MOST_STEPS = 100  # hardly any pair needs 10
 _TOLERANCE = 1e-4  # standard deviations
 
 
 class Lattice(NamedTuple):
-    """Where the bins are, and how votes fall off.
+    """Positions of the bins, and the width of the votes.
 
-    first, num_bins: `[2]` (x, y) center of the first bin, and how many there are.  bin_size, deviation, truncate: `[]`.
+    first, num_bins: `[2]` (x, y) center of the first bin, and number of bins.  bin_size, deviation (sigma of equation
+    1): `[]` px.  truncate: `[]` sigmas.
     """
 
     first: Array
@@ -26,92 +27,89 @@ class Lattice(NamedTuple):
     truncate: Array
 
     def centers(self, axis: int, index: Array) -> Array:
-        """Of bins by their (whole) number along an axis."""
+        """Centers of bins along an axis, px, by bin number."""
         return self.first[axis] + index * self.bin_size
 
-    def real(self, axis: int, index: Array) -> Array:
-        """Of a bin's number, the bin itself; beyond the last the last again, which no maximum notices."""
+    def clip_index(self, axis: int, index: Array) -> Array:
+        """Bin numbers, those beyond the last bin replaced by the last: a repeated bin changes no maximum."""
         return jnp.minimum(index, self.num_bins[axis] - 1)
 
     def inside(self, capacity: int) -> Array:
-        """`[B, B]` (y, x) bool, the bins that there are."""
+        """`[B, B]` (y, x) bool, True for bins within the range of shifts."""
         index = jnp.arange(capacity, dtype=self.num_bins.dtype)
         return (index < self.num_bins[1])[:, None] & (index < self.num_bins[0])[None]
 
     def usable(self, capacity: int) -> Array:
-        """`[]` bool, whether there is room for all bins, and a width and a reach of the votes."""
-        # Told beforehand: XLA's maximum over thousands of values on a CPU passes over NaN.
-        room = jnp.all((self.num_bins >= 1) & (self.num_bins <= capacity))
-        return room & ~jnp.isnan(self.deviation) & ~jnp.isnan(self.truncate)
+        """`[]` bool, False if the bins do not fit the capacity, or `deviation` or `truncate` is NaN."""
+        # Checked here, because XLA's maximum over thousands of values on a CPU skips NaN.
+        fits = jnp.all((self.num_bins >= 1) & (self.num_bins <= capacity))
+        return fits & ~jnp.isnan(self.deviation) & ~jnp.isnan(self.truncate)
 
 
 def gaussian(distance: Array, deviation: Array, truncate: Array) -> Array:
-    """Votes of matches at a distance along one axis."""
+    """Votes exp(-d^2 / (2 sigma^2)) of matches at a distance d along one axis."""
     sigmas = distance / deviation
     return jnp.where(jnp.abs(sigmas) > truncate, 0.0, jnp.exp(-0.5 * sigmas**2))
 
 
 def votes(shifts: Array, lattice: Lattice, capacity: int) -> tuple[Array, Array]:
-    """Votes `[B, K]` of shifts `[2, K]` along x and along y, without weights; beyond the last bin as for the last."""
+    """Unweighted votes `[B, K]` of shifts `[2, K]` along x and along y; beyond the last bin those for the last."""
     index = jnp.arange(capacity, dtype=shifts.dtype)
     x, y = (votes_along(axis, index, shifts, lattice) for axis in (0, 1))
     return x, y
 
 
 def votes_along(axis: int, index: Array, shifts: Array, lattice: Lattice) -> Array:
-    """Votes `[..., K]` of shifts `[2, K]` along one axis for bins by their number `[...]`."""
+    """Votes `[..., K]` of shifts `[2, K]` along one axis, for bin numbers `[...]`."""
     # Bins along rows: the exponentials then run along K, which is longer and contiguous (1.8x faster).
-    distance = lattice.centers(axis, lattice.real(axis, index))[..., None] - shifts[axis][(None,) * index.ndim]
+    distance = lattice.centers(axis, lattice.clip_index(axis, index))[..., None] - shifts[axis][(None,) * index.ndim]
     return gaussian(distance, lattice.deviation, lattice.truncate)
 
 
-def bins(votes_x: Array, votes_y: Array, weights: Array) -> Array:
-    """`[B, B]` (y, x) sums of the weighted votes `[B, K]`."""
+def bin_scores(votes_x: Array, votes_y: Array, weights: Array) -> Array:
+    """`[B, B]` (y, x) s_ij of equation 1: sums of the votes `[B, K]`, weighted by `[K]`."""
     return jnp.matmul(votes_y * weights[None], votes_x.T, precision=jax.lax.Precision.HIGHEST)
 
 
 def tallest(scores: Array, _: Array) -> Array:
-    """The largest of all bins."""
-    return jnp.max(scores)  # without a mask, which would cost as much as the product and is not needed
+    """Score of the tallest bin."""
+    return jnp.max(scores)  # the mask would cost as much as the product; bins beyond the last only repeat it
 
 
 def smooth_tallest(values: Array, mask: Array, *, temperature: Array) -> Array:
     """T log(mean of e^(v / T)) of the values where `mask`."""
-    # Relative to the maximum nothing overflows or cancels; its own gradient would be 0, since it drops out.
+    # Relative to the maximum nothing overflows or cancels. The maximum drops out, so that its gradient would be 0.
     largest = jax.lax.stop_gradient(jnp.max(values))
     below = (masked(values, mask, largest) - largest) / temperature
     return largest + temperature * jnp.log(jnp.mean(jnp.exp(below), where=mask))
 
 
-def of_all_bins(
+def pool_bins(
     shifts: Array,
     weights: Array,
     lattice: Lattice,
     capacity: int,
     pool: Callable[[Array, Array], Array] = tallest,
 ) -> Array:
-    """What `pool(scores, inside)` makes of all bins, `[W]`, by several weights `[W, K]` of one pair's matches.
+    """Scores `[W]` of one pair, `pool(bin scores, inside)`, with several weights `[W, K]` of its matches.
 
-    The Gaussians, which do not depend on the weights, are evaluated once.
+    The Gaussians do not depend on the weights and are evaluated once.
     """
     votes_x, votes_y = votes(shifts, lattice, capacity)
     inside = lattice.inside(capacity)
 
-    def one(weights: Array) -> Array:
-        return pool(bins(votes_x, votes_y, weights), inside)
-
-    return mapped(one, weights)
+    return map_rows(lambda weights: pool(bin_scores(votes_x, votes_y, weights), inside), weights)
 
 
-def mapped(function: Callable[[Array], Array], rows: Array) -> Array:
-    """`function` of every row, one at a time; of an only one without a loop."""
+def map_rows(function: Callable[[Array], Array], rows: Array) -> Array:
+    """`function` of every row, one row at a time; without a loop for a single row."""
     return function(rows[0])[None] if len(rows) == 1 else jax.lax.map(function, rows)
 
 
 def climb(start: Array, shifts: Array, weights: Array, deviation: Array) -> Array:
-    """The maximum `[2]` of sum_k w_k exp(-|s - s_k|^2 / (2 sigma^2)) uphill from `start`, to 1e-4 sigma.
+    """Position s `[2]` of the maximum of sum_k w_k exp(-|s - s_k|^2 / (2 sigma^2)) uphill from `start`, to 1e-4 sigma.
 
-    Each step is the higher of Newton's and of mean shift's. The derivatives are those of the maximum, up to the second.
+    Each step is Newton's or that of mean shift, whichever ends higher. First and second derivatives are exact.
     """
     fixed = jax.lax.stop_gradient((shifts, weights, deviation))
 
@@ -127,27 +125,28 @@ def climb(start: Array, shifts: Array, weights: Array, deviation: Array) -> Arra
         shift = higher(shift, jnp.stack([newton, steps[1]]))
         return number + 1, shift, _steps(shift, *fixed)
 
-    def goes_on(state: tuple[Array, Array, Array]) -> Array:
+    def is_climbing(state: tuple[Array, Array, Array]) -> Array:
         number, _, (newton, _) = state
         return (number < _MOST_STEPS) & (jnp.sqrt(jnp.sum(newton**2)) > _TOLERANCE * fixed[2])
 
     start = jax.lax.stop_gradient(start)
-    _, shift, _ = jax.lax.while_loop(goes_on, step, (jnp.zeros((), jnp.int32), start, _steps(start, *fixed)))
-    for _ in range(2):  # of which each doubles the order of the derivatives that are right
+    _, shift, _ = jax.lax.while_loop(is_climbing, step, (jnp.zeros((), jnp.int32), start, _steps(start, *fixed)))
+    for _ in range(2):  # each Newton step doubles the order up to which derivatives are correct
         shift = shift + _steps(shift, shifts, weights, deviation)[0]
     return shift
 
 
 def _pull(shift: Array, shifts: Array, weights: Array, deviation: Array) -> tuple[Array, Array]:
-    """Offsets `[K, 2]` of the matches from a shift, and their weighted votes `[K]` for it."""
+    """Offsets `[K, 2]` of the matches from a shift, and weighted votes `[K]` of the matches for it."""
     offsets = shifts - shift[None]
     return offsets, weights * jnp.exp(-0.5 * jnp.sum((offsets / deviation) ** 2, axis=-1))
 
 
 def _steps(shift: Array, shifts: Array, weights: Array, deviation: Array) -> Array:
-    """`[2, 2]` Newton's step and that of mean shift (Comaniciu & Meer, PAMI 2002), px; 0 where nothing votes.
+    """`[2, 2]` Newton's step and the step of mean shift (Comaniciu & Meer, PAMI 2002), px; 0 without votes.
 
-    Where the sum of votes is not concave, Newton's has a multiple of the identity more, so that it leads uphill.
+    If the sum of votes is not concave, a multiple of the identity is added to the Hessian, so that Newton's step leads
+    uphill.
     """
     offsets, pull = _pull(shift, shifts, weights, deviation)
     total = jnp.sum(pull)
@@ -156,9 +155,9 @@ def _steps(shift: Array, shifts: Array, weights: Array, deviation: Array) -> Arr
     xx, yy = 1 - jnp.sum(pull * scaled**2, axis=0)
     xy = -jnp.sum(pull[:, 0] * scaled[:, 0] * scaled[:, 1])
     smallest = (xx + yy) / 2 - safe_sqrt(((xx - yy) / 2) ** 2 + xy**2)  # eigenvalue
-    more = 2 * jnp.maximum(-smallest, 0.0)
-    xx, yy = xx + more, yy + more
-    volume = xx * yy - xy**2
+    damping = 2 * jnp.maximum(-smallest, 0.0)
+    xx, yy = xx + damping, yy + damping
+    determinant = xx * yy - xy**2
     newton = jnp.stack([yy * mean[0] - xy * mean[1], xx * mean[1] - xy * mean[0]])
-    newton = jnp.where(volume > 0, newton / jnp.where(volume > 0, volume, 1.0), mean)
+    newton = jnp.where(determinant > 0, newton / jnp.where(determinant > 0, determinant, 1.0), mean)
     return jnp.stack([newton, mean])

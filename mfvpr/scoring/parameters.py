@@ -1,4 +1,4 @@
-"""A scorer's parameters by name, `inner.sigma` for those of its parts; and its capacities, fitted to images."""
+"""Parameters of a scorer by dotted name (`inner.sigma` for a part), and capacities that fit image sizes."""
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
@@ -14,60 +14,64 @@ from mfvpr.types import Array
 
 
 def numbers(scorer: Any) -> dict[str, Any]:
-    """Its scalar leaves by dotted name: what `score_grid` may vary. A temperature that is None is one as well."""
+    """Scalar leaves of a scorer by dotted name, which `score_grid` may vary; also a `temperature` that is None."""
     leaves = jax.tree_util.tree_leaves_with_path(scorer, is_leaf=lambda leaf: leaf is None)
-    named = {
+    by_name = {
         jax.tree_util.keystr(path, simple=True, separator="."): leaf
         for path, leaf in leaves
         if path and all(isinstance(key, GetAttrKey) for key in path)
     }
     return {
         name: leaf
-        for name, leaf in named.items()
+        for name, leaf in by_name.items()
         if _is_number(leaf) or (leaf is None and name.rpartition(".")[2] == "temperature")
     }
 
 
 def whole_numbers(scorer: Any) -> set[str]:
-    """Names of those `numbers` that are whole: others in their place are, too, and may be indices."""
+    """Names of the `numbers` that are integers, such as indices; their replacements must be integers, too."""
     return {name for name, number in numbers(scorer).items() if number is not None and _is_whole(number)}
 
 
 def choices(scorer: Any) -> set[str]:
-    """Dotted names of its static fields, each value of which is a program of its own."""
-    found = set()
+    """Dotted names of the static fields of a scorer; each value of a static field has its own program."""
+    names = set()
     for field in fields(scorer) if is_dataclass(scorer) else ():
         if field.metadata.get("static"):
-            found.add(field.name)
+            names.add(field.name)
         else:
-            found |= {f"{field.name}.{name}" for name in choices(getattr(scorer, field.name))}
-    return found
+            names |= {f"{field.name}.{name}" for name in choices(getattr(scorer, field.name))}
+    return names
 
 
 def with_parameters(scorer: Any, values: Mapping[str, Any]) -> Any:
-    """The scorer with other values of some parameters, by dotted name."""
-    return reduce(lambda made, item: _with(made, *item), values.items(), scorer)
+    """The scorer with parameters replaced by `values`, by dotted name."""
+    return reduce(lambda varied, parameter: _replace(varied, *parameter), values.items(), scorer)
 
 
 def fit(scorer: Any, image_size0: Array, image_size1: Array, *, multiple: int = 1) -> Any:
-    """The scorer whose parts have the capacities that pairs of these sizes need, before `vmap` or `jit` hide them.
+    """The scorer with the capacities that pairs of these image sizes need, set before `vmap` or `jit` hide the sizes.
 
-    A part is fitted by its method `fitted(image_size0, image_size1, multiple)`, as that of `HistogramOfShifts`.
+    Capacities are set by the method `fit_capacity(image_size0, image_size1, multiple)` of a part, if it has one; see
+    `HistogramOfShifts`.
 
     Args:
-        scorer: any; parts may be anywhere in it.
+        scorer: any scorer, or a structure of scorers; parts are looked up at any depth.
         image_size0: `[..., 2]` px, of queries.
         image_size1: `[..., 2]` px, of candidates.
-        multiple: capacities are multiples of it, so that few programs serve many values.
+        multiple: capacities are multiples of it, so that many values share few programs.
     """
-    fits = lambda part: callable(getattr(part, "fitted", None))  # noqa: E731
-    size = lambda part: part.fitted(image_size0, image_size1, multiple) if fits(part) else part  # noqa: E731
-    return jax.tree.map(size, scorer, is_leaf=fits)
+    has_capacity = lambda part: callable(getattr(part, "fit_capacity", None))  # noqa: E731
+
+    def fit_part(part: Any) -> Any:
+        return part.fit_capacity(image_size0, image_size1, multiple) if has_capacity(part) else part
+
+    return jax.tree.map(fit_part, scorer, is_leaf=has_capacity)
 
 
-def _with(scorer: Any, name: str, value: Any) -> Any:
+def _replace(scorer: Any, name: str, value: Any) -> Any:
     outer, _, inner = name.partition(".")
-    return replace(scorer, **{outer: _with(getattr(scorer, outer), inner, value) if inner else value})
+    return replace(scorer, **{outer: _replace(getattr(scorer, outer), inner, value) if inner else value})
 
 
 def _is_number(value: Any) -> bool:

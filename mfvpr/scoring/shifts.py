@@ -1,4 +1,4 @@
-"""The shifts that scores are made of, and the sizes that bound them."""
+"""Shifts of matches, and the image sizes that bound them."""
 
 import math
 from dataclasses import replace
@@ -16,37 +16,42 @@ def match_shifts(matches: Matches) -> Array:
     return end - start
 
 
-def zoomed(matches: Matches, scale: float) -> Matches:
-    """One pair's matches as they would be if the candidate did not show the place `scale` times as large as the query.
+def compensate_scale(matches: Matches, scale: float) -> Matches:
+    """Matches of one pair, rescaled as if both images showed the place at the same size.
 
-    Points move about the centers of their images, of the candidate by 1 / sqrt(scale), of the query by sqrt(scale): so
-    it is the same whichever image is the query, and errors of a position count alike on both sides.
+    Points are scaled about the centers of their images: those of the query by sqrt(scale), those of the candidate by
+    1 / sqrt(scale). This treats both images alike, and position errors count the same in both.
+
+    Args:
+        matches: `[K, ...]`.
+        scale: size of the place in the candidate relative to the query.
     """
     if scale == 1:
         return matches
     root = math.sqrt(scale)
-    points0 = _about_center(matches.points0, matches.image_size0, root)
-    return replace(matches, points0=points0, points1=_about_center(matches.points1, matches.image_size1, 1 / root))
+    points0 = _scale_about_center(matches.points0, matches.image_size0, root)
+    points1 = _scale_about_center(matches.points1, matches.image_size1, 1 / root)
+    return replace(matches, points0=points0, points1=points1)
 
 
-def _about_center(points: Array, image_size: Array, factor: float) -> Array:
+def _scale_about_center(points: Array, image_size: Array, factor: float) -> Array:
     center = at_least_single(image_size)[None] / 2
     return center + factor * (at_least_single(points) - center)
 
 
 def image_sizes(matches: Matches) -> tuple[Array, Array]:
-    """Sizes `[2]` (width, height) of query and candidate, px; 1 for what is no size in a pair without matches."""
-    some = jnp.any(matches.mask)
+    """Sizes `[2]` (width, height) of query and candidate, px; an invalid size of a pair without matches becomes 1."""
+    has_matches = jnp.any(matches.mask)
     size0, size1 = at_least_single(matches.image_size0), at_least_single(matches.image_size1)
-    usable = lambda size: some | ((size > 0) & jnp.isfinite(size))  # noqa: E731
+    usable = lambda size: has_matches | ((size > 0) & jnp.isfinite(size))  # noqa: E731
     return masked(size0, usable(size0), 1.0), masked(size1, usable(size1), 1.0)
 
 
 def query_features(matches: Matches) -> Array:
-    """`[]` float32, how many keypoints the query of one pair has, 1 at least: what scores per feature are divided by.
+    """Number of keypoints of the query of one pair, at least 1, `[]` float32: the divisor of scores per feature.
 
     Raises:
-        InputError: the matches do not know.
+        InputError: the matches have no `count0`.
     """
     if matches.count0 is None:
         raise InputError("per_feature=True: expected matches that know how many keypoints the query has (count0), got "
@@ -54,13 +59,20 @@ def query_features(matches: Matches) -> Array:
     return jnp.maximum(jnp.asarray(matches.count0, jnp.float32), 1.0)
 
 
-def where_usable(found: Array, matches: Matches, shifts: Array, weights: Array, usable: Array) -> Array:
-    """What was `found` by weights `[W, K]` of one pair, `[W]` or of the only one; 0 without matches, and NaN where the
-    lattice is not usable, a shift or a weight no number: else the tallest bin would be anything."""
-    usable = usable & are_numbers(shifts, weights)
-    return jnp.where(jnp.any(matches.mask), jnp.where(usable, found, jnp.nan), 0.0)
+def where_usable(values: Array, matches: Matches, shifts: Array, weights: Array, usable: Array) -> Array:
+    """Values of one pair where they mean something; 0 without matches, NaN if not usable.
+
+    Args:
+        values: `[W]`, or `[...]` if W = 1.
+        matches: `[K, ...]`.
+        shifts: of the matches; a shift that is not finite makes all values NaN.
+        weights: `[W, K]` of the matches; a weight that is not finite makes its value NaN.
+        usable: `[]` bool, False makes all values NaN.
+    """
+    usable = usable & are_finite(shifts, weights)
+    return jnp.where(jnp.any(matches.mask), jnp.where(usable, values, jnp.nan), 0.0)
 
 
-def are_numbers(shifts: Array, weights: Array) -> Array:
+def are_finite(shifts: Array, weights: Array) -> Array:
     """`[W]` whether all shifts and the weights `[W, K]` are finite."""
     return jnp.all(jnp.isfinite(shifts)) & jnp.all(jnp.isfinite(weights), axis=1)

@@ -24,26 +24,26 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mfvpr.scoring.lattice import Lattice, gaussian, of_all_bins, votes_along
+from mfvpr.scoring.lattice import Lattice, gaussian, pool_bins, votes_along
 from mfvpr.types import Array
 
 BLOCKS_AT_ONCE = 4
-MOST_ROUNDS = 16  # after them all bins cost less
-WORTHWHILE = 2**13  # bins times weightings from which on a bound costs less than all bins
-PAIRS_AT_ONCE = 8  # times weightings: few and long operations, that still stay in the cache
-_SLACK = 2**-10  # of a bound: rounded positions and exponentials
-_SLACK_PER_MATCH = 2**-22  # of a bound: rounded sums
+MOST_ROUNDS = 16  # after so many rounds, evaluating all bins is cheaper
+WORTHWHILE = 2**13  # bins times weightings above which the bounds cost less than all bins
+PAIRS_AT_ONCE = 8  # divided by the weightings: few and long operations that still stay in the cache
+_SLACK = 2**-10  # relative; covers the rounding of positions and exponentials
+_SLACK_PER_MATCH = 2**-22  # relative; covers the rounding of sums
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(3,))
 def tallest_bins(shifts: Array, weights: Array, lattice: Lattice, capacity: int) -> Array:
-    """Maximum over the bins in range `[C, W]`, by several weights of the matches of each pair.
+    """Scores `[C, W]` of the tallest bins of C pairs, with W weights of the matches of each pair.
 
-    Its derivative is that of the maximum over all bins.
+    The derivative is the one of the maximum over all bins.
 
     Args:
         shifts: `[C, 2, K]` along x and along y.
-        weights: `[C, W, K]`, 0 on padding; if one of them is not finite, their maximum is NaN.
+        weights: `[C, W, K]`, 0 on padding; a weight that is not finite makes its score NaN.
         lattice: `[C, ...]`, of at most `capacity` bins along each axis.
         capacity: static.
     """
@@ -51,11 +51,11 @@ def tallest_bins(shifts: Array, weights: Array, lattice: Lattice, capacity: int)
     if capacity**2 * num_weights <= WORTHWHILE:
         return _all_bins(pairs, capacity, batch_size=max(1, PAIRS_AT_ONCE // num_weights))
 
-    def one(pair: Any) -> Array:
-        found, done = search_blocks(*pair, capacity=capacity)
-        return jax.lax.cond(done, lambda: found, lambda: of_all_bins(*pair, capacity=capacity))
+    def score_pair(pair: Any) -> Array:
+        scores, is_proven = search_blocks(*pair, capacity=capacity)
+        return jax.lax.cond(is_proven, lambda: scores, lambda: pool_bins(*pair, capacity=capacity))
 
-    return jax.lax.map(one, pairs)
+    return jax.lax.map(score_pair, pairs)
 
 
 @tallest_bins.defjvp
@@ -64,44 +64,44 @@ def _derivative(capacity: int, primals: tuple, tangents: tuple) -> tuple[Array, 
 
 
 def _all_bins(pairs: Any, capacity: int, *, batch_size: int | None = None) -> Array:
-    return jax.lax.map(lambda pair: of_all_bins(*pair, capacity=capacity), pairs, batch_size=batch_size)
+    return jax.lax.map(lambda pair: pool_bins(*pair, capacity=capacity), pairs, batch_size=batch_size)
 
 
 def search_blocks(shifts: Array, weights: Array, lattice: Lattice, capacity: int) -> tuple[Array, Array]:
-    """Of one pair the tallest bins `[W]`, and whether they are: no block that is left can hold a taller one."""
+    """Scores `[W]` of the tallest bins found for one pair, and whether no other block can hold a taller bin."""
     side = block_side(capacity)
     count = -(-capacity // side)
     usable = jnp.all(jnp.isfinite(weights), axis=1)
     bounds = block_bounds(shifts, jnp.where(usable[:, None], weights, 0.0), lattice, side, count)
 
-    def promise(tallest: Array, left: Array) -> tuple[Array, Array]:
-        """The blocks whose bounds exceed the tallest bins most, and by which factor, of those that are left."""
-        below = jnp.where(tallest < 0, jnp.inf, 0.0)  # as negative weights can be: even a bin without votes is taller
+    def next_blocks(tallest: Array, open_blocks: Array) -> tuple[Array, Array]:
+        """(factors, blocks) of the open blocks with bounds that exceed the tallest bins by the largest factors."""
+        below = jnp.where(tallest < 0, jnp.inf, 0.0)  # with negative weights even a bin without votes may be taller
         tallest = jnp.where(tallest > 0, tallest, jnp.finfo(tallest.dtype).tiny)
         factors = jnp.max(bounds / tallest[None, :, None] + below[None, :, None], axis=1).reshape(-1)
-        return jax.lax.top_k(jnp.where(left, factors, 0.0), min(BLOCKS_AT_ONCE, count**2))
+        return jax.lax.top_k(jnp.where(open_blocks, factors, 0.0), min(BLOCKS_AT_ONCE, count**2))
 
     def step(state: tuple) -> tuple:
-        rounds, tallest, left, _, blocks = state
+        rounds, tallest, open_blocks, _, blocks = state
         tallest = jnp.maximum(tallest, evaluate_blocks(blocks, shifts, weights, lattice, side, count))
-        left = left.at[blocks].set(False)
-        return rounds + 1, tallest, left, *promise(tallest, left)
+        open_blocks = open_blocks.at[blocks].set(False)
+        return rounds + 1, tallest, open_blocks, *next_blocks(tallest, open_blocks)
 
-    left, nothing = jnp.ones(count**2, bool), jnp.full(len(weights), -jnp.inf, bounds.dtype)
-    start = step((0, nothing, left, *promise(jnp.max(bounds, axis=(0, 2)), left)))
+    open_blocks, lowest = jnp.ones(count**2, bool), jnp.full(len(weights), -jnp.inf, bounds.dtype)
+    start = step((0, lowest, open_blocks, *next_blocks(jnp.max(bounds, axis=(0, 2)), open_blocks)))
     state = jax.lax.while_loop(lambda state: (state[3][0] > 1) & (state[0] < MOST_ROUNDS), step, start)
     _, tallest, _, factors, _ = state
-    # Those that are left are many where a field is so flat that all bins are nearly as tall.
+    # Many blocks stay open if the histogram is so flat that all bins are nearly as tall.
     return jnp.where(usable, tallest, jnp.nan), factors[0] <= 1
 
 
 def block_side(capacity: int) -> int:
-    """Bins along a side of a block."""
+    """Bins along one side of a block."""
     return 2 if capacity <= 48 else 3 if capacity <= 96 else 4 if capacity <= 256 else 8
 
 
 def block_bounds(shifts: Array, weights: Array, lattice: Lattice, side: int, count: int) -> Array:
-    """`[count (y), W, count (x)]` what no bin of a block exceeds, 0 for blocks out of range."""
+    """`[count (y), W, count (x)]` upper bounds of the bins of every block, 0 for blocks out of range."""
     width = side * lattice.bin_size
     narrow = width <= lattice.deviation
     start = side * jnp.arange(count + 1, dtype=shifts.dtype)
@@ -119,7 +119,7 @@ def block_bounds(shifts: Array, weights: Array, lattice: Lattice, side: int, cou
 
 
 def _block_votes(shifts: Array, axis: int, start: Array, lattice: Lattice, side: int, narrow: Array) -> Array:
-    """`[count + 1, K]` along one axis: votes for a block's first bin where blocks are narrow, else for its nearest."""
+    """`[count + 1, K]` votes along one axis: for the first bin of narrow blocks, else for the nearest bin."""
     last = lattice.num_bins[axis] - 1
     lower = lattice.centers(axis, start)[:, None]
     upper = lattice.centers(axis, jnp.minimum(start + (side - 1), last))[:, None]
@@ -133,8 +133,7 @@ def _block_votes(shifts: Array, axis: int, start: Array, lattice: Lattice, side:
 
 
 def evaluate_blocks(blocks: Array, shifts: Array, weights: Array, lattice: Lattice, side: int, count: int) -> Array:
-    """`[W]` tallest bin in range of some blocks `[n]`."""
-
+    """Scores `[W]` of the tallest bin within range in blocks `[n]`."""
     inner = jnp.arange(side, dtype=shifts.dtype)[None]
 
     def along(axis: int, block: Array) -> Array:

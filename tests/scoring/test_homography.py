@@ -93,7 +93,7 @@ def test_samples_are_the_first_draws_that_a_camera_can_see():
     points = np.concatenate(plane_points(5, 30, 0.5), axis=1) / 168 - 1
     points[5:10] = np.linspace(0, 0.75, 5, dtype=np.float32)[:, None]  # on a line in both images
     key = jax.random.key(7)
-    samples, count = quads.accepted(jnp.asarray(points), key, 3, np.int32(30))
+    samples, count = quads.draw_samples(jnp.asarray(points), key, 3, np.int32(30))
     drawn = np.asarray(quads.draw(key, 3, np.int32(30))).T
     kept = [four for four in drawn if ransac_oracle.keeps_orientation(points[four, :2], points[four, 2:])]
     assert int(count) == min(len(kept), quads.ROUND)
