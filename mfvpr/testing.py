@@ -1,6 +1,6 @@
-"""The contract of scorers as a test for those of other people: `check_scorer(MyScorer())` in a test of your own.
+"""Contract of scorers as a test for your own scorer: call `check_scorer(MyScorer())` in a test.
 
-What is checked is what the library relies on when it pads, batches, sweeps and learns; see `mfvpr.Scorer`.
+The library relies on this contract when it pads, batches, sweeps and learns; see `mfvpr.Scorer`.
 """
 
 from collections.abc import Callable, Iterator
@@ -27,20 +27,20 @@ TOLERANCE = 1e-4  # of the largest score: float32 sums in another order
 def check_scorer(
     scorer: Scorer, *, image_size: tuple[int, int] = (336, 336), num_keypoints: int | None = None, seed: int = 0
 ) -> None:
-    """Check that a scorer keeps the contract, on made-up matches.
+    """Check that a scorer fulfills the contract, on synthetic matches.
 
-    In this order: it is a value or a plain function; scores are scalars, float32 and finite, and exactly 0 without
-    matches; padding and the order of the matches change nothing; a batch scores as its pairs do; jit scores as without,
-    with one trace for all numbers; gradients are finite, or refused with a `NoGradientError`.
+    Checks, in this order: the scorer is a value or a plain function; scores are scalars, float32 and finite, and
+    exactly 0 without matches; padding and the order of the matches change nothing; a batch has the scores of its pairs;
+    `jit` does not change scores, and traces once for all numbers; gradients are finite, or raise a `NoGradientError`.
 
     Args:
-        scorer: any; a sampling one must be reproducible, and may hold a key.
-        image_size: (width, height) of the made-up images, px.
-        num_keypoints: of the made-up images, at least 40; None = three times as many as are matched.
-        seed: of the made-up matches.
+        scorer: any scorer; if it samples, it must be reproducible, and may hold a key.
+        image_size: (width, height) of the images, px.
+        num_keypoints: of each image, at least 40; None = three times the number of matches.
+        seed: of the matches.
 
     Raises:
-        AssertionError: it does not; the message says what broke, and the usual mend.
+        AssertionError: the scorer violates the contract; the message says how, and the usual fix.
     """
     try:
         _check(scorer, image_size, num_keypoints, seed)
@@ -54,12 +54,12 @@ def check_scorer(
 def _check(scorer: Scorer, image_size: tuple[int, int], num_keypoints: int | None, seed: int) -> None:
     _check_is_value(scorer)
     pairs = [
-        _made_up(np.random.default_rng([seed, count]), count, image_size, num_keypoints or 3 * count)
+        _random_matches(np.random.default_rng([seed, count]), count, image_size, num_keypoints or 3 * count)
         for count in COUNTS
     ]
     scorer = fit(scorer, pairs[0].image_size0, pairs[0].image_size1)
     scores = np.array([_check_scalar(scorer, pair, count) for pair, count in zip(pairs, COUNTS, strict=True)])
-    close = _Close(TOLERANCE * float(np.abs(scores).max()))
+    close = _AssertClose(TOLERANCE * float(np.abs(scores).max()))
     score_of = scorer if on_host(scorer) else jax.jit(lambda pair: scorer(pair))
     for pair, score in zip(pairs, scores, strict=True):
         close(score_of(pair), score, "jit scores otherwise than without; use jax.numpy on matches")
@@ -70,7 +70,7 @@ def _check(scorer: Scorer, image_size: tuple[int, int], num_keypoints: int | Non
         return
     _check_one_trace(scorer, pairs[-1], close)
     gradients = jax.jit(_gradients(scorer))
-    with suppress(NoGradientError):  # which says so in one line
+    with suppress(NoGradientError):
         for pair in pairs:
             _check_gradients(type(scorer).__name__, gradients, pair)
 
@@ -105,26 +105,26 @@ def _check_scalar(scorer: Scorer, pair: Matches, count: int) -> np.ndarray:
     return np.asarray(score)
 
 
-def _check_padding(scorer: Scorer, pair: Matches, score: np.ndarray, close: "_Close") -> None:
+def _check_padding(scorer: Scorer, pair: Matches, score: np.ndarray, close: "_AssertClose") -> None:
     for garbage in (np.inf, -1e30, 7.0):
-        close(scorer(_padded(pair, garbage, SLOTS)), score, f"padding that holds {garbage} changes the score; take "
+        close(scorer(_pad(pair, garbage, SLOTS)), score, f"padding that holds {garbage} changes the score; take "
               "values by mfvpr.masked(values, matches.mask)")  # fmt: skip
-    close(scorer(_padded(pair, np.nan, SLOTS + 16)), score, "more slots of padding change the score; count with "
+    close(scorer(_pad(pair, np.nan, SLOTS + 16)), score, "more slots of padding change the score; count with "
           "matches.mask, not with the number of slots")  # fmt: skip
 
 
-def _check_order(scorer: Scorer, pair: Matches, score: np.ndarray, close: "_Close") -> None:
+def _check_order(scorer: Scorer, pair: Matches, score: np.ndarray, close: "_AssertClose") -> None:
     order = np.random.default_rng(1).permutation(len(pair.mask))
     shuffled = replace(pair, mask=pair.mask[order], **{n: values[order] for n, values in per_match(pair).items()})
     close(scorer(shuffled), score, "the order of the matches, and where padding stands among them, changes the score")
 
 
-def _check_batch(scorer: Scorer, pairs: list[Matches], scores: np.ndarray, close: "_Close") -> None:
+def _check_batch(scorer: Scorer, pairs: list[Matches], scores: np.ndarray, close: "_AssertClose") -> None:
     batch = jax.tree.map(lambda *leaves: np.stack(leaves), *pairs)
     close(score_candidates(scorer, batch), scores, "vmap over a batch of pairs does not score as the pairs one by one")
 
 
-def _check_one_trace(scorer: Scorer, pair: Matches, close: "_Close") -> None:
+def _check_one_trace(scorer: Scorer, pair: Matches, close: "_AssertClose") -> None:
     traces = []
 
     @jax.jit
@@ -133,7 +133,7 @@ def _check_one_trace(scorer: Scorer, pair: Matches, close: "_Close") -> None:
         return scorer(pair)
 
     if holds_function(scorer):
-        return  # what holds a function has a program for it alone
+        return  # a scorer that holds a function is compiled at every call
     for changed in _with_other_numbers(scorer):
         expected = changed(pair)
         close(score(changed, pair), expected, "jit scores other numbers otherwise than without; use jax.numpy on them")
@@ -143,22 +143,22 @@ def _check_one_trace(scorer: Scorer, pair: Matches, close: "_Close") -> None:
 
 
 def _with_other_numbers(scorer: Any) -> Iterator[Any]:
-    """The scorer, and twice with its floating point numbers a little larger."""
+    """The scorer, and two copies with slightly larger floating point numbers."""
     for factor in (1.0, 1.01, 1.02):
         yield jax.tree.map(lambda leaf: leaf * factor if _is_floating(leaf) else leaf, scorer)  # noqa: B023
 
 
 def _gradients(scorer: Any) -> Callable[[Matches], tuple[list[Array], dict[str, Array]]]:
-    """Gradients of one pair's score for the scorer's floating point numbers, and for what belongs to a match."""
+    """Gradients of one pair's score with respect to the scorer's floating point numbers and to the matches."""
     leaves, structure = jax.tree.flatten(scorer)
-    places = [place for place, leaf in enumerate(leaves) if _is_floating(leaf)]
+    positions = [position for position, leaf in enumerate(leaves) if _is_floating(leaf)]
 
     def gradients(pair: Matches) -> tuple[list[Array], dict[str, Array]]:
         def score(numbers: list[Array], entries: dict[str, Array]) -> Array:
-            changed = dict(enumerate(leaves)) | dict(zip(places, numbers, strict=True))
+            changed = dict(enumerate(leaves)) | dict(zip(positions, numbers, strict=True))
             return jax.tree.unflatten(structure, changed.values())(replace(pair, **entries))
 
-        numbers = [jnp.asarray(leaves[place], jnp.float32) for place in places]
+        numbers = [jnp.asarray(leaves[position], jnp.float32) for position in positions]
         entries = {name: values for name, values in per_match(pair).items() if _is_floating(values)}
         return jax.grad(score, argnums=(0, 1))(numbers, entries)
 
@@ -179,8 +179,8 @@ def _check_gradients(name: str, gradients: Callable[[Matches], Any], pair: Match
             )
 
 
-class _Close:
-    """Asserts that scores are equal up to rounding, which is relative to the largest of them."""
+class _AssertClose:
+    """Assertion that scores are equal up to an absolute tolerance."""
 
     def __init__(self, tolerance: float) -> None:
         self.tolerance = tolerance
@@ -195,12 +195,12 @@ def _is_floating(leaf: Any) -> bool:
     return not callable(leaf) and jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
 
 
-def _made_up(rng: np.random.Generator, count: int, image_size: tuple[int, int], num_keypoints: int) -> Matches:
-    """Matches of one pair, half of which share a shift; padding holds NaN."""
+def _random_matches(rng: np.random.Generator, count: int, image_size: tuple[int, int], num_keypoints: int) -> Matches:
+    """Matches of one pair, half of them with the same shift; padding holds NaN."""
     size = np.array(image_size, np.float32)
     points0, anywhere = (rng.uniform(0, size, (count, 2)) for _ in range(2))
     points1 = np.where(rng.random((count, 1)) < 0.5, np.clip(points0 + size / 9, 0, size - 1), anywhere)
-    points1[-1:] = points0[-1:]  # a shift of 0, where lengths have no gradient
+    points1[-1:] = points0[-1:]  # the length of a shift of 0 has no gradient
     unit = (rng.uniform(0.05, 0.95, count) for _ in range(5))
     entries = [np.asarray(values, np.float32) for values in (points0, points1, *unit)]
     points0, points1, distance, scores0, scores1, ratio, confidence = entries
@@ -208,18 +208,18 @@ def _made_up(rng: np.random.Generator, count: int, image_size: tuple[int, int], 
     counts = np.full(2, num_keypoints, np.int32)
     real = np.ones(count, bool)
     pair = Matches(points0, points1, distance, scores0, scores1, real, size, size, ratio, confidence, *indices, *counts)
-    return _padded(pair, np.nan, SLOTS)
+    return _pad(pair, np.nan, SLOTS)
 
 
-def _padded(pair: Matches, garbage: float, slots: int) -> Matches:
-    """The real matches in `slots` slots, `garbage` in the others."""
+def _pad(pair: Matches, garbage: float, slots: int) -> Matches:
+    """Move the real matches to the front of `slots` slots, and fill the rest with `garbage`."""
     real = np.asarray(pair.mask)
     count = int(real.sum())
 
-    def padded(values: np.ndarray) -> np.ndarray:
-        whole = np.issubdtype(values.dtype, np.integer)
-        rows = np.full((slots, *values.shape[1:]), np.int32(-1) if whole else np.float32(garbage))
+    def pad(values: np.ndarray) -> np.ndarray:
+        is_integer = np.issubdtype(values.dtype, np.integer)
+        rows = np.full((slots, *values.shape[1:]), np.int32(-1) if is_integer else np.float32(garbage))
         rows[:count] = values[real]
         return rows
 
-    return replace(pair, mask=np.arange(slots) < count, **{n: padded(values) for n, values in per_match(pair).items()})
+    return replace(pair, mask=np.arange(slots) < count, **{n: pad(values) for n, values in per_match(pair).items()})

@@ -1,4 +1,4 @@
-"""What flows through the house: Features -> Shortlist and Matches -> Ranking.
+"""Data of all stages: Features -> Shortlist and Matches -> Ranking.
 
 Axis letters: Q queries, C candidates, N keypoints, K match slots, D descriptor dimension. `0` = query, `1` = candidate.
 Points are (x, y) in pixels of the image that the detector saw. `mask` is True on real entries; what padding holds
@@ -11,52 +11,52 @@ from typing import Any, TypeVar, dataclass_transform
 
 import jax
 
-Array = Any  # jax.Array or np.ndarray: the host builds with NumPy what the device computes with
+Array = Any  # jax.Array or np.ndarray: the host prepares arrays with NumPy, devices compute with JAX
 Class = TypeVar("Class", bound=type)
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))
 def value(cls: Class) -> Class:
-    """Class decorator: a frozen dataclass and a pytree, whose fields `jit` may trace, batch and differentiate.
+    """Make a class a frozen dataclass and a pytree: JAX may trace, batch and differentiate its fields.
 
         @value
         class Threshold:
             largest: float = 0.8
             kind: str = field(default="l2", metadata={"static": True})
 
-    Fields are leaves, or subtrees; those with the metadata `static` (a word, a flag, a capacity: what chooses the
-    program) are compared instead, and must be hashable. A whole number in a field whose default is a `float` is one.
+    Fields are leaves or subtrees. Fields with the metadata `static` (words, flags, capacities) select the compiled
+    program: they are compared, and must be hashable. An integer in a field with a `float` default becomes a float.
     Unflattening calls no `__init__`.
 
-    `jax.tree_util.register_dataclass` registers the same, but up to jaxlib 0.10 at least its nodes are compared without
-    their class. The programs of this library tell the classes apart. A `jit` of your own may take the program of one
-    class for that of another, by the luck of the hashes.
+    `jax.tree_util.register_dataclass` registers a class in the same way, but jaxlib up to 0.10 at least compares its
+    nodes without their class. The programs of this library tell the classes apart. With such classes, a `jit` of your
+    own may run the program of another class if hashes collide.
     """
-    made: Any = cls if is_dataclass(cls) and "__dataclass_fields__" in vars(cls) else dataclass(frozen=True)(cls)
-    static = [f.name for f in fields(made) if f.metadata.get("static")]
-    dynamic = [f.name for f in fields(made) if not f.metadata.get("static")]
-    floats = {f.name for f in fields(made) if isinstance(f.default, float)}
+    data: Any = cls if is_dataclass(cls) and "__dataclass_fields__" in vars(cls) else dataclass(frozen=True)(cls)
+    static = [f.name for f in fields(data) if f.metadata.get("static")]
+    dynamic = [f.name for f in fields(data) if not f.metadata.get("static")]
+    floats = {f.name for f in fields(data) if isinstance(f.default, float)}
     keys = [jax.tree_util.GetAttrKey(name) for name in dynamic]
 
     def child(self: Any, name: str) -> Any:
-        found = getattr(self, name)
-        return float(found) if type(found) is int and name in floats else found
+        content = getattr(self, name)
+        return float(content) if type(content) is int and name in floats else content
 
     def flatten(self: Any) -> tuple[list[Any], tuple[Any, ...]]:
         return [child(self, name) for name in dynamic], tuple(getattr(self, name) for name in static)
 
     def flatten_with_keys(self: Any) -> tuple[list[tuple[Any, Any]], tuple[Any, ...]]:
-        children, chosen = flatten(self)
-        return list(zip(keys, children, strict=True)), chosen
+        children, statics = flatten(self)
+        return list(zip(keys, children, strict=True)), statics
 
-    def unflatten(chosen: tuple[Any, ...], children: Any) -> Any:
-        self = object.__new__(made)
-        for name, content in (*zip(static, chosen, strict=True), *zip(dynamic, children, strict=True)):
+    def unflatten(statics: tuple[Any, ...], children: Any) -> Any:
+        self = object.__new__(data)
+        for name, content in (*zip(static, statics, strict=True), *zip(dynamic, children, strict=True)):
             object.__setattr__(self, name, content)
         return self
 
-    jax.tree_util.register_pytree_with_keys(made, flatten_with_keys, unflatten, flatten)
-    return made
+    jax.tree_util.register_pytree_with_keys(data, flatten_with_keys, unflatten, flatten)
+    return data
 
 
 @value
@@ -65,7 +65,7 @@ class Features:
 
     Attributes:
         keypoints: `[..., N, 2]` (x, y), px.
-        descriptors: `[..., N, D]`, of any length; those of this library's networks and of RootSIFT are of unit length.
+        descriptors: `[..., N, D]`; this library's networks and RootSIFT have unit length, others may differ.
         scores: `[..., N]` detection scores, larger = better.
         mask: `[..., N]` bool.
         image_size: `[..., 2]` (width, height), px.
@@ -79,7 +79,7 @@ class Features:
 
 
 def per_keypoint(features: Features) -> dict[str, Array]:
-    """The fields with a value for every keypoint, `[..., N, ...]` by name, the mask among them."""
+    """Fields with a value for every keypoint, `[..., N, ...]` by name, with the mask."""
     return {f.name: getattr(features, f.name) for f in fields(features) if not f.metadata.get("per_image")}
 
 
@@ -90,19 +90,19 @@ class Matches:
     Attributes:
         points0: `[..., K, 2]` (x, y) in the query, px.
         points1: `[..., K, 2]` (x, y) in the candidate, px.
-        distance: `[..., K]` Euclidean distance of the descriptors, in [0, 2] where these are of unit length.
+        distance: `[..., K]` Euclidean distance of the descriptors, in [0, 2] for unit length.
         scores0: `[..., K]` detection scores in the query.
         scores1: `[..., K]` detection scores in the candidate.
         mask: `[..., K]` bool.
         image_size0: `[..., 2]` (width, height) of the query, px.
         image_size1: `[..., 2]` (width, height) of the candidate, px.
-        ratio: `[..., K]` distance to the nearest descriptor of the candidate over that to the second nearest, in
-            [0, 1]; None where nobody asked for it.
-        confidence: `[..., K]` in [0, 1], how surely a match is one: it counts so much of its weight. None = 1.
-        index0: `[..., K]` int32, the match's keypoint among those of the query; None = unknown.
-        index1: `[..., K]` int32, the same of the candidate.
-        count0: `[...]` int32, keypoints of the query, matched or not; None = unknown.
-        count1: `[...]` int32, keypoints of the candidate.
+        ratio: `[..., K]` distance to the nearest descriptor of the candidate over the distance to the second nearest,
+            in [0, 1]; None unless the matcher was asked for it (`with_ratio=True`).
+        confidence: `[..., K]` in [0, 1], how certain a match is; multiplies its weight. None = 1.
+        index0: `[..., K]` int32, number of the match's keypoint in the query; None = unknown.
+        index1: `[..., K]` int32, number of the match's keypoint in the candidate; None = unknown.
+        count0: `[...]` int32, number of keypoints of the query, matched or not; None = unknown.
+        count1: `[...]` int32, number of keypoints of the candidate, matched or not; None = unknown.
     """
 
     points0: Array  # [..., K, 2]
@@ -121,30 +121,31 @@ class Matches:
     count1: Array | None = field(default=None, metadata={"per_pair": True})  # [...]
 
 
-INDICES = ("index0", "index1")  # whole numbers, of which nobody computes anything
+INDICES = ("index0", "index1")  # integer fields, which take part in no arithmetic
 
 
 def per_match(matches: Matches) -> dict[str, Array]:
-    """The fields with a value for every match, `[..., K, ...]` by name: those that are there, but for the mask."""
+    """Fields with a value for every match, `[..., K, ...]` by name, without the mask and without None."""
     return _present(matches, lambda f: f.name != "mask" and not f.metadata.get("per_pair"))
 
 
 def per_pair(matches: Matches) -> dict[str, Array]:
-    """The fields with one value for a pair of images, `[..., ...]` by name: those that are there."""
+    """Fields with one value per pair of images, `[..., ...]` by name, without None."""
     return _present(matches, lambda f: bool(f.metadata.get("per_pair")))
 
 
-def _present(matches: Matches, chosen: Callable[[Field[Any]], bool]) -> dict[str, Array]:
-    return {f.name: values for f in fields(matches) if chosen(f) and (values := getattr(matches, f.name)) is not None}
+def _present(matches: Matches, predicate: Callable[[Field[Any]], bool]) -> dict[str, Array]:
+    names = [f.name for f in fields(matches) if predicate(f)]
+    return {name: values for name in names if (values := getattr(matches, name)) is not None}
 
 
 @value
 class Shortlist:
-    """The filter's best candidates for each query.
+    """Best candidates of the retrieval for each query.
 
     Attributes:
         indices: `[Q, C]` int32 database rows, best first, -1 = none.
-        scores: `[Q, C]` filter scores (cosine similarity).
+        scores: `[Q, C]` retrieval scores (cosine similarity).
         mask: `[Q, C]` bool, False where the index is -1.
     """
 

@@ -1,4 +1,4 @@
-"""Shortlists -> matches of all their pairs: batches of queries on all devices, features read while these work."""
+"""Shortlists -> matches of all pairs: batches of queries on all devices, while a thread reads the next features."""
 
 import itertools
 from collections import deque
@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from mfvpr.features.feature_set import FeatureSet, Slots, Staged, memory_budget
-from mfvpr.matching.match_set import QueryMatches, compacted
+from mfvpr.matching.match_set import QueryMatches, split_pairs
 from mfvpr.matching.matcher import Matcher, match_pairs
 from mfvpr.types import Features, Matches, Shortlist, per_match
 from mfvpr.utils import ragged
@@ -18,18 +18,20 @@ from mfvpr.utils.numerics import Device
 from mfvpr.utils.ragged import Row
 from mfvpr.utils.threads import ordered_map
 
-QUERIES = 8  # of a batch: they share the candidates that are read for them
-PAIRS = 128  # of a call
+QUERIES = 8  # per batch; the queries of a batch share the features of their candidates
+PAIRS = 128  # per call
 
-Calls = list[tuple[np.ndarray, Matches]]  # (numbers of pairs [n], Matches [P, ...] that the device computes)
+Calls = list[
+    tuple[np.ndarray, Matches]
+]  # (positions in the pairs of a part [n], Matches [P, ...] that the device computes)
 
 
 class Part(NamedTuple):
-    """Pairs of a batch of queries whose candidates fit on the device at the same time.
+    """Pairs of a batch of queries, so many that their candidates fit on the device at the same time.
 
-    pairs: `[n, 3]` row of the query, place of the candidate in its shortlist, row of the database.
-    device: which matches them.
-    ends: `[B]` rows of the queries that have no further pairs.
+    pairs: `[n, 3]` row of the query, position of the candidate in its shortlist, row of the database.
+    device: matches these pairs.
+    ends: `[B]` rows of the queries without further pairs.
     """
 
     pairs: np.ndarray
@@ -38,7 +40,7 @@ class Part(NamedTuple):
 
 
 class Pair(NamedTuple):
-    """What was matched of one pair: its real matches, and the sizes `[2]` of its images."""
+    """Real matches of one pair, and the sizes `[2]` of its images."""
 
     matches: Row
     image_size0: np.ndarray
@@ -47,17 +49,17 @@ class Pair(NamedTuple):
 
 @dataclass(frozen=True)
 class Sides:
-    """Both sides' features on one device."""
+    """Features of queries and of the database on one device."""
 
     queries: Slots
     database: Slots
 
     def stage(self, part: Part) -> tuple[Staged, Staged]:
-        """Read what is not there."""
+        """Read the features that are not on the device."""
         return self.queries.stage(part.pairs[:, 0]), self.database.stage(part.pairs[:, 2])
 
     def begin(self, staged: tuple[Staged, Staged], matcher: Matcher) -> Calls:
-        """Hand a part's pairs to the device, a call for every `PAIRS` of the same capacities."""
+        """Start matching the pairs of a part on the device: one call per `PAIRS` pairs of the same capacities."""
         arrays0, arrays1 = self.queries.put(staged[0]), self.database.put(staged[1])
         capacities, slots = (
             np.stack([getattr(side, name) for side in staged], axis=1) for name in ("capacity", "slot")
@@ -67,9 +69,9 @@ class Sides:
             members = np.flatnonzero((capacities == shape).all(axis=1))
             sides = arrays0[int(shape[0])], arrays1[int(shape[1])]
             for start in range(0, len(members), PAIRS):
-                some = members[start : start + PAIRS]
-                pairs = ragged.filled(slots[some], PAIRS)
-                calls.append((some, match_pairs(*sides, pairs, np.int32(len(some)), matcher)))
+                positions = members[start : start + PAIRS]
+                pairs = ragged.filled(slots[positions], PAIRS)
+                calls.append((positions, match_pairs(*sides, pairs, np.int32(len(positions)), matcher)))
         return calls
 
 
@@ -83,29 +85,30 @@ def matched(
     memory: float | None,
     devices: Sequence[Device],
 ) -> Iterator[tuple[int, QueryMatches]]:
-    """(row, all of that query), in their order, NumPy.
+    """Match queries with their candidates: (row, matches of that query), in the order of `todo`, NumPy.
 
     Args:
         queries: Q images.
         database: M images.
         candidates: `[Q, C]` rows of the database.
-        todo: rows of the queries that are to be matched.
+        todo: rows of the queries to match.
         matcher: of one pair.
-        memory: GB for features of the database, see `sources.memory_budget`.
-        devices: that share the queries.
+        memory: GB for features of the database, see `mfvpr.features.feature_set.memory_budget`.
+        devices: share the queries.
     """
     indices, scores = np.asarray(candidates.indices), np.asarray(candidates.scores)
     counts0, counts1, rows = queries.counts, database.counts, np.asarray(todo, int)
-    # Of all queries, though some are done: what goes on where it was must have the shapes, and the bits, of one run.
-    some, budget = np.unique(indices), memory_budget(memory, devices)
+    # Shapes follow from all queries, not from `todo`: a run that is continued must have the bits of a single run.
+    database_rows, budget = np.unique(indices), memory_budget(memory, devices)
+    database_rows = database_rows[database_rows >= 0]
     sides = {
         device: Sides(
-            Slots(queries, np.arange(len(queries)), 0, device), Slots(database, some[some >= 0], budget, device)
+            Slots(queries, np.arange(len(queries)), 0, device), Slots(database, database_rows, budget, device)
         )
         for device in devices
     }
-    nothing = _nothing(queries, database, matcher)
-    pairs: dict[tuple[int, int], Pair] = {}  # by query and place, until the query's last
+    no_matches = _no_matches(queries, database, matcher)
+    pairs: dict[tuple[int, int], Pair] = {}  # by (query, place), until the last pair of the query
     begun: deque[tuple[Part, Calls]] = deque()
     parts = _parts(counts0, counts1, indices, rows, sides)
     staged = ordered_map(lambda part: (part, sides[part.device].stage(part)), parts, workers=1)
@@ -115,11 +118,11 @@ def matched(
         while len(begun) > (0 if step is None else len(devices)):
             part, calls = begun.popleft()
             for call in calls:
-                pairs.update(_collected(part, *call))
+                pairs.update(_collect(part, *call))
             for query in part.ends.tolist():
                 of_query = [pairs.pop((query, place), None) for place in range(indices.shape[1])]
                 keypoints = np.where(indices[query] >= 0, counts1[indices[query]], 0).astype(np.int32)
-                matches = _joined(of_query, nothing)
+                matches = _join_candidates(of_query, no_matches)
                 matches = replace(matches, count0=counts0[query].astype(np.int32), count1=keypoints)
                 counts = np.array([0 if pair is None else len(pair.matches["points0"]) for pair in of_query], np.int32)
                 yield query, QueryMatches(matches, counts, indices[query], scores[query])
@@ -128,43 +131,43 @@ def matched(
 def _parts(
     counts0: np.ndarray, counts1: np.ndarray, indices: np.ndarray, todo: np.ndarray, sides: dict[Device, Sides]
 ) -> Iterator[Part]:
-    """Batch by batch, each on the next device; without pairs that have no keypoints on one side, hence no matches."""
+    """Parts of all batches, each batch on the next device; without pairs that have no keypoints on one side."""
     for start, device in zip(range(0, len(todo), QUERIES), itertools.cycle(sides), strict=False):
         batch = todo[start : start + QUERIES]
         rows = indices[batch]
         number, place = np.nonzero((rows >= 0) & (counts1[rows] > 0) & (counts0[batch] > 0)[:, None])
         pairs = np.stack([batch[number], place, rows[number, place]], axis=1)
-        together = list(sides[device].database.parts(np.unique(pairs[:, 2])))
-        for some in together[:-1]:
-            yield Part(pairs[np.isin(pairs[:, 2], some)], device, batch[:0])
-        yield Part(pairs[np.isin(pairs[:, 2], together[-1:])], device, batch)
+        groups = list(sides[device].database.parts(np.unique(pairs[:, 2])))  # database rows that fit at the same time
+        for group in groups[:-1]:
+            yield Part(pairs[np.isin(pairs[:, 2], group)], device, batch[:0])
+        yield Part(pairs[np.isin(pairs[:, 2], groups[-1:])], device, batch)
 
 
-def _collected(part: Part, members: np.ndarray, matches: Matches) -> Iterator[tuple[tuple[int, int], Pair]]:
-    """((row of the query, place of the candidate), what was matched)."""
-    real = jax.tree.map(lambda values: np.asarray(values)[: len(members)], matches)
-    entries = zip(part.pairs[members].tolist(), compacted(real), real.image_size0, real.image_size1, strict=True)
+def _collect(part: Part, positions: np.ndarray, matches: Matches) -> Iterator[tuple[tuple[int, int], Pair]]:
+    """((row of the query, place of the candidate), pair) of every pair of a call."""
+    real = jax.tree.map(lambda values: np.asarray(values)[: len(positions)], matches)
+    entries = zip(part.pairs[positions].tolist(), split_pairs(real), real.image_size0, real.image_size1, strict=True)
     for (query, place, _), row, *sizes in entries:
         yield (query, place), Pair(row, *sizes)
 
 
-def _joined(pairs: Sequence[Pair | None], nothing: Row) -> Matches:
-    """All candidates' matches, one after the other; an image that was not matched is of 1 x 1 px, as nobody looks."""
-    some = [pair for pair in pairs if pair is not None]
-    rows = ragged.joined([pair.matches for pair in some] or [nothing])
+def _join_candidates(pairs: Sequence[Pair | None], no_matches: Row) -> Matches:
+    """Matches of all candidates, one after the other; images that were not matched get the size 1 x 1 px."""
+    matched_pairs = [pair for pair in pairs if pair is not None]
+    rows = ragged.joined([pair.matches for pair in matched_pairs] or [no_matches])
     unknown = np.ones(2, np.float32)
     return Matches(
         **rows,
         mask=np.ones(len(rows["points0"]), bool),
-        image_size0=some[0].image_size0 if some else unknown,
+        image_size0=matched_pairs[0].image_size0 if matched_pairs else unknown,
         image_size1=np.array([unknown if pair is None else pair.image_size1 for pair in pairs]).reshape(-1, 2),
     )
 
 
-def _nothing(queries: FeatureSet, database: FeatureSet, matcher: Matcher) -> Row:
-    """The entries of no match, of the fields that the matcher gives."""
-    known = [side.dimension for side in (queries, database) if (side.counts > 0).any()]
-    dimension = known[0] if known else getattr(matcher, "dimension", 1)
+def _no_matches(queries: FeatureSet, database: FeatureSet, matcher: Matcher) -> Row:
+    """Empty row with the fields that the matcher returns."""
+    dimensions = [side.dimension for side in (queries, database) if (side.counts > 0).any()]
+    dimension = dimensions[0] if dimensions else getattr(matcher, "dimension", 1)
     shapes = {"keypoints": (1, 2), "descriptors": (1, dimension), "scores": (1,), "image_size": (2,)}
     arrays = {name: np.ones(shape, np.float32) for name, shape in shapes.items()}
     image = Features(**arrays, mask=np.ones(1, bool))

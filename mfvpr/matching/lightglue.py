@@ -1,4 +1,4 @@
-"""LightGlue as a matcher: a network, trained for certain features, says which keypoints match, and how surely."""
+"""LightGlue as a matcher: a network, trained for certain features, that predicts matches and their confidence."""
 
 from dataclasses import field
 from typing import TYPE_CHECKING, Any
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from mfvpr.matching.nearest_neighbors import at_least_one, distance_ratio, paired, ready, slot_numbers
+from mfvpr.matching.nearest_neighbors import at_least_one, distance_ratio, make_matches, ready, slot_numbers
 from mfvpr.matching.similarity import nearest
 from mfvpr.networks.lightglue_assignment import Packed, assignment
 from mfvpr.types import Features, Matches, value
@@ -19,22 +19,23 @@ if TYPE_CHECKING:  # Flax takes half a second
 
 @value
 class LightGlueMatching:
-    """The pairs of keypoints whose assignment is the largest of both, and above a threshold.
+    """Mutual maxima of LightGlue's assignment that are above a threshold.
 
         matcher = LightGlueMatching.of(load_model("aliked_lightglue"), depth_confidence=0.95)
 
-    Matches have the assignment as their `confidence`; `distance` and `ratio` are those of the descriptors, as of
-    `mfvpr.match`. The published weights are for ALIKED's features of 128 dimensions, and mean nothing for others.
+    The assignment is the `confidence` of a match; `distance` and `ratio` are those of the descriptors, as in
+    `mfvpr.match`. The published weights are for ALIKED's features of 128 dimensions, and useless for other features.
 
     Attributes:
         weights: of the network.
-        network: the recipe of the network that they are of.
-        filter_threshold: a match is kept where its assignment is above it.
-        depth_confidence: layers of a pair are left out once more than this share of its keypoints is sure, which
-            leaves out matches, a third on photographs; None = never. Pairs of a chunk wait for the slowest. The public
-            code has 0.95 by default, and prunes keypoints as well (`width_confidence=0.99`), which is not done here:
-            with 0.95 only 4 of 30 pairs had the matches of its defaults. They are those of `width_confidence=-1`.
-        chunk_size: pairs at a time, see `mfvpr.Matcher`; it changes memory, time and the last bits alone.
+        network: recipe of the network that the weights belong to.
+        filter_threshold: a match is kept if its assignment is larger.
+        depth_confidence: skip the remaining layers of a pair once more than this share of its keypoints is confident.
+            This loses matches, a third on photographs; None = never. The pairs of a chunk wait for the slowest. The
+            public code uses 0.95 by default and also prunes keypoints (`width_confidence=0.99`), which this class does
+            not: with 0.95, only 4 of 30 pairs had the same matches as the public defaults. Matches equal those of
+            `width_confidence=-1`.
+        chunk_size: pairs at a time, see `mfvpr.Matcher`; changes only memory, time and the last bits.
     """
 
     weights: Packed
@@ -45,17 +46,17 @@ class LightGlueMatching:
 
     @classmethod
     def of(cls, model: "LightGlue", **options: Any) -> "LightGlueMatching":
-        """With the weights of a model, see `mfvpr.checkpoints.files.load_model`, and further attributes as options."""
+        """Matcher with the weights of a model (`mfvpr.checkpoints.load_model`) and attributes as options."""
         return cls(jax.jit(type(model).packed)(model), fingerprint(recipe_of(model)), **options)
 
     @property
     def dimension(self) -> int:
-        """Numbers of the descriptors it takes."""
+        """Dimension of the descriptors."""
         return self.weights.input.kernel.shape[0]
 
     @property
     def recipe(self) -> dict[str, Any]:
-        """All that the matches depend on; the packed weights may differ in their last bits from machine to machine."""
+        """Everything that matches depend on, without the packed weights: their last bits vary between machines."""
         return {
             "network": self.network,
             "filter_threshold": self.filter_threshold,
@@ -63,10 +64,10 @@ class LightGlueMatching:
         }
 
     def __call__(self, features0: Features, features1: Features) -> Matches:
-        """Of one pair, keypoints `[N0, 2]` and `[N1, 2]`: N0 slots, one at least; slot k is of keypoint k of the query.
+        """Matches of one pair, keypoints `[N0, 2]` and `[N1, 2]`; slot k of max(N0, 1) is keypoint k of the query.
 
         Raises:
-            InputError: descriptors of another dimension.
+            InputError: the descriptors have another dimension.
         """
         features0, features1 = (ready(at_least_one(features)) for features in (features0, features1))
         for features in (features0, features1):
@@ -78,5 +79,5 @@ class LightGlueMatching:
         confidence = jnp.exp(best1.similarity)
         mutual = best0.index[best1.index] == slot_numbers(features0)
         real = mutual & (confidence > self.filter_threshold) & (best1.similarity > -jnp.inf)
-        more = {"confidence": confidence, "ratio": distance_ratio(features0, features1)}
-        return paired(features0, features1, best1.index, real, **more)
+        ratio = distance_ratio(features0, features1)
+        return make_matches(features0, features1, best1.index, real, confidence=confidence, ratio=ratio)

@@ -1,4 +1,4 @@
-"""Matches of many queries with their candidates, ragged; in batches of pairs for whatever scores them."""
+"""Matches of many queries with their candidates: ragged sets, and padded batches of pairs for scoring."""
 
 import itertools
 import math
@@ -15,10 +15,10 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import available_cpus, round_up
 from mfvpr.utils.threads import ordered_map
 
-BATCH_SLOTS = 2**14  # matches of a batch of pairs: its votes stay in cache
+BATCH_SLOTS = 2**14  # slots of a batch of pairs: its votes stay in the cache
 PAIRS_STEP = 8
 SLOTS_STEP = 32
-PROGRAM_SLOTS = 2**21  # are scored by one setting while a program for one shape more would be compiled
+PROGRAM_SLOTS = 2**21  # slots that one setting scores in the time that another shape takes to compile
 QUANTILES = (0.25, 0.5, 0.75, 0.95, 1.0)
 BYTES_PER_SLOT = 41
 BLOCK_BYTES = 2**28
@@ -28,7 +28,7 @@ Normalize = Literal["zscore", "none"]
 
 @dataclass(frozen=True)
 class QueryMatches:
-    """All of one query: its candidates, and their real matches one after the other. NumPy.
+    """Candidates of one query, and their real matches one after the other. NumPy.
 
     Attributes:
         matches: Matches `[n, ...]` of all candidates, best candidate first, without padding; `image_size0` `[2]` and
@@ -49,9 +49,9 @@ class MatchSet:
     """Matches of every query with its candidates, of one scale, without padding.
 
     Attributes:
-        matches: per query, as in QueryMatches; those of a store may be read whenever they are asked for.
+        matches: per query, as in QueryMatches; a store may read them on access.
         counts: `[Q, C]` matches of each candidate.
-        capacity: slots that hold every pair's matches.
+        capacity: slots that suffice for every pair.
     """
 
     matches: Sequence[Matches]
@@ -60,7 +60,7 @@ class MatchSet:
 
     @classmethod
     def of(cls, matches: Sequence[Matches], counts: np.ndarray) -> "MatchSet":
-        """With a capacity that other sets of about as many matches have as well."""
+        """Match set with a rounded capacity, so that sets of similar size share programs."""
         return cls(matches, counts, round_up(int(counts.max(initial=0)), 64))
 
     def __getitem__(self, query: int) -> Matches:
@@ -71,44 +71,44 @@ class MatchSet:
         return len(self.matches)
 
     def take(self, queries: Sequence[int] | np.ndarray) -> "MatchSet":
-        """Of some queries, in memory."""
-        taken = ordered_map(self.matches.__getitem__, list(queries), workers=available_cpus())
-        return MatchSet(list(taken), self.counts[queries], self.capacity)
+        """Match set of the given queries, in memory."""
+        matches = ordered_map(self.matches.__getitem__, list(queries), workers=available_cpus())
+        return MatchSet(list(matches), self.counts[queries], self.capacity)
 
     def pairs(self, queries: np.ndarray, places: np.ndarray, capacity: int, *, total: int | None = None) -> Matches:
         """Matches `[P, K, ...]` of pairs, padded with zeros.
 
         Args:
-            queries: `[P]`.
-            places: `[P]` of the candidates in their shortlists.
-            capacity: K, no less than the matches of any of the pairs.
-            total: so many pairs in all; those beyond have no matches, and the images of the last.
+            queries: `[P]` rows of the queries.
+            places: `[P]` positions of the candidates in their shortlists.
+            capacity: K, at least the matches of any of the pairs.
+            total: number of pairs with padding; padding has no matches, and the images of the last pair.
         """
-        asked = {query: self.matches[query] for query in np.unique(queries).tolist()}
-        pairs = [(asked[query], query, place) for query, place in zip(queries.tolist(), places.tolist(), strict=True)]
-        rows = [self._row(of_query, query, place) for of_query, query, place in pairs]
+        by_query = {query: self.matches[query] for query in np.unique(queries).tolist()}
+        pairs = list(zip(queries.tolist(), places.tolist(), strict=True))
+        rows = [self._row(by_query[query], query, place) for query, place in pairs]
         entries, mask = ragged.padded(rows, capacity, total=total)
-        of_pair = {
-            name: np.stack([_of_pair(of_query, name, place) for of_query, _, place in pairs])
-            for name in per_pair(pairs[0][0])
+        pair_fields = {
+            name: np.stack([_pair_value(by_query[query], name, place) for query, place in pairs])
+            for name in per_pair(by_query[pairs[0][0]])
         }
         if total is not None:
-            of_pair = {name: ragged.filled(values, total) for name, values in of_pair.items()}
-        return Matches(**entries, mask=mask, **of_pair)
+            pair_fields = {name: ragged.filled(values, total) for name, values in pair_fields.items()}
+        return Matches(**entries, mask=mask, **pair_fields)
 
     @cached_property
     def _ends(self) -> np.ndarray:
-        """`[Q, C]` of each candidate's matches among its query's."""
+        """`[Q, C]` end of each candidate's matches among the matches of its query."""
         return np.cumsum(self.counts, axis=1)
 
-    def _row(self, of_query: Matches, query: int, place: int) -> ragged.Row:
-        """The matches of a pair, views."""
+    def _row(self, matches: Matches, query: int, place: int) -> ragged.Row:
+        """Views of the matches of one pair, out of the matches of its query."""
         end = self._ends[query, place]
-        return {name: values[end - self.counts[query, place] : end] for name, values in per_match(of_query).items()}
+        return {name: values[end - self.counts[query, place] : end] for name, values in per_match(matches).items()}
 
     @cached_property
     def image_sizes(self) -> tuple[np.ndarray, np.ndarray]:
-        """All combinations of sizes of query and database images, `[n, 2]` each."""
+        """Sizes of query and database images, `[n, 2]` each, in all combinations."""
         sizes = [
             [np.reshape(query.image_size0, (-1, 2)), np.reshape(query.image_size1, (-1, 2))] for query in self.matches
         ]
@@ -118,15 +118,15 @@ class MatchSet:
 
 @dataclass(frozen=True)
 class Scales:
-    """Several Matches of every pair, such as those of patches of several sizes: a match set for each scale.
+    """Matches of every pair at several scales, such as patches of several sizes: one match set per scale.
 
-    Whatever scores a MatchSet takes it in its place: each scale is scored for itself, then they are fused over the
-    candidates of a query, see `mfvpr.reranking.ranking.fuse_scales`.
+    Functions that score a MatchSet accept Scales, too: each scale is scored by itself, then the scores are fused over
+    the candidates of a query, see `mfvpr.reranking.ranking.fuse_scales`.
 
     Attributes:
-        match_sets: S, of the same queries and candidates.
+        match_sets: S match sets of the same queries and candidates.
         weights: of the scales; None = 1 each.
-        normalize: what is done to the scores of a scale before.
+        normalize: normalization of the scores of a scale before fusion.
     """
 
     match_sets: Sequence[MatchSet]
@@ -144,27 +144,27 @@ class Scales:
 
     @property
     def image_sizes(self) -> tuple[np.ndarray, np.ndarray]:
-        """As of a MatchSet, of all scales."""
+        """Image sizes of all scales, see `MatchSet.image_sizes`."""
         sizes0, sizes1 = zip(*(match_set.image_sizes for match_set in self.match_sets), strict=True)
         return np.concatenate(sizes0), np.concatenate(sizes1)
 
 
-def _of_pair(of_query: Matches, name: str, place: int) -> np.ndarray:
-    values = getattr(of_query, name)
+def _pair_value(matches: Matches, name: str, place: int) -> np.ndarray:
+    values = getattr(matches, name)
     return values if name.endswith("0") else values[place]
 
 
 def scales(match_set: MatchSet | Scales) -> Sequence[MatchSet]:
-    """The match set of each scale; of one that has none, itself."""
+    """The match set of each scale; a MatchSet is a single scale."""
     return match_set.match_sets if isinstance(match_set, Scales) else [match_set]
 
 
 class Batch(NamedTuple):
-    """Pairs of about as many matches, which are scored in one call.
+    """Pairs with similar numbers of matches, which are scored in one call.
 
-    places: `[n]` in the flattened `[queries, C]`.
-    slots: of each pair, no less than its matches.
-    pairs: of the call, no less than n; what is beyond has no matches.
+    places: `[n]` positions of the pairs in the flattened `[queries, C]`.
+    slots: per pair, at least its matches.
+    pairs: number of pairs with padding, at least n; padding has no matches.
     """
 
     places: np.ndarray
@@ -173,12 +173,12 @@ class Batch(NamedTuple):
 
 
 def slots(match_set: MatchSet, *, settings: float = math.inf) -> np.ndarray:
-    """`[Q, C]` slots of the batch that each pair belongs to: few sizes, each a shape to compile, of little padding.
+    """`[Q, C]` slots of the batch that each pair belongs to: few sizes to compile, with little padding.
 
     Args:
-        match_set: the largest size is its capacity, which those taken from it share.
-        settings: that every program scores. For few of them, or in a small set, padding costs less time than compiling
-            for a shape more, and there are fewer sizes.
+        match_set: the largest size is its capacity, so that subsets have the same sizes.
+        settings: number of settings that every program scores. There are fewer sizes for few settings or a small set,
+            because padding then costs less time than compiling for another size.
     """
     sizes = ragged.sizes(match_set.counts, QUANTILES, SLOTS_STEP)
     sizes[-1] = max(sizes[-1], match_set.capacity)
@@ -187,13 +187,13 @@ def slots(match_set: MatchSet, *, settings: float = math.inf) -> np.ndarray:
 
 
 def shapes(match_set: MatchSet, *, settings: float = math.inf) -> dict[int, int]:
-    """Pairs of a batch by their slots; not by how many there are, so that a larger set scores them as a smaller one."""
+    """Pairs per batch, by slots; independent of the number of pairs, so that larger sets score with the same bits."""
     sizes = np.unique(slots(match_set, settings=settings)).tolist()
     return {size: round_up(BATCH_SLOTS // size, PAIRS_STEP) for size in sizes}
 
 
 def partition(match_set: MatchSet, queries: range, *, settings: float = math.inf) -> list[Batch]:
-    """All pairs of some queries that have matches, in batches; the first of each shape come first."""
+    """Batches of all pairs of some queries that have matches; the first batch of each shape comes first."""
     part = slice(queries.start, queries.stop)
     counts = match_set.counts[part].reshape(-1)
     sizes = slots(match_set, settings=settings)[part].reshape(-1)
@@ -201,16 +201,15 @@ def partition(match_set: MatchSet, queries: range, *, settings: float = math.inf
     for size, pairs in shapes(match_set, settings=settings).items():
         places = np.flatnonzero((sizes == size) & (counts > 0))
         by_shape.append([Batch(places[start : start + pairs], size, pairs) for start in range(0, len(places), pairs)])
-    in_turn = itertools.chain.from_iterable(itertools.zip_longest(*by_shape))
-    return [batch for batch in in_turn if batch is not None]
+    interleaved = itertools.chain.from_iterable(itertools.zip_longest(*by_shape))
+    return [batch for batch in interleaved if batch is not None]
 
 
 def batches(match_set: MatchSet, queries: range, *, settings: float = math.inf) -> Iterator[tuple[np.ndarray, Matches]]:
-    """All pairs of some queries that have matches, those of about as many together.
+    """Padded matches of all batches of `partition`.
 
     Returns:
-        (places `[n]` in the flattened `[queries, C]`, Matches `[P, K, ...]` of P >= n pairs; padding has no matches),
-        the first of each shape first.
+        (places `[n]` in the flattened `[queries, C]`, Matches `[P, K, ...]` of P >= n pairs); padding has no matches.
     """
     part = match_set.take(queries)
     for places, size, pairs in partition(match_set, queries, settings=settings):
@@ -219,21 +218,21 @@ def batches(match_set: MatchSet, queries: range, *, settings: float = math.inf) 
 
 
 def queries_that_fit(match_set: MatchSet | Scales, num_settings: int) -> int:
-    """Queries whose matches, padded, and scores by so many settings BLOCK_BYTES hold, at least one."""
+    """Number of queries with padded matches and scores of all settings that fit BLOCK_BYTES, at least one."""
     bytes_of_query = block_bytes(match_set, num_settings, 1)
     return max(1, min(len(scales(match_set)[0]), BLOCK_BYTES // max(bytes_of_query, 1)))
 
 
 def block_bytes(match_set: MatchSet | Scales, num_settings: int, num_queries: int) -> int:
-    """Bytes that some queries take whose scores are computed together, about: matches, scores and their rankings."""
+    """Approximate bytes to score some queries at the same time: matches, scores and rankings."""
     padded = sum(slots(scale, settings=num_settings).sum(1) for scale in scales(match_set))
     largest, num_candidates = np.sort(padded)[::-1][:num_queries].sum(), scales(match_set)[0].counts.shape[1]
-    of_scores = (8 + 4 * len(scales(match_set))) * num_settings * num_queries * num_candidates
-    return int(2 * BYTES_PER_SLOT * largest) + of_scores
+    score_bytes = (8 + 4 * len(scales(match_set))) * num_settings * num_queries * num_candidates
+    return int(2 * BYTES_PER_SLOT * largest) + score_bytes
 
 
-def compacted(found: Matches) -> list[dict[str, np.ndarray]]:
-    """Matches `[P, K, ...]` as rows: the real ones of each pair, by field. NumPy."""
-    mask = np.asarray(found.mask)
-    flat = {name: np.asarray(values)[mask] for name, values in per_match(found).items()}
+def split_pairs(matches: Matches) -> list[ragged.Row]:
+    """Real matches of each of the pairs `[P, K, ...]`, by field. NumPy."""
+    mask = np.asarray(matches.mask)
+    flat = {name: np.asarray(values)[mask] for name, values in per_match(matches).items()}
     return ragged.split(flat, mask.sum(axis=1))

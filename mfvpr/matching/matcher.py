@@ -1,4 +1,4 @@
-"""What matches one pair of images, as a value; and pairs of many images, whatever matches them."""
+"""Matchers of one pair of images as values, and compiled matching of many pairs with any matcher."""
 
 from collections.abc import Callable
 from dataclasses import field, replace
@@ -12,12 +12,12 @@ from mfvpr.types import Array, Features, Matches, value
 from mfvpr.utils.numerics import compiled
 
 Matcher = Callable[[Features, Features], Matches]
-"""Features of a query and of a candidate -> their Matches, pure, so that it may be compiled and batched.
+"""Pure function of the features of a query and of a candidate that returns their Matches.
 
-Slots depend on shapes alone, and what padding holds must not matter, NaN included. A matcher is a value (`mfvpr.value`)
-whose arrays, such as the weights of a network, are fields; with a store its recipe is needed, see
-`mfvpr.utils.fingerprints.recipe_of`. A field `chunk_size` says how many pairs are matched at the same time; without
-one, or None, memory decides as if a pair took one matrix of similarities.
+It must work under `jit` and `vmap`: slots depend on shapes alone, and the content of padding has no effect, NaN
+included. A matcher is a value (`mfvpr.value`); its arrays, such as the weights of a network, are fields. A cache needs
+its recipe, see `mfvpr.utils.fingerprints.recipe_of`. An optional field `chunk_size` is the number of pairs that are
+matched at the same time; without it, or if None, memory decides, assuming one similarity matrix per pair.
 """
 
 
@@ -26,10 +26,10 @@ class Matching:
     """Nearest neighbors with their ratio, see `mfvpr.match` and `mfvpr.filter_matches`.
 
     Attributes:
-        cross_check: as in `match`.
-        max_distance: as in `filter_matches`.
-        max_matches: as there.
-        chunk_size: as in `match_candidates`; it changes memory and the last bits alone.
+        cross_check: see `match`.
+        max_distance: see `filter_matches`.
+        max_matches: see `filter_matches`.
+        chunk_size: see `match_candidates`; changes only memory and the last bits.
     """
 
     cross_check: CrossCheck = field(default="mutual", metadata={"static": True})
@@ -38,7 +38,7 @@ class Matching:
     chunk_size: int | None = field(default=None, metadata={"static": True})
 
     def __call__(self, features0: Features, features1: Features) -> Matches:
-        """Of one pair; slots as of `match`."""
+        """Matches of one pair, with the slots of `match`."""
         matches = match(features0, features1, cross_check=self.cross_check, with_ratio=True)
         return filter_matches(matches, max_distance=self.max_distance, max_matches=self.max_matches)
 
@@ -49,17 +49,17 @@ NEIGHBORS = Matching()
 def match_pairs(
     queries: Features, candidates: Features, pairs: Array, count: int | Array, matcher: Matcher = NEIGHBORS
 ) -> Matches:
-    """Matches of pairs, whatever query they belong to; how many is no shape, so it costs neither time nor a program.
+    """Match the first `count` pairs of images; other counts need no new program, and unused pairs cost no time.
 
     Args:
         queries: keypoints `[B, N0, 2]`.
         candidates: keypoints `[S, N1, 2]`.
-        pairs: `[P, 2]` int32 rows of both.
-        count: the first so many of the pairs are matched.
+        pairs: `[P, 2]` int32 rows of queries and candidates.
+        count: number of pairs to match.
         matcher: of one pair.
 
     Returns:
-        Matches with leading axis P and slots as of the matcher; pairs beyond `count` have none.
+        Matches with leading axis P and the slots of the matcher; pairs beyond `count` have no matches.
     """
     chunk_size = pairs_at_once(getattr(matcher, "chunk_size", None), queries, candidates)
     return _match_pairs(queries, candidates, pairs, count, matcher, chunk_size=min(chunk_size, len(pairs)))
@@ -69,7 +69,7 @@ def match_pairs(
 def _match_pairs(
     queries: Features, candidates: Features, pairs: Array, count: Array, matcher: Matcher, *, chunk_size: int
 ) -> Matches:
-    def one(pair: Array) -> Matches:
+    def match_pair(pair: Array) -> Matches:
         query, candidate = (
             jax.tree.map(lambda field: jnp.asarray(field)[row], features)  # noqa: B023
             for features, row in ((queries, pair[0]), (candidates, pair[1]))
@@ -77,12 +77,15 @@ def _match_pairs(
         return matcher(query, candidate)
 
     def chunk(number: Array, matches: Matches) -> Matches:
-        start = jnp.minimum(number * chunk_size, len(pairs) - chunk_size)  # the last may do some again
+        start = jnp.minimum(number * chunk_size, len(pairs) - chunk_size)  # the last chunk may repeat pairs
         part = jax.lax.dynamic_slice_in_dim(jnp.asarray(pairs), start, chunk_size)
-        new = jax.vmap(one)(part) if chunk_size > 1 else jax.tree.map(lambda leaf: leaf[None], one(part[0]))
+        if chunk_size > 1:
+            new = jax.vmap(match_pair)(part)
+        else:
+            new = jax.tree.map(lambda leaf: leaf[None], match_pair(part[0]))
         return jax.tree.map(partial(jax.lax.dynamic_update_slice_in_dim, start_index=start, axis=0), matches, new)
 
-    shapes = jax.eval_shape(jax.vmap(one), pairs)
-    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    matches = jax.lax.fori_loop(0, -(-count // chunk_size), chunk, nothing)
+    shapes = jax.eval_shape(jax.vmap(match_pair), pairs)
+    empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    matches = jax.lax.fori_loop(0, -(-count // chunk_size), chunk, empty)
     return replace(matches, mask=matches.mask & (jnp.arange(len(pairs)) < count)[:, None])

@@ -1,10 +1,9 @@
 """Features of two images -> Matches: nearest neighbors, and filters of the matches.
 
-The similarity matrix is the cost. It is formed once per pair, read once along its rows and once along its columns while
-it is in cache (see `neighbors`), and never stored for more than one chunk of candidates.
+The similarity matrix dominates the cost. It is computed once per pair, read once along its rows and once along its
+columns while it is in cache (see `similarity`), and never stored for more than one chunk of candidates.
 """
 
-from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import partial
 from typing import Any, Literal
@@ -20,7 +19,7 @@ from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.numerics import at_least_single, compiled, device_bytes, masked, safe_sqrt
 
 CrossCheck = Literal["mutual", "opencv_legacy", "none", "candidate"]
-MEMORY_SHARE = 1 / 256  # of a device's own memory, for the similarities that exist at the same time
+MEMORY_SHARE = 1 / 256  # of a device's memory, for the similarity matrices that exist at the same time
 
 
 def match(
@@ -35,27 +34,27 @@ def match(
         features0: query, keypoints `[N0, 2]`; padding may hold anything.
         features1: candidate, keypoints `[N1, 2]`.
         cross_check: `mutual` keeps i, j where each is the other's nearest. `opencv_legacy` is OpenCV's BFMatcher
-            before 2019: every candidate keypoint picks its nearest query keypoint, which keeps the closest of its
-            suitors. `none` keeps the nearest of every query keypoint, `candidate` that of every candidate keypoint,
-            as SSM-VPR does. (The paper says cross-check.)
-        with_ratio: also give the ratio of the distances to the nearest and the second nearest descriptor of the
-            candidate, matched or not (Lowe, IJCV 2004): 1 where both are 0 or there is no second. With `candidate`,
-            the two are descriptors of the query.
+            before 2019: every candidate keypoint picks its nearest query keypoint, which keeps the closest keypoint
+            that picked it. `none` keeps the nearest neighbor of every query keypoint, `candidate` the nearest neighbor
+            of every candidate keypoint, as SSM-VPR does. (The paper says cross-check, which is `mutual`.)
+        with_ratio: also return the ratio of the distances to the nearest and the second nearest descriptor of the
+            candidate, matched or not (Lowe, IJCV 2004): 1 if both are 0 or there is no second. With `candidate`,
+            both descriptors are of the query.
 
     Returns:
         Matches with K = N0 slots (`candidate`: N1). A descriptor that is not finite matches nothing.
     """
     require_word("cross_check", cross_check, CrossCheck)
     if cross_check == "candidate":
-        return _exchanged(match(features1, features0, cross_check="none", with_ratio=with_ratio))
+        return _swap_images(match(features1, features0, cross_check="none", with_ratio=with_ratio))
     slots = features0.mask.shape[-1]
-    features0, features1 = ready(_even(features0)), ready(_even(at_least_one(features1)))
+    features0, features1 = ready(_pad_to_blocks(features0)), ready(_pad_to_blocks(at_least_one(features1)))
     similarity = _similarity(features0, features1)
     nearest1, valid = _neighbors(similarity, cross_check)
     ratio = _ratio(features0, features1, similarity) if with_ratio else None
-    matches = paired(features0, features1, nearest1, valid, ratio=ratio)
-    own = {name: values[:slots] for name, values in per_match(matches).items()}
-    return replace(matches, mask=matches.mask[:slots], **own)
+    matches = make_matches(features0, features1, nearest1, valid, ratio=ratio)
+    without_padding = {name: values[:slots] for name, values in per_match(matches).items()}
+    return replace(matches, mask=matches.mask[:slots], **without_padding)
 
 
 def match_candidates(
@@ -71,49 +70,46 @@ def match_candidates(
     Args:
         query: keypoints `[N0, 2]`.
         candidates: keypoints `[C, N1, 2]`.
-        cross_check: as in `match`.
-        with_ratio: as in `match`.
-        chunk_size: candidates whose similarity matrices exist at the same time; by default as many as fit a
-            processor's own cache, or a small part of an accelerator's memory.
+        cross_check: see `match`.
+        with_ratio: see `match`.
+        chunk_size: number of candidates with similarity matrices in memory at the same time; by default one on a CPU,
+            where the matrix stays in the cache, and as many as fit a small part of an accelerator's memory.
 
     Returns:
-        Matches with leading axis C and slots as of `match`.
+        Matches with leading axis C and the slots of `match`.
     """
     if np.ndim(query.mask) != 1 or np.ndim(candidates.mask) != 2:
         shapes = f"{np.shape(query.mask)} and {np.shape(candidates.mask)}"
         raise ValueError(f"expected one query [N0] and candidates [C, N1], got masks of shapes {shapes}; see match")
     chunk_size = pairs_at_once(chunk_size, query, candidates)
-    if 0 in (np.shape(query.mask)[0], np.shape(candidates.mask)[1]):  # of which `lax.map` cannot make chunks
+    if 0 in (np.shape(query.mask)[0], np.shape(candidates.mask)[1]):  # `lax.map` cannot make chunks of them
         chunk_size = 1
     return _match_candidates(query, candidates, cross_check=cross_check, with_ratio=with_ratio, chunk_size=chunk_size)
 
 
 @partial(compiled, static_argnames=("cross_check", "with_ratio", "chunk_size"))
 def _match_candidates(query: Features, candidates: Features, *, chunk_size: int, **options: Any) -> Matches:
-    return _chunked_map(lambda candidate: match(query, candidate, **options), candidates, chunk_size)
+    batch_size = None if chunk_size == 1 else chunk_size
+    return jax.lax.map(lambda candidate: match(query, candidate, **options), candidates, batch_size=batch_size)
 
 
-def pairs_at_once(asked: int | None, query: Features, candidates: Features) -> int:
-    """As asked for; else one where its similarities then stay in a processor's cache; else what MEMORY_SHARE holds."""
-    if asked is None:
+def pairs_at_once(chunk_size: int | None, query: Features, candidates: Features) -> int:
+    """`chunk_size`, by default 1 on a CPU, where similarities stay in the cache, else what MEMORY_SHARE holds."""
+    if chunk_size is None:
         available = device_bytes((query, candidates))
         matrix = 4 * query.mask.shape[-1] * candidates.mask.shape[-1] + 1
         return 1 if available is None else max(1, int(MEMORY_SHARE * available) // matrix)
-    if asked < 1:
-        raise ValueError(f"chunk_size={asked}: expected a whole number above 0")
-    return asked
-
-
-def _chunked_map(function: Callable[[Any], Matches], items: Any, chunk_size: int) -> Matches:
-    return jax.lax.map(function, items, batch_size=None if chunk_size == 1 else chunk_size)
+    if chunk_size < 1:
+        raise ValueError(f"chunk_size={chunk_size}: expected a whole number above 0")
+    return chunk_size
 
 
 def filter_matches(
     matches: Matches, *, max_distance: float | Array | None = None, max_matches: int | None = None
 ) -> Matches:
-    """The matches of one pair that are close enough, and of those the `max_matches` closest.
+    """Keep the matches of one pair with a distance of at most `max_distance`, and the `max_matches` closest of them.
 
-    Slots stay where they are, the mask shrinks; among equal distances the first slots are kept.
+    Only the mask changes; among equal distances the first slots are kept.
     """
     if max_distance is not None:
         matches = replace(matches, mask=matches.mask & (matches.distance <= max_distance))
@@ -125,30 +121,35 @@ def filter_matches(
 
 
 def compact(matches: Matches, capacity: int) -> Matches:
-    """The real matches of one pair moved to the front, in their order, in `capacity` slots.
+    """Move the real matches of one pair to the front of `capacity` slots, in their order.
 
-    Everything after matching costs in proportion to K or to its square, so slots should be few. Matches beyond the
-    capacity are dropped: compare `matches.mask.sum()` with it.
+    The cost of all later steps is proportional to K or K^2, so that few slots are faster. Matches beyond the capacity
+    are dropped: compare `matches.mask.sum()` with it.
     """
     entries = ragged.in_front(per_match(matches), jnp.asarray(matches.mask), capacity)
     return replace(matches, mask=jnp.arange(capacity) < jnp.sum(matches.mask), **entries)
 
 
 def ready(features: Features) -> Features:
-    """On the device, in at least single precision: products of half ones flip near-ties, sums of points overflow."""
+    """Features on the device, in at least single precision.
+
+    In half precision, products would decide near-ties in another way, and sums of points would overflow.
+    """
     wide = {name: at_least_single(values) for name, values in per_keypoint(features).items() if name != "mask"}
     return replace(features, **wide, mask=jnp.asarray(features.mask), image_size=at_least_single(features.image_size))
 
 
-def paired(features0: Features, features1: Features, index1: Array, real: Array, **more: Array | None) -> Matches:
-    """Matches of every keypoint of image 0, N0 slots, where it is `real`.
+def make_matches(
+    features0: Features, features1: Features, index1: Array, real: Array, **optional: Array | None
+) -> Matches:
+    """Matches with N0 slots, one for every keypoint of the query.
 
     Args:
         features0: query, `ready`.
         features1: candidate, `ready`, with one slot or more.
         index1: `[N0]` int32, the candidate's keypoint of each match.
-        real: `[N0]` bool.
-        **more: further fields of the matches.
+        real: `[N0]` bool, the mask.
+        **optional: further fields of the matches.
     """
     return Matches(
         points0=features0.keypoints,
@@ -163,15 +164,16 @@ def paired(features0: Features, features1: Features, index1: Array, real: Array,
         index1=index1,
         count0=keypoint_count(features0),
         count1=keypoint_count(features1),
-        **more,
+        **optional,
     )
 
 
-def _exchanged(matches: Matches) -> Matches:
-    """The same matches, the images in each other's place."""
+def _swap_images(matches: Matches) -> Matches:
+    """The same matches with query and candidate swapped."""
     sides = [(f.name, f"{f.name[:-1]}1") for f in fields(matches) if f.name.endswith("0")]
-    others = {name0: getattr(matches, name1) for name0, name1 in sides}
-    return replace(matches, **others, **{name1: getattr(matches, name0) for name0, name1 in sides})
+    query = {name0: getattr(matches, name1) for name0, name1 in sides}
+    candidate = {name1: getattr(matches, name0) for name0, name1 in sides}
+    return replace(matches, **query, **candidate)
 
 
 def slot_numbers(features: Features) -> Array:
@@ -183,14 +185,14 @@ def keypoint_count(features: Features) -> Array:
 
 
 def at_least_one(features: Features) -> Features:
-    """An image without a single slot gets one of padding."""
+    """Add a slot of padding to an image without slots."""
     return replace(features, **ragged.at_least_one(per_keypoint(features)))
 
 
-def _even(features: Features) -> Features:
-    """With as many slots more as come out even in the blocks that similarities are searched by.
+def _pad_to_blocks(features: Features) -> Features:
+    """Pad the slots to a multiple of the blocks in which similarities are searched.
 
-    A few rows of padding are cheap; filling up the matrix itself takes several times as long as all of the matching.
+    A few padded rows are cheap; padding the matrix itself takes several times as long as all of the matching.
     """
     size = features.mask.shape[-1]
     missing = even_size(size) - size
@@ -203,14 +205,14 @@ def _even(features: Features) -> Features:
 
 
 def _similarity(features0: Features, features1: Features) -> Array:
-    """`[N0, N1]` dot products, -inf where either keypoint is padding or its descriptor is not finite."""
+    """`[N0, N1]` dot products, -inf for padding and for descriptors that are not finite."""
     similarity = products(features0.descriptors, features1.descriptors)
     real = features0.mask[:, None] & features1.mask[None] & jnp.isfinite(similarity)
     return jnp.where(real, similarity, -jnp.inf)
 
 
 def products(rows0: Array, rows1: Array) -> Array:
-    """Dot products of all rows of both, in full precision on every device."""
+    """Dot products of all rows `[N0, D]` and `[N1, D]`, in full precision on every device."""
     if rows0.shape[-1] != rows1.shape[-1]:
         raise InputError(f"descriptors: expected as many dimensions on both sides, got {rows0.shape[-1]} and "
                          f"{rows1.shape[-1]}; extract all images alike")  # fmt: skip
@@ -219,34 +221,34 @@ def products(rows0: Array, rows1: Array) -> Array:
 
 def _distance(features0: Features, features1: Features, index1: Array, real: Array) -> Array:
     """`[N0]` distances to the candidate's descriptors `index1`; 0 where not `real`."""
-    # The difference, not sqrt(2 - 2 cos): in float32 that would turn a distance of 0 into up to 3.5e-4.
+    # sqrt(2 - 2 cos) would turn a distance of 0 into up to 3.5e-4 in float32.
     difference = masked(features0.descriptors - features1.descriptors[index1], real)
     return safe_sqrt(jnp.sum(difference * difference, axis=-1))
 
 
 def distance_ratio(features0: Features, features1: Features) -> Array:
-    """`[N0]` as `match` gives it, of features that are `ready`."""
+    """`[N0]` ratio as in `match`, for features that are `ready`."""
     return _ratio(features0, features1, _similarity(features0, features1))
 
 
 def _ratio(features0: Features, features1: Features, similarity: Array) -> Array:
-    """`[N0]` distance to the nearest descriptor over that to the second nearest; 1 where there is no second."""
+    """`[N0]` distance to the nearest descriptor over the distance to the second nearest; 1 without a second."""
     nearest1, second1 = nearest_two(similarity)
-    some = second1.similarity > -jnp.inf
-    closest, next_closest = (_distance(features0, features1, found.index, some) for found in (nearest1, second1))
-    apart = some & (closest < next_closest)  # not where both are 0, nor where rounding swaps two of one distance
-    return jnp.where(apart, closest / jnp.where(apart, next_closest, 1.0), 1.0)
+    has_second = second1.similarity > -jnp.inf
+    closest, second = (_distance(features0, features1, side.index, has_second) for side in (nearest1, second1))
+    differ = has_second & (closest < second)  # False if both are 0, and if rounding swaps two equal distances
+    return jnp.where(differ, closest / jnp.where(differ, second, 1.0), 1.0)
 
 
 def _neighbors(similarity: Array, cross_check: CrossCheck) -> tuple[Array, Array]:
-    """For each row its column `[N0]` int32, and whether the pair counts `[N0]` bool."""
+    """Column of each row's match, `[N0]` int32, and whether the row has a match, `[N0]` bool."""
     rows = jnp.arange(similarity.shape[0], dtype=jnp.int32)
     nearest1 = nearest(similarity, axis=1)
-    some = nearest1.similarity > -jnp.inf
+    has_neighbor = nearest1.similarity > -jnp.inf
     if cross_check == "none":
-        return nearest1.index, some
+        return nearest1.index, has_neighbor
     nearest0 = nearest(similarity, axis=0)
     if cross_check == "mutual":
-        return nearest1.index, some & (nearest0.index[nearest1.index] == rows)
-    suitors = nearest(jnp.where(nearest0.index[None] == rows[:, None], similarity, -jnp.inf), axis=1)
-    return suitors.index, jnp.isfinite(suitors.similarity)
+        return nearest1.index, has_neighbor & (nearest0.index[nearest1.index] == rows)
+    closest = nearest(jnp.where(nearest0.index[None] == rows[:, None], similarity, -jnp.inf), axis=1)
+    return closest.index, jnp.isfinite(closest.similarity)

@@ -1,7 +1,7 @@
-"""Similarity matrix -> the nearest neighbors of its rows and columns, the first index where several are equal.
+"""Similarity matrix -> nearest neighbors of its rows and columns; the first index wins a tie.
 
-Each direction reads the matrix once: the largest of every block of some thirty entries, of which one is then looked at
-again. `argmax` would read it once as well, and take several times longer on XLA's CPU backend.
+Each direction reads the matrix once, for the maximum of every block of about 30 entries; then only the block with the
+largest maximum is read again. `argmax` would also read it once, but takes several times longer on XLA's CPU backend.
 """
 
 from typing import NamedTuple
@@ -15,58 +15,54 @@ BLOCK = 32
 
 
 class Nearest(NamedTuple):
-    """Of every row or column: the `index` `[n]` int32 of its largest similarity and that `similarity` `[n]`.
-
-    Where all are -inf there is none: the index is 0.
-    """
+    """Largest `similarity` `[n]` of every row or column, and its `index` `[n]` int32; 0 if all are -inf."""
 
     index: Array
     similarity: Array
 
 
 def nearest(similarity: Array, axis: int) -> Nearest:
-    """The largest entries of `similarity` `[N0, N1]` along an axis: 1 for the rows' neighbors, 0 for the columns'."""
+    """Nearest neighbors of the rows (axis 1) or of the columns (axis 0) of `similarity` `[N0, N1]`."""
     blocks = _blocks(similarity, axis)
-    return _look(blocks, jnp.max(blocks, axis=axis + 1), axis)
+    return _find_largest(blocks, jnp.max(blocks, axis=axis + 1), axis)
 
 
 def nearest_two(similarity: Array) -> tuple[Nearest, Nearest]:
     """The nearest and the second nearest neighbor of every row of `similarity` `[N0, N1]`."""
     blocks = _blocks(similarity, 1)
-    tops = jnp.max(blocks, axis=2)
-    best = _look(blocks, tops, 1)
+    maxima = jnp.max(blocks, axis=2)
+    best = _find_largest(blocks, maxima, 1)
     block, place = jnp.divmod(best.index, blocks.shape[2])
-    beside = _without(_block(blocks, block, 1), place)
-    elsewhere = _look(blocks, _without(tops, block), 1)
-    top = jnp.max(beside, axis=1)
-    index = block * blocks.shape[2] + first(beside == top[:, None], 1)
-    nearer = (top > elsewhere.similarity) | ((top == elsewhere.similarity) & (index < elsewhere.index))
-    second = Nearest(jnp.where(nearer, index, elsewhere.index), jnp.maximum(top, elsewhere.similarity))
+    same_block = _without(_take_block(blocks, block, 1), place)
+    other_block = _find_largest(blocks, _without(maxima, block), 1)
+    top = jnp.max(same_block, axis=1)
+    index = block * blocks.shape[2] + _first_true(same_block == top[:, None], 1)
+    is_nearer = (top > other_block.similarity) | ((top == other_block.similarity) & (index < other_block.index))
+    second = Nearest(jnp.where(is_nearer, index, other_block.index), jnp.maximum(top, other_block.similarity))
     return best, second
 
 
-def first(hit: Array, axis: int) -> Array:
-    """First index of True along `axis`; 0 where there is none."""
-    size = hit.shape[axis]
-    index = jax.lax.broadcasted_iota(jnp.int32, hit.shape, axis)
-    found = jnp.min(jnp.where(hit, index, size), axis=axis, initial=size)
-    return jnp.where(found == size, 0, found)
+def _first_true(hits: Array, axis: int) -> Array:
+    """First index of True along `axis`; 0 if there is none."""
+    size = hits.shape[axis]
+    index = jax.lax.broadcasted_iota(jnp.int32, hits.shape, axis)
+    first = jnp.min(jnp.where(hits, index, size), axis=axis, initial=size)
+    return jnp.where(first == size, 0, first)
 
 
 def even_size(size: int) -> int:
-    """The smallest size, not below this one, that comes out even in blocks."""
-    return size + -size % _length(size)
+    """Smallest multiple of the block length that is not below `size`."""
+    return size + -size % _block_length(size)
 
 
-def _length(size: int) -> int:
-    """Of the blocks."""
+def _block_length(size: int) -> int:
     return next((length for length in range(BLOCK, BLOCK // 4, -1) if size % length == 0), BLOCK)
 
 
 def _blocks(similarity: Array, axis: int) -> Array:
-    """The axis in two: blocks, and places in a block; filled up with -inf where they do not come out even."""
+    """Split an axis into blocks and places in a block; the last block is padded with -inf."""
     size = similarity.shape[axis]
-    length = _length(size)
+    length = _block_length(size)
     missing = even_size(size) - size if size else length
     if missing:
         widths = [(0, missing if place == axis else 0) for place in range(2)]
@@ -75,18 +71,17 @@ def _blocks(similarity: Array, axis: int) -> Array:
     return similarity.reshape(*similarity.shape[:axis], *parts, *similarity.shape[axis + 1 :])
 
 
-def _look(blocks: Array, tops: Array, axis: int) -> Nearest:
-    """The largest entry, in the first block that has it; `tops` are the blocks' largest, -inf for one to leave out."""
-    largest = jnp.max(tops, axis=axis, keepdims=True)
-    block = first(tops == largest, axis)
-    place = first(_block(blocks, block, axis) == largest, axis)
+def _find_largest(blocks: Array, maxima: Array, axis: int) -> Nearest:
+    """The largest entry, in the first block that has it; `maxima` of the blocks, -inf to leave a block out."""
+    largest = jnp.max(maxima, axis=axis, keepdims=True)
+    block = _first_true(maxima == largest, axis)
+    place = _first_true(_take_block(blocks, block, axis) == largest, axis)
     return Nearest(block * blocks.shape[axis + 1] + place, jnp.squeeze(largest, axis))
 
 
-def _block(blocks: Array, index: Array, axis: int) -> Array:
+def _take_block(blocks: Array, index: Array, axis: int) -> Array:
     """One block of every row or column."""
-    found = jnp.take_along_axis(blocks, jnp.expand_dims(index, (axis, axis + 1)), axis=axis)
-    return jnp.squeeze(found, axis)
+    return jnp.squeeze(jnp.take_along_axis(blocks, jnp.expand_dims(index, (axis, axis + 1)), axis=axis), axis)
 
 
 def _without(values: Array, place: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Matching made smooth, for whoever learns through it."""
+"""Smooth matching, through which gradients reach the features."""
 
 import jax
 import jax.numpy as jnp
@@ -9,11 +9,11 @@ from mfvpr.utils.numerics import as_float, masked, positive, safe_sqrt
 
 
 def soft_match(features0: Features, features1: Features, *, temperature: float | Array) -> Matches:
-    """`match` of one pair made smooth: a dual softmax over the similarities s_ij (Rocco et al., NeurIPS 2018).
+    """Smooth version of `match`: a dual softmax over the similarities s_ij (Rocco et al., NeurIPS 2018).
 
-    With R the softmax of s / T over the candidate's keypoints j and C that over the query's i, slot i goes to the
-    means of points, scores and squared distances 2 - 2 s_ij under R, with confidence sum_j R_ij C_ij. As T -> 0 that is
-    `match`: the neighbor, with confidence 1 where it is mutual and 0 elsewhere.
+    Let R be the softmax of s / T over the candidate's keypoints j, and C the softmax over the query's keypoints i. Slot
+    i holds the means of points, scores and squared distances 2 - 2 s_ij under R, with confidence sum_j R_ij C_ij. For
+    T -> 0 this is `match`: the nearest neighbor, with confidence 1 if it is mutual, else 0.
 
     Args:
         features0: query, keypoints `[N0, 2]`; padding may hold anything.
@@ -21,7 +21,7 @@ def soft_match(features0: Features, features1: Features, *, temperature: float |
         temperature: T, in units of the similarity, which lies in [-1, 1]; not above 0 gives NaN.
 
     Returns:
-        Matches with K = N0 slots, real where the query has a keypoint with a finite descriptor and the candidate any.
+        Matches with K = N0 slots; a slot is real if its keypoint has a finite descriptor, and the candidate has any.
     """
     features0, features1 = ready(features0), ready(at_least_one(features1))
     real0, real1 = (f.mask & jnp.all(jnp.isfinite(f.descriptors), axis=-1) for f in (features0, features1))
@@ -46,6 +46,6 @@ def soft_match(features0: Features, features1: Features, *, temperature: float |
 
 
 def _softmax(logits: Array, real: Array, axis: int) -> Array:
-    """Softmax over the real entries along `axis`; 0 elsewhere, also where none is real."""
-    lowest = jnp.finfo(logits.dtype).min  # not -inf, whose softmax over nothing real is NaN, and so is its gradient
+    """Softmax over the real entries along `axis`; all other entries are 0, even if none is real."""
+    lowest = jnp.finfo(logits.dtype).min  # with -inf, the softmax and its gradient would be NaN if no entry is real
     return masked(jax.nn.softmax(jnp.where(real, logits, lowest), axis=axis), real)

@@ -11,10 +11,10 @@ from mfvpr.types import Array, Matches, value
 class MatchCount:
     """Number of matches, each counted with its confidence.
 
-    Soft matches make it soft: its temperature is that of `mfvpr.soft_match`.
+    The score is smooth for matches of `mfvpr.soft_match`.
 
     Attributes:
-        single: what a pair with exactly one match scores: `count` it, or `zero`, as SelaVPR's code does by accident.
+        single: score of a pair with exactly one match: `count` it, or `zero`, as SelaVPR's code does by accident.
     """
 
     single: str = choice("count", "zero", note="a pair with one match")

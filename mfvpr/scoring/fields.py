@@ -1,7 +1,7 @@
-"""What a field of a method may hold, and what people need to know of it, declared where the field stands.
+"""Declarations of the fields of scorers: units, bounds, choices and notes, stored in the field's metadata.
 
-From it follow the checks of words, and, in programs, settings with their bounds, comments and axes: programs write
-plain values (numbers, words, lists, None), `Parameter.value` makes the field's of them.
+Scorers check their words against these declarations. Programs derive settings from them, with bounds, comments and
+sweep axes. Programs write plain values (numbers, words, lists, None); `Parameter.value` converts them to field values.
 """
 
 import math
@@ -14,7 +14,7 @@ import numpy as np
 
 from mfvpr.utils.errors import InputError
 
-POSITIVE = (1e-6, 1e12)  # beyond these bounds float32 would fail, without a word
+POSITIVE = (1e-6, 1e12)  # beyond these bounds float32 silently overflows or underflows
 SCORE = "units of the score"
 ANY = -1  # length of a list: one or more
 _KEY = "parameter"  # of the field's metadata
@@ -22,23 +22,23 @@ _KEY = "parameter"  # of the field's metadata
 
 @dataclass(frozen=True)
 class Parameter:
-    """What a field may hold, as plain values.
+    """Declaration of one field in terms of plain values.
 
     Attributes:
-        default: plain.
+        default: plain value.
         unit: of a number.
-        note: what name and unit do not say.
-        choices: the only values; none = numbers within `bounds`.
+        note: further explanation.
+        choices: all allowed values; empty = numbers within `bounds`.
         bounds: smallest and largest number.
-        whole: numbers are whole.
+        whole: numbers are integers.
         length: of a list of numbers; 0 = one number, ANY = a list of one or more.
-        optional: None may be written as well.
-        none: the field's value where None is written.
-        named: the field's values by the words of `choices`.
-        file: how the name of a file ends that may be written in place of a word; "" = none may.
-        swept: worth an axis of a sweep.
-        learned: a gradient may change it.
-        start: where learning starts if its own value is None; of the unit `SCORE` in units of the scores' spread.
+        optional: None is allowed as well.
+        none: field value for None.
+        named: field values by the words of `choices`.
+        file: suffix of files that are allowed in place of a word; "" = no files.
+        swept: offered as an axis of a sweep.
+        learned: a gradient may change the field.
+        start: start of learning if the value is None; for the unit `SCORE` in units of the scores' spread.
     """
 
     default: Any
@@ -58,20 +58,20 @@ class Parameter:
 
     @property
     def words(self) -> str:
-        """The choices that are words, in a row."""
-        words = [one for one in self.choices if isinstance(one, str)]
+        """The choices that are words, separated by commas."""
+        words = [word for word in self.choices if isinstance(word, str)]
         return ", ".join([*words, f"FILE{self.file}"] if self.file else words)
 
     @property
     def limits(self) -> dict[str, Any]:
-        """What checks a plain value, itself plain: `choices`, `whole` or `number`; what else is given."""
+        """Limits of a plain value, themselves plain, by name; limits that are not set are left out."""
         kind = "choices" if self.choices else "whole" if self.whole else "number"
         limits = {kind: list(self.choices or self.bounds)}
         limits |= {"length": self.length, "optional": self.optional, "file": self.file}
         return {name: limit for name, limit in limits.items() if limit}
 
     def value(self, plain: Any) -> Any:
-        """The field's value of a plain one."""
+        """Field value of a plain value."""
         if self.named is not None:
             return self.named[plain]
         if plain is None:
@@ -82,7 +82,7 @@ class Parameter:
 def number(
     default: float | None, unit: str = "", note: str = "", *, bounds: tuple[float, float] = POSITIVE, **more: Any
 ) -> Any:
-    """A number, which may be traced; None, too, where that is the default. It is written for an infinite default."""
+    """Declare a number, which may be traced; None is allowed if the default is None or infinite (None = infinite)."""
     unlimited = default == math.inf
     plain, none = (None, math.inf) if unlimited else (default, None)
     return _field(default, Parameter(plain, unit, note, bounds=bounds, optional=plain is None, none=none, **more))
@@ -91,58 +91,58 @@ def number(
 def numbers(
     default: Sequence[float] | None, length: int, unit: str = "", note: str = "", *, bounds: tuple = POSITIVE
 ) -> Any:
-    """A tuple of so many numbers; None, too, where that is the default."""
+    """Declare a tuple of `length` numbers; None is allowed if it is the default."""
     plain = None if default is None else list(default)
     optional = default is None
     return _field(default, Parameter(plain, unit, note, bounds=bounds, length=length, optional=optional, swept=False))
 
 
 def several(default: Sequence[float], unit: str = "", note: str = "", *, bounds: tuple[float, float] = POSITIVE) -> Any:
-    """A tuple of one or more numbers, which chooses a program."""
-    declared = Parameter([*default], unit, note, bounds=bounds, length=ANY, swept=False)
-    return _field(tuple(default), declared, static=True)
+    """Declare a static tuple of one or more numbers."""
+    parameter = Parameter([*default], unit, note, bounds=bounds, length=ANY, swept=False)
+    return _field(tuple(default), parameter, static=True)
 
 
 def whole(default: int | None, unit: str = "", note: str = "", *, bounds: tuple[int, int], swept: bool = True) -> Any:
-    """A whole number that chooses a program, such as a capacity; None, too, where that is the default."""
+    """Declare a static integer, such as a capacity; None is allowed if it is the default."""
     optional = default is None
-    declared = Parameter(default, unit, note, bounds=bounds, whole=True, optional=optional, swept=swept)
-    return _field(default, declared, static=True)
+    parameter = Parameter(default, unit, note, bounds=bounds, whole=True, optional=optional, swept=swept)
+    return _field(default, parameter, static=True)
 
 
-def choice(default: str, *others: str, note: str = "") -> Any:
-    """One of the words given, the first by default."""
-    return _field(default, Parameter(default, note=note, choices=(default, *others)), static=True)
+def choice(default: str, *alternatives: str, note: str = "") -> Any:
+    """Declare a static word, one of `default` and the alternatives."""
+    return _field(default, Parameter(default, note=note, choices=(default, *alternatives)), static=True)
 
 
 def flag(default: bool, note: str = "") -> Any:
-    """True or False, which chooses a program."""
+    """Declare a static boolean."""
     return _field(default, Parameter(default, note=note, choices=(True, False)), static=True)
 
 
 def named(values: Mapping[str, Any], default: str, note: str = "", *, file: str = "") -> Any:
-    """One of the values of a table, written as its name; of files that end so, too, if the table reads them."""
+    """Declare one of the values of a table, written as its name, or as a file with the suffix `file`."""
     return _field(values[default], Parameter(default, note=note, choices=tuple(values), named=values, file=file))
 
 
 def declared(method: Any) -> dict[str, Parameter]:
-    """The parameters of a class, or of one of its instances, by field. Other fields are no settings."""
-    return {one.name: one.metadata[_KEY] for one in fields(method) if _KEY in one.metadata}
+    """Parameters of a class, or of an instance, by field; fields without a declaration are no settings."""
+    return {f.name: f.metadata[_KEY] for f in fields(method) if _KEY in f.metadata}
 
 
 def made(method: type, values: Mapping[str, Any]) -> Any:
-    """An instance of plain values, by field."""
-    known = declared(method)
-    return method(**{name: known[name].value(plain) for name, plain in values.items()})
+    """Create an instance from plain values by field."""
+    parameters = declared(method)
+    return method(**{name: parameters[name].value(plain) for name, plain in values.items()})
 
 
 def summary(method: type) -> str:
-    """What it is: the first line of its module."""
+    """First line of the docstring of a class's module."""
     return (getmodule(method).__doc__ or method.__name__).splitlines()[0]
 
 
 def check_choices(method: Any) -> None:
-    """Raise a ValueError that names the field whose word is none of its choices."""
+    """Raise a ValueError if a field holds a word that is not one of its choices."""
     for name, parameter in declared(method).items():
         choices, value = parameter.choices, getattr(method, name)
         if choices and parameter.named is None and value not in choices:
@@ -151,7 +151,7 @@ def check_choices(method: Any) -> None:
 
 
 def check_bounds(method: Any) -> None:
-    """Raise an InputError that names the field whose number, which is no traced one, is beyond its bounds."""
+    """Raise an InputError if a field holds a number out of bounds; no number may be traced."""
     for name, parameter in declared(method).items():
         value, (low, high) = getattr(method, name), parameter.bounds
         if parameter.choices or value is None:

@@ -1,4 +1,4 @@
-"""How sure a dominant shift is, from the heights of all bins. Lengths are pixels."""
+"""Interval of the dominant shift from the scores of all bins. Lengths are pixels."""
 
 import jax.numpy as jnp
 
@@ -7,20 +7,20 @@ from mfvpr.types import Array
 
 
 def mass_interval(scores: Array, lattice: Lattice, level: float | Array, sharpness: float | Array) -> Array:
-    """`[2, 2]` (low, high) of (x, y): the middle part of a mass that is s_ij^sharpness in every bin, along each axis.
+    """Interval `[2, 2]` (low, high) of (x, y) with the central part of the mass s_ij^sharpness along each axis.
 
-    Mass is spread evenly within a bin. Where nothing votes every bin has the same.
+    Mass is spread evenly within a bin. Without votes all bins have the same mass.
 
     Args:
-        scores: `[B, B]` (y, x) of the bins, -inf of those that there are not; below 0 they count as 0.
-        lattice: where they are.
-        level: of the mass, between 0 and 1; as much is left out on either side.
-        sharpness: of the mass: the larger, the less the lower bins have.
+        scores: `[B, B]` (y, x) s_ij, -inf beyond the range of shifts; scores below 0 count as 0.
+        lattice: positions of the bins.
+        level: share of the mass, between 0 and 1; the rest is split between both sides.
+        sharpness: exponent; the larger, the less mass the lower bins have.
     """
     level, sharpness = (jnp.asarray(number, scores.dtype) for number in (level, sharpness))
-    heights, there = jnp.maximum(scores, 0.0), (scores > -jnp.inf).astype(scores.dtype)
+    heights, in_range = jnp.maximum(scores, 0.0), (scores > -jnp.inf).astype(scores.dtype)
     top = jnp.max(heights)
-    mass = jnp.where(top > 0, (heights / jnp.where(top > 0, top, 1.0)) ** sharpness, there)
+    mass = jnp.where(top > 0, (heights / jnp.where(top > 0, top, 1.0)) ** sharpness, in_range)
     tail = (1 - level) / 2
     edges = jnp.arange(len(scores) + 1, dtype=scores.dtype) - 0.5  # in bins
 

@@ -1,4 +1,4 @@
-"""A match weight that is learned: a small network of what is known about one match."""
+"""Learned match weight: a small network with measurements of one match as inputs."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -17,25 +17,25 @@ from mfvpr.utils.numerics import as_float, masked, masked_median
 
 RELATIVE = ("ratio", "distance_rank", "relative_distance", "score0_rank", "score1_rank")
 ABSOLUTE = ("scores0", "scores1", "distance", "ratio", "x0", "y0", "x1", "y1")
-_UNIT_BIAS = math.log(math.e - 1)  # softplus of it is 1
+_UNIT_BIAS = math.log(math.e - 1)  # softplus(_UNIT_BIAS) = 1
 
 
 @value
 class LearnedWeight:
-    """w = softplus(z), z = v . tanh(x M + b) + c, of the standardized inputs x of a match; above 0, dimensionless.
+    """w = softplus(z), z = v . tanh(x M + b) + c, with the standardized inputs x of a match; above 0, without unit.
 
-    `center` and `scale` are statistics: they have no gradient, so an optimizer leaves them alone (but one with weight
-    decay must be told to: `optax.masked`).
+    `center` and `scale` are statistics without gradient, so that an optimizer does not change them. Exclude them from
+    weight decay with `optax.masked`.
 
     Attributes:
         center: `[F]` mean of every input.
-        scale: `[F]` its standard deviation.
+        scale: `[F]` standard deviation of every input.
         hidden: `[F, H]` M.
         hidden_bias: `[H]` b.
         output: `[H]` v.
         output_bias: `[]` c.
-        names: of the F inputs, of `INPUTS`. RELATIVE ones compare a match with those of its own pair, so that they mean
-            the same of another detector, camera or place; ABSOLUTE ones are in units of these.
+        names: names of the F inputs, out of `INPUTS`. RELATIVE inputs compare a match with the other matches of its
+            pair, so that they carry over to other detectors, cameras and places; ABSOLUTE inputs have their units.
     """
 
     center: Array  # [F]
@@ -50,16 +50,16 @@ class LearnedWeight:
     def create(
         cls, key: Array, matches: Matches, hidden: int = 16, *, names: tuple[str, ...] = RELATIVE
     ) -> "LearnedWeight":
-        """A weight that is 1 everywhere, with the statistics of real matches.
+        """Weight that is 1 for every match, with the statistics of real matches.
 
         Args:
             key: of `jax.random`, for the hidden layer.
             matches: `[..., K]`; padding may hold anything. Without a real match, inputs are not standardized.
             hidden: H.
-            names: of the inputs.
+            names: names of the inputs.
 
         Raises:
-            InputError: the matches have no ratio, or there is no such input.
+            InputError: the matches have no ratio, or a name is unknown.
         """
         if not names or isinstance(names, str) or len({*names}) < len(names):
             raise InputError(f"LearnedWeight: expected different names of inputs, got {names}")
@@ -91,7 +91,7 @@ class LearnedWeight:
         return jnp.maximum(weights, jnp.finfo(weights.dtype).tiny)  # softplus may underflow
 
     def logits(self, matches: Matches) -> Array:
-        """`[K]` z of one pair: the logarithm of the odds that a match is right, where that is what was taught.
+        """`[K]` z of one pair: log-odds that a match is correct, if the weight was trained on correct matches.
 
         Raises:
             InputError: the matches have no ratio.
@@ -101,7 +101,7 @@ class LearnedWeight:
         return jnp.matmul(hidden, self.output, precision=exact) + self.output_bias
 
     def inputs(self, matches: Matches) -> Array:
-        """`[K, F]` what the network sees of every match, standardized.
+        """`[K, F]` standardized inputs of every match.
 
         `center + scale * inputs` undoes the standardization.
 
@@ -113,17 +113,17 @@ class LearnedWeight:
 
 
 def _raw_inputs(matches: Matches, names: tuple[str, ...]) -> Array:
-    """`[..., K, F]`; 0 on padding."""
+    """`[..., K, F]` inputs that are not standardized; 0 on padding."""
     columns = [masked(jnp.broadcast_to(INPUTS[name](matches), matches.mask.shape), matches.mask) for name in names]
     return jnp.stack(columns, axis=-1)
 
 
-def _itself(name: str, matches: Matches) -> Array:
+def _field(name: str, matches: Matches) -> Array:
     return as_float(getattr(matches, name))
 
 
 def _rank(name: str, matches: Matches) -> Array:
-    """The share of the pair's matches that are below, in (0, 1); of equals, half."""
+    """Share of the pair's matches with a smaller value, in (0, 1); equal values count half."""
     values = masked(as_float(getattr(matches, name)), matches.mask)
     return jax.lax.stop_gradient(jnp.vectorize(_mid_ranks, signature="(k),(k)->(k)")(values, matches.mask))
 
@@ -135,17 +135,17 @@ def _mid_ranks(values: Array, mask: Array) -> Array:
 
 
 def _relative_distance(matches: Matches) -> Array:
-    """In units of the median of the pair's."""
+    """Distance over the median distance of the pair."""
     distance = masked(as_float(matches.distance), matches.mask)
     median = jnp.vectorize(masked_median, signature="(k),(k)->()")(distance, matches.mask)[..., None]
     return distance / jnp.where(median > 0, median, 1.0)
 
 
-def _place(side: int, axis: int, matches: Matches) -> Array:
-    """A coordinate relative to the image's center, in units of half its size."""
+def _coordinate(side: int, axis: int, matches: Matches) -> Array:
+    """Coordinate relative to the center of the image, in units of half its size."""
     points, size = getattr(matches, f"points{side}"), getattr(matches, f"image_size{side}")
     half = jnp.broadcast_to(as_float(size)[..., None, axis] / 2, matches.mask.shape)
-    half = masked(half, matches.mask, 1.0)  # a padded pair's image may have any size
+    half = masked(half, matches.mask, 1.0)  # the image of a padded pair may have any size
     return masked(as_float(points)[..., axis], matches.mask, half) / half - 1
 
 
@@ -155,12 +155,12 @@ INPUTS: Mapping[str, Callable[[Matches], Any]] = {
     "relative_distance": _relative_distance,
     "score0_rank": partial(_rank, "scores0"),
     "score1_rank": partial(_rank, "scores1"),
-    "scores0": partial(_itself, "scores0"),
-    "scores1": partial(_itself, "scores1"),
-    "distance": partial(_itself, "distance"),
-    "x0": partial(_place, 0, 0),
-    "y0": partial(_place, 0, 1),
-    "x1": partial(_place, 1, 0),
-    "y1": partial(_place, 1, 1),
+    "scores0": partial(_field, "scores0"),
+    "scores1": partial(_field, "scores1"),
+    "distance": partial(_field, "distance"),
+    "x0": partial(_coordinate, 0, 0),
+    "y0": partial(_coordinate, 0, 1),
+    "x1": partial(_coordinate, 1, 0),
+    "y1": partial(_coordinate, 1, 1),
 }
-"""What a learned weight may see of a match, `[..., K]`, by name; what it gives on padding is arbitrary."""
+"""Inputs of a learned weight, `[..., K]`, by name; their values on padding are arbitrary."""

@@ -9,24 +9,24 @@ from mfvpr.scoring.weights import match_confidence
 from mfvpr.types import Array, Matches, value
 from mfvpr.utils.numerics import masked, positive, where_finite
 
-MAX_LENGTH = 8  # the phrases of 100,000 matches are still a number of float32
+MAX_LENGTH = 8  # the number of phrases of 100,000 matches still fits into float32
 
 
 @value
 class VisualPhrases:
-    """s = sum over cells of C(m, length), the phrases that the m matches with a shift in one cell make.
+    """s = sum over cells of C(m, length), the number of phrases of the m matches with a shift in one cell.
 
-    The plane of shifts, points1 - points0, is divided into square cells. Length 1 counts the matches, length 2 the
-    pairs that agree. A phrase counts the product of its matches' confidences, so that m need not be whole: matches of
-    confidence 0 are none, and where no cell has `length` matches the score is 0.
+    The plane of shifts, points1 - points0, is divided into square cells. Length 1 counts matches, length 2 pairs of
+    matches that agree. A phrase counts the product of its matches' confidences, so that matches of confidence 0 do not
+    count. The score is 0 if no cell has `length` matches.
 
-    The score is smooth in the confidences; where the points are it notices only by cells, with a gradient of 0. Matches
-    are sorted by cell, so that time and memory are those of the matches, whatever the number of cells.
+    The score is smooth in the confidences, and constant in the points within a cell (gradient 0). Matches are sorted
+    by cell, so that time and memory depend on the number of matches, not of cells.
 
     Attributes:
-        length: matches of a phrase.
+        length: matches per phrase.
         cell_size: width of the cells, px; not above 0 scores NaN.
-        align: `zero_center` centers a cell on shift 0; `zero_edge` puts an edge there. Edges belong to the cell above.
+        align: `zero_center` centers a cell on shift 0; `zero_edge` puts an edge there. Edges belong to the upper cell.
     """
 
     length: int = whole(2, "matches of a phrase", bounds=(1, MAX_LENGTH))
@@ -42,30 +42,30 @@ class VisualPhrases:
         """Score of one pair, `[]` float32."""
         confidence, cells = match_confidence(matches), self._cells(matches)
         rows, columns, votes = jax.lax.sort((cells[:, 1], cells[:, 0], confidence), num_keys=2)
-        changed = (rows != jnp.roll(rows, 1)) | (columns != jnp.roll(columns, 1))
-        first = changed.at[:1].set(True)  # of its cell
-        return where_finite(jnp.sum(_ending(votes, first, self.length)), confidence, cells)
+        differs = (rows != jnp.roll(rows, 1)) | (columns != jnp.roll(columns, 1))
+        is_first = differs.at[:1].set(True)  # of its cell
+        return where_finite(jnp.sum(_count_phrases(votes, is_first, self.length)), confidence, cells)
 
     def _cells(self, matches: Matches) -> Array:
-        """`[K, 2]` (column, row) of each match's shift, whole; 0 on padding."""
+        """`[K, 2]` (column, row) of the cell of each match's shift, integers; 0 on padding."""
         shifts = match_shifts(matches)
         size = positive(self.cell_size, shifts.dtype)
         start = shifts + size / 2 if self.align == "zero_center" else shifts
         cells = jnp.floor(start / size)
-        # A quotient may be rounded to either side of a whole number, and otherwise in another program.
+        # Another program may round a quotient near an integer to the other side.
         above, below = start >= (cells + 1) * size, start < cells * size
         return masked(cells + above.astype(cells.dtype) - below.astype(cells.dtype), matches.mask)
 
 
-def _ending(votes: Array, first: Array, length: int) -> Array:
-    """`[K]` phrases of sorted matches `[K]` of which each is the last; `first` are those that begin a cell."""
-    none = jnp.zeros(length, votes.dtype).at[0].set(1.0)
+def _count_phrases(votes: Array, is_first: Array, length: int) -> Array:
+    """`[K]` phrases that end with each match; matches are sorted by cell, `is_first` marks the first of a cell."""
+    empty = jnp.zeros(length, votes.dtype).at[0].set(1.0)
 
     def step(shorter: Array, match: tuple[Array, Array]) -> tuple[Array, Array]:
         vote, begins = match
-        shorter = jnp.where(begins, none, shorter)  # phrases of 0, ..., length - 1 matches of the cell before this one
-        longer = vote * shorter  # of 1, ..., length, with it
+        shorter = jnp.where(begins, empty, shorter)  # phrases of 0, ..., length - 1 earlier matches of the cell
+        longer = vote * shorter  # phrases of 1, ..., length matches that end with this one
         return shorter.at[1:].add(longer[:-1]), longer[-1]
 
-    # By sums of products alone, so that what is too few for a phrase is exactly 0.
-    return jax.lax.scan(step, none, (votes, first))[1]
+    # Only sums of products, so that cells with too few matches count exactly 0.
+    return jax.lax.scan(step, empty, (votes, is_first))[1]

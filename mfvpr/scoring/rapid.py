@@ -13,17 +13,17 @@ from mfvpr.utils.numerics import at_least_single, masked, masked_mean, where_fin
 class RapidSpatialScore:
     """s = sum_k ((X - |x_k - mean x|)^2 + (Y - |y_k - mean y|)^2) over the shifts, in px^2.
 
-    A match counts with its confidence, in the means as in the sum. A shift further than X from the mean counts more
-    again. With X and Y the image's size it is `AggregatedScore` with the weight 1.
+    A match counts with its confidence, in the means and in the sum. A shift further than X from the mean counts more
+    again. If X and Y are the image size, the score is `AggregatedScore` with weight 1.
 
     Attributes:
-        reach: what X and Y are. `image_size`: width and height of the query, as Patch-NetVLAD's code takes the largest
-            index of its grid of patches. `largest_coordinate`: largest x and y of the matched points of both images,
-            as re-ranking-for-VPR takes those of all keypoints, which matches do not hold. `largest_shift`: |max x_k|
-            and |max y_k|, Patch-NetVLAD's equation as printed, which rewards the largest outlier.
-        size: (X, Y) px where they are known, instead: of patches on a grid, the largest index times their step.
+        reach: choice of X and Y. `image_size`: width and height of the query; Patch-NetVLAD's code takes the largest
+            index of its grid of patches. `largest_coordinate`: largest x and y of the matched points of both images;
+            re-ranking-for-VPR takes those of all keypoints, which matches do not hold. `largest_shift`: |max x_k| and
+            |max y_k|, Patch-NetVLAD's equation as printed, which rewards the largest outlier.
+        size: (X, Y) px, instead of `reach`; for patches on a grid the largest index times the step.
         per_feature: divide by the number of the query's keypoints, matched or not, as both codes do. The ranking of
-            a query's candidates stays; scores of scales with more and with fewer patches become alike.
+            a query's candidates stays the same; scores of scales with different numbers of patches become comparable.
     """
 
     reach: str = choice("image_size", "largest_coordinate", "largest_shift")
@@ -37,7 +37,7 @@ class RapidSpatialScore:
         """Score of one pair, `[]` float32.
 
         Raises:
-            InputError: `per_feature`, and the matches do not know the query's keypoints.
+            InputError: `per_feature` is set, and the matches have no `count0`.
         """
         confidence, shifts = match_confidence(matches), match_shifts(matches)
         residuals = jnp.abs(shifts - masked_mean(shifts, matches.mask, confidence)[None])
@@ -48,7 +48,7 @@ class RapidSpatialScore:
         return where_finite(score, confidence, shifts)
 
     def _reach(self, matches: Matches, shifts: Array, real: Array) -> Array:
-        """`[2]` X and Y; 0 where they are the largest of no match."""
+        """`[2]` X and Y; 0 if they are a maximum over no matches."""
         if self.size is not None:
             return jnp.asarray(self.size, shifts.dtype)
         if self.reach == "image_size":
@@ -58,8 +58,8 @@ class RapidSpatialScore:
             return jnp.max(masked(values, real, -jnp.inf), axis=0, initial=-jnp.inf)
 
         if self.reach == "largest_shift":
-            found = jnp.abs(largest(shifts))
+            reach = jnp.abs(largest(shifts))
         else:
             points = (masked(at_least_single(points), matches.mask) for points in (matches.points0, matches.points1))
-            found = jnp.maximum(*map(largest, points))
-        return jnp.where(jnp.any(real), found, 0.0)
+            reach = jnp.maximum(*map(largest, points))
+        return jnp.where(jnp.any(real), reach, 0.0)

@@ -23,10 +23,10 @@ SCORERS: dict[str, type] = {
     "homography": Homography,
     "homography_opencv": OpenCvHomography,
 }
-"""The scores that programs know, by name. Their settings follow from their fields (`mfvpr.scoring.fields`)."""
+"""Scorers of the programs by name. Their settings follow from their fields (`mfvpr.scoring.fields`)."""
 
 PAPER = ("count", "sum", "anchor", "histogram")
-"""Those that are compared where nobody chooses."""
+"""Scorers that are compared by default."""
 
 ALONE = ("homography_opencv", "grid")
-"""Those that are not among all: OpenCV takes a second for a query, and not all features are cells of a grid."""
+"""Scorers that `scorer=all` leaves out: OpenCV takes a second per query, and not all features are cells of a grid."""

@@ -11,35 +11,38 @@ from mfvpr.types import Array, Matches
 from mfvpr.utils.errors import InputError
 
 Scorer = Callable[[Matches], Array]
-"""Maps the Matches of ONE pair, slots `[K]`, to a score `[]` float32: larger = more likely the same place, exactly 0
-for a pair without matches, and the same whatever the order of the matches, how much is padding, and what that holds.
+"""Function of the Matches of ONE pair, slots `[K]`, that returns a score `[]` float32.
 
-Any callable will do. A class decorated with `mfvpr.value` gets more than a plain function: its numbers may be swept,
-traced and learned, and its programs are kept. A class that `jax.tree_util.register_dataclass` registered gets the
-same; see `mfvpr.value` for its limits. `mfvpr.testing.check_scorer` checks all of this.
+A larger score means that both images more likely show the same place. The score is exactly 0 without matches. It does
+not depend on the order of the matches, nor on the amount and content of padding.
 
-What JAX cannot compute, such as another library's score, has a method `score_pairs(matches) -> [P]` as well, NumPy,
-of pairs `[P, K, ...]`, by which it is scored outside of `jit`; its class is a value.
+Any callable is a scorer. A class decorated with `mfvpr.value` can do more than a plain function: its numbers may be
+swept, traced and learned, and its compiled programs are reused. A class registered with
+`jax.tree_util.register_dataclass` can do the same; see `mfvpr.value` for its limits. `mfvpr.testing.check_scorer`
+checks this contract.
+
+A scorer that JAX cannot compile, for instance of another library, also has a method `score_pairs(matches) -> [P]` that
+takes pairs `[P, K, ...]` and returns NumPy; it is called outside of `jit`. The class of such a scorer is a value.
 """
 
 
 def on_host(scorer: Any) -> bool:
-    """Whether pairs are scored by `score_pairs`, outside of `jit`."""
+    """Whether the scorer has a method `score_pairs` and runs outside of `jit`."""
     return callable(getattr(type(scorer), "score_pairs", None))
 
 
 def check_host(scorer: Any) -> None:
-    """Raise an InputError where a scorer of the host is no value: what programs hold of it has no `score_pairs`."""
+    """Raise an InputError if a scorer with `score_pairs` is no value: compiled programs would lose the method."""
     if on_host(scorer) and jax.tree_util.all_leaves([scorer]):
         raise InputError(f"{type(scorer).__name__}: expected a class with score_pairs that is a value; decorate it "
                          "with @mfvpr.value")  # fmt: skip
 
 
 def score_pairs(scorer: Any, matches: Matches) -> np.ndarray:
-    """Scores `[P]` float32 of pairs `[P, K, ...]` by a scorer of the host.
+    """Scores `[P]` float32 of pairs `[P, K, ...]` by the method `score_pairs` of a scorer.
 
     Raises:
-        InputError: it gives anything but a number for each pair.
+        InputError: the method does not return a real number for each pair.
     """
     scores, name = np.asarray(scorer.score_pairs(matches)), f"{type(scorer).__name__}.score_pairs"
     if scores.shape != (len(matches.mask),):
@@ -50,6 +53,6 @@ def score_pairs(scorer: Any, matches: Matches) -> np.ndarray:
 
 
 def require_real(name: str, scores: Array | np.ndarray) -> None:
-    """Raise an InputError unless scores can be ranked."""
+    """Raise an InputError unless the scores are real numbers."""
     if scores.dtype.kind not in "fiub" and scores.dtype != jnp.bfloat16:
         raise InputError(f"{name}: expected real numbers as scores, got {scores.dtype}")

@@ -1,4 +1,4 @@
-"""Learned match weights as small readable files, with how they were made."""
+"""Learned match weights as small JSON files, with their provenance."""
 
 import json
 from collections.abc import Mapping
@@ -17,22 +17,22 @@ SUFFIX = ".json"
 _FORMAT = "mfvpr match weight 1"
 
 
-def write_weight(path: Path | str, weight: LearnedWeight, made: Mapping[str, Any]) -> None:
-    """Write a weight as JSON, to the last bit, with how it was made (JSON values).
+def write_weight(path: Path | str, weight: LearnedWeight, provenance: Mapping[str, Any]) -> None:
+    """Write a weight as JSON, exact to the last bit, with its provenance (JSON values).
 
     Raises:
         ValueError: a number is not finite.
     """
     arrays = {f.name: np.asarray(getattr(weight, f.name)).tolist() for f in fields(weight) if f.name != "names"}
-    content = {"format": _FORMAT, "made": made, "inputs": list(weight.names), **arrays}
+    content = {"format": _FORMAT, "made": provenance, "inputs": list(weight.names), **arrays}
     write_text(Path(path), json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
 def read_weight(path: Path | str) -> tuple[LearnedWeight, dict[str, Any]]:
-    """That of `write_weight`, to the last bit, and how it was made.
+    """Weight and provenance from a file of `write_weight`, exact to the last bit.
 
     Raises:
-        InputError: no such file, or another one.
+        InputError: the file does not exist, or is not a file of `write_weight`.
     """
     path = Path(path)
     require_file(path, "a match weight that experiments.learn wrote")

@@ -1,4 +1,4 @@
-"""Match weights by name: those set by hand, those that were learned and ship as files, and files of one's own."""
+"""Match weights by name: the fixed ones, learned ones that the package ships as files, and files of the user."""
 
 import os
 from collections.abc import Iterator, Mapping
@@ -12,34 +12,32 @@ from mfvpr.scoring.weights import WEIGHTS, Weight
 _LEARNED = Path(__file__).parent / "learned"
 
 
-class _Named(Mapping[str, Weight]):
-    """Files are read when they are asked for; the same name gives the same object, by which programs tell weights."""
+class _NamedWeights(Mapping[str, Weight]):
+    """Weights by name; files are read on access, and the same name returns the same object."""
 
     def __getitem__(self, name: Any) -> Weight:
-        if name in WEIGHTS:
-            return WEIGHTS[name]
-        return _of_file(name)[0]
+        return WEIGHTS[name] if name in WEIGHTS else _read_by_name(name)[0]
 
     def __iter__(self) -> Iterator[str]:
-        return iter([*WEIGHTS, *_learned()])
+        return iter([*WEIGHTS, *_learned_files()])
 
     def __len__(self) -> int:
-        return len(WEIGHTS) + len(_learned())
+        return len(WEIGHTS) + len(_learned_files())
 
 
 @cache
-def _learned() -> dict[str, Path]:
+def _learned_files() -> dict[str, Path]:
     return {path.stem: path for path in sorted(_LEARNED.glob(f"*{SUFFIX}"))}
 
 
 def how_made(name: str) -> dict[str, Any]:
-    """How a weight was learned; empty where it was set by hand."""
-    return {} if name in WEIGHTS else _of_file(name)[1]
+    """Provenance of a learned weight, as `write_weight` stored it; empty for a fixed weight."""
+    return {} if name in WEIGHTS else _read_by_name(name)[1]
 
 
-def _of_file(name: Any) -> tuple[Weight, dict[str, Any]]:
-    if name in _learned():
-        return _read(_learned()[name], 0)
+def _read_by_name(name: Any) -> tuple[Weight, dict[str, Any]]:
+    if name in _learned_files():
+        return _read(_learned_files()[name], 0)
     if isinstance(name, str) and name.endswith(SUFFIX):
         path = Path(os.path.expanduser(name))
         return _read(path, path.stat().st_mtime_ns if path.exists() else 0)
@@ -47,10 +45,10 @@ def _of_file(name: Any) -> tuple[Weight, dict[str, Any]]:
 
 
 @cache
-def _read(path: Path, changed: int) -> tuple[Weight, dict[str, Any]]:
-    """Of a file that was changed at a time."""
+def _read(path: Path, modified_ns: int) -> tuple[Weight, dict[str, Any]]:
+    """Contents of a file; `modified_ns` makes a modified file a new entry of the cache."""
     return read_weight(path)
 
 
-NAMED_WEIGHTS: Mapping[str, Weight] = _Named()
-"""By word, or by the path of a file that `experiments.learn` wrote, which ends in `.json` (InputError if it is not)."""
+NAMED_WEIGHTS: Mapping[str, Weight] = _NamedWeights()
+"""Weights by word, or by the path `*.json` of a file that `experiments.learn` wrote (InputError for other files)."""

@@ -1,6 +1,6 @@
-"""Match weights (paper, section IV-B): values that map one pair's Matches to one weight per slot.
+"""Match weights (paper, section IV-B): functions of one pair's Matches that return one weight w_k per slot.
 
-What they return on padding is arbitrary; `match_weights` is the form that scorers use.
+Weights of padding are arbitrary; scorers use `match_weights`, where they are 0.
 """
 
 from collections.abc import Callable
@@ -33,26 +33,26 @@ class DescriptorDistanceWeight:
 
 @value
 class RatioWeight:
-    """w = (1 - ratio)^exponent, in [0, 1], of the ratio of distances to the nearest and the second nearest descriptor.
+    """w = (1 - ratio)^exponent, in [0, 1], where ratio = distance to the nearest / second nearest descriptor.
 
-    The ratio is how ambiguous a match is (Lowe, IJCV 2004, section 7.1): a keypoint that resembles two of the
-    candidate's as much counts nothing. It is not the paper's.
+    The ratio tells how ambiguous a match is (Lowe, IJCV 2004, section 7.1): a keypoint that resembles two keypoints of
+    the candidate equally has weight 0. This weight is not from the paper.
 
     Attributes:
-        exponent: 1 is as good as others; larger ones count clear matches more.
+        exponent: a larger exponent emphasizes unambiguous matches; no value is better than 1.
     """
 
     exponent: float | Array = 1.0
 
     def __call__(self, matches: Matches) -> Array:
-        """`[K]`.
+        """Weights `[K]`.
 
         Raises:
             InputError: the matches have no ratio.
         """
         lead = 1.0 - match_ratio(matches)
-        none = (lead <= 0) & jnp.isfinite(lead)  # there the power's derivatives are infinite
-        return jnp.where(none, 0.0, jnp.where(none, 1.0, lead) ** jnp.asarray(self.exponent, lead.dtype))
+        is_zero = (lead <= 0) & jnp.isfinite(lead)  # the derivatives of the power would be infinite
+        return jnp.where(is_zero, 0.0, jnp.where(is_zero, 1.0, lead) ** jnp.asarray(self.exponent, lead.dtype))
 
 
 @value
@@ -65,7 +65,7 @@ class UnitWeight:
 
 @value
 class ChosenWeight:
-    """One of several weights, by its number: so the kind of weight may be traced and batched like a parameter."""
+    """One of several weights, selected by an index that may be traced and batched like any other parameter."""
 
     options: tuple[Weight, ...]
     index: int | Array
@@ -84,7 +84,7 @@ WEIGHTS: dict[str, Weight] = {
 
 def match_weights(weight: Weight, matches: Matches) -> Array:
     """`[K]` weights times the matches' confidence, 0 on padding."""
-    # Padding is 1 before any arithmetic of the weight: else its NaN would return in the gradients.
+    # Padding is set to 1 before the weight's arithmetic: its NaN would reappear in the gradients.
     clean = {
         name: masked(values if name in INDICES else at_least_single(values), matches.mask, 1)
         for name, values in per_match(matches).items()
@@ -97,7 +97,7 @@ def match_ratio(matches: Matches) -> Array:
     """`[..., K]` the matches' ratio.
 
     Raises:
-        InputError: they have none.
+        InputError: the matches have no ratio.
     """
     if matches.ratio is None:
         raise InputError("expected matches with a ratio, got none; match them with_ratio=True")
@@ -105,6 +105,6 @@ def match_ratio(matches: Matches) -> Array:
 
 
 def match_confidence(matches: Matches) -> Array:
-    """`[K]` the matches' confidence, 1 where nobody gave one, 0 on padding; a match of confidence 0 is none."""
+    """`[K]` the matches' confidence, by default 1; 0 on padding. A match of confidence 0 does not count."""
     confidence = jnp.ones_like(matches.distance) if matches.confidence is None else matches.confidence
     return masked(at_least_single(confidence), matches.mask)

@@ -18,7 +18,7 @@ from mfvpr.evaluation import stages
 from mfvpr.features import FeatureSet, InMemory
 from mfvpr.matching import Matching, MatchSet, batched, filter_matches
 from mfvpr.matching.batched import QUERIES
-from mfvpr.matching.match_set import batches, compacted, shapes, slots
+from mfvpr.matching.match_set import batches, shapes, slots, split_pairs
 from mfvpr.reranking.ranking import rank_shortlist
 from mfvpr.storage.features import open_store
 from mfvpr.types import Shortlist, per_match, per_pair
@@ -284,7 +284,7 @@ def test_a_querys_matches_are_padded_to_the_capacity(match_set):
             of_query = getattr(flat, name)
             expected = np.broadcast_to(of_query, values.shape) if name.endswith("0") else of_query
             np.testing.assert_array_equal(values, expected)
-        for place, row in enumerate(compacted(padded)):
+        for place, row in enumerate(split_pairs(padded)):
             for name, values in row.items():
                 np.testing.assert_array_equal(values, per_match(padded)[name][place][padded.mask[place]])
 
