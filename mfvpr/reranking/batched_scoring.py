@@ -1,4 +1,4 @@
-"""Scores of whole data sets: matches go pair by pair, whatever query they belong to, in batches on all devices."""
+"""Scores of whole data sets: batches of pairs of any query, on all devices."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
@@ -20,23 +20,23 @@ from mfvpr.utils.numerics import Device, available_cpus, compiled, held, knows_o
 from mfvpr.utils.progress import Track, untracked
 from mfvpr.utils.threads import ordered_map
 
-PaddedBatch = tuple[np.ndarray, Matches]  # places [n] of its pairs, and their Matches [P, K, ...]
+PaddedBatch = tuple[np.ndarray, Matches]  # positions [n] of its pairs, and their Matches [P, K, ...]
 
 
 def score(
     scorers: Mapping[str, Scorer], match_set: MatchSet | Scales, candidates: Shortlist, *,
     devices: Sequence[Device] | None = None, track: Track = untracked,
 ) -> dict[str, np.ndarray]:  # fmt: skip
-    """Scores `[Q, C]` float32 of every query's candidates by each scorer; NaN where there is no candidate.
+    """Scores `[Q, C]` float32 of every query's candidates, by name of the scorer; NaN without a candidate.
 
-    All scorers are one program for each shape of a batch, which other parameter values use again (histograms: within a
-    capacity of 8 bins). A pair without matches scores 0.
+    All scorers together are one program for each shape of a batch, which is reused for other parameter values
+    (histograms: up to the next multiple of 8 bins). A pair without matches scores 0.
 
     Args:
         scorers: by name.
-        match_set: matches of Q queries with C candidates; those of several scales are scored one by one and fused.
-        candidates: their shortlist.
-        devices: that share the batches, which changes no bit of the scores; None = the one that JAX takes.
+        match_set: matches of Q queries with C candidates; several scales are scored one by one and fused.
+        candidates: shortlist of the queries.
+        devices: share the batches, without effect on the bits of the scores; None = JAX's default device.
         track: progress, over batches.
     """
     if not scorers:
@@ -49,63 +49,63 @@ def score(
     fitted = held(fit(dict(scorers), *match_set.image_sizes, multiple=BIN_STEP))
     scores = {name: np.zeros((len(sets), *candidates.mask.shape), np.float32) for name in scorers}
 
-    def made() -> Iterator[tuple[range, np.ndarray, dict[str, np.ndarray]]]:
+    def score_parts() -> Iterator[tuple[range, np.ndarray, dict[str, np.ndarray]]]:
         for part in parts:
             part_batches = all_batches(match_set, part, settings=1)
             for places, values in scored(_score_all, (fitted,), part_batches, devices=devices):
                 yield part, places, values
 
-    total = sum(len(partition(one, part, settings=1)) for one in sets for part in parts)
-    for part, places, values in track(made(), total):
+    total = sum(len(partition(scale_set, part, settings=1)) for scale_set in sets for part in parts)
+    for part, places, values in track(score_parts(), total):
         scale, query, place = np.unravel_index(places, (len(sets), len(part), candidates.mask.shape[1]))
-        for name, of_pairs in values.items():
-            scores[name][scale, part.start + query, place] = of_pairs
+        for name, pair_scores in values.items():
+            scores[name][scale, part.start + query, place] = pair_scores
     fused = {name: fuse_all(match_set, by_scale, candidates.mask) for name, by_scale in scores.items()}
     return {name: np.where(candidates.mask, values, np.nan) for name, values in fused.items()}
 
 
 def all_batches(match_set: MatchSet | Scales, queries: range, *, settings: float) -> Iterator[PaddedBatch]:
-    """Those of some q queries and every scale, see `match_sets.batches`; places are in the flattened `[S, q, C]`."""
-    for scale, one in enumerate(scales(match_set)):
-        pairs = len(queries) * one.counts.shape[1]
-        for places, matches in batches(one, queries, settings=settings):
+    """`match_set.batches` of q queries at every scale; positions are in the flattened `[S, q, C]`."""
+    for scale, scale_set in enumerate(scales(match_set)):
+        pairs = len(queries) * scale_set.counts.shape[1]
+        for places, matches in batches(scale_set, queries, settings=settings):
             yield scale * pairs + places, matches
 
 
 def scored(
     program: Callable[..., Any], inputs: tuple, batches: Iterable[PaddedBatch], *, devices: Sequence[Device] | None
 ) -> Iterator[tuple[np.ndarray, Any]]:
-    """(places `[n]`, arrays `[..., n]`) of every batch, in their order, NumPy.
+    """Run a program on every batch: (positions `[n]`, arrays `[..., n]`) in the order of the batches, NumPy.
 
     Args:
-        program: of Matches `[P, K, ...]` and the inputs, gives arrays `[..., P]`.
-        inputs: arrays, and what holds some.
-        batches: of few shapes; only a few are held at a time.
-        devices: that take turns; None = the one that JAX takes.
+        program: function of Matches `[P, K, ...]` and the inputs that returns arrays `[..., P]`.
+        inputs: pytrees, copied to every device.
+        batches: of few shapes; only a few batches are in memory at the same time.
+        devices: take turns; None = JAX's default device.
     """
-    turns = [partial(jax.device_put, device=device) for device in devices or ()] or [_as_it_is]
-    own = [put(inputs) for put in turns]
-    known: set[tuple] = set()
+    to_device = [partial(jax.device_put, device=device) for device in devices or ()] or [lambda tree: tree]
+    device_inputs = [put(inputs) for put in to_device]
+    compiled_shapes: set[tuple] = set()
     compiling: dict[tuple, Lock] = {}
 
-    def score(numbered: tuple[int, PaddedBatch]) -> tuple[np.ndarray, Any]:
+    def run_batch(numbered: tuple[int, PaddedBatch]) -> tuple[np.ndarray, Any]:
         number, (places, matches) = numbered
-        turn = number % len(turns)
-        key = turn, matches.mask.shape
-        # The first batch of a shape compiles: those that come meanwhile wait for it.
-        with nullcontext() if key in known else compiling.setdefault(key, Lock()):
-            values = program(turns[turn](matches), *own[turn])
-        known.add(key)
-        return places, jax.tree.map(lambda of_pairs: np.asarray(of_pairs)[..., : len(places)], values)
+        device = number % len(to_device)
+        key = device, matches.mask.shape
+        # The first batch of a shape compiles; batches of the same shape wait for it.
+        with nullcontext() if key in compiled_shapes else compiling.setdefault(key, Lock()):
+            values = program(to_device[device](matches), *device_inputs[device])
+        compiled_shapes.add(key)
+        return places, jax.tree.map(lambda leaf: np.asarray(leaf)[..., : len(places)], values)
 
-    # Products this small keep one core busy: as many batches at a time as there are cores.
-    workers = max(available_cpus(), len(turns))
-    spread = partial(ordered_map, workers=workers) if knows_own_context() else map
-    return iter(spread(score, enumerate(batches)))
+    # A batch keeps only one core busy, so that one batch per core runs at the same time.
+    workers = max(available_cpus(), len(to_device))
+    run_all = partial(ordered_map, workers=workers) if knows_own_context() else map
+    return iter(run_all(run_batch, enumerate(batches)))
 
 
 def fuse_all(match_set: MatchSet | Scales, scores: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Scores `[..., Q, C]` of candidates `mask` `[Q, C]`, out of those of every scale `[S, ..., Q, C]`."""
+    """Fused scores `[..., Q, C]` of candidates `mask` `[Q, C]`, from scores `[S, ..., Q, C]` of every scale."""
     if not isinstance(match_set, Scales):
         return scores[0]
     weights = None if match_set.weights is None else np.asarray(match_set.weights, np.float32)
@@ -113,9 +113,9 @@ def fuse_all(match_set: MatchSet | Scales, scores: np.ndarray, mask: np.ndarray)
 
 
 def _score_all(matches: Matches, scorers: dict[str, Scorer]) -> dict[str, Array]:
-    elsewhere = {name: scorer for name, scorer in scorers.items() if on_host(scorer)}
-    scores = _in_jax(matches, {name: scorer for name, scorer in scorers.items() if name not in elsewhere})
-    return scores | {name: score_pairs(scorer, matches) for name, scorer in elsewhere.items()}
+    host_scorers = {name: scorer for name, scorer in scorers.items() if on_host(scorer)}
+    scores = _in_jax(matches, {name: scorer for name, scorer in scorers.items() if name not in host_scorers})
+    return scores | {name: score_pairs(scorer, matches) for name, scorer in host_scorers.items()}
 
 
 @compiled
@@ -125,7 +125,3 @@ def _in_jax(matches: Matches, scorers: dict[str, Scorer]) -> dict[str, Array]:
         if values.shape != matches.mask.shape[:1]:
             raise InputError(f"{name}: expected a number for each pair, got an array {list(values.shape[1:])}")
     return scores
-
-
-def _as_it_is(tree: Any) -> Any:
-    return tree

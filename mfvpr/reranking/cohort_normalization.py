@@ -1,11 +1,13 @@
-"""Hubs: database images that score high with whatever query, known by their scores with other places of the map.
+"""Score normalization with a cohort: lower the scores of hubs, database images that score high with any query.
 
-    matched = match_cohort(dataset, 5, extractor, filter)
-    among = pipeline.score({"histogram": HistogramOfShifts()}, matched.by_scale, matched.candidates)
-    better = by_hubness(candidates, scores, hubness(matched.candidates, among["histogram"], len(dataset.database)))
+    cohort = match_cohort(dataset, 5, extractor, filter)
+    scores = score({"histogram": HistogramOfShifts()}, cohort.by_scale, cohort.candidates)["histogram"]
+    strengths = hubness(cohort.candidates, scores, len(dataset.database))
+    normalized = by_hubness(candidates, query_scores, strengths)
 
-All but the last is done when the map is made: no query takes part. Images far apart in the drive count as other places:
-where it passes a place twice, its images score high with each other, and lose as hubs do.
+The cohort of a database image are other places of the map. Only the last line needs queries; all others run when the
+map is made. Images far apart in the drive count as different places: if the drive passes a place twice, its images
+score high with each other and are treated as hubs.
 """
 
 import numpy as np
@@ -16,20 +18,20 @@ from mfvpr.datasets.sequences import own_rows, without_neighbors
 from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError
 
-# Usual scores that each image is thought to have beside its own. On drawn streets the scores of an image vary (in
-# variance) about ten times as much as the means of images do.
+# Number of average scores that are added to the scores of each image. On synthetic streets the variance of an image's
+# scores is about ten times the variance of the images' means.
 PRIOR = 10
 
 
 def cohort_sequence(database: Contents, neighbors: int) -> QuerySequence:
-    """The database images as queries, none of which finds its own place.
+    """The database images as queries; the database images of the same place are excluded.
 
     Args:
         database: M images in the order of the drive.
-        neighbors: frames on both sides of an image that show its place, as images of the same content do.
+        neighbors: frames on both sides of an image that show the same place; images of equal content do, too.
 
     Raises:
-        InputError: no whole number from 0, or so many that an image has no others left.
+        InputError: `neighbors` is no integer from 0, or so large that no other images remain.
     """
     number = len(database.folder)
     if not isinstance(neighbors, int | np.integer) or isinstance(neighbors, bool) or neighbors < 0:
@@ -38,24 +40,24 @@ def cohort_sequence(database: Contents, neighbors: int) -> QuerySequence:
     if neighbors >= number // 2:
         raise InputError(f"cohort={neighbors}: expected less than half of {number} database images, as an image is "
                          "scored with those that are farther away; leave fewer out")  # fmt: skip
-    own = tuple(tuple({row, *same}) for row, same in enumerate(own_rows(database, database)))
-    return without_neighbors(QuerySequence("cohort", database.folder, None), number, own, int(neighbors))
+    equal_rows = tuple(tuple({row, *same}) for row, same in enumerate(own_rows(database, database)))
+    return without_neighbors(QuerySequence("cohort", database.folder, None), number, equal_rows, int(neighbors))
 
 
 def hubness(candidates: Shortlist, scores: np.ndarray, num_database: int, *, who: str = "a scorer") -> np.ndarray:
-    """`[N]` float64, how high each database image scores with other places, by how high all of them do: above 0.
+    """Hubness of each database image, `[N]` float64 above 0: its mean score with other places over the mean of all.
 
-    The mean of its scores by the mean of all, as if it had `PRIOR` further ones that are usual: 1 where it has none, or
-    where all are 0.
+    `PRIOR` average scores are added to the scores of each image. The hubness is 1 for an image without scores, and if
+    all scores are 0.
 
     Args:
         candidates: `[M, C]` of the cohort's images.
-        scores: `[M, C]` of these; those that are not finite take no part.
+        scores: `[M, C]` of the candidates; scores that are not finite are ignored.
         num_database: N.
-        who: scores them.
+        who: name of the scorer, for the error.
 
     Raises:
-        InputError: scores below 0.
+        InputError: a score is below 0.
     """
     known = np.asarray(candidates.mask) & np.isfinite(scores)
     rows, values = np.asarray(candidates.indices)[known], np.asarray(scores, np.float64)[known]
@@ -67,18 +69,24 @@ def hubness(candidates: Shortlist, scores: np.ndarray, num_database: int, *, who
 
 
 def by_hubness(candidates: Shortlist, scores: np.ndarray, hubness: np.ndarray, *, who: str = "a scorer") -> np.ndarray:
-    """Scores `[Q, C]` of a sequence's candidates, those of hubs divided by their `hubness` `[N]`; NumPy float32.
+    """Scores `[Q, C]` divided by the `hubness` `[N]` of the candidates where it is above 1; NumPy float32.
 
-    Only those above 1 count: an image that hardly matches anything would gain by every match. NaN stays NaN.
+    A hubness below 1 does not count: an image that hardly matches anything would gain by every match. NaN stays NaN.
+
+    Args:
+        candidates: `[Q, C]` of a sequence.
+        scores: `[Q, C]` of the candidates.
+        hubness: see `hubness`.
+        who: name of the scorer, for the error.
 
     Raises:
-        InputError: scores below 0, which would grow.
+        InputError: a score is below 0; division would increase it.
     """
     _require_positive(scores, who)
     return (scores / np.maximum(hubness, 1)[candidates.indices]).astype(np.float32)
 
 
-def _require_positive(scores: np.ndarray, who: str) -> None:
+def _require_positive(scores: np.ndarray, scorer: str) -> None:
     if (lowest := np.min(scores, initial=0, where=~np.isnan(scores))) < 0:
-        raise InputError(f"cohort: expected scores from 0, which can be divided, got {lowest:.4g} of {who}; choose "
+        raise InputError(f"cohort: expected scores from 0, which can be divided, got {lowest:.4g} of {scorer}; choose "
                          "another score, features of a single scale, or no cohort")  # fmt: skip

@@ -1,4 +1,4 @@
-"""Frame correlation of SSM-VPR (Camara & Preucil, RAS 2020): the next query is likely near the places of the last."""
+"""Frame correlation of SSM-VPR (Camara & Preucil, RAS 2020): the next query is likely near the previous places."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -11,19 +11,20 @@ from mfvpr.utils.errors import InputError
 
 @dataclass(frozen=True)
 class FrameCorrelation:
-    """Scores grow by a share of themselves near the places where the queries before were.
+    """Increase the scores of candidates near the places of the previous queries.
 
-    A candidate d rows of the database from where one of them was gains strength * gain * (1 - d / reach) of its score,
-    the most that any of them gives. The strength is the score of that query's place by the best of theirs; it is 1 of
-    a single one, or where all are 0. Queries and database images must be in the order of the drive.
+    The place of a query is its best candidate. A candidate d database rows from the place of a previous query gains
+    strength * gain * (1 - d / reach) of its score; the largest gain over the previous queries counts. The strength is
+    the score of that place over the best score of the previous places, and 1 if `previous` is 1 or all scores are 0.
+    Queries and database images must be in the order of the drive.
 
-    As in the public code, but that this rounds the scores of places to two digits, and puts a query of which nothing
-    scores above 0 at row 0, where it is nowhere here.
+    The public code differs in two details: it rounds the scores of places to two digits, and it assigns row 0 to a
+    query without a score above 0, which has no place here.
 
     Attributes:
-        previous: queries that are looked back at, from 1; those before the first so many are scored as they are.
-        reach: rows of the database.
-        gain: the most that a score grows by, in shares of itself.
+        previous: number of previous queries, from 1; the first `previous` queries keep their scores.
+        reach: database rows.
+        gain: largest relative increase of a score.
     """
 
     previous: int = 2
@@ -36,22 +37,22 @@ class FrameCorrelation:
                              "expected at least one query, a finite reach above 0, a finite gain from 0")  # fmt: skip
 
     def __call__(self, candidates: Shortlist, scores: np.ndarray) -> np.ndarray:
-        """Scores `[Q, C]` of a sequence's candidates, NumPy float32, out of those of each query by itself.
+        """Correlated scores `[Q, C]` of a sequence, NumPy float32, from scores `[Q, C]` of its candidates.
 
-        Those that are not above 0, NaN too, stay what they are. Of equal scores the lowest row is the query's place.
+        Scores that are not above 0, and NaN, stay the same. Among equal scores the lowest row is the query's place.
         """
         mask, correlated = np.asarray(candidates.mask), np.array(scores, np.float64)
         before: deque[tuple[float, float]] = deque(maxlen=self.previous)  # (row, score) of the last places
-        for of_query, rows, usable in zip(correlated, np.asarray(candidates.indices, float), mask, strict=True):
-            some = usable & (of_query > 0)
+        for row_scores, rows, usable in zip(correlated, np.asarray(candidates.indices, float), mask, strict=True):
+            positive = usable & (row_scores > 0)
             if len(before) == self.previous:
-                of_query[some] *= 1 + self._gains(rows[some], np.array(before))
-            best = of_query.max(where=some, initial=0)
-            before.append((rows.min(where=some & (of_query == best), initial=np.inf), best))
+                row_scores[positive] *= 1 + self._gains(rows[positive], np.array(before))
+            best = row_scores.max(where=positive, initial=0)
+            before.append((rows.min(where=positive & (row_scores == best), initial=np.inf), best))
         return correlated.astype(np.float32)
 
     def _gains(self, rows: np.ndarray, before: np.ndarray) -> np.ndarray:
-        """`[n]` of candidates' rows, the most that places and scores `[previous, 2]` give."""
+        """`[n]` largest relative gains of candidates by their rows; `before` `[previous, 2]` are places and scores."""
         places, scores = before.T
         best = scores.max()
         strength = scores / best if best > 0 and self.previous > 1 else np.ones(len(scores))

@@ -1,4 +1,4 @@
-"""Rankings of a sequence by every system: the filter alone, each scorer, and what is made of several scores."""
+"""Rankings of a sequence by every system: retrieval alone, each scorer, and fusions of several scores."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
@@ -17,16 +17,16 @@ from mfvpr.utils.errors import InputError, require_word
 
 @dataclass(frozen=True)
 class Fusion:
-    """How the filter's score, and those of further scorers, are added to the score of another, the main one.
+    """Sum of a main score, the retrieval score, and the scores of further scorers.
 
     Attributes:
-        c: the main score gets c times the filter's; None = as much as balances both per query. "zscore" = the sum of
-            all scores, each with mean 0 and standard deviation 1 over the query's candidates (where all are equal, 0):
-            of filter and main score it ranks as None does, but its values have the same unit for every query. A score
-            that is not finite is its candidate's alone.
-        filter_score: the filter's, see `mfvpr.reranking.ranking.filter_scores`.
-        weights: of "zscore" only, above 0: of the filter (as `filter`) and of the main scorer, 1 where they are not
-            named; and of further scorers, which take part by being named.
+        c: the combined score is main score + c * retrieval score; None = `balancing_c` of each query. "zscore" = the
+            sum of all scores, each with mean 0 and standard deviation 1 over the query's candidates (0 if all are
+            equal). With retrieval and main score only, "zscore" ranks as None does, but its values have the same unit
+            for every query. A score that is not finite affects only its own candidate.
+        filter_score: kind of retrieval score, see `mfvpr.reranking.ranking.filter_scores`.
+        weights: for "zscore" only, above 0, by name: of the retrieval (`filter`) and of the main scorer, by default 1;
+            and of further scorers, which take part only if they are named here.
     """
 
     c: float | Literal["zscore"] | None = None
@@ -34,26 +34,26 @@ class Fusion:
     weights: Mapping[str, float] = field(default_factory=dict)
 
     def members(self, main: str) -> list[str]:
-        """Names of the scorers that take part, the main one first."""
+        """Names of the scorers that take part, the main scorer first."""
         return [main, *(name for name in self.weights if name not in (main, FILTER))]
 
     def renamed(self, main: str, name: str) -> "Fusion":
-        """The same of a main scorer of another name, such as one with a cohort."""
+        """This fusion for a main scorer with another name, such as one with a cohort."""
         return replace(self, weights={name if key == main else key: weight for key, weight in self.weights.items()})
 
     def system(self, main: str) -> str:
-        """The name of what is ranked, such as `histogram + filter`."""
+        """Name of the fused system, such as `histogram + filter`."""
         return " + ".join([*self.members(main), FILTER])
 
     def check(self, main: str, scorers: Collection[str]) -> None:
-        """Refuse what cannot be fused.
+        """Check the settings and the names of scorers.
 
         Args:
             main: name of the main scorer.
-            scorers: names of all that score.
+            scorers: names of all scorers.
 
         Raises:
-            InputError: a value, or a name that is none of theirs.
+            InputError: a setting is out of bounds, or a name is not among the scorers.
         """
         require_word("filter_score", self.filter_score, FilterScore)
         known = ", ".join(scorers) or "there are none"
@@ -72,7 +72,7 @@ class Fusion:
                                  f"{weight!r}")  # fmt: skip
 
     def __call__(self, main: str, candidates: Shortlist, scores: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Combined scores `[Q, C]`, NumPy, of those `[Q, C]` of every scorer by name."""
+        """Combined scores `[Q, C]`, NumPy, from scores `[Q, C]` by name of the scorer."""
         if self.c != "zscore":
             return fuse_shortlist(candidates, scores[main], self.c, filter_score=self.filter_score)
         parts = {FILTER: filter_scores(candidates, self.filter_score)}
@@ -90,30 +90,31 @@ def rank_sequence(
     *,
     hubness: Mapping[str, np.ndarray] | None = None,
 ) -> dict[str, Ranked]:
-    """Rankings of a sequence by name of the system, see `mfvpr.evaluate`.
+    """Rankings of a sequence by name of the system.
 
     Args:
         matched: the sequence.
         scores: `[Q, C]` by name of the scorer.
-        fused: see there.
-        correlated: see there.
-        ties: see there.
-        hubness: `[N]` by name of the scorer; None = no cohort.
+        fused: see `mfvpr.evaluate`.
+        correlated: see `mfvpr.evaluate`.
+        ties: see `mfvpr.evaluate`.
+        hubness: `[N]` by name of the scorer; None = no score normalization with a cohort.
     """
     candidates, scores = matched.candidates, {**scores}
     scores |= {
         f"{name} + {COHORT}": by_hubness(candidates, scores[name], strengths, who=name)
         for name, strengths in (hubness or {}).items()
     }
-    scores |= {how.system(name): how(name, candidates, scores) for name, how in fused.items()}
-    scores |= {f"{name} + {FRAMES}": how(candidates, scores[name]) for name, how in correlated.items()}
-    return {name: _ranked(candidates, values, ties) for name, values in ({FILTER: candidates.scores} | scores).items()}
+    scores |= {fusion.system(name): fusion(name, candidates, scores) for name, fusion in fused.items()}
+    scores |= {f"{name} + {FRAMES}": correlate(candidates, scores[name]) for name, correlate in correlated.items()}
+    scores = {FILTER: candidates.scores} | scores
+    return {name: _rank(candidates, values, ties) for name, values in scores.items()}
 
 
 def _between(value: Any, low: float, high: float) -> bool:
     return isinstance(value, int | float | np.number) and bool(low <= value <= high)
 
 
-def _ranked(candidates: Shortlist, scores: np.ndarray, ties: Ties) -> Ranked:
+def _rank(candidates: Shortlist, scores: np.ndarray, ties: Ties) -> Ranked:
     order = rank_shortlist(candidates, scores, ties=ties)
     return Ranked(*(np.take_along_axis(values, order, axis=1) for values in (candidates.indices, scores)))

@@ -1,6 +1,6 @@
-"""One query x C candidates: scores of all candidates, their fusion with the filter's, and the ranking.
+"""One query x C candidates: scores of all candidates, fusion with the retrieval scores, and the ranking.
 
-Scorers know one pair; here is `vmap` over candidates. Whole grids of parameters are in `mfvpr.reranking.grids`.
+Scorers score one pair; this module maps them over candidates. See `mfvpr.reranking.grids` for grids of parameters.
 """
 
 from functools import partial
@@ -25,9 +25,9 @@ BIN_STEP = 8  # capacities of histograms are multiples of it
 def score_candidates(scorer: Scorer, matches: Matches) -> Array:
     """Scores `[C]` of matches `[C, K, ...]`.
 
-    Compiled once per shape; other numbers in the scorer compile nothing. A scorer that is a plain function, or holds
-    one, runs op by op. What needs a capacity gets that of the images: under a caller's `jit`, where these are traced,
-    it must have one before (`max_bins` of the histogram).
+    The program is compiled once per shape, and reused for other numbers in the scorer. A scorer that is or holds a
+    plain function runs operation by operation. Capacities (`max_bins` of the histogram) are fitted to the image sizes;
+    under a caller's `jit`, where sizes are traced, set them before.
     """
     check_candidates(matches)
     check_host(scorer)
@@ -42,7 +42,7 @@ def _score_candidates(scorer: Scorer, matches: Matches) -> Array:
 
 
 def check_candidates(matches: Matches) -> None:
-    """Raise a ValueError unless the matches are `[C, K, ...]`, of candidates."""
+    """Raise a ValueError unless the matches are `[C, K, ...]`."""
     if np.ndim(matches.mask) != 2:
         shape = np.shape(matches.mask)
         raise ValueError(f"expected matches [C, K, ...] of candidates, got a mask of shape {shape}; of one pair "
@@ -50,37 +50,43 @@ def check_candidates(matches: Matches) -> None:
 
 
 def matched_sizes(matches: Matches) -> tuple[Array, Array]:
-    """Both image sizes `[..., 2]`, without those of pairs that have no matches, which may be anything."""
+    """Sizes `[..., 2]` of both images, without pairs that have no matches: their sizes may be anything."""
     sizes = matches.image_size0, matches.image_size1
     if not is_concrete((matches.mask, sizes)):
         return sizes
-    some = np.any(matches.mask, axis=-1)
-    size0, size1 = (np.broadcast_to(size, (*some.shape, 2))[some] for size in sizes)
+    has_matches = np.any(matches.mask, axis=-1)
+    size0, size1 = (np.broadcast_to(size, (*has_matches.shape, 2))[has_matches] for size in sizes)
     return size0, size1
 
 
 def combine(filter_scores: Array, rerank_scores: Array, *, c: float | Array = 1e6) -> Array:
-    """s = c s_f + s_r (paper, section IV-E). `c` is in units of the re-ranking score; 1e6 suits D2-Net's."""
+    """Combined score s = c s_f + s_r, equation 4 (paper, section IV-E).
+
+    Args:
+        filter_scores: s_f, retrieval scores.
+        rerank_scores: s_r, re-ranking scores, of the same shape.
+        c: in units of the re-ranking score; the paper's 1e6 suits the scores of D2-Net's features.
+    """
     return c * filter_scores + rerank_scores
 
 
 def balancing_c(filter_scores: Array, rerank_scores: Array, mask: Array) -> Array:
-    """The `c` `[]` that gives both scores the same spread over one query's candidates `[C]`.
+    """The `c` `[]` that gives both scores the same standard deviation over one query's candidates `[C]`.
 
-    Not from the paper, whose c is a constant by hand; it serves detectors whose scores have other units.
+    The paper sets c by hand; this value adapts to detectors with scores in other units.
     """
 
-    def spread(scores: Array) -> Array:
+    def deviation(scores: Array) -> Array:
         return masked_std(scores, mask & jnp.isfinite(scores))
 
-    filter_spread = spread(filter_scores)
-    c = spread(rerank_scores) / jnp.where(filter_spread > 0, filter_spread, 1.0)
-    return jnp.where((filter_spread > 0) & jnp.isfinite(c), c, 0.0)
+    filter_deviation = deviation(filter_scores)
+    c = deviation(rerank_scores) / jnp.where(filter_deviation > 0, filter_deviation, 1.0)
+    return jnp.where((filter_deviation > 0) & jnp.isfinite(c), c, 0.0)
 
 
 @compiled
 def fuse(filter_scores: Array, scores: Array, mask: Array, c: float | Array | None) -> Array:
-    """Combined scores `[Q, C]` of several queries; `c` None balances the spread of both scores per query."""
+    """Combined scores `[Q, C]` of several queries; None as `c` is `balancing_c` of each query."""
     if c is None:
         c = jax.vmap(balancing_c)(filter_scores, scores, mask)[:, None]
     filter_scores, scores = masked(filter_scores, mask), masked(scores, mask)
@@ -90,20 +96,24 @@ def fuse(filter_scores: Array, scores: Array, mask: Array, c: float | Array | No
 def fuse_shortlist(
     candidates: Shortlist, scores: np.ndarray, c: float | None, *, filter_score: FilterScore = "cosine"
 ) -> np.ndarray:
-    """Combined scores `[Q, C]` of filter and re-ranking, NumPy; NaN without a candidate.
+    """Combined scores `[Q, C]` of retrieval and re-ranking, NumPy; NaN without a candidate.
 
     Args:
-        candidates: the filter's, with their cosine similarities.
-        scores: `[Q, C]` of the re-ranking.
-        c: weight of the filter; None balances the spread of both per query.
-        filter_score: the filter's score, see `filter_scores`.
+        candidates: shortlist with cosine similarities.
+        scores: `[Q, C]` re-ranking scores.
+        c: weight of the retrieval score; None is `balancing_c` of each query.
+        filter_score: kind of retrieval score, see `filter_scores`.
     """
     fused = fuse(filter_scores(candidates, filter_score), scores, candidates.mask, c)
     return np.asarray(or_nan(fused, candidates.mask))
 
 
 def filter_scores(candidates: Shortlist, kind: FilterScore = "cosine") -> np.ndarray:
-    """The filter's part of a combined score `[Q, C]`: cosine similarity, or minus the Euclidean distance."""
+    """Retrieval scores `[Q, C]` for a combined score: cosine similarity, or minus the Euclidean distance.
+
+    Raises:
+        InputError: `kind` is unknown, or `negative_euclidean` of scores above 1.
+    """
     require_word("filter_score", kind, FilterScore)
     cosine = candidates.scores
     if kind == "cosine":
@@ -117,15 +127,15 @@ def filter_scores(candidates: Shortlist, kind: FilterScore = "cosine") -> np.nda
 def fuse_scales(
     scores: Array, mask: Array, weights: Array | None = None, *, normalize: Literal["zscore", "none"] = "zscore"
 ) -> Array:
-    """Weighted sum `[..., C]` of the scores of S scales, as Patch-NetVLAD's, or scorers; NaN without a candidate.
+    """Weighted sum `[..., C]` of the scores of S scales (as in Patch-NetVLAD) or S scorers; NaN without a candidate.
 
     Args:
         scores: `[..., C, S]` of a query's candidates.
-        mask: `[..., C]` bool, with the axes of the scores or fewer in front.
+        mask: `[..., C]` bool; leading axes may be missing.
         weights: `[S]`; None = 1 each.
-        normalize: "zscore" first gives each scale mean 0 and standard deviation 1 over the query's candidates; where
-            all score the same, 0. A score that is not finite takes no part in that, and what it makes of the sum is its
-            candidate's alone. "none" leaves the scores as they are, as for a pair by itself.
+        normalize: "zscore" first gives each scale mean 0 and standard deviation 1 over the query's candidates, or 0 if
+            all scores are equal. A score that is not finite is left out of mean and deviation, and affects only the sum
+            of its own candidate. "none" leaves the scores as they are, for pairs without other candidates.
     """
     return or_nan(_fuse_scales(scores, mask, weights, normalize=normalize), mask)
 
@@ -138,39 +148,39 @@ def _fuse_scales(scores: Array, mask: Array, weights: Array | None, *, normalize
     mask = jnp.broadcast_to(mask, scores.shape[:-1])
     if normalize == "zscore":
         by_scale = jnp.moveaxis(scores, -1, -2)
-        standardized = jnp.vectorize(_standardized, signature="(c),(c)->(c)")
-        scores = jnp.moveaxis(standardized(by_scale, mask[..., None, :]), -2, -1)
+        standardize = jnp.vectorize(_standardize, signature="(c),(c)->(c)")
+        scores = jnp.moveaxis(standardize(by_scale, mask[..., None, :]), -2, -1)
     counts = jnp.expand_dims(weights != 0, tuple(range(scores.ndim - 1)))
-    scores = jnp.where(mask[..., None] & counts, scores, 0.0)  # infinity times 0 would be no number
+    scores = jnp.where(mask[..., None] & counts, scores, 0.0)  # infinity times 0 would be NaN
     return jnp.matmul(scores, weights.astype(scores.dtype), precision=jax.lax.Precision.HIGHEST)
 
 
-def _standardized(scores: Array, mask: Array) -> Array:
-    """Scores `[C]` with mean 0 and standard deviation 1 over the finite ones of the candidates."""
+def _standardize(scores: Array, mask: Array) -> Array:
+    """Scores `[C]` with mean 0 and standard deviation 1 over the finite scores of candidates."""
     finite = mask & jnp.isfinite(scores)
-    # Relative to one of them, equal scores have no spread that rounding would make.
-    some = jax.lax.stop_gradient(jnp.max(masked(scores, finite, -jnp.inf), initial=-jnp.inf))
-    values = masked(scores - jnp.where(jnp.isfinite(some), some, 0.0), finite)
-    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(values), initial=0.0))  # whose square may be no number
+    # Relative to the maximum, equal scores deviate by exactly 0, without rounding.
+    maximum = jax.lax.stop_gradient(jnp.max(masked(scores, finite, -jnp.inf), initial=-jnp.inf))
+    values = masked(scores - jnp.where(jnp.isfinite(maximum), maximum, 0.0), finite)
+    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(values), initial=0.0))  # its square may overflow
     values = values / jnp.where((largest > 0) & jnp.isfinite(largest), largest, 1.0)
-    mean, spread = masked_mean(values, finite), masked_std(values, finite)
-    return jnp.where(finite, (values - mean) / jnp.where(spread > 0, spread, 1.0), scores)
+    mean, deviation = masked_mean(values, finite), masked_std(values, finite)
+    return jnp.where(finite, (values - mean) / jnp.where(deviation > 0, deviation, 1.0), scores)
 
 
 def indexed(ties: Ties) -> bool:
-    """Whether equal scores go by the row of the database.
+    """Whether ties are broken by the database row.
 
     Raises:
-        InputError: another word.
+        InputError: unknown word.
     """
     require_word("ties", ties, Ties)
     return ties == "index"
 
 
 def rank_shortlist(candidates: Shortlist, scores: np.ndarray, *, ties: Ties = "filter") -> np.ndarray:
-    """Positions `[Q, C]` into the shortlist, best first, those without a candidate last, NumPy.
+    """Positions `[Q, C]` into the shortlist, best first, missing candidates last, NumPy.
 
-    Equal scores keep the filter's order, or go by database index.
+    Equal scores keep the order of the retrieval, or are ordered by database index.
     """
     tie_break = candidates.indices if indexed(ties) else None
     return np.asarray(rank(scores, candidates.mask, tie_break=tie_break))
@@ -179,14 +189,14 @@ def rank_shortlist(candidates: Shortlist, scores: np.ndarray, *, ties: Ties = "f
 def rank(scores: Array, mask: Array | None = None, *, tie_break: Array | None = None) -> Array:
     """Positions `[..., C]` int32 in descending order of `scores` `[..., C]`.
 
-    Stable: ties keep the given order, which is the filter's, or go by ascending `tie_break` `[..., C]`, such as the
-    database index. NaN comes after every number, masked last.
+    Ties keep their order (the order of the retrieval), or are ordered by ascending `tie_break` `[..., C]`, such as the
+    database index. NaN comes after all numbers, masked entries last.
     """
     return _rank(_in_32_bits(scores), mask, _in_32_bits(tie_break))
 
 
 def _in_32_bits(keys: Array | None) -> Array | None:
-    """Smaller whole numbers in the same order, where JAX would cut those of 64 bits."""
+    """Replace 64-bit integers, which JAX would truncate, by smaller integers in the same order."""
     if isinstance(keys, np.ndarray) and keys.dtype in (np.int64, np.uint64):
         return np.unique(keys, return_inverse=True)[1].reshape(keys.shape)
     return keys
@@ -198,7 +208,7 @@ def _rank(scores: Array, mask: Array | None, tie_break: Array | None) -> Array:
     number = present & ~jnp.isnan(scores)
     group = jnp.where(present, jnp.where(number, 0, 1), 2)
     scores = jnp.asarray(scores)
-    # Whole numbers stay what they are. Of those, unsigned ones and the smallest have no negative.
+    # ~ reverses the order of integers, also of unsigned ones and of the smallest, which have no negative.
     descending = -scores if jnp.issubdtype(scores.dtype, jnp.floating) else ~scores
     descending = masked(descending, number, jnp.zeros((), scores.dtype))
     keys = (descending, group) if tie_break is None else (tie_break, descending, group)
@@ -206,5 +216,5 @@ def _rank(scores: Array, mask: Array | None, tie_break: Array | None) -> Array:
 
 
 def rerank(scores: Array, mask: Array | None = None) -> Ranking:
-    """The ranking that `scores` `[..., C]` of a shortlist's candidates give."""
+    """Ranking of a shortlist by the re-ranking `scores` `[..., C]` of its candidates."""
     return Ranking(order=rank(scores, mask), scores=scores)

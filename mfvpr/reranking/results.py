@@ -9,14 +9,14 @@ from mfvpr.datasets.datasets import QuerySequence
 from mfvpr.matching.match_set import MatchSet, Scales
 from mfvpr.types import Shortlist
 
-FILTER = "filter"  # the name of the filter's own ranking
-FRAMES = "frames"  # in the names of those that the queries before take part in
-COHORT = "cohort"  # in the names of those that other places of the map take part in
+FILTER = "filter"  # name of the retrieval's own ranking
+FRAMES = "frames"  # in names of rankings by frame correlation, which uses the queries before
+COHORT = "cohort"  # in names of rankings by scores that are normalized with a cohort
 
 
 @dataclass(frozen=True)
 class Matched:
-    """A sequence's candidates, and their matches by scale; `weights` of the scales, None = 1 each."""
+    """Candidates of a sequence, and their matches by scale; `weights` of the scales, None = 1 each."""
 
     sequence: QuerySequence
     candidates: Shortlist
@@ -27,19 +27,19 @@ class Matched:
 
     @property
     def by_scale(self) -> MatchSet | Scales:
-        """What is scored: several scales are fused, each standardized over a query's candidates."""
+        """Input of scoring; several scales are fused, each standardized over a query's candidates."""
         return self.matches[0] if len(self.matches) == 1 else Scales(self.matches, self.weights)
 
 
 @dataclass(frozen=True)
 class Ranked:
-    """A system's ranking of a sequence: database rows `[Q, C]`, best first, and their scores in that order."""
+    """Ranking of a sequence by one system: database rows `[Q, C]`, best first, and scores in the same order."""
 
     rows: np.ndarray
     scores: np.ndarray
 
     @property
     def shortlist(self) -> Shortlist:
-        """The same, to be written (`mfvpr.io.write_shortlist`) or matched again."""
-        there = self.rows >= 0
-        return Shortlist(indices=self.rows, scores=np.where(there, self.scores, 0), mask=there)
+        """The ranking as a shortlist, to be written (`mfvpr.io.write_shortlist`) or matched again."""
+        mask = self.rows >= 0
+        return Shortlist(indices=self.rows, scores=np.where(mask, self.scores, 0), mask=mask)

@@ -1,8 +1,8 @@
-"""What must see the database before it can work: learned once, kept by what it was learned from, never for another.
+"""Extractors and retrievals with parts that are learned from the database: learn once, and store for that database.
 
     cells = fitted(SsmCells(model), database, archive)
 
-`mfvpr.evaluate` does it for the extractor and the filter that it is given.
+`mfvpr.evaluate` does this for its extractor and its retrieval.
 """
 
 import json
@@ -29,60 +29,66 @@ Tool = TypeVar("Tool")
 
 
 def fitted(tool: Tool, database: ImageFolder, archive: Archive) -> Tool:
-    """An extractor, a filter, or any dataclass that holds some: the same, where it or a part is to be learned, learned.
+    """Learn all parts of an extractor, a retrieval, or any dataclass of these, that are not learned yet.
 
-    Where the archive has a root, what is learned is kept below it, one `.npz` file by the images' content and by all
-    that makes it what it is; a hash of it is part of the recipe of whatever is computed with it.
+    If the archive has a root, a learned part is stored there as one `.npz` file, named by a hash of the images' content
+    and of all settings; this hash is part of the recipe of everything that is computed with it.
 
     Args:
-        tool: what is learned already stays, also where somebody learned it from another database on purpose.
-        database: whose images it learns from.
+        tool: parts that are learned already stay the same, even if they were learned from another database.
+        database: images to learn from.
         archive: see `Archive`.
 
+    Returns:
+        A copy of the tool, or the tool itself if there is nothing to learn.
+
     Raises:
-        InputError: images cannot be read, are too few or too many, or what was kept is damaged or of something else.
+        InputError: images cannot be read, are too few or too many, or a stored file is damaged or of another kind.
     """
     if isinstance(tool, WindowExtractor) and isinstance(tool.whitening, WindowFitting):
-        how = tool.whitening
-        learned = archive.once("whitening", lambda: _whitening(tool, how, database, archive), database, tool)
-        return replace(tool, whitening=learned)  # pyright: ignore[reportArgumentType, reportCallIssue, reportReturnType]
+        fitting = tool.whitening
+        whitening = archive.once("whitening", lambda: _whitening(tool, fitting, database, archive), database, tool)
+        return replace(tool, whitening=whitening)  # pyright: ignore[reportArgumentType, reportCallIssue, reportReturnType]
     if not is_dataclass(tool) or isinstance(tool, type):
         return tool
     parts = {part.name: getattr(tool, part.name) for part in fields(tool) if part.init}
-    learned = {name: fitted(part, database, archive) for name, part in parts.items()}
-    changed = {name: part for name, part in learned.items() if part is not parts[name]}
+    fitted_parts = {name: fitted(part, database, archive) for name, part in parts.items()}
+    changed = {name: part for name, part in fitted_parts.items() if part is not parts[name]}
     return replace(tool, **changed) if changed else tool
 
 
 def whitening_recipe(
-    extractor: WindowExtractor, how: WindowFitting, database: ImageFolder, archive: Archive
+    extractor: WindowExtractor, fitting: WindowFitting, database: ImageFolder, archive: Archive
 ) -> dict[str, Any]:
-    """All that changes what is learned: the images, the network and what it is fed with, windows, draws."""
-    parts = {"windows": archive.recipe_of(extractor.windows), "whitening": archive.recipe_of(how)}
+    """Recipe of a whitening: the images, the network and its input, the windows, and the choice of samples."""
+    parts = {"windows": archive.recipe_of(extractor.windows), "whitening": archive.recipe_of(fitting)}
     return {"format": FORMAT} | archive.recipe(database, extractor.maps) | parts
 
 
-def _whitening(extractor: WindowExtractor, how: WindowFitting, database: ImageFolder, archive: Archive) -> Whitening:
+def _whitening(
+    extractor: WindowExtractor, fitting: WindowFitting, database: ImageFolder, archive: Archive
+) -> Whitening:
+    """Whitening from the archive, learned and stored there if it is missing."""
     if archive.root is None:
-        return _learned(extractor, how, database, archive)
-    recipe = whitening_recipe(extractor, how, database, archive)
+        return _learn(extractor, fitting, database, archive)
+    recipe = whitening_recipe(extractor, fitting, database, archive)
     about, name = fingerprint(recipe), type(extractor).__name__
     path = archive.root / f"{name}-whitening-{about}.npz"
     archive.root.mkdir(parents=True, exist_ok=True)
     with locked(archive.root, "whitening", archive.tell) if not path.exists() else nullcontext():
-        if not path.exists():  # the first counts: bits may differ from machine to machine
-            learned = _learned(extractor, how, database, archive)
+        if not path.exists():  # never replaced, because bits may differ between machines
+            learned = _learn(extractor, fitting, database, archive)
             arrays = {"mean": learned.mean, "components": learned.components, "recipe": np.array(json.dumps(recipe))}
             write_arrays(path, arrays, about)
             archive.tell(
                 f"{name}: whitening of {learned.dimension} dimensions: {path.stat().st_size / _MB:.1f} MB in {path}"
             )
-    kept = read_arrays(path, about)
-    return Whitening(kept["mean"], kept["components"], origin(extractor))
+    arrays = read_arrays(path, about)
+    return Whitening(arrays["mean"], arrays["components"], origin(extractor))
 
 
-def _learned(extractor: WindowExtractor, how: WindowFitting, database: ImageFolder, archive: Archive) -> Whitening:
-    rows, bad = how.drawn(len(database)), {}
+def _learn(extractor: WindowExtractor, fitting: WindowFitting, database: ImageFolder, archive: Archive) -> Whitening:
+    rows, bad = fitting.drawn(len(database)), {}
 
     def maps() -> Iterator[dict[int, np.ndarray]]:
         track = archive.track(f"{type(extractor).__name__} whitening")
@@ -92,4 +98,4 @@ def _learned(extractor: WindowExtractor, how: WindowFitting, database: ImageFold
                 for row, description in batch.items() if description.vector is not None
             }  # fmt: skip
 
-    return replace(how.fit(maps(), extractor.windows, rows), origin=origin(extractor))
+    return replace(fitting.fit(maps(), extractor.windows, rows), origin=origin(extractor))

@@ -1,7 +1,6 @@
-"""What other programs computed, in place of extractors and filters: local features, global descriptors, shortlists.
+"""Files of other programs in place of extractors and retrievals: local features, global descriptors, shortlists.
 
-What was made from files is found again by their content, see `Archive.recipe_of`, wherever they are and whatever they
-are called.
+The cache identifies these files by their content, see `Archive.recipe_of`, not by their path.
 """
 
 from collections.abc import Mapping
@@ -24,21 +23,21 @@ from mfvpr.storage.feature_cache import Archive
 from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError
 
-TYPICAL = 1000  # keypoints of an image, where nobody knows before the file is read
+TYPICAL = 1000  # assumed keypoints of an image before the file is read
 
 
 @dataclass(frozen=True)
 class File:
-    """A file of another program, and what stands before the images' names in it, such as `database/`."""
+    """A file of another program, and the prefix of the images' names in it, such as `database/`."""
 
     path: Path
     prefix: str = ""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "path", Path(self.path))  # recipes know files by type, and tell them by their content
+        object.__setattr__(self, "path", Path(self.path))  # recipes recognize files by this type
 
     def names(self, folder: ImageFolder) -> list[str]:
-        """What a folder's images are called in it."""
+        """Names of a folder's images in the file."""
         return [self.prefix + name for name in folder.names]
 
 
@@ -47,9 +46,9 @@ class FeatureFiles:
     """Local features of another program, see `mfvpr.io.open_features`.
 
     Attributes:
-        files: by the root of the folder whose images they are of.
-        lengths: of descriptors, see there.
-        image_size: (width, height) px, where the files do not tell.
+        files: by the root of the folder of images.
+        lengths: of descriptors, see `mfvpr.io.open_features`.
+        image_size: (width, height) px, if the files do not store it.
     """
 
     files: Mapping[Path, File]
@@ -62,10 +61,10 @@ class FeatureFiles:
     )
 
     def opened(self, folder: ImageFolder, *, partial: bool) -> ImportedFeatures:
-        """The features of a folder's images; `partial`: some may be missing.
+        """Open the features of a folder's images; `partial` allows missing images.
 
         Raises:
-            InputError: there is no file of the folder, an entry stands for an image of another folder as well, or see
+            InputError: the folder has no file, an entry also matches an image of another folder, or see
                 `open_features`.
         """
         file = _file_of(self.files, folder)
@@ -81,9 +80,9 @@ class DescriptorFiles:
     """Candidates by global descriptors of another program, see `mfvpr.io.read_global_descriptors`.
 
     Attributes:
-        files: by the root of the folder whose images they are of.
-        lengths: see there.
-        search: among the descriptors.
+        files: by the root of the folder of images.
+        lengths: see `mfvpr.io.read_global_descriptors`.
+        search: search among the descriptors.
     """
 
     files: Mapping[Path, File]
@@ -115,8 +114,8 @@ class ShortlistFiles:
     """Candidates of another program, see `mfvpr.io.read_shortlist`.
 
     Attributes:
-        files: by the root of the folder of queries that they are for, with the prefix of these.
-        database_prefix: of the database images.
+        files: by the root of the folder of queries, with the prefix of the queries' names.
+        database_prefix: prefix of the database images' names.
     """
 
     files: Mapping[Path, File]
@@ -125,20 +124,19 @@ class ShortlistFiles:
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, archive: Archive
     ) -> Filtered:
-        """See `mfvpr.retrieval.retriever.Filter`; what the sequence excludes is left out, and the others move up."""
+        """See `mfvpr.retrieval.retriever.Filter`; candidates that the sequence excludes are removed."""
         file = _file_of(self.files, sequence.images)
         names = [self.database_prefix + name for name in database.names]
         shortlist, query_entries, database_entries = read_shortlist(file.path, file.names(sequence.images), names)
-        known: ImageOfEntry = {}
-        require_one_image(file.path, database.paths, database_entries, known)
-        require_one_image(file.path, sequence.images.paths, query_entries, known)
+        images: ImageOfEntry = {}
+        require_one_image(file.path, database.paths, database_entries, images)
+        require_one_image(file.path, sequence.images.paths, query_entries, images)
         if sequence.excluded is not None:
             shortlist = _without(shortlist, sequence.excluded.contains(shortlist.indices))
         return Filtered(_cut(shortlist, num_candidates), {}, {})
 
 
 def _file_of(files: Mapping[Path, File], folder: ImageFolder) -> File:
-    """The file of a folder's images."""
     files = {Path(root): file for root, file in files.items()}
     if folder.root not in files:
         known = ", ".join(map(str, files)) or "none"
@@ -148,17 +146,17 @@ def _file_of(files: Mapping[Path, File], folder: ImageFolder) -> File:
 
 
 def _without(shortlist: Shortlist, excluded: np.ndarray) -> Shortlist:
-    """A shortlist `[Q, C]` without some of its candidates; padding at the end."""
-    kept = shortlist.mask & ~excluded
-    order = np.argsort(~kept, axis=1, kind="stable")
-    kept, indices, scores = (
-        np.take_along_axis(values, order, axis=1) for values in (kept, shortlist.indices, shortlist.scores)
+    """Shortlist `[Q, C]` without the `excluded` candidates; the next candidates move up."""
+    mask = shortlist.mask & ~excluded
+    order = np.argsort(~mask, axis=1, kind="stable")
+    mask, indices, scores = (
+        np.take_along_axis(values, order, axis=1) for values in (mask, shortlist.indices, shortlist.scores)
     )
-    return Shortlist(np.where(kept, indices, -1), np.where(kept, scores, 0), kept)
+    return Shortlist(np.where(mask, indices, -1), np.where(mask, scores, 0), mask)
 
 
 def _cut(shortlist: Shortlist, num_candidates: int) -> Shortlist:
-    """To `[Q, num_candidates]`, with padding where there are fewer."""
+    """Shortlist `[Q, num_candidates]`, cut or padded."""
     missing = max(0, num_candidates - shortlist.mask.shape[1])
 
     def cut(values: np.ndarray, fill: float) -> np.ndarray:

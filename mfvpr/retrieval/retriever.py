@@ -1,4 +1,4 @@
-"""The first step of place recognition: which database images are worth a second look, for each image of a sequence."""
+"""Retrieval (the paper's filter): candidates among the database images for each query of a sequence."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from mfvpr.types import Shortlist
 
 
 class Filtered(NamedTuple):
-    """Candidates `[Q, C]` of a sequence's queries; images that the filter could not use, with reasons by row."""
+    """Candidates `[Q, C]` of a sequence's queries, and images that could not be used: row -> reason."""
 
     candidates: Shortlist
     bad_queries: Mapping[int, str]
@@ -24,21 +24,21 @@ class Filtered(NamedTuple):
 
 
 class Filter(Protocol):
-    """How candidates are found.
+    """Interface of a retrieval.
 
-    With a store of matches its recipe is needed, see `mfvpr.utils.fingerprints.recipe_of`: a frozen dataclass has one.
+    A cache of matches needs its recipe, see `mfvpr.utils.fingerprints.recipe_of`: a frozen dataclass has one.
     """
 
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, archive: Archive
     ) -> Filtered:
-        """The best candidates of each query, without those that the sequence excludes.
+        """Best candidates of each query, without database images that the sequence excludes.
 
         Args:
             sequence: Q queries.
             database: N images.
             num_candidates: C.
-            archive: where what is taken from the images is kept.
+            archive: cache of features of the images.
         """
         ...
 
@@ -48,8 +48,8 @@ class Retrieval:
     """Candidates by global descriptors.
 
     Attributes:
-        describer: what describes images, from their pixels or from their local features.
-        search: among the descriptors.
+        describer: computes descriptors from pixels or from local features.
+        search: search among the descriptors.
     """
 
     describer: Extractor | Aggregated
@@ -63,10 +63,11 @@ class Retrieval:
             partial(archive.vectors, database, self.describer, database, label="database"),
             partial(archive.vectors, sequence.images, self.describer, database, label=f"query {sequence.name}"),
         )
-        nothing = ~query_vectors.values.any(axis=1, keepdims=True)  # of no features, which resembles all alike
+        # An image without features has the descriptor 0, which is equally similar to all.
+        is_zero = ~query_vectors.values.any(axis=1, keepdims=True)
         search = archive.once("search", lambda: self.search.fit(database_vectors.values), database, self)
         candidates = search.shortlist(
-            np.where(nothing, np.nan, query_vectors.values),
+            np.where(is_zero, np.nan, query_vectors.values),
             database_vectors.values,
             num_candidates,
             excluded=sequence.excluded,

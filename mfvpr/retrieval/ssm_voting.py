@@ -1,4 +1,4 @@
-"""SSM-VPR's filter (Camara & Preucil, RAS 2020): windows of the query vote for the images of their nearest windows."""
+"""Retrieval of SSM-VPR (Camara & Preucil, RAS 2020): query windows vote for the images of their nearest windows."""
 
 from dataclasses import dataclass
 
@@ -13,19 +13,19 @@ from mfvpr.retrieval.search import EXACT, ExactSearch
 from mfvpr.storage.feature_cache import Archive
 from mfvpr.types import Shortlist
 
-QUERIES = 64  # at a time: their windows' nearest ones are listed together
+QUERIES = 64  # searched at a time
 
 
 @dataclass(frozen=True)
 class SsmVoting:
-    """Candidates by votes: each of the C nearest windows of the database, of each window of the query, is one.
+    """Candidates by votes: each query window votes for the images of its C nearest database windows.
 
-    The public code's order among images of equal votes is that of an unstable sort; here the lowest row comes first.
-    Images without votes fill the shortlist up.
+    Among images with equal votes the lowest row comes first; the public code's unstable sort leaves their order open.
+    Images without votes fill the rest of the shortlist.
 
     Attributes:
-        describer: what gives the windows of an image.
-        search: the memory of the search for the nearest.
+        describer: computes the windows of an image.
+        search: search for the nearest windows.
     """
 
     describer: SsmWindows
@@ -52,14 +52,14 @@ def voted(
     excluded: Positives | None = None,
     search: ExactSearch = EXACT,
 ) -> Shortlist:
-    """Candidates `[Q, C]` by votes, NumPy: most votes first, among equal ones the lowest row.
+    """Candidates `[Q, C]` by votes, NumPy: most votes first, then the lowest row.
 
     Args:
-        queries: `[Q, V, D]` windows; a query that has one that is not finite gets no candidates.
-        database: `[N, V, D]`; an image that has one that is not finite is no candidate.
-        num_candidates: C, and the neighbors of each window that vote.
-        excluded: images that each query may not find: their windows do not vote.
-        search: how many similarities may exist at the same time.
+        queries: `[Q, V, D]` windows; a query with a window that is not finite has no candidates.
+        database: `[N, V, D]` windows; an image with a window that is not finite is no candidate.
+        num_candidates: C, also the number of nearest windows that each query window votes for.
+        excluded: images that must not appear for each query; their windows get no votes.
+        search: search for the nearest windows.
     """
     usable0, usable1 = (np.asarray(np.isfinite(side).all(axis=(1, 2))) for side in (queries, database))
     windows = np.where(usable1[:, None, None], database, np.nan).reshape(-1, database.shape[2])
@@ -69,13 +69,13 @@ def voted(
     scores = np.zeros(indices.shape, np.float32)
     for start in range(0, len(queries), QUERIES):
         part = slice(start, start + QUERIES)
-        refused = ~(usable0[part, None] & usable1[None])
-        hidden = None
+        unusable = ~(usable0[part, None] & usable1[None])
+        excluded_windows = None
         if excluded is not None:
-            refused |= excluded.dense(part)
-            hidden = _windows_of(excluded.take(part), database.shape[1])
-        votes = _votes(queries[part], windows, num_candidates, hidden, search)
-        votes = np.where(refused, -1, votes)
+            unusable |= excluded.dense(part)
+            excluded_windows = _windows_of(excluded.take(part), database.shape[1])
+        votes = _count_votes(queries[part], windows, num_candidates, excluded_windows, search)
+        votes = np.where(unusable, -1, votes)
         order = np.argsort(-votes, axis=1, kind="stable")[:, :num_candidates]
         counts = np.take_along_axis(votes, order, axis=1)
         indices[part, : order.shape[1]] = np.where(counts < 0, -1, order)
@@ -83,24 +83,26 @@ def voted(
     return Shortlist(indices, scores, indices >= 0)
 
 
-def _votes(
+def _count_votes(
     queries: np.ndarray, windows: np.ndarray, num_neighbors: int, excluded: Positives | None, search: ExactSearch
 ) -> np.ndarray:
-    """`[q, N]` of some queries `[q, V, D]`; windows `[N * V, D + 1]` end in minus half their square.
+    """Votes `[q, N]` of queries `[q, V, D]` for images.
 
-    The nearest b to a is that of the largest a . b - |b|^2 / 2.
+    The window b that is nearest to a maximizes a . b - |b|^2 / 2, so that the database windows `[N * V, D + 1]` end in
+    -|b|^2 / 2, and the query windows in 1.
     """
     number, per_image, _ = queries.shape
     num_images = len(windows) // per_image
-    asking = np.concatenate([queries, np.ones((number, per_image, 1), np.float32)], axis=2)
-    nearest = search.shortlist(asking.reshape(number * per_image, -1), windows, num_neighbors, excluded=excluded)
+    query_windows = np.concatenate([queries, np.ones((number, per_image, 1), np.float32)], axis=2)
+    query_windows = query_windows.reshape(number * per_image, -1)
+    nearest = search.shortlist(query_windows, windows, num_neighbors, excluded=excluded)
     images = np.where(nearest.mask, nearest.indices // per_image, num_images).reshape(number, -1)
     places = images + (num_images + 1) * np.arange(number)[:, None]
     return np.bincount(places.reshape(-1), minlength=number * (num_images + 1)).reshape(number, -1)[:, :num_images]
 
 
 def _windows_of(excluded: Positives, per_image: int) -> Positives:
-    """For every window of every query, all windows of the images that the query may not find."""
-    own = np.arange(per_image)
-    rows = [(images[:, None] * per_image + own).reshape(-1) for images in map(excluded.of, range(len(excluded)))]
-    return Positives.from_rows((some for some in rows for _ in own), excluded.num_database * per_image)
+    """Rows of all windows of the images excluded for a query, for every window of the query."""
+    window = np.arange(per_image)
+    rows = [(images[:, None] * per_image + window).reshape(-1) for images in map(excluded.of, range(len(excluded)))]
+    return Positives.from_rows((of_query for of_query in rows for _ in window), excluded.num_database * per_image)
