@@ -149,7 +149,7 @@ def _with_other_numbers(scorer: Any) -> Iterator[Any]:
 
 
 def _gradients(scorer: Any) -> Callable[[Matches], tuple[list[Array], dict[str, Array]]]:
-    """Gradients of one pair's score with respect to the scorer's floating point numbers and to the matches."""
+    """Gradients of one pair's score with respect to the scorer's numbers and to the matches."""
     leaves, structure = jax.tree.flatten(scorer)
     positions = [position for position, leaf in enumerate(leaves) if _is_floating(leaf)]
 

@@ -17,7 +17,7 @@ Class = TypeVar("Class", bound=type)
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))
 def value(cls: Class) -> Class:
-    """Make a class a frozen dataclass and a pytree: JAX may trace, batch and differentiate its fields.
+    """Make a class a frozen dataclass and a pytree, with fields that JAX may transform.
 
         @value
         class Threshold:
@@ -125,7 +125,7 @@ INDICES = ("index0", "index1")  # integer fields, which take part in no arithmet
 
 
 def per_match(matches: Matches) -> dict[str, Array]:
-    """Fields with a value for every match, `[..., K, ...]` by name, without the mask and without None."""
+    """Fields with a value for every match, `[..., K, ...]` by name, without mask and None."""
     return _present(matches, lambda f: f.name != "mask" and not f.metadata.get("per_pair"))
 
 

@@ -1,4 +1,4 @@
-"""Shortlists -> matches of all pairs: batches of queries on all devices, while a thread reads the next features."""
+"""Shortlists -> matches of all pairs, in batches of queries on all devices."""
 
 import itertools
 from collections import deque
@@ -27,7 +27,7 @@ Calls = list[
 
 
 class Part(NamedTuple):
-    """Pairs of a batch of queries, so many that their candidates fit on the device at the same time.
+    """Pairs of a batch of queries with candidates that fit on the device at the same time.
 
     pairs: `[n, 3]` row of the query, position of the candidate in its shortlist, row of the database.
     device: matches these pairs.
@@ -59,7 +59,7 @@ class Sides:
         return self.queries.stage(part.pairs[:, 0]), self.database.stage(part.pairs[:, 2])
 
     def begin(self, staged: tuple[Staged, Staged], matcher: Matcher) -> Calls:
-        """Start matching the pairs of a part on the device: one call per `PAIRS` pairs of the same capacities."""
+        """Start matching a part on the device, a call per `PAIRS` pairs of the same capacities."""
         arrays0, arrays1 = self.queries.put(staged[0]), self.database.put(staged[1])
         capacities, slots = (
             np.stack([getattr(side, name) for side in staged], axis=1) for name in ("capacity", "slot")
@@ -85,7 +85,9 @@ def matched(
     memory: float | None,
     devices: Sequence[Device],
 ) -> Iterator[tuple[int, QueryMatches]]:
-    """Match queries with their candidates: (row, matches of that query), in the order of `todo`, NumPy.
+    """Match queries with their candidates: (row, matches) in the order of `todo`, NumPy.
+
+    A thread reads features while the devices work.
 
     Args:
         queries: Q images.
@@ -131,7 +133,7 @@ def matched(
 def _parts(
     counts0: np.ndarray, counts1: np.ndarray, indices: np.ndarray, todo: np.ndarray, sides: dict[Device, Sides]
 ) -> Iterator[Part]:
-    """Parts of all batches, each batch on the next device; without pairs that have no keypoints on one side."""
+    """Parts of all batches, each batch on the next device; without pairs that lack keypoints."""
     for start, device in zip(range(0, len(todo), QUERIES), itertools.cycle(sides), strict=False):
         batch = todo[start : start + QUERIES]
         rows = indices[batch]
@@ -152,7 +154,7 @@ def _collect(part: Part, positions: np.ndarray, matches: Matches) -> Iterator[tu
 
 
 def _join_candidates(pairs: Sequence[Pair | None], no_matches: Row) -> Matches:
-    """Matches of all candidates, one after the other; images that were not matched get the size 1 x 1 px."""
+    """Matches of all candidates, one after the other; images without a pair have 1 x 1 px."""
     matched_pairs = [pair for pair in pairs if pair is not None]
     rows = ragged.joined([pair.matches for pair in matched_pairs] or [no_matches])
     unknown = np.ones(2, np.float32)

@@ -46,7 +46,7 @@ class LightGlueMatching:
 
     @classmethod
     def of(cls, model: "LightGlue", **options: Any) -> "LightGlueMatching":
-        """Matcher with the weights of a model (`mfvpr.checkpoints.load_model`) and attributes as options."""
+        """Matcher from a model (`mfvpr.checkpoints.load_model`) and further attributes."""
         return cls(jax.jit(type(model).packed)(model), fingerprint(recipe_of(model)), **options)
 
     @property
@@ -56,7 +56,7 @@ class LightGlueMatching:
 
     @property
     def recipe(self) -> dict[str, Any]:
-        """Everything that matches depend on, without the packed weights: their last bits vary between machines."""
+        """Everything that matches depend on; packed weights vary in the last bits between machines."""
         return {
             "network": self.network,
             "filter_threshold": self.filter_threshold,
@@ -64,7 +64,9 @@ class LightGlueMatching:
         }
 
     def __call__(self, features0: Features, features1: Features) -> Matches:
-        """Matches of one pair, keypoints `[N0, 2]` and `[N1, 2]`; slot k of max(N0, 1) is keypoint k of the query.
+        """Matches of one pair, keypoints `[N0, 2]` and `[N1, 2]`.
+
+        There are max(N0, 1) slots; slot k is keypoint k of the query.
 
         Raises:
             InputError: the descriptors have another dimension.

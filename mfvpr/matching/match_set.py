@@ -118,7 +118,7 @@ class MatchSet:
 
 @dataclass(frozen=True)
 class Scales:
-    """Matches of every pair at several scales, such as patches of several sizes: one match set per scale.
+    """Matches of every pair at several scales, such as patch sizes: one match set per scale.
 
     Functions that score a MatchSet accept Scales, too: each scale is scored by itself, then the scores are fused over
     the candidates of a query, see `mfvpr.reranking.ranking.fuse_scales`.
@@ -173,7 +173,7 @@ class Batch(NamedTuple):
 
 
 def slots(match_set: MatchSet, *, settings: float = math.inf) -> np.ndarray:
-    """`[Q, C]` slots of the batch that each pair belongs to: few sizes to compile, with little padding.
+    """`[Q, C]` slots of the batch of each pair: few sizes to compile, with little padding.
 
     Args:
         match_set: the largest size is its capacity, so that subsets have the same sizes.
@@ -187,13 +187,16 @@ def slots(match_set: MatchSet, *, settings: float = math.inf) -> np.ndarray:
 
 
 def shapes(match_set: MatchSet, *, settings: float = math.inf) -> dict[int, int]:
-    """Pairs per batch, by slots; independent of the number of pairs, so that larger sets score with the same bits."""
+    """Pairs per batch, by slots.
+
+    They do not depend on the number of pairs, so that larger sets have scores with the same bits.
+    """
     sizes = np.unique(slots(match_set, settings=settings)).tolist()
     return {size: round_up(BATCH_SLOTS // size, PAIRS_STEP) for size in sizes}
 
 
 def partition(match_set: MatchSet, queries: range, *, settings: float = math.inf) -> list[Batch]:
-    """Batches of all pairs of some queries that have matches; the first batch of each shape comes first."""
+    """Batches of all pairs of some queries that have matches; the first of each shape comes first."""
     part = slice(queries.start, queries.stop)
     counts = match_set.counts[part].reshape(-1)
     sizes = slots(match_set, settings=settings)[part].reshape(-1)
@@ -218,7 +221,7 @@ def batches(match_set: MatchSet, queries: range, *, settings: float = math.inf) 
 
 
 def queries_that_fit(match_set: MatchSet | Scales, num_settings: int) -> int:
-    """Number of queries with padded matches and scores of all settings that fit BLOCK_BYTES, at least one."""
+    """Number of queries, at least 1, with matches and scores that fit into BLOCK_BYTES."""
     bytes_of_query = block_bytes(match_set, num_settings, 1)
     return max(1, min(len(scales(match_set)[0]), BLOCK_BYTES // max(bytes_of_query, 1)))
 

@@ -1,4 +1,4 @@
-"""Matchers of one pair of images as values, and compiled matching of many pairs with any matcher."""
+"""Matchers of one pair of images as values, and compiled matching of many pairs."""
 
 from collections.abc import Callable
 from dataclasses import field, replace
@@ -49,7 +49,9 @@ NEIGHBORS = Matching()
 def match_pairs(
     queries: Features, candidates: Features, pairs: Array, count: int | Array, matcher: Matcher = NEIGHBORS
 ) -> Matches:
-    """Match the first `count` pairs of images; other counts need no new program, and unused pairs cost no time.
+    """Match the first `count` pairs of images.
+
+    Another count needs no new program, and unused pairs cost no time.
 
     Args:
         queries: keypoints `[B, N0, 2]`.

@@ -94,7 +94,7 @@ def _match_candidates(query: Features, candidates: Features, *, chunk_size: int,
 
 
 def pairs_at_once(chunk_size: int | None, query: Features, candidates: Features) -> int:
-    """`chunk_size`, by default 1 on a CPU, where similarities stay in the cache, else what MEMORY_SHARE holds."""
+    """`chunk_size`; by default 1 on a CPU, to stay in its cache, else what MEMORY_SHARE allows."""
     if chunk_size is None:
         available = device_bytes((query, candidates))
         matrix = 4 * query.mask.shape[-1] * candidates.mask.shape[-1] + 1
@@ -107,7 +107,7 @@ def pairs_at_once(chunk_size: int | None, query: Features, candidates: Features)
 def filter_matches(
     matches: Matches, *, max_distance: float | Array | None = None, max_matches: int | None = None
 ) -> Matches:
-    """Keep the matches of one pair with a distance of at most `max_distance`, and the `max_matches` closest of them.
+    """Keep matches of one pair up to `max_distance`, and of these the `max_matches` closest.
 
     Only the mask changes; among equal distances the first slots are kept.
     """
@@ -232,7 +232,7 @@ def distance_ratio(features0: Features, features1: Features) -> Array:
 
 
 def _ratio(features0: Features, features1: Features, similarity: Array) -> Array:
-    """`[N0]` distance to the nearest descriptor over the distance to the second nearest; 1 without a second."""
+    """`[N0]` distance to the nearest over the second nearest descriptor; 1 without a second."""
     nearest1, second1 = nearest_two(similarity)
     has_second = second1.similarity > -jnp.inf
     closest, second = (_distance(features0, features1, side.index, has_second) for side in (nearest1, second1))

@@ -1,4 +1,4 @@
-"""Similarity matrix -> nearest neighbors of its rows and columns; the first index wins a tie.
+"""Nearest neighbors of the rows and columns of a similarity matrix; the first wins a tie.
 
 Each direction reads the matrix once, for the maximum of every block of about 30 entries; then only the block with the
 largest maximum is read again. `argmax` would also read it once, but takes several times longer on XLA's CPU backend.
@@ -15,14 +15,14 @@ BLOCK = 32
 
 
 class Nearest(NamedTuple):
-    """Largest `similarity` `[n]` of every row or column, and its `index` `[n]` int32; 0 if all are -inf."""
+    """Largest `similarity` `[n]` of rows or columns, and its `index` `[n]` int32; 0 if all are -inf."""
 
     index: Array
     similarity: Array
 
 
 def nearest(similarity: Array, axis: int) -> Nearest:
-    """Nearest neighbors of the rows (axis 1) or of the columns (axis 0) of `similarity` `[N0, N1]`."""
+    """Nearest neighbors of the rows (axis 1) or columns (axis 0) of `similarity` `[N0, N1]`."""
     blocks = _blocks(similarity, axis)
     return _find_largest(blocks, jnp.max(blocks, axis=axis + 1), axis)
 
@@ -72,7 +72,7 @@ def _blocks(similarity: Array, axis: int) -> Array:
 
 
 def _find_largest(blocks: Array, maxima: Array, axis: int) -> Nearest:
-    """The largest entry, in the first block that has it; `maxima` of the blocks, -inf to leave a block out."""
+    """Largest entries, by the `maxima` of the blocks; -inf leaves a block out."""
     largest = jnp.max(maxima, axis=axis, keepdims=True)
     block = _first_true(maxima == largest, axis)
     place = _first_true(_take_block(blocks, block, axis) == largest, axis)

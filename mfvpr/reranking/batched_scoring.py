@@ -27,7 +27,7 @@ def score(
     scorers: Mapping[str, Scorer], match_set: MatchSet | Scales, candidates: Shortlist, *,
     devices: Sequence[Device] | None = None, track: Track = untracked,
 ) -> dict[str, np.ndarray]:  # fmt: skip
-    """Scores `[Q, C]` float32 of every query's candidates, by name of the scorer; NaN without a candidate.
+    """Scores `[Q, C]` float32 by name of the scorer; NaN without a candidate.
 
     All scorers together are one program for each shape of a batch, which is reused for other parameter values
     (histograms: up to the next multiple of 8 bins). A pair without matches scores 0.
@@ -75,7 +75,7 @@ def all_batches(match_set: MatchSet | Scales, queries: range, *, settings: float
 def scored(
     program: Callable[..., Any], inputs: tuple, batches: Iterable[PaddedBatch], *, devices: Sequence[Device] | None
 ) -> Iterator[tuple[np.ndarray, Any]]:
-    """Run a program on every batch: (positions `[n]`, arrays `[..., n]`) in the order of the batches, NumPy.
+    """Run a program on every batch: (positions `[n]`, arrays `[..., n]`) in order, NumPy.
 
     Args:
         program: function of Matches `[P, K, ...]` and the inputs that returns arrays `[..., P]`.
@@ -105,7 +105,7 @@ def scored(
 
 
 def fuse_all(match_set: MatchSet | Scales, scores: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Fused scores `[..., Q, C]` of candidates `mask` `[Q, C]`, from scores `[S, ..., Q, C]` of every scale."""
+    """Fused scores `[..., Q, C]` from scores `[S, ..., Q, C]` of all scales; `mask` is `[Q, C]`."""
     if not isinstance(match_set, Scales):
         return scores[0]
     weights = None if match_set.weights is None else np.asarray(match_set.weights, np.float32)

@@ -1,4 +1,6 @@
-"""Score normalization with a cohort: lower the scores of hubs, database images that score high with any query.
+"""Score normalization with a cohort: lower the scores of hubs.
+
+Hubs are database images that score high with any query.
 
     cohort = match_cohort(dataset, 5, extractor, filter)
     scores = score({"histogram": HistogramOfShifts()}, cohort.by_scale, cohort.candidates)["histogram"]
@@ -45,10 +47,10 @@ def cohort_sequence(database: Contents, neighbors: int) -> QuerySequence:
 
 
 def hubness(candidates: Shortlist, scores: np.ndarray, num_database: int, *, who: str = "a scorer") -> np.ndarray:
-    """Hubness of each database image, `[N]` float64 above 0: its mean score with other places over the mean of all.
+    """Hubness of each database image, `[N]` float64 above 0.
 
-    `PRIOR` average scores are added to the scores of each image. The hubness is 1 for an image without scores, and if
-    all scores are 0.
+    The hubness is the mean score of the image with other places, over the mean of all scores. `PRIOR` average scores
+    are added to the scores of each image. The hubness is 1 for an image without scores, and if all scores are 0.
 
     Args:
         candidates: `[M, C]` of the cohort's images.
@@ -69,14 +71,14 @@ def hubness(candidates: Shortlist, scores: np.ndarray, num_database: int, *, who
 
 
 def by_hubness(candidates: Shortlist, scores: np.ndarray, hubness: np.ndarray, *, who: str = "a scorer") -> np.ndarray:
-    """Scores `[Q, C]` divided by the `hubness` `[N]` of the candidates where it is above 1; NumPy float32.
+    """Scores `[Q, C]` divided by the hubness of the candidates, NumPy float32.
 
     A hubness below 1 does not count: an image that hardly matches anything would gain by every match. NaN stays NaN.
 
     Args:
         candidates: `[Q, C]` of a sequence.
         scores: `[Q, C]` of the candidates.
-        hubness: see `hubness`.
+        hubness: `[N]`, see the function `hubness`.
         who: name of the scorer, for the error.
 
     Raises:

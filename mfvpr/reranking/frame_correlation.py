@@ -37,7 +37,7 @@ class FrameCorrelation:
                              "expected at least one query, a finite reach above 0, a finite gain from 0")  # fmt: skip
 
     def __call__(self, candidates: Shortlist, scores: np.ndarray) -> np.ndarray:
-        """Correlated scores `[Q, C]` of a sequence, NumPy float32, from scores `[Q, C]` of its candidates.
+        """Correlated scores `[Q, C]` of a sequence, from scores `[Q, C]`; NumPy float32.
 
         Scores that are not above 0, and NaN, stay the same. Among equal scores the lowest row is the query's place.
         """
@@ -52,7 +52,7 @@ class FrameCorrelation:
         return correlated.astype(np.float32)
 
     def _gains(self, rows: np.ndarray, before: np.ndarray) -> np.ndarray:
-        """`[n]` largest relative gains of candidates by their rows; `before` `[previous, 2]` are places and scores."""
+        """Largest relative gains `[n]` of rows; `before` `[previous, 2]` are places and scores."""
         places, scores = before.T
         best = scores.max()
         strength = scores / best if best > 0 and self.previous > 1 else np.ones(len(scores))

@@ -1,4 +1,4 @@
-"""Scores of one query x C candidates for whole grids of a scorer's parameters: `lax.map` around `vmap`."""
+"""Scores of the candidates of one query for grids of parameters: `lax.map` around `vmap`."""
 
 import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -91,7 +91,7 @@ def refuse_own_names(scorer: Any, names: Iterable[str], reserved: Iterable[str] 
 def by_capacity(
     scorer: Any, settings: Mapping[str, Array], num_settings: int, image_size0: Array, image_size1: Array
 ) -> list[tuple[Any, np.ndarray]]:
-    """Group settings `[G]` by the capacity of bins that they need: (scorer with the capacity, rows of the settings).
+    """Group settings `[G]` by the capacity of bins that they need: (scorer, rows of settings).
 
     There is one group if the scorer needs no capacity or has one, or if settings are traced. Capacities are multiples
     of 8 bins, which keeps programs few and padding small.
@@ -111,7 +111,7 @@ def by_capacity(
 def score_settings(
     scorer: Any, matches: Matches, settings: Mapping[str, Array], weightings: Mapping[str, Array]
 ) -> Array:
-    """Scores `[G, W, C]` of candidates, by one scorer with every combination of G settings and W weightings.
+    """Scores `[G, W, C]` of candidates for every combination of G settings and W weightings.
 
     Settings are scored one after the other, because all at once would leave the cache, and in one traced computation,
     so that other values cost no compilation.
@@ -195,9 +195,10 @@ def _map(function: Callable[[dict[str, Array]], Array], values: Mapping[str, Arr
 
 
 def _on_every_core(function: Callable[[Matches], Any], matches: Matches) -> Any:
-    """`function` of matches `[C, K, ...]`, split over the cores; candidates are the last axis of its results.
+    """`function` of matches `[C, K, ...]`, split over the cores.
 
-    There is a single call for few candidates, on accelerators, and with settings of JAX that threads do not inherit.
+    Candidates are the last axis of its results. There is a single call for few candidates, on accelerators, and with
+    settings of JAX that threads do not inherit.
     """
     cores, count = available_cpus(), len(matches.mask)
     if cores == 1 or count < 4 * cores or platform(matches) != "cpu" or not knows_own_context():

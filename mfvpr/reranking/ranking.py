@@ -1,4 +1,4 @@
-"""One query x C candidates: scores of all candidates, fusion with the retrieval scores, and the ranking.
+"""Scores of the candidates of one query, fusion with the retrieval scores, and the ranking.
 
 Scorers score one pair; this module maps them over candidates. See `mfvpr.reranking.grids` for grids of parameters.
 """
@@ -50,7 +50,7 @@ def check_candidates(matches: Matches) -> None:
 
 
 def matched_sizes(matches: Matches) -> tuple[Array, Array]:
-    """Sizes `[..., 2]` of both images, without pairs that have no matches: their sizes may be anything."""
+    """Sizes `[..., 2]` of both images, without pairs that have no matches and arbitrary sizes."""
     sizes = matches.image_size0, matches.image_size1
     if not is_concrete((matches.mask, sizes)):
         return sizes
@@ -71,9 +71,10 @@ def combine(filter_scores: Array, rerank_scores: Array, *, c: float | Array = 1e
 
 
 def balancing_c(filter_scores: Array, rerank_scores: Array, mask: Array) -> Array:
-    """The `c` `[]` that gives both scores the same standard deviation over one query's candidates `[C]`.
+    """The c `[]` with which both scores have the same standard deviation.
 
-    The paper sets c by hand; this value adapts to detectors with scores in other units.
+    Scores and mask are `[C]`, of one query's candidates. The paper sets c by hand; this value adapts to detectors with
+    scores in other units.
     """
 
     def deviation(scores: Array) -> Array:
@@ -109,7 +110,7 @@ def fuse_shortlist(
 
 
 def filter_scores(candidates: Shortlist, kind: FilterScore = "cosine") -> np.ndarray:
-    """Retrieval scores `[Q, C]` for a combined score: cosine similarity, or minus the Euclidean distance.
+    """Retrieval scores `[Q, C]`: cosine similarity, or minus the Euclidean distance.
 
     Raises:
         InputError: `kind` is unknown, or `negative_euclidean` of scores above 1.
@@ -127,7 +128,9 @@ def filter_scores(candidates: Shortlist, kind: FilterScore = "cosine") -> np.nda
 def fuse_scales(
     scores: Array, mask: Array, weights: Array | None = None, *, normalize: Literal["zscore", "none"] = "zscore"
 ) -> Array:
-    """Weighted sum `[..., C]` of the scores of S scales (as in Patch-NetVLAD) or S scorers; NaN without a candidate.
+    """Weighted sum `[..., C]` of the scores of S scales or scorers; NaN without a candidate.
+
+    Patch-NetVLAD fuses patch sizes in this way.
 
     Args:
         scores: `[..., C, S]` of a query's candidates.
@@ -196,7 +199,7 @@ def rank(scores: Array, mask: Array | None = None, *, tie_break: Array | None = 
 
 
 def _in_32_bits(keys: Array | None) -> Array | None:
-    """Replace 64-bit integers, which JAX would truncate, by smaller integers in the same order."""
+    """Replace 64-bit integers, which JAX truncates, by smaller integers in the same order."""
     if isinstance(keys, np.ndarray) and keys.dtype in (np.int64, np.uint64):
         return np.unique(keys, return_inverse=True)[1].reshape(keys.shape)
     return keys

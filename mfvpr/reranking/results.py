@@ -33,7 +33,7 @@ class Matched:
 
 @dataclass(frozen=True)
 class Ranked:
-    """Ranking of a sequence by one system: database rows `[Q, C]`, best first, and scores in the same order."""
+    """Ranking of a sequence: database rows `[Q, C]`, best first, and scores in this order."""
 
     rows: np.ndarray
     scores: np.ndarray

@@ -1,4 +1,4 @@
-"""Extractors and retrievals with parts that are learned from the database: learn once, and store for that database.
+"""Learn the parts of extractors and retrievals that depend on the database, and store them.
 
     cells = fitted(SsmCells(model), database, archive)
 
@@ -29,7 +29,7 @@ Tool = TypeVar("Tool")
 
 
 def fitted(tool: Tool, database: ImageFolder, archive: Archive) -> Tool:
-    """Learn all parts of an extractor, a retrieval, or any dataclass of these, that are not learned yet.
+    """Learn the parts of an extractor, a retrieval, or a dataclass of these that need a database.
 
     If the archive has a root, a learned part is stored there as one `.npz` file, named by a hash of the images' content
     and of all settings; this hash is part of the recipe of everything that is computed with it.
@@ -60,7 +60,7 @@ def fitted(tool: Tool, database: ImageFolder, archive: Archive) -> Tool:
 def whitening_recipe(
     extractor: WindowExtractor, fitting: WindowFitting, database: ImageFolder, archive: Archive
 ) -> dict[str, Any]:
-    """Recipe of a whitening: the images, the network and its input, the windows, and the choice of samples."""
+    """Recipe of a whitening: images, network and its input, windows, and samples."""
     parts = {"windows": archive.recipe_of(extractor.windows), "whitening": archive.recipe_of(fitting)}
     return {"format": FORMAT} | archive.recipe(database, extractor.maps) | parts
 

@@ -1,4 +1,4 @@
-"""Files of other programs in place of extractors and retrievals: local features, global descriptors, shortlists.
+"""Files of other programs in place of extractors and retrievals.
 
 The cache identifies these files by their content, see `Archive.recipe_of`, not by their path.
 """

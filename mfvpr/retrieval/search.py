@@ -1,4 +1,4 @@
-"""Search by global descriptors -> Shortlist: exact search in chunks, optionally after whitening."""
+"""Search by global descriptors -> Shortlist: exact, in chunks, optionally after whitening."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -30,13 +30,16 @@ class Search(Protocol):
     def shortlist(
         self, queries: np.ndarray, database: np.ndarray, num_candidates: int, *, excluded: Positives | None = None
     ) -> Shortlist:
-        """Candidates `[Q, C]`, NumPy, of queries `[Q, D]` in the database `[N, D]`, without `excluded` images."""
+        """Candidates `[Q, C]` of queries `[Q, D]` in the database `[N, D]`, NumPy.
+
+        Images in `excluded` are no candidates of their queries.
+        """
         ...
 
 
 @dataclass(frozen=True)
 class ExactSearch:
-    """Search for the largest dot products, like `retrieve`, in chunks that do not change the result.
+    """Search for the largest dot products in chunks, with the result of `retrieve`.
 
     Attributes:
         memory: GB of similarities that may exist at the same time, at least those of two queries with 65,536 rows;
@@ -80,7 +83,7 @@ class ExactSearch:
         return jax.tree.map(lambda *fields: np.concatenate(fields), *shortlists)
 
     def _chunk_size(self, num_queries: int, num_rows: int) -> int:
-        """Queries at a time, at least 2, so that similarities to `num_rows` rows fit; chunks have similar sizes."""
+        """Queries at a time, at least 2, with similarities to `num_rows` rows that fit."""
         available = SHARE * free_bytes(device_of(())) if self.memory is None else 1e9 * self.memory
         fitting = max(2, int(available) // 8 // num_rows)  # 8 bytes: a similarity, and its masked copy
         return -(-num_queries // -(-num_queries // fitting))
@@ -91,10 +94,10 @@ EXACT = ExactSearch()
 
 @dataclass(frozen=True)
 class WhitenedSearch:
-    """Search by whitened descriptors: principal components with unit variance, scaled to unit length.
+    """Search by whitened descriptors.
 
-    See Jegou & Chum, ECCV 2012. The components are those of the database: queries lose directions in which the database
-    does not vary.
+    These are principal components with unit variance, scaled to unit length. See Jegou & Chum, ECCV 2012. The
+    components are those of the database: queries lose directions in which the database does not vary.
 
     Attributes:
         dimension: D', number of components.
@@ -155,7 +158,7 @@ class Whitened:
 
 @compiled
 def _whiten(descriptors: Array, mean: Array, components: Array) -> Array:
-    """Principal components `[n, D']` of unit length. As in `retrieve`, a row does not depend on the other rows."""
+    """Principal components `[n, D']` of unit length; a row does not depend on the other rows."""
     rows = _at_least_two(at_least_single(descriptors))
     whitened = jnp.matmul(rows - mean[None], components.T, precision=jax.lax.Precision.HIGHEST)[: len(descriptors)]
     lengths = jnp.linalg.norm(whitened, axis=1, keepdims=True)
@@ -174,7 +177,7 @@ def _shortlist(queries: np.ndarray, database: np.ndarray, num_candidates: int, a
 
 @compiled
 def _best(first: Shortlist, second: Shortlist, start: int) -> Shortlist:
-    """Best candidates of two shortlists `[Q, C]`; rows of the second count from `start`; the first wins ties."""
+    """Merge shortlists `[Q, C]`; rows of the second count from `start`; the first wins ties."""
     second = replace(second, indices=jnp.where(second.mask, second.indices + start, -1))
     both = jax.tree.map(lambda *fields: jnp.concatenate(fields, axis=1), first, second)
     _, place = jax.lax.top_k(masked(both.scores, both.mask, -jnp.inf), first.mask.shape[1])

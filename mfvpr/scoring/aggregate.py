@@ -13,9 +13,13 @@ from mfvpr.utils.numerics import masked, masked_mean, masked_median, positive, s
 
 @value
 class AggregatedScore:
-    """s = sum_k w_k ((W - |x_k - mean x|)^2 + (H - |y_k - mean y|)^2), equation 3, in weight x px^2.
+    """Weighted sum over matches of the closeness of their shift to the mean shift, equation 3.
 
-    (x_k, y_k) is the shift of match k, w_k its weight, and (W, H) the image size, the paper's (x_im, y_im).
+    The score, in units of the weight times px^2, is
+
+        s = sum_k w_k ((W - |x_k - mean x|)^2 + (H - |y_k - mean y|)^2),
+
+    where (x_k, y_k) is the shift of match k, w_k its weight, and (W, H) the image size, the paper's (x_im, y_im).
 
     Attributes:
         weight: match weight, DMF by default as in the paper.

@@ -22,10 +22,15 @@ _LEAST_SHARE = 1e-12  # smallest share of the winner's votes: keeps the gradient
 
 @value
 class AnchorPoints:
-    """s = sum over anchors a of w_a sum over cells b in the window of max(tolerance - |d_a - d_b|, 0), equation 2.
+    """Agreement of the displacements of neighboring cells, equation 2.
 
-    The score does not change if all points of the second image move by the same number of whole cells and stay inside.
-    With tolerance 1 and unit cell weights it counts exact agreements, as SSM-VPR does.
+    The score is summed over all anchors a (the paper's (i, j)) and all cells b in the window N around a (its (k, l)):
+
+        s = sum_a w_a sum_{b in N} max(t - |d_a - d_b|, 0),
+
+    where d are displacements, t is the tolerance, and w_a the weight of the anchor. The score does not change if all
+    points of the second image move by the same number of whole cells and stay inside. With tolerance 1 and unit cell
+    weights it counts exact agreements, as SSM-VPR does.
 
     Attributes:
         num_bins: cells per side. Memory grows with the square of the number of cells, or of matches if there are
@@ -140,19 +145,19 @@ class AnchorPoints:
         return cells, rows, columns, occupancy, cell_weights
 
     def _positions(self, matches: Matches) -> tuple[Array, Array]:
-        """`[K, 2]` (x, y) of the points in the first and in the second image, in cells; 0 on padding."""
+        """`[K, 2]` (x, y) of the points in the first and second image, in cells; 0 on padding."""
         size0, size1 = image_sizes(matches)
         query = masked(at_least_single(matches.points0), matches.mask) * self.num_bins / size0[None]
         candidate = masked(at_least_single(matches.points1), matches.mask) * self.num_bins / size1[None]
         return (query, candidate) if self.first == "query" else (candidate, query)
 
     def _cell(self, position: Array) -> Array:
-        """`[K]` int32 row-major cell of each position; positions outside of the image belong to the border."""
+        """`[K]` int32 row-major cell of each position, clipped to the image."""
         column, row = jnp.clip(jnp.floor(position), 0, self.num_bins - 1).astype(jnp.int32).T
         return row * self.num_bins + column
 
     def _membership(self, position: Array, temperature: Array) -> Array:
-        """`[K, cells]` membership of each position in each cell, row-major; sums to 1 over the cells."""
+        """`[K, cells]` membership of each position in each cell, row-major; a row sums to 1."""
         centers = jnp.arange(self.num_bins, dtype=position.dtype) + 0.5
         distance = jnp.clip(position, 0, self.num_bins)[:, :, None] - centers[None, None]
         along = jax.nn.softmax(-(distance**2) / temperature, axis=-1)  # [K, (x, y), bins]

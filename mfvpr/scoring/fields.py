@@ -1,4 +1,4 @@
-"""Declarations of the fields of scorers: units, bounds, choices and notes, stored in the field's metadata.
+"""Declarations in the metadata of scorers' fields: units, bounds, choices and notes.
 
 Scorers check their words against these declarations. Programs derive settings from them, with bounds, comments and
 sweep axes. Programs write plain values (numbers, words, lists, None); `Parameter.value` converts them to field values.
@@ -82,7 +82,7 @@ class Parameter:
 def number(
     default: float | None, unit: str = "", note: str = "", *, bounds: tuple[float, float] = POSITIVE, **more: Any
 ) -> Any:
-    """Declare a number, which may be traced; None is allowed if the default is None or infinite (None = infinite)."""
+    """Declare a number; None is allowed if the default is None, or infinite (None = infinite)."""
     unlimited = default == math.inf
     plain, none = (None, math.inf) if unlimited else (default, None)
     return _field(default, Parameter(plain, unit, note, bounds=bounds, optional=plain is None, none=none, **more))
@@ -121,12 +121,12 @@ def flag(default: bool, note: str = "") -> Any:
 
 
 def named(values: Mapping[str, Any], default: str, note: str = "", *, file: str = "") -> Any:
-    """Declare one of the values of a table, written as its name, or as a file with the suffix `file`."""
+    """Declare a value of a table, written as its name, or as a file with the suffix `file`."""
     return _field(values[default], Parameter(default, note=note, choices=tuple(values), named=values, file=file))
 
 
 def declared(method: Any) -> dict[str, Parameter]:
-    """Parameters of a class, or of an instance, by field; fields without a declaration are no settings."""
+    """Parameters of a class, or of an instance, by name of the field."""
     return {f.name: f.metadata[_KEY] for f in fields(method) if _KEY in f.metadata}
 
 

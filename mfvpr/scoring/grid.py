@@ -20,7 +20,7 @@ _OUTSIDE = {"unequal": -1000, "zero": 0}
 
 @value
 class GridAnchors:
-    """s = number of pairs (anchor, cell of its patch) that agree, the anchors themselves included.
+    """Number of pairs (anchor, cell of its patch) that agree, the anchors themselves included.
 
     The score counts as the public code does. That code compares flat cell numbers, so that an expected cell may lie at
     the other end of a row (`wrap`), and the padding around the grid takes part (`outside`). With `wrap` False neither
@@ -58,7 +58,9 @@ class GridAnchors:
         return max(1, size - (size % 2 == 0))
 
     def __call__(self, matches: Matches) -> Array:
-        """Score of one pair, `[]` float32; NaN if the number of keypoints is not side^2, or an index is out of range.
+        """Score of one pair, `[]` float32.
+
+        The score is NaN if the number of keypoints is not side^2, or an index is out of range.
 
         Raises:
             InputError: the matches have no `index0` or no `index1`.
@@ -81,7 +83,7 @@ class GridAnchors:
         return jnp.where(usable | ~jnp.any(real), score.astype(jnp.float32), jnp.nan)
 
     def _agreements(self, index: Array, matched: Array, cells: Array) -> Array:
-        """Number of pairs of an anchor and a cell of its patch, both inside the grid, with the same displacement.
+        """Number of pairs that agree, of an anchor and a cell of its patch inside the grid.
 
         Agreement is symmetric, so that half of the offsets suffice: those to the right, and those in the rows below.
         Rows are padded, so that an offset is a shift of the flat array.
@@ -112,7 +114,7 @@ class GridAnchors:
         return 2 * jnp.sum(counts) + jnp.sum(matched, dtype=jnp.int32)
 
     def _agreements_outside(self, index: Array, matched: Array, cells: Array) -> Array:
-        """Number of anchors with a patch cell in the padding, where the value of the padding is the expected cell."""
+        """Number of anchors that agree with the value of the padding around the grid."""
         side, half = self.side, self.size // 2
         row, column = jnp.divmod(cells, side)
         down, right = jnp.divmod(_OUTSIDE[self.outside] - index + half, side)  # the only offset, as n <= side

@@ -42,12 +42,16 @@ class ShiftHistogram(NamedTuple):
 
 @value
 class HistogramOfShifts:
-    """Maximum over bins of s_ij = sum_k w_k exp(-((x_k - x_ij)^2 + (y_k - y_ij)^2) / (2 sigma^2)), equation 1.
+    """Score of the tallest bin of a histogram of shifts with Gaussian votes, equation 1.
 
-    (x_k, y_k) is the shift of match k, w_k its weight, (x_ij, y_ij) the center of bin (i, j). The score does not change
-    with the order of the matches, nor with a translation of all points of one image by a multiple of `bin_size` while
-    the peak stays in range. Numbers are pytree leaves and may be traced or batched; `max_bins` and the choices are
-    static.
+    The score is the maximum over bins (i, j) of
+
+        s_ij = sum_k w_k exp(-((x_k - x_ij)^2 + (y_k - y_ij)^2) / (2 sigma^2)),
+
+    where (x_k, y_k) is the shift of match k, w_k its weight, and (x_ij, y_ij) the center of the bin. The score does not
+    change with the order of the matches, nor with a translation of all points of one image by a multiple of `bin_size`
+    while the peak stays in range. Numbers are pytree leaves and may be traced or batched; `max_bins` and the choices
+    are static.
 
     Attributes:
         bin_size: width of the square bins, px.
@@ -111,7 +115,7 @@ class HistogramOfShifts:
         return where_usable(scores, matches, shifts, weights, lattice.usable(capacity))
 
     def batch_scores_by_weights(self, matches: Matches, weights: Array) -> Array:
-        """`scores_by_weights` of many pairs: matches `[C, K, ...]` and weights `[C, W, K]` -> scores `[C, W]`.
+        """Scores `[C, W]` of pairs `[C, K, ...]` with weights `[C, W, K]`, see `scores_by_weights`.
 
         On a CPU it scores pair by pair, which stays in the cache, and skips most bins by branch and bound where that
         pays. The scores are the same; the time depends on the data.
@@ -148,7 +152,7 @@ class HistogramOfShifts:
         return _dominant_shift(self._fit_to(matches), matches, refine=refine)
 
     def dominant_scale(self, matches: Matches) -> Array:
-        """The one of the `scales` that has the tallest bin, `[]`: the first on a tie, 1 without votes."""
+        """Scale `[]` that has the tallest bin: the first on a tie, 1 without votes."""
         return _dominant_scale(self._fit_to(matches), matches)
 
     def shift_interval(self, matches: Matches, *, level: float = 0.95, sharpness: float = 24.0) -> Array:
@@ -167,15 +171,16 @@ class HistogramOfShifts:
         return _shift_interval(self._fit_to(matches), matches, level, sharpness)
 
     def agrees(self, matches: Matches, shift: Array) -> Array:
-        """Real matches with a shift within two standard deviations of `shift` `[2]` along both axes, `[K]` bool."""
+        """`[K]` bool, matches within two standard deviations of a `shift` `[2]` along both axes."""
         shifts = self._shifts_by_scale(matches)[self._vote(matches)[-1] if len(self.scales) > 1 else 0].T
         near = jnp.all(jnp.abs(shifts - shift[None]) <= 2 * self._deviation(shifts.dtype), axis=-1)
         return near & matches.mask
 
     def with_capacity(self, image_size0: Array, image_size1: Array, *, multiple: int = 1) -> "HistogramOfShifts":
-        """This scorer with `max_bins` set to the bins that its concrete values need, rounded up to a `multiple`.
+        """This scorer with `max_bins` set to the bins that its concrete values need.
 
-        `bin_size` and the sizes may be batched: the capacity suffices for all of them.
+        The number of bins is rounded up to a `multiple`. `bin_size` and the sizes may be batched: the capacity suffices
+        for all of them.
 
         Raises:
             InputError: `bin_size` is not above 0, or so small that more than 1024 bins are needed.
@@ -253,7 +258,7 @@ class HistogramOfShifts:
         return capacity
 
     def _bin_range(self, image_size0: Array, image_size1: Array, dtype: Any, xp: Any) -> tuple[Array, Array]:
-        """Center of the first bin and number of bins, both `[..., 2]` along (x, y); in NumPy or JAX (`xp`)."""
+        """Center of the first bin and number of bins, `[..., 2]` (x, y), in NumPy or JAX (`xp`)."""
         lower, upper = -xp.asarray(image_size0, dtype=dtype), xp.asarray(image_size1, dtype=dtype)
         if self.direction == "query_minus_candidate":
             lower, upper = -upper, -lower

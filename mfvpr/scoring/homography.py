@@ -39,10 +39,11 @@ class Estimate(NamedTuple):
 
 @value
 class Homography:
-    """s = number of inliers of the best homography: matches it maps to within `threshold` of the query's point.
+    """Number of inliers of the best homography that RANSAC finds.
 
-    The samples of a pair depend on its matches alone: the score is the same in any batch, on any number of devices, and
-    for any order of the matches. Each match counts with its confidence. There is no gradient.
+    An inlier is a match with its candidate point mapped to within `threshold` of its query point. The samples of a pair
+    depend on its matches alone: the score is the same in any batch, on any number of devices, and for any order of the
+    matches. Each match counts with its confidence. There is no gradient.
 
     Attributes:
         threshold: largest error of an inlier, px of the query; 8 and 24 in the paper.
@@ -115,7 +116,7 @@ class Homography:
 
 
 class _Search(NamedTuple):
-    """RANSAC among the matches of one pair, in canonical order and in the coordinates of a frame."""
+    """RANSAC of one pair, with matches in canonical order and in the coordinates of a frame."""
 
     measure: str
     each_counts_one: bool
@@ -167,7 +168,7 @@ class _Search(NamedTuple):
         return _closeness(*planes.miss(model, points, self.threshold))
 
     def _compare(self, models: Array) -> tuple[Array, Array, Array]:
-        """(quality, sum of the inliers' counts, number of inliers), `[R]` each, of models `[9, R]`.
+        """Quality, sum of the inliers' counts, and number of inliers, `[R]`, of models `[9, R]`.
 
         Matches are compared `_MATCHES_PER_STEP` at a time: all would leave the cache, one would make too short a step.
         """
@@ -192,7 +193,7 @@ class _Search(NamedTuple):
         return inliers if self.measure == "inliers" else quality, inliers, inliers if self.each_counts_one else number
 
     def _count_samples(self, inliers: Array) -> Array:
-        """Samples needed to draw four inliers with the given probability, at most `max_iterations`."""
+        """Samples needed to draw four inliers with `probability`, at most `max_iterations`."""
         share = inliers / jnp.maximum(jnp.sum(self.counts), 1e-6)
         log_outlier = jnp.log1p(-(jnp.minimum(share, 1.0) ** 4))  # log of the probability that a sample has an outlier
         samples = jnp.round(jnp.log1p(-self.probability) / jnp.where(log_outlier < 0, log_outlier, -1.0))
@@ -201,7 +202,7 @@ class _Search(NamedTuple):
 
 
 def _closeness(error: Array, limit: Array) -> Array:
-    """1 - error / limit, both squared and in the same unit: 1 without error, 0 at the threshold."""
+    """1 - error / limit (squares, in the same unit): 1 without error, 0 at the threshold."""
     return 1.0 - error / jnp.where(limit > 0, limit, 1.0)
 
 

@@ -7,9 +7,9 @@ from mfvpr.types import Array
 
 
 def mass_interval(scores: Array, lattice: Lattice, level: float | Array, sharpness: float | Array) -> Array:
-    """Interval `[2, 2]` (low, high) of (x, y) with the central part of the mass s_ij^sharpness along each axis.
+    """Interval `[2, 2]` (low, high) of (x, y) with the central mass along each axis.
 
-    Mass is spread evenly within a bin. Without votes all bins have the same mass.
+    The mass of a bin is s_ij^sharpness. Mass is spread evenly within a bin. Without votes all bins have the same mass.
 
     Args:
         scores: `[B, B]` (y, x) s_ij, -inf beyond the range of shifts; scores below 0 count as 0.

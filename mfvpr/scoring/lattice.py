@@ -1,4 +1,4 @@
-"""The bins of a histogram of shifts, the votes of matches for them, and the peak between bins. Lengths are pixels."""
+"""Bins of a histogram of shifts, votes for them, and the peak between bins. Lengths are pixels."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -31,7 +31,7 @@ class Lattice(NamedTuple):
         return self.first[axis] + index * self.bin_size
 
     def clip_index(self, axis: int, index: Array) -> Array:
-        """Bin numbers, those beyond the last bin replaced by the last: a repeated bin changes no maximum."""
+        """Bin numbers, at most the last bin; a repeated bin changes no maximum."""
         return jnp.minimum(index, self.num_bins[axis] - 1)
 
     def inside(self, capacity: int) -> Array:
@@ -40,7 +40,7 @@ class Lattice(NamedTuple):
         return (index < self.num_bins[1])[:, None] & (index < self.num_bins[0])[None]
 
     def usable(self, capacity: int) -> Array:
-        """`[]` bool, False if the bins do not fit the capacity, or `deviation` or `truncate` is NaN."""
+        """`[]` bool, whether the bins fit the capacity, and `deviation` and `truncate` are numbers."""
         # Checked here, because XLA's maximum over thousands of values on a CPU skips NaN.
         fits = jnp.all((self.num_bins >= 1) & (self.num_bins <= capacity))
         return fits & ~jnp.isnan(self.deviation) & ~jnp.isnan(self.truncate)
@@ -53,7 +53,7 @@ def gaussian(distance: Array, deviation: Array, truncate: Array) -> Array:
 
 
 def votes(shifts: Array, lattice: Lattice, capacity: int) -> tuple[Array, Array]:
-    """Unweighted votes `[B, K]` of shifts `[2, K]` along x and along y; beyond the last bin those for the last."""
+    """Unweighted votes `[B, K]` of shifts `[2, K]` along x and along y."""
     index = jnp.arange(capacity, dtype=shifts.dtype)
     x, y = (votes_along(axis, index, shifts, lattice) for axis in (0, 1))
     return x, y
@@ -91,9 +91,9 @@ def pool_bins(
     capacity: int,
     pool: Callable[[Array, Array], Array] = tallest,
 ) -> Array:
-    """Scores `[W]` of one pair, `pool(bin scores, inside)`, with several weights `[W, K]` of its matches.
+    """Scores `[W]` of one pair by pooling its bins, with weights `[W, K]` of its matches.
 
-    The Gaussians do not depend on the weights and are evaluated once.
+    `pool(scores, inside)` takes arrays `[B, B]`. The Gaussians do not depend on the weights and are evaluated once.
     """
     votes_x, votes_y = votes(shifts, lattice, capacity)
     inside = lattice.inside(capacity)
@@ -107,9 +107,10 @@ def map_rows(function: Callable[[Array], Array], rows: Array) -> Array:
 
 
 def climb(start: Array, shifts: Array, weights: Array, deviation: Array) -> Array:
-    """Position s `[2]` of the maximum of sum_k w_k exp(-|s - s_k|^2 / (2 sigma^2)) uphill from `start`, to 1e-4 sigma.
+    """Position `[2]` of the maximum of the sum of votes uphill from `start`, to 1e-4 sigma.
 
-    Each step is Newton's or that of mean shift, whichever ends higher. First and second derivatives are exact.
+    The sum of votes for a shift s is sum_k w_k exp(-|s - s_k|^2 / (2 sigma^2)). Each step is Newton's or that of mean
+    shift, whichever ends higher. First and second derivatives are exact.
     """
     fixed = jax.lax.stop_gradient((shifts, weights, deviation))
 
@@ -137,16 +138,16 @@ def climb(start: Array, shifts: Array, weights: Array, deviation: Array) -> Arra
 
 
 def _pull(shift: Array, shifts: Array, weights: Array, deviation: Array) -> tuple[Array, Array]:
-    """Offsets `[K, 2]` of the matches from a shift, and weighted votes `[K]` of the matches for it."""
+    """Offsets `[K, 2]` of the matches from a shift, and their weighted votes `[K]` for it."""
     offsets = shifts - shift[None]
     return offsets, weights * jnp.exp(-0.5 * jnp.sum((offsets / deviation) ** 2, axis=-1))
 
 
 def _steps(shift: Array, shifts: Array, weights: Array, deviation: Array) -> Array:
-    """`[2, 2]` Newton's step and the step of mean shift (Comaniciu & Meer, PAMI 2002), px; 0 without votes.
+    """`[2, 2]` Newton's step and the step of mean shift, px; 0 without votes.
 
-    If the sum of votes is not concave, a multiple of the identity is added to the Hessian, so that Newton's step leads
-    uphill.
+    For mean shift see Comaniciu & Meer, PAMI 2002. If the sum of votes is not concave, a multiple of the identity is
+    added to the Hessian, so that Newton's step leads uphill.
     """
     offsets, pull = _pull(shift, shifts, weights, deviation)
     total = jnp.sum(pull)

@@ -22,10 +22,10 @@ _UNIT_BIAS = math.log(math.e - 1)  # softplus(_UNIT_BIAS) = 1
 
 @value
 class LearnedWeight:
-    """w = softplus(z), z = v . tanh(x M + b) + c, with the standardized inputs x of a match; above 0, without unit.
+    """Learned match weight w = softplus(z), z = v . tanh(x M + b) + c, above 0, without unit.
 
-    `center` and `scale` are statistics without gradient, so that an optimizer does not change them. Exclude them from
-    weight decay with `optax.masked`.
+    x are the standardized inputs of a match. `center` and `scale` are statistics without gradient, so that an optimizer
+    does not change them. Exclude them from weight decay with `optax.masked`.
 
     Attributes:
         center: `[F]` mean of every input.
@@ -91,7 +91,7 @@ class LearnedWeight:
         return jnp.maximum(weights, jnp.finfo(weights.dtype).tiny)  # softplus may underflow
 
     def logits(self, matches: Matches) -> Array:
-        """`[K]` z of one pair: log-odds that a match is correct, if the weight was trained on correct matches.
+        """`[K]` z of one pair: log-odds that a match is correct, if the training taught this.
 
         Raises:
             InputError: the matches have no ratio.

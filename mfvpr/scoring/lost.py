@@ -13,7 +13,7 @@ _SMALLEST = 1e-12  # below what float32 resolves of a cosine distance, and below
 
 @value
 class LostScore:
-    """s = log(1 + 1 / L): the smallest L, LoST's best candidate, has the largest score; 0 without matches.
+    """Score s = log(1 + 1 / L): LoST's best candidate has the smallest L; 0 without matches.
 
     L = (1 - cos(v x0, v x1)) / (n |v|) over the n matches. x0 and x1 are the positions along x in both images, px.
     v = max d - d, where d are the cosine distances of the descriptors, distance^2 / 2, divided by their sum. A match

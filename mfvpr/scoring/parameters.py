@@ -1,4 +1,4 @@
-"""Parameters of a scorer by dotted name (`inner.sigma` for a part), and capacities that fit image sizes."""
+"""Parameters of a scorer by dotted name (`inner.sigma`), and capacities that fit image sizes."""
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
@@ -14,7 +14,7 @@ from mfvpr.types import Array
 
 
 def numbers(scorer: Any) -> dict[str, Any]:
-    """Scalar leaves of a scorer by dotted name, which `score_grid` may vary; also a `temperature` that is None."""
+    """Numbers of a scorer by dotted name, which a grid may vary; also a `temperature` of None."""
     leaves = jax.tree_util.tree_leaves_with_path(scorer, is_leaf=lambda leaf: leaf is None)
     by_name = {
         jax.tree_util.keystr(path, simple=True, separator="."): leaf
@@ -29,12 +29,12 @@ def numbers(scorer: Any) -> dict[str, Any]:
 
 
 def whole_numbers(scorer: Any) -> set[str]:
-    """Names of the `numbers` that are integers, such as indices; their replacements must be integers, too."""
+    """Names of the `numbers` that are integers, such as indices, and must remain integers."""
     return {name for name, number in numbers(scorer).items() if number is not None and _is_whole(number)}
 
 
 def choices(scorer: Any) -> set[str]:
-    """Dotted names of the static fields of a scorer; each value of a static field has its own program."""
+    """Dotted names of the static fields of a scorer, whose values select the compiled program."""
     names = set()
     for field in fields(scorer) if is_dataclass(scorer) else ():
         if field.metadata.get("static"):
@@ -50,10 +50,10 @@ def with_parameters(scorer: Any, values: Mapping[str, Any]) -> Any:
 
 
 def fit(scorer: Any, image_size0: Array, image_size1: Array, *, multiple: int = 1) -> Any:
-    """The scorer with the capacities that pairs of these image sizes need, set before `vmap` or `jit` hide the sizes.
+    """The scorer with the capacities that pairs of these image sizes need.
 
-    Capacities are set by the method `fit_capacity(image_size0, image_size1, multiple)` of a part, if it has one; see
-    `HistogramOfShifts`.
+    Call it before `vmap` or `jit` hide the sizes. Capacities are set by the method `fit_capacity(image_size0,
+    image_size1, multiple)` of a part, if it has one; see `HistogramOfShifts`.
 
     Args:
         scorer: any scorer, or a structure of scorers; parts are looked up at any depth.

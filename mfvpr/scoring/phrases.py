@@ -14,11 +14,12 @@ MAX_LENGTH = 8  # the number of phrases of 100,000 matches still fits into float
 
 @value
 class VisualPhrases:
-    """s = sum over cells of C(m, length), the number of phrases of the m matches with a shift in one cell.
+    """Number of phrases: groups of `length` matches with shifts in the same cell.
 
-    The plane of shifts, points1 - points0, is divided into square cells. Length 1 counts matches, length 2 pairs of
-    matches that agree. A phrase counts the product of its matches' confidences, so that matches of confidence 0 do not
-    count. The score is 0 if no cell has `length` matches.
+    s = sum over cells of C(m, length), where m matches have a shift in the cell. The plane of shifts, points1 -
+    points0, is divided into square cells. Length 1 counts matches, length 2 pairs of matches that agree. A phrase
+    counts the product of its matches' confidences, so that matches of confidence 0 do not count. The score is 0 if no
+    cell has `length` matches.
 
     The score is smooth in the confidences, and constant in the points within a cell (gradient 0). Matches are sorted
     by cell, so that time and memory depend on the number of matches, not of cells.
@@ -58,7 +59,7 @@ class VisualPhrases:
 
 
 def _count_phrases(votes: Array, is_first: Array, length: int) -> Array:
-    """`[K]` phrases that end with each match; matches are sorted by cell, `is_first` marks the first of a cell."""
+    """`[K]` phrases that end with each of the sorted matches; `is_first` begins a cell."""
     empty = jnp.zeros(length, votes.dtype).at[0].set(1.0)
 
     def step(shorter: Array, match: tuple[Array, Array]) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""Homographies of matched points: coordinate frames, models through four matches, errors, and least squares.
+"""Homographies of matched points: frames, models through four matches, errors, least squares.
 
 A model `[9]` is a matrix, row by row, that maps points of the candidate (1) to points of the query (0). Matches are
 `[K, 4]` coordinates x1, y1, x0, y0.
@@ -18,9 +18,10 @@ _EXACT = jax.lax.Precision.HIGHEST
 
 
 class Frame(NamedTuple):
-    """Coordinates in which the points of an image lie within -1 and 1, where single precision is enough.
+    """Coordinates in which the points of an image lie within -1 and 1.
 
-    The frame follows from the image sizes, not from the points: one far point would cost the others their digits.
+    Single precision is enough in these coordinates. The frame follows from the image sizes, not from the points: one
+    far point would cost the others their digits.
 
     center: `[4]`, px; scale: `[2]`, px.
     """
@@ -51,12 +52,12 @@ class Frame(NamedTuple):
 
 
 def through(four: Array) -> Array:
-    """Homographies `[9, S]` through four matches `[4, 4, S]` (x1, y1, x0, y0); no three points may lie on a line.
+    """Homographies `[9, S]` through four matches `[4, 4, S]` (x1, y1, x0, y0).
 
-    The fourth point of the candidate is p_3 = sum_i l_i p_i, where the l_i are ratios of triangles; in the query,
-    q_3 = sum_i m_i q_i. A map from p_i to (m_i / l_i) q_i for i < 3 also maps p_3 to q_3. Hence
-    H = sum_i (m_i / l_i) q_i r_i^T, where the r_i are the rows of the inverse of (p_0 p_1 p_2): the lines through two
-    of these points. H is multiplied by l_0 l_1 l_2, so that it needs no division.
+    No three points may lie on a line. The fourth point of the candidate is p_3 = sum_i l_i p_i, where the l_i are
+    ratios of triangles; in the query, q_3 = sum_i m_i q_i. A map from p_i to (m_i / l_i) q_i for i < 3 also maps p_3 to
+    q_3. Hence H = sum_i (m_i / l_i) q_i r_i^T, where the r_i are the rows of the inverse of (p_0 p_1 p_2): the lines
+    through two of these points. H is multiplied by l_0 l_1 l_2, so that it needs no division.
     """
     x1, y1, x0, y0 = four
     (l0, l1, l2), (m0, m1, m2) = _shares(x1, y1), _shares(x0, y0)
@@ -84,17 +85,17 @@ def through(four: Array) -> Array:
 
 
 def _shares(x: Array, y: Array) -> tuple[Array, Array, Array]:
-    """l_0, l_1, l_2 of the fourth point, up to a common factor that avoids underflow of their products."""
+    """l_0, l_1, l_2 of the fourth point, up to a common factor that avoids underflow."""
     _, a013, a023, a123 = areas(x, y)
     size = jnp.abs(a013) + jnp.abs(a023) + jnp.abs(a123)
     return a123 / size, -a023 / size, a013 / size
 
 
 def miss(model: Array, points: Array, threshold: Array) -> tuple[Array, Array]:
-    """Squared distance of H p1 from p0, and squared threshold, both times (last coordinate of H p1)^2.
+    """Squared distance of H p1 from p0, and squared threshold, up to a common factor.
 
-    The common factor avoids a division. Either models `[9, ...]` and one match `[4]`, or one model and matches
-    `[K, 4]`.
+    The factor, the square of the last coordinate of H p1, avoids a division. Either models `[9, ...]` and one match
+    `[4]`, or one model and matches `[K, 4]`.
     """
     x1, y1, x0, y0 = jnp.moveaxis(points, -1, 0)
     u, v, w = (model[row] * x1 + model[row + 1] * y1 + model[row + 2] for row in (0, 3, 6))
@@ -103,13 +104,13 @@ def miss(model: Array, points: Array, threshold: Array) -> tuple[Array, Array]:
 
 
 def is_inlier(model: Array, points: Array, threshold: Array) -> Array:
-    """Whether the distance of H p1 from p0 is at most the threshold, False for NaN; shapes as in `miss`."""
+    """Whether the distance of H p1 from p0 is at most the threshold; shapes as in `miss`."""
     error, limit = miss(model, points, threshold)
     return error <= limit
 
 
 def least_squares(model: Array, points: Array, weights: Array) -> Array:
-    """Model `[9]` with the least squared error for matches `[K, 4]`, weighted `[K]`, by Levenberg-Marquardt."""
+    """Model `[9]` with the least squared error for matches `[K, 4]`, weighted `[K]`."""
     x1, y1, x0, y0 = points.T
     plane, roots = jnp.stack([x1, y1, jnp.ones_like(x1)]), jnp.sqrt(weights)
     target = jnp.stack([x0, y0])

@@ -1,4 +1,4 @@
-"""Samples of four matches for RANSAC: uniform, never degenerate, the same in any batch and with any padding."""
+"""Samples of four matches for RANSAC: uniform, never degenerate, independent of batch and padding."""
 
 import jax
 import jax.numpy as jnp
@@ -46,7 +46,7 @@ def draw(key: Array, round_number: Array, count: Array) -> Array:
 
 
 def draw_samples(points: Array, key: Array, round_number: Array, count: Array) -> tuple[Array, Array]:
-    """Draw the samples of a round: (x1, y1, x0, y0) of four matches each, `[4, 4, R]`, and the number of samples.
+    """Draw samples: (x1, y1, x0, y0) of four matches each, `[4, 4, R]`, and their number.
 
     Only so many of the R entries are samples. As in OpenCV's findHomography, a draw is rejected if no camera can see
     it: three of the points lie on a line in one image, or some but not all triangles change their orientation.
@@ -77,7 +77,7 @@ def _gather(points: Array, index: Array) -> Array:
 
 
 def _is_degenerate(samples: Array) -> Array:
-    """`[S]` bool: some triangles change their orientation and others do not, or one is flat up to rounding."""
+    """`[S]` bool: some but not all triangles change their orientation, or a triangle is flat."""
     x1, y1, x0, y0 = samples
     same_orientation, flat = [], []
     for area1, area0, (corner, *ends) in zip(areas(x1, y1), areas(x0, y0), _TRIANGLES, strict=True):
@@ -90,7 +90,7 @@ def _is_degenerate(samples: Array) -> Array:
 
 
 def _running_count(hits: Array) -> Array:
-    """`[S]` float32 cumulative sum of booleans, by a small matrix product, which is faster than a scan."""
+    """`[S]` float32 cumulative sum of booleans; a matrix product is faster than a scan."""
     within = jnp.matmul(hits.astype(jnp.float32).reshape(-1, _BLOCK), _TRIANGLE)
     before = jnp.cumsum(within[:, -1]) - within[:, -1]
     return (within + before[:, None]).reshape(-1)

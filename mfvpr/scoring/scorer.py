@@ -32,7 +32,7 @@ def on_host(scorer: Any) -> bool:
 
 
 def check_host(scorer: Any) -> None:
-    """Raise an InputError if a scorer with `score_pairs` is no value: compiled programs would lose the method."""
+    """Raise an InputError if a scorer with `score_pairs` is no value: `jit` loses the method."""
     if on_host(scorer) and jax.tree_util.all_leaves([scorer]):
         raise InputError(f"{type(scorer).__name__}: expected a class with score_pairs that is a value; decorate it "
                          "with @mfvpr.value")  # fmt: skip

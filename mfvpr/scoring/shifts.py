@@ -40,7 +40,10 @@ def _scale_about_center(points: Array, image_size: Array, factor: float) -> Arra
 
 
 def image_sizes(matches: Matches) -> tuple[Array, Array]:
-    """Sizes `[2]` (width, height) of query and candidate, px; an invalid size of a pair without matches becomes 1."""
+    """Sizes `[2]` (width, height) of query and candidate, px.
+
+    An invalid size of a pair without matches is replaced by 1.
+    """
     has_matches = jnp.any(matches.mask)
     size0, size1 = at_least_single(matches.image_size0), at_least_single(matches.image_size1)
     usable = lambda size: has_matches | ((size > 0) & jnp.isfinite(size))  # noqa: E731
@@ -48,7 +51,7 @@ def image_sizes(matches: Matches) -> tuple[Array, Array]:
 
 
 def query_features(matches: Matches) -> Array:
-    """Number of keypoints of the query of one pair, at least 1, `[]` float32: the divisor of scores per feature.
+    """Number of the query's keypoints, at least 1, `[]` float32: divisor of scores per feature.
 
     Raises:
         InputError: the matches have no `count0`.

@@ -37,7 +37,7 @@ _SLACK_PER_MATCH = 2**-22  # relative; covers the rounding of sums
 
 @partial(jax.custom_jvp, nondiff_argnums=(3,))
 def tallest_bins(shifts: Array, weights: Array, lattice: Lattice, capacity: int) -> Array:
-    """Scores `[C, W]` of the tallest bins of C pairs, with W weights of the matches of each pair.
+    """Scores `[C, W]` of the tallest bins of C pairs, with W weights of each match.
 
     The derivative is the one of the maximum over all bins.
 
@@ -68,14 +68,14 @@ def _all_bins(pairs: Any, capacity: int, *, batch_size: int | None = None) -> Ar
 
 
 def search_blocks(shifts: Array, weights: Array, lattice: Lattice, capacity: int) -> tuple[Array, Array]:
-    """Scores `[W]` of the tallest bins found for one pair, and whether no other block can hold a taller bin."""
+    """Scores `[W]` of the tallest bins of one pair, and whether no bin can be taller."""
     side = block_side(capacity)
     count = -(-capacity // side)
     usable = jnp.all(jnp.isfinite(weights), axis=1)
     bounds = block_bounds(shifts, jnp.where(usable[:, None], weights, 0.0), lattice, side, count)
 
     def next_blocks(tallest: Array, open_blocks: Array) -> tuple[Array, Array]:
-        """(factors, blocks) of the open blocks with bounds that exceed the tallest bins by the largest factors."""
+        """(factors, blocks) of open blocks: largest factors by which bounds exceed the tallest bins."""
         below = jnp.where(tallest < 0, jnp.inf, 0.0)  # with negative weights even a bin without votes may be taller
         tallest = jnp.where(tallest > 0, tallest, jnp.finfo(tallest.dtype).tiny)
         factors = jnp.max(bounds / tallest[None, :, None] + below[None, :, None], axis=1).reshape(-1)
@@ -101,7 +101,7 @@ def block_side(capacity: int) -> int:
 
 
 def block_bounds(shifts: Array, weights: Array, lattice: Lattice, side: int, count: int) -> Array:
-    """`[count (y), W, count (x)]` upper bounds of the bins of every block, 0 for blocks out of range."""
+    """Upper bounds `[count (y), W, count (x)]` of the bins of every block, 0 out of range."""
     width = side * lattice.bin_size
     narrow = width <= lattice.deviation
     start = side * jnp.arange(count + 1, dtype=shifts.dtype)
@@ -119,7 +119,7 @@ def block_bounds(shifts: Array, weights: Array, lattice: Lattice, side: int, cou
 
 
 def _block_votes(shifts: Array, axis: int, start: Array, lattice: Lattice, side: int, narrow: Array) -> Array:
-    """`[count + 1, K]` votes along one axis: for the first bin of narrow blocks, else for the nearest bin."""
+    """`[count + 1, K]` votes along one axis for the first bin of narrow blocks, else the nearest."""
     last = lattice.num_bins[axis] - 1
     lower = lattice.centers(axis, start)[:, None]
     upper = lattice.centers(axis, jnp.minimum(start + (side - 1), last))[:, None]

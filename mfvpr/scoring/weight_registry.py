@@ -1,4 +1,4 @@
-"""Match weights by name: the fixed ones, learned ones that the package ships as files, and files of the user."""
+"""Match weights by name: fixed weights, learned weights of the package, and files of the user."""
 
 import os
 from collections.abc import Iterator, Mapping

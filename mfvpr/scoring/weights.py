@@ -33,10 +33,11 @@ class DescriptorDistanceWeight:
 
 @value
 class RatioWeight:
-    """w = (1 - ratio)^exponent, in [0, 1], where ratio = distance to the nearest / second nearest descriptor.
+    """w = (1 - ratio)^exponent, in [0, 1], from the ratio of descriptor distances.
 
-    The ratio tells how ambiguous a match is (Lowe, IJCV 2004, section 7.1): a keypoint that resembles two keypoints of
-    the candidate equally has weight 0. This weight is not from the paper.
+    The ratio is the distance to the nearest over the distance to the second nearest descriptor. It tells how ambiguous
+    a match is (Lowe, IJCV 2004, section 7.1): a keypoint that resembles two keypoints of the candidate equally has
+    weight 0. This weight is not from the paper.
 
     Attributes:
         exponent: a larger exponent emphasizes unambiguous matches; no value is better than 1.
@@ -65,7 +66,7 @@ class UnitWeight:
 
 @value
 class ChosenWeight:
-    """One of several weights, selected by an index that may be traced and batched like any other parameter."""
+    """One of several weights, selected by an index that may be traced and batched."""
 
     options: tuple[Weight, ...]
     index: int | Array
@@ -105,6 +106,6 @@ def match_ratio(matches: Matches) -> Array:
 
 
 def match_confidence(matches: Matches) -> Array:
-    """`[K]` the matches' confidence, by default 1; 0 on padding. A match of confidence 0 does not count."""
+    """`[K]` the matches' confidence, by default 1, and 0 on padding. Confidence 0 means no match."""
     confidence = jnp.ones_like(matches.distance) if matches.confidence is None else matches.confidence
     return masked(at_least_single(confidence), matches.mask)
