@@ -234,7 +234,7 @@ def block_bytes(match_set: MatchSet | Scales, num_settings: int, num_queries: in
     return int(2 * BYTES_PER_SLOT * largest) + score_bytes
 
 
-def split_pairs(matches: Matches) -> list[ragged.Row]:
+def split_pairs(matches: Matches) -> list[dict[str, np.ndarray]]:
     """Real matches of each of the pairs `[P, K, ...]`, by field. NumPy."""
     mask = np.asarray(matches.mask)
     flat = {name: np.asarray(values)[mask] for name, values in per_match(matches).items()}
