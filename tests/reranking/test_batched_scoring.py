@@ -78,7 +78,7 @@ def devices_agree():
 
 
 def test_devices_share_the_batches_and_change_no_bit():
-    code = "from tests.sweeping.test_scores import devices_agree; devices_agree()"
+    code = "from tests.reranking.test_batched_scoring import devices_agree; devices_agree()"
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=8"
     environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
     done = subprocess.run(
