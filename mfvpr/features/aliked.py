@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache, cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +12,7 @@ from jax import Array
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale
-from mfvpr.features.network import compiled, in_batches, require_size
+from mfvpr.features.network import compiled, in_batches, local_features, require_size
 from mfvpr.networks.aliked import Aliked
 from mfvpr.networks.aliked_detection import RADIUS, Detections
 from mfvpr.types import Features
@@ -24,21 +24,24 @@ _PIXELS_PER_SLOT = 40  # photographs have a keypoint in 65 px at most
 
 @dataclass(frozen=True)
 class AlikedFeatures:
-    """What the public code extracts, in its order: row by row; by falling score where there are too many.
+    """ALIKED's keypoints and descriptors, as the public code extracts them.
+
+    Keypoints are in row order, or by falling score if an image has more than `max_keypoints`.
 
     Attributes:
         model: the network with its weights.
         image_size: (width, height) px.
         interpolation: see `mfvpr.datasets.images.resize`.
         threshold: of the detection score, in (0, 1). 0.1 is that of Pivonka & Preucil (IEEE T-IV 2024); its authors'
-            default is 0.2. Where no score of an image is above it, those above the image's mean are taken.
-        max_keypoints: those of the highest scores are kept; None = all.
+            default is 0.2. If no score of an image is above it, keypoints above the image's mean score are taken.
+        max_keypoints: the keypoints of the highest scores are kept; None = all.
         batch_size: images per call.
 
     Raises:
         InputError: images of this size have no room for a keypoint.
     """
 
+    vector_size: ClassVar[int] = 0  # no global descriptor
     model: Aliked
     image_size: tuple[int, int] = (320, 320)
     interpolation: Interpolation = "pil_bilinear"
@@ -52,15 +55,10 @@ class AlikedFeatures:
             raise InputError(f"ALIKED: expected images of {_SMALLEST} x {_SMALLEST} px or more, got {width} x {height}")
 
     @property
-    def vector_size(self) -> int:
-        """0: there is no global descriptor."""
-        return 0
-
-    @property
     def scales(self) -> tuple[Scale, ...]:
-        """One, of 128 dimensions, or 64 of the smallest network.
+        """One scale of 128 dimensions, or 64 of the smallest network.
 
-        One keypoint in 125 px, or `max_keypoints`; aliked-n16rot and aliked-n32 find half to two thirds of that.
+        Images have one keypoint in 125 px, or `max_keypoints`; with aliked-n16rot and aliked-n32, half to two thirds.
         """
         return (Scale(self.model.dimension, min(self._limit, math.prod(self.image_size) // 125)),)
 
@@ -68,19 +66,19 @@ class AlikedFeatures:
         """Local features of each image `[B, H, W, 3]` RGB, 0 .. 255.
 
         Raises:
-            InputError: the images do not have the size asked for.
+            InputError: the images do not have `image_size`.
         """
         require_size("ALIKED", images, self.image_size)
         usual = min(self._limit, math.ceil(math.prod(self.image_size) / _PIXELS_PER_SLOT))
-        found = in_batches(self._program(usual), images, self.batch_size)
-        crowded = [row for row, (detections, _) in enumerate(found) if detections.count > usual]
+        extracted = in_batches(self._program(usual), images, self.batch_size)
+        crowded = [row for row, (detections, _) in enumerate(extracted) if detections.count > usual]
         if crowded and usual < self._limit:
-            most = max(int(found[row][0].count) for row in crowded)
-            roomy = min(self._limit, 1 << (most - 1).bit_length())  # a power of two: few programs, whatever comes
-            again = in_batches(self._program(roomy), images[crowded], self.batch_size)
+            most = max(int(extracted[row][0].count) for row in crowded)
+            capacity = min(self._limit, 1 << (most - 1).bit_length())  # powers of two: few programs for all images
+            again = in_batches(self._program(capacity), images[crowded], self.batch_size)
             for row, result in zip(crowded, again, strict=True):
-                found[row] = result
-        return [Description(local=(self._features(*result),)) for result in found]
+                extracted[row] = result
+        return [Description(local=(self._features(*result),)) for result in extracted]
 
     @property
     def _limit(self) -> int:
@@ -89,7 +87,7 @@ class AlikedFeatures:
 
     @cached_property
     def _program(self) -> Callable[[int], Callable[[Any], Any]]:
-        """By the number of keypoint slots."""
+        """The compiled network for a number of keypoint slots."""
 
         def program(capacity: int) -> Callable[[Any], Any]:
             def extract(model: Aliked, images: Array) -> tuple[Detections, Array]:
@@ -100,11 +98,5 @@ class AlikedFeatures:
         return cache(program)
 
     def _features(self, detections: Detections, descriptors: np.ndarray) -> Features:
-        kept = np.flatnonzero(detections.mask)
-        return Features(
-            keypoints=np.asarray(detections.keypoints)[kept],
-            descriptors=descriptors[kept],
-            scores=np.asarray(detections.scores)[kept],
-            mask=np.ones(len(kept), bool),
-            image_size=np.array(self.image_size, np.float32),
-        )
+        keypoints, scores, mask = map(np.asarray, (detections.keypoints, detections.scores, detections.mask))
+        return local_features(keypoints[mask], descriptors[mask], self.image_size, scores[mask])

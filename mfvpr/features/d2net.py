@@ -2,14 +2,14 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property, partial
-from typing import Any
+from functools import cache, cached_property, partial
+from typing import Any, ClassVar
 
 import numpy as np
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale
-from mfvpr.features.network import compiled, in_batches, require_size
+from mfvpr.features.network import compiled, in_batches, local_features, require_size
 from mfvpr.networks.d2net import SCALES, STRIDE, D2Net, Detections, extract, map_size
 from mfvpr.networks.imagenet import Preprocessing
 from mfvpr.types import Features
@@ -21,7 +21,9 @@ _SMALLEST_MAP = 2
 
 @dataclass(frozen=True)
 class D2NetFeatures:
-    """What the public code extracts, in its order; scores are activations, which other images' do not compare with.
+    """D2-Net's keypoints and descriptors, as the public code extracts them and in its order.
+
+    Scores are activations, which are not comparable between images.
 
     Attributes:
         model: the network with its weights.
@@ -29,13 +31,14 @@ class D2NetFeatures:
         interpolation: see `mfvpr.datasets.images.resize`.
         preprocessing: "caffe" as published, or "torch".
         multiscale: detect at half, full and double size as well, in this order.
-        max_keypoints: those of the highest scores are kept, in the same order; None = all.
+        max_keypoints: the keypoints of the highest scores are kept, in the same order; None = all.
         batch_size: images per call.
 
     Raises:
         InputError: images of this size are too small for the network.
     """
 
+    vector_size: ClassVar[int] = 0  # no global descriptor
     model: D2Net
     image_size: tuple[int, int] = (336, 336)
     interpolation: Interpolation = "pil_bilinear"
@@ -54,15 +57,10 @@ class D2NetFeatures:
             )
 
     @property
-    def vector_size(self) -> int:
-        """0: there is no global descriptor."""
-        return 0
-
-    @property
     def scales(self) -> tuple[Scale, ...]:
-        """One, of 512 dimensions: all of the network's own scales are one set of features.
+        """One scale of 512 dimensions, with the features of all of the network's own scales.
 
-        740 at 336 x 336 px, and in proportion to the map's size; 1.4 times as many with all scales.
+        Images have 740 features at 336 x 336 px, in proportion to the map's size, and 1.4 times as many multi-scale.
         """
         width, height = self.image_size
         share = map_size(width) * map_size(height) / map_size(336) ** 2
@@ -73,41 +71,29 @@ class D2NetFeatures:
         """Local features of each image `[B, H, W, 3]` RGB, 0 .. 255.
 
         Raises:
-            InputError: the images do not have the size asked for.
+            InputError: the images do not have `image_size`.
         """
         require_size("D2-Net", images, self.image_size)
-        found = in_batches(self._usual_program, images, self.batch_size)
-        crowded = [row for row, levels in enumerate(found) if any(level.count > len(level.mask) for level in levels)]
-        for row, levels in zip(crowded, in_batches(self._roomy_program, images[crowded], self.batch_size), strict=True):
-            found[row] = levels
-        return [Description(local=(self._features(levels),)) for levels in found]
+        results = in_batches(self._program(_SHARE), images, self.batch_size)
+        crowded = [row for row, levels in enumerate(results) if any(level.count > len(level.mask) for level in levels)]
+        for row, levels in zip(crowded, in_batches(self._program(1.0), images[crowded], self.batch_size), strict=True):
+            results[row] = levels
+        return [Description(local=(self._features(levels),)) for levels in results]
 
     @property
     def _network_scales(self) -> tuple[float, ...]:
         return SCALES if self.multiscale else (1.0,)
 
     @cached_property
-    def _usual_program(self) -> Callable[..., Any]:
-        return self._program(_SHARE)
-
-    @cached_property
-    def _roomy_program(self) -> Callable[..., Any]:
-        return self._program(1.0)
-
-    def _program(self, share: float) -> Callable[..., Any]:
-        function = partial(extract, preprocessing=self.preprocessing, scales=self._network_scales, share=share)
-        return compiled(self.model, function)
+    def _program(self) -> Callable[[float], Callable[..., Any]]:
+        """The compiled network for a share of positions that have a keypoint slot."""
+        function = partial(extract, preprocessing=self.preprocessing, scales=self._network_scales)
+        return cache(lambda share: compiled(self.model, partial(function, share=share)))
 
     def _features(self, levels: tuple[Detections, ...]) -> Features:
         keypoints, descriptors, scores = (
             np.concatenate([getattr(level, name)[level.mask] for level in levels])
             for name in ("keypoints", "descriptors", "scores")
         )
-        kept = np.sort(np.argsort(-scores, kind="stable")[: self.max_keypoints])
-        return Features(
-            keypoints=keypoints[kept],
-            descriptors=descriptors[kept],
-            scores=scores[kept],
-            mask=np.ones(len(kept), bool),
-            image_size=np.array(self.image_size, np.float32),
-        )
+        strongest = np.sort(np.argsort(-scores, kind="stable")[: self.max_keypoints])
+        return local_features(keypoints[strongest], descriptors[strongest], self.image_size, scores[strongest])

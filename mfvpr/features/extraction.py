@@ -1,23 +1,19 @@
-"""Images -> descriptions of a whole folder: threads decode while the device works."""
+"""Extract descriptions of a folder's images: threads decode while the device works."""
 
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import fields
-from functools import partial
-from typing import TypeVar
 
 import numpy as np
 
 from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.datasets.images import Interpolation, resize
+from mfvpr.datasets.images import resize
 from mfvpr.features.extractor import Description, Extractor
 from mfvpr.features.feature_set import check_features, without_padding
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import available_cpus
 from mfvpr.utils.progress import Track, untracked
 from mfvpr.utils.threads import ordered_map
-
-Item = TypeVar("Item")
 
 
 def described(
@@ -29,102 +25,88 @@ def described(
     skip_bad: bool = False,
     track: Track = untracked,
 ) -> Iterator[dict[int, Description]]:
-    """Descriptions of some images by row, batch by batch.
+    """Extract descriptions of the images in `rows`, by row, batch by batch.
 
     Args:
         folder: the images.
-        extractor: what turns images into descriptions.
-        rows: which.
-        bad: gets the reason, by row, of images that are not used: those that cannot be read, if they are skipped, and
-            those whose description is not finite.
-        skip_bad: go on where an image cannot be read, instead of raising.
+        extractor: images -> descriptions.
+        rows: of the images.
+        bad: images that are not used are added to it, row -> reason: images that cannot be read (if they are skipped),
+            and images whose description is not finite.
+        skip_bad: skip images that cannot be read, instead of raising.
         track: progress.
 
     Raises:
         InputError: an image cannot be read (unless `skip_bad`).
     """
-    for part, images in _image_batches(folder, rows, extractor, skip_bad, bad, track):
-        found = dict(zip(part, described_images(images, extractor), strict=True))
-        for row in (row for row, description in found.items() if description is None):
-            bad[row] = f"{folder.paths[row]}: features are not finite (NaN or infinite); the image ranks last"
-        yield {row: description for row, description in found.items() if description is not None}
+    images = _readable_images(folder, rows, extractor, skip_bad, bad, track)
+    while batch := list(itertools.islice(images, extractor.batch_size)):
+        batch_rows, arrays = zip(*batch, strict=True)
+        descriptions = {}
+        for row, description in zip(batch_rows, described_images(np.stack(arrays), extractor), strict=True):
+            if description is None:
+                bad[row] = f"{folder.paths[row]}: features are not finite (NaN or infinite); the image ranks last"
+            else:
+                descriptions[row] = description
+        yield descriptions
 
 
 def described_images(images: np.ndarray, extractor: Extractor) -> list[Description | None]:
-    """Descriptions of images `[B, H, W, 3]` of the extractor's size; None of one that is not finite.
+    """Extract descriptions of images `[B, H, W, 3]` of the extractor's size; None if a description is not finite.
 
     Raises:
-        InputError: the extractor gives something else than it says.
+        InputError: the extractor returns something else than its `scales` and `vector_size` promise.
     """
-    found = _checked(list(extractor(images)), extractor, len(images))
-    return [description if _finite(description) else None for description in found]
+    descriptions = list(extractor(images))
+    _check_descriptions(descriptions, extractor, len(images))
+    unpadded = (Description(vector, tuple(map(without_padding, local))) for vector, local in descriptions)
+    return [description if _is_finite(description) else None for description in unpadded]
 
 
-def _checked(descriptions: list[Description], extractor: Extractor, number: int) -> list[Description]:
-    """What an extractor of somebody's own gives.
-
-    Raises:
-        InputError: not what it says.
-    """
-    who, scales = type(extractor).__name__, extractor.scales
-    if len(descriptions) != number:
-        raise InputError(f"{who}: expected a Description of each of {number} images, got {len(descriptions)}")
-    for one in descriptions:
-        if not isinstance(one, Description):
-            raise InputError(f"{who}: expected a Description, got {type(one).__name__}; return "
+def _check_descriptions(descriptions: list[Description], extractor: Extractor, num_images: int) -> None:
+    name, expected = type(extractor).__name__, [scale.dimension for scale in extractor.scales]
+    if len(descriptions) != num_images:
+        raise InputError(f"{name}: expected a Description of each of {num_images} images, got {len(descriptions)}")
+    for description in descriptions:
+        if not isinstance(description, Description):
+            raise InputError(f"{name}: expected a Description, got {type(description).__name__}; return "
                              "Description(vector, (features,))")  # fmt: skip
-        for local in one.local:
-            check_features(local, f"{who}: features", unit_length=False)
-        sizes = [local.descriptors.shape[-1] for local in one.local]
-        if sizes != (expected := [scale.dimension for scale in scales]):
-            raise InputError(f"{who}: expected local features of {expected} dimensions, as its scales say, got {sizes}")
-        if (size := 0 if one.vector is None else np.size(one.vector)) != extractor.vector_size:
-            raise InputError(f"{who}: vector_size={extractor.vector_size}, but a description with {size} numbers")
-    return [Description(one.vector, tuple(map(without_padding, one.local))) for one in descriptions]
+        vector, local = description
+        for features in local:
+            check_features(features, f"{name}: features", unit_length=False)
+        if (got := [features.descriptors.shape[-1] for features in local]) != expected:
+            raise InputError(f"{name}: expected local features of {expected} dimensions, as its scales say, got {got}")
+        if (size := 0 if vector is None else np.size(vector)) != extractor.vector_size:
+            raise InputError(f"{name}: vector_size={extractor.vector_size}, but a description with {size} numbers")
 
 
-def _image_batches(
+def _readable_images(
     folder: ImageFolder,
-    wanted: Sequence[int],
+    rows: Sequence[int],
     extractor: Extractor,
     skip_bad: bool,
     bad: dict[int, str],
     track: Track,
-) -> Iterator[tuple[list[int], np.ndarray]]:
-    """(rows, images `[B, H, W, 3]`) of the readable ones among `wanted`; the reasons of the others go into `bad`."""
-    load = partial(_load, folder, size=extractor.image_size, interpolation=extractor.interpolation)
+) -> Iterator[tuple[int, np.ndarray]]:
+    """(row, image `[H, W, 3]`) of readable images; the reasons of the others are added to `bad`."""
 
-    def readable() -> Iterator[tuple[int, np.ndarray]]:
-        images = ordered_map(load, wanted, workers=available_cpus())
-        for row, image in zip(wanted, track(images, len(wanted)), strict=True):
-            if isinstance(image, InputError):
-                if not skip_bad:
-                    raise InputError(f"{image}, or skip bad images")
-                bad[row] = str(image)
-            else:
-                yield row, image
+    def load(row: int) -> np.ndarray | InputError:
+        try:
+            return resize(folder.read(row), extractor.image_size, extractor.interpolation)
+        except InputError as error:
+            return error
 
-    for batch in _batches(readable(), extractor.batch_size):
-        rows, images = zip(*batch, strict=True)
-        yield list(rows), np.stack(images)
-
-
-def _load(
-    folder: ImageFolder, row: int, *, size: tuple[int, int], interpolation: Interpolation
-) -> np.ndarray | InputError:
-    try:
-        return resize(folder.read(row), size, interpolation)
-    except InputError as error:
-        return error
+    images = ordered_map(load, rows, workers=available_cpus())
+    for row, image in zip(rows, track(images, len(rows)), strict=True):
+        if not isinstance(image, InputError):
+            yield row, image
+        elif skip_bad:
+            bad[row] = str(image)
+        else:
+            raise InputError(f"{image}, or skip bad images")
 
 
-def _batches(items: Iterable[Item], size: int) -> Iterator[list[Item]]:
-    iterator = iter(items)
-    while batch := list(itertools.islice(iterator, size)):
-        yield batch
-
-
-def _finite(description: Description) -> bool:
+def _is_finite(description: Description) -> bool:
     arrays = [getattr(local, part.name) for local in description.local for part in fields(local)]
     arrays += [] if description.vector is None else [description.vector]
     return all(np.isfinite(array).all() for array in arrays)

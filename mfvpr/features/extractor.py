@@ -1,4 +1,4 @@
-"""Extractors, aggregations and sources of features, as protocols, and the descriptions that they give."""
+"""Protocols of extractors, aggregations and sources of features, and the descriptions that they return."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,11 +13,11 @@ from mfvpr.types import Features
 
 
 class Scale(NamedTuple):
-    """Local features of one scale.
+    """One scale of an extractor's local features.
 
     dimension: D of the descriptors.
-    typical_count: of an image's features, for forecasts of space.
-    weight: of its score, where those of several scales are fused.
+    typical_count: usual number of features in an image, for forecasts of disk space.
+    weight: weight of the scale's score when the scores of several scales are fused.
     """
 
     dimension: int
@@ -26,10 +26,10 @@ class Scale(NamedTuple):
 
 
 class Description(NamedTuple):
-    """What one pass over an image gives. NumPy.
+    """Global descriptor and local features of one image, as NumPy arrays.
 
-    vector: `[D]` global descriptor of unit length, or several `[V, D]`; None = none.
-    local: Features by scale, unpadded, mask all True; () = none.
+    vector: `[D]` global descriptor of unit length, or several `[V, D]`; None = no global descriptor.
+    local: Features by scale, without padding (mask all True); () = no local features.
     """
 
     vector: np.ndarray | None = None
@@ -37,10 +37,10 @@ class Description(NamedTuple):
 
     @property
     def features(self) -> Features:
-        """Of the only scale.
+        """The features of the only scale.
 
         Raises:
-            ValueError: there are several, or none.
+            ValueError: there are several scales, or none.
         """
         if len(self.local) != 1:
             raise ValueError(f"expected features of one scale, got {len(self.local)}; see `local`")
@@ -51,17 +51,17 @@ class Description(NamedTuple):
 class Extractor(Protocol):
     """Images `[B, H, W, 3]` uint8 RGB -> a Description of each.
 
-    With a store its recipe is needed, see `mfvpr.utils.fingerprints.recipe_of`: a frozen dataclass has one.
+    A cache needs the extractor's recipe, see `mfvpr.utils.fingerprints.recipe_of`; every frozen dataclass has one.
     """
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """(width, height) that images are squashed to."""
+        """(width, height) that images are resized to, px."""
         ...
 
     @property
     def interpolation(self) -> Interpolation:
-        """How they are squashed."""
+        """Interpolation of the resizing, see `mfvpr.datasets.images.resize`."""
         ...
 
     @property
@@ -71,12 +71,12 @@ class Extractor(Protocol):
 
     @property
     def vector_size(self) -> int:
-        """Numbers of the global descriptor; 0 = there is none."""
+        """Length of the global descriptor; 0 = no global descriptor."""
         ...
 
     @property
     def scales(self) -> tuple[Scale, ...]:
-        """Of the local features; () = there are none."""
+        """Scales of the local features; () = no local features."""
         ...
 
     def __call__(self, images: np.ndarray) -> list[Description]: ...
@@ -87,47 +87,47 @@ class Aggregation(Protocol):
 
     @property
     def vector_size(self) -> int:
-        """D."""
+        """Length D of a global descriptor."""
         ...
 
     def __call__(self, images: Sequence[Features]) -> np.ndarray: ...
 
 
 class Fitting(Protocol):
-    """What an aggregation is before it has seen the database."""
+    """Settings of an aggregation that is learned from the database."""
 
     def fit(self, database: FeatureSet) -> Aggregation:
-        """Fitted on the database's local features; the same ones give the same aggregation."""
+        """Fit the aggregation to the database's local features; equal features give equal aggregations."""
         ...
 
 
 @runtime_checkable
 class Source(Protocol):
-    """What has local features of folders of images, without extracting them."""
+    """Local features of folders of images that were extracted elsewhere."""
 
     @property
     def image_size(self) -> tuple[int, int] | None:
-        """(width, height) of the images that the keypoints are in; None = as the files are."""
+        """(width, height) of the images that the keypoints are in, px; None = the size of the image files."""
         ...
 
     @property
     def interpolation(self) -> Interpolation:
-        """How images are squashed to it."""
+        """Interpolation of the resizing to `image_size`."""
         ...
 
     @property
     def scales(self) -> tuple[Scale, ...]:
-        """One."""
+        """The only scale."""
         ...
 
     def opened(self, folder: ImageFolder, *, partial: bool) -> FeatureSource:
-        """The features of a folder's images; `partial`: some may be missing."""
+        """The features of a folder's images; if `partial`, features of some images may be missing."""
         ...
 
 
 @dataclass(frozen=True)
 class Aggregated:
-    """Global descriptors that are computed from an extractor's local features, once the database's are known."""
+    """Global descriptors that are aggregated from local features, by an aggregation that is fitted to the database."""
 
     extractor: Extractor | Source
     fitting: Fitting

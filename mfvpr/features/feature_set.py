@@ -1,7 +1,7 @@
-"""Features on demand: where the local features of many images come from, and the few that lie on a device just now.
+"""Sources of local features, and the features that are on a device at the moment.
 
-A data set's features need not fit into memory. They stay where they are (a store, a file of another program, a list),
-known by their counts; rows are read when somebody matches them, and kept on the device until others need the room.
+A data set's features need not fit into memory. They stay in their source (a store, a file of another program, a list);
+only their counts are always known. Rows are read when they are matched, and stay on the device until it is full.
 """
 
 import itertools
@@ -20,30 +20,29 @@ from mfvpr.utils import ragged
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import Device, compiled, free_bytes, round_up
 
-SHARE = 1 / 3  # of the free memory, where nobody says how much
+SHARE = 1 / 3  # of the free memory, by default
 STEP = 32  # capacities are multiples of it
 WRITTEN = 16  # rows that go to the device at a time: one program
-KEPT, STAGED = 3 / 5, 1 / 24  # of the budget: for rows that stay, and for each of the parts on their way, up to six
+KEPT, STAGED = 3 / 5, 1 / 24  # of the budget: for rows that stay, and for each of up to six parts on their way
 
 
 class FeatureSource(Protocol):
-    """Local features of M images, in rows."""
+    """Local features of M images, by row."""
 
     @property
     def counts(self) -> np.ndarray:
-        """`[M]` int keypoints of each image; below 0 = there are none to be read."""
+        """Number of keypoints of each image, `[M]` int; below 0 = the image has no features to read."""
         ...
 
     def read(self, rows: Iterable[int] | None = None) -> Iterator[tuple[int, Features]]:
-        """(row, Features `[n, ...]`, NumPy, without padding) of the rows asked for, in their order; by default all."""
+        """Read (row, Features `[n, ...]`, NumPy, without padding) of `rows`, in their order; by default of all."""
         ...
 
 
 class InMemory:
-    """A source of features that are in memory, `[n, ...]` each, without padding."""
+    """A source of features in memory: Features `[n, ...]` without padding, by row of `total` images."""
 
     def __init__(self, images: Mapping[int, Features], total: int) -> None:
-        """Of `total` images; rows that are not among `images` have none to be read."""
         self._images = images
         self.counts = np.array([len(images[row].mask) if row in images else -1 for row in range(total)], int)
 
@@ -57,8 +56,8 @@ class FeatureSet:
     """Local features of all images of a folder, of one scale.
 
     Attributes:
-        source: where they are.
-        bad: reason by row, for images that are not used: they gave no usable features, or no usable global descriptor.
+        source: where the features are.
+        bad: images without usable features or without a usable global descriptor: row -> reason.
     """
 
     source: FeatureSource
@@ -66,15 +65,15 @@ class FeatureSet:
 
     @classmethod
     def of(cls, images: Sequence[Features], *, unit_length: bool = True) -> "FeatureSet":
-        """Features of your own, image by image `[N_i, ...]`, of as many keypoints as each has; padding is dropped.
+        """Make a set from your own features, one `[N_i, ...]` per image; padding is dropped.
 
         Args:
             images: at least one.
-            unit_length: whether descriptors must be of unit length, as for the weight 2 - distance; what is matched is
-                the largest dot product, of whatever length.
+            unit_length: whether descriptors must be of unit length, as the weight 2 - distance requires. Matching looks
+                for the largest dot product, and takes descriptors of any length.
 
         Raises:
-            InputError: there are none, their arrays do not fit, or descriptors are not of unit length.
+            InputError: no images, arrays of wrong shapes, or descriptors that are not of unit length.
         """
         if not images:
             raise InputError("FeatureSet.of: expected the features of at least one image, got none")
@@ -89,7 +88,7 @@ class FeatureSet:
 
     @property
     def counts(self) -> np.ndarray:
-        """`[M]` int keypoints of each image, 0 where there are none to be read."""
+        """Number of keypoints of each image, `[M]` int; 0 if the image has no features to read."""
         return np.maximum(self.source.counts, 0)
 
     def __len__(self) -> int:
@@ -107,24 +106,24 @@ class FeatureSet:
 
     @property
     def keypoint_bytes(self) -> int:
-        """Bytes of one keypoint with all that belongs to it, as the first image says that has any."""
+        """Bytes of one keypoint with its descriptor, score and mask."""
         return sum(values[:1].nbytes for values in per_keypoint(self._example).values())
 
     @property
     def dimension(self) -> int:
-        """Numbers of a descriptor, likewise."""
+        """Length of a descriptor."""
         return self._example.descriptors.shape[1]
 
     def read(self, rows: Iterable[int]) -> Iterator[tuple[int, Features]]:
-        """(row, Features `[n, ...]`) of those among `rows` that have keypoints."""
+        """Read (row, Features `[n, ...]`) of the images in `rows` that have keypoints."""
         counts = self.counts
         return self.source.read([row for row in rows if counts[row] > 0])
 
 
 def memory_budget(memory: float | None, devices: Sequence[Device]) -> int:
-    """Bytes for features on each of the devices that share the work.
+    """Bytes for features on each device: `memory` GB, by default a third of the free memory.
 
-    They are `memory` GB, by default a third of what is free. Devices without a memory of their own share it.
+    Devices without memory of their own share the host's.
     """
     free = free_bytes(devices[0])
     sharing = 1 if devices[0].memory_stats() else len(devices)
@@ -132,22 +131,23 @@ def memory_budget(memory: float | None, devices: Sequence[Device]) -> int:
 
 
 def _capacities(counts: np.ndarray) -> np.ndarray:
-    """One or two capacities for images of such counts: two where that spares the half of them a quarter or more."""
+    """The capacity that fits all counts `[n]`, and a smaller one for half of the images if it saves a quarter."""
     half, most = ragged.sizes(counts, (0.5, 1.0), STEP)[[0, -1]]
     return np.array([half, most] if half <= 0.75 * most else [most])
 
 
 def few_sizes(number: int) -> int:
-    """At least as many slots, by a quarter more at most: another number is another program."""
+    """Round a number of slots up, by a quarter at most, because each number needs a program of its own."""
     number = max(WRITTEN, number)
     return round_up(number, 2 ** (number.bit_length() - 3))
 
 
 class Staged(NamedTuple):
-    """Rows that are to be on the device, and those among them that are not there yet.
+    """Slots of rows on the device, and the rows that have to be written to them first.
 
-    capacity, slot: `[n]` where each of the rows is: in the slots of which capacity, and in which.
-    new: (capacity, slots `[WRITTEN]`, Features `[WRITTEN, N, ...]`), some of which may be no rows: no slots either.
+    capacity: `[n]` capacity of each row's slot.
+    slot: `[n]` number of each row's slot, among those of its capacity.
+    new: rows to write: (capacity, slots `[WRITTEN]`, Features `[WRITTEN, N, ...]`); padding has a slot beyond the last.
     """
 
     capacity: np.ndarray
@@ -156,15 +156,14 @@ class Staged(NamedTuple):
 
 
 class Recent:
-    """The slots of one capacity: which row is in which; what was used longest ago makes room."""
+    """Assignment of rows to `number` slots of one capacity; the least recently used row makes room."""
 
     def __init__(self, number: int) -> None:
-        """All of them empty."""
         self.number = number
         self._slots: OrderedDict[int, int] = OrderedDict()
 
     def take(self, rows: Sequence[int]) -> tuple[list[int], list[int]]:
-        """(slots of distinct rows, the rows among them that were not there).
+        """Assign distinct rows to slots; return their slots, and the rows that were in no slot before.
 
         Raises:
             ValueError: more rows than slots.
@@ -172,7 +171,7 @@ class Recent:
         if len(rows) > self.number:
             raise ValueError(f"expected at most {self.number} rows at the same time, got {len(rows)}")
         new = [row for row in rows if row not in self._slots]
-        for row in rows:  # first all that are there, so that none of them makes room
+        for row in rows:  # before new rows come, so that none of these rows makes room for them
             if row in self._slots:
                 self._slots.move_to_end(row)
         for row in new:
@@ -184,59 +183,58 @@ class Recent:
 class Slots:
     """Rows of a feature set on one device, padded, in slots of a few capacities.
 
-    An image's capacity depends on its count and on those of all the images that will be asked for, never on the
-    others that are matched with it. `stage` reads, and may run ahead on another thread, by two calls; `put` writes to
-    the device.
+    An image's capacity depends on its count and on the counts of all `wanted` images, never on the images that it is
+    matched with. `stage` reads rows, and may run ahead on another thread by two calls; `put` writes them to the device.
     """
 
     def __init__(self, features: FeatureSet, wanted: np.ndarray, budget: int, device: Device) -> None:
-        """Nothing is on the device yet.
+        """Plan the slots; all are empty.
 
         Args:
-            features: whose rows.
-            wanted: `[n]` distinct rows that will be asked for.
-            budget: bytes that the slots and what is on its way to them may take; a few slots there are in any case.
-            device: where.
+            features: source of the rows.
+            wanted: `[n]` distinct rows that will be staged.
+            budget: bytes for the slots and the rows on their way to them; a few slots are used in any case.
+            device: of the slots.
         """
         self._features, self._device = features, device
         counts = features.counts
         capacities = _capacities(counts[wanted])
         self._capacity = ragged.fitting(capacities, np.minimum(counts, capacities[-1]))
-        asked = self._capacity[wanted[counts[wanted] > 0]]
-        rows = {int(capacity): int(np.sum(asked == capacity)) for capacity in capacities}
-        size = features.keypoint_bytes if asked.size else 1
-        kept = KEPT * budget / max(1, sum(capacity * size * number for capacity, number in rows.items()))
-        self._together = max(WRITTEN, int(STAGED * budget / (capacities[-1] * size)))
+        wanted_capacities = self._capacity[wanted[counts[wanted] > 0]]
+        rows = {int(capacity): int(np.sum(wanted_capacities == capacity)) for capacity in capacities}
+        size = features.keypoint_bytes if wanted_capacities.size else 1
+        share = KEPT * budget / max(1, sum(capacity * size * number for capacity, number in rows.items()))
+        self._part_size = max(WRITTEN, int(STAGED * budget / (capacities[-1] * size)))
         self._recent = {
-            capacity: Recent(few_sizes(min(number, max(self._together, int(kept * number)))))
+            capacity: Recent(few_sizes(min(number, max(self._part_size, int(share * number)))))
             for capacity, number in rows.items()
         }
         self._arrays: dict[int, Features] = {}
 
     def parts(self, rows: np.ndarray) -> Iterator[np.ndarray]:
-        """Distinct rows in parts that can be asked for at the same time, as they come."""
-        return (rows[start : start + self._together] for start in range(0, len(rows), self._together))
+        """Split distinct rows into parts that fit on the device together, in their order."""
+        return (rows[start : start + self._part_size] for start in range(0, len(rows), self._part_size))
 
     def stage(self, rows: np.ndarray) -> Staged:
-        """Where rows `[n]` of one of the `parts` will be, each as often as it comes, having read what is not there."""
-        distinct, place = np.unique(rows, return_inverse=True)
+        """Assign slots to rows `[n]` of one of the `parts`, with repetitions, and read the rows that are in no slot."""
+        distinct, inverse = np.unique(rows, return_inverse=True)
         capacity, slot = self._capacity[distinct], np.zeros(len(distinct), np.int32)
         missing: list[tuple[int, list[int]]] = []
         for size, recent in self._recent.items():
-            there = capacity == size
-            slot[there], new = recent.take(distinct[there].tolist())
+            has_size = capacity == size
+            slot[has_size], new = recent.take(distinct[has_size].tolist())
             missing += [(size, new[start : start + WRITTEN]) for start in range(0, len(new), WRITTEN)]
-        read = self._features.read([row for _, new in missing for row in new])
-        written = []
+        features = self._features.read([row for _, new in missing for row in new])
+        writes = []
         for size, new in missing:
-            images = [image for _, image in itertools.islice(read, len(new))]
+            images = [image for _, image in itertools.islice(features, len(new))]
             slots = np.full(WRITTEN, self._recent[size].number, np.int32)
             slots[: len(new)] = slot[np.searchsorted(distinct, new)]
-            written.append((size, slots, stacked(images, size, total=WRITTEN)))
-        return Staged(capacity[place], slot[place], written)
+            writes.append((size, slots, stacked(images, size, total=WRITTEN)))
+        return Staged(capacity[inverse], slot[inverse], writes)
 
     def put(self, staged: Staged) -> Mapping[int, Features]:
-        """The rows on the device, by capacity `[slots, N, ...]`: good until the next call."""
+        """Write staged rows to the device; return all slots `[slots, N, ...]` by capacity, until the next call."""
         for capacity, slots, features in staged.new:
             rows = jax.device_put(features, self._device)
             if capacity not in self._arrays:
@@ -246,12 +244,12 @@ class Slots:
 
 
 def empty_slots(rows: Features, number: int) -> Features:
-    """As many rows `[number, N, ...]` of zeros, where rows `[R, N, ...]` are."""
+    """Zeros `[number, N, ...]` on the device of rows `[R, N, ...]`, with their types."""
     return jax.tree.map(lambda leaf: jnp.zeros((number, *leaf.shape[1:]), leaf.dtype, device=leaf.device), rows)
 
 
 def write_slots(arrays: Features, slots: np.ndarray, rows: Features) -> Features:
-    """With rows `[R, N, ...]` in slots `[R]`, beyond the last those that are none; in place."""
+    """Write rows `[R, N, ...]` to slots `[R]` in place; rows with a slot beyond the last are dropped."""
     return jax.tree.map(lambda array, row: array.at[slots].set(row, mode="drop"), arrays, rows)
 
 
@@ -259,7 +257,7 @@ write_slots = compiled(write_slots, donate_argnums=0)  # the arrays may be as la
 
 
 def stacked(images: Sequence[Features], capacity: int, *, total: int | None = None) -> Features:
-    """Features `[n, ...]` of at least one image as `[R, capacity, ...]`, NumPy; see `ragged.padded`."""
+    """Pad Features `[n, ...]` of at least one image to `[R, capacity, ...]`, NumPy; see `ragged.padded`."""
     rows = [{name: values for name, values in per_keypoint(image).items() if name != "mask"} for image in images]
     arrays, mask = ragged.padded(rows, capacity, total=total)
     sizes = np.stack([image.image_size for image in images])
@@ -267,36 +265,30 @@ def stacked(images: Sequence[Features], capacity: int, *, total: int | None = No
 
 
 def without_padding(image: Features) -> Features:
-    """In single precision, as it is matched."""
-    real = np.asarray(image.mask)
-    arrays = {name: np.asarray(values, np.float32)[real] for name, values in per_keypoint(image).items()}
-    return Features(**arrays | {"mask": real[real]}, image_size=np.asarray(image.image_size, np.float32))
+    """Features without padding, in single precision."""
+    mask = np.asarray(image.mask)
+    arrays = {name: np.asarray(values, np.float32)[mask] for name, values in per_keypoint(image).items()}
+    return Features(**arrays | {"mask": mask[mask]}, image_size=np.asarray(image.image_size, np.float32))
 
 
-def check_features(image: Features, who: str, *, unit_length: bool) -> None:
-    """Features of one's own, `[N, ...]`.
+def check_features(image: Features, name: str, *, unit_length: bool) -> None:
+    """Check Features `[N, ...]` that come from user code; errors begin with `name`.
 
     Raises:
-        InputError: arrays do not fit, or descriptors are not of unit length where they must be.
+        InputError: arrays of wrong shapes, or descriptors that are not of unit length if `unit_length`.
     """
-    count = len(image.mask)
-    shapes = {name: np.shape(values) for name, values in per_keypoint(image).items()}
-    expected = {
-        "keypoints": (count, 2),
-        "descriptors": (count, *shapes["descriptors"][1:]),
-        "scores": (count,),
-        "mask": (count,),
-    }
-    if shapes != expected or len(shapes["descriptors"]) != 2 or np.asarray(image.mask).dtype != bool:
+    count, shapes = len(image.mask), [np.shape(values) for values in per_keypoint(image).values()]
+    expected = [(count, 2), (count, *shapes[1][1:]), (count,), (count,)]
+    if shapes != expected or len(shapes[1]) != 2 or np.asarray(image.mask).dtype != bool:
         raise InputError(
-            f"{who}: expected keypoints [N, 2], descriptors [N, D], scores [N] and mask [N] bool, "
-            f"got shapes {', '.join(str(shape) for shape in shapes.values())}; transpose descriptors that are [D, N]"
+            f"{name}: expected keypoints [N, 2], descriptors [N, D], scores [N] and mask [N] bool, "
+            f"got shapes {', '.join(map(str, shapes))}; transpose descriptors that are [D, N]"
         )
-    lengths = (
-        np.linalg.norm(np.asarray(image.descriptors, np.float32)[image.mask], axis=1) if unit_length else np.ones(1)
-    )
+    if not unit_length:
+        return
+    lengths = np.linalg.norm(np.asarray(image.descriptors, np.float32)[image.mask], axis=1)
     if (wrong := np.abs(lengths - 1) > 0.01).any():
         raise InputError(
-            f"{who}: expected descriptors of unit length, got {lengths[wrong][0]:.4g}; "
+            f"{name}: expected descriptors of unit length, got {lengths[wrong][0]:.4g}; "
             "divide them by their Euclidean length, or say unit_length=False"
         )

@@ -1,9 +1,9 @@
-"""Global descriptors of networks that take images of many sizes: NetVLAD, generalized means, transformers."""
+"""Global descriptors of networks that take images of many sizes: NetVLAD, generalized mean pooling, transformers."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import jax
 import numpy as np
@@ -16,20 +16,20 @@ from mfvpr.utils.errors import InputError
 
 
 class DescriptorNetwork(Protocol):
-    """What gives descriptors `[B, D]` of unit length of images that it has preprocessed, `[B, H, W, 3]`."""
+    """A network that maps preprocessed images `[B, H, W, 3]` to descriptors `[B, D]` of unit length."""
 
     @property
     def dimension(self) -> int:
-        """D."""
+        """Length D of a descriptor."""
         ...
 
     @property
     def has_components(self) -> bool:
-        """Whether a descriptor's numbers are principal components, the largest first."""
+        """Whether a descriptor consists of principal components, the largest first."""
         ...
 
     def require(self, size: tuple[int, int]) -> None:
-        """Raise an InputError unless images of this (width, height) px will do."""
+        """Raise an InputError if the network cannot take images of this (width, height) px."""
         ...
 
     def preprocess(self, images: jax.Array) -> jax.Array: ...
@@ -39,19 +39,20 @@ class DescriptorNetwork(Protocol):
 
 @dataclass(frozen=True)
 class GlobalDescriptor:
-    """What the public codes extract.
+    """A network's global descriptors, as the public code extracts them.
 
     Attributes:
         model: the network with its weights.
         image_size: (width, height) px; 640 x 480 is Patch-NetVLAD's.
         interpolation: see `mfvpr.datasets.images.resize`.
-        components: how many of the first principal components are kept, scaled to unit length again; None = all.
+        components: number of principal components that are kept, scaled to unit length again; None = all.
         batch_size: images per call.
 
     Raises:
-        InputError: images of this size are not the network's, or it has no so many principal components.
+        InputError: the network cannot take images of this size, or has fewer principal components.
     """
 
+    scales: ClassVar[tuple[Scale, ...]] = ()  # no local features
     model: DescriptorNetwork
     image_size: tuple[int, int] = (640, 480)
     interpolation: Interpolation = "pil_bilinear"
@@ -66,20 +67,15 @@ class GlobalDescriptor:
             raise InputError(f"components={self.components}: expected from 1 to {self.model.dimension}")
 
     @property
-    def scales(self) -> tuple[Scale, ...]:
-        """(): there are no local features."""
-        return ()
-
-    @property
     def vector_size(self) -> int:
-        """Numbers of a descriptor."""
+        """Length of a descriptor."""
         return self.components or self.model.dimension
 
     def __call__(self, images: np.ndarray) -> list[Description]:
         """`[D]` float32 descriptors of unit length, of images `[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32.
 
         Raises:
-            InputError: the images do not have the size asked for.
+            InputError: the images do not have `image_size`.
         """
         require_size(type(self.model).__name__, images, self.image_size)
         return [Description(np.asarray(vector)) for vector in in_batches(self._program, images, self.batch_size)]

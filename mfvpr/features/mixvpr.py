@@ -1,9 +1,9 @@
-"""MixVPR's global descriptors (Ali-bey et al., WACV 2023), 4096, 512 or 128 dimensions: the paper's filter."""
+"""MixVPR's global descriptors (Ali-bey et al., WACV 2023), 4096, 512 or 128 dimensions: the paper's retrieval."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import numpy as np
@@ -16,32 +16,24 @@ from mfvpr.networks.mixvpr import IMAGE_SIZE, MixVPR, preprocess
 
 @dataclass(frozen=True)
 class MixVprDescriptor:
-    """What the public code extracts.
+    """MixVPR's global descriptors, as the public code extracts them.
 
     Attributes:
-        model: the network with its weights.
-        interpolation: see `mfvpr.datasets.images.resize`. "pil_bicubic" is that of the authors' demonstration and of
-            OpenVPRLab, "pil_bilinear" their training's, "torch_bilinear" VPR-methods-evaluation's.
+        model: the network with its weights, which are for 320 x 320 px only.
+        interpolation: see `mfvpr.datasets.images.resize`. The authors' demonstration and OpenVPRLab use "pil_bicubic",
+            the authors' training "pil_bilinear", VPR-methods-evaluation "torch_bilinear".
         batch_size: images per call.
     """
 
+    image_size: ClassVar[tuple[int, int]] = IMAGE_SIZE
+    scales: ClassVar[tuple[Scale, ...]] = ()  # no local features
     model: MixVPR
     interpolation: Interpolation = "pil_bicubic"
     batch_size: int = field(default=8, metadata={"recipe": False})
 
     @property
-    def image_size(self) -> tuple[int, int]:
-        """(320, 320), the only one the weights are for."""
-        return IMAGE_SIZE
-
-    @property
-    def scales(self) -> tuple[Scale, ...]:
-        """(): there are no local features."""
-        return ()
-
-    @property
     def vector_size(self) -> int:
-        """4096, 512 or 128 with published weights."""
+        """Length of a descriptor: 4096, 512 or 128 with published weights."""
         return self.model.dimension
 
     def __call__(self, images: np.ndarray) -> list[Description]:
@@ -55,8 +47,7 @@ class MixVprDescriptor:
 
     @cached_property
     def _program(self) -> Callable[..., Any]:
-        return compiled(self.model, _describe)
+        def describe(model: MixVPR, images: jax.Array) -> jax.Array:
+            return model(preprocess(images))
 
-
-def _describe(model: MixVPR, images: jax.Array) -> jax.Array:
-    return model(preprocess(images))
+        return compiled(self.model, describe)

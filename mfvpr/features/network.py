@@ -1,4 +1,4 @@
-"""How a network is put to work: weights are arguments of one compiled program; images and batches have one size."""
+"""Run networks: weights are arguments of one compiled program; images and batches have one size."""
 
 from collections.abc import Callable
 from typing import Any
@@ -22,7 +22,7 @@ def compiled(model: nnx.Module, function: Callable[..., Any]) -> Callable[..., A
 
 
 def require_network(name: str, model: Any, expected: type[nnx.Module]) -> None:
-    """Raise an InputError unless the model is such a network."""
+    """Raise an InputError unless the model is a network of the expected class."""
     if not isinstance(model, expected):
         raise InputError(f"{name}: expected a {expected.__name__} as model, got {type(model).__name__}; "
                          "`mfvpr.checkpoints.files.load_model` gives a network by its name")  # fmt: skip
@@ -35,32 +35,34 @@ def require_size(name: str, images: np.ndarray, size: tuple[int, int]) -> None:
         raise InputError(f"{name}: expected images of {size[0]} x {size[1]} px, got {columns} x {rows}")
 
 
-def at_places(keypoints: np.ndarray, descriptors: np.ndarray, image_size: tuple[int, int]) -> Features:
-    """Features of every image's same places `[N, 2]` (x, y) px: scores are 1."""
+def local_features(
+    keypoints: np.ndarray, descriptors: np.ndarray, image_size: tuple[int, int], scores: np.ndarray | None = None
+) -> Features:
+    """Features of one image without padding, from keypoints `[N, 2]` (x, y) px; scores are 1 by default."""
     return Features(
         keypoints=keypoints.astype(np.float32),
         descriptors=descriptors,
-        scores=np.ones(len(keypoints), np.float32),
+        scores=np.ones(len(keypoints), np.float32) if scores is None else scores,
         mask=np.ones(len(keypoints), bool),
         image_size=np.array(image_size, np.float32),
     )
 
 
 def in_batches(program: Callable[[Any], Any], images: np.ndarray, batch_size: int) -> list[Any]:
-    """What `program` gives for each image of `[B, H, W, 3]`, NumPy.
+    """Results of `program` for each image of `[B, H, W, 3]`, NumPy.
 
-    A device without memory of its own takes them one by one, which keeps activations in the processor's caches (a batch
-    of 8 is no faster there); elsewhere the last batch is filled up, so that there is one program.
+    A device without memory of its own takes images one by one, which keeps activations in the processor's caches (a
+    batch of 8 is no faster there); elsewhere the last batch is filled up, so that there is one program.
 
     Raises:
-        InputError: floating-point images of 0 to 1, to which every network here is blind.
+        InputError: floating-point images of 0 to 1, in which every network here sees black.
     """
     if images.dtype.kind == "f" and images.size and 0 < (largest := images.max()) <= 1:
         raise InputError(f"images: expected values from 0 to 255, the largest is {largest:.3g}; multiply by 255")
     size = 1 if device_bytes(()) is None else batch_size
-    found = []
+    results = []
     for start in range(0, len(images), size):
         batch = images[start : start + size]
-        results = jax.tree.map(np.asarray, program(ragged.filled(batch, size)))
-        found += [jax.tree.map(lambda field, row=row: field[row], results) for row in range(len(batch))]
-    return found
+        outputs = jax.tree.map(np.asarray, program(ragged.filled(batch, size)))
+        results += [jax.tree.map(lambda field, row=row: field[row], outputs) for row in range(len(batch))]
+    return results

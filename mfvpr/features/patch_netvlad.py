@@ -1,4 +1,4 @@
-"""Patch-NetVLAD's features (Hausler et al., CVPR 2021): NetVLAD of all squares of a map, of several sizes."""
+"""Patch-NetVLAD's features (Hausler et al., CVPR 2021): NetVLAD of all square patches of a map, of several sizes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ import numpy as np
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale
-from mfvpr.features.network import at_places, compiled, in_batches, require_network, require_size
+from mfvpr.features.network import compiled, in_batches, local_features, require_network, require_size
 from mfvpr.networks.netvlad import VggNetVlad
 from mfvpr.networks.vgg import STRIDE
 from mfvpr.types import Features
@@ -21,21 +21,21 @@ _MIDDLE = (STRIDE - 1) // 2  # px from a position's first pixel, as published: a
 
 @dataclass(frozen=True)
 class PatchNetVladFeatures:
-    """The global descriptor and the patches of one pass, as the public code extracts them.
+    """Global descriptor and patch descriptors, as the public code extracts them.
 
-    Patches are in rows from the top, each from the left; their scores are 1.
+    Patches are in row order; their scores are 1.
 
     Attributes:
         model: the network with its weights.
         image_size: (width, height) px.
         interpolation: see `mfvpr.datasets.images.resize`.
-        patch_sizes: sides of the squares, in positions of the map; each size is a scale.
-        scale_weights: how much the score of each scale counts, see `mfvpr.fuse_scales`; None = all alike.
+        patch_sizes: sides of the patches, in positions of the map; each size is a scale.
+        scale_weights: weight of each scale's score, see `mfvpr.fuse_scales`; None = equal weights.
         batch_size: images per call.
 
     Raises:
-        InputError: another network; no patch sizes, one twice, or one that images of this size have no room for;
-            weights of other scales.
+        InputError: another network; no patch sizes, duplicates, or a patch that is larger than the map; another number
+            of weights than of patch sizes.
     """
 
     model: VggNetVlad
@@ -59,7 +59,7 @@ class PatchNetVladFeatures:
 
     @property
     def vector_size(self) -> int:
-        """Numbers of the global descriptor."""
+        """Length of the global descriptor."""
         return self.model.dimension
 
     @property
@@ -81,11 +81,11 @@ class PatchNetVladFeatures:
         """Descriptors of images `[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32.
 
         Raises:
-            InputError: the images do not have the size asked for.
+            InputError: the images do not have `image_size`.
         """
         require_size("Patch-NetVLAD", images, self.image_size)
-        found = in_batches(self._program, images, self.batch_size)
-        return [Description(vector, tuple(map(self._features, self.patch_sizes, patches))) for vector, patches in found]
+        pairs = in_batches(self._program, images, self.batch_size)
+        return [Description(vector, tuple(map(self._features, self.patch_sizes, patches))) for vector, patches in pairs]
 
     @cached_property
     def _program(self) -> Callable[..., Any]:
@@ -98,4 +98,4 @@ class PatchNetVladFeatures:
         columns, rows = (side - size + 1 for side in self._map_size)
         row, column = np.indices((rows, columns)).reshape(2, -1)
         middle = STRIDE * np.stack([column, row], axis=1) + STRIDE * (size - 1) // 2 + _MIDDLE
-        return at_places(middle, descriptors, self.image_size)
+        return local_features(middle, descriptors, self.image_size)

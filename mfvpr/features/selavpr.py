@@ -1,4 +1,4 @@
-"""SelaVPR's features (Lu et al., ICLR 2024): its global descriptor, and a dense map of local ones."""
+"""SelaVPR's features (Lu et al., ICLR 2024): a global descriptor and a dense map of local descriptors."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ import numpy as np
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale
-from mfvpr.features.network import at_places, compiled, in_batches, require_network, require_size
+from mfvpr.features.network import compiled, in_batches, local_features, require_network, require_size
 from mfvpr.networks.selavpr import LOCAL, SelaVpr
 from mfvpr.networks.vit import PATCH, require_patches
 from mfvpr.types import Features
@@ -21,19 +21,19 @@ _MIDDLE = (PATCH - 1) / 2  # px from a patch's first pixel to its middle
 
 @dataclass(frozen=True)
 class SelaVprFeatures:
-    """The global descriptor and the local map of one pass, as the public code extracts them.
+    """Global descriptor and dense local features, as the public code extracts them.
 
-    Local features are in rows from the top, each from the left; their scores are 1. A position of the map is taken for
-    where it lies between the middles of the patches; the public code, whose score knows no positions, has none.
+    Local features are in row order; their scores are 1. Their keypoints are interpolated between the middles of the
+    network's patches; the public code has no keypoints, because its score does not depend on them.
 
     Attributes:
         model: the network with its weights.
         image_size: (width, height) px, multiples of 14; 224 x 224 is published.
-        interpolation: see `mfvpr.datasets.images.resize`; as published, colors between pixels, without antialiasing.
+        interpolation: see `mfvpr.datasets.images.resize`; published without antialiasing and without rounding.
         batch_size: images per call.
 
     Raises:
-        InputError: another network, or an image has no whole number of patches.
+        InputError: another network, or an image size that is no multiple of 14.
     """
 
     model: SelaVpr
@@ -47,12 +47,12 @@ class SelaVprFeatures:
 
     @property
     def vector_size(self) -> int:
-        """Numbers of the global descriptor."""
+        """Length of the global descriptor."""
         return self.model.dimension
 
     @property
     def scales(self) -> tuple[Scale, ...]:
-        """One, of every position of the map."""
+        """One scale with every position of the map."""
         columns, rows = self._map_size
         return (Scale(LOCAL, columns * rows),)
 
@@ -65,11 +65,11 @@ class SelaVprFeatures:
         """Descriptors of images `[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32.
 
         Raises:
-            InputError: the images do not have the size asked for.
+            InputError: the images do not have `image_size`.
         """
         require_size("SelaVPR", images, self.image_size)
-        found = in_batches(self._program, images, self.batch_size)
-        return [Description(vector, (self._features(local),)) for vector, local in found]
+        pairs = in_batches(self._program, images, self.batch_size)
+        return [Description(vector, (self._features(local),)) for vector, local in pairs]
 
     @cached_property
     def _program(self) -> Callable[..., Any]:
@@ -80,4 +80,5 @@ class SelaVprFeatures:
 
     def _features(self, local: np.ndarray) -> Features:
         row, column = np.indices(local.shape[:2]).reshape(2, -1)
-        return at_places(_MIDDLE + _STEP * np.stack([column, row], axis=1), local.reshape(-1, LOCAL), self.image_size)
+        keypoints = _MIDDLE + _STEP * np.stack([column, row], axis=1)
+        return local_features(keypoints, local.reshape(-1, LOCAL), self.image_size)

@@ -1,6 +1,7 @@
 """OpenCV SIFT as RootSIFT (Lowe, IJCV 2004; Arandjelovic & Zisserman, CVPR 2012): local features without a download."""
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -17,11 +18,12 @@ class Sift:
     Attributes:
         image_size: (width, height) px.
         interpolation: see `mfvpr.datasets.images.resize`.
-        max_keypoints: the strongest are kept; None = all.
+        max_keypoints: the keypoints of the highest scores are kept; None = all.
         contrast_threshold: OpenCV's; low, so that dark images reach `max_keypoints` as well.
         clahe_clip: clip limit of local histogram equalization before detection; 0 turns it off.
     """
 
+    vector_size: ClassVar[int] = 0  # no global descriptor
     image_size: tuple[int, int] = (336, 336)
     interpolation: Interpolation = "pil_bilinear"
     max_keypoints: int | None = 800
@@ -30,13 +32,8 @@ class Sift:
     batch_size: int = field(default=8, metadata={"recipe": False})
 
     @property
-    def vector_size(self) -> int:
-        """0: there is no global descriptor."""
-        return 0
-
-    @property
     def scales(self) -> tuple[Scale, ...]:
-        """One, of 128 dimensions; textured images reach `max_keypoints`, or one keypoint in 100 px."""
+        """One scale of 128 dimensions; textured images reach `max_keypoints`, or one keypoint in 100 px."""
         return (Scale(128, self.max_keypoints or self.image_size[0] * self.image_size[1] // 100),)
 
     def __call__(self, images: np.ndarray) -> list[Description]:
@@ -48,10 +45,10 @@ class Sift:
         if self.clahe_clip > 0:
             gray = cv2.createCLAHE(self.clahe_clip, (8, 8)).apply(gray)
         detector = cv2.SIFT_create(self.max_keypoints or 0, contrastThreshold=self.contrast_threshold)  # pyright: ignore
-        found, descriptors = detector.detectAndCompute(gray, None)
-        scores = np.array([keypoint.response for keypoint in found], np.float32)
+        detections, descriptors = detector.detectAndCompute(gray, None)
+        scores = np.array([keypoint.response for keypoint in detections], np.float32)
         strongest = np.argsort(-scores, kind="stable")[: self.max_keypoints]  # OpenCV keeps ties beyond the limit
-        keypoints = np.array([keypoint.pt for keypoint in found], np.float32).reshape(-1, 2)
+        keypoints = np.array([keypoint.pt for keypoint in detections], np.float32).reshape(-1, 2)
         descriptors = np.zeros((0, 128), np.float32) if descriptors is None else descriptors
         return Features(
             keypoints=keypoints[strongest],

@@ -1,20 +1,19 @@
-"""SSM-VPR's descriptors (Camara & Preucil, RAS 2020): windows for its filter, cells of a grid for its matching."""
+"""SSM-VPR's descriptors (Camara & Preucil, RAS 2020): windows for retrieval, cells of a grid for matching."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import jax
 import numpy as np
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale
-from mfvpr.features.network import at_places, compiled, in_batches
-from mfvpr.features.windows import WindowFitting, Windows, kernels, known, normalized, whitened
+from mfvpr.features.network import compiled, in_batches, local_features
+from mfvpr.features.windows import WindowFitting, Windows, kernels, learned_whitening, normalize_maps, whiten_windows
 from mfvpr.networks.imagenet import Preprocessing
 from mfvpr.networks.ssm import STAGE1_STRIDE, STAGE2_STRIDE, SsmVgg
-from mfvpr.types import Features
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.whitening import Whitening
 
@@ -27,7 +26,7 @@ _MIDDLE = (STAGE2_STRIDE - 1) / 2  # px from a position's first pixel to its mid
 
 @dataclass(frozen=True)
 class SsmMaps:
-    """The maps of one stage, of unit length at every position, as vectors.
+    """Feature maps of one stage as global descriptors, of unit length at every position.
 
     Attributes:
         model: the network with its weights.
@@ -38,6 +37,7 @@ class SsmMaps:
         batch_size: images per call.
     """
 
+    scales: ClassVar[tuple[Scale, ...]] = ()  # no local features
     model: SsmVgg
     stage: Literal[1, 2]
     image_size: tuple[int, int]
@@ -53,40 +53,39 @@ class SsmMaps:
 
     @property
     def vector_size(self) -> int:
-        """Numbers of a map."""
+        """Length of a map as a vector."""
         return int(np.prod(self.shape))
-
-    @property
-    def scales(self) -> tuple[Scale, ...]:
-        """(): there are no local features."""
-        return ()
 
     def __call__(self, images: np.ndarray) -> list[Description]:
         """Maps of images `[B, H, W, 3]` RGB, 0 .. 255."""
         return [Description(maps.reshape(-1)) for maps in in_batches(self._program, images, self.batch_size)]
 
-    def computed(self, model: SsmVgg, images: jax.Array) -> jax.Array:
-        """`[B, rows, columns, 512]`, to be compiled."""
+    def compute(self, model: SsmVgg, images: jax.Array) -> jax.Array:
+        """Maps `[B, rows, columns, 512]`; call it from a compiled function."""
         stage = {1: model.stage1, 2: model.stage2}[self.stage]
-        return normalized(stage(model.preprocess(images, self.preprocessing)))
+        return normalize_maps(stage(model.preprocess(images, self.preprocessing)))
 
     @cached_property
     def _program(self) -> Callable[..., Any]:
-        return compiled(self.model, self.computed)
+        return compiled(self.model, self.compute)
 
 
 @dataclass(frozen=True)
 class SsmWindows:
-    """What the filter votes with: 36 windows of 9 x 9 positions of the first stage's map.
+    """Descriptors for retrieval by votes: 36 whitened windows of 9 x 9 positions of the first stage's map.
+
+    Images have 224 x 224 px, because the map of a larger image has more windows and the public code draws 36.
 
     Attributes:
         model: the network with its weights.
-        interpolation: as of `SsmMaps`.
-        preprocessing: likewise.
-        whitening: how it is learned from the database, or what was learned.
+        interpolation: see `SsmMaps`.
+        preprocessing: see `SsmMaps`.
+        whitening: settings to learn it from the database, or the learned whitening.
         batch_size: images per call.
     """
 
+    image_size: ClassVar[tuple[int, int]] = STAGE1_SIZE
+    scales: ClassVar[tuple[Scale, ...]] = ()  # no local features
     model: SsmVgg
     interpolation: Interpolation = "pil_bilinear"
     preprocessing: Preprocessing = "torch"
@@ -94,63 +93,54 @@ class SsmWindows:
     batch_size: int = field(default=8, metadata={"recipe": False})
 
     @property
-    def image_size(self) -> tuple[int, int]:
-        """(224, 224), the only one: larger maps would have more windows, of which the public code draws 36."""
-        return STAGE1_SIZE
-
-    @property
     def maps(self) -> SsmMaps:
-        """What the windows are taken from."""
+        """Extractor of the first stage's maps."""
         return SsmMaps(self.model, 1, self.image_size, self.interpolation, self.preprocessing, self.batch_size)
 
     @property
     def windows(self) -> Windows:
-        """36."""
+        """The 36 windows of a map."""
         return Windows(self.maps.shape, 9)
 
     @property
     def vector_size(self) -> int:
-        """Numbers of all windows, one after the other."""
+        """Length of all windows' descriptors, one after the other."""
         return self.windows.count * self.whitening.dimension
-
-    @property
-    def scales(self) -> tuple[Scale, ...]:
-        """(): there are no local features."""
-        return ()
 
     def __call__(self, images: np.ndarray) -> list[Description]:
         """Whitened windows of images `[B, 224, 224, 3]` RGB, 0 .. 255, `[36 * D']` float32 each.
 
         Raises:
-            InputError: it has not seen the database.
+            InputError: the whitening was not learned yet.
         """
         return [Description(vectors.reshape(-1)) for vectors in in_batches(self._program, images, self.batch_size)]
 
     @cached_property
     def _program(self) -> Callable[..., Any]:
-        return _program(self.model, self.maps, self.windows, known(self))
+        return _whitening_program(self)
 
 
 @dataclass(frozen=True)
 class SsmCells:
-    """What is matched: whitened windows of 3 x 3 positions of the second stage's map, each a cell of a grid.
+    """Local features for matching: whitened windows of 3 x 3 positions of the second stage's map, the cells of a grid.
 
-    They are of any length: what is matched is the largest dot product, for every cell of the candidate (`candidate` of
-    `mfvpr.match`), and scored by `GridAnchors`, whose `side` is that of `windows.grid`.
+    Descriptors are of any length. Match each cell of the candidate to the cell of the largest dot product
+    (`cross_check="candidate"` of `mfvpr.match`), and score with `GridAnchors`, `side` as in `windows.grid`.
 
     Attributes:
         model: the network with its weights.
         image_size: (width, height) px: 336 x 336 as the paper, 224 x 224 as the public program, 448 x 448.
-        interpolation: as of `SsmMaps`.
-        preprocessing: likewise.
+        interpolation: see `SsmMaps`.
+        preprocessing: see `SsmMaps`.
         stride: positions from cell to cell.
-        whitening: how it is learned from the database, or what was learned.
+        whitening: settings to learn it from the database, or the learned whitening.
         batch_size: images per call.
 
     Raises:
         InputError: images of this size have no cells.
     """
 
+    vector_size: ClassVar[int] = 0  # no global descriptor
     model: SsmVgg
     image_size: tuple[int, int] = (336, 336)
     interpolation: Interpolation = "pil_bilinear"
@@ -166,46 +156,43 @@ class SsmCells:
 
     @property
     def maps(self) -> SsmMaps:
-        """What the cells are taken from."""
+        """Extractor of the second stage's maps."""
         return SsmMaps(self.model, 2, self.image_size, self.interpolation, self.preprocessing, self.batch_size)
 
     @property
     def windows(self) -> Windows:
-        """Of a map: 40 x 40 at 336 px."""
+        """The windows of a map: 40 x 40 at 336 px."""
         return Windows(self.maps.shape, 3, self.stride)
 
     @property
-    def vector_size(self) -> int:
-        """0: there is no global descriptor."""
-        return 0
-
-    @property
     def scales(self) -> tuple[Scale, ...]:
-        """One, of all cells."""
+        """One scale with all cells."""
         return (Scale(self.whitening.dimension, self.windows.count),)
 
     def __call__(self, images: np.ndarray) -> list[Description]:
-        """Cells of images `[B, H, W, 3]` RGB, 0 .. 255, rows from the top, each from the left; scores are 1.
+        """Cells of images `[B, H, W, 3]` RGB, 0 .. 255, in row order; scores are 1.
 
         Raises:
-            InputError: it has not seen the database.
+            InputError: the whitening was not learned yet.
         """
-        cells = in_batches(self._program, images, self.batch_size)
-        return [Description(local=(self._features(vectors),)) for vectors in cells]
+        middles = STAGE2_STRIDE * (self.windows.corners[:, ::-1] + self.windows.size // 2) + _MIDDLE
+        return [
+            Description(local=(local_features(middles, descriptors, self.image_size),))
+            for descriptors in in_batches(self._program, images, self.batch_size)
+        ]
 
     @cached_property
     def _program(self) -> Callable[..., Any]:
-        return _program(self.model, self.maps, self.windows, known(self))
-
-    def _features(self, descriptors: np.ndarray) -> Features:
-        middle = STAGE2_STRIDE * (self.windows.corners[:, ::-1] + self.windows.size // 2) + _MIDDLE
-        return at_places(middle, descriptors, self.image_size)
+        return _whitening_program(self)
 
 
-def _program(model: SsmVgg, maps: SsmMaps, windows: Windows, whitening: Whitening) -> Callable[..., Any]:
-    """Images -> whitened windows `[V, D']`; the whitening is no constant of the program."""
-    learned = jax.device_put(kernels(whitening, windows))
-    program = compiled(
-        model, lambda model, images, *parts: whitened(maps.computed(model, images), *parts, stride=windows.stride)
-    )
-    return lambda images: program(images, *learned)
+def _whitening_program(extractor: SsmWindows | SsmCells) -> Callable[..., Any]:
+    """Compile images -> whitened windows `[V, D']`; the whitening is an argument, so that XLA does not fold it."""
+    maps, windows = extractor.maps, extractor.windows
+    convolution = jax.device_put(kernels(learned_whitening(extractor), windows))
+
+    def describe(model: SsmVgg, images: jax.Array, kernel: jax.Array, offset: jax.Array) -> jax.Array:
+        return whiten_windows(maps.compute(model, images), kernel, offset, stride=windows.stride)
+
+    program = compiled(extractor.model, describe)
+    return lambda images: program(images, *convolution)

@@ -1,7 +1,7 @@
-"""Windows of a network's maps, whitened: how both stages of SSM-VPR describe images (Camara & Preucil, RAS 2020).
+"""Whitened windows of a network's maps, the descriptors of both stages of SSM-VPR (Camara & Preucil, RAS 2020).
 
-The whitening is learned from windows of the database's images; see `mfvpr.retrieval.fitting`. It is linear, so that a
-window's descriptor is a convolution of the map, and no windows are formed once it is known.
+The whitening is learned from windows of the database's images; see `mfvpr.retrieval.fitting`. It is linear: descriptors
+of all windows are one convolution of the map, and only the fitting forms windows.
 """
 
 from collections.abc import Iterable, Mapping
@@ -23,12 +23,12 @@ from mfvpr.utils.whitening import Whitening, fit_bytes, fit_whitening
 
 @dataclass(frozen=True)
 class Windows:
-    """Where the windows of a map are: rows from the top, each from the left.
+    """Positions of the windows of a map, in row order.
 
     Attributes:
         shape: (rows, columns, channels) of the map.
-        size: of a window, positions per side.
-        stride: from window to window.
+        size: positions per side of a window.
+        stride: positions from window to window.
     """
 
     shape: tuple[int, int, int]
@@ -48,12 +48,12 @@ class Windows:
 
     @property
     def count(self) -> int:
-        """V, windows of a map."""
+        """Number V of windows of a map."""
         return self.grid[0] * self.grid[1]
 
     @property
     def dimension(self) -> int:
-        """D, numbers of a window, (row, column, channel)."""
+        """Length D of a window as a vector, (row, column, channel)."""
         return self.size**2 * self.shape[2]
 
     @property
@@ -62,22 +62,22 @@ class Windows:
         return self.stride * np.stack(np.divmod(np.arange(self.count), self.grid[1]), axis=1)
 
     def take(self, maps: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-        """`[n, D]` some windows of one map."""
+        """The windows `numbers` `[n]` of one map, `[n, D]`."""
         parts = [maps[row : row + self.size, column : column + self.size] for row, column in self.corners[numbers]]
         return np.reshape(parts, (len(numbers), self.dimension))
 
 
 @dataclass(frozen=True)
 class WindowFitting:
-    """How the whitening is learned: from windows that are drawn from images that are drawn from the database.
+    """Settings of a whitening that is learned from random windows of random images of the database.
 
     Attributes:
-        dimension: D' of what comes out.
-        max_images: of the database, at most; None = all.
-        max_windows: of theirs, at most; None = all.
-        zero_row: a window of zeros more, as in the public code's second stage.
-        dtype: of the windows and of the result. Sums are in double precision either way.
-        seed: of the draws. (The public code has none.)
+        dimension: D' of the whitened vectors.
+        max_images: number of images to learn from; None = all.
+        max_windows: number of windows of these images to learn from; None = all.
+        zero_row: add a window of zeros, as in the public code's second stage.
+        dtype: of the windows and of the result. Sums are always in double precision.
+        seed: of the random images and windows. (The public code has no seed.)
     """
 
     dimension: int
@@ -88,15 +88,20 @@ class WindowFitting:
     seed: int = 0
 
     def drawn(self, num_images: int) -> list[int]:
-        """Rows of the images that are looked at."""
+        """Rows of the images to learn from."""
         rows = np.random.default_rng([self.seed, 0]).permutation(num_images)
         return sorted(rows[: self.max_images].tolist())
 
     def fit(self, maps: Iterable[Mapping[int, np.ndarray]], windows: Windows, rows: list[int]) -> Whitening:
-        """Learned from maps `[rows, columns, channels]` by row, some at a time, of those that were `drawn`.
+        """Learn the whitening from maps `[rows, columns, channels]`, which come by row in batches.
+
+        Args:
+            maps: of the images in `rows`; unreadable images may be missing.
+            windows: of these maps.
+            rows: from `drawn`.
 
         Raises:
-            InputError: they do not fit into memory, or there are fewer windows than dimensions.
+            InputError: the windows do not fit into memory, or there are fewer windows than dimensions.
         """
         total = len(rows) * windows.count
         chosen = np.arange(total)
@@ -111,72 +116,69 @@ class WindowFitting:
                 f"but {free / 1e9:.1f} GB are free; lower max_images or max_windows"
             )
         sample, filled = np.zeros((count, windows.dimension), self.dtype), 0
-        place = {row: windows.count * number for number, row in enumerate(rows)}
-        for some in maps:
-            for row, of_image in some.items():
-                first, end = np.searchsorted(chosen, [place[row], place[row] + windows.count])
-                sample[filled : filled + end - first] = windows.take(of_image, chosen[first:end] - place[row])
+        starts = {row: windows.count * number for number, row in enumerate(rows)}
+        for batch in maps:
+            for row, image_map in batch.items():
+                first, end = np.searchsorted(chosen, [starts[row], starts[row] + windows.count])
+                sample[filled : filled + end - first] = windows.take(image_map, chosen[first:end] - starts[row])
                 filled += end - first
         return fit_whitening(sample[: filled + self.zero_row], self.dimension)
 
 
 @runtime_checkable
 class WindowExtractor(Protocol):
-    """An extractor of whitened windows, which must see the database first: a dataclass, of which `replace` makes it."""
+    """An extractor of whitened windows: a dataclass whose `whitening` is replaced when it was learned."""
 
     @property
     def whitening(self) -> WindowFitting | Whitening:
-        """How it is to be learned, or what was."""
+        """Settings to learn it from the database, or the learned whitening."""
         ...
 
     @property
     def windows(self) -> Windows:
-        """Of its maps."""
+        """The windows of a map."""
         ...
 
     @property
     def maps(self) -> Extractor:
-        """What gives the maps that windows are taken from, as the images' vectors."""
+        """Extractor of the maps, as global descriptors."""
         ...
 
 
-def known(extractor: WindowExtractor) -> Whitening:
-    """The whitening that was learned.
+def learned_whitening(extractor: WindowExtractor) -> Whitening:
+    """The extractor's learned whitening.
 
     Raises:
-        InputError: none was, or that of other windows, or of another network or preprocessing.
+        InputError: the whitening was not learned yet, or from other windows, another network or other preprocessing.
     """
-    who, whitening, expected = type(extractor).__name__, extractor.whitening, extractor.windows.dimension
+    name, whitening, expected = type(extractor).__name__, extractor.whitening, extractor.windows.dimension
     if not isinstance(whitening, Whitening):
-        raise InputError(f"{who}: has not seen the database; take mfvpr.retrieval.fitting.fitted(...) of it")
+        raise InputError(f"{name}: has not seen the database; take mfvpr.retrieval.fitting.fitted(...) of it")
     if len(whitening.mean) != expected:
-        raise InputError(f"{who}: expected a whitening of {expected} numbers, got one of {len(whitening.mean)}; learn "
+        raise InputError(f"{name}: expected a whitening of {expected} numbers, got one of {len(whitening.mean)}; learn "
                          "it from windows of these maps")  # fmt: skip
     if whitening.origin and whitening.origin != origin(extractor):
-        raise InputError(f"{who}: expected a whitening of its own network, images and windows, got one that was "
+        raise InputError(f"{name}: expected a whitening of its own network, images and windows, got one that was "
                          "learned with others; replace it by a WindowFitting")  # fmt: skip
     return whitening
 
 
 def origin(extractor: WindowExtractor) -> str:
-    """Hash of what makes the windows of an image: the network, what it is fed with, and where windows are.
-
-    "" where that has no recipe.
-    """
+    """Hash of the network, its preprocessing and the windows; "" if they have no recipe."""
     with suppress(TypeError):
         return fingerprint(recipe_of([extractor.maps, extractor.windows]))
     return ""
 
 
 def kernels(whitening: Whitening, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
-    """The whitening as a convolution: `[size, size, channels, D']`, and `[D']` to subtract, float32."""
+    """The whitening as a convolution: the kernel `[size, size, channels, D']` and an offset `[D']`, float32."""
     components = whitening.components.reshape(-1, windows.size, windows.size, windows.shape[2])
     offset = whitening.components.astype(np.float64) @ whitening.mean
     return np.moveaxis(components, 0, -1).astype(np.float32), offset.astype(np.float32)
 
 
-def whitened(maps: Array, kernel: Array, offset: Array, *, stride: int) -> Array:
-    """`[B, V, D']` descriptors of all windows of maps `[B, rows, columns, channels]`."""
+def whiten_windows(maps: Array, kernel: Array, offset: Array, *, stride: int) -> Array:
+    """Descriptors `[B, V, D']` of all windows of maps `[B, rows, columns, channels]`."""
     descriptors = jax.lax.conv_general_dilated(
         maps, kernel, (stride, stride), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC"),
         precision=jax.lax.Precision.HIGHEST,
@@ -184,7 +186,7 @@ def whitened(maps: Array, kernel: Array, offset: Array, *, stride: int) -> Array
     return descriptors.reshape(len(maps), -1, descriptors.shape[-1]) - offset[None, None]
 
 
-def normalized(maps: Array) -> Array:
-    """Maps `[..., channels]` of unit length at every position; zero stays zero."""
+def normalize_maps(maps: Array) -> Array:
+    """Scale maps `[..., channels]` to unit length at every position; zero stays zero."""
     length = jnp.sqrt(jnp.sum(maps * maps, axis=-1, keepdims=True))
     return maps / jnp.where(length > 0, length, 1.0)

@@ -16,7 +16,7 @@ from mfvpr.evaluation import match_sequence, stages
 from mfvpr.evaluation.sequence_matching import matches_recipe
 from mfvpr.features import Aggregated, FeatureSet, Sift, SsmCells, SsmWindows, VladFitting, WindowFitting, windows
 from mfvpr.features.ssm import SsmMaps
-from mfvpr.features.windows import Windows, kernels, normalized, whitened
+from mfvpr.features.windows import Windows, kernels, normalize_maps, whiten_windows
 from mfvpr.matching import Matching
 from mfvpr.networks import SsmVgg
 from mfvpr.retrieval import Retrieval, SsmVoting, fitted
@@ -82,7 +82,7 @@ def test_a_convolution_is_the_whitening_of_every_window():
     maps, found = rng.normal(size=(2, 6, 7, 4)).astype(np.float32), Windows((6, 7, 4), 3, 2)
     sample = np.concatenate([found.take(one, np.arange(found.count)) for one in maps])
     learned = fit_whitening(np.concatenate([sample, rng.normal(size=(40, 36))]), 5)
-    got = jax.jit(partial(whitened, stride=2))(maps, *kernels(learned, found))
+    got = jax.jit(partial(whiten_windows, stride=2))(maps, *kernels(learned, found))
     expected = (sample - learned.mean) @ learned.components.T
     np.testing.assert_allclose(np.reshape(got, (-1, 5)), expected, atol=1e-5)
 
@@ -90,7 +90,7 @@ def test_a_convolution_is_the_whitening_of_every_window():
 def test_maps_are_of_unit_length_where_there_is_something():
     maps = np.random.default_rng(2).normal(size=(1, 3, 3, 8)).astype(np.float32)
     maps[0, 1, 1] = 0
-    lengths = np.linalg.norm(np.asarray(normalized(maps)), axis=-1)
+    lengths = np.linalg.norm(np.asarray(normalize_maps(maps)), axis=-1)
     np.testing.assert_allclose(lengths, np.where(np.arange(9).reshape(1, 3, 3) == 4, 0, 1), atol=1e-6)
 
 

@@ -13,7 +13,7 @@ from mfvpr.checkpoints.tables import SSM
 from mfvpr.datasets import resize
 from mfvpr.features import WindowFitting
 from mfvpr.features.ssm import SsmMaps
-from mfvpr.features.windows import Windows, kernels, normalized, whitened
+from mfvpr.features.windows import Windows, kernels, normalize_maps, whiten_windows
 from mfvpr.reranking import FrameCorrelation
 from mfvpr.retrieval.ssm_voting import voted
 from tests.builders import make_matches
@@ -34,7 +34,7 @@ pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
 
 FITTINGS = WindowFitting(DIMENSIONS[0]), WindowFitting(DIMENSIONS[1], zero_row=True, dtype="float64")
 SIZES = 9, 3
-project = jax.jit(whitened, static_argnames="stride")
+project = jax.jit(whiten_windows, static_argnames="stride")
 score = jax.jit(lambda scorer, matches: scorer(matches))
 match = jax.jit(mfvpr.match, static_argnames="cross_check")
 
@@ -56,7 +56,7 @@ def of_maps(seed, stage):
     """Of the made-up ones."""
     rows = [(row, False) for row in range(DATABASE)] + [(row, True) for row in range(QUERIES)]
     return described(
-        np.asarray(normalized(np.stack([made_up_map(seed, stage, *row) for row in rows]))), stage, DATABASE
+        np.asarray(normalize_maps(np.stack([made_up_map(seed, stage, *row) for row in rows]))), stage, DATABASE
     )
 
 
