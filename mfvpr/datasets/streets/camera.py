@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from mfvpr.datasets.streets.types import Floats
 
-NEAR = 0.5  # what is nearer than this is not seen, meters
+NEAR = 0.5  # objects that are nearer to the camera are invisible, meters
 CAMERA_HEIGHT = 1.6  # meters
 
 

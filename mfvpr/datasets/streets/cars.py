@@ -20,7 +20,7 @@ TRAFFIC = (
 
 @dataclass(frozen=True)
 class Car:
-    """A car with its middle at x = 0 and its near end at z = 0: seen from behind, and coming along."""
+    """A car with its middle at x = 0 and its near end at z = 0: seen from behind, and oncoming."""
 
     ahead: Prop
     oncoming: Prop
@@ -50,7 +50,7 @@ def build_car(seed: int, index: int) -> Car:
     rng = np.random.default_rng([seed, 4, index])
     body, color = BODIES[int(rng.choice(3, p=(0.4, 0.35, 0.25)))], pick(rng, CARS)
     side = draw_side(rng, body, color)
-    right, left = texture(side), texture(side.mirrored())
+    right, left = texture(side), texture(side.mirror())
     rear = texture(draw_end(body, color, (160, 30, 30), (255, 50, 40)))
     front = texture(draw_end(body, color, (236, 236, 228), (255, 250, 230)))
     covers = (texture(draw_shadow()), texture(draw_top(color)), texture(draw_glass(body, color)))
@@ -68,10 +68,10 @@ def assemble(
     sides: tuple[Texture, Texture],
     covers: tuple[Texture, Texture, Texture],
 ) -> Prop:
-    """A car from its textures; `near` and `far` say where glass and roof start, in meters from the respective end.
+    """Build a car from its textures; `near` and `far`: start of glass and roof, in meters from the respective end.
 
-    `sides` are the left and the right as seen from behind, `covers` shadow, top and glass. All panels that face away
-    are there too: they are never painted.
+    `sides` are the left and the right as seen from behind, `covers` shadow, top and glass. Panels that face away are
+    included, but never painted.
     """
     shadow, top, glass = covers
     width, length, left = body.width, body.length, -body.width / 2
@@ -89,7 +89,7 @@ def assemble(
 
 
 def traffic(cars: tuple[Car, ...], camera: Camera, rng: Rng) -> list[Prop]:
-    """Cars ahead, cars that come along and parked cars, as the camera meets them."""
+    """Cars ahead, oncoming cars and parked cars around the camera."""
     props = []
     for x, nearest, farthest, oncoming in TRAFFIC:
         car = cars[int(rng.integers(len(cars)))]
@@ -100,7 +100,7 @@ def traffic(cars: tuple[Car, ...], camera: Camera, rng: Rng) -> list[Prop]:
 
 
 def draw_side(rng: Rng, body: Body, paint: Color) -> Sheet:
-    """The car from its right side: it drives to the right."""
+    """The right side of the car, which drives to the right."""
     sheet = Sheet(body.length, body.roof, None)
     length, waist = body.length, body.roof - body.hood
     low, high = body.rear
@@ -146,7 +146,7 @@ def draw_glass(body: Body, paint: Color) -> Sheet:
 
 
 def draw_shadow() -> Sheet:
-    """What a car darkens of the ground below it."""
+    """The shadow on the ground below a car."""
     sheet = Sheet(2.0, 2.0, None)
     sheet.ellipse(1.0, 1.0, 1.0, 1.0, (66, 66, 70), snow=60)
     return sheet

@@ -1,4 +1,4 @@
-"""What the street is painted with: palettes, and the arithmetic of colors."""
+"""Palettes of the street, and arithmetic with colors."""
 
 import numpy as np
 from numpy.typing import NDArray

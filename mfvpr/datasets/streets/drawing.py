@@ -1,4 +1,4 @@
-"""A folder of drawn images and their ground truth, whole or not there at all."""
+"""The folder of the synthetic street: images and ground truth, complete or absent."""
 
 import os
 import tempfile
@@ -22,14 +22,14 @@ from mfvpr.datasets.streets.sky import sky_prop
 from mfvpr.datasets.streets.weather import WEATHERS, Weather
 from mfvpr.utils.numerics import available_cpus
 
-VERSION = 1  # of the drawings: raise it when they change, so that old caches are not taken for new ones
+VERSION = 1  # of the images: raise it when they change, so that old caches are not used for new ones
 SIGHT = 100.0  # panels farther away are not drawn, meters
 Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One image to draw: where to, from where, in what weather, among which cars, with which random numbers."""
+    """One image to draw: its file, camera, weather, cars and seed."""
 
     path: Path
     camera: Camera
@@ -46,17 +46,18 @@ def streets_folder(
     image_size: tuple[int, int] = (448, 336),
     progress: Progress | None = None,
 ) -> Path:
-    """The folder of the drawn street inside `cache`, drawn now if it is not there yet; see `draw_streets`."""
-    name = f"streets-v{VERSION}-seed{seed}-{num_frames}x{image_size[0]}x{image_size[1]}"
+    """The folder of the synthetic street inside `cache`, drawn if it is missing; see `draw_streets`."""
     draw = partial(draw_streets, seed=seed, num_frames=num_frames, image_size=image_size, progress=progress)
-    return kept(Path(cache) / name, draw)
+    return cached_folder(Path(cache), "streets", draw)
 
 
-def kept(folder: Path, draw: Callable[[Path], None]) -> Path:
-    """A folder that `draw(folder)` makes, unless it is there.
+def cached_folder(cache: Path, kind: str, draw: partial[None]) -> Path:
+    """The folder inside `cache` that `draw(folder)` makes, drawn if it is missing.
 
-    It is drawn under another name and renamed when complete, so a killed run leaves nothing that looks complete.
+    It is drawn under another name and renamed when complete, so that a killed run leaves nothing that looks complete.
     """
+    seed, num_frames, (width, height) = (draw.keywords[name] for name in ("seed", "num_frames", "image_size"))
+    folder = cache / f"{kind}-v{VERSION}-seed{seed}-{num_frames}x{width}x{height}"
     if not folder.exists():
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".drawing-") as temporary:
@@ -78,19 +79,23 @@ def draw_streets(
     image_size: tuple[int, int] = (448, 336),
     progress: Progress | None = None,
 ) -> None:
-    """Draw the street into `folder`.
+    """Draw the synthetic street into `folder`.
 
-    It gets database/0000.png ... (a summer day), queries/0000.png ... (the same places, first at night, from half
-    of the frames on in snow; other lane, other heading, other cars) and ground_truth.csv with the columns query,
-    database (file names), shift_x and shift_y: candidate minus query position in px of the drawn image, x to the
-    right, y down. The shift is the median, per axis, over a grid of those facade points that the query's camera
-    sees (trees, signs and cars disregarded) and that also lie inside the database image; see `image_shift`.
-    The result depends on seed, number and size only, down to the last bit.
+    The folder gets
+
+    * database/0000.png ...: a summer day,
+    * queries/0000.png ...: the same places with another lane, other headings and other cars; the first half of the
+      frames at night, the second half in snow,
+    * ground_truth.csv: columns query, database (file names), shift_x and shift_y: candidate minus query position in px
+      of the image, x to the right, y down. The shift is the median, per axis, over facade points that are visible in
+      both images (trees, signs and cars disregarded); see `image_shift`.
+
+    The files depend on `seed`, `num_frames` and `image_size` only, to the bit.
 
     Args:
-        folder: which must not exist yet.
+        folder: must not exist yet.
         seed: of the street, its cars and the drives.
-        num_frames: places, 1.75 m apart; twice as many images.
+        num_frames: number of places, 1.75 m apart; there are twice as many images.
         image_size: (width, height) in px.
         progress: `progress(done, total)` is called in the caller's thread after every image.
 
@@ -104,7 +109,11 @@ def draw_streets(
     scene = build_scene(seed, SPACING * num_frames + SIGHT)
     database, queries = plan_drives(seed, num_frames, image_size)
     write_ground_truth(folder / "ground_truth.csv", scene.facades, queries, database)
-    shots = plan_shots(folder, scene, seed, database, queries)
+    shots = []
+    for row, (query, candidate) in enumerate(zip(queries, database, strict=True)):  # no car is in both drives
+        weather, name = WEATHERS["night" if row < num_frames // 2 else "snow"], f"{row:04d}.png"
+        shots.append(Shot(folder / "database" / name, candidate, WEATHERS["day"], scene.cars[1::2], (seed, 7, row)))
+        shots.append(Shot(folder / "queries" / name, query, weather, scene.cars[::2], (seed, 8, row)))
     draw_shots(scene, shots, progress)
 
 
@@ -112,8 +121,8 @@ def draw_shots(scene: Scene, shots: Sequence[Shot], progress: Progress | None) -
     """Draw the images on threads."""
     pool = ThreadPoolExecutor(available_cpus())  # more would only wait for each other
     try:
-        drawn = [pool.submit(draw_shot, scene, shot) for shot in shots]
-        for done, future in enumerate(as_completed(drawn), start=1):
+        futures = [pool.submit(draw_shot, scene, shot) for shot in shots]
+        for done, future in enumerate(as_completed(futures), start=1):
             future.result()
             if progress is not None:
                 progress(done, len(shots))
@@ -121,22 +130,10 @@ def draw_shots(scene: Scene, shots: Sequence[Shot], progress: Progress | None) -
         pool.shutdown(cancel_futures=True)
 
 
-def plan_shots(folder: Path, scene: Scene, seed: int, database: list[Camera], queries: list[Camera]) -> list[Shot]:
-    """The images of both drives; no car is met in both."""
-    query_cars, database_cars = scene.cars[::2], scene.cars[1::2]
-    shots = []
-    for i, (query, candidate) in enumerate(zip(queries, database, strict=True)):
-        weather, name = WEATHERS["night" if i < len(queries) // 2 else "snow"], f"{i:04d}.png"
-        shots.append(Shot(folder / "database" / name, candidate, WEATHERS["day"], database_cars, (seed, 7, i)))
-        shots.append(Shot(folder / "queries" / name, query, weather, query_cars, (seed, 8, i)))
-    return shots
-
-
 def draw_shot(scene: Scene, shot: Shot) -> None:
     """Draw one image and write it."""
-    rng = np.random.default_rng(shot.seed)
-    camera = shot.camera
-    # Nothing on the street can hide behind a house, hence houses first, then all that stands on the street.
+    rng, camera = np.random.default_rng(shot.seed), shot.camera
+    # Objects on the street are never behind a house, hence houses are painted first.
     layers = (scene.ground, scene.houses, (*scene.street, *traffic(shot.cars, camera, rng)))
     near = ([prop for prop in layer if prop.z < camera.z + SIGHT] for layer in layers)
     image = expose(paint(([sky_prop(scene.sky, camera)], *near), camera, shot.weather), shot.weather, rng)

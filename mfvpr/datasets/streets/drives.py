@@ -1,4 +1,4 @@
-"""Where the cameras of both drives are."""
+"""Positions of the cameras of all drives."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ _DEGREE = np.pi / 180
 
 
 def smooth_walk(rng: Rng, count: int, correlation: float = 8.0) -> Floats:
-    """Smooth random values `[count]` in [-1, 1], alike over `correlation` frames."""
+    """Smooth random values `[count]` in [-1, 1], similar over `correlation` frames."""
     steps = np.arange(-30, 31)
     kernel = np.exp(-0.5 * (steps / correlation) ** 2)
     walk = np.convolve(rng.standard_normal(count + len(steps) - 1), kernel, mode="valid")
@@ -27,20 +27,20 @@ def plan_drives(seed: int, count: int, image_size: tuple[int, int]) -> tuple[lis
     lane, heading, pitch = _path(rng, count)
     wobble = 0.3 * _DEGREE * rng.standard_normal((2, count))
     z = SPACING * np.arange(count)
-    database = [Camera(LANE, z[i], wobble[0, i], wobble[1, i], image_size) for i in range(count)]
-    queries = [Camera(lane[i], z[i], heading[i], pitch[i], image_size) for i in range(count)]
+    database = [Camera(LANE, *pose, image_size) for pose in zip(z, *wobble, strict=True)]
+    queries = [Camera(*pose, image_size) for pose in zip(lane, z, heading, pitch, strict=True)]
     return database, queries
 
 
 def plan_return(seed: int, number: int, count: int, image_size: tuple[int, int]) -> list[Camera]:
-    """The cameras of the same road on another day, `number`: its own lane, heading and places between the frames.
+    """The cameras of drive `number` on another day, with another lane, other headings and positions between frames.
 
-    Frame i is taken nearer to the database's frame i than to any other, by up to 0.4 of their spacing.
+    Frame i is at most 0.4 of the database's spacing away from the database's frame i.
     """
     rng = np.random.default_rng([seed, 9, number])
     lane, heading, pitch = _path(rng, count)
     z = SPACING * (np.arange(count) + rng.uniform(-0.2, 0.2) + 0.2 * smooth_walk(rng, count))
-    return [Camera(lane[i], z[i], heading[i], pitch[i], image_size) for i in range(count)]
+    return [Camera(*pose, image_size) for pose in zip(lane, z, heading, pitch, strict=True)]
 
 
 def _path(rng: Rng, count: int) -> tuple[Floats, Floats, Floats]:

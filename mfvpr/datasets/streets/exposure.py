@@ -1,4 +1,4 @@
-"""What lens, air and sensor make of the painted image."""
+"""Effects of lens, air and sensor on a painted image."""
 
 import cv2
 import numpy as np
@@ -8,7 +8,7 @@ from mfvpr.datasets.streets.weather import Weather
 
 
 def expose(image: Image, weather: Weather, rng: Rng) -> Image:
-    """The image as the camera gives it: a few frames come out much worse than the rest."""
+    """The image with all effects of its weather; a few frames are much worse than the rest."""
     exposure, seen = weather.exposure, image.astype(np.float32)
     # Heavy-tailed: below 1 in six of ten frames, above 10 in one of ten.
     severity = min(rng.exponential() ** 3, 20.0) * image.shape[1] / 448
@@ -30,7 +30,7 @@ def expose(image: Image, weather: Weather, rng: Rng) -> Image:
 
 
 def bloom(image: Floats, gain: float) -> Floats:
-    """The image with the glow around bright lights, as a lens spreads it."""
+    """The image with a glow around bright lights, as from a lens."""
     small = cv2.resize(image, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
     bright = np.maximum(small - 150, 0)
     spread = 0.6 * cv2.GaussianBlur(bright, (0, 0), 2) + 0.9 * cv2.GaussianBlur(bright, (0, 0), 7)

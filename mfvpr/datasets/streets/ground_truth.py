@@ -1,4 +1,4 @@
-"""How far the scene moves between two images, from the geometry of the street."""
+"""Shifts of the scene between two images, from the geometry of the street."""
 
 import csv
 from collections.abc import Iterable
@@ -22,7 +22,7 @@ class Facade:
 
 
 def visible_points(facades: Iterable[Facade], camera: Camera, step: int = 8) -> Floats:
-    """Facade points `[n, 3]` that a grid of one px in `step` of the image sees, other facades in front removed."""
+    """Points `[n, 3]` on the nearest facades, seen through a grid of every `step`-th px of the image."""
     width, height = camera.image_size
     u, v = np.meshgrid(np.arange(step / 2, width, step), np.arange(step / 2, height, step))
     rays = np.stack([(u - width / 2) / camera.focal, (v - height / 2) / camera.focal, np.ones_like(u)], -1)
@@ -35,15 +35,15 @@ def visible_points(facades: Iterable[Facade], camera: Camera, step: int = 8) -> 
         hit = (distance > 0) & (points[:, 2] >= facade.start) & (points[:, 2] <= facade.end)
         hit &= (points[:, 1] <= 0) & (points[:, 1] >= -facade.height)
         nearest = np.where(hit & (distance < nearest), distance, nearest)
-    seen = np.isfinite(nearest)
-    return camera.center() + nearest[seen, None] * rays[seen]
+    hits = np.isfinite(nearest)
+    return camera.center() + nearest[hits, None] * rays[hits]
 
 
 def image_shift(points: Floats, query: Camera, database: Camera) -> tuple[float, float]:
-    """Where the scene of the query image has to move to fall on the database image, (x, y) in px.
+    """Shift (x, y) in px that moves the scene of the query image onto the database image.
 
-    It is the median, per axis, over the world points `[n, 3]` inside both images, of the point's position in the
-    database image minus its position in the query image.
+    It is the median, per axis, of the position in the database image minus the position in the query image, over the
+    world points `[n, 3]` inside both images.
     """
     (before, inside_query), (after, inside_database) = query.project(points), database.project(points)
     x, y = np.median((after - before)[inside_query & inside_database], axis=0)

@@ -1,4 +1,4 @@
-"""What a house looks like from the street: windows, walls, shops, gable and roof."""
+"""Drawings of houses: windows, walls, shops, gable and roof."""
 
 from dataclasses import dataclass
 
@@ -96,7 +96,7 @@ def draw_wall(sheet: Sheet, rng: Rng) -> None:
 
 
 def draw_damage(sheet: Sheet, rng: Rng) -> None:
-    """What makes a wall this wall: flaked plaster with bare bricks, posters, scribbles."""
+    """Marks that tell walls apart: flaked plaster with bare bricks, posters, scribbles."""
     for _ in range(rng.integers(10, 22)):
         x, y = rng.uniform((0.3, 0.5), (sheet.width - 0.3, sheet.height - 0.5))
         angles = np.linspace(0, 2 * np.pi, 11)
@@ -127,7 +127,7 @@ def draw_shop(sheet: Sheet, rng: Rng, top: float, trim: Color, accent: Color) ->
 
 @dataclass(frozen=True)
 class Design:
-    """What houses of one builder share: width in meters, floors above the ground floor, windows, use."""
+    """Design that several houses share: width in meters, floors above the ground floor, windows, use."""
 
     width: float
     floors: int

@@ -1,4 +1,4 @@
-"""What stands between the houses: the ground, trees, lamps, signs, hedges."""
+"""Drawings of the ground, trees, lamps, signs and hedges."""
 
 import numpy as np
 

@@ -1,6 +1,7 @@
 """Panels in true perspective, painted from far to near."""
 
 from collections.abc import Iterable
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -10,7 +11,7 @@ from mfvpr.datasets.streets.panels import Panel, Prop
 from mfvpr.datasets.streets.types import Floats, Image
 from mfvpr.datasets.streets.weather import Weather
 
-OVERSAMPLING = 1.5  # the canvas is that much larger than the image, against jagged edges
+OVERSAMPLING = 1.5  # size of the canvas per size of the image, against jagged edges
 
 
 def paint(layers: Iterable[Iterable[Prop]], camera: Camera, weather: Weather) -> Image:
@@ -54,27 +55,26 @@ def paint_panel(canvas: Image, projection: Floats, panel: Panel, weather: Weathe
 
 
 def clip_outline(homography: Floats) -> Floats | None:
-    """Corners `[n, 2]`, in px, of the unit square's image, cut off in front of the camera; None if not in front."""
+    """Corners `[n, 2]` px of the unit square's image, clipped in front of the camera; None if all of it is behind."""
     corners = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1.0]]) @ homography.T
     if np.all(corners[:, 2] > NEAR):
         return corners[:, :2] / corners[:, 2:]
-    kept = []
-    for here, after in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        if here[2] > NEAR:
-            kept.append(here)
-        if (here[2] > NEAR) != (after[2] > NEAR):
-            kept.append(here + (after - here) * (NEAR - here[2]) / (after[2] - here[2]))
-    return np.array([p[:2] / p[2] for p in kept]) if kept else None
+    outline = []
+    for corner, following in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        if corner[2] > NEAR:
+            outline.append(corner)
+        if (corner[2] > NEAR) != (following[2] > NEAR):
+            outline.append(corner + (following - corner) * (NEAR - corner[2]) / (following[2] - corner[2]))
+    return np.array([point[:2] / point[2] for point in outline]) if outline else None
 
 
 def shows_back(outline: Floats) -> bool:
     """Whether the corners `[n, 2]` run the wrong way around, or enclose less than half a px."""
-    (x0, y0), *others = outline.tolist()
-    corners = [*others, (x0, y0)]
-    area = 0.0
-    for x1, y1 in corners:
-        area, x0, y0 = area + x0 * y1 - y0 * x1, x1, y1
-    return area <= 1  # twice the area
+    corners = outline.tolist()
+    double_area = 0.0
+    for (x0, y0), (x1, y1) in pairwise([*corners, corners[0]]):
+        double_area = double_area + x0 * y1 - y0 * x1
+    return double_area <= 1
 
 
 def haze_table(weather: Weather, depth: float) -> Image:

@@ -1,4 +1,4 @@
-"""Flat panels, of which everything on the street is made."""
+"""Flat panels, the parts of all objects on the street."""
 
 from dataclasses import dataclass, replace
 

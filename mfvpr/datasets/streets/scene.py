@@ -20,7 +20,7 @@ NUM_CARS = 24
 
 @dataclass(frozen=True)
 class Scene:
-    """All that stands along the street; each of ground, houses and street is painted as one layer."""
+    """All objects of the street; ground, houses and street are painted as one layer each."""
 
     ground: tuple[Prop, ...]
     houses: tuple[Prop, ...]
@@ -44,7 +44,7 @@ def build_scene(seed: int, length: float) -> Scene:
 
 
 def lamp_light(z: Floats) -> Floats:
-    """How strongly the street lamps light what is at z (meters), 0..1."""
+    """Light of the street lamps at z (meters), 0..1."""
     return np.exp(-((((z + LAMP_SPACING / 2) % LAMP_SPACING - LAMP_SPACING / 2) / 5.0) ** 2))
 
 
@@ -57,8 +57,8 @@ def build_row(seed: int, side: int, length: float) -> tuple[list[Prop], list[Fac
     while z < length:
         if rng.random() < 0.2:
             gap = rng.uniform(2.0, 4.0)
-            props += [build_tree(rng, side * 12.5, z + gap - 0.5)]
-            props += [upright(texture(draw_hedge(rng, 5.0, 1.9)), side * 9.9, z + 0.2, 5.0, 1.9)]
+            props.append(build_tree(rng, side * 12.5, z + gap - 0.5))
+            props.append(upright(texture(draw_hedge(rng, 5.0, 1.9)), side * 9.9, z + 0.2, 5.0, 1.9))
             z += gap
         design = designs[len(facades) % len(designs)]
         prop, facade = build_house(rng, design, side, rng.choice((7.4, 7.9, 8.4, 9.4)), z)
@@ -106,9 +106,8 @@ def build_furniture(seed: int, length: float) -> list[Prop]:
     """Lamps, trees and signs along both sidewalks."""
     rng = np.random.default_rng([seed, 2])
     lamp = texture(draw_lamp())
-    props = []
-    for index, z in enumerate(np.arange(LAMP_SPACING, length, LAMP_SPACING)):
-        props.append(upright(lamp, 5.4 if index % 2 else -5.4, z, 1.0, 5.2))
+    places = enumerate(np.arange(LAMP_SPACING, length, LAMP_SPACING))
+    props = [upright(lamp, 5.4 if index % 2 else -5.4, z, 1.0, 5.2) for index, z in places]
     for side in (-1, 1):
         for z in np.arange(6.0, length, 11.0):
             kind = rng.random()

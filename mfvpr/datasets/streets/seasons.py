@@ -1,16 +1,16 @@
-"""The drawn street by day, and again on seven other days: as RobotCar Seasons stands to its seven conditions."""
+"""The synthetic street by day and in seven other conditions, those of RobotCar Seasons."""
 
 from functools import partial
 from pathlib import Path
 
-from mfvpr.datasets.streets.drawing import SIGHT, VERSION, Progress, Shot, draw_shots, kept
+from mfvpr.datasets.streets.drawing import SIGHT, Progress, Shot, cached_folder, draw_shots
 from mfvpr.datasets.streets.drives import SPACING, plan_drives, plan_return
 from mfvpr.datasets.streets.ground_truth import write_ground_truth
 from mfvpr.datasets.streets.scene import build_scene
 from mfvpr.datasets.streets.weather import WEATHERS
 
 CONDITIONS = ("dawn", "dusk", "night", "night-rain", "winter", "rain", "snow")
-TRUTH = "ground_truth.csv"  # in the folder of each
+TRUTH = "ground_truth.csv"  # in the folder of each condition
 
 
 def seasons_folder(
@@ -21,10 +21,9 @@ def seasons_folder(
     image_size: tuple[int, int] = (448, 336),
     progress: Progress | None = None,
 ) -> Path:
-    """The folder of the drawn seasons inside `cache`, drawn now if it is not there yet; see `draw_seasons`."""
-    name = f"seasons-v{VERSION}-seed{seed}-{num_frames}x{image_size[0]}x{image_size[1]}"
+    """The folder of the synthetic street's seasons inside `cache`, drawn if it is missing; see `draw_seasons`."""
     draw = partial(draw_seasons, seed=seed, num_frames=num_frames, image_size=image_size, progress=progress)
-    return kept(Path(cache) / name, draw)
+    return cached_folder(Path(cache), "seasons", draw)
 
 
 def draw_seasons(
@@ -35,16 +34,16 @@ def draw_seasons(
     image_size: tuple[int, int] = (448, 336),
     progress: Progress | None = None,
 ) -> None:
-    """Draw the street into `folder`: database/0000.png ... by day, and a folder per condition.
+    """Draw the synthetic street into `folder`: database/0000.png ... by day, and a folder per condition.
 
-    Each is a drive of its own, in another lane, with other headings and between the frames of the database, and has a
-    ground_truth.csv as `draw_streets` writes it: frame i shows the place of the database's frame i. The result depends
-    on seed, number and size only, down to the last bit.
+    Each condition has its own drive, in another lane, with other headings and between the frames of the database, and a
+    ground_truth.csv as from `draw_streets`: frame i shows the place of the database's frame i. The files depend on
+    `seed`, `num_frames` and `image_size` only, to the bit.
 
     Args:
-        folder: which must not exist yet.
+        folder: must not exist yet.
         seed: of the street, its cars and the drives.
-        num_frames: places, 1.75 m apart; eight times as many images.
+        num_frames: number of places, 1.75 m apart; there are eight times as many images.
         image_size: (width, height) in px.
         progress: `progress(done, total)` is called in the caller's thread after every image.
 
@@ -55,17 +54,15 @@ def draw_seasons(
     folder.mkdir(parents=True)
     scene = build_scene(seed, SPACING * (num_frames + 1) + SIGHT)
     database, _ = plan_drives(seed, num_frames, image_size)
-    drives = {"database": database}
+    drives = {"database": (database, WEATHERS["day"], scene.cars[1::2])}
     for number, condition in enumerate(CONDITIONS):
-        drives[condition] = plan_return(seed, number, num_frames, image_size)
-    for name in drives:
-        (folder / name).mkdir()
+        cameras = plan_return(seed, number, num_frames, image_size)
+        drives[condition] = (cameras, WEATHERS[condition], scene.cars[::2])
+        (folder / condition).mkdir()
+        write_ground_truth(folder / condition / TRUTH, scene.facades, cameras, database)
+    (folder / "database").mkdir()
     shots = []
-    for row in range(num_frames):  # all weathers in turn: threads then need not make the same textures at a time
-        for number, (name, cameras) in enumerate(drives.items()):
-            cars = scene.cars[1::2] if name == "database" else scene.cars[::2]
-            weather = WEATHERS["day" if name == "database" else name]
+    for row in range(num_frames):  # all weathers in turn, so that threads rarely need the same textures
+        for number, (name, (cameras, weather, cars)) in enumerate(drives.items()):
             shots.append(Shot(folder / name / f"{row:04d}.png", cameras[row], weather, cars, (seed, 10, number, row)))
-    for condition in CONDITIONS:
-        write_ground_truth(folder / condition / TRUTH, scene.facades, drives[condition], database)
     draw_shots(scene, shots, progress)

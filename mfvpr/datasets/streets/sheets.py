@@ -1,7 +1,6 @@
 """Sheets: flat drawings in meters, and the textures they become in each weather.
 
-Besides its summer-day colors a sheet knows where it glows at night and where snow settles, so that it can be seen in
-any weather.
+A sheet has its colors on a summer day, its glow at night, and the amount of snow that settles, for use in any weather.
 """
 
 from collections.abc import Callable
@@ -67,7 +66,7 @@ class Sheet:
         """Let snow settle on the whole sheet: `amount` is 0..255, broadcast over rows and columns."""
         self.effects[..., 3] = amount
 
-    def mirrored(self) -> "Sheet":
+    def mirror(self) -> "Sheet":
         """The sheet with left and right exchanged."""
         sheet = Sheet(self.width, self.height, None, self.scale)
         sheet.day[:], sheet.effects[:] = self.day[:, ::-1], self.effects[:, ::-1]
@@ -75,10 +74,10 @@ class Sheet:
 
 
 def texture(sheet: Sheet, lamp_light: NDArray[np.floating] | float = 0.0, sun: float = 1.0) -> Texture:
-    """What a finished sheet looks like, drawn for a weather when that is first asked for.
+    """The texture of a finished sheet, computed when a weather is first used.
 
-    `lamp_light` (0..1, broadcast over rows and columns) is the light of street lamps that falls on it, `sun` the gain
-    of a surface that faces the sun as this one does.
+    `lamp_light` (0..1, broadcast over rows and columns) is the light of street lamps on the sheet, `sun` the gain of
+    a surface with this orientation to the sun.
     """
     light = np.asarray(lamp_light, np.float32)
 
@@ -96,13 +95,13 @@ def texture(sheet: Sheet, lamp_light: NDArray[np.floating] | float = 0.0, sun: f
 
 
 def blotches(rng: Rng, shape: tuple[int, int], cell: float) -> Floats:
-    """Smooth noise of about unit spread whose spots are `cell` px wide."""
+    """Smooth noise with a standard deviation of about 1 and spots `cell` px wide."""
     rows, columns = (max(2, round(n / cell)) for n in shape)
     return cv2.resize(rng.standard_normal((rows, columns), np.float32), shape[::-1], interpolation=cv2.INTER_CUBIC)
 
 
 def draw_glyphs(sheet: Sheet, rng: Rng, x: float, y: float, width: float, height: float, color: Color) -> None:
-    """A word in no alphabet: glyphs of random strokes between the corners of a small grid."""
+    """Draw a word of random glyphs, whose strokes connect points of a small grid."""
     step = height * 0.85
     for left in np.arange(x, x + width - 0.6 * step, step):
         nodes = rng.integers(0, (3, 4), (5, 2)) / (2, 3) * (0.6 * step, height)

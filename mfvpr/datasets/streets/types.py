@@ -1,4 +1,4 @@
-"""Names of what passes between the modules; the annotations of cv2 do not tell element types."""
+"""Array types that pass between the modules; the annotations of cv2 lack element types."""
 
 from typing import Any
 

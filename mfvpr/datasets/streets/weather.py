@@ -1,4 +1,4 @@
-"""The table of weathers: all that the drawing knows of an hour and a season is in its row."""
+"""The table of weathers: all settings of the drawing that depend on hour and season."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from mfvpr.datasets.streets.types import Color
 
 @dataclass(frozen=True)
 class Exposure:
-    """What lens, air and sensor add to the painted image, in px of an image 448 px wide; 0 leaves an effect out.
+    """Strength of the effects of lens, air and sensor, in px of an image 448 px wide; 0 leaves an effect out.
 
     Some effects grow with the frame's `severity`, which is heavy-tailed: see `exposure.expose`.
     """
@@ -16,28 +16,28 @@ class Exposure:
     motion: float = 0.0  # width of the blur along the turn, px per unit of severity
     bloom: float = 0.0  # gain on the glow around bright lights
     defocus: float = 0.0  # least standard deviation of the blur, px of the drawn image
-    defocus_spread: float = 0.0  # how much more it is at random, at most
-    drops: float = 0.0  # how much more it is by drops on the lens, px per unit of severity
+    defocus_spread: float = 0.0  # largest random addition to it, px
+    drops: float = 0.0  # addition to it by drops on the lens, px per unit of severity
     flakes: float = 0.0  # mean number of snow flakes per image
     streaks: float = 0.0  # mean number of rain streaks per image
 
 
 @dataclass(frozen=True)
 class Weather:
-    """How the street looks at one hour and season; colors are RGB gains or RGB values 0..255."""
+    """Light and colors of the street at one hour and season; colors are RGB gains or RGB values 0..255."""
 
     ambient: tuple[float, float, float]  # gain on the day colors
     lamp: tuple[float, float, float]  # further gain right under a street lamp
-    sun: float  # how much what faces the sun differs from what does not: 0..1
-    glow: float  # how much of the glowing parts shows: 0..1
-    snow: float  # how much of the settled snow shows: 0..1
+    sun: float  # contrast between surfaces that face the sun and others, 0..1
+    glow: float  # visibility of glowing parts, 0..1
+    snow: float  # visibility of settled snow, 0..1
     zenith: Color
     horizon: Color  # also the color of the haze
     haze: float  # distance at which the haze has taken 63 %, meters
     exposure: Exposure
 
 
-# New weathers go to the end: the place in the table seeds the clouds (see `scene.build_scene`).
+# New weathers go to the end: the position in the table seeds the clouds (see `sky.sky_texture`).
 WEATHERS = {
     "day": Weather(
         ambient=(1.0, 1.0, 1.0), lamp=(0, 0, 0), sun=1.0, glow=0.0, snow=0.0,
