@@ -1,8 +1,7 @@
-"""What image files hold, remembered from run to run, so that nothing is read again that has not changed.
+"""Hashes and headers of image files, remembered between runs, so that unchanged files are not read again.
 
-A file's content decides, never its name or its age: a record is trusted only where path, size, both times and number of
-the file are what they were, and only if the times were old enough when it was read: a file that is written twice within
-one tick of the clock keeps them.
+A remembered hash is used only if path, size, both times and inode number of the file are unchanged, and if the times
+were old enough when the file was read: a file that is written twice within one tick of the clock keeps its times.
 """
 
 import hashlib
@@ -21,18 +20,18 @@ from mfvpr.datasets.images import read_header
 from mfvpr.utils.files import IMAGE_SUFFIXES, write_text
 from mfvpr.utils.threads import ordered_map
 
-FORMAT = 2  # of the records: raise it when they change
+FORMAT = 2  # of the record files: raise it when they change
 SETTLED = 2_000_000_000  # ns; the coarsest clock of a file system (FAT) ticks every two seconds
 
 
 @dataclass(frozen=True)
 class Content:
-    """One file.
+    """Hash and header of one file.
 
     Attributes:
-        sha256: of all bytes; "" = it cannot be read.
+        sha256: of all bytes; "" = the file cannot be read.
         orientation: see `mfvpr.datasets.images.Header`.
-        largest: see there.
+        largest: see `mfvpr.datasets.images.Header`.
     """
 
     sha256: str = ""
@@ -42,14 +41,14 @@ class Content:
 
 @dataclass(frozen=True)
 class Contents:
-    """The files of a folder, in its order."""
+    """The contents of a folder's files, in its order."""
 
     folder: ImageFolder
     files: tuple[Content, ...]
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 over names, contents and what reading does to them; the first 16 hexadecimal digits."""
+        """SHA-256 over names, contents and applied conversions; the first 16 hexadecimal digits."""
         digest = hashlib.sha256()
         for name, file in zip(self.folder.names, self.files, strict=True):
             content = bytes.fromhex(file.sha256) if file.sha256 else b"unreadable"
@@ -62,56 +61,53 @@ class Contents:
 
     @cached_property
     def sha256(self) -> str:
-        """Over the contents alone, whatever the files are called; the first 16 hexadecimal digits."""
+        """SHA-256 over the contents without names; the first 16 hexadecimal digits."""
         return hashlib.sha256("".join(file.sha256 for file in self.files).encode()).hexdigest()[:16]
 
     def summary(self) -> dict[str, int | bool | None]:
-        """What reading does to the images, for people and results."""
-        tagged = sum(file.orientation != 1 for file in self.files)
-        deep = [file.largest for file in self.files if file.largest is not None]
+        """Conversions of the images when they are read: numbers of turned and of scaled images, for results."""
+        num_turned = sum(file.orientation != 1 for file in self.files)
+        largest = [file.largest for file in self.files if file.largest is not None]
         return {
             "orient": self.folder.orient,
-            "turned": tagged if self.folder.orient else 0,
+            "turned": num_turned if self.folder.orient else 0,
             "bits": self.folder.bits,
-            "scaled_16bit": len(deep) if self.folder.bits is not None else 0,
-            "largest_16bit": max(deep, default=None),
+            "scaled_16bit": len(largest) if self.folder.bits is not None else 0,
+            "largest_16bit": max(largest, default=None),
         }
 
 
 def contents(folder: ImageFolder, cache: Path | str | None = None) -> Contents:
-    """What the files of `folder` hold.
+    """The contents of the files of `folder`.
 
     Args:
         folder: images.
-        cache: folder in which it is remembered; None = everything is read. A record that is damaged, or that another
+        cache: folder of the record files; None = all files are read. A record file that is damaged, or that another
             process replaces meanwhile, costs time only.
     """
     root = folder.root.absolute()
-    record = None if cache is None else Path(cache) / f"{hashlib.sha256(os.fsencode(root)).hexdigest()[:32]}.json"
-    known, begun = {} if record is None else _recalled(record), time.time_ns()
+    path = None if cache is None else Path(cache) / f"{hashlib.sha256(os.fsencode(root)).hexdigest()[:32]}.json"
+    records, start = {} if path is None else _read_records(path), time.time_ns()
     states = dict(zip(folder.names, map(state_of, folder.paths), strict=True))
-    trusted = {name for name, state in states.items() if state and name in known and known[name][:4] == state}
-    changed = [name for name in folder.names if name not in trusted]
-    read = ordered_map(read_content, [folder.root / name for name in changed], workers=2)
-    files = {name: Content(*known[name][4:]) for name in trusted} | dict(zip(changed, read, strict=True))
-    if record is not None and changed:  # other files of this folder, which another data set asks for, stay known
-        settled = {name: state for name, state in states.items() if state and max(state[1:3]) < begun - SETTLED}
-        _remember(record, known | {name: [*state, *astuple(files[name])] for name, state in settled.items()})
+    unchanged = {name for name, state in states.items() if state and name in records and records[name][:4] == state}
+    changed = [name for name in folder.names if name not in unchanged]
+    new = ordered_map(read_content, [folder.root / name for name in changed], workers=2)
+    files = {name: Content(*records[name][4:]) for name in unchanged} | dict(zip(changed, new, strict=True))
+    if path is not None and changed:  # records of other files of this folder, from other data sets, stay
+        settled = {name: state for name, state in states.items() if state and max(state[1:3]) < start - SETTLED}
+        _write_records(path, records | {name: [*state, *astuple(files[name])] for name, state in settled.items()})
     return Contents(folder, tuple(files[name] for name in folder.names))
 
 
 def files_of(path: PurePath) -> ImageFolder:
-    """A file, or all files below a folder, as what contents are known of."""
+    """A file, or all files below a folder, as a folder for `contents`."""
     path = Path(path)
     names = [file.relative_to(path).as_posix() for file in path.rglob("*") if file.is_file()]
     return ImageFolder(path, tuple(sorted(names))) if path.is_dir() else ImageFolder(path.parent, (path.name,))
 
 
 def state_of(path: Path | str) -> list[int] | None:
-    """Size, when content and entry last changed (ns), and the number of the file, which moves along with it.
-
-    None where there is no file.
-    """
+    """Size, times of the last change of content and of entry (ns), and inode number; None if there is no file."""
     try:
         status = os.stat(path)
     except OSError:
@@ -121,32 +117,32 @@ def state_of(path: Path | str) -> list[int] | None:
 
 def read_content(path: Path) -> Content:
     try:
-        if not path.is_file():  # a pipe would keep us waiting
+        if not path.is_file():  # a pipe would block
             return Content()
-        if path.suffix.lower() not in IMAGE_SUFFIXES:  # no image, and perhaps larger than the memory
+        if path.suffix.lower() not in IMAGE_SUFFIXES:  # perhaps larger than the memory
             with path.open("rb") as file:
                 return Content(hashlib.file_digest(file, "sha256").hexdigest())
         content = path.read_bytes()
     except OSError:
-        return Content()  # whoever reads the image will tell
+        return Content()  # reading the image raises
     header = read_header(content)
     return Content(hashlib.sha256(content).hexdigest(), header.orientation, header.largest)
 
 
-def _recalled(record: Path) -> dict[str, list[Any]]:
-    """By name: the state of the file, and its Content. Empty where there is no record, or a damaged one."""
+def _read_records(path: Path) -> dict[str, list[Any]]:
+    """State and content of files by name; empty if the record file is missing or damaged."""
     try:
-        check, _, text = record.read_text(encoding="ascii").partition("\n")
+        check, _, text = path.read_text(encoding="ascii").partition("\n")
     except (OSError, UnicodeError):
         return {}
-    return json.loads(text) if check == _check(text) else {}
+    return json.loads(text) if check == _checksum(text) else {}
 
 
-def _remember(record: Path, files: Mapping[str, Any]) -> None:
-    text = json.dumps(files, separators=(",", ":"))  # ASCII: file names may be no UTF-8
-    with suppress(OSError):  # it would only have saved time
-        write_text(record, f"{_check(text)}\n{text}")
+def _write_records(path: Path, records: Mapping[str, Any]) -> None:
+    text = json.dumps(records, separators=(",", ":"))  # ASCII: file names may be no UTF-8
+    with suppress(OSError):  # records only save time
+        write_text(path, f"{_checksum(text)}\n{text}")
 
 
-def _check(text: str) -> str:
+def _checksum(text: str) -> str:
     return f"{FORMAT} {hashlib.sha256(text.encode('ascii')).hexdigest()}"

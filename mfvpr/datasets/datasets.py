@@ -1,4 +1,4 @@
-"""A data set: database images, query images, and where the queries really are."""
+"""Data sets: database images, query images, and ground truth."""
 
 import os
 import re
@@ -16,7 +16,7 @@ from mfvpr.datasets.truth_files import truth_from_file, truth_from_labels
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import IMAGE_SUFFIXES
 
-MEANS = ("mean", "pooled")  # what results call the means over sequences, and over all of their queries
+MEANS = ("mean", "pooled")  # names in results of the means over sequences, and over all of their queries
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,9 @@ class ImageFolder:
 
     Attributes:
         root: folder.
-        names: of the images.
-        orient: how they are read, see `mfvpr.datasets.images.read_image`.
-        bits: likewise.
+        names: relative paths of the images.
+        orient: see `mfvpr.datasets.images.read_image`.
+        bits: see `mfvpr.datasets.images.read_image`.
     """
 
     root: Path
@@ -40,14 +40,14 @@ class ImageFolder:
 
     @property
     def paths(self) -> list[Path]:
-        """Full paths, in order."""
+        """Full paths of the images, in order."""
         return [self.root / name for name in self.names]
 
     def __len__(self) -> int:
         return len(self.names)
 
     def read(self, row: int) -> np.ndarray:
-        """One image, `[H, W, 3]` uint8 RGB; raises as `read_image` does."""
+        """Read one image, `[H, W, 3]` uint8 RGB; errors are those of `read_image`."""
         return read_image(self.root / self.names[row], orient=self.orient, bits=self.bits)
 
 
@@ -56,10 +56,10 @@ class QuerySequence:
     """Query images of one drive or walk, with their ground truth.
 
     Attributes:
-        name: what results call it.
-        images: to find in the database.
-        truth: which database images are right; None = only rankings can be told.
-        excluded: the database images that each query may not find; None = it may find all.
+        name: in results.
+        images: the queries.
+        truth: which database images are correct; None = no ground truth, rankings only.
+        excluded: the database images that are no candidates of each query; None = all images are candidates.
     """
 
     name: str
@@ -70,12 +70,12 @@ class QuerySequence:
 
 @dataclass(frozen=True)
 class Dataset:
-    """One database, and the query sequences that are to be found in it.
+    """One database and at least one sequence of queries.
 
     Attributes:
-        name: what results call it.
-        database: images to find.
-        sequences: at least one.
+        name: in results.
+        database: the database images.
+        sequences: the sequences of queries.
     """
 
     name: str
@@ -87,46 +87,45 @@ class Dataset:
         """The only sequence.
 
         Raises:
-            InputError: there are several.
+            InputError: there are several sequences.
         """
         if len(self.sequences) != 1:
             raise InputError(f"{self.name}: expected one query sequence, got {len(self.sequences)}; choose one of "
                              f"{', '.join(sequence.name for sequence in self.sequences)}")  # fmt: skip
-        [sequence] = self.sequences
-        return sequence
+        return self.sequences[0]
 
     @property
     def queries(self) -> ImageFolder:
-        """Of the only sequence."""
+        """Query images of the only sequence."""
         return self.only.images
 
     @property
     def truth(self) -> Truth | None:
-        """Of the only sequence."""
+        """Ground truth of the only sequence."""
         return self.only.truth
 
     @property
     def excluded(self) -> Positives | None:
-        """Of the only sequence."""
+        """Excluded database images of the only sequence."""
         return self.only.excluded
 
 
 def image_folder(root: Path | str, *, orient: bool = True, bits: int | None = 16) -> ImageFolder:
-    """All images below `root`, subfolders included, linked ones as well; hidden files and folders are not.
+    """All images below `root`, in subfolders and linked folders as well; hidden files and folders are skipped.
 
     Args:
         root: folder.
-        orient: how the images are read, see `mfvpr.datasets.images.read_image`.
-        bits: likewise.
+        orient: see `mfvpr.datasets.images.read_image`.
+        bits: see `mfvpr.datasets.images.read_image`.
 
     Raises:
-        InputError: no such folder, one that cannot be listed, a link that leads to nothing or back to a folder that it
-            is in, or no images.
+        InputError: no such folder, a folder that cannot be listed, a broken link, a link to a parent folder, or no
+            images.
     """
     root = Path(root)
     if not root.is_dir():
-        found = "a file" if os.path.lexists(root) else "nothing"
-        raise InputError(f"{root}: expected a folder of images, got {found}; check the path")
+        got = "a file" if os.path.lexists(root) else "nothing"
+        raise InputError(f"{root}: expected a folder of images, got {got}; check the path")
     names = [path.relative_to(root).as_posix() for path in _images_below(root)]
     if not names:
         raise InputError(f"{root}: expected images ({', '.join(sorted(IMAGE_SUFFIXES))}), found none; check the path")
@@ -153,22 +152,18 @@ def folder_dataset(
     Args:
         database: folder of database images.
         queries: folder of query images.
-        ground_truth: one of `ground_truth.KINDS`, which says what each means; "none" = rankings only. Nothing is
-            assumed.
-        name: what results call it.
+        ground_truth: kind of ground truth, one of `ground_truth.KINDS`; "none" = rankings only.
+        name: in results.
         index_file: for `index`, see `truth_files.truth_from_file`.
         widen_index: for `index`, whether database images within a tolerance in frames count as well.
         database_labels: for `label`, see `truth_files.truth_from_labels`.
-        query_labels: likewise.
-        orient: how the images are read, see `mfvpr.datasets.images.read_image`.
-        bits: likewise.
+        query_labels: for `label`, see `truth_files.truth_from_labels`.
+        orient: see `mfvpr.datasets.images.read_image`.
+        bits: see `mfvpr.datasets.images.read_image`.
     """
     images = image_folder(database, orient=orient, bits=bits)
-    sequence = _sequence(
-        name, images, queries, ground_truth=ground_truth, index_file=index_file, widen_index=widen_index,
-        database_labels=database_labels, query_labels=query_labels,
-    )  # fmt: skip
-    return Dataset(name, images, (sequence,))
+    files = {"index_file": index_file, "database_labels": database_labels, "query_labels": query_labels}
+    return Dataset(name, images, (_sequence(name, images, queries, ground_truth, files, widen_index),))
 
 
 def sequences_dataset(
@@ -182,41 +177,38 @@ def sequences_dataset(
     orient: bool = True,
     bits: int | None = 16,
 ) -> Dataset:
-    """One folder of database images and several of queries, each a sequence that is called as its folder.
+    """One folder of database images and several folders of queries, each a sequence with the name of its folder.
 
     Args:
         database: folder of database images.
-        queries: folders of query images, each of another name, and none called as a mean (`MEANS`).
-        ground_truth: one of `ground_truth.KINDS` but `label`, of every sequence.
-        name: what results call it.
+        queries: folders of query images, with different names that are not in `MEANS`.
+        ground_truth: kind of ground truth of every sequence, one of `ground_truth.KINDS` except `label`.
+        name: in results.
         index_file: for `index`, the file's name in the folder of each sequence, see `truth_files.truth_from_file`.
         widen_index: for `index`, whether database images within a tolerance in frames count as well.
-        orient: how the images are read, see `mfvpr.datasets.images.read_image`.
-        bits: likewise.
+        orient: see `mfvpr.datasets.images.read_image`.
+        bits: see `mfvpr.datasets.images.read_image`.
 
     Raises:
-        InputError: no sequence, two of one name, or one with the name of a mean; or as `folder_dataset`.
+        InputError: no sequence, two sequences of one name, or a sequence with the name of a mean.
     """
     folders = [Path(folder) for folder in queries]
     names = [(folder.resolve() if folder.name in ("", "..") else folder).name for folder in folders]
     if not names:
         raise InputError("queries: expected the folder of at least one sequence, got none")
-    for twice in {one for one in names if names.count(one) > 1}:
+    for duplicate in {name for name in names if names.count(name) > 1}:
         raise InputError(
-            f"queries: expected sequences of different names, got {twice} twice; rename one of the folders"
+            f"queries: expected sequences of different names, got {duplicate} twice; rename one of the folders"
         )
-    for taken in {*names} & {*MEANS}:
+    for mean in {*names} & {*MEANS}:
         raise InputError(
-            f"queries: expected no sequence called {taken}, as results call one of their means; rename the folder"
+            f"queries: expected no sequence called {mean}, as results call one of their means; rename the folder"
         )
-    images = image_folder(database, orient=orient, bits=bits)
-    sequences = (
-        _sequence(
-            one, images, folder, ground_truth=ground_truth, index_file=folder / index_file if index_file else None,
-            widen_index=widen_index, database_labels=None, query_labels=None,
-        )
-        for one, folder in zip(names, folders, strict=True)
-    )  # fmt: skip
+    images, sequences = image_folder(database, orient=orient, bits=bits), []
+    for folder_name, folder in zip(names, folders, strict=True):
+        index = folder / index_file if index_file else None
+        files = {"index_file": index, "database_labels": None, "query_labels": None}
+        sequences.append(_sequence(folder_name, images, folder, ground_truth, files, widen_index))
     return Dataset(name, images, tuple(sequences))
 
 
@@ -224,16 +216,12 @@ def _sequence(
     name: str,
     database: ImageFolder,
     queries: Path | str,
-    *,
     ground_truth: str,
-    index_file: Path | str | None,
+    files: Mapping[str, Path | str | None],
     widen_index: bool,
-    database_labels: Path | str | None,
-    query_labels: Path | str | None,
 ) -> QuerySequence:
-    """The queries of a folder, read as the database is, with their ground truth."""
+    """The queries of a folder with their ground truth; `orient` and `bits` are those of the database."""
     images = image_folder(queries, orient=database.orient, bits=database.bits)
-    files = {"index_file": index_file, "database_labels": database_labels, "query_labels": query_labels}
     _check_files(ground_truth, files)
     names = images.names, database.names
     truth: Truth | None = None
@@ -241,15 +229,14 @@ def _sequence(
         truth = truth_by_order(len(images), len(database))
     elif ground_truth == "utm":
         truth = truth_from_names(*names)
-    elif index_file:
+    elif index_file := files["index_file"]:
         truth = truth_from_file(index_file, *names, widened=widen_index)
-    elif query_labels and database_labels:
+    elif (query_labels := files["query_labels"]) and (database_labels := files["database_labels"]):
         truth = truth_from_labels(query_labels, database_labels, *names)
     return QuerySequence(name, images, truth)
 
 
 def _check_files(ground_truth: str, files: Mapping[str, Path | str | None]) -> None:
-    """Refuse an unknown kind of ground truth, and files that it lacks or does not read."""
     if ground_truth not in KINDS:
         raise InputError(f"ground_truth={ground_truth}: expected one of {CHOICES}")
     for option, path in files.items():
@@ -261,25 +248,24 @@ def _check_files(ground_truth: str, files: Mapping[str, Path | str | None]) -> N
 
 
 def _images_below(root: Path) -> Iterator[Path]:
-    """Paths of all images."""
-    waiting: list[tuple[Path, tuple[tuple[int, int], ...]]] = [(root, ())]  # folders, with those that they are in
+    waiting: list[tuple[Path, tuple[tuple[int, int], ...]]] = [(root, ())]  # folders with their parents' numbers
     while waiting:
-        folder, above = waiting.pop()
+        folder, parents = waiting.pop()
         try:
             status = folder.stat()
             entries = list(os.scandir(folder))
             folders = {entry.name for entry in entries if entry.is_dir()}
         except OSError as error:
             raise InputError(f"{folder}: cannot be listed ({error.strerror}); make it readable, or remove it") from None
-        this = (status.st_dev, status.st_ino)
-        if this in above:
+        number = (status.st_dev, status.st_ino)
+        if number in parents:
             raise InputError(f"{folder}: a link back to {folder.resolve()}, which it is in; remove it")
         for entry in entries:
             path = folder / entry.name
             if entry.name.startswith("."):
                 continue
             if entry.name in folders:
-                waiting.append((path, (*above, this)))
+                waiting.append((path, (*parents, number)))
             elif path.suffix.lower() in IMAGE_SUFFIXES:
                 yield path
             elif entry.is_symlink() and not path.exists():
@@ -287,12 +273,13 @@ def _images_below(root: Path) -> Iterator[Path]:
 
 
 def _natural(name: str) -> tuple[list[tuple[int, int, str]], str]:
-    """Sort key in which runs of digits compare as numbers."""
+    """Sort key in which runs of digits, of any length, compare as numbers."""
     parts = re.split(r"(\d+)", name)
-    return [_number(part) if part.isdecimal() else (0, 0, part) for part in parts], name
+    return [_natural_part(part) for part in parts], name
 
 
-def _number(digits: str) -> tuple[int, int, str]:
-    """As its value sorts, at any length."""
-    value = digits.lstrip("0")
+def _natural_part(part: str) -> tuple[int, int, str]:
+    if not part.isdecimal():
+        return 0, 0, part
+    value = part.lstrip("0")
     return 1, len(value), value

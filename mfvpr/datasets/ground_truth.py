@@ -1,7 +1,7 @@
-"""Where each query really is: by file order, UTM coordinates in the file names, or what `truth_files` reads.
+"""Kinds of ground truth; by file order or UTM coordinates in file names (`truth_files` reads it from files).
 
-Truth comes in three kinds. Two have a threshold that decides what still counts: frames of the database sequence, or a
-radius in meters. The third is exact: a database image is right or it is not.
+There are three units. Frames of the database sequence and meters have a threshold up to which database images count as
+correct. Exact ground truth has none.
 """
 
 from bisect import bisect_right
@@ -25,8 +25,8 @@ KINDS = {
     "none": "rankings only",
 }
 CHOICES = "; ".join(f"{kind} ({meaning})" for kind, meaning in KINDS.items())
-_NONE = np.zeros(0, np.int32)
-FARTHEST = 1e9  # meters; beyond, distances lose their centimeters, and at last their meaning
+_NO_ROWS = np.zeros(0, np.int32)
+FARTHEST = 1e9  # meters; beyond, distances are not exact to a centimeter
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class FrameTruth(Truth):
     Attributes:
         rows: per query; empty = unknown place, which counts as a failure.
         num_database: N.
-        widened: False = no neighbors count, at any tolerance.
-        starts: database rows at which a new drive begins, ascending: neighbors are of the same drive.
+        widened: False = neighbors do not count, at any tolerance.
+        starts: database rows at which a new drive begins, ascending; neighbors are of the same drive.
     """
 
     rows: tuple[tuple[int, ...], ...]
@@ -47,22 +47,22 @@ class FrameTruth(Truth):
 
     @property
     def unit(self) -> Unit:
-        """Frames, where there are tolerances."""
+        """Frames if neighbors count, else exact."""
         return "frames" if self.widened else "exact"
 
     def positives(self, threshold: float) -> Positives:
-        """Those for a tolerance in frames, inclusive."""
+        """Correct database images at a tolerance in frames, inclusive."""
         tolerance = int(min(threshold, self.num_database)) if self.widened else 0
 
         def around(row: int) -> np.ndarray:
             first, last = self._drive(row)
             return np.arange(max(row - tolerance, first), min(row + tolerance + 1, last), dtype=np.int32)
 
-        rows = (np.concatenate([_NONE, *map(around, rows)]) for rows in self.rows)
+        rows = (np.concatenate([_NO_ROWS, *map(around, rows)]) for rows in self.rows)
         return Positives.from_rows(rows, self.num_database)
 
     def distance(self, query: int) -> np.ndarray:
-        """`[N]` frames to the nearest of the query's rows."""
+        """Frames `[N]` to the nearest of the query's rows."""
         distance = np.full(self.num_database, np.inf)
         for row in self.rows[query]:
             drive = slice(*self._drive(row))
@@ -70,7 +70,7 @@ class FrameTruth(Truth):
         return distance if self.widened else np.where(distance > 0, np.inf, 0.0)
 
     def _drive(self, row: int) -> tuple[int, int]:
-        """First database row of a row's drive, and the row behind its last."""
+        """First and last + 1 database row of a row's drive."""
         bounds = (0, *self.starts, self.num_database)
         number = bisect_right(bounds, row)
         return bounds[number - 1], bounds[number]
@@ -78,50 +78,50 @@ class FrameTruth(Truth):
 
 @dataclass(frozen=True)
 class RadiusTruth(Truth):
-    """Positions in meters; database images within a radius of the query count."""
+    """Positions in meters; database images within a radius of the query are correct."""
 
     unit: ClassVar[Unit] = "m"
     query_xy: np.ndarray  # [Q, 2]
     database_xy: np.ndarray  # [N, 2]
 
     def positives(self, threshold: float) -> Positives:
-        """Those within a radius in meters, inclusive."""
+        """Correct database images at a radius in meters, inclusive."""
         return Positives.from_rows(rows_within(self.query_xy, self.database_xy, threshold), len(self.database_xy))
 
     def distance(self, query: int) -> np.ndarray:
-        """`[N]` meters."""
+        """Meters `[N]` to the query."""
         return np.linalg.norm(self.database_xy - self.query_xy[query], axis=1)
 
 
 @dataclass(frozen=True)
 class LabelTruth(Truth):
-    """Labels, of floors or rooms, as numbers; database images of the query's label are right. -1 = no label."""
+    """Labels of floors or rooms as numbers; database images with the query's label are correct. -1 = no label."""
 
     unit: ClassVar[Unit] = "exact"
     query_labels: np.ndarray  # [Q]
     database_labels: np.ndarray  # [N]
 
     def positives(self, threshold: float = 0) -> Positives:
-        """Those of the same label, at any threshold."""
+        """Database images with the query's label, at any threshold."""
         order = np.argsort(self.database_labels, kind="stable").astype(np.int32)
         labels, starts = np.unique(self.database_labels[order], return_index=True)
-        alike = zip(labels.tolist(), np.split(order, starts[1:]), strict=False)  # no labels: no images, in one part
-        rows = {label: some for label, some in alike if label >= 0}
-        return Positives.from_rows((rows.get(label, _NONE) for label in self.query_labels.tolist()), len(order))
+        groups = np.split(order, starts[1:])  # one, empty, if there are no images and so no labels
+        rows = {label: group for label, group in zip(labels.tolist(), groups, strict=False) if label >= 0}
+        return Positives.from_rows((rows.get(label, _NO_ROWS) for label in self.query_labels.tolist()), len(order))
 
     def distance(self, query: int) -> np.ndarray:
-        """`[N]` 0 or infinite."""
+        """0 if correct, else infinite, `[N]`."""
         label = self.query_labels[query]
         return np.where((self.database_labels == label) & (label >= 0), 0.0, np.inf)
 
 
 @dataclass(frozen=True)
 class AllowedTruth(Truth):
-    """Another truth, of which some database images are no answer to some queries.
+    """Ground truth without database images that are excluded from the candidates of a query.
 
     Attributes:
-        truth: the other.
-        excluded: which images, by query.
+        truth: the ground truth of all images.
+        excluded: the excluded images, by query.
     """
 
     truth: Truth
@@ -129,26 +129,26 @@ class AllowedTruth(Truth):
 
     @property
     def unit(self) -> Unit:
-        """The other's."""
+        """Unit of the ground truth of all images."""
         return self.truth.unit
 
     def positives(self, threshold: float) -> Positives:
-        """The other's that are not excluded."""
+        """Correct images that are not excluded."""
         return self.truth.positives(threshold) - self.excluded
 
     def shows_place(self, threshold: float) -> Positives:
-        """The other's, and what is excluded: the query itself, and its neighbors."""
+        """Images of the query's place: correct images and excluded ones (the query itself and its neighbors)."""
         return self.truth.shows_place(threshold) | self.excluded
 
     def distance(self, query: int) -> np.ndarray:
-        """`[N]` the other's; infinite where an image is excluded."""
+        """Distance `[N]`, infinite for excluded images."""
         distance = np.array(self.truth.distance(query), np.float64)
         distance[self.excluded.of(query)] = np.inf
         return distance
 
 
 def truth_by_order(num_queries: int, num_database: int) -> FrameTruth:
-    """Query i shows database image i, in file order."""
+    """Ground truth where query i shows database image i, in file order."""
     if num_queries != num_database:
         raise InputError(
             f"ground_truth=order: expected as many queries as database images, got {num_queries} and {num_database}; "
@@ -159,13 +159,11 @@ def truth_by_order(num_queries: int, num_database: int) -> FrameTruth:
 
 def truth_from_names(query_names: Sequence[str], database_names: Sequence[str]) -> RadiusTruth:
     """UTM easting and northing from names `@easting@northing@...` (the convention of VPR-datasets-downloader)."""
-    return RadiusTruth(
-        np.array([_position(name) for name in query_names]), np.array([_position(name) for name in database_names])
-    )
+    return RadiusTruth(*(np.array([_position(name) for name in names]) for names in (query_names, database_names)))
 
 
 def _position(name: str) -> tuple[float, float]:
-    """Easting, northing of one name; folders above the file may contain '@' as well."""
+    """Easting and northing in a file's name; its folders may contain '@' as well."""
     fields = PurePosixPath(name).name.split("@")
     try:
         easting, northing = parse_number(fields[1]), parse_number(fields[2])

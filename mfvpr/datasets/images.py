@@ -1,8 +1,7 @@
-"""Image files -> RGB arrays `[H, W, 3]` of a stated size (width, height) in pixels.
+"""Read and resize images: files -> RGB arrays `[H, W, 3]`.
 
-Decoding and the default resampling are Pillow's, which the published networks were fed with. Two things that Pillow
-leaves to its callers are done here: images are turned as their EXIF orientation says, and images of 16 bits a channel
-become images of 8 bits by their upper ones.
+Decoding and the default resampling are Pillow's, as in the published networks' code. In addition, images are turned by
+their EXIF orientation, and 16 bits a channel are reduced to the upper 8.
 """
 
 import stat
@@ -33,7 +32,7 @@ _TURN = {
     5: Image.Transpose.TRANSPOSE, 6: Image.Transpose.ROTATE_270, 7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }  # fmt: skip
-_INVERSE = {6: 8, 8: 6}  # all others undo themselves
+_INVERSE = {6: 8, 8: 6}  # all others are their own inverse
 _MAY_BE_TURNED = (b"eXIf", b"Raw profile type exif", b"XML:com.adobe.xmp")  # of a PNG file
 
 # Pillow warns from 89 megapixels on; `read_image` refuses earlier, with the file's name.
@@ -43,12 +42,12 @@ warnings.filterwarnings("ignore", message="Palette images with Transparency")
 
 @dataclass(frozen=True)
 class Header:
-    """What a file says of its image.
+    """Orientation and range of an image file.
 
     Attributes:
         orientation: EXIF's, 1 .. 8; 1 = as stored.
-        largest: of the values of 16 bits a channel, not all of which need be in use; 0 where the file itself states its
-            range, cannot be decoded, or has 32 bits; None = no such image.
+        largest: largest value of an image of 16 bits a channel; 0 if the file states its range, cannot be decoded, or
+            has 32 bits; None = an image of 8 bits.
     """
 
     orientation: int
@@ -56,20 +55,19 @@ class Header:
 
 
 def read_image(path: Path | str, *, orient: bool = True, bits: int | None = 16) -> np.ndarray:
-    """`[H, W, 3]` uint8 RGB.
+    """Read an image file as `[H, W, 3]` uint8 RGB.
 
     Args:
         path: image file.
-        orient: turn the image as its EXIF orientation says.
-        bits: how many bits of 16-bit gray and color files are in use (cameras of 12 bits write 16 as well): the upper 8
-            of them are taken, so that 2^bits - 1 becomes 255, and 256 v and 257 v become v. The same for all images,
-            since the brightness of one would not be comparable if it depended on its own darkest and brightest pixel.
-            Netpbm files state their largest value, which is used instead. None = as Pillow converts: gray cut off at
-            255, the upper 8 of 16 bits of color.
+        orient: turn the image by its EXIF orientation.
+        bits: number of bits in use in 16-bit gray and color files (12-bit cameras write 16 bits as well). The upper 8
+            of them are kept: 2^bits - 1 becomes 255, 256 v and 257 v become v. It is the same for all images, so that
+            their brightness stays comparable. Netpbm files state their largest value, which is used instead. None =
+            Pillow's conversion: gray is cut off at 255, of color the upper 8 of 16 bits are kept.
 
     Raises:
-        InputError: not a regular file, empty, not an image, truncated, over 64 megapixels (refused from the header,
-            before anything is decoded), or of 32 bits a channel, whose range nobody knows (unless `bits` is None).
+        InputError: not a regular file, empty, not an image, truncated, over 64 megapixels (checked before decoding),
+            or of 32 bits a channel, whose range is unknown (unless `bits` is None).
     """
     path = Path(path)
     _check_file(path)
@@ -82,52 +80,52 @@ def read_image(path: Path | str, *, orient: bool = True, bits: int | None = 16) 
                 raise InputError(f"{path}: expected 8 or 16 bits a channel, got 32, of unknown range; convert it")
             orientation = _orientation(image)
             rgb = _as_rgb(image, path, used)
-            if image.format == "TIFF":  # is turned already
+            if image.format == "TIFF":  # already turned by Pillow
                 orientation = 1 if orient else _INVERSE.get(orientation, orientation)
             elif not orient:
                 orientation = 1
-            converted = rgb.transpose(_TURN[orientation]) if orientation in _TURN else rgb
-            return np.asarray(converted)
+            return np.asarray(rgb.transpose(_TURN[orientation]) if orientation in _TURN else rgb)
     except InputError:
         raise
     except Image.DecompressionBombError:
         raise InputError(_too_large(path, "several times as many")) from None
-    except (
-        Exception
-    ) as error:  # decoders raise whatever a broken file leads them to: OSError, SyntaxError, struct.error
+    except Exception as error:  # decoders raise OSError, SyntaxError, struct.error and more on broken files
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: cannot be read as an image ({reason}); replace or remove it") from None
 
 
 def read_header(content: bytes) -> Header:
-    """What an image file's `content` says; orientation 1 and no largest value where it cannot be read."""
+    """Header of an image file's `content`; orientation 1 and no largest value if it cannot be read."""
     try:
         with Image.open(BytesIO(content)) as image:
             used = _bits_in_use(image, 16) if image.width * image.height <= MAX_PIXELS else None
             may_be_turned = image.format != "PNG" or any(mark in content for mark in _MAY_BE_TURNED)
-            orientation = _orientation(image) if may_be_turned else 1  # of a PNG file, this decodes all
-            if used is None:  # of 32 bits nobody knows the range
+            orientation = _orientation(image) if may_be_turned else 1  # of a PNG file, `_orientation` decodes all
+            if used is None:  # the range of 32 bits is unknown
                 return Header(orientation, 0 if image.mode in ("I", "F") and image.format != "PPM" else None)
-            own_range = used != 16 or image.format == "PPM"
-            return Header(orientation, 0 if own_range else _largest(image, content))
-    except Exception:  # whoever reads the image will tell
+            has_range = used != 16 or image.format == "PPM"
+            return Header(orientation, 0 if has_range else _largest(image, content))
+    except Exception:  # reading the image raises
         return Header(1, None)
 
 
 def resize(image: np.ndarray, size: tuple[int, int], interpolation: Interpolation = "pil_bilinear") -> np.ndarray:
-    """`image` `[H, W, 3]` uint8 squashed to `size` (width, height), no crop, aspect not kept. Half-pixel centers.
+    """Resize an image `[H, W, 3]` uint8 to `size` (width, height) without crop; the aspect ratio changes.
+
+    Pixel centers are at half pixels.
 
     | interpolation | as | result |
     | :-- | :-- | :-- |
-    | `pil_bilinear`, `pil_bicubic` | Pillow, antialiased; torch's of uint8, but for a level in 1 % of values | uint8 |
+    | `pil_bilinear`, `pil_bicubic` | Pillow, antialiased; as torch's of uint8, up to a level in 1 % of values | uint8 |
     | `cv2_linear`, `cv2_area`, `cv2_cubic` | OpenCV; only `cv2_area` is antialiased | uint8 |
     | `torch_bilinear` | torch's antialiasing of floats, not rounded | float32, 0 .. 255 |
     | `torch_no_antialias` | torch's bilinear of floats as it was up to 2022, not rounded | float32, 0 .. 255 |
 
     Networks take both types; SIFT refuses floats.
     """
-    if interpolation == "torch_bilinear":
-        return _resized_in_float(image, size)
+    if interpolation == "torch_bilinear":  # Pillow's kernel is torch's, and its float images are not rounded
+        channels = (Image.fromarray(channel) for channel in np.moveaxis(image.astype(np.float32), -1, 0))
+        return np.stack([np.asarray(channel.resize(size, Image.Resampling.BILINEAR)) for channel in channels], axis=-1)
     if interpolation == "torch_no_antialias":
         return np.asarray(cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_LINEAR))
     if interpolation in _PIL:
@@ -135,22 +133,16 @@ def resize(image: np.ndarray, size: tuple[int, int], interpolation: Interpolatio
     return np.asarray(cv2.resize(image, size, interpolation=_CV2[interpolation]))
 
 
-def _resized_in_float(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Bilinear, antialiased, `[H, W, 3]` float32: Pillow's kernel is torch's, and its float images are not rounded."""
-    channels = (Image.fromarray(channel) for channel in np.moveaxis(image.astype(np.float32), -1, 0))
-    return np.stack([np.asarray(channel.resize(size, Image.Resampling.BILINEAR)) for channel in channels], axis=-1)
-
-
 def _orientation(image: Image.Image) -> int:
     try:
         value = image.getexif().get(_ORIENTATION, 1)
-    except Exception:  # damaged tags do not keep anybody from seeing the image
+    except Exception:  # an image with damaged tags is readable
         return 1
     return value if value in _TURN else 1
 
 
 def _bits_in_use(image: ImageFile.ImageFile, bits: int | None) -> int | None:
-    """Of 16 bits a channel; None = 8 bits, or whatever Pillow makes of it. To be asked before anything is decoded."""
+    """Bits in use of 16 bits a channel; None = Pillow's conversion applies. Call it before the image is decoded."""
     if bits is None or not image.tile:
         return None
     tile = image.tile[0]
@@ -163,37 +155,37 @@ def _bits_in_use(image: ImageFile.ImageFile, bits: int | None) -> int | None:
 
 
 def _as_rgb(image: Image.Image, path: Path, used: int | None) -> Image.Image:
-    """8-bit RGB as stored, but of TIFF files, which Pillow and OpenCV turn."""
-    color = image.mode not in _GRAY
-    if used is None or (color and used == 16):  # of which Pillow takes the upper 8 itself
+    """Convert to 8-bit RGB, as stored, except for TIFF files, which Pillow and OpenCV turn."""
+    is_color = image.mode not in _GRAY
+    if used is None or (is_color and used == 16):  # Pillow takes the upper 8 of 16 bits of color
         return image.convert("RGB")
-    if color and image.mode not in _COLOR:
+    if is_color and image.mode not in _COLOR:
         raise ValueError(f"its 16 bits a channel are {image.mode}, not gray or RGB")
-    values = _color_values(np.fromfile(path, np.uint8)) if color else np.asarray(image)
+    values = _color_values(np.fromfile(path, np.uint8)) if is_color else np.asarray(image)
     upper = np.clip(values.astype(np.int32), 0, 2**used - 1) >> (used - 8)
     return Image.fromarray(upper.astype(np.uint8)).convert("RGB")
 
 
 def _largest(image: Image.Image, content: bytes) -> int:
     try:
-        gray = image.mode in _GRAY
-        return int((np.asarray(image) if gray else _color_values(np.frombuffer(content, np.uint8))).max())
-    except Exception:  # whoever reads the image will tell
+        is_gray = image.mode in _GRAY
+        return int((np.asarray(image) if is_gray else _color_values(np.frombuffer(content, np.uint8))).max())
+    except Exception:  # reading the image raises
         return 0
 
 
 def _color_values(content: np.ndarray) -> np.ndarray:
-    """`[H, W, 3]` uint16 RGB, of which Pillow gives the upper 8 bits alone."""
-    found = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
-    if found is None or found.dtype != np.uint16 or found.ndim != 3:
+    """Decode to `[H, W, 3]` uint16 RGB with OpenCV, because Pillow drops the lower 8 bits."""
+    image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
+    if image is None or image.dtype != np.uint16 or image.ndim != 3:
         raise ValueError("its 16 bits of color cannot be decoded")
-    return found[..., 2::-1]
+    return image[..., 2::-1]
 
 
 def _check_file(path: Path) -> None:
     try:
         status = path.stat()
-    except (OSError, ValueError) as error:  # a character that no file name has is a ValueError
+    except (OSError, ValueError) as error:  # a null character in the path is a ValueError
         reason = error.strerror if isinstance(error, OSError) else error
         raise InputError(f"{path}: cannot be opened ({reason}); check the path and its permissions") from None
     if not stat.S_ISREG(status.st_mode):

@@ -1,4 +1,4 @@
-"""Which database images are right for each query, as rows per query. Host-side NumPy: nothing is worth a device."""
+"""Correct database images of each query, as rows per query, in NumPy on the host."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -11,23 +11,23 @@ from scipy.spatial import KDTree
 from mfvpr.utils.errors import InputError
 
 _AT_A_TIME = 1 << 20  # ranked rows and positives that are looked up at once, in numbers of eight bytes
-_QUERIES_AT_A_TIME = 128  # of a search by radius, whose results are Python's lists before they are arrays
+_QUERIES_AT_A_TIME = 128  # of a search by radius, which returns Python lists
 
 
 @dataclass(frozen=True, eq=False)
 class Positives:
-    """The database rows that each query has, ragged: memory grows with their number and never with Q x N.
+    """Ragged lists of database rows, one per query; memory grows with the number of rows, not with Q x N.
 
-    `from_rows` and `from_matrix` make them. `first | second` and `first - second` are union and difference, query by
-    query.
+    Create it with `from_rows` or `from_matrix`. `first | second` and `first - second` are union and difference, query
+    by query.
 
     Attributes:
-        rows: `[P]` int32, the rows of all queries one after the other; ascending, none twice in one query.
+        rows: `[P]` int32, the rows of all queries one after the other; ascending and distinct for each query.
         offsets: `[Q + 1]` int64; query q has `rows[offsets[q] : offsets[q + 1]]`.
         num_database: N.
 
     Raises:
-        InputError: rows and offsets that are not as above.
+        InputError: rows or offsets of another form.
     """
 
     rows: np.ndarray
@@ -36,21 +36,21 @@ class Positives:
 
     def __post_init__(self) -> None:
         rows, offsets, last = self.rows, self.offsets, self.num_database - 1
-        is_there = not len(rows) or 0 <= rows.min() <= rows.max() <= last
-        if [*offsets[[0, -1]]] != [0, len(rows)] or (np.diff(offsets) < 0).any() or not is_there:
+        is_in_range = not len(rows) or 0 <= rows.min() <= rows.max() <= last
+        if [*offsets[[0, -1]]] != [0, len(rows)] or (np.diff(offsets) < 0).any() or not is_in_range:
             raise InputError(f"positives: expected rows from 0 to {last}, and offsets that grow from 0 to {len(rows)}")
         if not _ascending(rows, offsets):
             raise InputError("positives: expected rows that ascend for each query; from_rows takes them in any order")
 
     @classmethod
     def from_rows(cls, rows: Iterable[Sequence[int] | np.ndarray], num_database: int) -> "Positives":
-        """From the rows of each query, in any order.
+        """Create from the rows of each query, in any order.
 
         Raises:
-            InputError: a row that is none of the database, or no whole number.
+            InputError: rows outside the database, or no whole numbers.
         """
-        per_query = [np.asarray(some) for some in rows]
-        flat = np.concatenate([some for some in per_query if len(some)] or [np.zeros(0, np.int32)])
+        per_query = [np.asarray(query_rows) for query_rows in rows]
+        flat = np.concatenate([query_rows for query_rows in per_query if len(query_rows)] or [np.zeros(0, np.int32)])
         if flat.dtype.kind not in "iu":
             raise InputError(f"positives: expected rows as whole numbers, got {flat.dtype}; from_matrix takes matrices")
         if flat.size and not 0 <= flat.min() <= flat.max() < num_database:
@@ -59,61 +59,61 @@ class Positives:
         flat, offsets = flat.astype(np.int32, copy=False), _offsets(list(map(len, per_query)))
         if _ascending(flat, offsets):
             return cls(flat, offsets, num_database)
-        none = cls(flat[:0], np.zeros_like(offsets), num_database)
-        return none._with(_distinct(_keys(flat, offsets, num_database)))
+        empty = cls(flat[:0], np.zeros_like(offsets), num_database)
+        return empty._from_keys(_distinct(_keys(flat, offsets, num_database)))
 
     @classmethod
     def from_matrix(cls, matrix: Any) -> "Positives":
-        """From `[Q, N]` bool."""
+        """Create from a matrix `[Q, N]` bool."""
         matrix = np.asarray(matrix, bool)
         if matrix.ndim != 2:
             raise InputError(f"positives: expected a matrix [queries, database], got shape {matrix.shape}")
-        return cls.from_rows((np.flatnonzero(right).astype(np.int32) for right in matrix), matrix.shape[1])
+        return cls.from_rows((np.flatnonzero(row).astype(np.int32) for row in matrix), matrix.shape[1])
 
     def __len__(self) -> int:
-        """Q."""
+        """Number Q of queries."""
         return len(self.offsets) - 1
 
     @property
     def counts(self) -> np.ndarray:
-        """`[Q]` how many each query has."""
+        """Number of rows of each query, `[Q]`."""
         return np.diff(self.offsets)
 
     def any(self) -> bool:
-        """Whether any query has any."""
+        """Whether at least one query has rows."""
         return len(self.rows) > 0
 
     def of(self, query: int) -> np.ndarray:
-        """`[n]` the rows of one query, ascending."""
+        """Rows `[n]` of one query, ascending."""
         query = range(len(self))[query]
         return self.rows[self.offsets[query] : self.offsets[query + 1]]
 
     def union(self) -> np.ndarray:
-        """`[N]` bool, the rows that at least one query has."""
+        """Mask `[N]` of the rows of all queries."""
         union = np.zeros(self.num_database, bool)
         union[self.rows] = True
         return union
 
     def take(self, queries: Any) -> "Positives":
-        """Of some queries: numbers `[q]` in any order, a mask `[Q]`, or a slice."""
+        """Select queries by numbers `[q]` in any order, a mask `[Q]`, or a slice."""
         queries = np.arange(len(self))[queries]
         counts = self.counts[queries]
         offsets = _offsets(counts)
-        kept = np.repeat(self.offsets[queries] - offsets[:-1], counts) + np.arange(offsets[-1])
-        return Positives(self.rows[kept], offsets, self.num_database)
+        places = np.repeat(self.offsets[queries] - offsets[:-1], counts) + np.arange(offsets[-1])
+        return Positives(self.rows[places], offsets, self.num_database)
 
     def among(self, allowed: np.ndarray) -> "Positives":
-        """Those that are among database rows `[N]` bool."""
+        """Select the rows that a mask `[N]` of the database allows."""
         if np.shape(allowed) != (self.num_database,):
             raise InputError(f"allowed: expected shape ({self.num_database},), got {np.shape(allowed)}")
-        kept = np.asarray(allowed, bool)[self.rows]
-        return Positives(self.rows[kept], _offsets(kept)[self.offsets], self.num_database)
+        is_allowed = np.asarray(allowed, bool)[self.rows]
+        return Positives(self.rows[is_allowed], _offsets(is_allowed)[self.offsets], self.num_database)
 
     def contains(self, rows: Any) -> np.ndarray:
-        """Which of some database rows are right, bool; -1 never is.
+        """Whether rankings are correct: for each row, whether it is among the query's rows; -1 never is.
 
         Args:
-            rows: `[..., Q, k]`, of each query; several rankings may lie on the leading axes.
+            rows: `[..., Q, k]` of each query; leading axes hold several rankings.
 
         Raises:
             InputError: another number of queries, or rows beyond the database.
@@ -121,35 +121,36 @@ class Positives:
         rows = np.asarray(rows)
         if rows.ndim < 2 or rows.shape[-2] != len(self):
             raise InputError(f"rows: expected shape [..., {len(self)} queries, k], got {list(rows.shape)}")
-        right = np.zeros(rows.shape, bool)
+        is_correct = np.zeros(rows.shape, bool)
         if not rows.size:
-            return right
+            return is_correct
         if rows.dtype.kind not in "iu" or rows.max() >= self.num_database:
             raise InputError(f"rows: expected whole numbers below {self.num_database}, got {rows.dtype} up to "
                              f"{rows.max()}; rank images of this database")  # fmt: skip
         for first, last in pairwise(self._cuts(rows.size // len(self))):
-            block, some = self.take(slice(first, last)), rows[..., first:last, :]
-            keys = np.append(block._keys(), -1)  # what lies beyond the last key is not there
-            asked = np.arange(last - first)[:, None] * self.num_database + some.astype(np.int64)
-            right[..., first:last, :] = (keys[np.searchsorted(keys[:-1], asked)] == asked) & (some >= 0)
-        return right
+            block_rows = rows[..., first:last, :]
+            keys = np.append(self.take(slice(first, last))._keys(), -1)  # -1: the key beyond the last
+            ranked = np.arange(last - first)[:, None] * self.num_database + block_rows.astype(np.int64)
+            is_known = keys[np.searchsorted(keys[:-1], ranked)] == ranked
+            is_correct[..., first:last, :] = is_known & (block_rows >= 0)
+        return is_correct
 
     def dense(self, queries: Any = slice(None)) -> np.ndarray:
-        """`[q, N]` bool of some queries, as `take` has them; of all it is what this class is there to avoid."""
+        """Matrix `[q, N]` bool of queries that are selected as in `take`; large data sets do not fit into memory."""
         part = self.take(queries)
         dense = np.zeros((len(part), self.num_database), bool)
-        for query, right in enumerate(dense):
-            right[part.of(query)] = True
+        for query, row in enumerate(dense):
+            row[part.of(query)] = True
         return dense
 
     def __or__(self, other: "Positives") -> "Positives":
-        return self._with(_distinct(np.concatenate(self._both(other))))
+        return self._from_keys(_distinct(np.concatenate(self._key_pair(other))))
 
     def __sub__(self, other: "Positives") -> "Positives":
-        return self._with(np.setdiff1d(*self._both(other), assume_unique=True))
+        return self._from_keys(np.setdiff1d(*self._key_pair(other), assume_unique=True))
 
-    def _both(self, other: "Positives") -> tuple[np.ndarray, np.ndarray]:
-        sizes = [(len(one), one.num_database) for one in (self, other)]
+    def _key_pair(self, other: "Positives") -> tuple[np.ndarray, np.ndarray]:
+        sizes = [(len(positives), positives.num_database) for positives in (self, other)]
         if sizes[0] != sizes[1]:
             raise InputError(f"positives: expected two of one size (queries, database), got {sizes[0]} and {sizes[1]}")
         return self._keys(), other._keys()
@@ -157,50 +158,50 @@ class Positives:
     def _keys(self) -> np.ndarray:
         return _keys(self.rows, self.offsets, self.num_database)
 
-    def _with(self, keys: np.ndarray) -> "Positives":
-        """Of the same queries and database, by ascending keys."""
+    def _from_keys(self, keys: np.ndarray) -> "Positives":
+        """Positives of the same queries and database, from ascending keys."""
         offsets = np.searchsorted(keys, np.arange(len(self) + 1) * self.num_database)
         rows = keys - np.repeat(np.arange(len(self)) * self.num_database, np.diff(offsets))
         return Positives(rows.astype(np.int32), offsets, self.num_database)
 
-    def _cuts(self, ranked: int) -> np.ndarray:
-        """Where to cut the queries, each with so many ranked rows beside its own, so that a part is of bounded size."""
-        sizes = self.offsets + np.arange(len(self) + 1) * ranked
+    def _cuts(self, num_ranked: int) -> np.ndarray:
+        """Bounds of blocks of queries, so that a block's positives and `num_ranked` rows per query are few enough."""
+        sizes = self.offsets + np.arange(len(self) + 1) * num_ranked
         ends = np.arange(0, sizes[-1] + _AT_A_TIME, _AT_A_TIME)
         return np.unique(np.minimum(np.searchsorted(sizes, ends), len(self)))
 
 
 def side_by_side(parts: Sequence[Positives]) -> Positives:
-    """Of all queries and databases, one behind the other."""
+    """Concatenate queries and databases of independent data sets."""
     starts = np.cumsum([0, *(part.num_database for part in parts)])
     rows = np.concatenate([part.rows + int(start) for part, start in zip(parts, starts[:-1], strict=True)])
     return Positives(rows.astype(np.int32), _offsets(np.concatenate([part.counts for part in parts])), int(starts[-1]))
 
 
 def stacked(parts: Sequence[Positives]) -> Positives:
-    """Of all queries, one behind the other, of the same database."""
+    """Concatenate queries of the same database."""
     rows = np.concatenate([part.rows for part in parts])
     return Positives(rows, _offsets(np.concatenate([part.counts for part in parts])), parts[0].num_database)
 
 
 def rows_within(query_xy: np.ndarray, database_xy: np.ndarray, radius: float) -> Iterator[np.ndarray]:
-    """For each query `[n]` int32, the database rows at most `radius` meters away; as `radius_positives`."""
+    """Database rows `[n]` int32 at most `radius` meters away from each query; coordinates as in `radius_positives`."""
     query_xy, database_xy = np.asarray(query_xy, np.float64), np.asarray(database_xy, np.float64)
     if not len(database_xy):
         yield from (np.zeros(0, np.int32) for _ in query_xy)
         return
     tree = KDTree(database_xy)
     for first in range(0, len(query_xy), _QUERIES_AT_A_TIME):
-        some = query_xy[first : first + _QUERIES_AT_A_TIME]
-        for rows in tree.query_ball_point(some, radius, return_sorted=True):
+        block = query_xy[first : first + _QUERIES_AT_A_TIME]
+        for rows in tree.query_ball_point(block, radius, return_sorted=True):
             yield np.array(rows, np.int32)
 
 
 def frame_positives(query_index: np.ndarray, database_index: np.ndarray, *, tolerance: int) -> np.ndarray:
-    """`[Q, N]` bool: |database_index - query_index| <= tolerance, inclusive.
+    """Matrix `[Q, N]` bool: |database_index - query_index| <= tolerance.
 
     Args:
-        query_index: `[Q]` frame number of each query's true place; negative = unknown, no positives.
+        query_index: `[Q]` frame number of each query's place; negative = unknown, no positives.
         database_index: `[N]` frame number of each database image.
         tolerance: in frames.
     """
@@ -212,32 +213,32 @@ def frame_positives(query_index: np.ndarray, database_index: np.ndarray, *, tole
 
 
 def radius_positives(query_xy: np.ndarray, database_xy: np.ndarray, *, radius: float = 25.0) -> np.ndarray:
-    """`[Q, N]` bool: at most `radius` meters apart, inclusive. Coordinates `[Q, 2]`, `[N, 2]` are UTM, float64."""
+    """Matrix `[Q, N]` bool: at most `radius` meters apart. Coordinates `[Q, 2]`, `[N, 2]` are UTM, float64."""
     positives = np.zeros((len(query_xy), len(database_xy)), bool)
-    for right, rows in zip(positives, rows_within(query_xy, database_xy, radius), strict=True):
-        right[rows] = True
+    for row, near in zip(positives, rows_within(query_xy, database_xy, radius), strict=True):
+        row[near] = True
     return positives
 
 
 def _ascending(rows: np.ndarray, offsets: np.ndarray) -> bool:
-    """Whether the rows of each query ascend, none twice."""
+    """Whether the rows of each query ascend strictly."""
     ascending = rows[1:] > rows[:-1]
-    starts = offsets[(offsets > 0) & (offsets < len(rows))]  # of another query: its rows begin anew
+    starts = offsets[(offsets > 0) & (offsets < len(rows))]  # the first row of a query may be any
     ascending[starts - 1] = True
     return bool(ascending.all())
 
 
 def _keys(rows: np.ndarray, offsets: np.ndarray, num_database: int) -> np.ndarray:
-    """`[P]` int64, query x N + row: ascending if the rows of each query are, and a set of them is one of pairs."""
+    """Keys `[P]` int64 of pairs, query x N + row; they ascend if the rows of each query do."""
     return np.repeat(np.arange(len(offsets) - 1) * num_database, np.diff(offsets)) + rows
 
 
 def _distinct(keys: np.ndarray) -> np.ndarray:
-    """Ascending, none twice. `np.unique` hashes, which takes a hundred times as long on keys that nearly ascend."""
+    """Sort and remove duplicates; `np.unique` hashes, which takes 100 times as long on keys that nearly ascend."""
     keys = np.sort(keys, kind="stable")
     return keys[np.diff(keys, prepend=-1) > 0]
 
 
 def _offsets(counts: Any) -> np.ndarray:
-    """`[n + 1]` int64, where each of n runs of so many begins, and the end."""
+    """Start of each of n runs of `counts` `[n]` entries, and the end, `[n + 1]` int64."""
     return np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])

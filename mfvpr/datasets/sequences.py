@@ -1,4 +1,4 @@
-"""Database and queries of one sequence: an image must not be the answer to itself, nor may its neighbors in time."""
+"""Database and queries from one sequence: exclude each query and its neighbors in time from its candidates."""
 
 from collections import defaultdict
 from dataclasses import replace
@@ -12,7 +12,7 @@ OwnRows = tuple[tuple[int, ...], ...]
 
 
 def own_rows(queries: Contents, database: Contents) -> OwnRows:
-    """For each query, the database rows of the very same image: the same file, or one of the same content."""
+    """For each query, the database rows of files with the same content."""
     rows = defaultdict(list)
     for row, file in enumerate(database.files):
         if file.sha256:
@@ -20,25 +20,25 @@ def own_rows(queries: Contents, database: Contents) -> OwnRows:
     return tuple(tuple(rows.get(file.sha256, ())) for file in queries.files)
 
 
-def without_neighbors(sequence: QuerySequence, num_database: int, own: OwnRows, neighbors: int) -> QuerySequence:
-    """The queries, none of which finds itself, nor what stands within `neighbors` frames of it in the database.
+def without_neighbors(sequence: QuerySequence, num_database: int, query_rows: OwnRows, neighbors: int) -> QuerySequence:
+    """Exclude each query and its neighbors within `neighbors` frames from the query's candidates.
 
-    Neither do these images count as right: a query all of whose right answers they are has none, and is a failure.
+    Excluded images are not correct either: a query without other correct images counts as a failure.
 
     Args:
-        sequence: of a database that is a sequence.
+        sequence: queries from the database, which is a sequence.
         num_database: N.
-        own: `own_rows` of both.
-        neighbors: in frames; 0 = the image itself alone.
+        query_rows: `own_rows` of queries and database.
+        neighbors: in frames; 0 = exclude the query itself only.
 
     Raises:
-        InputError: no query is among the database images, so that nobody knows where in the sequence it is.
+        InputError: no query is among the database images, so that their frame numbers are unknown.
     """
-    if not any(own):
+    if not any(query_rows):
         raise InputError(
             f"exclude_neighbors={neighbors}: expected queries that are among the database images, got none in "
             f"{sequence.images.root}; leave it out for two different sequences"
         )
-    excluded = FrameTruth(own, num_database).positives(neighbors)
+    excluded = FrameTruth(query_rows, num_database).positives(neighbors)
     truth = None if sequence.truth is None else AllowedTruth(sequence.truth, excluded)
     return replace(sequence, truth=truth, excluded=excluded)

@@ -1,4 +1,4 @@
-"""Frames of a video file, one after the other."""
+"""Frames of video files."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,10 +13,10 @@ VIDEO_SUFFIXES = frozenset({".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm"})
 
 
 def frames(path: Path | str, *, every: int = 1) -> Iterator[tuple[int, np.ndarray]]:
-    """(number from 0, `[H, W, 3]` uint8 RGB) of every so many frames.
+    """Read (number from 0, image `[H, W, 3]` uint8 RGB) of every `every`-th frame.
 
     Raises:
-        InputError: no video, or one without frames that can be read.
+        InputError: no video, or a video without readable frames.
     """
     path = Path(path)
     require_file(path, "a video file")
@@ -24,8 +24,8 @@ def frames(path: Path | str, *, every: int = 1) -> Iterator[tuple[int, np.ndarra
     try:
         while video.grab():
             if number % every == 0:
-                there, image = video.retrieve()
-                if there:
+                is_valid, image = video.retrieve()
+                if is_valid:
                     yield number, cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
             number += 1
     finally:

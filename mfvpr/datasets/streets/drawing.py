@@ -5,7 +5,6 @@ import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -47,22 +46,31 @@ def streets_folder(
     progress: Progress | None = None,
 ) -> Path:
     """The folder of the synthetic street inside `cache`, drawn if it is missing; see `draw_streets`."""
-    draw = partial(draw_streets, seed=seed, num_frames=num_frames, image_size=image_size, progress=progress)
-    return cached_folder(Path(cache), "streets", draw)
+    return cached_folder(
+        cache, "streets", draw_streets, seed=seed, num_frames=num_frames, image_size=image_size, progress=progress
+    )
 
 
-def cached_folder(cache: Path, kind: str, draw: partial[None]) -> Path:
-    """The folder inside `cache` that `draw(folder)` makes, drawn if it is missing.
+def cached_folder(
+    cache: Path | str,
+    kind: str,
+    draw: Callable[..., None],
+    *,
+    seed: int,
+    num_frames: int,
+    image_size: tuple[int, int],
+    progress: Progress | None,
+) -> Path:
+    """The folder inside `cache` that `draw` makes, drawn if it is missing.
 
     It is drawn under another name and renamed when complete, so that a killed run leaves nothing that looks complete.
     """
-    seed, num_frames, (width, height) = (draw.keywords[name] for name in ("seed", "num_frames", "image_size"))
-    folder = cache / f"{kind}-v{VERSION}-seed{seed}-{num_frames}x{width}x{height}"
+    folder = Path(cache) / f"{kind}-v{VERSION}-seed{seed}-{num_frames}x{image_size[0]}x{image_size[1]}"
     if not folder.exists():
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".drawing-") as temporary:
             drawing = Path(temporary) / folder.name
-            draw(drawing)
+            draw(drawing, seed=seed, num_frames=num_frames, image_size=image_size, progress=progress)
             try:
                 os.replace(drawing, folder)
             except OSError:

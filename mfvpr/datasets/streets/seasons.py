@@ -1,6 +1,5 @@
 """The synthetic street by day and in seven other conditions, those of RobotCar Seasons."""
 
-from functools import partial
 from pathlib import Path
 
 from mfvpr.datasets.streets.drawing import SIGHT, Progress, Shot, cached_folder, draw_shots
@@ -22,8 +21,9 @@ def seasons_folder(
     progress: Progress | None = None,
 ) -> Path:
     """The folder of the synthetic street's seasons inside `cache`, drawn if it is missing; see `draw_seasons`."""
-    draw = partial(draw_seasons, seed=seed, num_frames=num_frames, image_size=image_size, progress=progress)
-    return cached_folder(Path(cache), "seasons", draw)
+    return cached_folder(
+        cache, "seasons", draw_seasons, seed=seed, num_frames=num_frames, image_size=image_size, progress=progress
+    )
 
 
 def draw_seasons(
