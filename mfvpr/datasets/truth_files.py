@@ -1,7 +1,8 @@
-"""Ground truth from files: pairs of images, positions, or labels. Nothing in them is ever executed."""
+"""Ground truth from files: pairs of images, positions, or labels. No code in the files is executed."""
 
 import csv
 import json
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -19,10 +20,10 @@ MAX_DIGITS = 20  # of a row number
 def truth_from_labels(
     query_file: Path | str, database_file: Path | str, query_names: Sequence[str], database_names: Sequence[str]
 ) -> LabelTruth:
-    """Same label = right, from a csv with the columns `name,label` for each side, one line per image.
+    """Ground truth by equal labels, from a csv with the columns `name,label` for each side, one line per image.
 
-    A query with an empty label has no right answer, and a database image with one is nobody's; labels are compared as
-    they are written, but for spaces around them.
+    A query with an empty label has no correct database image, and a database image with an empty label is never
+    correct. Labels are compared as text, without spaces around them.
     """
     labels = [_labels(Path(query_file), query_names), _labels(Path(database_file), database_names)]
     numbers = {"": -1} | {label: number for number, label in enumerate(sorted({*labels[0], *labels[1]} - {""}))}
@@ -32,11 +33,11 @@ def truth_from_labels(
 def truth_from_file(
     path: Path | str, query_names: Sequence[str], database_names: Sequence[str], *, widened: bool = False
 ) -> Truth:
-    """Truth from an index file.
+    """Ground truth from an index file.
 
     * `.csv`: a header with the columns `query` and `database` (or SSM-VPR's `Live` and `Reference`), then one line per
-      pair: file names, or numbers from 0 in file order. Several lines for one query are several true places; an empty
-      database cell says that there is none.
+      pair: file names, or numbers from 0 in file order. A query may have several lines; an empty database cell means
+      that its place is not in the database.
     * `.npz`: arrays `query` and `database`, the same pairs; or Patch-NetVLAD's `utmQ` and `utmDb`.
     * `.json`: VPR-Bench's `[[query, [database, ...]], ...]`.
 
@@ -44,23 +45,26 @@ def truth_from_file(
         path: index file.
         query_names: of the images.
         database_names: of the images.
-        widened: whether database images within a tolerance in frames of a pair's count as well, as in a sequence; if
-            not, the pairs are all that is right.
+        widened: whether database images within a tolerance in frames count as well, for databases that are sequences.
     """
     path = Path(path)
     readers = {".csv": _csv_pairs, ".npz": _npz_pairs, ".json": _json_pairs}
     if path.suffix.lower() not in readers:
         raise InputError(f"{path}: expected an index file named .csv, .npz or .json, got {path.suffix or 'no suffix'}")
-    content = _parsed(path, readers[path.suffix.lower()])
-    if isinstance(content, RadiusTruth):
-        _same_count(path, "query positions (utmQ)", len(content.query_xy), len(query_names))
-        _same_count(path, "database positions (utmDb)", len(content.database_xy), len(database_names))
-        return content
-    return _frame_truth(path, content, query_names, database_names, widened)
+    content = _parse(path, readers[path.suffix.lower()])
+    if not isinstance(content, RadiusTruth):
+        return _frame_truth(path, content, query_names, database_names, widened)
+    for name, got, expected in (
+        ("query positions (utmQ)", len(content.query_xy), len(query_names)),
+        ("database positions (utmDb)", len(content.database_xy), len(database_names)),
+    ):
+        if got != expected:
+            raise InputError(f"{path}: expected {expected} {name}, one per image, got {got}")
+    return content
 
 
-def _parsed(path: Path, reader: Callable[[Path], Any]) -> Any:
-    """What `reader` finds in a foreign file."""
+def _parse(path: Path, reader: Callable[[Path], Any]) -> Any:
+    """Content of a file that `reader` reads; all errors become InputErrors."""
     require_file(path, "a ground truth file")
     try:
         return reader(path)
@@ -94,17 +98,16 @@ def _frame_truth(
 
 
 def _labels(path: Path, names: Sequence[str]) -> list[str]:
-    """The label of every image."""
     table = _row_table(names)
     labels: dict[int, str] = {}
-    for number, (name, label) in enumerate(_parsed(path, _csv_labels), start=1):
+    for number, (name, label) in enumerate(_parse(path, _csv_labels), start=1):
         row = table.get(name.strip())
         if row is None:
-            several = any(PurePosixPath(one).name == name.strip() for one in names)
+            several = any(PurePosixPath(image).name == name.strip() for image in names)
             mend = "several images have this name, give their paths" if several else "no image has this name, remove it"
-            raise InputError(f"{path}: entry {number}: got {_shortened(name)!r}; {mend}")
+            raise InputError(f"{path}: entry {number}: got {_clip(name)!r}; {mend}")
         if row in labels:
-            raise InputError(f"{path}: entry {number}: {_shortened(name)!r} has a label already; keep one of them")
+            raise InputError(f"{path}: entry {number}: {_clip(name)!r} has a label already; keep one of them")
         labels[row] = label.strip()
     missing = [name for row, name in enumerate(names) if row not in labels]
     if missing:
@@ -116,16 +119,16 @@ def _labels(path: Path, names: Sequence[str]) -> list[str]:
 
 
 def _csv_columns(path: Path, *choices: tuple[str, str]) -> list[tuple[str, str]]:
-    """The first of the pairs of columns that a csv has."""
-    with path.open(newline="", encoding="utf-8-sig", errors="surrogateescape") as file:  # as file names are read
+    """Cells of the first of several pairs of columns that a csv has."""
+    with path.open(newline="", encoding="utf-8-sig", errors="surrogateescape") as file:  # as file names are decoded
         lines = csv.reader(file)
         names = [name.strip().lower() for name in next(lines, [])]
         for pair in choices:
             if all(names.count(column) == 1 for column in pair):
                 first, second = map(names.index, pair)
-                short = [""] * len(names)  # cells that a line lacks are empty
-                return [((line + short)[first], (line + short)[second]) for line in lines if line]
-    got = _shortened(",".join(names)) or "no header"
+                padding = [""] * len(names)  # missing cells at the end of a line are empty
+                return [((line + padding)[first], (line + padding)[second]) for line in lines if line]
+    got = _clip(",".join(names)) or "no header"
     raise InputError(f"{path}: expected a header with the columns {','.join(choices[0])}; got {got}")
 
 
@@ -142,18 +145,20 @@ def _npz_pairs(path: Path) -> list[tuple[Any, Any]] | RadiusTruth:
         if len({*arrays.files}) < len(arrays.files):
             raise InputError(f"{path}: expected every array once, got {', '.join(arrays.files)}; write the file anew")
         if {"utmQ", "utmDb"} <= set(arrays):
-            positions = [arrays[name].astype(np.float64) for name in ("utmQ", "utmDb")]
-            for name, xy in zip(("utmQ", "utmDb"), positions, strict=True):
+            positions = {name: arrays[name].astype(np.float64) for name in ("utmQ", "utmDb")}
+            for name, xy in positions.items():
                 if xy.ndim != 2 or xy.shape[1] != 2:
                     raise InputError(f"{path}: {name}: expected positions [n, 2] in meters, got shape {xy.shape}")
                 if not (np.abs(xy) <= FARTHEST).all():  # NaN neither
                     raise InputError(f"{path}: {name}: expected positions of at most {FARTHEST:g} m, got others")
-            return RadiusTruth(*positions)
+            return RadiusTruth(*positions.values())
         if {"query", "database"} <= set(arrays):
-            if arrays["query"].shape != arrays["database"].shape or arrays["query"].ndim != 1:
-                raise InputError(f"{path}: expected query and database of one length, got "
-                                 f"{arrays['query'].shape} and {arrays['database'].shape}")  # fmt: skip
-            return list(zip(arrays["query"].tolist(), arrays["database"].tolist(), strict=True))
+            query, database = arrays["query"], arrays["database"]
+            if query.shape != database.shape or query.ndim != 1:
+                raise InputError(
+                    f"{path}: expected query and database of one length, got {query.shape} and {database.shape}"
+                )
+            return list(zip(query.tolist(), database.tolist(), strict=True))
         raise InputError(f"{path}: expected arrays query and database, or utmQ and utmDb; got {', '.join(arrays)}")
 
 
@@ -167,14 +172,10 @@ def _json_pairs(path: Path) -> list[tuple[Any, Any]]:
 
 
 def _row_table(names: Sequence[str]) -> dict[str, int]:
-    """Rows by relative path, and by file name where that is unique."""
-    table: dict[str, int] = {}
-    ambiguous = set()
-    for row, name in enumerate(names):
-        base = PurePosixPath(name).name
-        ambiguous |= {base} & table.keys()
-        table[base] = row
-    table = {base: row for base, row in table.items() if base not in ambiguous}
+    """Rows by relative path, and by unique file names."""
+    bases = [PurePosixPath(name).name for name in names]
+    counts = Counter(bases)
+    table = {base: row for row, base in enumerate(bases) if counts[base] == 1}
     return table | {name: row for row, name in enumerate(names)}
 
 
@@ -186,15 +187,10 @@ def _row(path: Path, line: int, side: str, value: Any, table: dict[str, int], co
         return int(text)
     raise InputError(
         f"{path}: pair {line}: expected the name of a {side} image or a number from 0 to {count - 1}, got "
-        f"{_shortened(text)!r}"
+        f"{_clip(text)!r}"
     )
 
 
-def _shortened(text: str) -> str:
-    """Foreign text, for a message of one line."""
+def _clip(text: str) -> str:
+    """Shorten text from a file for an error message."""
     return text if len(text) <= 60 else f"{text[:40]}... ({len(text)} characters)"
-
-
-def _same_count(path: Path, what: str, got: int, expected: int) -> None:
-    if got != expected:
-        raise InputError(f"{path}: expected {expected} {what}, one per image, got {got}")

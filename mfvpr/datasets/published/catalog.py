@@ -1,8 +1,7 @@
-"""The published data sets: what their folders hold, and the numbers of images that papers report."""
+"""The table of published data sets: layouts of their folders, and published numbers of images."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 from mfvpr.datasets.datasets import Dataset
@@ -12,18 +11,18 @@ from mfvpr.utils.errors import InputError
 
 @dataclass(frozen=True)
 class Published:
-    """One of them.
+    """A published data set.
 
     Attributes:
         name: of the choice `dataset=`, and of its folder below a folder of data sets.
-        title: what it is, and whose.
-        layout: what its folder holds, in lines.
+        title: short description with its authors.
+        layout: contents of its folder, in lines.
         database: published number of database images.
         queries: published numbers of queries, by sequence.
-        read: `read(folder, name)`, and `seasons=` where it has them.
-        archive: the name it is distributed under, which its folder may keep.
-        source: where it is, or how to come by it.
-        seasons: (database, queries), where they can be chosen.
+        read: `read(folder, name)`, with the keyword `seasons` if it has seasons.
+        archive: name under which it is distributed, another possible name of its folder.
+        source: where to get it.
+        seasons: default (database, queries) if seasons can be chosen.
     """
 
     name: str
@@ -38,18 +37,14 @@ class Published:
 
     @property
     def folders(self) -> tuple[str, ...]:
-        """Names that its folder may have."""
+        """Possible names of its folder."""
         return (self.name,) if self.archive is None else (self.name, self.archive)
-
-
-def _one(name: str, queries: int) -> Mapping[str, int]:
-    return {name: queries}
 
 
 def _ssm(name: str, title: str, database: int, queries: int, archive: str) -> Published:
     source = "http://imr.ciirc.cvut.cz/Datasets/Ssm-vpr"
     return Published(
-        name, f"{title}, as SSM-VPR has it", ssm_vpr.LAYOUT, database, _one(name, queries), ssm_vpr.ssm_vpr, source,
+        name, f"{title}, as SSM-VPR has it", ssm_vpr.LAYOUT, database, {name: queries}, ssm_vpr.ssm_vpr, source,
         archive,
     )  # fmt: skip
 
@@ -57,7 +52,7 @@ def _ssm(name: str, title: str, database: int, queries: int, archive: str) -> Pu
 def _pittsburgh(part: str, queries: int) -> Published:
     name = f"pitts30k_{part}"
     return Published(
-        name, f"Pittsburgh30k, {part} part", pittsburgh.LAYOUT.format(part=part), 10_000, _one(name, queries),
+        name, f"Pittsburgh30k, {part} part", pittsburgh.LAYOUT.format(part=part), 10_000, {name: queries},
         pittsburgh.pitts30k, "on request from its authors: https://github.com/Relja/netvlad", "pitts30k",
     )  # fmt: skip
 
@@ -74,17 +69,17 @@ PUBLISHED = {
         _ssm("nordland_1415", "Synthesized Nordland, 1415 frames", 1415, 1415, "Nordland_RAS2020"),
         Published(
             "nordland_27592", "Nordland, every frame but tunnels and stations (Patch-NetVLAD's)",
-            nordland.LAYOUT_27592, 27_592, _one("nordland_27592", 27_592), nordland.nordland_27592,
+            nordland.LAYOUT_27592, 27_592, {"nordland_27592": 27_592}, nordland.nordland_27592,
             "https://github.com/QVPR/Patch-NetVLAD", "nordland", ("summer", "winter"),
         ),
         Published(
             "nordland_3450", "Nordland, the test part of Olid, Facil and Civera", nordland.LAYOUT_3450, 3450,
-            _one("nordland_3450", 3450), nordland.nordland_3450, "http://webdiis.unizar.es/~jmfacil/pr-nordland/", None,
+            {"nordland_3450": 3450}, nordland.nordland_3450, "http://webdiis.unizar.es/~jmfacil/pr-nordland/", None,
             ("summer", "winter"),
         ),
         Published(
             "nordland_vprbench", "Nordland, VPR-Bench's: winter, every tenth frame of summer", nordland.LAYOUT_VPRBENCH,
-            27_592, _one("nordland_vprbench", 2760), nordland.nordland_vprbench,
+            27_592, {"nordland_vprbench": 2760}, nordland.nordland_vprbench,
             "https://github.com/MubarizZaffar/VPR-Bench",
         ),
         Published(
@@ -96,7 +91,7 @@ PUBLISHED = {
         _pittsburgh("test", 6816),
         Published(
             "msls_val", "Mapillary Street-Level Sequences, validation part", msls.LAYOUT, 18_871,
-            _one("msls_val", 740), msls.msls_val, "https://www.mapillary.com/dataset/places", "msls",
+            {"msls_val": 740}, msls.msls_val, "https://www.mapillary.com/dataset/places", "msls",
         ),
     )
 }  # fmt: skip
@@ -108,27 +103,26 @@ def published_dataset(name: str, root: Path | str, *, seasons: tuple[str, str] |
     Args:
         name: of `PUBLISHED`.
         root: its folder.
-        seasons: (database, queries) of Nordland's.
+        seasons: (database, queries) of Nordland.
 
     Raises:
-        InputError: no such folder, or another layout than the data set's.
+        InputError: no such folder, or a folder of another layout.
     """
     entry, root = PUBLISHED[name], Path(root)
     if not root.is_dir():
-        found = "a file" if root.exists() else "nothing"
-        raise InputError(f"{root}: expected the folder of {name}, got {found}; it is to be had at {entry.source}")
-    known = seasons is None or (entry.seasons is not None and {*seasons} <= {*nordland.SEASONS})
-    if seasons is not None and not (known and len({*seasons}) == 2):
+        got = "a file" if root.exists() else "nothing"
+        raise InputError(f"{root}: expected the folder of {name}, got {got}; it is to be had at {entry.source}")
+    if seasons is not None and not (entry.seasons and len({*seasons}) == 2 and {*seasons} <= {*nordland.SEASONS}):
         raise InputError(f"seasons={list(seasons)}: expected two of {', '.join(nordland.SEASONS)}")
-    read = entry.read if entry.seasons is None else partial(entry.read, seasons=seasons or entry.seasons)
+    options = {} if entry.seasons is None else {"seasons": seasons or entry.seasons}
     try:
-        return read(root, name)
+        return entry.read(root, name, **options)
     except InputError as error:
         raise InputError(f"{error} (layout: python -m experiments.data list {name})") from error
 
 
 def differences(dataset: Dataset) -> Iterator[str]:
-    """Where numbers of images are not the published ones, in words; of other data sets nothing."""
+    """Differences from the published numbers of images, in words; none for data sets that are not published."""
     entry = PUBLISHED.get(dataset.name)
     if entry is None:
         return

@@ -1,25 +1,27 @@
-"""Images that a list names, and lists of NumPy's files, in which nothing is executed."""
+"""Images from lists of names, and NumPy's files of lists, whose code is never executed."""
 
-from collections.abc import Iterable
+import csv
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from mfvpr.datasets.datasets import ImageFolder
+from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
+from mfvpr.datasets.ground_truth import FrameTruth
 from mfvpr.io.formats.numpy_objects import Array, read_objects
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_file
 
-_DAMAGE = (ArithmeticError, LookupError, TypeError, ValueError, EOFError)
+_DAMAGE = (ArithmeticError, LookupError, TypeError, ValueError, EOFError, StopIteration, csv.Error)
 _OBJECTS = b"'|O'"
 
 
 def listed_images(root: Path, names: Iterable[str], origin: Path) -> ImageFolder:
-    """The images below `root` that a list names.
+    """The images below `root` with the names of a list.
 
     Raises:
-        InputError: the list is empty, leads out of the folder, or names what is not there.
+        InputError: an empty list, names outside the folder, duplicates, or missing images.
     """
     names = tuple(names)
     if not names:
@@ -28,8 +30,8 @@ def listed_images(root: Path, names: Iterable[str], origin: Path) -> ImageFolder
         if name.startswith("/") or ".." in name.split("/"):
             raise InputError(f"{origin}: expected names below {root}, got {name}")
     if len({*names}) < len(names):
-        twice = next(name for row, name in enumerate(names) if name in names[:row])
-        raise InputError(f"{origin}: expected every image once, got {twice} again; get the file again")
+        duplicate = next(name for row, name in enumerate(names) if name in names[:row])
+        raise InputError(f"{origin}: expected every image once, got {duplicate} again; get the file again")
     missing = [name for name in names if not (root / name).is_file()]
     if missing:
         raise InputError(f"{root}: {len(missing):,} of the {len(names):,} images of {origin.name} are missing, the "
@@ -37,82 +39,99 @@ def listed_images(root: Path, names: Iterable[str], origin: Path) -> ImageFolder
     return ImageFolder(root, names)
 
 
+def dataset_of_lists(
+    root: Path, name: str, database_list: Path, query_list: Path, truth_list: Path, selection_list: Path | None = None
+) -> Dataset:
+    """Data set from NumPy's lists of GSV-Cities and OpenVPRLab: image names, and correct database rows by query.
+
+    Args:
+        root: folder of the images.
+        name: of the data set.
+        database_list: names of database images.
+        query_list: names of query images.
+        truth_list: database rows by query.
+        selection_list: rows of `query_list` that are queries; None = all.
+    """
+    database = listed_images(root, read_names(database_list), database_list)
+    names, rows = read_names(query_list), read_rows(truth_list, len(database))
+    expected = f"{len(names)} queries"
+    if selection_list is not None:
+        names = [names[row] for selection in read_rows(selection_list, len(names)) for row in selection]
+        expected = f"the {len(names)} queries of {selection_list.name}"
+    if len(rows) != len(names):
+        raise InputError(f"{truth_list}: expected rows of {expected}, got {len(rows)}")
+    truth = FrameTruth(tuple(rows), len(database), widened=False)
+    return Dataset(name, database, (QuerySequence(name, listed_images(root, names, query_list), truth),))
+
+
+@contextmanager
+def reading(path: Path, damage: str, kind: str = "a list") -> Iterator[None]:
+    """Require a regular file, and raise all errors of reading it as InputErrors; `damage` describes another content."""
+    require_file(path, kind)
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except InputError as error:
+        raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
+    except _DAMAGE:
+        raise InputError(f"{path}: {damage}") from None
+
+
 def expected_file(root: Path, *names: str) -> Path | None:
-    """The first of these that is there."""
+    """The first of several files that exists."""
     return next((root / name for name in names if (root / name).is_file()), None)
 
 
 def read_lines(path: Path) -> list[str]:
-    """Lines that are not empty, without the spaces around them.
+    """Read lines that are not empty, without the spaces around them.
 
     Raises:
         InputError: the file cannot be read.
     """
-    require_file(path, "a list")
-    try:
+    with reading(path, "expected lines of text; get it again"):
         text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
     return [stripped for line in text.splitlines() if (stripped := line.strip())]
 
 
 def read_names(path: Path) -> list[str]:
-    """Names of an `.npy` file of text."""
-    names = _array(path)
+    """Read names from an `.npy` file of text."""
+    names = _read_array(path)
     if names.ndim != 1 or names.dtype.kind != "U":
         raise InputError(f"{path}: expected a list of names, got {names.dtype} {list(names.shape)}")
     return [str(name) for name in names]
 
 
 def read_rows(path: Path, num_database: int) -> list[tuple[int, ...]]:
-    """Rows of the database by query, of an `.npy` file of lists, or of an array `[Q]` or `[Q, P]`.
+    """Read database rows by query from an `.npy` file of lists, or of an array `[Q]` or `[Q, P]`.
 
     Raises:
-        InputError: the file is another, is damaged, or a row is none of the database.
+        InputError: a file of another content, a damaged file, or rows outside the database.
     """
-    rows = _rows(path)
-    if rows and num_database > 2 and all(len(found) == num_database and {*found} <= {0, 1} for found in rows):
+    with reading(path, "this file is damaged; get it again"), path.open("rb") as file:
+        if _OBJECTS in file.read(128):
+            file.seek(0)
+            lists = read_objects(file, "lists of rows")
+            arrays = ((rows.numbers() if isinstance(rows, Array) else np.array(rows)).reshape(-1) for rows in lists)
+            per_query = (_require_integers(rows, path) if rows.size else rows for rows in arrays)
+        else:
+            per_query = map(np.atleast_1d, _require_integers(_read_array(path), path))
+        table = [tuple(rows.tolist()) for rows in per_query]
+    if table and num_database > 2 and all(len(rows) == num_database and {*rows} <= {0, 1} for rows in table):
         raise InputError(f"{path}: expected rows of the database, got flags for each of them; get the file again")
-    for query, found in enumerate(rows):
-        if found and not 0 <= min(found) <= max(found) < num_database:
+    for query, rows in enumerate(table):
+        if rows and not 0 <= min(rows) <= max(rows) < num_database:
             raise InputError(f"{path}: query {query}: expected rows from 0 to {num_database - 1}, got "
-                             f"{min(found)} to {max(found)}")  # fmt: skip
+                             f"{min(rows)} to {max(rows)}")  # fmt: skip
+    return table
+
+
+def _require_integers(rows: np.ndarray, path: Path) -> np.ndarray:
+    if rows.dtype.kind not in "iu" or rows.ndim > 2:
+        raise InputError(f"{path}: expected lists of rows, got {rows.dtype} {list(rows.shape)}")
     return rows
 
 
-def _rows(path: Path) -> list[tuple[int, ...]]:
-    require_file(path, "a list")
-    try:
-        with path.open("rb") as file:
-            if _OBJECTS not in file.read(128):
-                return [tuple(np.atleast_1d(row).tolist()) for row in _whole(_array(path), path)]
-            file.seek(0)
-            return [_row(one, path) for one in read_objects(file, "lists of rows")]
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except InputError as error:
-        raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
-    except _DAMAGE:
-        raise InputError(f"{path}: this file is damaged; get it again") from None
-
-
-def _row(one: Any, path: Path) -> tuple[int, ...]:
-    numbers = one.numbers() if isinstance(one, Array) else np.array(one)
-    return tuple(_whole(numbers.reshape(-1), path).tolist()) if numbers.size else ()
-
-
-def _whole(numbers: np.ndarray, path: Path) -> np.ndarray:
-    if numbers.dtype.kind not in "iu" or numbers.ndim > 2:
-        raise InputError(f"{path}: expected lists of rows, got {numbers.dtype} {list(numbers.shape)}")
-    return numbers
-
-
-def _array(path: Path) -> np.ndarray:
-    require_file(path, "a list")
-    try:
-        with path.open("rb") as file:
-            return np.lib.format.read_array(file, allow_pickle=False)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except (ValueError, EOFError):
-        raise InputError(f"{path}: expected an array of NumPy; get it again") from None
+def _read_array(path: Path) -> np.ndarray:
+    with reading(path, "expected an array of NumPy; get it again"), path.open("rb") as file:
+        return np.lib.format.read_array(file, allow_pickle=False)

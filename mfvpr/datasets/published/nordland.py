@@ -1,4 +1,4 @@
-"""Nordland (Suenderhauf et al., 2013): a train's journey in four seasons. Its variants are different data sets."""
+"""Nordland (Suenderhauf et al., 2013): a train journey in four seasons. Its variants are different data sets."""
 
 from pathlib import Path, PurePosixPath
 
@@ -8,7 +8,7 @@ from mfvpr.datasets.published.lists import expected_file, listed_images, read_li
 from mfvpr.utils.errors import InputError
 
 SEASONS = ("fall", "spring", "summer", "winter")
-EACH = 10  # frames of VPR-Bench's database per query
+EACH = 10  # database frames per query in VPR-Bench
 
 LAYOUT_27592 = """summer/images-00202.png, ...  the database (or another of dataset.seasons)
 winter/images-00202.png, ...  the queries: the same names
@@ -20,29 +20,29 @@ query/0000000.jpg, ...  the queries, in summer: query i shows database image 10 
 
 
 def nordland_27592(root: Path, name: str, *, seasons: tuple[str, str]) -> Dataset:
-    """Patch-NetVLAD's and gmberton's: every frame but tunnels and stations; right within 10 frames.
+    """Patch-NetVLAD's and gmberton's variant: every frame but tunnels and stations; correct within 10 frames.
 
     Raises:
         InputError: images are missing, or the seasons' frames differ.
     """
-    folders = (_listed(root, season, side) for season, side in zip(seasons, ("index", "query"), strict=True))
-    return _paired(name, *folders)
+    folders = (_season_images(root, season, side) for season, side in zip(seasons, ("index", "query"), strict=True))
+    return _frame_pairs(name, *folders)
 
 
 def nordland_3450(root: Path, name: str, *, seasons: tuple[str, str]) -> Dataset:
-    """The test part of Olid, Facil and Civera's (2018); right within 2 frames of the same section.
+    """The test part of Olid, Facil and Civera (2018); correct within 2 frames of the same section.
 
     Raises:
         InputError: images are missing, or the seasons' frames differ.
     """
-    return _paired(name, *(image_folder(root / f"{season}_images_test") for season in seasons))
+    return _frame_pairs(name, *(image_folder(root / f"{season}_images_test") for season in seasons))
 
 
 def nordland_vprbench(root: Path, name: str) -> Dataset:
-    """VPR-Bench's (Zaffar et al., IJCV 2021): every tenth frame is asked; right within 1 frame.
+    """VPR-Bench's variant (Zaffar et al., IJCV 2021): every tenth frame is a query; correct within 1 frame.
 
     Raises:
-        InputError: images are missing, or too few are in the database.
+        InputError: images are missing, or the database has too few images.
     """
     database, queries = image_folder(root / "ref"), image_folder(root / "query")
     last = EACH * (len(queries) - 1)
@@ -53,16 +53,16 @@ def nordland_vprbench(root: Path, name: str) -> Dataset:
     return Dataset(name, database, (QuerySequence(name, queries, truth),))
 
 
-def _listed(root: Path, season: str, side: str) -> ImageFolder:
-    """Of the list where there is one, whose names have folders above the season."""
+def _season_images(root: Path, season: str, side: str) -> ImageFolder:
+    """Images of Patch-NetVLAD's list if it exists (its names begin with other folders), else all images."""
     origin = expected_file(root, f"nordland_imageNames_{side}.txt")
     if origin is None:
         return image_folder(root / season)
     return listed_images(root / season, [PurePosixPath(line).name for line in read_lines(origin)], origin)
 
 
-def _paired(name: str, database: ImageFolder, queries: ImageFolder) -> Dataset:
-    """The same frame of both; each folder of the database is a drive."""
+def _frame_pairs(name: str, database: ImageFolder, queries: ImageFolder) -> Dataset:
+    """Data set of equal frames of two seasons; each folder of the database is a drive."""
     if len(database) != len(queries):
         raise InputError(f"{queries.root}: expected as many frames as in {database.root}, got {len(queries):,} and "
                          f"{len(database):,}; get the whole data set")  # fmt: skip

@@ -1,11 +1,11 @@
-"""Oxford RobotCar Seasons (Sattler et al., CVPR 2018), version 2, as the paper takes it.
+"""Oxford RobotCar Seasons (Sattler et al., CVPR 2018), version 2, as in the paper.
 
-Its rear camera alone, and of its images those whose position is public: summer is the database, seven other conditions
-are the queries. The right answer is the reference whose camera was nearest, and frames around it; a query without one
-within five meters is left out.
+Images are those of the rear camera with public positions: summer is the database, seven other conditions are the
+queries. The database image with the nearest camera is correct, and frames around it. Queries without a database image
+within five meters are left out.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ REFERENCE = "overcast-summer"  # the paper's figure; its text says overcast-refe
 CONDITIONS = ("dawn", "dusk", "night", "night-rain", "overcast-winter", "rain", "snow")
 REACH = 5.0  # meters
 POSES = "robotcar_v2_train.txt"
-_LAST_ROW = 1e-6  # tolerance of its numbers
+_LAST_ROW = 1e-6  # tolerance of the last row of a pose, 0 0 0 1
 LAYOUT = f"""images/CONDITION/rear/TIMESTAMP.jpg  of {REFERENCE} (the database),
                                      {", ".join(CONDITIONS)}
 {POSES}                per line CONDITION/rear/TIMESTAMP.jpg and 16 numbers, camera to world"""
@@ -34,22 +34,21 @@ def robotcar_seasons(root: Path, name: str) -> Dataset:
     """
     path = root / POSES
     centers = camera_centers(path)
-    database = _of(centers, REFERENCE, path)
+    database, places = _condition(centers, REFERENCE, path)
     images = listed_images(root / "images", database, path)
-    places = np.array([centers[one] for one in database])
     sequences = []
     for condition in CONDITIONS:
-        names = _of(centers, condition, path)
-        nearest, distances = nearest_places(np.array([centers[one] for one in names]), places)
-        kept = np.flatnonzero(distances <= REACH)
-        rows = tuple((int(row),) for row in nearest[kept])
-        queries = listed_images(root / "images", [names[row] for row in kept.tolist()], path)
+        names, positions = _condition(centers, condition, path)
+        nearest, distances = nearest_places(positions, places)
+        near = np.flatnonzero(distances <= REACH).tolist()
+        rows = tuple((int(nearest[query]),) for query in near)
+        queries = listed_images(root / "images", [names[query] for query in near], path)
         sequences.append(QuerySequence(condition, queries, FrameTruth(rows, len(database))))
     return Dataset(name, images, tuple(sequences))
 
 
 def camera_centers(path: Path) -> dict[str, np.ndarray]:
-    """`[3]` meters by image name, of a file of poses.
+    """Read camera centers `[3]` in meters by image name from a file of poses.
 
     Raises:
         InputError: a line is no pose.
@@ -76,14 +75,15 @@ def camera_centers(path: Path) -> dict[str, np.ndarray]:
 
 
 def nearest_places(queries: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Row `[Q]` of the nearest of places `[N, 3]` for each of `[Q, 3]`, the first of equal ones, and how far it is."""
+    """Row `[Q]` of the nearest of places `[N, 3]` for queries `[Q, 3]`, the first on a tie, and its distance `[Q]`."""
     distances = np.linalg.norm(queries[:, None] - places[None], axis=-1)
     nearest = np.argmin(distances, axis=1)
     return nearest, distances[np.arange(len(queries)), nearest]
 
 
-def _of(centers: Mapping[str, np.ndarray], condition: str, path: Path) -> Sequence[str]:
+def _condition(centers: Mapping[str, np.ndarray], condition: str, path: Path) -> tuple[list[str], np.ndarray]:
+    """Names and camera centers `[n, 3]` of a condition's images."""
     names = sorted(name for name in centers if name.startswith(f"{condition}/rear/"))
     if not names:
         raise InputError(f"{path}: expected poses of {condition}/rear, got none; use the file of the data set")
-    return names
+    return names, np.array([centers[name] for name in names])

@@ -1,4 +1,4 @@
-"""The data sets of SSM-VPR (Camara and Preucil, 2020), which the paper takes over: two folders and a table."""
+"""The data sets of SSM-VPR (Camara and Preucil, 2020), which the paper uses as well: two folders and a table."""
 
 import re
 from pathlib import Path, PurePosixPath
@@ -13,18 +13,18 @@ GroundTruth.csv                         Reference,Live and then a line per query
 
 
 def ssm_vpr(root: Path, name: str) -> Dataset:
-    """Places are right within a tolerance in frames of the database image that the table names.
+    """Correct within a tolerance in frames of the database image in the table.
 
     Raises:
         InputError: a folder or the table is missing, or images are not numbered as the table counts them.
     """
-    database, queries = (_numbered(root / side) for side in ("Reference", "Live"))
+    database, queries = (_numbered_images(root / side) for side in ("Reference", "Live"))
     truth = truth_from_file(root / "GroundTruth.csv", queries.names, database.names, widened=True)
     return Dataset(name, database, (QuerySequence(name, queries, truth),))
 
 
-def _numbered(folder: Path) -> ImageFolder:
-    """Images whose names end in 0, 1, ..., as the table and the tolerance count them."""
+def _numbered_images(folder: Path) -> ImageFolder:
+    """Images with names that end in 0, 1, ..., the numbers in the table."""
     images = image_folder(folder)
     for row, name in enumerate(images.names):
         digits = re.search(r"(\d+)$", PurePosixPath(name).stem)
