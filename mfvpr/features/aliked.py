@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache, cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -41,7 +41,7 @@ class AlikedFeatures:
         InputError: images of this size have no room for a keypoint.
     """
 
-    vector_size: ClassVar[int] = 0  # no global descriptor
+    vector_size = 0  # no global descriptor
     model: Aliked
     image_size: tuple[int, int] = (320, 320)
     interpolation: Interpolation = "pil_bilinear"

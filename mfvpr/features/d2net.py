@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -38,7 +38,7 @@ class D2NetFeatures:
         InputError: images of this size are too small for the network.
     """
 
-    vector_size: ClassVar[int] = 0  # no global descriptor
+    vector_size = 0  # no global descriptor
     model: D2Net
     image_size: tuple[int, int] = (336, 336)
     interpolation: Interpolation = "pil_bilinear"

@@ -3,13 +3,13 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, ClassVar, Protocol
+from typing import Any, Protocol
 
 import jax
 import numpy as np
 
 from mfvpr.datasets.images import Interpolation
-from mfvpr.features.extractor import Description, Scale
+from mfvpr.features.extractor import Description
 from mfvpr.features.network import compiled, in_batches, require_size
 from mfvpr.networks.lengths import of_unit_length
 from mfvpr.utils.errors import InputError
@@ -52,7 +52,7 @@ class GlobalDescriptor:
         InputError: the network cannot take images of this size, or has fewer principal components.
     """
 
-    scales: ClassVar[tuple[Scale, ...]] = ()  # no local features
+    scales = ()  # no local features
     model: DescriptorNetwork
     image_size: tuple[int, int] = (640, 480)
     interpolation: Interpolation = "pil_bilinear"

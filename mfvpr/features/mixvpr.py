@@ -3,13 +3,13 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import numpy as np
 
 from mfvpr.datasets.images import Interpolation
-from mfvpr.features.extractor import Description, Scale
+from mfvpr.features.extractor import Description
 from mfvpr.features.network import compiled, in_batches, require_size
 from mfvpr.networks.mixvpr import IMAGE_SIZE, MixVPR, preprocess
 
@@ -25,8 +25,8 @@ class MixVprDescriptor:
         batch_size: images per call.
     """
 
-    image_size: ClassVar[tuple[int, int]] = IMAGE_SIZE
-    scales: ClassVar[tuple[Scale, ...]] = ()  # no local features
+    image_size = IMAGE_SIZE
+    scales = ()  # no local features
     model: MixVPR
     interpolation: Interpolation = "pil_bicubic"
     batch_size: int = field(default=8, metadata={"recipe": False})

@@ -1,7 +1,6 @@
 """OpenCV SIFT as RootSIFT (Lowe, IJCV 2004; Arandjelovic & Zisserman, CVPR 2012): local features without a download."""
 
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -23,7 +22,7 @@ class Sift:
         clahe_clip: clip limit of local histogram equalization before detection; 0 turns it off.
     """
 
-    vector_size: ClassVar[int] = 0  # no global descriptor
+    vector_size = 0  # no global descriptor
     image_size: tuple[int, int] = (336, 336)
     interpolation: Interpolation = "pil_bilinear"
     max_keypoints: int | None = 800

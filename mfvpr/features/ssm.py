@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -37,7 +37,7 @@ class SsmMaps:
         batch_size: images per call.
     """
 
-    scales: ClassVar[tuple[Scale, ...]] = ()  # no local features
+    scales = ()  # no local features
     model: SsmVgg
     stage: Literal[1, 2]
     image_size: tuple[int, int]
@@ -84,8 +84,8 @@ class SsmWindows:
         batch_size: images per call.
     """
 
-    image_size: ClassVar[tuple[int, int]] = STAGE1_SIZE
-    scales: ClassVar[tuple[Scale, ...]] = ()  # no local features
+    image_size = STAGE1_SIZE
+    scales = ()  # no local features
     model: SsmVgg
     interpolation: Interpolation = "pil_bilinear"
     preprocessing: Preprocessing = "torch"
@@ -140,7 +140,7 @@ class SsmCells:
         InputError: images of this size have no cells.
     """
 
-    vector_size: ClassVar[int] = 0  # no global descriptor
+    vector_size = 0  # no global descriptor
     model: SsmVgg
     image_size: tuple[int, int] = (336, 336)
     interpolation: Interpolation = "pil_bilinear"

@@ -27,7 +27,7 @@ def plan_drives(seed: int, count: int, image_size: tuple[int, int]) -> tuple[lis
     lane, heading, pitch = _path(rng, count)
     wobble = 0.3 * _DEGREE * rng.standard_normal((2, count))
     z = SPACING * np.arange(count)
-    database = [Camera(LANE, *pose, image_size) for pose in zip(z, *wobble, strict=True)]
+    database = [Camera(LANE, *pose, image_size) for pose in zip(z, wobble[0], wobble[1], strict=True)]
     queries = [Camera(*pose, image_size) for pose in zip(lane, z, heading, pitch, strict=True)]
     return database, queries
 
