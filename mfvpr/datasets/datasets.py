@@ -184,10 +184,10 @@ def sequences_dataset(
         queries: folders of query images, with different names that are not in `MEANS`.
         ground_truth: kind of ground truth of every sequence, one of `ground_truth.KINDS` except `label`.
         name: in results.
-        index_file: for `index`, the file's name in the folder of each sequence, see `truth_files.truth_from_file`.
-        widen_index: for `index`, whether database images within a tolerance in frames count as well.
-        orient: see `mfvpr.datasets.images.read_image`.
-        bits: see `mfvpr.datasets.images.read_image`.
+        index_file: for `index`, the file's name in the folder of each sequence.
+        widen_index: see `folder_dataset`.
+        orient: see `folder_dataset`.
+        bits: see `folder_dataset`.
 
     Raises:
         InputError: no sequence, two sequences of one name, or a sequence with the name of a mean.
@@ -274,12 +274,5 @@ def _images_below(root: Path) -> Iterator[Path]:
 
 def _natural(name: str) -> tuple[list[tuple[int, int, str]], str]:
     """Sort key in which runs of digits, of any length, compare as numbers."""
-    parts = re.split(r"(\d+)", name)
-    return [_natural_part(part) for part in parts], name
-
-
-def _natural_part(part: str) -> tuple[int, int, str]:
-    if not part.isdecimal():
-        return 0, 0, part
-    value = part.lstrip("0")
-    return 1, len(value), value
+    parts = [part.lstrip("0") if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
+    return [(1, len(part), part) if place % 2 else (0, 0, part) for place, part in enumerate(parts)], name

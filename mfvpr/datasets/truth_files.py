@@ -4,6 +4,7 @@ import csv
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -48,7 +49,8 @@ def truth_from_file(
         widened: whether database images within a tolerance in frames count as well, for databases that are sequences.
     """
     path = Path(path)
-    readers = {".csv": _csv_pairs, ".npz": _npz_pairs, ".json": _json_pairs}
+    csv_pairs = partial(_csv_columns, choices=(("query", "database"), ("live", "reference")))
+    readers: dict[str, Callable[[Path], Any]] = {".csv": csv_pairs, ".npz": _npz_pairs, ".json": _json_pairs}
     if path.suffix.lower() not in readers:
         raise InputError(f"{path}: expected an index file named .csv, .npz or .json, got {path.suffix or 'no suffix'}")
     content = _parse(path, readers[path.suffix.lower()])
@@ -100,7 +102,8 @@ def _frame_truth(
 def _labels(path: Path, names: Sequence[str]) -> list[str]:
     table = _row_table(names)
     labels: dict[int, str] = {}
-    for number, (name, label) in enumerate(_parse(path, _csv_labels), start=1):
+    read_labels = partial(_csv_columns, choices=(("name", "label"),))
+    for number, (name, label) in enumerate(_parse(path, read_labels), start=1):
         row = table.get(name.strip())
         if row is None:
             several = any(PurePosixPath(image).name == name.strip() for image in names)
@@ -118,7 +121,7 @@ def _labels(path: Path, names: Sequence[str]) -> list[str]:
     return [labels[row] for row in range(len(names))]
 
 
-def _csv_columns(path: Path, *choices: tuple[str, str]) -> list[tuple[str, str]]:
+def _csv_columns(path: Path, choices: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
     """Cells of the first of several pairs of columns that a csv has."""
     with path.open(newline="", encoding="utf-8-sig", errors="surrogateescape") as file:  # as file names are decoded
         lines = csv.reader(file)
@@ -130,14 +133,6 @@ def _csv_columns(path: Path, *choices: tuple[str, str]) -> list[tuple[str, str]]
                 return [((line + padding)[first], (line + padding)[second]) for line in lines if line]
     got = _clip(",".join(names)) or "no header"
     raise InputError(f"{path}: expected a header with the columns {','.join(choices[0])}; got {got}")
-
-
-def _csv_pairs(path: Path) -> list[tuple[str, str]]:
-    return _csv_columns(path, ("query", "database"), ("live", "reference"))
-
-
-def _csv_labels(path: Path) -> list[tuple[str, str]]:
-    return _csv_columns(path, ("name", "label"))
 
 
 def _npz_pairs(path: Path) -> list[tuple[Any, Any]] | RadiusTruth:

@@ -88,7 +88,9 @@ class Vlad:
         if descriptors.shape[1] != self.centers.shape[1]:
             raise InputError(f"VLAD: expected descriptors of {self.centers.shape[1]} dimensions, as those that it was "
                              f"fitted on, got {descriptors.shape[1]}")  # fmt: skip
-        word = _nearest(descriptors, self.centers)
+        # No matrix product: its threads stay awake for a while and take the cores from the matching that comes next.
+        products = np.vecdot(descriptors[:, None], self.centers)
+        word = np.argmin((self.centers**2).sum(1) - 2 * products, axis=1)  # the first on a tie
         cell = np.repeat(np.arange(len(images)) * len(self.centers), list(map(len, per_image))) + word
         order = np.argsort(cell, kind="stable")
         occupied, starts, counts = np.unique(cell[order], return_index=True, return_counts=True)
@@ -122,13 +124,6 @@ def _mixture_centers(sample: np.ndarray, num_words: int, rng: np.random.Generato
 def _chunks(sample: np.ndarray, num_words: int) -> Iterator[np.ndarray]:
     rows = max(1, _CHUNK // max(num_words, sample.shape[1]))
     return (sample[start : start + rows].astype(np.float64) for start in range(0, len(sample), rows))
-
-
-def _nearest(descriptors: np.ndarray, centers: np.ndarray) -> np.ndarray:
-    """Index `[n]` of the nearest center, the first on a tie."""
-    # No matrix product: its threads stay awake for a while and take the cores from the matching that comes next.
-    products = np.vecdot(descriptors[:, None], centers)
-    return np.argmin((centers**2).sum(1) - 2 * products, axis=1)
 
 
 def _unit_length(vectors: np.ndarray) -> np.ndarray:

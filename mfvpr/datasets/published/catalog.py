@@ -42,11 +42,8 @@ class Published:
 
 
 def _ssm(name: str, title: str, database: int, queries: int, archive: str) -> Published:
-    source = "http://imr.ciirc.cvut.cz/Datasets/Ssm-vpr"
-    return Published(
-        name, f"{title}, as SSM-VPR has it", ssm_vpr.LAYOUT, database, {name: queries}, ssm_vpr.ssm_vpr, source,
-        archive,
-    )  # fmt: skip
+    title, source = f"{title}, as SSM-VPR has it", "http://imr.ciirc.cvut.cz/Datasets/Ssm-vpr"
+    return Published(name, title, ssm_vpr.LAYOUT, database, {name: queries}, ssm_vpr.ssm_vpr, source, archive)
 
 
 def _pittsburgh(part: str, queries: int) -> Published:

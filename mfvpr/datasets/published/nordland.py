@@ -25,7 +25,14 @@ def nordland_27592(root: Path, name: str, *, seasons: tuple[str, str]) -> Datase
     Raises:
         InputError: images are missing, or the seasons' frames differ.
     """
-    folders = (_season_images(root, season, side) for season, side in zip(seasons, ("index", "query"), strict=True))
+    folders = []
+    for season, side in zip(seasons, ("index", "query"), strict=True):
+        origin = expected_file(root, f"nordland_imageNames_{side}.txt")
+        if origin is None:
+            folders.append(image_folder(root / season))
+        else:  # names begin with other folders
+            names = [PurePosixPath(line).name for line in read_lines(origin)]
+            folders.append(listed_images(root / season, names, origin))
     return _frame_pairs(name, *folders)
 
 
@@ -51,14 +58,6 @@ def nordland_vprbench(root: Path, name: str) -> Dataset:
                          "get the whole data set")  # fmt: skip
     truth = FrameTruth(tuple((EACH * row,) for row in range(len(queries))), len(database))
     return Dataset(name, database, (QuerySequence(name, queries, truth),))
-
-
-def _season_images(root: Path, season: str, side: str) -> ImageFolder:
-    """Images of Patch-NetVLAD's list if it exists (its names begin with other folders), else all images."""
-    origin = expected_file(root, f"nordland_imageNames_{side}.txt")
-    if origin is None:
-        return image_folder(root / season)
-    return listed_images(root / season, [PurePosixPath(line).name for line in read_lines(origin)], origin)
 
 
 def _frame_pairs(name: str, database: ImageFolder, queries: ImageFolder) -> Dataset:

@@ -40,15 +40,7 @@ def draw_seasons(
     ground_truth.csv as from `draw_streets`: frame i shows the place of the database's frame i. The files depend on
     `seed`, `num_frames` and `image_size` only, to the bit.
 
-    Args:
-        folder: must not exist yet.
-        seed: of the street, its cars and the drives.
-        num_frames: number of places, 1.75 m apart; there are eight times as many images.
-        image_size: (width, height) in px.
-        progress: `progress(done, total)` is called in the caller's thread after every image.
-
-    Raises:
-        FileExistsError: the folder exists.
+    Arguments and errors are those of `draw_streets`; there are eight times as many images as frames.
     """
     folder = Path(folder)
     folder.mkdir(parents=True)
