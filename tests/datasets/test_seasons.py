@@ -1,4 +1,4 @@
-"""The drawn seasons: seven drives of their own down one street, reproducible to the bit."""
+"""The synthetic street in seven more conditions: other drives down one street, reproducible to the bit."""
 
 import csv
 import time

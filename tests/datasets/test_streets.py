@@ -1,4 +1,4 @@
-"""The drawn street: reproducible, complete or absent, and with a ground truth that follows the geometry."""
+"""The synthetic street: reproducible, complete or absent, and with a ground truth that follows the geometry."""
 
 import csv
 from dataclasses import replace
