@@ -1,15 +1,16 @@
-"""A map that is asked: images with their places, one image as the question, one answer.
+"""Localization: a map of images with known places, in which one image at a time is localized.
 
     known = Map("map", Sift(), VladFitting())
     known.build(folder, places)            # or, image by image: known.add(image, place)
-    answer = known.localize("query.jpg")   # the place, what else it may be, how sure that is, and where to steer
-    route = Route(Drive(advance=1))        # of images in the order of a drive, of a map in the order of one as well:
-    located = route(answer, known.there)   # the row that the images before, this one and the motion say together
+    answer = known.localize("query.jpg")   # place, alternatives, confidence, and the shift for steering
+    route = Route(Drive(advance=1))        # if the map and the queries are in the order of a drive:
+    located = route(answer, known.there)   # the row that is most probable given all images so far and the motion
 
-Other processes may ask a map while one process adds to it, and several threads may share one `Map`.
+Other processes may read a map while one process adds to it, and several threads may share one `Map`.
 
-Read first: map, answers, then what it uses: describing, vectors, matching, resident (features in memory), evidence (too
-few features or matches), shifts, route (a drive through a map).
+Read first: map (localize one image), growing (add images), state (the images that this process knows), answers. Then
+their parts: vocabulary, describing, vectors, matching, resident (features on the device), evidence (too few features or
+matches), shifts, route (a drive through a map).
 
 Imports datasets, evaluation, features, matching, reranking, scoring, storage, types, utils.
 """

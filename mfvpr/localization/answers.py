@@ -1,4 +1,4 @@
-"""What a map answers."""
+"""Results of localizing an image in a map."""
 
 import math
 from dataclasses import asdict, dataclass, replace
@@ -16,8 +16,8 @@ class Alternative:
     Attributes:
         row: of the map.
         name: of its image.
-        place: where that was taken.
-        score: its own; larger = more similar.
+        place: where the image was taken.
+        score: of the candidate; larger = more similar.
     """
 
     row: int
@@ -28,19 +28,18 @@ class Alternative:
 
 @dataclass(frozen=True)
 class Answer:
-    """Where an image was taken.
+    """The place of an image, with its confidence and the alternatives.
 
     Attributes:
         place: of the best candidate; None = no place, and `reason` says why.
-        alternatives: the candidates, best first, the answer's own among them, also where p is below the threshold;
-            none for every other reason.
-        score: of the best candidate; 0 where there is none.
-        p_right: how probably that is right; None where no confidence was given, or there is no candidate.
-        shift: (x, y) px of the image that the detector saw, from what is at the query's center to where the candidate
-            shows it; None where there is no place, nothing votes for one, or the score is no histogram of shifts.
-        shift_interval: 95 %: (low, high), each (x, y); None likewise.
+        alternatives: all candidates, best first; empty if there is no place for another reason than "low confidence".
+        score: of the best candidate; 0 if there is none.
+        p_right: probability that the top prediction is correct; None without a confidence or without candidates.
+        shift: (x, y) px of the image that the detector saw, from the query's center to the same point in the best
+            candidate; None without a place, if no match votes, or if the score is no histogram of shifts.
+        shift_interval: its 95 % interval (low, high), each (x, y); None likewise.
         scale: how much larger the candidate shows the place; None likewise.
-        reason: why there is no place; None where there is one.
+        reason: why there is no place; None if there is one.
     """
 
     place: Any
@@ -58,19 +57,19 @@ class Answer:
         return self.reason not in (None, "no candidates")
 
     def as_json(self, most: int = 5) -> dict[str, Any]:
-        """JSON values, with so many alternatives."""
+        """JSON values, with at most `most` alternatives."""
         values = asdict(replace(self, alternatives=self.alternatives[:most]))
-        for one in (values, *values["alternatives"]):
-            one["score"] = one["score"] if math.isfinite(one["score"]) else None
+        for scored in (values, *values["alternatives"]):
+            scored["score"] = scored["score"] if math.isfinite(scored["score"]) else None
         return values
 
 
 class Asked(NamedTuple):
-    """An answer, and what it was found with.
+    """An answer with the features and matches that led to it.
 
-    answer: to the image.
-    described: the image's features and descriptor, with which it can be added to the map.
-    matches: with the best candidate, `[K, ...]`, NumPy; None where there is none.
+    answer: to the query.
+    described: features and global descriptor of the query, with which it can be added to the map.
+    matches: with the best candidate, `[K, ...]`, NumPy; None if there is none.
     """
 
     answer: Answer

@@ -1,4 +1,4 @@
-"""Images -> local features and a global descriptor, as a map keeps them of its own images and takes them of queries."""
+"""Images -> local features and a global descriptor, the same for images of the map and for queries."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -25,7 +25,7 @@ Described = tuple[Features, np.ndarray]
 
 @dataclass(frozen=True)
 class Describing:
-    """What describes images; features are as a store gives them back, those of queries as well.
+    """Extractors of a map; the features of queries are rounded as a store rounds the features of the map.
 
     Attributes:
         extractor: of the local features, of one scale.
@@ -37,28 +37,28 @@ class Describing:
 
     @property
     def recipe(self) -> dict[str, Any]:
-        """All that changes what it gives."""
+        """JSON values that determine the features and descriptors."""
         return {"extractor": recipe_of(self.extractor), "describer": recipe_of(self.describer)}
 
     def image(self, image: Image) -> Described:
         """Describe one image: a file, or `[H, W, 3]` uint8 RGB in any form that `np.asarray` converts.
 
         Raises:
-            InputError: it cannot be read, is something else, or something is not finite.
+            InputError: the image cannot be read or has another format, or its features are not finite.
         """
         pixels, name = (read_image(image), str(image)) if is_file(image) else (_pixels(image), "image")
-        description = _one(self.extractor, pixels, name)
+        description = _extract(self.extractor, pixels, name)
         features = as_stored(description.features)
         if self.describer is self.extractor:
             return features, _flat(description)
         if isinstance(describer := self.describer, Extractor):
-            return features, _flat(_one(describer, pixels, name))
+            return features, _flat(_extract(describer, pixels, name))
         return features, describer([features])[0]
 
     def folder(
         self, images: ImageFolder, rows: Sequence[int], track: Track = untracked
     ) -> Iterator[dict[int, Described]]:
-        """Of some images of a folder, by row, batch by batch.
+        """Describe some images of a folder: batches of descriptions by row.
 
         Raises:
             InputError: as `image`.
@@ -76,35 +76,35 @@ class Describing:
 
 
 def is_file(image: Image) -> TypeGuard[Path | str]:
-    """Whether an image is given by its path."""
+    """Whether an image is a path."""
     return isinstance(image, str | os.PathLike)
 
 
 def _pixels(image: Any) -> np.ndarray:
     try:
         pixels = np.asarray(image)
-    except Exception as error:  # other libraries raise what they like, as torch for tensors with gradients
+    except Exception as error:  # other libraries raise any error, torch for tensors with gradients
         reason = " ".join(str(error).split())
         raise InputError(f"image: expected a file or [H, W, 3] uint8 RGB, got {type(image).__name__} ({reason}). "
                          "Convert it to a NumPy array.") from None  # fmt: skip
     if pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size or pixels.dtype != np.uint8:
-        what = f"{list(pixels.shape)} {pixels.dtype}" if pixels.shape else type(image).__name__
-        raise InputError(f"image: expected a file or [H, W, 3] uint8 RGB, got {what}. Check that the camera gave an "
+        got = f"{list(pixels.shape)} {pixels.dtype}" if pixels.shape else type(image).__name__
+        raise InputError(f"image: expected a file or [H, W, 3] uint8 RGB, got {got}. Check that the camera gave an "
                          "image.")  # fmt: skip
     return pixels
 
 
 def local_features(images: ImageFolder, extractor: Extractor, track: Track = untracked) -> Iterator[Features]:
-    """Of all images of a folder."""
+    """Extract the local features of all images of a folder."""
     for batch in _batches(images, extractor, range(len(images)), track):
         yield from (as_stored(description.features) for description in batch.values())
 
 
-def _one(extractor: Extractor, pixels: np.ndarray, name: str) -> Description:
-    [found] = described_images(resize(pixels, extractor.image_size, extractor.interpolation)[None], extractor)
-    if found is None:
+def _extract(extractor: Extractor, pixels: np.ndarray, name: str) -> Description:
+    [description] = described_images(resize(pixels, extractor.image_size, extractor.interpolation)[None], extractor)
+    if description is None:
         raise InputError(f"{name}: features are not finite (NaN or infinite)")
-    return found
+    return description
 
 
 def _batches(

@@ -1,13 +1,12 @@
-"""Where a robot is that drives along a map: a discrete Bayes filter over the rows, in the order of the drive.
+"""Localization along a drive: a discrete Bayes filter over the rows of a map, in the order of the drive.
 
     route = Route(Drive(advance=1))
-    for image in images:                       # in their order; nothing is known of those that come
-        found = route(known.localize(image), known.there)
+    for image in images:                       # in their order; later images are not used
+        located = route(known.localize(image), known.there)
 
-From one image to the next the belief moves along the rows, and of a small part of it nobody knows where: the robot may
-have been carried away. What an image says is how probable a row is if nothing else were known: the answer is right with
-p, shared among the candidates by how far their scores are above the mean of them all; otherwise it is any row. Rows
-that are not next to each other on the road are no map for this.
+From one image to the next the belief moves along the rows. A small part of it spreads over all rows: the robot may have
+been carried away. The likelihood of an image is p, shared among the candidates by how far their scores are above the
+mean of all candidates, plus 1 - p, shared among all rows. Neighboring rows must be neighbors on the road.
 """
 
 import math
@@ -26,19 +25,19 @@ from mfvpr.utils.numerics import compiled
 FIRST_ROWS = 1024  # rows; twice as many whenever they do not suffice, and a program for each
 _REACH = 4  # standard deviations of the motion
 MOST = 10_000  # rows from one image to the next
-NEAR = 2  # rows beside a place that are taken for it
+NEAR = 2  # rows beside a row that count as the same place
 
 
 @dataclass(frozen=True)
 class Drive:
-    """How a robot moves, and what its images say; what is given here was chosen on one drawn street and its seasons.
+    """Motion of a robot and reliability of its images; defaults were chosen on one synthetic street and its seasons.
 
     Attributes:
-        advance: rows, by which an image is further than the one before, on average; below 0 = against the order.
-        spread: rows, the standard deviation of that.
-        kidnapped: probability that it may be anywhere, at each image.
-        p_right: of answers that have none of their own.
-        sharpness: the power of a candidate's score above the mean to which its share is proportional.
+        advance: mean motion from one image to the next, rows; below 0 = against the order of the map.
+        spread: standard deviation of the motion, rows.
+        kidnapped: probability at each image that the robot may be anywhere.
+        p_right: probability that the top prediction is correct, for answers without their own.
+        sharpness: exponent of a candidate's share, which is its score above the mean to this power.
     """
 
     advance: float = 1.0
@@ -59,10 +58,10 @@ class Drive:
 
 
 class Located(NamedTuple):
-    """Where the robot is.
+    """The position of the robot.
 
     row: of the map, the most probable one.
-    p: that it is there, or within `NEAR` rows.
+    p: probability that the robot is there or within `NEAR` rows.
     """
 
     row: int
@@ -70,36 +69,36 @@ class Located(NamedTuple):
 
 
 class Route:
-    """The belief, which every image moves on; any number of rows may be added to the map between two."""
+    """The belief, updated with every image. Rows may be added to the map between two images."""
 
     def __init__(self, drive: Drive) -> None:
-        """It may be anywhere."""
+        """Start without knowledge: the robot may be anywhere."""
         self._drive, self.belief = drive, np.zeros(FIRST_ROWS, np.float32)
         self._motion = motion(drive.advance, drive.spread)
 
     def __call__(self, answer: Answer | None, there: np.ndarray) -> Located | None:
-        """Where it is now; None where there is no row.
+        """Update the belief with the next image; return the position, or None if there is no row.
 
         Args:
-            answer: of the next image; None = it says nothing, but the robot has moved on.
-            there: `[R]` bool, rows where it may be.
+            answer: of the next image; None = the image gives no evidence, but the robot has moved.
+            there: `[R]` bool, rows where the robot may be.
         """
         if not there.any():
             return None
-        found = () if answer is None else answer.alternatives
-        if (last := max((one.row for one in found), default=-1)) >= len(there):
+        alternatives = () if answer is None else answer.alternatives
+        if (last := max((alternative.row for alternative in alternatives), default=-1)) >= len(there):
             raise InputError(f"there: expected the rows of the map that answered, up to {last} at least, got "
                              f"{len(there)}")  # fmt: skip
         while len(there) > len(self.belief):
             self.belief = np.concatenate([self.belief, np.zeros_like(self.belief)])
         drive, allowed = self._drive, np.zeros(len(self.belief), bool)
         allowed[: len(there)] = there
-        says = np.zeros(len(self.belief), np.float32)
-        if found:
-            rows, scores = np.array([one.row for one in found]), np.array([one.score for one in found])
-            says[rows] = shares(scores, drive.sharpness)
+        share = np.zeros(len(self.belief), np.float32)
+        if alternatives:
+            rows, scores = map(np.array, zip(*((each.row, each.score) for each in alternatives), strict=True))
+            share[rows] = shares(scores, drive.sharpness)
         p = drive.p_right if answer is None or answer.p_right is None else answer.p_right
-        belief = step(self.belief, allowed, self._motion, np.float32(drive.kidnapped), says, np.float32(p))
+        belief = step(self.belief, allowed, self._motion, np.float32(drive.kidnapped), share, np.float32(p))
         self.belief = np.asarray(belief)
         row = int(np.argmax(self.belief))
         return Located(row, min(1.0, float(self.belief[max(0, row - NEAR) : row + NEAR + 1].sum())))
@@ -115,17 +114,17 @@ def motion(advance: float, spread: float) -> np.ndarray:
 
 
 def shares(scores: np.ndarray, sharpness: float) -> np.ndarray:
-    """`[C]` of a query's candidates: (score - their mean)^sharpness, 0 below the mean, over the sum of all.
+    """Shares `[C]` of a query's candidates: (score - mean)^sharpness, or 0 below the mean, divided by their sum.
 
-    Equal ones where all scores are equal; scores that are not finite have none. 0 where no score is finite.
+    Shares are equal if all scores are equal. Scores that are not finite have the share 0.
     """
-    some = np.isfinite(scores)
-    if not some.any():
+    finite = np.isfinite(scores)
+    if not finite.any():
         return np.zeros(len(scores))
-    above = np.where(some, scores - scores[some].mean(), 0.0)
+    above = np.where(finite, scores - scores[finite].mean(), 0.0)
     above = np.maximum(above, 0) / max(above.max(), np.finfo(np.float64).tiny)  # no power is too large, or too small
     powers = above**sharpness
-    return powers / powers.sum() if powers.any() else some / some.sum()
+    return powers / powers.sum() if powers.any() else finite / finite.sum()
 
 
 @compiled
@@ -133,28 +132,28 @@ def step(belief: Array, there: Array, motion: Array, kidnapped: Array, says: Arr
     """The belief after the next image.
 
     Args:
-        belief: `[N]` after the one before, all 0 = nothing is known yet.
+        belief: `[N]` after the previous image; all 0 = nothing is known yet.
         there: `[N]` bool, rows where the robot may be.
-        motion: `[2 R + 1]` probabilities of -R .. R rows. What leaves the map is shared by those that stay.
-        kidnapped: `[]` probability that it may be anywhere.
-        says: `[N]` shares of rows, as the image's answer says, if that is right; all 0 = it says nothing.
-        p_right: `[]` that it is.
+        motion: `[2 R + 1]` probabilities of -R .. R rows. Belief that leaves the map is shared by the rest.
+        kidnapped: `[]` probability that the robot may be anywhere.
+        says: `[N]` shares of the rows if the image's answer is correct; all 0 = no evidence.
+        p_right: `[]` probability that the answer is correct.
 
     Returns:
-        `[N]` with the sum 1, where any row is there. Where image and motion exclude each other, what the motion says.
+        `[N]` with the sum 1, if there is any row. If image and motion exclude each other, the motion decides.
     """
     anywhere = there.astype(belief.dtype)
     anywhere /= jnp.maximum(anywhere.sum(), 1)
     reach = len(motion) // 2
     moved = jnp.convolve(belief, motion, precision=jax.lax.Precision.HIGHEST)[reach : reach + len(belief)]
-    before = (1 - kidnapped) * _normalized(jnp.where(there, moved, 0), anywhere) + kidnapped * anywhere
-    image = _normalized(jnp.where(there, says, 0), anywhere)
-    likelihood = p_right * image + (1 - p_right) * anywhere  # of rows alike before, what the image makes of them
-    return _normalized(before * likelihood, before)
+    before = (1 - kidnapped) * _normalize(jnp.where(there, moved, 0), anywhere) + kidnapped * anywhere
+    image = _normalize(jnp.where(there, says, 0), anywhere)
+    likelihood = p_right * image + (1 - p_right) * anywhere
+    return _normalize(before * likelihood, before)
 
 
-def _normalized(values: Array, otherwise: Array) -> Array:
-    """With the sum 1; others where all are 0. Divided by the largest first, as small ones may have no product."""
+def _normalize(values: Array, otherwise: Array) -> Array:
+    """`values` with the sum 1, or `otherwise` if all are 0; divided by the largest first, against underflow."""
     largest = values.max()
     scaled = values / jnp.where(largest > 0, largest, 1)
     return jnp.where(largest > 0, scaled / jnp.where(largest > 0, scaled.sum(), 1), otherwise)

@@ -1,4 +1,4 @@
-"""Where to steer: the shift between a query and a candidate, where a score tells one."""
+"""The shift between a query and a candidate, for steering, if the scorer is a histogram of shifts."""
 
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ Point = tuple[float, float]
 
 
 class Shift(NamedTuple):
-    """As of `mfvpr.localization.Answer`."""
+    """The fields of the same names of `mfvpr.localization.Answer`."""
 
     shift: Point | None = None
     interval: tuple[Point, Point] | None = None
@@ -23,15 +23,14 @@ class Shift(NamedTuple):
 
 
 def shift_of(scorer: Scorer, pair: Matches) -> Shift:
-    """Of one pair's matches `[1, K, ...]`."""
+    """The shift of one pair, from its matches `[1, K, ...]`."""
     if not isinstance(scorer, HistogramOfShifts):
         return Shift()
     fitted = fit(scorer, pair.image_size0, pair.image_size1, multiple=BIN_STEP)
     shift, interval, scale = (np.asarray(values)[0] for values in pair_shifts(fitted, pair))
-    low, high = _pair(interval[0]), _pair(interval[1])
-    return Shift(_pair(shift), (low, high) if low and high else None, float(scale) if np.isfinite(scale) else None)
+    low, high = _point(interval[0]), _point(interval[1])
+    return Shift(_point(shift), (low, high) if low and high else None, float(scale) if np.isfinite(scale) else None)
 
 
-def _pair(values: np.ndarray) -> Point | None:
-    """(x, y), None where it is not finite."""
+def _point(values: np.ndarray) -> Point | None:
     return (float(values[0]), float(values[1])) if np.isfinite(values).all() else None

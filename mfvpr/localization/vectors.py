@@ -1,4 +1,4 @@
-"""Global descriptors of a map's rows in memory, and the rows that resemble a query's most."""
+"""Global descriptors of a map in memory, and the rows that are most similar to a query."""
 
 from functools import partial
 
@@ -11,42 +11,42 @@ _FIRST = 1024  # rows; twice as many whenever they are full
 
 
 class Vectors:
-    """Descriptors by row; rows may come in any order, and some may be missing.
+    """Global descriptors by row. Rows may be added in any order, and some may be missing.
 
     Attributes:
         total: one more than the largest row.
     """
 
     def __init__(self) -> None:
-        """None yet."""
+        """Start without rows."""
         self._values = np.zeros((0, 0), np.float32)
         self._there = np.zeros(0, bool)
         self.total = 0
 
     @property
     def length(self) -> int | None:
-        """D, None = there is no descriptor yet."""
+        """D; None = there is no descriptor yet."""
         return self._values.shape[1] if self._values.size else None
 
     def put(self, row: int, vector: np.ndarray) -> None:
-        """The descriptor `[D]` of a row."""
+        """Store the descriptor `[D]` of a row."""
         if not self._values.size:
             self._values, self._there = np.zeros((_FIRST, len(vector)), np.float32), np.zeros(_FIRST, bool)
         while row >= len(self._there):
             self._values = np.concatenate([self._values, np.zeros_like(self._values)])
             self._there = np.concatenate([self._there, np.zeros_like(self._there)])
         self._values[row] = vector
-        # Of no features, which resembles all alike: nobody's candidate, as in `mfvpr.retrieval.retriever.Retrieval`.
+        # An image without features has a zero descriptor and is never a candidate, as in `mfvpr.retrieval.Retrieval`.
         self._there[row] = bool(np.isfinite(vector).all() and vector.any())
         self.total = max(self.total, row + 1)
 
     def nearest(self, query: np.ndarray, number: int, *, before: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """(rows, their products with the query `[D]`), best first, of equal ones the lowest row first.
+        """The most similar rows and their products with the query `[D]`, best first; the lowest row wins a tie.
 
         Args:
-            query: a descriptor; of no features it finds nothing.
-            number: rows, at most.
-            before: rows from this on are left out; None = none.
+            query: a descriptor; the zero descriptor of an image without features has no similar rows.
+            number: of rows, at most.
+            before: rows from this one on are left out; None = no such limit.
         """
         total = self.total if before is None else max(0, min(self.total, before))
         rows = np.flatnonzero(self._there[:total])
@@ -61,7 +61,7 @@ class Vectors:
 
 
 def _products(vectors: np.ndarray, query: np.ndarray) -> np.ndarray:
-    """`vectors @ query`, whose own threads wait for the next product with the cores kept busy: a third of an answer."""
+    """`vectors @ query` on own threads: those of BLAS spin while they wait, which costs a third of an answer's time."""
     workers = available_cpus()
     parts = np.array_split(vectors, workers)
     return np.concatenate([*ordered_map(partial(np.vecdot, query), parts, workers=workers)])

@@ -1,0 +1,107 @@
+"""The vocabulary of a map whose global descriptors are VLAD: one file in the folder of the map, learned once."""
+
+import itertools
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mfvpr.datasets.datasets import ImageFolder
+from mfvpr.features.extractor import Extractor
+from mfvpr.features.feature_set import FeatureSet
+from mfvpr.features.vlad import Vlad, VladFitting
+from mfvpr.localization.describing import local_features
+from mfvpr.storage.disk import told
+from mfvpr.storage.features import FeatureStore, open_store
+from mfvpr.storage.maps import MAP, file_stamp, has_rows, settle_map
+from mfvpr.utils.arrays import read_arrays, write_arrays
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.fingerprints import fingerprint, recipe_of
+from mfvpr.utils.progress import Track
+
+_VOCABULARY = "vocabulary.npz"
+_LEARNING = "learning"  # the folder of features that a vocabulary is being learned from
+
+
+class VocabularyFile:
+    """The vocabulary of one map."""
+
+    def __init__(self, folder: Path, extractor: Extractor, fitting: VladFitting) -> None:
+        """Read nothing yet.
+
+        Args:
+            folder: of the map.
+            extractor: of the local features.
+            fitting: learns the vocabulary.
+        """
+        self._folder, self._path = folder, folder / _VOCABULARY
+        self._extractor, self._fitting = extractor, fitting
+        self._key = fingerprint({"extractor": recipe_of(extractor), "vocabulary": recipe_of(fitting)})
+        self._stamp = None  # of the file that was read
+
+    def find(self) -> Vlad | None:
+        """Read the vocabulary; None if it is not learned yet.
+
+        Raises:
+            InputError: the map has rows but no vocabulary, or the vocabulary has other settings or is damaged.
+        """
+        expects_vocabulary = has_rows(self._folder)  # looked at first: another process may be making the map
+        if self._path.exists():
+            return self.read()
+        if expects_vocabulary:
+            raise InputError(f"{self._path}: expected the vocabulary of the rows, got none. Put it back.")
+        return None
+
+    def read(self) -> Vlad:
+        """Read the vocabulary.
+
+        Raises:
+            InputError: it is missing or damaged, or has other settings.
+        """
+        self._stamp = file_stamp(self._path)  # first: a file that replaces this one is noticed
+        try:
+            arrays = read_arrays(self._path, self._key)
+        except InputError:
+            raise InputError(
+                f"{self._path}: expected the vocabulary that {self._fitting} learned from features of "
+                f"{type(self._extractor).__name__} with these settings, got another or a damaged one. Use the "
+                "extractor and the settings that the map was made with, or put a copy of the file back."
+            ) from None
+        return Vlad(arrays["centers"], float(arrays["power"]))
+
+    def check_unchanged(self) -> None:
+        """Raise `InputError` if the file was replaced or removed since it was read."""
+        if file_stamp(self._path) != self._stamp:
+            raise InputError(f"{self._path}: expected the file that the map was opened with, got one that replaced it, "
+                             "or none. Open the map again.")  # fmt: skip
+
+    @contextmanager
+    def learn(self, images: ImageFolder, settings: Mapping[str, Any], track: Track) -> Iterator[FeatureStore]:
+        """Learn and write the vocabulary, within `hold_map`; yield the local features, which are deleted afterwards.
+
+        Args:
+            images: to learn from.
+            settings: of the map.
+            track: progress.
+
+        Raises:
+            InputError: images cannot be read or have too few features, or the disk is full.
+        """
+        folder = self._folder / _LEARNING
+        shutil.rmtree(folder, ignore_errors=True)  # left by a process that was killed
+        try:
+            with open_store(folder, settings, num_images=len(images)) as store:
+                features = enumerate(local_features(images, self._extractor, track))
+                while batch := dict(itertools.islice(features, self._extractor.batch_size)):
+                    store.write(batch)
+            vocabulary = self._fitting.fit(FeatureSet(store, {}))
+            settle_map(self._folder, settings)
+            with told(self._folder, MAP.content):
+                arrays = {"centers": vocabulary.centers, "power": np.array(vocabulary.power)}
+                write_arrays(self._path, arrays, self._key)
+            yield store
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
