@@ -1,4 +1,4 @@
-"""A whole evaluation, and what it is worth: recall, precision, calibration, statistics.
+"""Evaluation of all stages in one call: recall, precision, calibration, statistics.
 
 Read first: evaluation (`evaluate`: all stages), sequence_matching and stages (its steps), results, recall, protocol
 and selection (choose settings on one half, report on the other), precision, calibration, statistics, distributed

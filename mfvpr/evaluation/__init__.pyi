@@ -21,7 +21,7 @@ __all__ = [
     "read_confidences",
     "recall_at_k",
     "reliability",
-    "separated",
+    "separate",
     "write_confidences",
 ]
 
@@ -31,6 +31,6 @@ from .precision import precision_recall, reliability
 from .protocol import Judge, Split, judge
 from .recall import Tally, hits, recall_at_k
 from .results import Recall, Result
-from .selection import Half, best_setting, halves, neighbors, separated
+from .selection import Half, best_setting, halves, neighbors, separate
 from .sequence_matching import match_sequence
 from .statistics import estimate, mcnemar

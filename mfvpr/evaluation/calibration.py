@@ -1,7 +1,7 @@
-"""How sure the first answer of a ranking is: p(right), from how its score stands out among the query's other scores.
+"""Confidence: the probability that the top prediction is correct, from how its score stands out among the others.
 
-Nothing of it has a unit, so that what was fitted on some images can say something of others: every difference of scores
-is in units of their spread over the same query's candidates.
+Differences of scores are in units of their spread over the same query's candidates. So a model that was fitted on some
+images can be used for other images.
 """
 
 import json
@@ -21,48 +21,48 @@ Input = Literal["margin", "height", "filter", "score"]
 INPUTS: tuple[Input, ...] = ("margin", "height")  # by default
 APART = 5  # rows of the database, by default
 _LEAST_SPREAD = 1e-3  # of the first score: less is rounding
-_PRIOR = 2  # candidates of other places whose scores spread as those of all candidates, beside those that there are
-_LEAST_WEIGHT = 1e-9  # of an input: less is where the search for it ended, and would order equal answers by rounding
+_PRIOR = 2  # added candidates of other places, with the variance of all candidates
+_LEAST_WEIGHT = 1e-9  # of an input: less is a rest of the optimization, which would order equal predictions by rounding
 _FORMAT = "mfvpr confidence 2"
 
 
 def confidence_inputs(
     ranked: Ranked, filtered: Ranked, *, inputs: Sequence[Input] = INPUTS, apart: int = APART
 ) -> np.ndarray:
-    """What p(right) of the first answers is computed from, `[Q, F]`; NaN where there is no answer.
+    """Inputs `[Q, F]` of the confidence in the top predictions; NaN without a prediction.
 
-    margin: log(1 + how far the first score is above that of the best candidate of another place), in units of the
-        standard deviation of the scores of all candidates of other places, of few of them drawn towards that of all
-        candidates; infinite where there are none, which says nothing.
-    height: the same, above their mean.
-    filter: minus the log of the best rank, from 1, that the filter gives to a candidate of the answer's place.
-    score: inverse hyperbolic sine of the first score itself: not free of scale.
+    margin: log(1 + x), where x is the difference of the first score and that of the best candidate of another place,
+        divided by the standard deviation of the scores of candidates of other places. If there are few of them, that is
+        drawn towards the standard deviation of all candidates; if there are none, the input is infinite.
+    height: the same, with the mean score of candidates of other places instead of the best.
+    filter: minus the log of the best rank, from 1, that the retrieval gives to a candidate of the predicted place.
+    score: inverse hyperbolic sine of the first score itself, which depends on the scale of scores.
 
-    The larger each is, the surer is the answer.
+    A larger input means a more confident prediction.
 
     Args:
         ranked: of a system, `[Q, C]`.
-        filtered: the filter's own ranking of the same candidates.
+        filtered: the ranking of the same candidates by retrieval.
         inputs: names of F inputs.
-        apart: database images within so many rows of the answer are taken for its place.
+        apart: database images within this many rows of the prediction count as its place.
     """
     there = (ranked.rows >= 0) & np.isfinite(ranked.scores)
     scores, first = np.where(there, ranked.scores, 0.0).astype(np.float64), ranked.rows[:, :1]
-    others = there & (np.abs(ranked.rows - first) > apart)
-    (count, mean, variance), (_, _, prior) = _moments(scores, others), _moments(scores, there)
+    elsewhere = there & (np.abs(ranked.rows - first) > apart)
+    (count, mean, variance), (_, _, prior) = _moments(scores, elsewhere), _moments(scores, there)
     spread = np.sqrt((count * variance + _PRIOR * prior) / (count + _PRIOR))
     spread = np.maximum(np.maximum(spread, _LEAST_SPREAD * np.abs(scores[:, 0])), np.finfo(np.float64).tiny)
-    second = np.max(scores, axis=1, where=others, initial=-np.inf)
-    near = np.abs(filtered.rows - first) <= apart  # the answer is among them, before all that is no candidate
+    second = np.max(scores, axis=1, where=elsewhere, initial=-np.inf)
+    near = np.abs(filtered.rows - first) <= apart  # the prediction is among them; -1, no candidate, comes last
     above = {"margin": scores[:, 0] - second, "height": scores[:, 0] - mean}
-    found = {name: np.where(others.any(axis=1), np.log1p(np.maximum(value, 0) / spread), np.inf)
-             for name, value in above.items()}  # fmt: skip
-    found |= {"filter": -np.log1p(np.argmax(near, axis=1)), "score": np.arcsinh(scores[:, 0])}
-    return np.where(there[:, :1], np.stack([found[name] for name in inputs], axis=1), np.nan)
+    columns = {name: np.where(elsewhere.any(axis=1), np.log1p(np.maximum(value, 0) / spread), np.inf)
+               for name, value in above.items()}  # fmt: skip
+    columns |= {"filter": -np.log1p(np.argmax(near, axis=1)), "score": np.arcsinh(scores[:, 0])}
+    return np.where(there[:, :1], np.stack([columns[name] for name in inputs], axis=1), np.nan)
 
 
 def _moments(scores: np.ndarray, where: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`[Q]` how many scores `[Q, C]` there are, their mean and variance, 0 of none."""
+    """Number `[Q]`, mean and variance of the scores `[Q, C]`; 0 if there are none."""
     count = where.sum(axis=1)
     mean = np.sum(scores, axis=1, where=where) / np.maximum(count, 1)
     squares = np.sum((scores - mean[:, None]) ** 2, axis=1, where=where)
@@ -71,13 +71,13 @@ def _moments(scores: np.ndarray, where: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 @dataclass(frozen=True)
 class Confidence:
-    """p(right) of a system's first answers: a logistic model, made by `fit_confidence`.
+    """A logistic model of the probability that the top prediction of a system is correct, see `fit_confidence`.
 
     Attributes:
         inputs: names, see `confidence_inputs`.
-        apart: see there.
-        center: of each input, where it was fitted.
-        scale: likewise, its standard deviation.
+        apart: see `confidence_inputs`.
+        center: mean of each input over the data that the model was fitted on.
+        scale: standard deviation of each input over these data.
         weights: of the inputs in these units.
         bias: log odds at the center.
     """
@@ -90,11 +90,11 @@ class Confidence:
     bias: float
 
     def __call__(self, ranked: Ranked, filtered: Ranked) -> np.ndarray:
-        """`[Q]` of rankings, NaN where there is no answer; see `confidence_inputs`."""
+        """Probabilities `[Q]`, NaN without a prediction; for the arguments see `confidence_inputs`."""
         return self.probability(confidence_inputs(ranked, filtered, inputs=self.inputs, apart=self.apart))
 
     def probability(self, inputs: np.ndarray) -> np.ndarray:
-        """`[Q]` of inputs `[Q, F]`; infinite ones say nothing, as if they were where the model was fitted."""
+        """Probabilities `[Q]` from inputs `[Q, F]`; an infinite input counts as its center."""
         centered = (np.where(np.isinf(inputs), self.center, inputs) - self.center) / np.array(self.scale)
         return special.expit(centered @ np.array(self.weights) + self.bias)
 
@@ -102,21 +102,21 @@ class Confidence:
 def fit_confidence(
     values: np.ndarray, right: np.ndarray, *, inputs: Sequence[Input] = INPUTS, apart: int = APART, ridge: float = 1.0
 ) -> Confidence:
-    """The logistic model, of weights not below 0, under which right and wrong answers are most probable.
+    """Fit a logistic model with weights of at least 0 by maximum likelihood.
 
-    Where larger inputs go with wrong answers, p does not depend on them. Where all are right, p is near 1 and never 1:
-    half a right and half a wrong answer more are thought to be at the center.
+    If larger inputs go with incorrect predictions, the probability does not depend on them. If all predictions are
+    correct, it stays below 1: half a correct and half an incorrect prediction are added at the center.
 
     Args:
-        values: `[Q, F]` of `confidence_inputs`; rows that are not finite, without an answer or without candidates of
+        values: `[Q, F]` of `confidence_inputs`; rows that are not finite, without a prediction or without candidates of
             other places, are left out.
-        right: `[Q]` bool, of the first answers; of queries without a place in the database False.
-        inputs: what the values are.
-        apart: what they were computed with.
-        ridge: penalty on weights: half of it times the sum of their squares, beside the log likelihood of all queries.
+        right: `[Q]` bool, whether the top prediction is correct; False for queries without a place in the database.
+        inputs: names of the values.
+        apart: with which the values were computed.
+        ridge: penalty on weights: half of it times the sum of their squares is added to the negative log likelihood.
 
     Raises:
-        InputError: no answers.
+        InputError: no predictions.
     """
     there = np.isfinite(values).all(axis=1)
     values, right = values[there], np.asarray(right, bool)[there]
@@ -136,31 +136,35 @@ def fit_confidence(
 
     bounds = [(None, None), *[(0.0, None)] * values.shape[1]]
     options = {"ftol": 1e-13, "gtol": 1e-8, "maxiter": 1000}
-    found = optimize.minimize(loss, np.zeros(len(bounds)), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-    bias, *weights = np.where(np.abs(found.x) > _LEAST_WEIGHT, found.x, 0.0).tolist()
+    start = np.zeros(len(bounds))
+    best = optimize.minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
+    bias, *weights = np.where(np.abs(best) > _LEAST_WEIGHT, best, 0.0).tolist()
     return Confidence(tuple(inputs), apart, tuple(center.tolist()), tuple(scale.tolist()), tuple(weights), bias)
 
 
-def write_confidences(path: Path | str, systems: Mapping[str, Confidence], made: Mapping[str, Any]) -> None:
-    """Write the confidences of systems by name as JSON, with how they were made (JSON values)."""
-    values = {name: {field.name: getattr(one, field.name) for field in fields(one)} for name, one in systems.items()}
-    found = {"format": _FORMAT, "made": made, "systems": values}
-    write_text(Path(path), json.dumps(found, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+def write_confidences(path: Path | str, systems: Mapping[str, Confidence], recipe: Mapping[str, Any]) -> None:
+    """Write the confidences of systems by name as JSON, with the recipe of their rankings (JSON values)."""
+    values = {
+        name: {field.name: getattr(confidence, field.name) for field in fields(confidence)}
+        for name, confidence in systems.items()
+    }
+    content = {"format": _FORMAT, "made": recipe, "systems": values}
+    write_text(Path(path), json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
 def read_confidences(path: Path | str) -> tuple[dict[str, Confidence], dict[str, Any]]:
-    """Those of `write_confidences` by system, and how they were made.
+    """Read the file of `write_confidences`: confidences by name of the system, and the recipe.
 
     Raises:
-        InputError: no such file, or another one.
+        InputError: no such file, or a file of another format.
     """
     path = Path(path)
     require_file(path, "the confidence.json that an evaluation wrote")
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        if found["format"] != _FORMAT:
-            raise ValueError(f"format {found['format']!r}")
-        return {name: _confidence(**one) for name, one in found["systems"].items()}, dict(found["made"])
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if content["format"] != _FORMAT:
+            raise ValueError(f"format {content['format']!r}")
+        return {name: _confidence(**values) for name, values in content["systems"].items()}, dict(content["made"])
     except (OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         reason = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
         raise InputError(f"{path}: expected the confidence.json that an evaluation wrote ({reason}); evaluate images "

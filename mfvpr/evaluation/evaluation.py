@@ -1,11 +1,11 @@
-"""The whole way in one call: images -> features -> shortlist -> matches -> scores -> ranking -> recall.
+"""All stages in one call: images -> features -> shortlist -> matches -> scores -> ranking -> recall.
 
     sift = Sift()
     result = mfvpr.evaluate(dataset, sift, Retrieval(Aggregated(sift, VladFitting())),
                             {"histogram": mfvpr.HistogramOfShifts()}, candidates=50)
     print(result.recall([0.0])["histogram"].pooled)
 
-Features, shortlist and matches are kept in an archive, where that has a folder.
+Features, shortlist and matches are kept in the folder of an archive, if it has one.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ from mfvpr.datasets.datasets import Dataset, QuerySequence
 from mfvpr.evaluation import stages
 from mfvpr.evaluation.results import Result
 from mfvpr.evaluation.sequence_matching import match_sequence, matches_recipe
-from mfvpr.evaluation.validation import check_request, nan_scores
+from mfvpr.evaluation.validation import check_request, score_warnings
 from mfvpr.features.extractor import Extractor, Source
 from mfvpr.matching.matcher import NEIGHBORS, Matcher
 from mfvpr.reranking.cohort_normalization import cohort_sequence, hubness
@@ -38,7 +38,7 @@ from mfvpr.utils.numerics import Device
 from mfvpr.utils.progress import Stopwatch
 
 Tools = tuple[Extractor | Source, Filter, int | Literal["all"]]
-Scored = tuple[Matched, dict[str, np.ndarray]]  # of a sequence, and its scores [Q, C] by name of the scorer
+Scored = tuple[Matched, dict[str, np.ndarray]]  # a sequence, and its scores [Q, C] by name of the scorer
 
 
 def evaluate(
@@ -62,58 +62,60 @@ def evaluate(
 
     Args:
         dataset: one database, one or more query sequences.
-        extractor: what takes local features from images, or has them, see `mfvpr.retrieval.precomputed`.
-        filter: what finds candidates.
+        extractor: extracts local features, or reads them, see `mfvpr.retrieval.precomputed`.
+        filter: the retrieval, which finds candidates.
         scorers: by name.
-        candidates: that the filter proposes for each query.
-        matching: what matches a pair, see `mfvpr.Matcher`.
-        fused: scorers, by name, that are ranked together with the filter's score as well, as `name + filter`, or with
-            other scorers' and the filter's, as `name + other + filter`; see `mfvpr.reranking.fusion.Fusion`.
-        correlated: scorers and those that are fused, by name, that are ranked by their scores with frame correlation as
-            well, as `name + frames`.
-        cohort: all scorers are ranked with a cohort as well, as `name + cohort`: database images that score high with
-            other places lose as much (`mfvpr.reranking.cohort_normalization`). The number says how many frames on both
-            sides of an image show its place, and are left out; None = no cohort.
-        ties: equal scores keep the order of the filter, or go by the row of the database: "filter", "index".
+        candidates: number of candidates of each query.
+        matching: matches a pair, see `mfvpr.Matcher`.
+        fused: by name of a scorer, how its score is combined with the retrieval's (system `name + filter`), or with
+            other scorers' and the retrieval's (`name + other + filter`); see `mfvpr.reranking.fusion.Fusion`.
+        correlated: by name of a scorer or a fused system, how its scores are correlated with those of the queries
+            before (`name + frames`).
+        cohort: rank by every scorer with a cohort as well: database images that score high with other places lose as
+            much (`mfvpr.reranking.cohort_normalization`). The number says how many frames on both sides of an image
+            show its place, and are left out; None = no cohort.
+        ties: equal scores keep the order of the retrieval, or go by the row of the database: "filter", "index".
         archive: where features and matches are kept; None = in memory.
         memory: GB that features of the database may take on the devices, and matches that are kept in memory; None = a
             third of what is free.
         devices: that share the queries; None = the one that JAX takes.
-        watch: gets the seconds of the stages; all that a cohort takes is a stage of its own, but for the extraction of
-            local features, which is the stage `features` also where the filter or a cohort asks for it.
+        watch: gets the seconds of the stages. A cohort is a stage of its own. The extraction of local features always
+            counts as the stage `features`.
 
     Raises:
-        InputError: arguments, images, stores or features that cannot be used, or what an extractor, a filter or a
-            scorer gives; one line says which, and the mend.
-        NotYet: the archive is that of a shard, which has done its part, and others have not; see
-            `mfvpr.storage.shards`.
+        InputError: arguments, images, stores or features that cannot be used, or an invalid result of an extractor, the
+            retrieval or a scorer; one line says which, and how to fix it.
+        NotYet: this shard has done its part, but other shards have not; see `mfvpr.storage.shards`.
     """
     fused, correlated = fused or {}, correlated or {}
     check_request(scorers, fused, correlated, ties, memory, cohort=cohort is not None)
     watch = watch or Stopwatch()
     archive = replace(archive or Archive(), watch=watch)
     tools = (extractor, filter, candidates)
-    how = {"matching": matching, "archive": archive, "memory": memory, "devices": devices}
-    calls = [partial(_scored, dataset, sequence, tools, scorers, watch, **how) for sequence in dataset.sequences]
+    options = {"matching": matching, "archive": archive, "memory": memory, "devices": devices}
+    calls = [partial(_score, dataset, sequence, tools, scorers, watch, **options) for sequence in dataset.sequences]
     if cohort is not None:
-        others = cohort_sequence(archive.contents(dataset.database), cohort)
-        calls.insert(0, partial(_scored_cohort, dataset, others, tools, scorers, watch, **how))
-    found: list[Scored] = together(*calls)
+        sequence = cohort_sequence(archive.contents(dataset.database), cohort)
+        calls.insert(0, partial(_score_cohort, dataset, sequence, tools, scorers, watch, **options))
+    scored: list[Scored] = together(*calls)
     strengths: dict[str, np.ndarray] = {}
     if cohort is not None:
-        among, scores = found.pop(0)
+        cohort_matches, cohort_scores = scored.pop(0)
         strengths = {
-            name: hubness(among.candidates, values, len(dataset.database), who=name) for name, values in scores.items()
+            name: hubness(cohort_matches.candidates, scores, len(dataset.database), who=name)
+            for name, scores in cohort_scores.items()
         }
-    matched = [one for one, _ in found]
-    ranked = [rank_sequence(one, scores, fused, correlated, ties, hubness=strengths) for one, scores in found]
-    for line in nan_scores(matched, ranked, scorers):
+    matched = [sequence for sequence, _ in scored]
+    ranked = [
+        rank_sequence(sequence, scores, fused, correlated, ties, hubness=strengths) for sequence, scores in scored
+    ]
+    for line in score_warnings(matched, ranked, scorers):
         archive.warn(line)
     systems = {name: [by_system[name] for by_system in ranked] for name in ranked[0]}
     return Result(dataset, matched, systems, watch.seconds)
 
 
-def _scored(
+def _score(
     dataset: Dataset,
     sequence: QuerySequence,
     tools: Tools,
@@ -122,54 +124,57 @@ def _scored(
     *,
     archive: Archive,
     label: str = "",
-    **how: Any,
+    **options: Any,
 ) -> Scored:
-    """All of a sequence; a shard scores its own queries, and asks the others' of their stores."""
+    """Match and score a sequence; a shard computes scores of its own queries and reads those of other shards."""
 
     def match(rows: Sequence[int] | None = None) -> Matched:
-        options: dict[str, Any] = how | ({"track": archive.track(f"{label}matching")} if label else {})
-        return match_sequence(dataset, sequence, *tools, archive=archive, watch=watch, rows=rows, **options)
+        track = archive.track(f"{label}matching")
+        return match_sequence(
+            dataset, sequence, *tools, archive=archive, watch=watch, rows=rows, track=track, **options
+        )
 
     def score(matched: Matched) -> dict[str, np.ndarray]:
         with watch("scores"):
             track = archive.track(f"{label}scores")
-            return stages.score(scorers, matched.by_scale, matched.candidates, devices=how["devices"], track=track)
+            return stages.score(scorers, matched.by_scale, matched.candidates, devices=options["devices"], track=track)
 
     if archive.shard is None or archive.root is None:
         matched = match()
         return matched, score(matched)
-    names, who = sequence.images.names, sorted(scorers)
-    with _score_store(dataset, sequence, tools, scorers, how["matching"], archive) as store:
-        own = archive.shard.rows(names)
-        missing = [row for row in own if not store.done[row]]
-        # One without queries has images to take; and what is done together, all must do or none.
-        if missing or not own or (archive.shard.meets and not store.done.all()):
-            part = match(own)
-            if missing:  # all are scored, so that what goes on has the bits of one run
-                found = score(part)
-                by_query = np.stack([found[name] for name in who], axis=1)
-                rows = dict(zip(own, map(QueryScores, by_query, np.asarray(part.candidates.indices)), strict=True))
+    names, scorer_names = sequence.images.names, sorted(scorers)
+    with _score_store(dataset, sequence, tools, scorers, options["matching"], archive) as store:
+        shard_rows = archive.shard.rows(names)
+        missing = [row for row in shard_rows if not store.done[row]]
+        # A shard without queries still extracts features of images; and all shards must join collective computations.
+        if missing or not shard_rows or (archive.shard.meets and not store.done.all()):
+            part = match(shard_rows)
+            if missing:  # all rows are scored, so that a continued run has the bits of a single one
+                scores = score(part)
+                by_query = np.stack([scores[name] for name in scorer_names], axis=1)
+                indices = np.asarray(part.candidates.indices)
+                rows = dict(zip(shard_rows, map(QueryScores, by_query, indices), strict=True))
                 store.write({row: rows[row] for row in missing})
 
-        def lacking() -> Sequence[int]:
+        def missing_rows() -> Sequence[int]:
             store.look()
             return np.flatnonzero(~store.done).tolist()
 
-        archive.shard.wait(lacking, names, f"{sequence.name} scores", patience=archive.patience, is_complete=True)
+        archive.shard.wait(missing_rows, names, f"{sequence.name} scores", patience=archive.patience, is_complete=True)
         stored = [query for _, query in store.read()]
     matched = match()
     if (np.stack([query.indices for query in stored]) != matched.candidates.indices).any():
         raise InputError(f"{store.folder}: expected scores of these candidates, got those of another shortlist; delete "
                          "this folder, and run again")  # fmt: skip
     by_scorer = np.stack([query.scores for query in stored], axis=1)
-    return matched, {name: by_scorer[who.index(name)] for name in scorers}
+    return matched, {name: by_scorer[scorer_names.index(name)] for name in scorers}
 
 
 def _score_store(
     dataset: Dataset, sequence: QuerySequence, tools: Tools, scorers: Mapping[str, Scorer], matching: Matcher,
     archive: Archive,
 ) -> ScoreStore:  # fmt: skip
-    """Of a shard; scorers are told by what they are, not by what they call."""
+    """Open a shard's store of scores. Its recipe covers the code of the scorers, but not of functions they call."""
     if archive.root is None or not scorers:
         raise InputError("scorers: expected at least one, got none; a shard keeps their scores")
     recipes, extractor = {}, tools[0]
@@ -187,9 +192,9 @@ def _score_store(
     return open_score_store(path, recipe, num_queries=len(sequence.images), **archive.store_options)
 
 
-def _scored_cohort(
-    dataset: Dataset, others: QuerySequence, tools: Any, scorers: Any, watch: Stopwatch, **how: Any
+def _score_cohort(
+    dataset: Dataset, sequence: QuerySequence, tools: Tools, scorers: Any, watch: Stopwatch, **options: Any
 ) -> Scored:
-    """Of the database among itself: a stage of its own."""
+    """Match and score the database with itself, as a stage of its own."""
     with watch(COHORT):
-        return _scored(dataset, others, tools, scorers, Stopwatch(), label="cohort ", **how)
+        return _score(dataset, sequence, tools, scorers, Stopwatch(), label="cohort ", **options)

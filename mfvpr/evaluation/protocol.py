@@ -1,4 +1,4 @@
-"""The protocol of choosing and reporting: which queries decide, which are reported on, and what counts as right."""
+"""The protocol of an evaluation: which queries choose settings, which are reported on, and what is correct."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -22,18 +22,18 @@ _HALVES = ("first_half", "second_half")
 
 @dataclass(frozen=True)
 class Judge:
-    """What rankings are judged by.
+    """Ground truth at several thresholds, and a split into queries to choose on and queries to report on.
 
     Attributes:
-        thresholds: what counts as right, frames or meters, ascending.
+        thresholds: largest distances of a correct prediction, frames or meters, ascending.
         unit: of the thresholds.
         positives: at each threshold.
-        places: images of a query's place at the widest threshold, also those that are no answer.
+        places: images of a query's place at the widest threshold, also those that are no positives.
         halves: where to choose and where to report; none = both on all queries.
         views: candidates `[Q, C]` bool that are ranked: all, and for each half those that choosing may see.
-        split: which half to choose on, or both in turn; "other sets" where whole data sets are the halves, see
+        split: which half to choose on, or both in turn; "other sets" if the halves are complete data sets, see
             `mfvpr.tuning.learning.data_sets`; None = no halves.
-        reported_sets: queries of each data set that is reported on, by its name, where they are several sets.
+        reported_sets: number of queries of each data set that is reported on, by name, if there are several sets.
     """
 
     thresholds: Sequence[float]
@@ -52,77 +52,77 @@ class Judge:
 
     @property
     def names(self) -> list[str]:
-        """Of the halves."""
+        """Names of the halves."""
         return list(_HALVES) if self.split == "both" else [self.split] if self.split else []
 
     @property
     def fingerprint(self) -> str:
-        """Of what is right at each threshold."""
-        return content_hash([(right.offsets, right.rows) for right in self.positives])
+        """Hash of the positives at each threshold."""
+        return content_hash([(positives.offsets, positives.rows) for positives in self.positives])
 
     def of(self, candidates: Shortlist) -> "Judge":
-        """With the views of a shortlist."""
+        """This judge with the views of a shortlist."""
         allowed = [half.allowed[np.maximum(candidates.indices, 0)] for half in self.halves]
-        return replace(self, views=[candidates.mask, *(candidates.mask & one for one in allowed)])
+        return replace(self, views=[candidates.mask, *(candidates.mask & rows for rows in allowed)])
 
     def label(self, k: int, threshold: float) -> str:
-        """R@K and what counts, for tables."""
+        """R@K with its threshold, for tables."""
         return f"R@{k}{threshold_words(self.unit, threshold)}"
 
     def recall(self, rows: np.ndarray, k: int = 1) -> np.ndarray:
-        """`[S, thresholds]` recall at k of all queries, of rows `[S, Q, depth]`."""
-        return np.stack([hits(rows, right, k).mean(axis=-1) for right in self.positives], axis=-1)
+        """Recall@k `[S, thresholds]` over all queries, of rankings `[S, Q, depth]`."""
+        return np.stack([hits(rows, positives, k).mean(axis=-1) for positives in self.positives], axis=-1)
 
     def tuning(self, rows: np.ndarray) -> np.ndarray:
-        """`[halves, S, thresholds]` recall at 1 that choosing may see, of rows `[V, S, Q, depth]`."""
+        """Recall@1 `[halves, S, thresholds]` over the queries to choose on, of rankings `[V, S, Q, depth]`."""
         if not self.halves:
             return self.recall(rows[0])[None]
         seen = [
-            [hits(rows[view][:, half.tune], right.take(half.tune)).mean(axis=-1) for right in self.positives]
+            [hits(rows[view][:, half.tune], positives.take(half.tune)).mean(axis=-1) for positives in self.positives]
             for view, half in enumerate(self.halves, start=1)
         ]
         return np.moveaxis(np.array(seen), 1, -1)
 
-    def reported(self, rows: np.ndarray, chosen: Sequence[int]) -> np.ndarray:
-        """`[thresholds, R]` hits of the queries that are reported on, each by the setting chosen without it."""
+    def reported_hits(self, rows: np.ndarray, chosen: Sequence[int]) -> np.ndarray:
+        """Hits `[thresholds, R]` of the queries to report on, each with the setting that was chosen without it."""
         if not self.halves:
-            return np.stack([hits(rows[0][chosen[0]], right) for right in self.positives])[:, self.order]
+            return np.stack([hits(rows[0][chosen[0]], positives) for positives in self.positives])[:, self.order]
         parts = [
-            [hits(rows[0][setting][half.report], right.take(half.report)) for right in self.positives]
+            [hits(rows[0][setting][half.report], positives.take(half.report)) for positives in self.positives]
             for setting, half in zip(chosen, self.halves, strict=True)
         ]
-        return self.joined([np.array(part) for part in parts])
+        return self.join_halves([np.array(part) for part in parts])
 
-    def joined(self, parts: Sequence[np.ndarray]) -> np.ndarray:
-        """`[thresholds, R]` of `[thresholds, r]`, what each half reports: in the order of the path.
+    def join_halves(self, parts: Sequence[np.ndarray]) -> np.ndarray:
+        """Join hits `[thresholds, r]` of each half to `[thresholds, R]` in the order of the path.
 
-        Neighbors fail together, so intervals depend on who is whose neighbor.
+        Neighbors fail together, so confidence intervals depend on this order.
         """
         place = np.argsort(self.order)[np.concatenate([half.report for half in self.halves])]
         return np.concatenate(parts, axis=1)[:, np.argsort(place)]
 
     @cached_property
     def order(self) -> np.ndarray:
-        """`[Q]` queries in the order of their path, and of data sets one after the other.
+        """Queries `[Q]` in the order of their path, data set by data set.
 
-        That is theirs, but names with positions in meters may be sorted by anything.
+        This is the order of their rows, except for positions in meters, whose images may have any order.
         """
         if self.unit != "m":
             return np.arange(len(self.places))
         places = places_along_path(self.places, self.unit)
         sizes = [*self.reported_sets.values()]
-        before = len(self.places) - sum(sizes)  # those that are learned on
+        before = len(self.places) - sum(sizes)  # queries that are learned on
         part = np.repeat(np.arange(len(sizes) + 1), [before, *sizes])
         return np.lexsort((places, part))
 
 
 def judge(truth: Truth, thresholds: Iterable[float], split: Split | None = None) -> Judge:
-    """What rankings are judged by, before there are any: what is wrong with the ground truth is told early.
+    """Prepare a `Judge` before anything is ranked, so that errors of the ground truth are raised early.
 
     Args:
         truth: of the queries, in the order of their path.
-        thresholds: at least one, in any order; the middle one decides, and no place within the widest is shared by
-            the queries to choose on and those to report on.
+        thresholds: at least one, in any order. The middle one decides. Queries to choose on and queries to report on
+            share no place within the widest one.
         split: the half of the path to choose on, or both in turn; None = choose and report on all queries.
 
     Raises:

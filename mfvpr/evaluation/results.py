@@ -1,4 +1,4 @@
-"""What an evaluation found: candidates, matches and rankings of every sequence, and their recall."""
+"""Results of an evaluation: candidates, matches and rankings of every sequence, and their recall."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -45,12 +45,12 @@ class Recall:
 
 @dataclass(frozen=True, repr=False)
 class Result:
-    """What an evaluation found.
+    """The result of `mfvpr.evaluate`.
 
     Attributes:
-        dataset: what was evaluated.
-        matched: by sequence.
-        systems: by name and sequence: the filter alone, each scorer, and those combined with the filter.
+        dataset: that was evaluated.
+        matched: candidates and matches by sequence.
+        systems: rankings by name of the system and sequence: retrieval alone, each scorer, and combined scores.
         seconds: by stage.
     """
 
@@ -60,14 +60,15 @@ class Result:
     seconds: Mapping[str, float]
 
     def __repr__(self) -> str:
-        sizes = ", ".join(f"{one.sequence.name} ({len(one.sequence.images)} queries)" for one in self.matched)
+        sequences = [matched.sequence for matched in self.matched]
+        sizes = ", ".join(f"{sequence.name} ({len(sequence.images)} queries)" for sequence in sequences)
         return f"Result({self.dataset.name}: {sizes}; {', '.join(self.systems)})"
 
     def positives(self, threshold: float) -> list[Positives]:
-        """What is right at a threshold, by sequence.
+        """Positives at a threshold, by sequence.
 
         Raises:
-            InputError: a sequence has no ground truth, or one of other images.
+            InputError: a sequence has no ground truth, or its ground truth has another number of images.
         """
         if not threshold >= 0:
             raise InputError(f"threshold={threshold}: expected a number from 0")
@@ -75,18 +76,18 @@ class Result:
         if any(truth is None for truth in truths):
             raise InputError(f"{self.dataset.name}: there is no ground truth, so rankings only")
         positives = [truth.positives(threshold) for truth in truths if truth is not None]
-        for sequence, right in zip(self.dataset.sequences, positives, strict=True):
-            expected, got = (len(sequence.images), len(self.dataset.database)), (len(right), right.num_database)
+        for sequence, truth in zip(self.dataset.sequences, positives, strict=True):
+            expected, got = (len(sequence.images), len(self.dataset.database)), (len(truth), truth.num_database)
             if got != expected:
                 raise InputError(f"{sequence.name}: expected a ground truth of {expected[0]} queries and {expected[1]} "
                                  f"database images, got one of {got[0]} and {got[1]}")  # fmt: skip
         return positives
 
     def recall(self, thresholds: Sequence[float], ks: Sequence[int] = (1, 5, 10)) -> dict[str, Recall]:
-        """Recall@K of every system; a query without a right answer counts as a failure.
+        """Recall@K of every system; a query without positives counts as a failure.
 
         Args:
-            thresholds: what counts as right, in the unit of the ground truth.
+            thresholds: largest distances of a correct prediction, in the unit of the ground truth.
             ks: depths, from 1.
 
         Raises:
@@ -94,12 +95,12 @@ class Result:
         """
         if min(ks, default=1) < 1:
             raise InputError(f"ks={[*ks]}: expected depths from 1")
-        right = [self.positives(threshold) for threshold in thresholds]
+        by_threshold = [self.positives(threshold) for threshold in thresholds]
 
-        def of(ranked: Sequence[Ranked]) -> Recall:
+        def count(rankings: Sequence[Ranked]) -> Recall:
             return Recall([
-                [Tally.of(sequence.rows, positives[number], ks) for positives in right]
-                for number, sequence in enumerate(ranked)
+                [Tally.of(ranking.rows, positives[sequence], ks) for positives in by_threshold]
+                for sequence, ranking in enumerate(rankings)
             ])  # fmt: skip
 
-        return {name: of(ranked) for name, ranked in self.systems.items()}
+        return {name: count(rankings) for name, rankings in self.systems.items()}

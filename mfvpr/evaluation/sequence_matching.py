@@ -1,4 +1,4 @@
-"""Matches of a sequence: images -> features -> shortlist -> matches, kept in an archive, where that has a folder."""
+"""Matches of a sequence: images -> features -> shortlist -> matches, kept in the folder of an archive, if any."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,7 +12,7 @@ import numpy as np
 
 from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.evaluation import stages
-from mfvpr.evaluation.validation import check_matching, checked_candidates, wrong_with
+from mfvpr.evaluation.validation import check_matching, image_warnings, validate_candidates
 from mfvpr.features.extractor import Extractor, Source
 from mfvpr.features.feature_set import FeatureSet
 from mfvpr.matching.matcher import NEIGHBORS, Matcher
@@ -31,7 +31,7 @@ from mfvpr.utils.fingerprints import recipe_of
 from mfvpr.utils.progress import Stopwatch
 
 _REMARKS = "images.json"  # beside the matches: which images are bad
-_SHORTLIST = "shortlist.npz"  # likewise, of shards
+_SHORTLIST = "shortlist.npz"  # beside the matches of shards
 
 
 def match_sequence(
@@ -47,26 +47,26 @@ def match_sequence(
     rows: Sequence[int] | None = None,
     **where: Any,
 ) -> Matched:
-    """Candidates and matches of one sequence's queries; features of no other database images than candidates are taken.
+    """Find and match the candidates of one sequence's queries; features of other database images are not extracted.
 
-    Where the archive has a root, matches are kept below it, and where they are all there, nothing else is read.
+    If the archive has a root, matches are kept below it. If they are all there, nothing else is read.
 
     Args:
         dataset: of the sequence.
         sequence: Q queries.
         extractor: see `evaluate`.
-        filter: see there.
-        candidates: see there.
-        matching: see there.
-        archive: see there.
+        filter: see `evaluate`.
+        candidates: see `evaluate`.
+        matching: see `evaluate`.
+        archive: see `evaluate`.
         watch: gets the seconds of the stages.
-        rows: of the queries that are matched, and given; None = all. Of some, all are filtered, which decides whose
-            features are taken.
-        **where: `memory`, `devices` and `track` of `pipeline.match`.
+        rows: of the queries that are matched and returned; None = all. Candidates are found for all queries, since they
+            decide which features are extracted.
+        **where: `memory`, `devices` and `track` of `stages.match`.
 
     Raises:
         InputError: as `evaluate`.
-        NotYet: of a shard, other ones have not taken their features.
+        NotYet: other shards have not extracted their features.
     """
     check_matching(candidates, extractor, matching)
     if rows is not None and not all(0 <= row < len(sequence.images) for row in rows):
@@ -77,55 +77,57 @@ def match_sequence(
         extractor = fitted(extractor, database, archive)
     with watch("filter"):
         filter = fitted(filter, database, archive)
-    num_candidates = _number(candidates, database)
-    with ExitStack() as held:
+    with ExitStack() as stack:
         stores = []
         if archive.root is not None:
             recipe = matches_recipe(dataset, sequence, extractor, filter, candidates, matching, archive)
-            stores = [held.enter_context(one) for one in _match_stores(sequence, extractor, recipe, archive)]
-        weights = tuple(scale.weight for scale in extractor.scales)
+            stores = [stack.enter_context(store) for store in _match_stores(sequence, extractor, recipe, archive)]
         is_joint = rows is not None and archive.shard is not None and archive.shard.meets
-        if kept := None if is_joint else _kept(sequence, stores, rows, archive, watch, where.get("memory")):
-            kept = replace(kept, weights=weights)
-            return kept if rows is not None else _looked_at(kept, archive)
-        with watch("filter"):
-            filtered = _filtered(sequence, database, filter, num_candidates, archive, stores)
-        with watch("features"):
-            sides, bad = _features(dataset, sequence, extractor, filtered, archive)
-        _remark(stores, archive, bad)
-        options = {"track": archive.track("matching"), **where}
-        with watch("matching"):
-            matches = tuple(
-                stages.match(*scale, filtered.candidates, matching, store=store, rows=rows, **options)
-                for scale, store in zip(sides, stores or [None] * len(sides), strict=True)
-            )
-    given = filtered.candidates if rows is None else jax.tree.map(lambda of: of[rows], filtered.candidates)
-    matched = Matched(sequence, given, matches, bad["queries"], bad["database"], weights)
-    return matched if rows is not None else _looked_at(matched, archive)
+        matched = None if is_joint else _read_matches(sequence, stores, rows, archive, watch, where.get("memory"))
+        if matched is None:
+            with watch("filter"):
+                filtered = _find_candidates(sequence, database, filter, candidates, archive, stores)
+            with watch("features"):
+                sides, remarks = _extract(dataset, sequence, extractor, filtered, archive)
+            _write_remarks(stores, archive, remarks)
+            options = {"track": archive.track("matching"), **where}
+            with watch("matching"):
+                matches = tuple(
+                    stages.match(*scale, filtered.candidates, matching, store=store, rows=rows, **options)
+                    for scale, store in zip(sides, stores or [None] * len(sides), strict=True)
+                )
+            shortlist = filtered.candidates
+            if rows is not None:
+                shortlist = jax.tree.map(lambda values: values[rows], shortlist)
+            matched = Matched(sequence, shortlist, matches, remarks["queries"], remarks["database"])
+    if rows is None:
+        _warn_of_queries_without_candidates(matched, archive)
+    return replace(matched, weights=tuple(scale.weight for scale in extractor.scales))
 
 
-def _filtered(
-    sequence: QuerySequence, database: ImageFolder, filter: Filter, num_candidates: int, archive: Archive,
+def _find_candidates(
+    sequence: QuerySequence, database: ImageFolder, filter: Filter, candidates: int | Literal["all"], archive: Archive,
     stores: Sequence[MatchStore],
 ) -> Filtered:  # fmt: skip
-    """The shortlist; of shards, what the first of them found: on another machine near ties may come out otherwise."""
+    """The shortlist; all shards use that of the first, since near ties may come out differently on other machines."""
 
-    def found() -> Filtered:
-        sizes = len(sequence.images), len(database), num_candidates
-        shortlist = filter.shortlist(sequence, database, num_candidates, archive)
-        return checked_candidates(shortlist, type(filter).__name__, *sizes)
+    def retrieve() -> Filtered:
+        number = _number(candidates, database)
+        filtered = filter.shortlist(sequence, database, number, archive)
+        return validate_candidates(filtered, type(filter).__name__, len(sequence.images), len(database), number)
 
     if archive.shard is None:
-        return found()
-    path, about = stores[0].folder / _SHORTLIST, stores[0].folder.name
+        return retrieve()
+    path, key = stores[0].folder / _SHORTLIST, stores[0].folder.name
     if archive.shard.meets or not path.exists():
-        candidates, *bad = found()
-        arrays = {"indices": candidates.indices, "scores": candidates.scores, "bad": np.array(json.dumps(bad))}
+        shortlist, *bad = retrieve()
+        arrays = {"indices": shortlist.indices, "scores": shortlist.scores, "bad": np.array(json.dumps(bad))}
         with placing(path) as temporary:
-            write_arrays(temporary, arrays, about)
-    kept = read_arrays(path, about)
-    bad = [{int(row): reason for row, reason in side.items()} for side in json.loads(str(kept["bad"]))]
-    return Filtered(Shortlist(kept["indices"], kept["scores"], kept["indices"] >= 0), *bad)
+            write_arrays(temporary, arrays, key)
+    arrays = read_arrays(path, key)
+    bad_queries, bad_database = map(_by_row, json.loads(str(arrays["bad"])))
+    shortlist = Shortlist(arrays["indices"], arrays["scores"], arrays["indices"] >= 0)
+    return Filtered(shortlist, bad_queries, bad_database)
 
 
 def match_cohort(
@@ -138,18 +140,18 @@ def match_cohort(
     archive: Archive | None = None,
     **how: Any,
 ) -> Matched:
-    """Candidates and matches of the database images among each other, once for all sequences.
+    """Match the database images among each other, once for all sequences.
 
     See `mfvpr.reranking.cohort_normalization`.
 
     Args:
-        dataset: whose database, in the order of the drive.
-        neighbors: frames on both sides of an image that show its place, and are none of its candidates.
-        extractor: see `evaluate`; and for all others `match_sequence`, which keeps the matches.
-        filter: see there.
-        candidates: see there.
-        archive: see there.
-        **how: see there.
+        dataset: its database, in the order of the drive.
+        neighbors: frames on both sides of an image that show its place, and are never its candidates.
+        extractor: see `match_sequence`.
+        filter: see `match_sequence`.
+        candidates: see `match_sequence`.
+        archive: see `match_sequence`.
+        **how: further arguments of `match_sequence`.
     """
     archive = archive or Archive()
     sequence = cohort_sequence(archive.contents(dataset.database), neighbors)
@@ -157,10 +159,10 @@ def match_cohort(
     return match_sequence(dataset, sequence, extractor, filter, candidates, archive=archive, **how)
 
 
-def _features(
+def _extract(
     dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, filtered: Filtered, archive: Archive
 ) -> tuple[list[tuple[FeatureSet, FeatureSet]], dict[str, Any]]:
-    """By scale, those of the queries and of all candidates; and what is wrong with some images of either side."""
+    """Features of the queries and of all candidates by scale, and remarks on bad images of both sides."""
     rows = np.unique(filtered.candidates.indices[filtered.candidates.mask])
     database, queries = together(
         partial(archive.local, dataset.database, extractor, rows.tolist(), label="database"),
@@ -171,56 +173,53 @@ def _features(
         "database": _by_row(filtered.bad_database, database[0].bad),
     }
     warnings = [
-        *wrong_with(dataset.database, database[0], bad["database"]),
-        *wrong_with(sequence.images, queries[0], bad["queries"]),
+        *image_warnings(dataset.database, database[0], bad["database"]),
+        *image_warnings(sequence.images, queries[0], bad["queries"]),
     ]
     return list(zip(queries, database, strict=True)), bad | {"warnings": warnings}
 
 
-def _looked_at(matched: Matched, archive: Archive) -> Matched:
-    """The same; queries that the filter finds nothing for are told."""
-    nothing = [row for row in np.flatnonzero(~matched.candidates.mask.any(axis=1)) if row not in matched.bad_queries]
-    if nothing:
+def _warn_of_queries_without_candidates(matched: Matched, archive: Archive) -> None:
+    missing = [row for row in np.flatnonzero(~matched.candidates.mask.any(axis=1)) if row not in matched.bad_queries]
+    if missing:
         images = matched.sequence.images
-        archive.warn(f"{images.paths[nothing[0]]}: no candidates ({len(nothing)} such queries of {len(images)}), which "
+        archive.warn(f"{images.paths[missing[0]]}: no candidates ({len(missing)} such queries of {len(images)}), which "
                      "counts as a failure")  # fmt: skip
-    return matched
 
 
 def _number(candidates: int | Literal["all"], database: ImageFolder) -> int:
     return len(database) if candidates == "all" else min(int(candidates), len(database))
 
 
-def _by_row(*reasons: Mapping[int, str]) -> dict[int, str]:
-    return {int(row): reason for some in reasons for row, reason in some.items()}
+def _by_row(*reasons: Mapping[Any, str]) -> dict[int, str]:
+    return {int(row): reason for side in reasons for row, reason in side.items()}
 
 
-def _kept(
+def _read_matches(
     sequence: QuerySequence, stores: Sequence[MatchStore], rows: Sequence[int] | None, archive: Archive,
     watch: Stopwatch, memory: float | None,
 ) -> Matched | None:  # fmt: skip
-    """Matches of all scales, of stores that have them all."""
-    asked = slice(None) if rows is None else [*rows]
-    if not stores or not asked or not all(store.done[asked].all() for store in stores):
+    """Matches of all scales from the stores; None if some are missing."""
+    requested = slice(None) if rows is None else [*rows]
+    if not stores or not requested or not all(store.done[requested].all() for store in stores):
         return None
     try:
         remarks = json.loads((stores[0].folder / _REMARKS).read_text())
-        bad = [{int(row): reason for row, reason in remarks[side].items()} for side in ("queries", "database")]
-        warnings = [*remarks["warnings"]]
+        queries, database, warnings = _by_row(remarks["queries"]), _by_row(remarks["database"]), [*remarks["warnings"]]
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
-        return None  # so images are looked at again, but not matched
+        return None  # so images are read again, but not matched
     with watch("matches read"):
-        read = [stages.stored_matches(store, rows, memory=memory) for store in stores]
-    if any((other.indices != read[0][1].indices).any() for _, other in read):
-        return None  # another shortlist for some scales, which will be told
+        scales = [stages.stored_matches(store, rows, memory=memory) for store in stores]
+    match_sets, shortlists = zip(*scales, strict=True)
+    if any((shortlist.indices != shortlists[0].indices).any() for shortlist in shortlists):
+        return None  # scales with different shortlists: matching will raise
     for line in warnings:
         archive.warn(line)
-    queries, database = bad
-    return Matched(sequence, read[0][1], tuple(match_set for match_set, _ in read), queries, database)
+    return Matched(sequence, shortlists[0], match_sets, queries, database)
 
 
-def _remark(stores: Sequence[MatchStore], archive: Archive, remarks: Mapping[str, Any]) -> None:
-    """Tell what is wrong with images, also to those who will read the matches and nothing else."""
+def _write_remarks(stores: Sequence[MatchStore], archive: Archive, remarks: Mapping[str, Any]) -> None:
+    """Warn of bad images, and keep the warnings for later runs, which read the matches and nothing else."""
     for store in stores[:1]:
         write_text(store.folder / _REMARKS, json.dumps(remarks))
     for line in remarks["warnings"]:
@@ -231,7 +230,7 @@ def matches_recipe(
     dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, filter: Filter,
     candidates: int | Literal["all"], matching: Matcher, archive: Archive,
 ) -> dict[str, Any]:  # fmt: skip
-    """All that changes a shortlist and its matches: both sides' images and features, the filter, and the matching."""
+    """JSON values that determine a shortlist and its matches: images and features, retrieval, and matching."""
     excluded, database = sequence.excluded, dataset.database
     extractor, filter = fitted(extractor, database, archive), fitted(filter, database, archive)
     return {
@@ -248,7 +247,7 @@ def matches_recipe(
 def _match_stores(
     sequence: QuerySequence, extractor: Extractor | Source, recipe: Mapping[str, Any], archive: Archive
 ) -> Iterator[AbstractContextManager[MatchStore]]:
-    """A store for the matches of each scale."""
+    """One store of matches per scale."""
     several = len(extractor.scales) > 1
     share = 1 if recipe["matching"].get("cross_check") in ("none", "candidate") else 3
     for number, scale in enumerate(extractor.scales):

@@ -1,7 +1,7 @@
 """The stages of re-ranking a data set: match, score, explain. `mfvpr.reranking` fuses and ranks.
 
 Files and threads stay on the host; each computation is one compiled program per shape. `track` wraps the iterable of a
-stage: a progress bar, or nothing.
+stage, for a progress bar.
 """
 
 import itertools
@@ -47,50 +47,50 @@ def match(
     rows: Sequence[int] | None = None,
     track: Track = untracked,
 ) -> MatchSet:
-    """Matches of every query with its candidates, with their ratio: weights may ask for it.
+    """Match every query with its candidates; matches include their ratio, which some weights use.
 
     Args:
         queries: Q images.
         database: M images.
         candidates: `[Q, C]` rows of the database.
         matcher: of one pair.
-        memory: GB that features of the database may take on the devices, and, of a store, the matches in memory; None
-            = a third of what is free.
+        memory: GB that features of the database may take on the devices, and matches that are read from a store in
+            memory; None = a third of what is free.
         devices: that share the queries; None = the one that JAX takes.
-        store: of these features, candidates and matcher. Only queries that it lacks are matched; some at a time are on
-            disk before the next are begun; and what comes back was read from it.
-        rows: of the queries that are matched, and given; None = all.
+        store: of these features, candidates and matcher. Queries that it lacks are matched and written in small
+            batches; the result is read from it.
+        rows: of the queries that are matched and returned; None = all.
         track: progress, over queries.
 
     Raises:
-        InputError: the two sides' descriptors do not fit; or the store cannot be used, or is of other candidates: then
-            nothing is written.
+        InputError: the two sides' descriptors have different lengths; or the store cannot be used or has other
+            candidates, and then nothing is written.
     """
     if (queries.counts > 0).any() and (database.counts > 0).any() and queries.dimension != database.dimension:
         raise InputError(f"features: expected as many dimensions on both sides, got {queries.dimension} "
                          f"and {database.dimension} (database); extract all images alike")  # fmt: skip
-    made = partial(
+    match_rows = partial(
         batched.matched, queries, database, candidates, matcher=matcher, memory=memory,
         devices=devices or [device_of(())],
     )  # fmt: skip
-    asked = range(len(queries)) if rows is None else rows
+    requested = range(len(queries)) if rows is None else rows
     if store is None:
-        found = [row for _, row in track(made(asked), len(asked))]
-        return MatchSet.of([row.matches for row in found], np.array([row.counts for row in found]))
-    if missing := [row for row in asked if not store.done[row]]:
-        before = {query: row.indices for query, row in store.read()}
-        _require_same(store, candidates, before)  # then nothing is written
-        tracked = iter(track(made(missing), len(missing)))
+        matched = [query for _, query in track(match_rows(requested), len(requested))]
+        return MatchSet.of([query.matches for query in matched], np.array([query.counts for query in matched]))
+    if missing := [row for row in requested if not store.done[row]]:
+        stored = {row: query.indices for row, query in store.read()}
+        _require_candidates(store, candidates, stored)  # before anything is written
+        tracked = iter(track(match_rows(missing), len(missing)))
         while batch := dict(itertools.islice(tracked, STORE_BATCH)):
             store.write(batch)
-    match_set, listed = stored_matches(store, rows, memory=memory)
+    match_set, shortlist = stored_matches(store, rows, memory=memory)
     if not missing:
-        _require_same(store, candidates, dict(zip(asked, listed.indices, strict=True)))
+        _require_candidates(store, candidates, dict(zip(requested, shortlist.indices, strict=True)))
     return match_set
 
 
-def _require_same(store: MatchStore, candidates: Shortlist, stored: Mapping[int, np.ndarray]) -> None:
-    """That what the store holds, by row, is of these candidates."""
+def _require_candidates(store: MatchStore, candidates: Shortlist, stored: Mapping[int, np.ndarray]) -> None:
+    """Raise unless the candidates of the stored rows are `candidates`."""
     same_shape = candidates.indices.shape == tuple(store.sizes.values())
     if not same_shape or any((indices != candidates.indices[row]).any() for row, indices in stored.items()):
         raise InputError(
@@ -102,13 +102,13 @@ def _require_same(store: MatchStore, candidates: Shortlist, stored: Mapping[int,
 def stored_matches(
     store: MatchStore, rows: Sequence[int] | None = None, *, memory: float | None = None
 ) -> tuple[MatchSet, Shortlist]:
-    """What a store holds, NumPy: the features are not needed any more.
+    """Read matches and their shortlist from a store, NumPy; features are not needed.
 
     Args:
         store: of matches.
-        rows: of the queries whose matches are asked for; None = all.
-        memory: GB that all matches may take in memory; None = a third of what is free. Where that is not enough, none
-            stays there, and they are read whenever they are asked for.
+        rows: of the queries; None = all.
+        memory: GB that all matches may take in memory; None = a third of what is free. If that is not enough, none are
+            kept in memory, and they are read from the store whenever they are used.
 
     Raises:
         InputError: matches of some queries are missing or damaged.
@@ -137,7 +137,7 @@ def stored_matches(
 
 @dataclass(frozen=True)
 class Explanation:
-    """What a histogram says of one pair, NumPy.
+    """The histogram of one pair and its parts, NumPy.
 
     Attributes:
         histogram: all bins `[B, B]` (-inf beyond the range of shifts) with their centers, px.
@@ -146,8 +146,8 @@ class Explanation:
         peak: `[2]` the refined peak between bin centers, px.
         weights: `[K]` of the matches.
         agrees: `[K]` whether a match's shift lies within two standard deviations of the peak along both axes.
-        scale: of the scorer's, at which all of this is.
-        direction: of the shifts, the scorer's.
+        scale: the dominant one of the scorer's scales, to which all of this belongs.
+        direction: of the shifts, as the scorer defines it.
     """
 
     histogram: ShiftHistogram
@@ -177,52 +177,52 @@ def _explain(scorer: HistogramOfShifts, matches: Matches) -> tuple[Any, ...]:
 def dominant_shifts(
     scorer: HistogramOfShifts, match_set: MatchSet, queries: np.ndarray, places: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How far candidates show what is at the center of their queries from there, px: refined dominant shifts `[n, 2]`
-    (candidate minus query), their 95 % intervals `[n, 2, 2]` (low, high), and the scales `[n]`; one program.
+    """Shifts from the center of a query to the same point in a candidate, px, with their intervals; one program.
 
     Args:
-        scorer: whose histogram is taken.
+        scorer: computes the histogram.
         match_set: of all queries.
-        queries: `[n]`.
+        queries: `[n]` rows.
         places: `[n]` of the candidates in their shortlists.
 
     Returns:
-        NaN where nothing votes.
+        Refined dominant shifts `[n, 2]` (candidate minus query), their 95 % intervals `[n, 2, 2]` (low, high), and the
+        scales `[n]`; NaN if no match votes.
     """
     fitted = fit(scorer, *match_set.image_sizes, multiple=BIN_STEP)
     parts = [(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))]
     for start in range(0, len(queries), SHIFTS_AT_ONCE):
-        some = slice(start, start + SHIFTS_AT_ONCE)
-        pairs = match_set.pairs(queries[some], places[some], match_set.capacity, total=SHIFTS_AT_ONCE)
-        number = len(queries[some])
+        part = slice(start, start + SHIFTS_AT_ONCE)
+        pairs = match_set.pairs(queries[part], places[part], match_set.capacity, total=SHIFTS_AT_ONCE)
+        number = len(queries[part])
         shifts, intervals, scales = pair_shifts(fitted, pairs)
         parts.append((shifts[:number], intervals[:number], scales[:number]))
-    shifts, intervals, scales = (np.concatenate(same) for same in zip(*parts, strict=True))
+    shifts, intervals, scales = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     return shifts, intervals, scales
 
 
 def pair_shifts(scorer: HistogramOfShifts, matches: Matches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`dominant_shifts` of matches `[P, K, ...]`, by a scorer that is fitted to their images."""
+    """`dominant_shifts` of matches `[P, K, ...]`, by a scorer with the capacity for their images."""
     votes, shifts, intervals, scales = jax.tree.map(np.asarray, _pair_shifts(scorer, matches))
-    none = ~votes  # the host makes the NaN: `jax_debug_nans` stops at those of programs
+    no_votes = ~votes  # the host makes the NaN: `jax_debug_nans` stops at those of programs
     return (
-        np.where(none[:, None], np.nan, shifts),
-        np.where(none[:, None, None], np.nan, intervals),
-        np.where(none, np.nan, scales),
+        np.where(no_votes[:, None], np.nan, shifts),
+        np.where(no_votes[:, None, None], np.nan, intervals),
+        np.where(no_votes, np.nan, scales),
     )
 
 
 @compiled
 def _pair_shifts(scorer: HistogramOfShifts, matches: Matches) -> tuple[Array, Array, Array, Array]:
-    """Whether anything votes `[P]`, and `pair_shifts`, 0 where nothing does."""
+    """Whether any match votes `[P]`, and `pair_shifts`, 0 without votes."""
 
-    def of_pair(one: Matches) -> tuple[Array, Array, Array, Array]:
-        scale, votes = scorer.dominant_scale(one), scorer(one) > 0
-        found = jnp.concatenate([scorer.dominant_shift(one, refine=True)[None], scorer.shift_interval(one)])
+    def of_pair(pair: Matches) -> tuple[Array, Array, Array, Array]:
+        scale, votes = scorer.dominant_scale(pair), scorer(pair) > 0
+        shifts = jnp.concatenate([scorer.dominant_shift(pair, refine=True)[None], scorer.shift_interval(pair)])
         if scorer.direction == "query_minus_candidate":
-            found = -found[jnp.array([0, 2, 1])]
-        apart = (at_least_single(one.image_size1) - at_least_single(one.image_size0))[None] / 2  # of the centers
-        found = jnp.where(votes, apart + jnp.sqrt(scale) * (found - apart), 0.0)
-        return votes, found[0], found[1:], jnp.where(votes, scale, 0.0)
+            shifts = -shifts[jnp.array([0, 2, 1])]
+        offset = (at_least_single(pair.image_size1) - at_least_single(pair.image_size0))[None] / 2  # of the centers
+        shifts = jnp.where(votes, offset + jnp.sqrt(scale) * (shifts - offset), 0.0)
+        return votes, shifts[0], shifts[1:], jnp.where(votes, scale, 0.0)
 
     return jax.vmap(of_pair)(matches)

@@ -1,4 +1,4 @@
-"""How sure a recall is, and whether two differ: on the same queries, which follow each other along a path."""
+"""Confidence intervals of recalls, and tests of their differences, on queries that follow each other along a path."""
 
 import math
 from collections.abc import Sequence
@@ -9,13 +9,13 @@ from scipy import special, stats
 
 from mfvpr.utils.errors import InputError
 
-_PSEUDO_EVENTS = 1.0  # of a default autocorrelation: a path with hits only, or misses only, does not show its own
+_PSEUDO_EVENTS = 1.0  # with a default autocorrelation: a path with hits only, or misses only, does not show its own
 
 
 class McNemar(NamedTuple):
     """Two systems on the same queries.
 
-    only_first, only_second: queries that only one of them gets right.
+    only_first, only_second: number of queries for which only this system is correct.
     p_value: probability of a difference at least this large if neither were better.
     """
 
@@ -27,9 +27,9 @@ class McNemar(NamedTuple):
 class SignFlips(NamedTuple):
     """Two systems on the same queries, by blocks of the path, see `block_sign_flips`.
 
-    block: queries of a block.
-    blocks: those in which one of the two is ahead.
-    p_value: probability of a difference at least this large if each of these blocks were as likely the other way round.
+    block: number of queries of a block.
+    blocks: number of blocks in which one of the two is ahead.
+    p_value: probability of a difference at least this large if the sign of each of these blocks were random.
     """
 
     block: int
@@ -38,10 +38,10 @@ class SignFlips(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """A recall and how sure it is.
+    """A recall and its confidence interval.
 
     recall: fraction of the queries.
-    interval: its confidence interval, see `recall_interval`.
+    interval: (low, high), see `recall_interval`.
     """
 
     recall: float
@@ -49,22 +49,22 @@ class Estimate(NamedTuple):
 
 
 def estimate(hits: np.ndarray) -> Estimate:
-    """Recall of queries along a path, `[Q]` bool, at least one, with its interval."""
+    """Recall of hits `[Q]` bool along a path with at least one query, with its confidence interval."""
     return Estimate(float(np.mean(hits)), recall_interval(hits))
 
 
 def recall_interval(hits: np.ndarray, *, level: float = 0.95) -> tuple[float, float]:
     """Confidence interval of the recall of queries along a path, which succeed and fail together with their neighbors.
 
-    Clopper and Pearson's (1934) at the number of independent queries that the path is worth, Q / `design_effect`, less
-    what is due to that number being an estimate (Korn & Graham, Survey Methodology 24, 1998). It never has zero width:
-    100 hits of 100 say [82.8 %, 100 %].
+    The interval of Clopper and Pearson (1934) for the effective number of independent queries, Q / `design_effect`,
+    which is reduced because it is an estimate (Korn & Graham, Survey Methodology 24, 1998). It never has zero width:
+    100 hits of 100 give [82.8 %, 100 %].
 
-    Drawn Markov chains of 50 to 500 queries had their recall (0.5 to 1) in 96 % or more of these intervals without
-    autocorrelation, in 92 % or more with 0.8 from query to query; with 0.9 in 91 % or more from 300 queries, but down
-    to 77 % at 50 or 101, which are worth no more than 3 to 6 independent ones. Thresholded Gaussian sequences, which
-    forget more slowly than their first lag says: with 0.8 between latent neighbors in 91 to 98 % at 101 queries, in 89
-    % or more at 50; with 0.9 in 79 % or more at 50, 85 % or more at 101, 88 % or more at 300.
+    Coverage of the 95 % interval in simulations with recalls of 0.5 to 1. Markov chains of 50 to 500 queries: at least
+    96 % without autocorrelation and 92 % with 0.8 from query to query; with 0.9 at least 91 % from 300 queries, but
+    down to 77 % for 50 or 101 queries, which are worth 3 to 6 independent ones. Thresholded Gaussian sequences, with
+    longer memory: with 0.8 between latent neighbors 91 to 98 % for 101 queries, at least 89 % for 50; with 0.9 at least
+    79 % for 50, 85 % for 101, 88 % for 300.
 
     Args:
         hits: `[Q]` bool, in the order of the path.
@@ -81,23 +81,23 @@ def recall_interval(hits: np.ndarray, *, level: float = 0.95) -> tuple[float, fl
         raise InputError(f"hits: expected [Q], one of every query, got {list(hits.shape)}; call it for each row")
     if len(hits) == 0:
         return 0.0, 1.0
-    worth = len(hits) / design_effect(hits)
-    worth *= (_quantile(level, len(hits)) / _quantile(level, worth)) ** 2
-    right = hits.mean() * worth
-    wrong, tail = worth - right, (1 - level) / 2
-    low = special.betaincinv(right, wrong + 1, tail) if right > 0 else 0.0
-    high = special.betaincinv(right + 1, wrong, 1 - tail) if wrong > 0 else 1.0
+    effective = len(hits) / design_effect(hits)
+    effective *= (_quantile(level, len(hits)) / _quantile(level, effective)) ** 2
+    correct = hits.mean() * effective
+    incorrect, tail = effective - correct, (1 - level) / 2
+    low = special.betaincinv(correct, incorrect + 1, tail) if correct > 0 else 0.0
+    high = special.betaincinv(correct + 1, incorrect, 1 - tail) if incorrect > 0 else 1.0
     return float(low), float(high)
 
 
 def design_effect(hits: np.ndarray) -> float:
-    """How many queries of a path `[Q]` bool are worth one independent query, in 1 ... Q.
+    """Number of queries of a path, in 1 ... Q, that are worth one independent query, from hits `[Q]` bool.
 
-    The larger of two estimates of the variance of the mean, in units of that of independent queries: a flat-top lag
-    window whose width follows from the data (Politis & White, Econometric Reviews 23, 2004, section 3.2), and a Markov
-    chain with the lag-1 autocorrelation, corrected for its bias (Kendall, Biometrika 41, 1954), since short paths hide
-    slow changes. A path that is all hits or all misses tells nothing; then it is the cube root of Q, which with few
-    hits or few misses counts as much as one of these.
+    This is the variance of the mean divided by the variance for independent queries. It is the larger of two estimates:
+    a flat-top lag window whose width follows from the data (Politis & White, Econometric Reviews 23, 2004, section
+    3.2), and a Markov chain with the lag-1 autocorrelation, corrected for its bias (Kendall, Biometrika 41, 1954),
+    since short paths hide slow changes. A path of only hits or only misses shows no autocorrelation; then the result is
+    the cube root of Q. With few hits or few misses, this default counts as much as one of them.
     """
     hits = np.asarray(hits, np.float64)
     return _design_effect([hits], min(hits.sum(), len(hits) - hits.sum()))
@@ -106,9 +106,9 @@ def design_effect(hits: np.ndarray) -> float:
 def mcnemar(first: np.ndarray, second: np.ndarray) -> McNemar:
     """Exact test of two systems' hits `[Q]` bool (McNemar, 1947): a fair coin for every query in which they differ.
 
-    It takes queries for independent. Along a path they are not, and the p-value is smaller than it should be: with an
-    autocorrelation of 0.8 between neighbors of latent Gaussian sequences it is at most 5 % in 7 to 44 % of the draws of
-    two systems that are equally good. See `block_sign_flips`.
+    The test assumes independent queries. Along a path they are not, and the p-value is too small: with an
+    autocorrelation of 0.8 between neighbors of latent Gaussian sequences it is at most 5 % in 7 to 44 % of the
+    simulations of two equally good systems. See `block_sign_flips`.
     """
     first, second = np.asarray(first, bool), np.asarray(second, bool)
     only_first, only_second = int((first & ~second).sum()), int((second & ~first).sum())
@@ -126,25 +126,25 @@ def block_sign_flips(
     The statistic is the difference of the two recalls. All flips of the blocks' signs are counted, by convolution. With
     blocks of one query this is `mcnemar`.
 
-    Drawn thresholded Gaussian sequences of 101 to 500 queries, two systems equally good, more or less alike, with
-    recalls of 0.5 to 0.95: p is at most 5 % in at most 6 % of the draws without autocorrelation, in at most 7 % with
-    0.5 between latent neighbors, in at most 8 % with 0.8 or 0.9 (McNemar's in up to 6, 18, 44 and 61 %); it is at most
-    1 % in at most 3 %.
+    False positives in simulations of equally good systems with recalls of 0.5 to 0.95, more or less similar
+    (thresholded Gaussian sequences of 101 to 500 queries): p is at most 5 % in at most 6 % of the simulations without
+    autocorrelation, in at most 7 % with 0.5 between latent neighbors, and in at most 8 % with 0.8 or 0.9 (`mcnemar`: in
+    up to 6, 18, 44 and 61 %). p is at most 1 % in at most 3 %.
 
     Args:
         first: `[Q]` bool, in the order of the path.
-        second: of the same queries.
+        second: `[Q]` bool, of the same queries.
         block: queries of a block, from 1; the last of a sequence may be shorter. None = the cube root of Q times the
-            `design_effect` of the differences; where they change slowly along the path, that leaves few blocks, which
-            no difference makes significant.
-        sequences: how many of the queries each sequence has, one behind the other, where there are several: no block
-            goes from one into the next.
-        places: `[Q]` whole numbers in the order of the path, where several queries, such as those of several drives
-            along it, show the same places: then blocks are of places, whose queries differ together. Drives taken for
-            independent have p below 5 % in up to 58 % of the draws of equally good systems.
+            `design_effect` of the differences. If they change slowly along the path, few blocks remain, and no
+            difference is significant.
+        sequences: number of queries of each sequence, if there are several one after the other; no block contains
+            queries of two sequences.
+        places: `[Q]` whole numbers in the order of the path, if several queries show the same places, for example on
+            several drives. Then blocks are made of places. Without `places`, p is below 5 % in up to 58 % of the
+            simulations of equally good systems on several drives.
 
     Raises:
-        InputError: hits of other shapes, sequences of other queries, or blocks without any.
+        InputError: arrays of different shapes, sequences that do not add up to Q, or `block` below 1.
     """
     first, second = np.asarray(first, bool), np.asarray(second, bool)
     sequences = [len(first)] if sequences is None else [*sequences]
@@ -164,13 +164,13 @@ def block_sign_flips(
 
 
 def _block_length(paths: Sequence[np.ndarray]) -> int:
-    """By the cube root, the rate at which what neighboring blocks share gets lost in the error of its estimate."""
-    differ, total = float(sum(map(np.count_nonzero, paths))), sum(map(len, paths))
-    return max(1, min(math.ceil(total ** (1 / 3) * _design_effect(paths, differ)), total))
+    """The default block length; at the rate of the cube root, the correlation of neighboring blocks is negligible."""
+    differences, total = float(sum(map(np.count_nonzero, paths))), sum(map(len, paths))
+    return max(1, min(math.ceil(total ** (1 / 3) * _design_effect(paths, differences)), total))
 
 
 def _flipped_tail(sizes: np.ndarray, total: int) -> float:
-    """The probability that whole numbers `[B]` with random signs sum to at least a total, either way."""
+    """Probability that whole numbers `[B]` with random signs have a sum of absolute value at least `total`."""
     reach = int(sizes.sum())
     chances = np.zeros(2 * reach + 1)  # of the sums -reach ... reach
     chances[reach] = 1
@@ -180,23 +180,23 @@ def _flipped_tail(sizes: np.ndarray, total: int) -> float:
 
 
 def _design_effect(paths: Sequence[np.ndarray], events: float) -> float:
-    """Of all values of some paths, of which so many tell something."""
+    """`design_effect` of the values of several paths; `events` counts the informative ones (hits, or differences)."""
     total = sum(map(len, paths))
-    unknown = total ** (1 / 3)
+    default = total ** (1 / 3)
     if events == 0 or np.ptp(np.concatenate(paths)) == 0:
-        return unknown
+        return default
     correlations = _autocorrelations(paths)
-    found = max(1.0, _flat_top(correlations), _markov(correlations))
-    return min((events * found + _PSEUDO_EVENTS * unknown) / (events + _PSEUDO_EVENTS), float(total))
+    estimate = max(1.0, _flat_top(correlations), _markov(correlations))
+    return min((events * estimate + _PSEUDO_EVENTS * default) / (events + _PSEUDO_EVENTS), float(total))
 
 
 def _quantile(level: float, count: float) -> float:
-    """Of Student's t for the mean of so many values."""
+    """Two-sided quantile of Student's t for the mean of `count` values."""
     return float(stats.t.ppf((1 + level) / 2, max(count - 1, 1)))
 
 
 def _autocorrelations(paths: Sequence[np.ndarray]) -> np.ndarray:
-    """`[Q]` at lags 0 ... Q - 1, within paths of Q values together, which differ."""
+    """Autocorrelations `[Q]` at lags 0 ... Q - 1 within paths of Q values in total, which are not all equal."""
     mean, total = np.concatenate(paths).mean(), sum(map(len, paths))
     spectra = [np.fft.rfft(path - mean, 2 * total) for path in paths]  # padded: a path is no circle
     covariances = np.fft.irfft(sum(np.abs(spectrum) ** 2 for spectrum in spectra))[:total]
@@ -204,9 +204,9 @@ def _autocorrelations(paths: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _flat_top(correlations: np.ndarray) -> float:
-    """Sum of the autocorrelations at all lags, by a window that is 1 up to half its width and falls to 0 at its end.
+    """Sum of the autocorrelations at all lags in a window that is 1 up to half its width and falls to 0 at its end.
 
-    Half its width is the lag after which the next few autocorrelations are all insignificant.
+    Half the width is the lag after which the next few autocorrelations are all insignificant.
     """
     total = len(correlations)
     run = max(5, math.ceil(math.sqrt(math.log10(total))))

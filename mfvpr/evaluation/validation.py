@@ -1,4 +1,4 @@
-"""What an evaluation is asked for, and what filters and scorers of others give: told in one line."""
+"""Checks of an evaluation: its arguments, candidates of user-defined retrievals, scores, and images."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -27,18 +27,18 @@ def check_request(
     scorers: Mapping[str, Any], fused: Mapping[str, Fusion], correlated: Iterable[str], ties: Ties,
     memory: float | None, *, cohort: bool = False,
 ) -> None:  # fmt: skip
-    """What `mfvpr.evaluate` is asked to do with matches.
+    """Check the arguments of `mfvpr.evaluate` that concern scores.
 
     Args:
         scorers: by name.
-        fused: how the filter's score is added to some of them, by name.
-        correlated: names of scorers, and of those that are fused.
-        ties: see there.
-        memory: see there.
-        cohort: whether there is one, so that scorers are ranked with it as well.
+        fused: combinations with the retrieval's score, by name of the scorer.
+        correlated: names of scorers and fused systems.
+        ties: see `mfvpr.evaluate`.
+        memory: see `mfvpr.evaluate`.
+        cohort: whether scorers are ranked with a cohort as well.
 
     Raises:
-        InputError: one cannot be used.
+        InputError: an argument cannot be used.
     """
     require_word("ties", ties, Ties)
     if memory is not None and not 0 < memory < math.inf:
@@ -52,9 +52,9 @@ def check_request(
     if unknown := [name for name in correlated if name not in several]:
         raise InputError(f"correlated: expected names of scorers ({', '.join(several) or 'there are none'}), got "
                          f"{unknown[0]}")  # fmt: skip
-    made = {FILTER, *with_cohort, *combined, *(f"{other} + {FRAMES}" for other in correlated)}
+    reserved = {FILTER, *with_cohort, *combined, *(f"{system} + {FRAMES}" for system in correlated)}
     for name, scorer in scorers.items():
-        if name in made:
+        if name in reserved:
             raise InputError(f"scorers: {name} is the name of another system; choose another one")
         if isinstance(scorer, type) or not callable(scorer):
             got = f"the class {scorer.__name__}; write {scorer.__name__}(...)" if isinstance(scorer, type) else scorer
@@ -64,13 +64,13 @@ def check_request(
 
 
 def check_matching(candidates: Any, extractor: Extractor | Source, matching: Matcher) -> None:
-    """What is asked of the matches of a sequence.
+    """Check the arguments of `mfvpr.evaluate` that concern matches.
 
     Raises:
-        InputError: one cannot be used.
+        InputError: an argument cannot be used.
     """
-    whole = isinstance(candidates, int | np.integer) and not isinstance(candidates, bool)
-    if candidates != "all" and not (whole and candidates >= 1):
+    is_whole = isinstance(candidates, int | np.integer) and not isinstance(candidates, bool)
+    if candidates != "all" and not (is_whole and candidates >= 1):
         raise InputError(f"candidates={candidates!r}: expected a whole number from 1, or 'all'")
     if not extractor.scales:
         raise InputError(f"{type(extractor).__name__}: gives no local features; expected an extractor that does")
@@ -91,12 +91,12 @@ def check_matching(candidates: Any, extractor: Extractor | Source, matching: Mat
                              "extract these, or match nearest neighbors")  # fmt: skip
 
 
-def checked_candidates(filtered: Any, who: str, num_queries: int, num_database: int, num_candidates: int) -> Filtered:
-    """What a filter of somebody's own gives, with -1 and 0 as padding.
+def validate_candidates(filtered: Any, name: str, num_queries: int, num_database: int, num_candidates: int) -> Filtered:
+    """Check the candidates of a retrieval, which may be user-defined; return them padded with -1 and 0.
 
     Args:
-        filtered: of the filter.
-        who: the filter's name.
+        filtered: result of the retrieval.
+        name: of the retrieval.
         num_queries: Q.
         num_database: N.
         num_candidates: C.
@@ -106,33 +106,33 @@ def checked_candidates(filtered: Any, who: str, num_queries: int, num_database: 
             query.
     """
     if not isinstance(filtered, Filtered):
-        raise InputError(f"{who}: expected a Filtered, got {type(filtered).__name__}; return "
+        raise InputError(f"{name}: expected a Filtered, got {type(filtered).__name__}; return "
                          "Filtered(shortlist, {}, {})")  # fmt: skip
     shortlist = filtered.candidates
     if not isinstance(shortlist, Shortlist):
-        raise InputError(f"{who}: expected a Shortlist as the candidates of Filtered, got {type(shortlist).__name__}")
+        raise InputError(f"{name}: expected a Shortlist as the candidates of Filtered, got {type(shortlist).__name__}")
     indices, scores, mask = (np.asarray(part) for part in (shortlist.indices, shortlist.scores, shortlist.mask))
     expected = (num_queries, num_candidates)
     if {indices.shape, scores.shape, mask.shape} != {expected} or mask.dtype != bool or indices.dtype.kind not in "iu":
         shapes = f"{list(indices.shape)}, {list(scores.shape)} and {list(mask.shape)}"
-        raise InputError(f"{who}: expected indices (whole), scores and mask (bool) of {list(expected)} each, got "
+        raise InputError(f"{name}: expected indices (whole), scores and mask (bool) of {list(expected)} each, got "
                          f"{shapes}; pad with -1")  # fmt: skip
     if not ((indices[mask] >= 0) & (indices[mask] < num_database)).all():
-        raise InputError(f"{who}: expected rows of the database from 0 to {num_database - 1}, got "
+        raise InputError(f"{name}: expected rows of the database from 0 to {num_database - 1}, got "
                          f"{indices[mask].min()} to {indices[mask].max()}")  # fmt: skip
     ordered = np.sort(np.where(mask, indices, -1), axis=1)
-    if (twice := (ordered[:, 1:] == ordered[:, :-1]) & (ordered[:, 1:] >= 0)).any():
-        query, place = np.argwhere(twice)[0]
-        raise InputError(f"{who}: expected every row of the database once, got {ordered[query, place]} twice for query "
-                         f"{query}")  # fmt: skip
+    if (is_repeated := (ordered[:, 1:] == ordered[:, :-1]) & (ordered[:, 1:] >= 0)).any():
+        query, place = np.argwhere(is_repeated)[0]
+        raise InputError(f"{name}: expected every row of the database once, got {ordered[query, place]} twice for "
+                         f"query {query}")  # fmt: skip
     if not np.isfinite(scores[mask]).all():
-        raise InputError(f"{who}: expected finite scores")
+        raise InputError(f"{name}: expected finite scores")
     indices, scores = np.where(mask, indices, -1).astype(np.int32), np.where(mask, scores, 0).astype(np.float32)
     return filtered._replace(candidates=Shortlist(indices, scores, mask))
 
 
-def wrong_with(folder: ImageFolder, features: FeatureSet, bad: Mapping[int, str]) -> Iterator[str]:
-    """What is wrong with some images, which rank last, or have no matches."""
+def image_warnings(folder: ImageFolder, features: FeatureSet, bad: Mapping[int, str]) -> Iterator[str]:
+    """Warnings of bad images, which rank last, and of images without keypoints, which have no matches."""
     yield from bad.values()
     counts = np.asarray(features.source.counts)
     if empty := [row for row in np.flatnonzero(counts == 0).tolist() if row not in bad]:
@@ -140,18 +140,18 @@ def wrong_with(folder: ImageFolder, features: FeatureSet, bad: Mapping[int, str]
                "scores are 0")  # fmt: skip
 
 
-def nan_scores(
+def score_warnings(
     matched: Sequence[Matched], ranked: Sequence[Mapping[str, Ranked]], scorers: Iterable[str]
 ) -> Iterator[str]:
-    """What says of scores that are no numbers: scorers of one's own may divide by 0.
+    """Warnings of scores that are NaN or infinite, for example if a user-defined scorer divides by 0.
 
     Args:
         matched: by sequence.
         ranked: by sequence and system.
-        scorers: the systems that are no sums of others, whose 0 may say that all are equal.
+        scorers: names of the systems that rank by the scores of one scorer.
 
     Raises:
-        InputError: a scorer gives no other number than 0, where nothing matches: its ranking would be another's.
+        InputError: every score of a scorer is NaN, infinite, or 0, the score of pairs without matches.
     """
     for name in scorers:
         values = np.concatenate([systems[name].scores[systems[name].rows >= 0] for systems in ranked])

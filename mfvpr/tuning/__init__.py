@@ -1,4 +1,4 @@
-"""Parameters that are searched and learned.
+"""Search and learning of the parameters of re-ranking.
 
 Read first: sweeps/ (grids and Optuna, over whole data sets in compiled calls), learning/ (losses, training, match
 weights).

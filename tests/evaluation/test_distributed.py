@@ -14,7 +14,7 @@ import pytest
 
 import mfvpr
 from mfvpr.datasets import Positives
-from mfvpr.evaluation.distributed import all_devices, retrieve_spread, score_spread
+from mfvpr.evaluation.distributed import all_devices, retrieve_on_mesh, score_on_mesh
 from mfvpr.utils import InputError
 from tests.builders import make_matches, unit
 from tests.experiments.test_shards_program import tables
@@ -52,14 +52,14 @@ def work(mesh, queries):
     """By name, what a process gets."""
     found = {}
     for name, left_out in (("all", None), ("some", retrieval()[2])):
-        shortlist = retrieve_spread(*retrieval()[:2], num_candidates=CANDIDATES, mesh=mesh, excluded=left_out)
+        shortlist = retrieve_on_mesh(*retrieval()[:2], num_candidates=CANDIDATES, mesh=mesh, excluded=left_out)
         found |= {
             f"{name} indices": shortlist.indices,
             f"{name} scores": shortlist.scores,
             f"{name} mask": shortlist.mask,
         }
     own = taken(matched(), queries)
-    return found | {"scores": score_spread(mfvpr.HistogramOfShifts(), own, mesh=mesh)}
+    return found | {"scores": score_on_mesh(mfvpr.HistogramOfShifts(), own, mesh=mesh)}
 
 
 def process(address, index, out):
@@ -109,9 +109,9 @@ def test_one_device_is_a_mesh(tmp_path):
 
 def test_what_cannot_be_spread():
     with pytest.raises(InputError, match="expected a scorer that runs on devices"):
-        score_spread(mfvpr.OpenCvHomography(), matched(), mesh=all_devices())
+        score_on_mesh(mfvpr.OpenCvHomography(), matched(), mesh=all_devices())
     with pytest.raises(ValueError, match="expected matches"):
-        score_spread(mfvpr.MatchCount(), taken(matched(), 0), mesh=all_devices())
+        score_on_mesh(mfvpr.MatchCount(), taken(matched(), 0), mesh=all_devices())
 
 
 @pytest.mark.slow

@@ -32,7 +32,7 @@ def test_recall_is_of_all_queries(rows):
         expected = [[recall_of(one, range(QUERIES), tolerance, k) for tolerance in TOLERANCES] for one in rows[0]]
         np.testing.assert_allclose(found.recall(rows[0], k), expected)
     np.testing.assert_array_equal(found.tuning(rows), [found.recall(rows[0])])
-    np.testing.assert_allclose(found.reported(rows, [2]).mean(axis=1), found.recall(rows[0])[2])
+    np.testing.assert_allclose(found.reported_hits(rows, [2]).mean(axis=1), found.recall(rows[0])[2])
 
 
 @pytest.mark.parametrize(("split", "numbers"), [("both", [0, 1]), ("first_half", [0]), ("second_half", [1])])
@@ -52,7 +52,7 @@ def test_each_half_chooses_by_its_own_view_and_is_reported_on_by_the_other(rows,
         for setting, number in zip(chosen, numbers, strict=True)
     ]  # fmt: skip
     along_the_path = np.concatenate(parts[::-1], axis=1)  # the first half is reported on by who chose on the second
-    np.testing.assert_array_equal(found.reported(rows, chosen), along_the_path)
+    np.testing.assert_array_equal(found.reported_hits(rows, chosen), along_the_path)
 
 
 def test_choosing_sees_no_candidate_of_a_reported_place():
@@ -109,7 +109,7 @@ def test_positions_are_reported_along_their_path_however_names_sort_them(split):
     positions = np.stack([rng.normal(0, 0.1, 40), 10 * north], axis=1)
     found = judge(RadiusTruth(positions, positions), [12.0], split)
     rows = np.where(north < 25, np.arange(40), -1).astype(np.int32)[None, None, :, None].repeat(3, axis=0)
-    hits = found.reported(rows, [0, 0] if split else [0])[0]
+    hits = found.reported_hits(rows, [0, 0] if split else [0])[0]
     changes = np.flatnonzero(np.diff(hits.astype(int)))
     assert hits.sum() == 25
     assert len(changes) == 1  # neighbors of the street are neighbors

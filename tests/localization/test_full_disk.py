@@ -44,7 +44,7 @@ def test_what_was_added_stays_and_adding_goes_on(tmp_path):
     need_small_disks(tmp_path)
     street = streets_folder(tmp_path / "data", num_frames=12, image_size=(160, 120))
     (tmp_path / "disk").mkdir()
-    code = f"from tests.maps.test_full_disk import fill; fill({str(tmp_path / 'disk')!r}, {str(street)!r})"
+    code = f"from tests.localization.test_full_disk import fill; fill({str(tmp_path / 'disk')!r}, {str(street)!r})"
     found = subprocess.run([*UNSHARE, sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert found.returncode == 0, found.stderr
     found = json.loads(found.stdout)

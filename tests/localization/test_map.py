@@ -486,7 +486,7 @@ def test_killed_while_adding_it_has_whole_rows(small_street, tmp_path):
     """Rows appear one by one; whatever is there can be read, and the next goes on behind it."""
     program = (
         "import sys; from pathlib import Path; from mfvpr.datasets.datasets import folder_dataset\n"
-        "from mfvpr.localization import Map; from tests.maps.test_map import SIFT, VLAD\n"
+        "from mfvpr.localization import Map; from tests.localization.test_map import SIFT, VLAD\n"
         "root = Path(sys.argv[1]); data = folder_dataset(root / 'database', root / 'queries', ground_truth='order')\n"
         "known = Map(sys.argv[2], SIFT, VLAD); known.learn(data.database); print('ready', flush=True)\n"
         "for turn in range(int(sys.argv[3]), 10**6):\n"

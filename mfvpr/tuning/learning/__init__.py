@@ -1,1 +1,1 @@
-"""What can be learned from losses of a ranking: match weights, projections, scorers' numbers; and what it is worth."""
+"""Learning of match weights, projections and parameters of scorers from losses of a ranking, and its evaluation."""

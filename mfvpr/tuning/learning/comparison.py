@@ -1,4 +1,4 @@
-"""Learned scores beside hand-set and grid-searched ones, on queries that none of them was chosen on."""
+"""Comparison of learned, hand-set and grid-searched scores, on queries that none of them was chosen on."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,10 +30,10 @@ _OF_THE_PAPER = (FeatureScoreWeight, DescriptorDistanceWeight, UnitWeight)
 
 
 class Checkpoints(NamedTuple):
-    """Where trainings are kept, and go on.
+    """The folder of trainings, where an interrupted training is continued.
 
-    folder: of all.
-    recipe: JSON values, everything that the results depend on but for the half and the model.
+    folder: of all trainings.
+    recipe: JSON values that determine the results, without the half and the model.
     """
 
     folder: Path
@@ -42,14 +42,14 @@ class Checkpoints(NamedTuple):
 
 @dataclass(frozen=True)
 class Row:
-    """One way to score, on one half.
+    """One score, chosen or learned on one half and evaluated on the other.
 
     Attributes:
-        half: where it was chosen or learned.
-        name: of the way.
+        half: name of the half to choose or learn on.
+        name: of the score.
         hits: `[thresholds, R]` bool, of the queries of the other half.
-        values: what was chosen or learned, plain.
-        fitted: the training, where there was one.
+        values: chosen or learned parameters, as plain values.
+        fitted: the training; None if nothing was trained.
     """
 
     half: str
@@ -61,10 +61,10 @@ class Row:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What became of all halves.
+    """The scores of all halves.
 
     Attributes:
-        judge: what is right.
+        judge: the ground truth.
         match_set: of all queries.
         candidates: their shortlist.
         halves: the rows of each half, in the same order.
@@ -77,33 +77,33 @@ class Comparison:
 
     def rows(self) -> Iterator[tuple[str, np.ndarray, Sequence[Row]]]:
         """Name, hits `[thresholds, R]` of all reported queries along the path, and the row of each half."""
-        for same in zip(*self.halves, strict=True):
-            yield same[0].name, self.judge.joined([row.hits for row in same]), same
+        for rows in zip(*self.halves, strict=True):
+            yield rows[0].name, self.judge.join_halves([row.hits for row in rows]), rows
 
 
 def compare(
     axes: Axes, judge: Judge, match_set: MatchSet, candidates: Shortlist, options: Options | None = None, *,
     checkpoints: Checkpoints | None = None, track: Stages = untracked_stages,
 ) -> Comparison:  # fmt: skip
-    """The scorer as it is, weighted by the ratio, the best of the grid, and what gradients find: each alone and fused.
+    """Compare a scorer as it is, weighted by the ratio, the best of a grid, and learned: each alone and fused.
 
-    Everything is chosen or learned on one half of the path, and reported on the other; or on some data sets and
-    reported on others, see `mfvpr.tuning.learning.data_sets`. Gradients go through the ranking: "gradient" learns the
-    scorer's numbers, "match weights" the weights as well; "match labels" learns weights from the matches of right pairs
-    that agree with the dominant shift, and all others.
+    Everything is chosen or learned on one half of the path and reported on the other, or chosen on some data sets and
+    reported on others, see `mfvpr.tuning.learning.data_sets`. "gradient" learns the scorer's parameters through the
+    ranking, and "match weights" the weights as well. "match labels" learns weights from labels of matches: a match is
+    correct if it is one of a correct pair and agrees with the dominant shift.
 
     Args:
-        axes: the scorer, and the grid to search; an axis `c` is in units of the c that balances filter and score.
-        judge: what is right, with halves.
+        axes: the scorer, and the grid to search; an axis `c` is in units of the c that balances retrieval and score.
+        judge: the ground truth, with halves.
         match_set: matches of Q queries with C candidates, with their ratio.
         candidates: their shortlist.
-        options: how to learn.
-        checkpoints: where a training that was interrupted goes on; None = nowhere.
+        options: of the learning.
+        checkpoints: where an interrupted training is continued; None = nowhere.
         track: progress.
 
     Raises:
         InputError: the scorer has nothing to learn or no match weight, a setting cannot be scored, a half has too few
-            queries, or the checkpoints are of something else.
+            queries, or the checkpoints belong to another training.
         TrainingError: a loss is not finite.
     """
     if not can_learn(axes.scorer) or not hasattr(axes.scorer, "weight"):
@@ -111,12 +111,12 @@ def compare(
     axes.check(match_set.image_sizes)
     options = options or Options()
     splits = training_splits(match_set, candidates, judge, filter_score=options.filter_score)
-    compared = [_Compared(split, axes, options, checkpoints, track) for split in splits]
-    return Comparison(judge, match_set, candidates, [list(one.rows()) for one in compared])
+    halves = [_HalfComparison(split, axes, options, checkpoints, track) for split in splits]
+    return Comparison(judge, match_set, candidates, [list(half.rows()) for half in halves])
 
 
 @dataclass(frozen=True)
-class _Compared:
+class _HalfComparison:
     """One half of `compare`; the other fields are its arguments."""
 
     split: TrainingSplit
@@ -126,72 +126,72 @@ class _Compared:
     track: Stages
 
     def rows(self) -> Iterator[Row]:
-        """Each is reported as soon as it is chosen or learned."""
-        own: Any = self.axes.scorer
-        yield from self.by_hand("paper" if isinstance(own.weight, _OF_THE_PAPER) else "as set", own)
-        yield from self.by_hand("1 - ratio", replace(own, weight=RatioWeight()))
-        spread = self.split.spread(own)
+        """All scores, each evaluated as soon as it is chosen or learned."""
+        scorer: Any = self.axes.scorer
+        yield from self.by_hand("paper" if isinstance(scorer.weight, _OF_THE_PAPER) else "as set", scorer)
+        yield from self.by_hand("1 - ratio", replace(scorer, weight=RatioWeight()))
+        deviation = self.split.score_deviation(scorer)
         for fused in (False, True):
             name = "grid search" + " + filter" * fused
-            chosen, plain = self.searched(name, spread, fused=fused)
-            yield replace(self.reported(name, own, chosen), values=plain)
+            setting, values = self.search(name, deviation, fused=fused)
+            yield replace(self.evaluate(name, scorer, setting), values=values)
         for learned_weight in (False, True):
             for fused in (False, True):
                 name = ("match weights" if learned_weight else "gradient") + " + filter" * fused
-                model = start(self.split, own, self.options, fused=fused, learned_weight=learned_weight)
-                fitted = self.learned(name, model)
+                model = start(self.split, scorer, self.options, fused=fused, learned_weight=learned_weight)
+                fitted = self.learn(name, model)
                 values = model.values(fitted.parameters)
                 setting = {FUSION: values[FUSION]} if fused else {}
-                row = self.reported(name, model.scorer_of(fitted.parameters), setting)
+                row = self.evaluate(name, model.scorer_of(fitted.parameters), setting)
                 yield replace(row, values=values, fitted=fitted)
-        name, model = "match labels", of_matches(self.split, own, self.options)
-        fitted = self.learned(name, model)
+        name, model = "match labels", of_matches(self.split, scorer, self.options)
+        fitted = self.learn(name, model)
         for row in self.by_hand(name, model.scorer_of(fitted.parameters)):
-            yield replace(row, fitted=fitted if row.name == name else None)  # fused by hand it is the same
+            yield replace(row, fitted=fitted if row.name == name else None)  # both rows have the same training
 
     def by_hand(self, name: str, scorer: Scorer) -> Iterator[Row]:
-        """Alone, and fused with the filter's weight that is set by hand."""
-        yield self.reported(name, scorer, {})
-        yield self.reported(f"{name} + filter", scorer, {FUSION: self.options.c})
+        """The scorer alone, and fused with the retrieval by the c of the options."""
+        yield self.evaluate(name, scorer, {})
+        yield self.evaluate(f"{name} + filter", scorer, {FUSION: self.options.c})
 
-    def reported(self, name: str, scorer: Scorer, setting: Setting) -> Row:
-        """A scorer with the values of a setting, on the half that is reported on, with all candidates."""
+    def evaluate(self, name: str, scorer: Scorer, setting: Setting) -> Row:
+        """Evaluate a setting on the half to report on, with all candidates."""
         queries, judge = self.split.half.report, self.split.judge
-        [first] = self.ranked(name, scorer, [setting], queries, self.split.candidates.mask)
-        right = [hits(first, positives.take(queries)) for positives in judge.positives]
-        return Row(self.split.name, name, np.stack(right), {}, None)
+        [first] = self.first_rows(name, scorer, [setting], queries, self.split.candidates.mask)
+        by_threshold = [hits(first, positives.take(queries)) for positives in judge.positives]
+        return Row(self.split.name, name, np.stack(by_threshold), {}, None)
 
-    def searched(self, name: str, spread: float, *, fused: bool) -> tuple[Setting, Mapping[str, Any]]:
-        """The best setting of the grid on the half to choose on: as the sweep takes it, and plain."""
+    def search(self, name: str, deviation: float, *, fused: bool) -> tuple[Setting, Mapping[str, Any]]:
+        """The best setting of the grid on the half to choose on: as the sweep takes it, and as plain values."""
         axes = self.axes if fused else self.axes.without(FUSION)
         grid, queries, judge = axes.grid(), self.split.half.tune, self.split.judge
-        settings = [self.fusing(axes.setting(plain), self.split.balance(spread), fused=fused) for plain in grid]
-        rows = self.ranked(name, axes.scorer, settings, queries, self.split.seen)
+        settings = [self.with_fusion(axes.setting(plain), self.split.balance(deviation), fused=fused) for plain in grid]
+        rows = self.first_rows(name, axes.scorer, settings, queries, self.split.seen)
         recall = hits(rows, judge.positives[judge.main].take(queries)).mean(axis=-1)
         best = best_setting(recall, axes.values)
         return settings[best], grid[best]
 
-    def fusing(self, setting: Setting, balance: float, *, fused: bool) -> Setting:
-        """With c in units of the scores, or that set by hand."""
+    def with_fusion(self, setting: Setting, balance: float, *, fused: bool) -> Setting:
+        """The setting with its c in units of the scores, or with the c of the options."""
         if fused and FUSION not in setting:
             return {**setting, FUSION: self.options.c}
         c = setting.get(FUSION)
         return setting if c is None else {**setting, FUSION: c * balance}
 
-    def ranked(
+    def first_rows(
         self, name: str, scorer: Scorer, settings: Sequence[Setting], queries: np.ndarray, seen: np.ndarray
     ) -> np.ndarray:
-        """`[S, q, 1]` the first row of some queries' rankings of the candidates that are seen, by every setting."""
+        """First rows `[S, q, 1]` of the rankings of the seen candidates by every setting."""
         track = self.track(f"{self.split.name}: {name}") if len(settings) > 1 else untracked
         part, views = self.split.part(queries), [seen[queries]]
         return sweep(scorer, settings, *part, views=views, depth=1, ties=self.options.ties, track=track)[0]
 
-    def learned(self, name: str, model: Model) -> Fit:
-        """The training, where it is kept as `half-name`."""
+    def learn(self, name: str, model: Model) -> Fit:
+        """Train a model, with checkpoints in the folder `half-name`."""
         folder, recipe = None, None
         if self.checkpoints:
-            place = f"{self.split.name}-{name}".replace(" ", "_").replace("_+_", "_")
-            folder = self.checkpoints.folder / place
+            folder_name = f"{self.split.name}-{name}".replace(" ", "_").replace("_+_", "_")
+            folder = self.checkpoints.folder / folder_name
             recipe = {**self.checkpoints.recipe, "half": self.split.name, "model": name}
         track = self.track(f"{self.split.name}: {name}")
         return train(self.split, model, self.options, folder=folder, recipe=recipe, track=track)

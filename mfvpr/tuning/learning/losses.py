@@ -1,7 +1,7 @@
-"""Losses of one query's ranking: scores, which candidates are right, which are there -> a number, smaller = better.
+"""Losses of one query's ranking: scores, positives and mask of the candidates -> a number, smaller = better.
 
-A query without a right candidate teaches nothing: its loss and its gradient are 0. Bind a temperature with
-`functools.partial` to get what `mean_loss` takes.
+A query without a positive has the loss 0 and the gradient 0. For `mean_loss`, set a temperature with
+`functools.partial`.
 """
 
 from collections.abc import Callable
@@ -21,11 +21,11 @@ def cross_entropy(scores: Array, positives: Array, mask: Array) -> Array:
 
     Args:
         scores: `[C]`; padding may hold anything.
-        positives: `[C]` bool, the right candidates.
+        positives: `[C]` bool, the correct candidates.
         mask: `[C]` bool.
     """
     scores, positives, real, teaches = _usable(scores, positives, mask)
-    # From the highest score: else a small loss is lost in the rounding of scores in the thousands.
+    # The highest score is subtracted first: else scores in the thousands round a small loss away.
     scores = scores - jax.lax.stop_gradient(jnp.max(scores, where=real, initial=-jnp.inf))
     loss = jax.nn.logsumexp(scores, where=real) - jax.nn.logsumexp(scores, where=positives)
     return jnp.where(teaches, loss, 0.0)
@@ -38,7 +38,7 @@ def smooth_recall_at_1(scores: Array, positives: Array, mask: Array, temperature
 
     Args:
         scores: `[C]`; padding may hold anything.
-        positives: `[C]` bool, the right candidates.
+        positives: `[C]` bool, the correct candidates.
         mask: `[C]` bool.
         temperature: above 0, in units of the scores; else the loss is NaN.
     """
@@ -50,20 +50,21 @@ def smooth_recall_at_1(scores: Array, positives: Array, mask: Array, temperature
 def smooth_average_precision(scores: Array, positives: Array, mask: Array, temperature: float | Array) -> Array:
     """1 - Smooth-AP (Brown et al., ECCV 2020, equation 4), `[]` in [0, 1].
 
-    A candidate's rank is 1 + the sum over all others of sigmoid(their lead / temperature). The loss tends to
-    1 - average precision as the temperature tends to 0, where a tie counts half.
+    The rank of a candidate is 1 + the sum of sigmoid(lead / temperature) over all other candidates, where lead is how
+    far their score is above its own. The loss tends to 1 - average precision as the temperature tends to 0; a tie
+    counts half.
 
     Args:
         scores: `[C]`; padding may hold anything.
-        positives: `[C]` bool, the right candidates.
+        positives: `[C]` bool, the correct candidates.
         mask: `[C]` bool.
         temperature: above 0, in units of the scores; else the loss is NaN.
     """
     scores, positives, real, teaches = _usable(scores, positives, mask)
     lead = jax.nn.sigmoid((scores[None] - scores[:, None]) / positive(temperature, scores.dtype))  # [i, j] of j over i
-    others = real[None] & ~jnp.eye(len(real), dtype=bool)
-    rank = 1 + jnp.sum(masked(lead, others), axis=1)
-    rank_among_positives = 1 + jnp.sum(masked(lead, others & positives[None]), axis=1)
+    is_other = real[None] & ~jnp.eye(len(real), dtype=bool)
+    rank = 1 + jnp.sum(masked(lead, is_other), axis=1)
+    rank_among_positives = 1 + jnp.sum(masked(lead, is_other & positives[None]), axis=1)
     return jnp.where(teaches, 1 - masked_mean(rank_among_positives / rank, positives), 0.0)
 
 
@@ -72,11 +73,11 @@ LOSSES: dict[str, Loss] = {
     "recall": partial(smooth_recall_at_1, temperature=1.0),
     "average_precision": partial(smooth_average_precision, temperature=1.0),
 }
-"""Losses that programs know, by name."""
+"""Losses of the programs, by name."""
 
 
 def mean_loss(loss: Loss, scores: Array, positives: Array, mask: Array) -> Array:
-    """Mean of `loss` over the queries that have a positive, `[]`; 0 where none has.
+    """Mean of `loss` over the queries with a positive, `[]`; 0 if there are none.
 
     Args:
         loss: of one query.
@@ -88,9 +89,9 @@ def mean_loss(loss: Loss, scores: Array, positives: Array, mask: Array) -> Array
 
 
 def _usable(scores: Array, positives: Array, mask: Array) -> tuple[Array, Array, Array, Array]:
-    """Scores, positives, real candidates, and whether the query teaches.
+    """Scores, positives, real candidates, and whether the query has a positive.
 
-    One that does not is all zeros and all positive, so that nothing is divided by 0, in gradients neither.
+    A query without one gets zeros as scores and only positives, so that losses and gradients never divide by 0.
     """
     positives = positives & mask
     teaches = jnp.any(positives)

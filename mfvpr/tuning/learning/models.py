@@ -1,4 +1,4 @@
-"""What is learned: a model is its start, and how its parameters score the candidates of a query."""
+"""Models of learning: parameters to start from, and a differentiable score of the candidates of a query."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -22,19 +22,19 @@ Parameters = dict[str, Any]  # `numbers` by name and `c` as logarithms, `sharpne
 Objective = Callable[["Parameters", Batch], Array]
 
 SHARPNESS = 2.0  # of the loss at the start, per unit of the scores
-LEAST_C = 1e-3  # of the filter at the start, in units of the scores
+LEAST_C = 1e-3  # weight of the retrieval at the start, in units of the scores
 
 
 @dataclass(frozen=True)
 class Model:
-    """One way to score.
+    """A score with parameters to learn.
 
     Attributes:
-        scorer: whose numbers are learned; its other parameters stay.
+        scorer: its numbers are learned; its other parameters stay.
         start: the parameters to begin with.
-        unit: spread of the scores at the start; what the loss sees is in this unit.
-        teacher: says which matches of a right pair are right, and these teach the match weight; None = the ranking
-            teaches.
+        unit: spread of the scores at the start; the loss sees scores in this unit.
+        teacher: labels the matches of correct pairs as correct or incorrect, from which the match weight is learned;
+            None = learn from the ranking.
     """
 
     scorer: Any
@@ -49,8 +49,8 @@ class Model:
         Args:
             scorer: the hand-set one.
             unit: spread of its scores.
-            c: the filter's weight to start with; None = not fused.
-            weight: the match weight to start with; None = the scorer's own, not learned.
+            c: the retrieval's weight to start with; None = not fused.
+            weight: the match weight to start with; None = that of the scorer, which is not learned.
         """
         numbers = to_logarithms(starts(scorer, unit))
         start: Parameters = {"numbers": numbers, "sharpness": jnp.log(jnp.asarray(SHARPNESS))}
@@ -78,17 +78,17 @@ class Model:
         return replace(self.scorer, **numbers, **weight)
 
     def c_of(self, parameters: Parameters) -> Array | None:
-        """Weight of the filter, None where it is not asked."""
+        """Weight of the retrieval; None if the score is not fused."""
         return self.unit * jnp.exp(parameters["c"]) if "c" in parameters else None
 
     def values(self, parameters: Parameters) -> dict[str, float]:
-        """What was learned, by name, but for the match weight."""
+        """Learned values by name, without the match weight."""
         scorer, c = self.scorer_of(parameters), self.c_of(parameters)
         numbers = {name: float(getattr(scorer, name)) for name in parameters["numbers"]}
         return numbers if c is None else numbers | {"c": float(c)}
 
     def objective(self, loss: Loss) -> Objective:
-        """Parameters and a batch -> mean loss of its queries; of its matches, where these teach."""
+        """A function of parameters and a batch: the mean loss of its queries, or of its matches with a teacher."""
         return self._of_ranking(loss) if self.teacher is None else partial(_of_matches, self.teacher)
 
     def _of_ranking(self, loss: Loss) -> Objective:
@@ -103,13 +103,14 @@ class Model:
 
 
 def _of_matches(teacher: HistogramOfShifts, parameters: Parameters, batch: Batch) -> Array:
-    """Cross entropy of whether a match is right, where right and wrong ones count the same in all, `[]`, in nats."""
+    """Cross entropy of the labels of matches, `[]`, in nats; correct and incorrect ones have the same total weight."""
     weight: LearnedWeight = parameters["weight"]
 
-    def judged(matches: Matches, positive: Array) -> tuple[Array, Array]:
+    def logits_and_labels(matches: Matches, positive: Array) -> tuple[Array, Array]:
         peak = teacher.dominant_shift(matches, refine=True)
         return weight.logits(matches), teacher.agrees(matches, peak) & positive
 
-    logits, right = (values.reshape(-1) for values in jax.vmap(jax.vmap(judged))(batch.matches, batch.positives))
-    wrong = (batch.matches.mask & batch.mask[..., None]).reshape(-1) & ~right
-    return (masked_mean(jax.nn.softplus(-logits), right) + masked_mean(jax.nn.softplus(logits), wrong)) / 2
+    of_pairs = jax.vmap(jax.vmap(logits_and_labels))(batch.matches, batch.positives)
+    logits, correct = (values.reshape(-1) for values in of_pairs)
+    incorrect = (batch.matches.mask & batch.mask[..., None]).reshape(-1) & ~correct
+    return (masked_mean(jax.nn.softplus(-logits), correct) + masked_mean(jax.nn.softplus(logits), incorrect)) / 2

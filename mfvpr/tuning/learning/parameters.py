@@ -1,4 +1,4 @@
-"""Positive numbers (sigma, temperature, tolerance, ...) are learned through their logarithm."""
+"""Parameters of scorers to learn. Positive numbers (sigma, temperature, ...) are learned through their logarithm."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,25 +13,28 @@ from mfvpr.utils.numerics import as_float
 
 
 def can_learn(scorer: Any) -> bool:
-    """Whether a scorer, or a class of them, has numbers that are declared to be learned."""
+    """Whether a scorer, or a class of scorers, has fields that are declared to be learned."""
     return any(parameter.learned for parameter in declared(scorer).values())
 
 
 def starts(scorer: Any, spread: float) -> dict[str, float]:
-    """Where learning starts, by the fields that are learned: its own values, or those declared where it has none.
+    """Values to start learning from, by field: the scorer's values, or declared ones for fields that are None.
 
     Args:
         scorer: a value.
-        spread: of its scores.
+        spread: standard deviation of its scores.
     """
-    learned = {name: parameter for name, parameter in declared(scorer).items() if parameter.learned}
-    own = {name: getattr(scorer, name) for name in learned}
-    begin = {name: one.start * (spread if one.unit == SCORE else 1.0) for name, one in learned.items()}
-    return {name: float(begin[name] if value is None else value) for name, value in own.items()}
+    values = {}
+    for name, field in declared(scorer).items():
+        if field.learned:
+            default = field.start * (spread if field.unit == SCORE else 1.0)
+            value = getattr(scorer, name)
+            values[name] = float(default if value is None else value)
+    return values
 
 
 def to_logarithms(values: Mapping[str, float | Array]) -> dict[str, Array]:
-    """Free parameters, any real number, of positive values of any shape.
+    """Unbounded parameters from positive values of any shape.
 
     Raises:
         InputError: a value is not above 0, or infinite.
@@ -43,5 +46,5 @@ def to_logarithms(values: Mapping[str, float | Array]) -> dict[str, Array]:
 
 
 def from_logarithms(parameters: Mapping[str, Array]) -> dict[str, Array]:
-    """The positive values of free parameters, as `dataclasses.replace(scorer, **values)` takes them."""
+    """Positive values from unbounded parameters, for `dataclasses.replace(scorer, **values)`."""
     return {name: jnp.exp(parameter) for name, parameter in parameters.items()}

@@ -12,7 +12,7 @@ from mfvpr.utils.numerics import masked, safe_sqrt
 
 @value
 class Projection:
-    """x -> x M / |x M|; a descriptor that M annihilates, and padding, become 0.
+    """x -> x M / |x M|; padding, and a descriptor with x M = 0, become 0.
 
     Attributes:
         matrix: `[D, d]`.
@@ -21,7 +21,7 @@ class Projection:
     matrix: Array  # [D, d]
 
     def __call__(self, features: Features) -> Features:
-        """Features whose descriptors `[..., N, D]` became `[..., N, d]`, of unit length; all else stays."""
+        """Project the descriptors `[..., N, D]` of features to `[..., N, d]` of unit length."""
         descriptors = masked(jnp.asarray(features.descriptors, dtype=self.matrix.dtype), features.mask)
         projected = jnp.matmul(descriptors, self.matrix, precision=jax.lax.Precision.HIGHEST)
         length = safe_sqrt(jnp.sum(projected**2, axis=-1, keepdims=True))
@@ -29,10 +29,10 @@ class Projection:
 
     @classmethod
     def principal(cls, descriptors: np.ndarray, dimension: int) -> "Projection":
-        """The projection that keeps most of the descriptors' squared length: PCA without centering.
+        """The projection that preserves most of the descriptors' squared length: PCA without centering.
 
-        Without a mean, since matching compares dot products, which a translation would change. The columns are
-        orthonormal, the strongest first.
+        The mean is not subtracted, since matching compares dot products. The columns are orthonormal, the strongest
+        first.
 
         Args:
             descriptors: `[n, D]`, all real.

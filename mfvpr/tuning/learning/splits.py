@@ -1,4 +1,4 @@
-"""Half of a path to learn on: which queries teach, which validate, and what may be seen of their candidates."""
+"""The half of a path to learn on: queries to train on, queries to validate on, and their visible candidates."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -8,7 +8,7 @@ import numpy as np
 
 from mfvpr.datasets.positives import Positives
 from mfvpr.evaluation.protocol import Judge
-from mfvpr.evaluation.selection import Half, separated
+from mfvpr.evaluation.selection import Half, separate
 from mfvpr.matching.match_set import MatchSet
 from mfvpr.reranking.batched_scoring import score
 from mfvpr.reranking.ranking import FilterScore, filter_scores
@@ -40,12 +40,12 @@ class TrainingSplit:
 
     Attributes:
         match_set: matches of all Q queries.
-        candidates: of all queries; their scores are the filter's part of a combined score.
-        judge: what is right.
-        half: where to choose and where to report.
+        candidates: of all queries; their scores are the retrieval's part of a combined score.
+        judge: the ground truth.
+        half: queries to choose on and to report on.
         train: `[t]` queries of the losses.
-        validation: `[v]` queries that stop the learning.
-        seen: `[Q, C]` bool, candidates that learning may look at.
+        validation: `[v]` queries that decide when learning stops.
+        seen: `[Q, C]` bool, candidates that learning may use.
         name: of the half.
     """
 
@@ -60,12 +60,12 @@ class TrainingSplit:
 
     @cached_property
     def right(self) -> np.ndarray:
-        """`[Q, C]` bool, candidates that are right within the threshold that decides."""
+        """Correct candidates `[Q, C]` bool at the main threshold."""
         return self._positive(self.judge.positives[self.judge.main])
 
     @cached_property
     def usable(self) -> np.ndarray:
-        """`[Q, C]` bool, candidates of the losses: seen, and not right by the widest threshold alone."""
+        """Candidates `[Q, C]` bool of the losses: seen, and not correct at the widest threshold only."""
         return self.seen & ~(self._positive(self.judge.positives[-1]) & ~self.right)
 
     def _positive(self, positives: Positives) -> np.ndarray:
@@ -73,7 +73,7 @@ class TrainingSplit:
 
     @cached_property
     def width(self) -> int:
-        """Candidates that hold every query's usable ones."""
+        """Number of candidates of a batch, at least the number of usable candidates of every query."""
         most = int(self.usable[self.half.tune].sum(axis=1).max())
         return min(round_up(most, 8), self.usable.shape[1])
 
@@ -82,7 +82,7 @@ class TrainingSplit:
         return self.match_set.take(queries), jax.tree.map(lambda values: values[queries], self.candidates)
 
     def batch(self, queries: np.ndarray, size: int) -> Batch:
-        """Some queries, padded to `size`; padding has no candidates, and what is no candidate has no matches."""
+        """A batch of queries, padded to `size` with queries without candidates."""
         padded = ragged.filled(queries, size)
         places = np.argsort(~self.usable[padded], axis=1, kind="stable")[:, : self.width]
         take = partial(np.take_along_axis, indices=places, axis=1)
@@ -92,30 +92,30 @@ class TrainingSplit:
         matches = replace(matches, mask=matches.mask & mask[..., None])
         return Batch(matches, take(self.candidates.scores[padded]), take(self.right[padded]), mask)
 
-    def spread(self, scorer: Scorer) -> float:
-        """Standard deviation of the scores that learning may see; 1 where all are equal."""
+    def score_deviation(self, scorer: Scorer) -> float:
+        """Standard deviation of the scores that learning may use; 1 if all are equal."""
         scores = score({"it": scorer}, *self.part(self.train))["it"]
         return float(np.std(scores[self.seen[self.train]])) or 1.0
 
-    def balance(self, spread: float) -> float:
-        """The c that gives the filter's scores the same spread; 0 where all are equal."""
-        deviation = float(np.std(self.candidates.scores[self.train][self.seen[self.train]]))
-        return spread / deviation if deviation else 0.0
+    def balance(self, deviation: float) -> float:
+        """The c that gives the retrieval's scores a standard deviation; 0 if they are all equal."""
+        of_retrieval = float(np.std(self.candidates.scores[self.train][self.seen[self.train]]))
+        return deviation / of_retrieval if of_retrieval else 0.0
 
 
 def training_splits(
     match_set: MatchSet, candidates: Shortlist, judge: Judge, *, filter_score: FilterScore = "cosine"
 ) -> list[TrainingSplit]:
-    """The halves of a judge, each to be learned on.
+    """Split each half of a judge into queries to train on and queries to validate on.
 
     Args:
         match_set: matches of Q queries with C candidates.
         candidates: their shortlist.
-        judge: what is right, with halves.
-        filter_score: the filter's part of a combined score, see `mfvpr.reranking.ranking.filter_scores`.
+        judge: the ground truth, with halves.
+        filter_score: the retrieval's part of a combined score, see `mfvpr.reranking.ranking.filter_scores`.
 
     Raises:
-        InputError: the judge has no halves, or one has no queries that teach, or none to validate with.
+        InputError: the judge has no halves, or a half has no usable queries to train on or to validate on.
     """
     if not judge.halves:
         raise InputError("split=None: expected first_half, second_half or both, since what is learned is never "
@@ -128,12 +128,12 @@ def training_splits(
 def _split(match_set: MatchSet, candidates: Shortlist, judge: Judge, half: Half, name: str) -> TrainingSplit:
     paths = np.split(half.tune, np.cumsum(half.paths[:-1]).astype(int)) if half.paths else [half.tune]
     pieces = [np.split(path, [len(path) - round(VALIDATION * len(path))]) for path in paths]
-    apart = separated(judge.places, *(np.concatenate(same) for same in zip(*pieces, strict=True)))
+    split_half = separate(judge.places, *(np.concatenate(parts) for parts in zip(*pieces, strict=True)))
     seen = candidates.mask & half.allowed[np.maximum(candidates.indices, 0)]
-    split = TrainingSplit(match_set, candidates, judge, half, apart.tune, apart.report, seen, name)
-    right, wrong = split.right & split.usable, ~split.right & split.usable
-    teaches = np.asarray(right.any(axis=1) & wrong.any(axis=1))  # the loss of others is 0, whatever the scores
-    train, validation = apart.tune[teaches[apart.tune]], apart.report[teaches[apart.report]]
+    split = TrainingSplit(match_set, candidates, judge, half, split_half.tune, split_half.report, seen, name)
+    correct, incorrect = split.right & split.usable, ~split.right & split.usable
+    has_both = np.asarray(correct.any(axis=1) & incorrect.any(axis=1))  # else the loss is 0 for any scores
+    train, validation = (rows[has_both[rows]] for rows in (split_half.tune, split_half.report))
     if not len(train) or not len(validation):
         raise InputError(
             f"split={name}: expected queries to learn on and to validate with, got {len(train)} and "

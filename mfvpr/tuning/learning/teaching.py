@@ -1,4 +1,4 @@
-"""Where learning starts on one half of a path, and its training."""
+"""Initial models for one half of a path, and their training."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,16 +18,16 @@ from mfvpr.tuning.learning.splits import Batch, TrainingSplit
 from mfvpr.tuning.learning.training import Fit, fit
 
 TEACHER_SIGMA = 0.03  # of the teacher of single matches, in units of the largest side of an image
-FIRST_SHARE = 0.3  # of the filter where learning starts, in units of what balances it
+FIRST_SHARE = 0.3  # the retrieval's weight at the start, in units of the balanced weight
 
 
 @dataclass(frozen=True)
 class Options:
-    """How scores are learned and compared.
+    """Options of learning and comparing scores.
 
     Attributes:
-        c: weight of the filter where it is set by hand, None = balanced.
-        filter_score: the filter's part of a combined score, as in `mfvpr.reranking.ranking.fuse_shortlist`.
+        c: the retrieval's weight if it is set by hand; None = balanced.
+        filter_score: the retrieval's part of a combined score, as in `mfvpr.reranking.ranking.fuse_shortlist`.
         ties: as in `mfvpr.reranking.ranking.rank_shortlist`.
         loss: of one query.
         steps: updates of a training, at most.
@@ -36,8 +36,8 @@ class Options:
         batch: queries of a step.
         learning_rate: of Adam.
         hidden: width of the network of match weights.
-        inputs: what that network sees of a match, see `LearnedWeight`.
-        seed: of that network, and of the order of the queries.
+        inputs: properties of a match that the network sees, see `LearnedWeight`.
+        seed: of the network, and of the order of the queries.
     """
 
     c: float | None = None
@@ -57,34 +57,34 @@ class Options:
 def start(
     split: TrainingSplit, scorer: Any, options: Options, *, fused: bool = False, learned_weight: bool = False
 ) -> Model:
-    """Where learning starts, from a hard scorer.
+    """The model that learns from rankings, starting from a hard scorer.
 
     Args:
         split: to learn on.
         scorer: the hand-set one.
-        options: how to learn.
-        fused: whether the filter's weight is learned as well.
-        learned_weight: whether the match weight is, from 1 for every match.
+        options: of the learning.
+        fused: learn the retrieval's weight as well.
+        learned_weight: learn the match weight as well, starting from 1 for every match.
     """
     weight = None
     if learned_weight:
-        scorer = replace(scorer, weight=UnitWeight())  # what a learned weight starts as
+        scorer = replace(scorer, weight=UnitWeight())  # the start of a learned weight
         weight = _first_weight(split, options)
-    spread = split.spread(scorer)
-    c = FIRST_SHARE * split.balance(spread) if fused else None
-    return Model.of(parameters.fit(scorer, *split.match_set.image_sizes), spread, c=c, weight=weight)
+    deviation = split.score_deviation(scorer)
+    c = FIRST_SHARE * split.balance(deviation) if fused else None
+    return Model.of(parameters.fit(scorer, *split.match_set.image_sizes), deviation, c=c, weight=weight)
 
 
 def of_matches(split: TrainingSplit, scorer: Any, options: Options) -> Model:
-    """Where learning from single matches starts.
+    """The model that learns a match weight from labels of single matches.
 
     Args:
         split: to learn on.
         scorer: the hand-set one.
-        options: how to learn.
+        options: of the learning.
     """
     sizes = split.match_set.image_sizes
-    seen, _ = split.match_set.take(split.half.tune).image_sizes  # or reported images would change what is taught
+    seen, _ = split.match_set.take(split.half.tune).image_sizes  # else reported images would change the labels
     sigma = TEACHER_SIGMA * float(np.max(seen))
     teacher = HistogramOfShifts(bin_size=sigma / 2, sigma=sigma, weight=RatioWeight())
     scorer = parameters.fit(scorer, *sizes)
@@ -92,9 +92,9 @@ def of_matches(split: TrainingSplit, scorer: Any, options: Options) -> Model:
 
 
 def _first_weight(split: TrainingSplit, options: Options) -> LearnedWeight:
-    """1 for every match, with the statistics of a few queries from everywhere along the path."""
-    some = split.train[np.linspace(0, len(split.train) - 1, min(options.batch, len(split.train))).astype(int)]
-    matches = split.batch(some, options.batch).matches
+    """A match weight of 1, with statistics of the matches of a few queries that are spread along the path."""
+    queries = split.train[np.linspace(0, len(split.train) - 1, min(options.batch, len(split.train))).astype(int)]
+    matches = split.batch(queries, options.batch).matches
     return LearnedWeight.create(jax.random.key(options.seed), matches, options.hidden, names=options.inputs)
 
 
@@ -104,23 +104,23 @@ def train(split: TrainingSplit, model: Model, options: Options, **keeping: Any) 
     Args:
         split: to learn on.
         model: the start.
-        options: how to learn.
+        options: of the learning.
         keeping: `folder`, `recipe` and `track` of `mfvpr.tuning.learning.training.fit`.
     """
     size = options.batch
     objective = model.objective(options.loss)
-    validated = jax.jit(objective)
+    mean_loss = jax.jit(objective)
     parts = [split.validation[place : place + size] for place in range(0, len(split.validation), size)]
     validation = [(split.batch(part, size), len(part)) for part in parts]
 
     def batches(step: int) -> Batch:
-        """Every query once before any comes again, in an order that the step alone decides."""
+        """The batch of a step: every query once per epoch, in an order that depends on the step alone."""
         epoch, place = divmod(step, -(-len(split.train) // size))
         order = np.random.default_rng([options.seed, epoch]).permutation(split.train)
         return split.batch(order[place * size : (place + 1) * size], size)
 
     def validate(learned: Parameters) -> float:
-        return sum(float(validated(learned, batch)) * count for batch, count in validation) / len(split.validation)
+        return sum(float(mean_loss(learned, batch)) * count for batch, count in validation) / len(split.validation)
 
     return fit(
         model.start, objective, batches, optimizer=optax.adam(options.learning_rate), steps=options.steps,

@@ -1,4 +1,4 @@
-"""Gradient descent on a pytree of arrays: validated, stopped in time, and resumed to the bit."""
+"""Gradient descent on a pytree of arrays, with validation, early stopping, and resuming to the bit."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -19,13 +19,15 @@ from mfvpr.utils.progress import Track, untracked
 
 
 class TrainingError(InputError):
-    """Something became NaN or infinite. The message is one line: when, what, with which values, and the mend."""
+    """A value became NaN or infinite. The message is one line: step, value, parameters, and how to fix it."""
 
 
 class Record(NamedTuple):
-    """One validation: after how many steps, their mean loss since the one before, and its result (smaller = better).
+    """One validation.
 
-    Before the first step there is no loss; without `validate` there is no validation.
+    step: number of steps before it.
+    loss: mean over the steps since the previous record; None before the first step.
+    validation: its result, smaller = better; None without `validate`.
     """
 
     step: int
@@ -34,10 +36,10 @@ class Record(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """What a training came to.
+    """The result of a training.
 
-    parameters: those of the best validation, the start included; the last ones where nothing validates.
-    step: after how many steps they were reached.
+    parameters: of the best validation, which may be the start; the last ones without validation.
+    step: number of steps that lead to them.
     history: every validation, the start first.
     ended: why the training ended, in words.
     """
@@ -49,7 +51,7 @@ class Fit(NamedTuple):
 
 
 class _State(NamedTuple):
-    """All that a training goes on from, but for its history."""
+    """The state of a training, without its history."""
 
     parameters: Any
     best: Any
@@ -75,20 +77,20 @@ def fit(
     Args:
         parameters: pytree of floating-point arrays to start from.
         objective: parameters and a batch -> loss `[]`; compiled once per shape of the batches.
-        batches: a step, counted from 0, -> its batch; the same whenever it is asked.
+        batches: a step, counted from 0, -> its batch; the same batch in every call.
         optimizer: of optax.
-        steps: updates in all, those of a run that is resumed included.
+        steps: total number of updates, also of a resumed training.
         validate: parameters -> a number, smaller = better.
         every: steps from one validation, and checkpoint, to the next; the last step has both as well.
         patience: validations without a gain after which to stop.
-        folder: where checkpoints are kept; a training that is found there goes on, and ends with the very bits of one
-            that was never interrupted (given the same `every`), also where it had ended and is given more steps.
-        recipe: JSON values that say what is trained: the model, the data, every setting that the result depends on.
+        folder: of checkpoints. A training in it is resumed, also to do more steps. With the same `every`, the result
+            has the bits of a training that was never interrupted.
+        recipe: JSON values that determine the result: the model, the data, all settings.
         track: progress over the steps.
 
     Raises:
-        InputError: the folder cannot be used, another process trains in it, or it holds something else, or the
-            checkpoint of something else, or of more steps.
+        InputError: the folder cannot be used, another process trains in it, or it has other files, or a checkpoint of
+            another training or of more steps.
         TrainingError: loss, gradient, parameters or validation are not finite. The last checkpoint stays.
     """
     if every < 1 or steps < 0 or (patience is not None and (validate is None or patience < 1)):
@@ -99,13 +101,13 @@ def fit(
     start = _State(parameters, parameters, _strong(optimizer.init(parameters)))
     with checkpoints.held(folder) if folder else nullcontext():
         state, history = training.descend(*training.begin(start))
-    exhausted = _exhausted(history, patience)
-    ended = f"no gain in {patience} validations" if exhausted else f"all {steps} steps are done"
+    is_early = _is_exhausted(history, patience)
+    ended = f"no gain in {patience} validations" if is_early else f"all {steps} steps are done"
     return Fit(state.best, _best(history).step, tuple(history), ended)
 
 
 def _update(objective: Callable, optimizer: optax.GradientTransformation) -> Callable:
-    """The compiled step: parameters, optimizer state, batch -> both updated, loss, gradient, all is finite `[]`."""
+    """Compile a step: parameters, optimizer state, batch -> both updated, loss, gradient, whether all is finite."""
 
     @jax.jit
     def update(parameters: Any, memory: Any, batch: Any) -> tuple[Any, Any, Array, Any, Array]:
@@ -121,7 +123,7 @@ def _update(objective: Callable, optimizer: optax.GradientTransformation) -> Cal
 
 @dataclass(frozen=True)
 class _Training:
-    """The way from a state and its history to the next; the fields are the arguments of `fit`."""
+    """The steps of a training; the fields are arguments of `fit`."""
 
     update: Callable
     batches: Callable[[int], Any]
@@ -134,7 +136,7 @@ class _Training:
     track: Track
 
     def begin(self, state: _State) -> tuple[_State, list[Record], list[float]]:
-        """Where the folder's training stands, or `state` at the start; and the losses since the last validation."""
+        """State, history and the losses since the last validation, from the folder or at the start."""
         stored = checkpoints.restore(self.folder, self.recipe, state) if self.folder else None
         if stored is None:
             return state, [Record(0, None, self.validation(state.parameters, 0))], []
@@ -148,36 +150,38 @@ class _Training:
         return state, history, losses
 
     def descend(self, state: _State, history: list[Record], losses: list[float]) -> tuple[_State, list[Record]]:
-        """All steps that are left, unless patience ends before."""
+        """Do the remaining steps, until patience ends."""
         done = history[-1].step + len(losses)
-        left = 0 if _exhausted(history, self.patience) else self.steps - done
-        for step in self.track(range(done, done + left), left):
+        remaining = 0 if _is_exhausted(history, self.patience) else self.steps - done
+        for step in self.track(range(done, done + remaining), remaining):
             state, loss = self.advance(state, step)
             losses = [*losses, loss]
-            if due := (step + 1) % self.every == 0:
-                state, history, losses = self.validated(state, history, losses)
-            if self.folder and (due or step + 1 == self.steps):
+            if is_due := (step + 1) % self.every == 0:
+                state, history, losses = self.add_record(state, history, losses)
+            if self.folder and (is_due or step + 1 == self.steps):
                 checkpoints.save(self.folder, step + 1, self.recipe, state, (history, losses))
-            if _exhausted(history, self.patience):
+            if _is_exhausted(history, self.patience):
                 break
-        if losses:  # after the checkpoint: whoever asks for more steps would not have validated here
-            state, history, _ = self.validated(state, history, losses)
+        if losses:  # after the checkpoint: a training of more steps would not validate here
+            state, history, _ = self.add_record(state, history, losses)
         return state, history
 
-    def validated(self, state: _State, history: list[Record], losses: list[float]) -> tuple[_State, list[Record], list]:
-        """With one more record; no losses are left."""
+    def add_record(
+        self, state: _State, history: list[Record], losses: list[float]
+    ) -> tuple[_State, list[Record], list[float]]:
+        """Validate; return the state with the best parameters so far, the history, and no losses."""
         step = history[-1].step + len(losses)
         history = [*history, Record(step, float(np.mean(losses)), self.validation(state.parameters, step))]
         return state._replace(best=state.parameters) if _best(history) is history[-1] else state, history, []
 
     def advance(self, state: _State, step: int) -> tuple[_State, float]:
-        """One step, and its loss before it."""
+        """Do one step; return the loss before it as well."""
         batch = self.batches(step)
         parameters, memory, loss, gradient, finite = self.update(state.parameters, state.optimizer, batch)
         if not finite:
             suspects = checkpoints.named({"loss": loss, "gradient": gradient, "updated": parameters})
             culprit = next(name for name, leaf in suspects.items() if not np.all(np.isfinite(leaf)))
-            raise self.broken(f"{culprit} of batch {step}", state.parameters, step)
+            raise self.error(f"{culprit} of batch {step}", state.parameters, step)
         return _State(parameters, state.best, memory), float(loss)
 
     def validation(self, parameters: Any, step: int) -> float | None:
@@ -185,30 +189,30 @@ class _Training:
             return None
         value = float(self.validate(parameters))
         if not math.isfinite(value):
-            raise self.broken("validation", parameters, step)
+            raise self.error("validation", parameters, step)
         return value
 
-    def broken(self, what: str, parameters: Any, step: int) -> TrainingError:
+    def error(self, what: str, parameters: Any, step: int) -> TrainingError:
         leaves = checkpoints.named(parameters).items()
         scalars = [f"{name or 'parameter'}={float(leaf):.6g}" for name, leaf in leaves if leaf.ndim == 0]
         values = f" at {', '.join(scalars)}" if scalars else ""
         saved = self.folder and checkpoints.newest(self.folder)
-        kept = f"the last good checkpoint is {saved}" if saved else "there is no checkpoint yet"
+        checkpoint = f"the last good checkpoint is {saved}" if saved else "there is no checkpoint yet"
         return TrainingError(
-            f"step {step}: {what} is not finite{values}; {kept}; look at the data, or lower the learning rate"
+            f"step {step}: {what} is not finite{values}; {checkpoint}; look at the data, or lower the learning rate"
         )
 
 
 def _best(history: Sequence[Record]) -> Record:
-    """The first record of the smallest validation; the last record where nothing validates."""
-    validated = [(record.validation, record.step, record) for record in history if record.validation is not None]
-    return min(validated)[-1] if validated else history[-1]
+    """The first record with the smallest validation; the last record without validation."""
+    validations = [(record.validation, record.step, record) for record in history if record.validation is not None]
+    return min(validations)[-1] if validations else history[-1]
 
 
-def _exhausted(history: Sequence[Record], patience: int | None) -> bool:
+def _is_exhausted(history: Sequence[Record], patience: int | None) -> bool:
     return patience is not None and len(history) - 1 - history.index(_best(history)) >= patience
 
 
 def _strong(tree: Any) -> Any:
-    """Arrays of a definite type: a Python number would compile once more when an array takes its place."""
+    """Arrays with strong types: a weak type would compile once more when a strong one takes its place."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=jnp.result_type(leaf)), tree)

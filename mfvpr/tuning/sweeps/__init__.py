@@ -1,4 +1,4 @@
-"""Parameters of the re-ranking searched over whole data sets, in compiled calls on cached matches."""
+"""Search of parameters of re-ranking over complete data sets, in compiled calls on cached matches."""
 
 from mfvpr.tuning.sweeps.axes import Axes
 from mfvpr.tuning.sweeps.outcome import Outcome

@@ -1,4 +1,4 @@
-"""What a sweep varies, written in plain values: words, numbers, None."""
+"""The axes of a sweep, in plain values: words, numbers, None."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -14,19 +14,19 @@ from mfvpr.tuning.sweeps.settings import FUSION, Setting, grid
 from mfvpr.utils.errors import InputError
 
 MAX_DISTANCE = "max_distance"
-CAPACITY = ("bin_size", "align")  # what decides how many bins there are
+CAPACITY = ("bin_size", "align")  # parameters that determine the number of bins
 
 
 @dataclass(frozen=True)
 class Axes:
-    """What is varied.
+    """Parameters to vary, and their values.
 
     Attributes:
-        scorer: whose other parameters stay.
-        values: by name, different ones of each. Names are fields of the scorer, their values plain where the field is
-            declared (`mfvpr.scoring.fields`: a weight is the word `fs`, no limit is None); `max_distance` of matches,
-            None = any; and `c` of the fusion with the filter, "auto" = balanced.
-        own: the value of each that the scorer has, or would be used without a sweep; plain as well.
+        scorer: its other parameters stay.
+        values: distinct values by name. A name is a field of the scorer, `max_distance` of matches (None = any), or `c`
+            of the fusion with retrieval ("auto" = balanced). Values of declared fields are plain
+            (`mfvpr.scoring.fields`: a weight is the word `fs`, no limit is None).
+        own: by name, the plain value of the scorer, or the one that is used without a sweep.
     """
 
     scorer: Scorer
@@ -35,34 +35,34 @@ class Axes:
 
     @property
     def size(self) -> int:
-        """Settings of the grid."""
+        """Number of settings of the grid."""
         return math.prod(map(len, self.values.values()))
 
     def grid(self) -> list[dict[str, Any]]:
-        """Every combination, plain."""
+        """Every combination of the plain values."""
         return grid(self.values)
 
     def without(self, name: str) -> "Axes":
-        """The others."""
-        values, own = ({key: one for key, one in of.items() if key != name} for of in (self.values, self.own))
-        return Axes(self.scorer, values, own)
+        """All axes but one."""
+        values = {key: value for key, value in self.values.items() if key != name}
+        return Axes(self.scorer, values, {key: value for key, value in self.own.items() if key != name})
 
     def setting(self, plain: Mapping[str, Any]) -> Setting:
-        """A combination as `mfvpr.tuning.sweeps.sweep` takes it.
+        """Convert plain values to a setting of `mfvpr.tuning.sweeps.sweep`.
 
         Raises:
-            InputError: a word that is none of its parameter's.
+            InputError: a word that its parameter does not have.
         """
         return {name: self._value(name, value) for name, value in plain.items()}
 
     def check(self, image_sizes: tuple[np.ndarray, np.ndarray]) -> None:
-        """Refuse before any work what would be refused when its turn comes.
+        """Raise errors of settings before any work.
 
         Args:
-            image_sizes: `[n, 2]` of queries and of database images, all that occur (`MatchSet.image_sizes`).
+            image_sizes: `[n, 2]` all sizes of queries and of database images (`MatchSet.image_sizes`).
 
         Raises:
-            InputError: the scorer's own values are of other parameters, or histograms have more bins than there may be.
+            InputError: `own` and `values` have different names, or a histogram has too many bins.
         """
         if {*self.own} != {*self.values}:
             raise InputError(f"own: expected a value of each of {', '.join(self.values)}, got {', '.join(self.own)}")

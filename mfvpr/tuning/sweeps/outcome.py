@@ -1,4 +1,4 @@
-"""What a sweep came to: the best setting, and what it is worth on queries that it was not chosen on."""
+"""The result of a sweep: the best setting, and its recall on queries that it was not chosen on."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,13 +14,13 @@ from mfvpr.tuning.sweeps.axes import Axes
 
 
 class Verdict(NamedTuple):
-    """The chosen settings beside the scorer's own values, at one threshold.
+    """Comparison of the chosen settings with the scorer's own values, at one threshold.
 
-    threshold: what counts as right.
-    queries: that are reported on.
-    chosen, own: recall at 1.
-    mcnemar: whether they differ; the chosen ones are first.
-    sign_flips: the same by blocks of the path.
+    threshold: largest distance of a correct prediction.
+    queries: number of queries that are reported on.
+    chosen, own: recall@1.
+    mcnemar: test of their difference; the chosen settings are first.
+    sign_flips: the same test by blocks of the path.
     """
 
     threshold: float
@@ -33,15 +33,15 @@ class Verdict(NamedTuple):
 
 @dataclass(frozen=True)
 class Outcome:
-    """All rankings of a sweep, and what follows from them.
+    """All rankings of a sweep, and their evaluation.
 
     Attributes:
-        axes: what was varied.
-        judge: what is right, with the views of the shortlist.
-        settings: S plain ones; of a whole grid those come first, in its order.
+        axes: of the sweep.
+        judge: the ground truth, with the views of the shortlist.
+        settings: S settings in plain values; those of a complete grid come first, in its order.
         rows: `[V, S, Q, depth]` database rows, best first.
-        ks: of the recall, ascending; none beyond the depth.
-        is_grid: whether all settings of the grid are there.
+        ks: depths of the recall, ascending, up to the depth of `rows`.
+        is_grid: whether `settings` has all settings of the grid.
     """
 
     axes: Axes
@@ -53,17 +53,17 @@ class Outcome:
 
     @cached_property
     def recall(self) -> np.ndarray:
-        """`[S, thresholds]` at 1, of all queries."""
+        """Recall@1 `[S, thresholds]` over all queries."""
         return self.judge.recall(self.rows[0])
 
     @property
     def own(self) -> int:
-        """The number of the scorer's own values."""
+        """Number of the setting with the scorer's own values."""
         return self.settings.index(dict(self.axes.own))
 
     @cached_property
     def chosen(self) -> list[int]:
-        """The number of the best setting, for each half."""
+        """Number of the best setting, for each half."""
         size = self.axes.size if self.is_grid else len(self.settings)
         axes = self.axes.values if self.is_grid else None
         tuning = self.judge.tuning(self.rows)
@@ -71,13 +71,13 @@ class Outcome:
 
     @cached_property
     def report(self) -> list[Verdict]:
-        """By threshold, of the queries that are reported on."""
-        chosen = self.judge.reported(self.rows, self.chosen)
-        own = self.judge.reported(self.rows, [self.own] * len(self.chosen))
+        """Verdicts by threshold, on the queries to report on."""
+        chosen_hits = self.judge.reported_hits(self.rows, self.chosen)
+        own_hits = self.judge.reported_hits(self.rows, [self.own] * len(self.chosen))
         return [
             Verdict(
                 threshold, len(first), estimate(first), estimate(second),
                 mcnemar(first, second), block_sign_flips(first, second),
             )
-            for threshold, first, second in zip(self.judge.thresholds, chosen, own, strict=True)
+            for threshold, first, second in zip(self.judge.thresholds, chosen_hits, own_hits, strict=True)
         ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Settings of a sweep -> groups that one program serves: of the same choices, and of about as many bins."""
+"""Settings of a sweep -> groups that share one program: the same choices, and similar numbers of bins."""
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,11 +24,11 @@ class Group:
     """Settings of one program, the product of G settings and W weightings.
 
     Attributes:
-        scorer: with the choices and the capacity of these settings.
+        scorer: with the choices and the capacity for these settings.
         settings: `[G]` values by parameter.
         weightings: `[W]` values of `weight` (an option's number) and `max_distance`.
         rows: `[G, W]` numbers of the settings.
-        program: what the scorer computes, where that is asked.
+        program: the scorer's program as text, if blocks are stored.
     """
 
     scorer: Any
@@ -38,7 +38,7 @@ class Group:
     program: str = ""
 
     def blocks(self, size: int) -> Iterator["Group"]:
-        """Parts of one shape with at most `size` settings each; the last repeats what it has to reach it."""
+        """Parts of one shape with at most `size` settings each; the last part repeats settings to reach the shape."""
         width = min(size, self.rows.shape[1])
         for columns in _parts(self.rows.shape[1], width):
             for lines in _parts(self.rows.shape[0], max(1, size // width)):
@@ -53,29 +53,28 @@ def grid(axes: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
 
 
 def distinct(settings: Sequence[Setting]) -> tuple[list[dict[str, Any]], list[list[int]]]:
-    """The settings that are scored differently, without `c`, and the places in `settings` that share their scores."""
+    """Settings with different scores, without `c`, and for each the places in `settings` that share its scores."""
     places: dict[Any, list[int]] = {}
-    scored = {}
+    unique = {}
     for place, setting in enumerate(settings):
-        own = {name: value for name, value in setting.items() if name != FUSION}
-        key = _key(own)
+        without_c = {name: value for name, value in setting.items() if name != FUSION}
+        key = _key(without_c)
         places.setdefault(key, []).append(place)
-        scored.setdefault(key, own)
-    return list(scored.values()), list(places.values())
+        unique.setdefault(key, without_c)
+    return list(unique.values()), list(places.values())
 
 
 def groups(scorer: Any, settings: Sequence[Setting], image_sizes: tuple[np.ndarray, np.ndarray]) -> Iterator[Group]:
-    """All settings, group by group.
+    """Group settings by program.
 
     Args:
-        scorer: whose other parameters stay.
-        settings: the same names in each. What is static, or None, costs a program for each value.
-        image_sizes: all that occur, `[n, 2]` of queries and of database images.
+        scorer: its other parameters stay.
+        settings: the same names in each. Each value of a static parameter, and None, has its own program.
+        image_sizes: `[n, 2]` all sizes of queries and of database images.
     """
-    static = parameters.choices(scorer)
-    whole = parameters.whole_numbers(scorer)
+    static, integers = parameters.choices(scorer), parameters.whole_numbers(scorer)
     weights = list({id(s["weight"]): s["weight"] for s in settings if "weight" in s}.values())
-    for choices, members in _grouped(
+    for choices, members in _group_by(
         settings, range(len(settings)), lambda name, value: name in static or value is None
     ):
         chosen = with_parameters(scorer, choices)
@@ -83,31 +82,29 @@ def groups(scorer: Any, settings: Sequence[Setting], image_sizes: tuple[np.ndarr
             chosen = replace(chosen, weight=ChosenWeight(tuple(weights), 0))
         chosen = held(chosen)
         for rows in _products(settings, members):
-            values = _arrays(
-                [settings[row] for row in rows[:, 0]], weights, whole=whole, without={*choices, *WEIGHTINGS}
-            )
+            values = _arrays([settings[row] for row in rows[:, 0]], weights, integers, without={*choices, *WEIGHTINGS})
             weightings = _arrays(
-                [settings[row] for row in rows[0]], weights, whole=whole, without=set(settings[0]) - set(WEIGHTINGS)
+                [settings[row] for row in rows[0]], weights, integers, without=set(settings[0]) - set(WEIGHTINGS)
             )
             for fitted, part in grids.by_capacity(chosen, values, len(rows), *image_sizes):
                 yield Group(fitted, {name: axis[part] for name, axis in values.items()}, weightings, rows[part])
 
 
 def _products(settings: Sequence[Setting], members: Sequence[int]) -> list[np.ndarray]:
-    """The members as products `[G, W]` of settings and weightings: those with the same weightings are one."""
-    columns = _grouped(settings, members, lambda name, _: name in WEIGHTINGS)
+    """Split the members into products `[G, W]` of settings and weightings."""
+    columns = _group_by(settings, members, lambda name, _: name in WEIGHTINGS)
     column = {row: place for place, (_, rows) in enumerate(columns) for row in rows}
     products: dict[tuple[int, ...], list[list[int]]] = {}
-    for _, line in _grouped(settings, members, lambda name, _: name not in WEIGHTINGS):
+    for _, line in _group_by(settings, members, lambda name, _: name not in WEIGHTINGS):
         line = sorted(line, key=column.__getitem__)
         products.setdefault(tuple(column[row] for row in line), []).append(line)
     return [np.array(lines) for lines in products.values()]
 
 
-def _grouped(
+def _group_by(
     settings: Sequence[Setting], members: Sequence[int], chosen: Callable[[str, Any], bool]
 ) -> list[tuple[dict, list[int]]]:
-    """Members that share the chosen names' values, with those values."""
+    """Group the members by the values of the chosen names; return the values and the members of each group."""
     groups: dict[Any, tuple[dict, list[int]]] = {}
     for row in members:
         shared = {name: value for name, value in settings[row].items() if chosen(name, value)}
@@ -116,15 +113,15 @@ def _grouped(
 
 
 def _arrays(
-    settings: Sequence[Setting], weights: Sequence[Any], *, whole: set[str], without: set[str]
+    settings: Sequence[Setting], weights: Sequence[Any], integers: set[str], *, without: set[str]
 ) -> dict[str, np.ndarray]:
-    """`[n]` values by name, int where `whole`; a kind of weight is its number among `weights`."""
+    """Values `[n]` by name; a match weight is its number among `weights`."""
     number = {id(weight): place for place, weight in enumerate(weights)}
     names = [name for name in settings[0] if name not in without]
     return {
         name: np.array([number[id(setting[name])] for setting in settings])
         if name == "weight"
-        else np.array([setting[name] for setting in settings], int if name in whole else np.float32)
+        else np.array([setting[name] for setting in settings], int if name in integers else np.float32)
         for name in names
     }
 
@@ -134,6 +131,6 @@ def _key(setting: Setting) -> tuple:
 
 
 def _parts(total: int, size: int) -> list[np.ndarray]:
-    """Even parts of range(total), none longer than `size`, all of one length: the last repeats its last."""
+    """Parts of range(total) of one length, at most `size`; the last part repeats its last number."""
     length = -(-total // -(-total // size))
     return [np.minimum(np.arange(start, start + length), total - 1) for start in range(0, total, length)]

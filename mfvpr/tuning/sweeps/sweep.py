@@ -1,7 +1,8 @@
-"""Every setting of a sweep on every query: scores, rankings, and of those the first few rows.
+"""Scores and the first rows of the rankings of every query by every setting of a sweep.
 
 Settings are batch axes of one compiled call. Matches are scored pair by pair, whatever query they belong to. Work goes
-block by block (some settings, some queries), which bounds the memory and is where an interrupted sweep goes on.
+block by block (some settings, some queries): this bounds the memory, and an interrupted sweep continues with the next
+block.
 """
 
 import itertools
@@ -35,12 +36,12 @@ _ALONE = "alone"  # the c of a score that is not fused
 
 @dataclass(frozen=True)
 class Work:
-    """What `sweep` was asked for, and a part of the queries.
+    """The arguments of `sweep` for a part of the queries.
 
     Attributes:
         match_set: of all queries.
         queries: the part.
-        settings: that a program serves, for which the batches are made.
+        settings: mean number of settings of a program, for the size of the batches.
         candidates: of the part, `[q, C]`.
         views: V times the candidates `[q, C]` bool that are ranked.
         depth: rows kept of each ranking.
@@ -59,15 +60,15 @@ class Work:
 
     @cached_property
     def digest(self) -> str:
-        """Of the matches, how scales are fused, the shortlist and the views of these queries."""
-        taken = [scale.take(self.queries) for scale in scales(self.match_set)]
+        """Hash of the matches, the fusion of scales, the shortlist and the views of these queries."""
+        parts = [scale.take(self.queries) for scale in scales(self.match_set)]
         fusion = (self.match_set.weights, self.match_set.normalize) if isinstance(self.match_set, Scales) else ()
         return content_hash(
-            fusion, [(scale.counts, scale.matches) for scale in taken], self.candidates, list(self.views)
+            fusion, [(scale.counts, scale.matches) for scale in parts], self.candidates, list(self.views)
         )
 
     def parts(self, size: int) -> Iterator["Work"]:
-        """The same for at most `size` queries at a time."""
+        """Split into at most `size` queries at a time."""
         for start in range(0, len(self.queries), size):
             part = slice(start, start + size)
             candidates = jax.tree.map(lambda values: values[part], self.candidates)  # noqa: B023
@@ -85,23 +86,23 @@ def sweep(
     """The first rows of every query's ranking by every setting.
 
     Args:
-        scorer: whose other parameters stay.
-        settings: S times values by name, the same names in each: fields of the scorer (numbers are batch axes, what
-            is static costs a program for each value), `weight` (a Weight), `max_distance` of matches, and `c` of the
-            fusion with the filter (None = balanced). Without `c` the score alone ranks.
-        match_set: matches of Q queries with C candidates; those of several scales are scored one by one and fused over
-            the candidates that are ranked.
+        scorer: its other parameters stay.
+        settings: S times values by name, the same names in each: fields of the scorer (numbers are batch axes; each
+            value of a static field has its own program), `weight` (a Weight), `max_distance` of matches, and `c` of the
+            fusion with retrieval (None = balanced). Without `c` the score alone ranks.
+        match_set: matches of Q queries with C candidates; several scales are scored one by one and fused over the
+            candidates that are ranked.
         candidates: their shortlist.
         views: V times the candidates `[Q, C]` bool that are ranked; by default one, all of the shortlist.
-        depth: how many rows of a ranking are kept.
+        depth: number of rows of a ranking to return.
         ties: as in `reranking.rank_shortlist`.
         filter_score: as in `reranking.fuse_shortlist`.
-        settings_per_block: by default 64. The result does not depend on it, nor on the next.
-        queries_per_block: by default what 256 MB hold.
-        folder: where finished blocks are kept, to be read instead of being computed again; None = nowhere. Blocks of
-            other matches, shortlists, values or scorers, by what their code computes, may lie there as well. A scorer
-            that calls back to Python, or scores on the host, is computed anew: nobody sees what that does.
-        devices: that share the batches of pairs; no bit of the scores depends on it. None = the one that JAX takes.
+        settings_per_block: by default 64. The result does not depend on it.
+        queries_per_block: by default as many as fit into 256 MB. The result does not depend on it.
+        folder: where finished blocks are stored, and read instead of being computed again; None = nowhere. It may hold
+            blocks of other sweeps, which differ in matches, shortlists, values or the program of the scorer. Blocks of
+            a scorer that calls back to Python or runs on the host are never stored, since its code is not known.
+        devices: that share the batches of pairs, without any change of the scores; None = the one that JAX takes.
         track: progress over blocks.
 
     Returns:
@@ -112,60 +113,60 @@ def sweep(
     grids.refuse_own_names(scorer, names, reserved=(*grids.WEIGHTINGS, FUSION))
     num_queries = len(candidates.mask)
     views = [candidates.mask] if views is None else views
-    scored_once, places = distinct(settings)
-    per_block = min(settings_per_block or SETTINGS_PER_BLOCK, len(scored_once))
+    unique, places = distinct(settings)
+    per_block = min(settings_per_block or SETTINGS_PER_BLOCK, len(unique))
     queries = queries_per_block or queries_that_fit(match_set, per_block)
-    found_groups = list(groups(scorer, scored_once, match_set.image_sizes))
-    per_program = len(scored_once) / len(found_groups)
+    programs = list(groups(scorer, unique, match_set.image_sizes))
+    per_program = len(unique) / len(programs)
     work = Work(match_set, range(num_queries), per_program, candidates, views, depth, ties, filter_score)
     if folder is not None:
-        found_groups = [replace(group, program=group_program(work, group)) for group in found_groups]
-    blocks = [block for group in found_groups for block in group.blocks(per_block)]
-    found = np.full((len(views), len(settings), num_queries, depth), -1, np.int32)
+        programs = [replace(group, program=group_program(work, group)) for group in programs]
+    blocks = [block for group in programs for block in group.blocks(per_block)]
+    all_rows = np.full((len(views), len(settings), num_queries, depth), -1, np.int32)
     steps = ((part, block) for part in work.parts(queries) for block in blocks)
-    held: dict[range, list[PaddedBatch]] = {}
+    batches: dict[range, list[PaddedBatch]] = {}
     for part, block in track(steps, len(blocks) * -(-num_queries // queries)):
-        if part.queries not in held:  # the batches of one part at a time, and only if some block needs them
-            held = {part.queries: []}
-        sharing = [places[row] for row in dict.fromkeys(block.rows.reshape(-1).tolist())]
-        wanted, shares = list(itertools.chain.from_iterable(sharing)), list(map(len, sharing))
-        cs = [settings[place].get(FUSION, _ALONE) for place in wanted]
-        compute = partial(_rows, part, block, held[part.queries], cs, shares, devices)
-        rows = _kept(folder, part, block, cs, compute)
-        found[:, wanted, part.queries.start : part.queries.stop] = rows
-    return found
+        if part.queries not in batches:  # the batches of one part at a time, and only if a block needs them
+            batches = {part.queries: []}
+        places_of_block = [places[row] for row in dict.fromkeys(block.rows.reshape(-1).tolist())]
+        members, repeats = list(itertools.chain.from_iterable(places_of_block)), list(map(len, places_of_block))
+        cs = [settings[place].get(FUSION, _ALONE) for place in members]
+        compute = partial(_rows, part, block, batches[part.queries], cs, repeats, devices)
+        rows = _read_or_compute(folder, part, block, cs, compute)
+        all_rows[:, members, part.queries.start : part.queries.stop] = rows
+    return all_rows
 
 
 def result_bytes(num_views: int, num_settings: int, num_queries: int, depth: int) -> int:
-    """Bytes that `sweep` returns."""
+    """Size of the result of `sweep` in bytes."""
     return 4 * num_views * num_settings * num_queries * depth
 
 
 def _rows(
-    part: Work, block: Group, held: list[PaddedBatch], cs: Sequence[Any], shares: Sequence[int],
+    part: Work, block: Group, batches: list[PaddedBatch], cs: Sequence[Any], repeats: Sequence[int],
     devices: Sequence[Device] | None,
 ) -> np.ndarray:  # fmt: skip
-    """`[V, W, q, depth]`: the block's distinct settings, each as often as it has values of c."""
-    if not held:
-        held.extend(all_batches(part.match_set, part.queries, settings=part.settings))
+    """Rows `[V, W, q, depth]` of the block's distinct settings, each repeated for all its values of c."""
+    if not batches:
+        batches.extend(all_batches(part.match_set, part.queries, settings=part.settings))
     shape = len(scales(part.match_set)), *part.candidates.mask.shape
-    scores = block_scores(block, held, shape, devices)
+    scores = block_scores(block, batches, shape, devices)
     _, first = np.unique(block.rows, return_index=True)
     scores = scores.reshape(shape[0], -1, *shape[1:])[:, np.sort(first)]
 
     def first_rows(view: np.ndarray) -> np.ndarray:
-        return _first_rows(part, np.repeat(fuse_all(part.match_set, scores, view), shares, axis=0), cs, view)
+        return _first_rows(part, np.repeat(fuse_all(part.match_set, scores, view), repeats, axis=0), cs, view)
 
     return np.stack([first_rows(view) for view in part.views])
 
 
 def block_scores(
-    block: Group, held: Sequence[PaddedBatch], shape: tuple[int, int, int], devices: Sequence[Device] | None
+    block: Group, batches: Sequence[PaddedBatch], shape: tuple[int, int, int], devices: Sequence[Device] | None
 ) -> np.ndarray:
-    """`[S, G, W, q, C]` of every scale; a pair without matches scores 0."""
+    """Scores `[S, G, W, q, C]` of every scale; a pair without matches scores 0."""
     scores = np.zeros((*block.rows.shape, math.prod(shape)), np.float32)
     inputs = block.scorer, block.settings, block.weightings
-    for places, values in scored(_score_settings, inputs, held, devices=devices):
+    for places, values in scored(_score_settings, inputs, batches, devices=devices):
         scores[..., places] = values
     return np.moveaxis(scores.reshape(*block.rows.shape, *shape), 2, 0)
 
@@ -175,7 +176,7 @@ def _score_settings(matches: Matches, scorer: Any, *values: Mapping[str, Array])
 
 
 def _first_rows(part: Work, scores: np.ndarray, cs: Sequence[Any], view: np.ndarray) -> np.ndarray:
-    """`[W, q, depth]` database rows by scores `[W, q, C]`, each fused with its own c."""
+    """Database rows `[W, q, depth]` by scores `[W, q, C]`, each setting fused with its own c."""
     indices, of_filter = part.candidates.indices, filter_scores(part.candidates, part.filter_score)
     rows = np.full((*scores.shape[:2], part.depth), -1, np.int32)
     kinds = np.array(["alone" if c == _ALONE else "balanced" if c is None else "given" for c in cs])
@@ -194,19 +195,19 @@ def _first_rows(part: Work, scores: np.ndarray, cs: Sequence[Any], view: np.ndar
 def _orders(
     of_filter: Array, scores: Array, c: Array | None, view: Array, tie_break: Array | None, *, fused: bool
 ) -> Array:
-    """`[W, q, C]` positions into the shortlist, best first, one ranking of all queries at a time."""
+    """Positions `[W, q, C]` into the shortlist, best first, one setting at a time."""
 
-    def one(scores_c: tuple[Array, Array | None]) -> Array:
+    def order(scores_c: tuple[Array, Array | None]) -> Array:
         scores, c = scores_c
         return ranking.rank(ranking.fuse(of_filter, scores, view, c) if fused else scores, view, tie_break=tie_break)
 
-    return jax.lax.map(one, (scores, c))
+    return jax.lax.map(order, (scores, c))
 
 
-def _kept(
+def _read_or_compute(
     folder: Path | None, part: Work, block: Group, cs: Sequence[Any], compute: Callable[[], np.ndarray]
 ) -> np.ndarray:
-    """A block's rows, from its file where that is there and whole; else computed and written."""
+    """Rows of a block, from its file; if that is missing or damaged, they are computed and written."""
     if folder is None or "callback" in block.program:
         return compute()
     key = _fingerprint(part, block, cs)
@@ -214,15 +215,15 @@ def _kept(
     try:
         return read_arrays(path, key)["rows"]
     except (OSError, InputError):
-        pass  # not there, or damaged
+        pass  # missing or damaged
     rows = compute()
-    with suppress(FileNotFoundError):  # the folder goes where another process ends the same sweep meanwhile
+    with suppress(FileNotFoundError):  # another process that ends the same sweep removes the folder
         write_arrays(path, {"rows": rows}, key)
     return rows
 
 
 def _fingerprint(part: Work, block: Group, cs: Sequence[Any]) -> str:
-    """All that a block's rows depend on: matches and shortlist, the scorer's program, and its numbers."""
+    """Hash of everything that determines a block's rows: matches and shortlist, the scorer's program and numbers."""
     options = (
         part.depth,
         part.ties,
@@ -236,7 +237,7 @@ def _fingerprint(part: Work, block: Group, cs: Sequence[Any]) -> str:
 
 
 def group_program(work: Work, group: Group) -> str:
-    """What the scorer computes of batches of these shapes: a user's code may change while its class keeps its name."""
+    """The scorer's program for batches of these shapes, as text: user code may change while the class name stays."""
     if on_host(group.scorer):
         return "callback"
 

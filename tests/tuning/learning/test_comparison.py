@@ -84,8 +84,8 @@ def test_images_of_two_sizes_are_reported_on_as_one_by_one():
     for query in at.half.report:
         order = np.argsort(-(scores_of(HISTOGRAM, at, query) + c * at.candidates.scores[query]), kind="stable")
         expected.append([abs(at.candidates.indices[query][order[0]] - query) <= width for width in TOLERANCES])
-    compared = comparison._Compared(at, Axes(HISTOGRAM, {}, {}), OPTIONS, None, untracked_stages)
-    np.testing.assert_array_equal(compared.reported("it", HISTOGRAM, {"c": c}).hits, np.transpose(expected))
+    compared = comparison._HalfComparison(at, Axes(HISTOGRAM, {}, {}), OPTIONS, None, untracked_stages)
+    np.testing.assert_array_equal(compared.evaluate("it", HISTOGRAM, {"c": c}).hits, np.transpose(expected))
 
 
 def test_images_of_two_sizes_are_learned_from_as_one_by_one():

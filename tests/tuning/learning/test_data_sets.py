@@ -84,13 +84,13 @@ def test_the_last_quarter_of_each_set_validates_and_nothing_reported_is_seen(who
 def test_what_is_reported_is_what_the_set_has_alone(parts, whole):
     [split] = training_splits(whole.match_set, whole.candidates, whole.judge)
     scorer = HistogramOfShifts(bin_size=20.0, sigma=20.0)
-    compared = comparison._Compared(split, Axes(scorer, {}, {}), Options(), None, untracked_stages)
+    compared = comparison._HalfComparison(split, Axes(scorer, {}, {}), Options(), None, untracked_stages)
     last = parts[2]
     alone = training_splits(*_halved(last))[0]
-    expected = comparison._Compared(alone, Axes(scorer, {}, {}), Options(), None, untracked_stages)
+    expected = comparison._HalfComparison(alone, Axes(scorer, {}, {}), Options(), None, untracked_stages)
     for setting in ({}, {"c": None}, {"c": 3.0}):
-        got = compared.reported("it", scorer, setting).hits[:, alone.half.report]
-        np.testing.assert_array_equal(got, expected.reported("it", scorer, setting).hits)
+        got = compared.evaluate("it", scorer, setting).hits[:, alone.half.report]
+        np.testing.assert_array_equal(got, expected.evaluate("it", scorer, setting).hits)
 
 
 def _halved(one):

@@ -60,7 +60,7 @@ def same(one: Fit, other: Fit) -> bool:
 
 def program(lines: str) -> subprocess.CompletedProcess[str]:
     """What a process of its own says that runs some lines with all of this module."""
-    call = [sys.executable, "-W", "default", "-c", f"from tests.learning.toys import *\n{lines}"]
+    call = [sys.executable, "-W", "default", "-c", f"from tests.tuning.learning.toys import *\n{lines}"]
     return subprocess.run(call, cwd=ROOT, capture_output=True, text=True, check=False)
 
 
