@@ -121,7 +121,7 @@ def fit_confidence(
     there = np.isfinite(values).all(axis=1)
     values, right = values[there], np.asarray(right, bool)[there]
     if not len(values):
-        raise InputError("confidence: expected answers to fit it on, with candidates of other places, got none")
+        raise InputError("confidence: expected predictions to fit it on, with candidates of other places, got none")
     center, scale = values.mean(axis=0), values.std(axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     columns = np.column_stack([np.ones(len(values)), (values - center) / scale])

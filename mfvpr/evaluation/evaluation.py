@@ -8,7 +8,7 @@
 Features, shortlist and matches are kept in the folder of an archive, if it has one.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
@@ -32,7 +32,7 @@ from mfvpr.scoring.scorer import Scorer
 from mfvpr.storage.feature_cache import Archive
 from mfvpr.storage.manifest import SCORES, store_path
 from mfvpr.storage.scores import QueryScores, ScoreStore, open_score_store
-from mfvpr.storage.shards import together
+from mfvpr.storage.shards import Shard, together
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import Device
 from mfvpr.utils.progress import Stopwatch
@@ -98,13 +98,7 @@ def evaluate(
         sequence = cohort_sequence(archive.contents(dataset.database), cohort)
         calls.insert(0, partial(_score_cohort, dataset, sequence, tools, scorers, watch, **options))
     scored: list[Scored] = together(*calls)
-    strengths: dict[str, np.ndarray] = {}
-    if cohort is not None:
-        cohort_matches, cohort_scores = scored.pop(0)
-        strengths = {
-            name: hubness(cohort_matches.candidates, scores, len(dataset.database), who=name)
-            for name, scores in cohort_scores.items()
-        }
+    strengths = {} if cohort is None else _hubness(*scored.pop(0), len(dataset.database))
     matched = [sequence for sequence, _ in scored]
     ranked = [
         rank_sequence(sequence, scores, fused, correlated, ties, hubness=strengths) for sequence, scores in scored
@@ -129,10 +123,8 @@ def _score(
     """Match and score a sequence; a shard computes scores of its own queries and reads those of other shards."""
 
     def match(rows: Sequence[int] | None = None) -> Matched:
-        track = archive.track(f"{label}matching")
-        return match_sequence(
-            dataset, sequence, *tools, archive=archive, watch=watch, rows=rows, track=track, **options
-        )
+        tracked: dict[str, Any] = options | ({"track": archive.track(f"{label}matching")} if label else {})
+        return match_sequence(dataset, sequence, *tools, archive=archive, watch=watch, rows=rows, **tracked)
 
     def score(matched: Matched) -> dict[str, np.ndarray]:
         with watch("scores"):
@@ -142,25 +134,17 @@ def _score(
     if archive.shard is None or archive.root is None:
         matched = match()
         return matched, score(matched)
-    names, scorer_names = sequence.images.names, sorted(scorers)
+    scorer_names = sorted(scorers)
     with _score_store(dataset, sequence, tools, scorers, options["matching"], archive) as store:
-        shard_rows = archive.shard.rows(names)
-        missing = [row for row in shard_rows if not store.done[row]]
-        # A shard without queries still extracts features of images; and all shards must join collective computations.
-        if missing or not shard_rows or (archive.shard.meets and not store.done.all()):
-            part = match(shard_rows)
-            if missing:  # all rows are scored, so that a continued run has the bits of a single one
-                scores = score(part)
-                by_query = np.stack([scores[name] for name in scorer_names], axis=1)
-                indices = np.asarray(part.candidates.indices)
-                rows = dict(zip(shard_rows, map(QueryScores, by_query, indices), strict=True))
-                store.write({row: rows[row] for row in missing})
+        _write_scores(store, archive.shard, sequence.images.names, scorer_names, match, score)
 
         def missing_rows() -> Sequence[int]:
             store.look()
             return np.flatnonzero(~store.done).tolist()
 
-        archive.shard.wait(missing_rows, names, f"{sequence.name} scores", patience=archive.patience, is_complete=True)
+        archive.shard.wait(
+            missing_rows, sequence.images.names, f"{sequence.name} scores", patience=archive.patience, is_complete=True
+        )
         stored = [query for _, query in store.read()]
     matched = match()
     if (np.stack([query.indices for query in stored]) != matched.candidates.indices).any():
@@ -168,6 +152,23 @@ def _score(
                          "this folder, and run again")  # fmt: skip
     by_scorer = np.stack([query.scores for query in stored], axis=1)
     return matched, {name: by_scorer[scorer_names.index(name)] for name in scorers}
+
+
+def _write_scores(
+    store: ScoreStore, shard: Shard, names: Sequence[str], scorer_names: Sequence[str],
+    match: Callable[[Sequence[int]], Matched], score: Callable[[Matched], dict[str, np.ndarray]],
+) -> None:  # fmt: skip
+    """Match and score the queries of a shard, and write the missing scores."""
+    rows = shard.rows(names)
+    missing = [row for row in rows if not store.done[row]]
+    # A shard without queries still extracts features of images; and all shards must join collective computations.
+    if missing or not rows or (shard.meets and not store.done.all()):
+        matched = match(rows)
+        if missing:  # all rows are scored, so that a continued run has the bits of a single one
+            scores = score(matched)
+            by_query = np.stack([scores[name] for name in scorer_names], axis=1)
+            queries = dict(zip(rows, map(QueryScores, by_query, np.asarray(matched.candidates.indices)), strict=True))
+            store.write({row: queries[row] for row in missing})
 
 
 def _score_store(
@@ -190,6 +191,11 @@ def _score_store(
     }
     path = store_path(archive.root, "scores", recipe, SCORES)
     return open_score_store(path, recipe, num_queries=len(sequence.images), **archive.store_options)
+
+
+def _hubness(matched: Matched, scores: Mapping[str, np.ndarray], num_database: int) -> dict[str, np.ndarray]:
+    """Hubness `[N]` of the database images by name of the scorer, from the matches and scores of the cohort."""
+    return {name: hubness(matched.candidates, values, num_database, who=name) for name, values in scores.items()}
 
 
 def _score_cohort(

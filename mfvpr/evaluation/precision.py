@@ -69,7 +69,8 @@ def precision_recall(
     confidence, right = np.asarray(confidence, np.float64), np.asarray(right, bool)
     has_answer = np.ones(len(right), bool) if has_answer is None else np.asarray(has_answer, bool)
     if np.any(right & ~has_answer):
-        raise InputError("right: expected no right answers to queries that have none; take both of the same truth")
+        raise InputError("right: expected no correct predictions for queries without positives. Take both from one "
+                         "ground truth.")  # fmt: skip
     order = np.argsort(-confidence, kind="stable")[: np.sum(~np.isnan(confidence))]
     thresholds, hits = confidence[order], np.cumsum(right[order])
     ends = np.append(thresholds[1:] != thresholds[:-1], [True] * min(len(thresholds), 1))

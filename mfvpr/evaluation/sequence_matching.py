@@ -50,15 +50,11 @@ def match_sequence(
     """Find and match the candidates of one sequence's queries; features of other database images are not extracted.
 
     If the archive has a root, matches are kept below it. If they are all there, nothing else is read.
+    Arguments not listed here are those of `evaluate`.
 
     Args:
         dataset: of the sequence.
         sequence: Q queries.
-        extractor: see `evaluate`.
-        filter: see `evaluate`.
-        candidates: see `evaluate`.
-        matching: see `evaluate`.
-        archive: see `evaluate`.
         watch: gets the seconds of the stages.
         rows: of the queries that are matched and returned; None = all. Candidates are found for all queries, since they
             decide which features are extracted.
@@ -87,19 +83,8 @@ def match_sequence(
         if matched is None:
             with watch("filter"):
                 filtered = _find_candidates(sequence, database, filter, candidates, archive, stores)
-            with watch("features"):
-                sides, remarks = _extract(dataset, sequence, extractor, filtered, archive)
-            _write_remarks(stores, archive, remarks)
-            options = {"track": archive.track("matching"), **where}
-            with watch("matching"):
-                matches = tuple(
-                    stages.match(*scale, filtered.candidates, matching, store=store, rows=rows, **options)
-                    for scale, store in zip(sides, stores or [None] * len(sides), strict=True)
-                )
-            shortlist = filtered.candidates
-            if rows is not None:
-                shortlist = jax.tree.map(lambda values: values[rows], shortlist)
-            matched = Matched(sequence, shortlist, matches, remarks["queries"], remarks["database"])
+            options = {"matcher": matching, "rows": rows, "track": archive.track("matching"), **where}
+            matched = _match(dataset, sequence, extractor, filtered, stores, archive, watch, **options)
     if rows is None:
         _warn_of_queries_without_candidates(matched, archive)
     return replace(matched, weights=tuple(scale.weight for scale in extractor.scales))
@@ -130,6 +115,25 @@ def _find_candidates(
     return Filtered(shortlist, bad_queries, bad_database)
 
 
+def _match(
+    dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, filtered: Filtered,
+    stores: Sequence[MatchStore], archive: Archive, watch: Stopwatch, *, rows: Sequence[int] | None, **options: Any,
+) -> Matched:  # fmt: skip
+    """Extract features and match all scales."""
+    with watch("features"):
+        sides, remarks = _extract(dataset, sequence, extractor, filtered, archive)
+    _write_remarks(stores, archive, remarks)
+    shortlist = filtered.candidates
+    with watch("matching"):
+        matches = tuple(
+            stages.match(*scale, shortlist, store=store, rows=rows, **options)
+            for scale, store in zip(sides, stores or [None] * len(sides), strict=True)
+        )
+    if rows is not None:
+        shortlist = jax.tree.map(lambda values: values[rows], shortlist)
+    return Matched(sequence, shortlist, matches, remarks["queries"], remarks["database"])
+
+
 def match_cohort(
     dataset: Dataset,
     neighbors: int,
@@ -142,16 +146,11 @@ def match_cohort(
 ) -> Matched:
     """Match the database images among each other, once for all sequences.
 
-    See `mfvpr.reranking.cohort_normalization`.
+    See `mfvpr.reranking.cohort_normalization`. Arguments not listed here are those of `match_sequence`.
 
     Args:
         dataset: its database, in the order of the drive.
         neighbors: frames on both sides of an image that show its place, and are never its candidates.
-        extractor: see `match_sequence`.
-        filter: see `match_sequence`.
-        candidates: see `match_sequence`.
-        archive: see `match_sequence`.
-        **how: further arguments of `match_sequence`.
     """
     archive = archive or Archive()
     sequence = cohort_sequence(archive.contents(dataset.database), neighbors)

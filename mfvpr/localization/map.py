@@ -75,7 +75,7 @@ class Map(GrowingMap):
                              f"got {len(extractor.scales)}")  # fmt: skip
         candidates = _whole_number("candidates", candidates, least=1)
         if threshold is not None and confidence is None:
-            raise InputError(f"threshold={threshold}: expected a confidence as well, which gives p(right)")
+            raise InputError(f"threshold={threshold}: expected a confidence as well, which gives p")
         self.scorer: Scorer = HistogramOfShifts() if scorer is None else scorer
         self.matcher, self.confidence, self.threshold = matcher, confidence, threshold
         super().__init__(folder, extractor, describer, candidates=candidates, memory=memory)

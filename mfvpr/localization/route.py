@@ -128,7 +128,7 @@ def shares(scores: np.ndarray, sharpness: float) -> np.ndarray:
 
 
 @compiled
-def step(belief: Array, there: Array, motion: Array, kidnapped: Array, says: Array, p_right: Array) -> Array:
+def step(belief: Array, there: Array, motion: Array, kidnapped: Array, share: Array, p_right: Array) -> Array:
     """The belief after the next image.
 
     Args:
@@ -136,7 +136,7 @@ def step(belief: Array, there: Array, motion: Array, kidnapped: Array, says: Arr
         there: `[N]` bool, rows where the robot may be.
         motion: `[2 R + 1]` probabilities of -R .. R rows. Belief that leaves the map is shared by the rest.
         kidnapped: `[]` probability that the robot may be anywhere.
-        says: `[N]` shares of the rows if the image's answer is correct; all 0 = no evidence.
+        share: `[N]` shares of the rows if the image's answer is correct; all 0 = no evidence.
         p_right: `[]` probability that the answer is correct.
 
     Returns:
@@ -147,7 +147,7 @@ def step(belief: Array, there: Array, motion: Array, kidnapped: Array, says: Arr
     reach = len(motion) // 2
     moved = jnp.convolve(belief, motion, precision=jax.lax.Precision.HIGHEST)[reach : reach + len(belief)]
     before = (1 - kidnapped) * _normalize(jnp.where(there, moved, 0), anywhere) + kidnapped * anywhere
-    image = _normalize(jnp.where(there, says, 0), anywhere)
+    image = _normalize(jnp.where(there, share, 0), anywhere)
     likelihood = p_right * image + (1 - p_right) * anywhere
     return _normalize(before * likelihood, before)
 

@@ -129,7 +129,7 @@ class MapState:
     def _use(self, describer: Extractor | Aggregation) -> None:
         """Open the rows, which are described by `describer`."""
         describing = Describing(self.extractor, describer)
-        rows = MapRows(self.folder, describing.recipe if self._vocabulary is None else self._settings)
+        rows = MapRows(self.folder, describing.recipe)
         typical = self.extractor.scales[0].typical_count
         resident = Resident(rows, typical=typical, **self._resident_options)
         self._described = DescribedMap(describing, rows, resident, MapStrength(rows))

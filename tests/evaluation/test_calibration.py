@@ -144,7 +144,7 @@ def test_where_all_answers_are_right_or_wrong_p_is_not_certain(right):
     probability = fit_confidence(np.vstack([values, [[np.nan, np.nan]]]), np.full(51, right)).probability(values)
     probability = probability if right else 1 - probability
     np.testing.assert_allclose(probability, 50.5 / 51, rtol=1e-3)
-    with pytest.raises(InputError, match="expected answers to fit it on"):
+    with pytest.raises(InputError, match="expected predictions to fit it on"):
         fit_confidence(np.full((2, 2), np.nan), np.zeros(2))
 
 

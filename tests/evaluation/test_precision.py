@@ -55,7 +55,7 @@ def test_answers_to_queries_without_a_place_cost_precision_and_no_recall():
     curve = precision_recall(confidence, right, np.array([True, False, True]))
     assert curve.recall.tolist() == [0.5, 0.5, 1.0]
     np.testing.assert_allclose(curve.precision, [1, 1 / 2, 2 / 3])
-    with pytest.raises(InputError, match="no right answers to queries that have none"):
+    with pytest.raises(InputError, match="no correct predictions for queries without positives"):
         precision_recall(confidence, ~right, np.array([True, False, True]))
 
 

@@ -246,6 +246,15 @@ def test_a_vocabulary_that_is_damaged_or_gone_is_to_be_put_back(dataset, folder,
     assert asked(tmp_path / "map").names == list(dataset.database.names)
 
 
+def test_rows_of_another_vocabulary_are_refused(dataset, folder, tmp_path):
+    """Both maps have the same settings, but vocabularies that were learned from other images."""
+    shutil.copytree(folder, tmp_path / "map")
+    Map(tmp_path / "other", SIFT, VLAD).learn(dataset.sequences[0].images)
+    shutil.copy(tmp_path / "other/vocabulary.npz", tmp_path / "map")
+    with pytest.raises(InputError, match=r"recipe\.describer\.centers"):
+        asked(tmp_path / "map")
+
+
 @pytest.mark.parametrize("part", ["entries", "features"])
 def test_damaged_rows_are_told_and_stay(dataset, folder, tmp_path, part):
     shutil.copytree(folder, tmp_path / "map")

@@ -34,12 +34,9 @@ def cross_entropy(scores: Array, positives: Array, mask: Array) -> Array:
 def smooth_recall_at_1(scores: Array, positives: Array, mask: Array, temperature: float | Array) -> Array:
     """1 - the probability that softmax(scores / temperature) gives to the positives, `[]` in [0, 1].
 
-    It tends to 1 - R@1 as the temperature tends to 0.
+    It tends to 1 - R@1 as the temperature tends to 0. For the other arguments see `cross_entropy`.
 
     Args:
-        scores: `[C]`; padding may hold anything.
-        positives: `[C]` bool, the correct candidates.
-        mask: `[C]` bool.
         temperature: above 0, in units of the scores; else the loss is NaN.
     """
     scores, positives, real, teaches = _usable(scores, positives, mask)
@@ -52,12 +49,9 @@ def smooth_average_precision(scores: Array, positives: Array, mask: Array, tempe
 
     The rank of a candidate is 1 + the sum of sigmoid(lead / temperature) over all other candidates, where lead is how
     far their score is above its own. The loss tends to 1 - average precision as the temperature tends to 0; a tie
-    counts half.
+    counts half. For the other arguments see `cross_entropy`.
 
     Args:
-        scores: `[C]`; padding may hold anything.
-        positives: `[C]` bool, the correct candidates.
-        mask: `[C]` bool.
         temperature: above 0, in units of the scores; else the loss is NaN.
     """
     scores, positives, real, teaches = _usable(scores, positives, mask)

@@ -59,14 +59,14 @@ class TrainingSplit:
     name: str
 
     @cached_property
-    def right(self) -> np.ndarray:
+    def correct(self) -> np.ndarray:
         """Correct candidates `[Q, C]` bool at the main threshold."""
         return self._positive(self.judge.positives[self.judge.main])
 
     @cached_property
     def usable(self) -> np.ndarray:
         """Candidates `[Q, C]` bool of the losses: seen, and not correct at the widest threshold only."""
-        return self.seen & ~(self._positive(self.judge.positives[-1]) & ~self.right)
+        return self.seen & ~(self._positive(self.judge.positives[-1]) & ~self.correct)
 
     def _positive(self, positives: Positives) -> np.ndarray:
         return positives.contains(self.candidates.indices) & self.candidates.mask
@@ -90,7 +90,7 @@ class TrainingSplit:
         pairs = self.match_set.pairs(np.repeat(padded, self.width), places.reshape(-1), self.match_set.capacity)
         matches: Matches = jax.tree.map(lambda values: values.reshape(*places.shape, *values.shape[1:]), pairs)
         matches = replace(matches, mask=matches.mask & mask[..., None])
-        return Batch(matches, take(self.candidates.scores[padded]), take(self.right[padded]), mask)
+        return Batch(matches, take(self.candidates.scores[padded]), take(self.correct[padded]), mask)
 
     def score_deviation(self, scorer: Scorer) -> float:
         """Standard deviation of the scores that learning may use; 1 if all are equal."""
@@ -131,7 +131,7 @@ def _split(match_set: MatchSet, candidates: Shortlist, judge: Judge, half: Half,
     split_half = separate(judge.places, *(np.concatenate(parts) for parts in zip(*pieces, strict=True)))
     seen = candidates.mask & half.allowed[np.maximum(candidates.indices, 0)]
     split = TrainingSplit(match_set, candidates, judge, half, split_half.tune, split_half.report, seen, name)
-    correct, incorrect = split.right & split.usable, ~split.right & split.usable
+    correct, incorrect = split.correct & split.usable, ~split.correct & split.usable
     has_both = np.asarray(correct.any(axis=1) & incorrect.any(axis=1))  # else the loss is 0 for any scores
     train, validation = (rows[has_both[rows]] for rows in (split_half.tune, split_half.report))
     if not len(train) or not len(validation):

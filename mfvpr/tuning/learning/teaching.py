@@ -76,13 +76,7 @@ def start(
 
 
 def of_matches(split: TrainingSplit, scorer: Any, options: Options) -> Model:
-    """The model that learns a match weight from labels of single matches.
-
-    Args:
-        split: to learn on.
-        scorer: the hand-set one.
-        options: of the learning.
-    """
+    """The model that learns a match weight from labels of single matches; for the arguments see `start`."""
     sizes = split.match_set.image_sizes
     seen, _ = split.match_set.take(split.half.tune).image_sizes  # else reported images would change the labels
     sigma = TEACHER_SIGMA * float(np.max(seen))

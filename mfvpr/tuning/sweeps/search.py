@@ -62,18 +62,13 @@ def search_optuna(
     """Rank with the scorer's own values, and with settings that Optuna's sampler (TPE) proposes from a seed.
 
     Numbers are drawn between the smallest and the largest value of an axis, words among its values. If the judge has
-    halves, Optuna gets the mean recall of the queries to choose on.
+    halves, Optuna gets the mean recall of the queries to choose on. Arguments not listed here are those of
+    `search_grid`.
 
     Args:
         axes: bounds, or words to choose from.
-        judge: see `search_grid`.
-        match_set: see `search_grid`.
-        candidates: see `search_grid`.
         trials: number of settings that Optuna proposes.
         seed: of the sampler.
-        ks: see `search_grid`.
-        track: see `search_grid`.
-        options: see `search_grid`.
 
     Raises:
         InputError: Optuna is not installed, or a setting cannot be scored.

@@ -96,7 +96,7 @@ def test_images_of_two_sizes_are_learned_from_as_one_by_one():
     found = jax.jit(model.objective(LOSSES["cross_entropy"]))(model.start, batch)
     scores = np.stack([scores_of(model.scorer_of(model.start), at, query) for query in at.train])
     assert np.all(np.isfinite(scores))
-    expected = mean_loss(cross_entropy, 2 * scores / model.unit, at.right[at.train], at.usable[at.train])
+    expected = mean_loss(cross_entropy, 2 * scores / model.unit, at.correct[at.train], at.usable[at.train])
     assert float(found) == pytest.approx(float(expected), rel=1e-4)
 
 
