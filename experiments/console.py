@@ -1,4 +1,4 @@
-"""What programs tell while they work, on stderr: notes, warnings, and how far they are."""
+"""Notes, warnings and progress of the programs, on stderr."""
 
 import sys
 from collections.abc import Iterable
@@ -11,7 +11,7 @@ if TYPE_CHECKING:  # or the command line would wait for JAX
 
 
 def tell(text: str) -> None:
-    """A line that is no result."""
+    """Print a line that is no result."""
     print(text, file=sys.stderr)
 
 
@@ -21,20 +21,20 @@ def track(label: str) -> "Track":
 
 
 def bar(label: str, total: int, items: Iterable[Any] | None = None) -> tqdm:
-    """The one look of all progress bars; none where there is nothing to do."""
-    shown = tqdm if sys.stderr.isatty() else _Lines
-    return shown(items, total=total, desc=f"{label:<20}", unit="", dynamic_ncols=True, disable=total == 0)
+    """A progress bar in the look that all programs share; hidden if `total` is 0."""
+    style = tqdm if sys.stderr.isatty() else _Lines
+    return style(items, total=total, desc=f"{label:<20}", unit="", dynamic_ncols=True, disable=total == 0)
 
 
 class _Lines(tqdm):
-    """Progress without a terminal, in a file or a log: a line per 10 %, and one after the first item."""
+    """Progress in a file or a log: a line per 10 %, and one after the first item."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         self._shown = (-1, 0)
         super().__init__(*arguments, mininterval=0, miniters=1, leave=False, **options)
 
     def display(self, msg: str | None = None, pos: int | None = None) -> None:
-        """What tqdm calls wherever a bar would be drawn."""
+        """Print a line where tqdm would draw a bar."""
         tenths = 10 * self.n // self.total
         if (tenths, min(self.n, 1)) > self._shown:
             self._shown = tenths, min(self.n, 1)

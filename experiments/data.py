@@ -4,15 +4,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from experiments.errors import Parser, refuse, run_command
+from experiments.errors import Parser, command_parser, refuse, run_command
 
 if TYPE_CHECKING:
     from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
     from mfvpr.datasets.contents import Contents
 
 # Functions import what they need: --help and wrong usage need not wait for JAX.
-DATA = "python -m experiments.data"
-_OTHERS = {
+_UNPUBLISHED = {
     "grief_season": "a park path in summer, and in snow (Krajnik et al., ECMR 2015): database/ and queries/",
     "corridor": "an indoor corridor, 111 + 111 frames, as VPR-Bench has it: ref/ and query/",
     "streets_seasons": "drawn: a street by day, and on seven other days; it needs no folder",
@@ -26,10 +25,9 @@ def main() -> None:
 
 
 def _parser() -> Parser:
-    from experiments.launch import version
-
-    parser = Parser(prog=DATA, description="Nothing is downloaded: each data set has its place and its license.")
-    parser.add_argument("--version", action="version", version=version(), help="print it and exit")
+    parser = command_parser(
+        "python -m experiments.data", "Nothing is downloaded: each data set has its place and its license."
+    )
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     command = commands.add_parser("list", help="the published data sets, their sizes, and what their folders hold")
     command.add_argument("names", metavar="NAME", nargs="*", help="by default a table of all")
@@ -43,17 +41,17 @@ def _parser() -> Parser:
 
 
 def list_data(names: list[str]) -> None:
-    """Print a table, or what is known of some."""
+    """Print a table of all data sets, or details of those that are named."""
     from mfvpr.datasets.published import PUBLISHED
     from mfvpr.report import Table
     from mfvpr.utils import InputError
 
     for name in names:
-        if name not in PUBLISHED and name not in _OTHERS:
-            raise InputError(f"{name}: expected one of {', '.join((*PUBLISHED, *_OTHERS))}")
+        if name not in PUBLISHED and name not in _UNPUBLISHED:
+            raise InputError(f"{name}: expected one of {', '.join((*PUBLISHED, *_UNPUBLISHED))}")
     if names:
-        for name in (name for name in names if name in _OTHERS):
-            print(f"{name}: {_OTHERS[name]}")
+        for name in (name for name in names if name in _UNPUBLISHED):
+            print(f"{name}: {_UNPUBLISHED[name]}")
         for entry in (PUBLISHED[name] for name in names if name in PUBLISHED):
             layout = "\n".join(f"  {line}" for line in entry.layout.splitlines())
             print(f"{entry.name}: {entry.title}\n{layout}\nfrom {entry.source}")
@@ -63,12 +61,12 @@ def list_data(names: list[str]) -> None:
         for entry in PUBLISHED.values()
     ]
     print(Table(["name", "what it is", "database", "queries"], rows, text_columns=2).text(), end="")
-    for name, what in _OTHERS.items():
-        print(f"{name}: {what}")
+    for name, description in _UNPUBLISHED.items():
+        print(f"{name}: {description}")
 
 
 def check(name: str, settings: list[str], sheet: Path | None) -> None:
-    """Print counts beside the published ones and what is odd about the ground truth; draw pairs."""
+    """Print image counts beside the published ones and the ground truth's extent; draw image pairs."""
     from experiments import data_sets
     from experiments.stages import dataset_of
     from mfvpr.datasets.published import differences
@@ -79,14 +77,14 @@ def check(name: str, settings: list[str], sheet: Path | None) -> None:
     [chosen] = data_sets.composed("check", ":".join([name, *settings]))
     dataset = dataset_of(chosen)
     archive = Archive(None)
-    contents = [archive.contents(dataset.database), *(archive.contents(one.images) for one in dataset.sequences)]
+    database, *contents = map(archive.contents, [dataset.database, *(part.images for part in dataset.sequences)])
     counts, unreadable = list(_counts(dataset)), list(_unreadable(dataset))
-    rows = [[*row, f"{len(bad):,}"] for row, bad in zip(counts, unreadable, strict=True)]
+    rows = [[*row, f"{len(reasons):,}"] for row, reasons in zip(counts, unreadable, strict=True)]
     print(Table(["images of", "there", "published", "unreadable"], rows).text())
-    for line in (line for bad in unreadable for line in bad[:3]):
-        print(f"unreadable: {line}")
-    for sequence, queries in zip(dataset.sequences, contents[1:], strict=True):
-        for line in _truth(sequence, queries, contents[0]):
+    for reason in (reason for reasons in unreadable for reason in reasons[:3]):
+        print(f"unreadable: {reason}")
+    for sequence, queries in zip(dataset.sequences, contents, strict=True):
+        for line in _truth_lines(sequence, queries, database):
             print(f"{sequence.name}: {line}")
     target = sheet or Path(f"{dataset.name}.png")
     contact_sheet(target, dataset)
@@ -97,7 +95,7 @@ def check(name: str, settings: list[str], sheet: Path | None) -> None:
 
 
 def _counts(dataset: "Dataset") -> Iterator[list[str]]:
-    """Side, images, and how many are published."""
+    """Rows of side, number of images, and published number."""
     from mfvpr.datasets.published import PUBLISHED
 
     entry = PUBLISHED.get(dataset.name)
@@ -110,28 +108,27 @@ def _counts(dataset: "Dataset") -> Iterator[list[str]]:
 
 
 def _unreadable(dataset: "Dataset") -> Iterator[list[str]]:
-    """Why images of each side cannot be read, those that cannot."""
+    """Error messages of the images that cannot be read, by side."""
     from experiments import console
     from mfvpr.utils import InputError
     from mfvpr.utils.numerics import available_cpus
     from mfvpr.utils.threads import ordered_map
 
-    for side, folder in [("database", dataset.database), *((one.name, one.images) for one in dataset.sequences)]:
+    for side, folder in [("database", dataset.database), *((part.name, part.images) for part in dataset.sequences)]:
 
-        def why(row: int, folder: "ImageFolder" = folder) -> str | None:
+        def read_error(row: int, folder: "ImageFolder" = folder) -> str | None:
             try:
                 folder.read(row)
             except InputError as error:
                 return str(error)
             return None
 
-        found = console.track(f"reading {side}")(ordered_map(why, range(len(folder)), workers=available_cpus()),
-                                                 len(folder))  # fmt: skip
-        yield [reason for reason in found if reason]
+        reasons = ordered_map(read_error, range(len(folder)), workers=available_cpus())
+        yield [reason for reason in console.track(f"reading {side}")(reasons, len(folder)) if reason]
 
 
-def _truth(sequence: "QuerySequence", queries: "Contents", database: "Contents") -> Iterator[str]:
-    """What the ground truth of a sequence says, and how many of its queries are database images."""
+def _truth_lines(sequence: "QuerySequence", queries: "Contents", database: "Contents") -> Iterator[str]:
+    """Extent of a sequence's ground truth, and number of queries that are database images."""
     import numpy as np
 
     from mfvpr.datasets.sequences import own_rows
@@ -145,8 +142,8 @@ def _truth(sequence: "QuerySequence", queries: "Contents", database: "Contents")
         within = threshold_words(sequence.truth.unit, threshold).strip()
         yield (f"right images of a query{f' ({within})' if within else ''}: {counts.min()} to {counts.max()}, median "
                f"{np.median(counts):g}; {(counts == 0).sum():,} queries have none")  # fmt: skip
-    if own := sum(map(bool, own_rows(queries, database))):
-        yield f"{own:,} queries are images of the database"
+    if num_same := sum(map(bool, own_rows(queries, database))):
+        yield f"{num_same:,} queries are images of the database"
 
 
 if __name__ == "__main__":

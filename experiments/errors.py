@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from experiments.settings import SettingsError
 
-if TYPE_CHECKING:  # it brings JAX along
+if TYPE_CHECKING:  # it imports JAX
     from mfvpr.checkpoints.registry import Entry
 
 WEIGHTS = "python -m experiments.weights"
@@ -21,15 +21,24 @@ _INTERRUPTED = "\ninterrupted; nothing half-written was left, and what was finis
 
 
 class Parser(argparse.ArgumentParser):
-    """Of programs without settings."""
+    """Command line of a program that has commands instead of settings."""
 
     def error(self, message: str) -> NoReturn:
-        """Refuse wrong usage."""
+        """Exit with one line for wrong usage."""
         refuse(f"{message}; see {self.prog} --help")
 
 
+def command_parser(prog: str, description: str) -> Parser:
+    """A parser that knows `--version`."""
+    from experiments.launch import version
+
+    parser = Parser(prog=prog, description=description)
+    parser.add_argument("--version", action="version", version=version(), help="print it and exit")
+    return parser
+
+
 def run_command(parser: Callable[[], argparse.ArgumentParser]) -> None:
-    """Run the command that is typed: `run` among the parser's defaults, with all else that it gives."""
+    """Parse the command line and call its default `run` with all other arguments."""
     unwind_on_sigterm()
     with one_line():
         arguments = vars(parser().parse_args())
@@ -38,13 +47,13 @@ def run_command(parser: Callable[[], argparse.ArgumentParser]) -> None:
 
 @contextmanager
 def one_line() -> Iterator[None]:
-    """Exit with 2 for wrong input, 130 for Ctrl-C, 141 for a reader who left; faults of our own pass through."""
+    """Exit with 2 for wrong input, 130 for Ctrl-C, 141 for a closed stdout; raise all other exceptions."""
     try:
         yield
     except KeyboardInterrupt:
         print(_INTERRUPTED, end="", file=sys.stderr)
-        _unwound(130)
-    except BrokenPipeError:  # whoever read our output has left: `| head`
+        _exit_after_threads(130)
+    except BrokenPipeError:  # as in `| head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)
     except SettingsError as error:
@@ -60,28 +69,28 @@ def one_line() -> Iterator[None]:
 
 
 def with_command(error: Exception) -> str:
-    """The message, and where weights are to be installed, how."""
+    """The message; for missing weights also the command that installs them."""
     from mfvpr.checkpoints import WeightsError
 
     return f"{error}: {how_to_install(error.entry)}" if isinstance(error, WeightsError) else str(error)
 
 
 def how_to_install(entry: "Entry") -> str:
-    """The command that an installation of weights begins with."""
+    """The first command that installs a checkpoint."""
     command = f"convert {shlex.quote(entry.file)}" if entry.sha256 is None else f"download {entry.name}"
     return f"{WEIGHTS} {command}"
 
 
 def refuse(reason: str) -> NoReturn:
-    """One line on stderr, exit code 2."""
+    """Print one line on stderr and exit with code 2."""
     print("error:", *reason.splitlines(), file=sys.stderr)
     sys.exit(2)
 
 
 @contextmanager
-def on_interrupt(answer: Callable[[int, FrameType | None], None]) -> Iterator[None]:
-    """Ctrl-C is answered so until the block ends."""
-    before = signal.signal(signal.SIGINT, answer)
+def on_interrupt(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """Handle Ctrl-C with `handler` until the block ends."""
+    before = signal.signal(signal.SIGINT, handler)
     try:
         yield
     finally:
@@ -89,25 +98,25 @@ def on_interrupt(answer: Callable[[int, FrameType | None], None]) -> Iterator[No
 
 
 def leave(*_: object) -> NoReturn:
-    """Of `on_interrupt` before anything is begun: an extension that is being imported could lose an exception."""
+    """Exit on Ctrl-C without an exception, which a C extension that is being imported could lose."""
     os.write(2, _INTERRUPTED.encode())
     os._exit(130)
 
 
 def unwind_on_sigterm() -> None:
-    """Let SIGTERM unwind the stack, so that temporary files go."""
-    signal.signal(signal.SIGTERM, lambda *_: _unwound(143))
+    """Let SIGTERM unwind the stack, so that temporary files are removed."""
+    signal.signal(signal.SIGTERM, lambda *_: _exit_after_threads(143))
 
 
-def _unwound(code: int) -> NoReturn:
-    """Exit where a computation of XLA's may be under way, which would abort an interpreter that ends around it."""
-    atexit.register(leave_at_once, code)  # asked when the threads of Python's have been joined
+def _exit_after_threads(code: int) -> NoReturn:
+    """Exit where XLA may be computing, which would abort an interpreter that shuts down meanwhile."""
+    atexit.register(leave_at_once, code)  # runs when Python's threads have been joined
     sys.exit(code)
 
 
 def leave_at_once(code: int) -> NoReturn:
-    """End the process without what else is to be done at its end."""
+    """End the process without the other exit handlers."""
     for stream in (sys.stdout, sys.stderr):
-        with suppress(OSError):  # whoever read it has left
+        with suppress(OSError):  # its reader may be gone
             stream.flush()
     os._exit(code)

@@ -1,6 +1,6 @@
-"""Starts a program; what the user got wrong becomes one line and exit code 2.
+"""Start a program: settings in, one line and exit code 2 for wrong input.
 
-Nothing slow is imported before Ctrl-C is answered: Hydra and JAX come later, when they are needed.
+Nothing slow is imported before Ctrl-C is handled: Hydra and JAX come later, when they are needed.
 """
 
 import io
@@ -15,7 +15,7 @@ from experiments.settings import Program
 
 
 def launch(program: Program, config: str = "config") -> None:
-    """`program()(settings)` with the settings of conf/`config`.yaml and the command line, plain and checked."""
+    """Call `program()(settings)` with the checked settings of conf/`config`.yaml and the command line."""
     with on_interrupt(leave), one_line():
         unwind_on_sigterm()
         sys.unraisablehook = keep_interrupt
@@ -28,7 +28,7 @@ def launch(program: Program, config: str = "config") -> None:
 
             print(help_text.help_text(config, sys.argv[1:]))
         else:
-            warnings.filterwarnings("ignore", "A worker stopped")  # joblib renews one that has grown; no job is lost
+            warnings.filterwarnings("ignore", "A worker stopped")  # joblib renews a worker that has grown
             if not os.environ.get("MFVPR_CACHE"):  # empty is unset, or the cache would be the root of the file system
                 os.environ.pop("MFVPR_CACHE", None)
             from experiments import command_line
@@ -37,14 +37,14 @@ def launch(program: Program, config: str = "config") -> None:
 
 
 def version() -> str:
-    """One line, the same for every program."""
+    """Versions of mfvpr, JAX and Python in one line."""
     from importlib.metadata import version
 
     return f"mfvpr {version('mfvpr')} (jax {version('jax')}, Python {sys.version.split()[0]})"
 
 
 def keep_interrupt(lost: "sys.UnraisableHookArgs") -> None:
-    """Send Ctrl-C again where nobody could catch it, as in JAX's callback of the garbage collector."""
+    """Send Ctrl-C again if it was raised where no code can catch it, as in JAX's garbage collection callback."""
     if issubclass(lost.exc_type, KeyboardInterrupt):
         main = threading.main_thread().ident
         threading.Timer(0.01, signal.pthread_kill, [main, signal.SIGINT]).start()

@@ -1,15 +1,15 @@
-"""Maps that are asked: build one, add to it, say what it holds. `python -m experiments.map --help`."""
+"""Build a map for localization, add images to it, list its content. `python -m experiments.map --help`."""
 
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from experiments.errors import Parser, run_command
+from experiments.errors import Parser, command_parser, run_command
 from experiments.launch import launch
 
 # Functions import what they need: --help and wrong usage need not wait for JAX.
-MAP = "python -m experiments.map"
+_MAP = "python -m experiments.map"
 
 
 def main() -> None:
@@ -22,26 +22,15 @@ def main() -> None:
 
 
 def build() -> Callable[[dict[str, Any]], None]:
-    """A map of a data set's database."""
+    """The job that maps a data set's database."""
+    from experiments import maps
 
-    def job(settings: dict[str, Any]) -> None:
-        from experiments import maps
-        from experiments.console import track
-        from experiments.stages import dataset_of
-
-        known = maps.made(settings)
-        added = known.build(dataset_of(settings["dataset"]).database, track=track("images"))
-        print(f"{known.folder}: {len(known)} images, {added} of them new")
-
-    return job
+    return maps.build_map
 
 
 def _parser() -> Parser:
-    from experiments.launch import version
-
-    parser = Parser(prog=MAP, description=f"Ask a map with python -m experiments.localize. Settings of the first "
-                     f"command: {MAP} build --help.")  # fmt: skip
-    parser.add_argument("--version", action="version", version=version(), help="print it and exit")
+    parser = command_parser(_MAP, "Ask a map with python -m experiments.localize. Settings of the first command: "
+                            f"{_MAP} build --help.")  # fmt: skip
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     commands.add_parser("build", help="build map=DIR dataset=...: of the database of a data set")
     command = commands.add_parser("info", help="what a map holds, and what it was made with")
@@ -56,26 +45,26 @@ def _parser() -> Parser:
 
 
 def info(folder: Path) -> None:
-    """Print images, bytes and settings."""
+    """Print the number of images, the size on disk and the settings of a map."""
     import json
 
     from experiments import maps
     from mfvpr.storage.disk import used_bytes
 
-    settings, known = maps.read(folder), maps.opened(folder)
-    print(f"{folder}: {len(known)} images, {used_bytes(folder) / 1e6:.1f} MB")
+    settings, robot_map = maps.read(folder), maps.opened(folder)
+    print(f"{folder}: {len(robot_map)} images, {used_bytes(folder) / 1e6:.1f} MB")
     print(json.dumps(settings, indent=1, ensure_ascii=False))
 
 
 def add(folder: Path, images: list[Path], place: str | None) -> None:
-    """Add files under their absolute paths."""
+    """Add image files to a map, one by one."""
     from experiments import maps
     from mfvpr.utils.files import printable
 
-    known = maps.opened(folder)
+    robot_map = maps.opened(folder)
     for path in images:
-        known.add(path, path.name if place is None else place)
-        print(printable(f"{path}: added, {len(known)} images"), flush=True)
+        robot_map.add(path, path.name if place is None else place)
+        print(printable(f"{path}: added, {len(robot_map)} images"), flush=True)
 
 
 if __name__ == "__main__":

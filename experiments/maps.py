@@ -1,4 +1,4 @@
-"""Maps of the programs: a folder that knows the settings it was made with."""
+"""Map folders of the programs, with the settings that they were made with."""
 
 import json
 from collections.abc import Mapping
@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from experiments import build
+from experiments.console import track
 from experiments.settings import SettingsError, check
+from experiments.stages import dataset_of
 from mfvpr.features import Aggregated
 from mfvpr.localization import Map
 from mfvpr.utils.files import written_once
@@ -16,27 +18,34 @@ _FORMAT = "mfvpr map 1"
 _GROUPS = ("features", "retrieval", "matching", "scorer", "candidates")
 
 
+def build_map(settings: Mapping[str, Any]) -> None:
+    """Map the database of a data set."""
+    robot_map = made(settings)
+    added = robot_map.build(dataset_of(settings["dataset"]).database, track=track("images"))
+    print(f"{robot_map.folder}: {len(robot_map)} images, {added} of them new")
+
+
 def made(settings: Mapping[str, Any]) -> Map:
-    """The map that settings name, a new one or one of the same settings.
+    """The map in the folder of the settings, which is created if it is not there.
 
     Raises:
-        SettingsError: the folder has a map of other settings, or none can be made with these.
+        SettingsError: the folder holds a map with other settings, or the settings do not allow a map.
     """
-    folder, own = build.expanded(settings["map"]), {name: settings[name] for name in _GROUPS}
-    _check(own)
-    is_foreign = folder.is_dir() and any(not path.name.startswith(".") for path in folder.iterdir())
+    folder, map_settings = build.expanded(settings["map"]), {name: settings[name] for name in _GROUPS}
+    _check(map_settings)
     if (folder / SETTINGS).exists():
-        _compare(folder, own)
-    elif is_foreign:
+        _compare(folder, map_settings)
+    elif folder.is_dir() and any(not path.name.startswith(".") for path in folder.iterdir()):
         raise SettingsError(f"map={folder}: expected a new or empty folder, or a map; name another")
-    opened = map_of(folder, own)  # before the settings, which then are of a map that can be
-    written_once(folder / SETTINGS, json.dumps({"format": _FORMAT} | own, indent=1, ensure_ascii=False) + "\n")
-    _compare(folder, own)  # another process may have begun a map here
-    return opened
+    robot_map = map_of(folder, map_settings)  # before settings.json is written, since it may fail
+    text = json.dumps({"format": _FORMAT} | map_settings, indent=1, ensure_ascii=False) + "\n"
+    written_once(folder / SETTINGS, text)
+    _compare(folder, map_settings)  # another process may have written it first
+    return robot_map
 
 
 def opened(folder: Path, **options: Any) -> Map:
-    """A map that is there; options as of `Map`."""
+    """The map in a folder, with options of `Map`."""
     return map_of(folder, read(folder), **options)
 
 
@@ -48,21 +57,20 @@ def read(folder: Path) -> dict[str, Any]:
     """
     path = folder / SETTINGS
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(found, dict) or found["format"] != _FORMAT or not {*_GROUPS} <= {*found}:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(content, dict) or content["format"] != _FORMAT or not {*_GROUPS} <= {*content}:
             raise ValueError
     except (OSError, ValueError, KeyError):
         raise SettingsError(f"map={folder}: expected a folder with a map, got none ({SETTINGS} is missing, or "
                             "another); make one: python -m experiments.map build map=DIR") from None  # fmt: skip
-    own = {name: found[name] for name in _GROUPS}
-    check(own)
-    return own
+    settings = {name: content[name] for name in _GROUPS}
+    check(settings)
+    return settings
 
 
-def _compare(folder: Path, own: Mapping[str, Any]) -> None:
-    """Refuse settings that a map was not made with."""
+def _compare(folder: Path, settings: Mapping[str, Any]) -> None:
     before = read(folder)
-    if differing := [name for name in _GROUPS if before[name] != own[name]]:
+    if differing := [name for name in _GROUPS if before[name] != settings[name]]:
         raise SettingsError(f"map={folder}: was made with other {' and '.join(differing)}; name another folder, or "
                             "set what it was made with (python -m experiments.map info)")  # fmt: skip
 
@@ -80,9 +88,10 @@ def _check(settings: Mapping[str, Any]) -> None:
 
 
 def map_of(folder: Path, settings: Mapping[str, Any], **options: Any) -> Map:
-    extractor: Any = build.extractor(settings["features"], None)  # not of files
-    filter: Any = build.filter(settings["retrieval"], extractor, None)  # with a describer, as all that are left
-    describer: Any = filter.describer
+    """The map in a folder, with these settings."""
+    extractor: Any = build.extractor(settings["features"], None)  # `_check` excludes feature files
+    retrieval: Any = build.filter(settings["retrieval"], extractor, None)  # and retrieval without a describer
+    describer: Any = retrieval.describer
     describer = describer.fitting if isinstance(describer, Aggregated) else describer
     [scorer] = build.scorers(settings["scorer"]).values()
     return Map(folder, extractor, describer, scorer=scorer, matcher=build.matching(settings["matching"]),

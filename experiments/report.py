@@ -2,44 +2,38 @@
 
 from pathlib import Path
 
-from experiments.errors import Parser, one_line, unwind_on_sigterm
+from experiments.errors import Parser, command_parser, run_command
 
 # Functions import what they need: --help and wrong usage need not wait for JAX.
-REPORT = "python -m experiments.report"
 _COMPARISON = "comparison.html"
 
 
 def main() -> None:
     """Run the command line."""
-    unwind_on_sigterm()
-    with one_line():
-        arguments = _parser().parse_args()
-        write(arguments.runs, arguments.out)
+    run_command(_parser)
 
 
 def _parser() -> Parser:
-    from experiments.launch import version
-
-    parser = Parser(prog=REPORT, description="One HTML file that needs no other and no network: of one run folder of "
-                     "experiments.evaluate, or of several beside each other.")  # fmt: skip
-    parser.add_argument("--version", action="version", version=version(), help="print it and exit")
+    parser = command_parser("python -m experiments.report", "One HTML file that needs no other and no network: of one "
+                            "run folder of experiments.evaluate, or of several beside each other.")  # fmt: skip
     parser.add_argument("runs", metavar="RUN", nargs="+", type=Path, help="a run folder")
     parser.add_argument("--out", metavar="FILE", type=Path,
                         help=f"by default RUN/report.html of one run, {_COMPARISON} here of several")  # fmt: skip
+    parser.set_defaults(run=write)
     return parser
 
 
-def write(folders: list[Path], out: Path | None) -> None:
-    """The page of one run, or of several; says where it is."""
+def write(runs: list[Path], out: Path | None) -> None:
+    """Write the page of one run, or of several compared, and print its path."""
     from mfvpr.report.pages.one_run import write_report
     from mfvpr.report.pages.several_runs import write_comparison
     from mfvpr.utils.files import printable
 
-    if len(folders) == 1:
-        path = write_report(folders[0], out)
+    if len(runs) == 1:
+        path = write_report(runs[0], out)
     else:
         path = out or Path(_COMPARISON)
-        write_comparison(folders, path)
+        write_comparison(runs, path)
     print(printable(f"report: {path}"))
 
 

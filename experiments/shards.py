@@ -1,10 +1,8 @@
-"""How far a run is that several tasks share (evaluate shard=i/n out=DIR). `python -m experiments.shards --help`."""
+"""Progress of a run that several tasks share (evaluate shard=i/n out=DIR). `python -m experiments.shards --help`."""
 
 from pathlib import Path
 
-from experiments.errors import Parser, run_command
-
-SHARDS = "python -m experiments.shards"
+from experiments.errors import Parser, command_parser, run_command
 
 
 def main() -> None:
@@ -13,10 +11,7 @@ def main() -> None:
 
 
 def _parser() -> Parser:
-    from experiments.launch import version
-
-    parser = Parser(prog=SHARDS, description="Start missing tasks again until none is.")
-    parser.add_argument("--version", action="version", version=version(), help="print it and exit")
+    parser = command_parser("python -m experiments.shards", "Start missing tasks again until none is.")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     for name, run, words in (
         ("status", status, "what each task of a run says of itself"),
@@ -39,7 +34,7 @@ def status(folder: Path) -> None:
 
 
 def missing(folder: Path) -> None:
-    """Print the expression."""
+    """Print the numbers of the tasks to start as an array expression."""
     from experiments import sharding
     from mfvpr.storage.shards import indices
 

@@ -6,14 +6,13 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from experiments.errors import WEIGHTS, Parser, how_to_install, refuse, run_command, with_command
+from experiments.errors import WEIGHTS, Parser, command_parser, how_to_install, refuse, run_command, with_command
 
 if TYPE_CHECKING:
     from mfvpr.checkpoints.registry import Entry
 
 # Functions import what they need: --help and wrong usage need not wait for JAX.
-_CHUNK = 1 << 18
-
+_CHUNK = 1 << 18  # bytes
 _LARGE = 200  # MiB, which take some seconds to convert
 
 
@@ -23,11 +22,8 @@ def main() -> None:
 
 
 def _parser() -> Parser:
-    from experiments.launch import version
-
-    parser = Parser(prog=WEIGHTS, description="Weights live in MFVPR_WEIGHTS, by default "
-                     "~/.cache/mfvpr/weights. None come with the package; each has its own license.")  # fmt: skip
-    parser.add_argument("--version", action="version", version=version(), help="print it and exit")
+    parser = command_parser(WEIGHTS, "Weights live in MFVPR_WEIGHTS, by default ~/.cache/mfvpr/weights. None come with "
+                            "the package; each has its own license.")  # fmt: skip
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     command = commands.add_parser("list", help="all known weights, their licenses, and whether they are installed")
     command.set_defaults(run=list_weights)
@@ -45,7 +41,7 @@ def _parser() -> Parser:
 
 
 def list_weights() -> None:
-    """Print a table of the registry."""
+    """Print all checkpoints with licenses and whether they are installed."""
     from mfvpr.checkpoints import REGISTRY, is_installed
     from mfvpr.report import Table
 
@@ -64,7 +60,7 @@ def convert(file: Path, name: str | None) -> None:
     from mfvpr.checkpoints import install
     from mfvpr.checkpoints.files import read_manifest
 
-    entry = _recognized(file, name)
+    entry = _entry(file, name)
     if file.is_file() and (megabytes := file.stat().st_size >> 20) > _LARGE:
         print(f"{file}: {megabytes:,} MiB to convert, some {max(1, megabytes // 50)} s", file=sys.stderr)
     path = install(file, entry.name)
@@ -78,14 +74,14 @@ def verify(names: Iterable[str]) -> None:
     from mfvpr.checkpoints import REGISTRY, entry_of, weights_folder
     from mfvpr.utils import InputError
 
-    there = [entry for entry in REGISTRY.values() if _runtime_present(entry) or _original_present(entry)]
-    entries = [entry_of(name) for name in names] or there
+    entries = [entry_of(name) for name in names]
+    entries = entries or [entry for entry in REGISTRY.values() if _has_runtime_file(entry) or _has_original(entry)]
     if not entries:
         print(f"nothing is installed in {weights_folder()}")
     bad = 0
     for entry in entries:
         try:
-            print(f"{entry.name}: {_verified(entry)}")
+            print(f"{entry.name}: {_verify(entry)}")
         except InputError as error:
             print(f"{entry.name}: BAD, {with_command(error).removeprefix(f'{entry.name}: ')}")
             bad += 1
@@ -94,7 +90,7 @@ def verify(names: Iterable[str]) -> None:
 
 
 def download(name: str) -> None:
-    """Fetch an official checkpoint into the weights folder; it gets its name once its hash is right."""
+    """Download an official checkpoint into the weights folder, under its name only if its hash is the published one."""
     from mfvpr.checkpoints import entry_of, weights_folder
     from mfvpr.checkpoints.files import file_sha256
     from mfvpr.utils import InputError
@@ -137,7 +133,7 @@ def _fetch(entry: "Entry", target: Path) -> None:
                 digest.update(chunk)
                 bar.update(file.write(chunk))
                 if entry.size and bar.n > entry.size:
-                    break  # the hash will tell
+                    break  # the hash will differ
             file.flush()
             check_sha256(digest.hexdigest(), entry, entry.source)
     except (OSError, HTTPException) as error:
@@ -145,56 +141,53 @@ def _fetch(entry: "Entry", target: Path) -> None:
         raise InputError(f"{entry.source}: could not be downloaded to {target.parent}: {reason}") from error
 
 
-def _recognized(file: Path, name: str | None) -> "Entry":
+def _entry(file: Path, name: str | None) -> "Entry":
     from mfvpr.checkpoints import REGISTRY, entry_of
     from mfvpr.utils import InputError
 
     if name is not None:
         return entry_of(name)
-    for entry in REGISTRY.values():
-        if entry.file == file.name:
-            return entry
+    if known := [entry for entry in REGISTRY.values() if entry.file == file.name]:
+        return known[0]
     if not file.exists():
         raise InputError(f"{file}: no such file")
     raise InputError(f"{file}: no official file name; say what it is with --as NAME, one of {', '.join(REGISTRY)}")
 
 
-def _runtime_present(entry: "Entry") -> bool:
+def _has_runtime_file(entry: "Entry") -> bool:
     from mfvpr.checkpoints import weights_folder
 
     return any((weights_folder() / f"{entry.name}{suffix}").exists() for suffix in (".safetensors", ".json"))
 
 
-def _original_present(entry: "Entry") -> bool:
+def _has_original(entry: "Entry") -> bool:
     from mfvpr.checkpoints import weights_folder
 
     return entry.sha256 is not None and (weights_folder() / entry.file).exists()
 
 
-def _verified(entry: "Entry") -> str:
-    """What was found good.
+def _verify(entry: "Entry") -> str:
+    """Check the files of an entry and list the checks in words.
 
     Raises:
-        InputError: what is not.
+        InputError: a check fails.
     """
     from mfvpr.checkpoints import load_model, weights_folder
     from mfvpr.checkpoints.files import check_published, read_manifest
     from mfvpr.utils import InputError
 
     good = []
-    original = weights_folder() / entry.file
-    if _original_present(entry):
-        check_published(original, entry)
+    if _has_original(entry):
+        check_published(weights_folder() / entry.file, entry)
         good.append(f"{entry.file} has the published hash")
-    if not good or _runtime_present(entry):
+    if not good or _has_runtime_file(entry):
         load_model(entry.name)
-        parameters = read_manifest(entry.name).parameters
-        if parameters != entry.parameters:
-            raise InputError(f"expected {entry.parameters:,} parameters, got {parameters:,}")
-        good.append(f"{parameters:,} parameters as converted")
+        manifest = read_manifest(entry.name)
+        if manifest.parameters != entry.parameters:
+            raise InputError(f"expected {entry.parameters:,} parameters, got {manifest.parameters:,}")
+        good.append(f"{manifest.parameters:,} parameters as converted")
         if entry.sha256 is None:
-            hash = read_manifest(entry.name).source_sha256[:12]
-            good.append(f"from a {entry.file} of sha256 {hash}..., which nobody published")
+            good.append(f"from a {entry.file} of sha256 {manifest.source_sha256[:12]}..., which nobody published")
     return "good, " + ", ".join(good)
 
 
