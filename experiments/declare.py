@@ -1,6 +1,6 @@
-"""Writes the files of conf/ that follow from the fields of the scores: `make conf`, or `python -m experiments.declare`.
+"""Write the files of conf/ that follow from the scorers' fields: `make conf`, or `python -m experiments.declare`.
 
-They are files, not made when a program starts, because --help and a wrong setting must not wait for JAX.
+They are files because --help and a wrong setting must not wait for JAX.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,14 +10,12 @@ from typing import Any
 import yaml
 
 from experiments.settings import CONF
-from mfvpr.scoring import ALONE, PAPER, SCORERS
-from mfvpr.scoring.fields import declared, summary
+from mfvpr.scoring import ALONE, PAPER, SCORERS, fields
 from mfvpr.utils.files import write_text
 
 _FIRST = "# Made by `make conf` from mfvpr/scoring: change it there.\n"
 
-
-# Scores with other values than their fields' defaults, by name.
+# Scorers with other values than their fields' defaults, by name.
 _VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "homography_8": ("homography", {"threshold": 8.0}),
     "homography_24": ("homography", {"threshold": 24.0}),
@@ -31,65 +29,65 @@ _HOMOGRAPHIES = ("homography_8", "homography_24", "magsac_8")
 def files() -> dict[str, str]:
     """Texts by path below conf/."""
     scorers = {name: (name, {}) for name in SCORERS} | _VARIANTS
-    made = {f"scorer/{name}.yaml": "\n".join(_scorer(*one)) for name, one in scorers.items()}
+    texts = {f"scorer/{name}.yaml": "\n".join(_scorer(*variant)) for name, variant in scorers.items()}
     every = [name for name in SCORERS if name not in ALONE]
-    beside = [name for name in every if name != "homography"]
-    made |= {
-        f"scorer/{name}.yaml": "\n".join([f"# {what}", "defaults:", *(f"  - {one}" for one in _placed(members))])
-        for name, what, members in (
+    without_homography = [name for name in every if name != "homography"]
+    texts |= {
+        f"scorer/{name}.yaml": "\n".join([f"# {summary}", "defaults:", *_entries(members)])
+        for name, summary, members in (
             ("paper", "The paper's scores, each with its parameters, and the number of matches.", PAPER),
             ("all", "Every score of any features but OpenCV's, each with the parameters of its paper.", every),
             ("compared", "Every score, and homographies as the paper has them beside MAGSAC.",
-             [*beside, *_HOMOGRAPHIES]),
+             [*without_homography, *_HOMOGRAPHIES]),
             ("demo", "The paper's, and the histogram weighted by the ratio of distances (not the paper's).",
              [*PAPER, "histogram_ratio"]),
             ("ratio", "Anchor points and histogram of shifts, matches weighted by the ratio of distances (not the "
              "paper's).", {"anchor": "anchor_ratio", "histogram": "histogram_ratio"}),
         )
     }  # fmt: skip
-    made["axes.yaml"] = "\n".join(_axes())
+    texts["axes.yaml"] = "\n".join(_axes())
     limits = {
-        name: {field: parameter.limits for field, parameter in declared(scorer).items()}
+        name: {field: parameter.limits for field, parameter in fields.declared(scorer).items()}
         for name, scorer in SCORERS.items()
     }
-    made["rules.yaml"] = yaml.safe_dump(limits, sort_keys=False, default_flow_style=None).strip()
-    return {path: f"{_FIRST}{text}\n" for path, text in made.items()}
+    texts["rules.yaml"] = yaml.safe_dump(limits, sort_keys=False, default_flow_style=None).strip()
+    return {path: f"{_FIRST}{text}\n" for path, text in texts.items()}
 
 
 def write(conf: Path) -> None:
-    """All of them, and no other scorer."""
-    made = {conf / path: text for path, text in files().items()}
-    for path, text in made.items():
+    """Write all files, and remove the files of other scorers."""
+    texts = {conf / path: text for path, text in files().items()}
+    for path, text in texts.items():
         write_text(path, text)
-    for path in {*(conf / "scorer").glob("*.yaml")} - made.keys():
+    for path in {*(conf / "scorer").glob("*.yaml")} - texts.keys():
         path.unlink()
 
 
 def _scorer(method: str, values: Mapping[str, Any]) -> Iterator[str]:
-    yield f"# {summary(SCORERS[method])}"
+    yield f"# {fields.summary(SCORERS[method])}"
     yield f"method: {method}"
-    for field, parameter in declared(SCORERS[method]).items():
+    for field, parameter in fields.declared(SCORERS[method]).items():
         comment = "; ".join(filter(None, (parameter.unit, parameter.note, parameter.words)))
         yield _line(field, values.get(field, parameter.default), comment)
 
 
-def _placed(members: Sequence[str] | Mapping[str, str]) -> Iterator[str]:
-    """Files of scores, each under a name: its own, or that it has in a mapping."""
+def _entries(members: Sequence[str] | Mapping[str, str]) -> Iterator[str]:
+    """Entries of a defaults list: files of scorers under their own names, or under those of a mapping."""
     named = members if isinstance(members, Mapping) else {member: member for member in members}
-    yield from (f"{file}@{name}" for name, file in named.items())
+    yield from (f"  - {file}@{name}" for name, file in named.items())
 
 
 def _axes() -> Iterator[str]:
-    """Parameters of one scorer, scorer by scorer; then those that several have."""
+    """Lines of the parameters that can be swept: of one scorer each, then those that several scorers share."""
     owners: dict[str, dict[str, str]] = {}
     for name, scorer in SCORERS.items():
-        for field, parameter in declared(scorer).items():
+        for field, parameter in fields.declared(scorer).items():
             if parameter.swept:
                 owners.setdefault(field, {})[name] = parameter.unit or parameter.words
     yield "grid:  # lists of values of the scorer's parameters; null = its own value"
     for field, units in sorted(owners.items(), key=lambda item: len(item[1]) > 1):
-        [unit, *others] = {*units.values()}
-        yield _line(f"  {field}", None, ", ".join(units) + (f": {unit}" if unit and not others else ""))
+        [unit, *more] = {*units.values()}
+        yield _line(f"  {field}", None, ", ".join(units) + (f": {unit}" if unit and not more else ""))
 
 
 def _line(name: str, default: Any, comment: str) -> str:

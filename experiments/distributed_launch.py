@@ -1,7 +1,7 @@
-"""Tasks of one run that are at work at the same time and know of each other (`jax.distributed`): coordinator=HOST:PORT.
+"""Connect the tasks of one run that work at the same time (`jax.distributed`): coordinator=HOST:PORT.
 
-The filter then spreads over the devices of all of them, and a task waits for what the others make. Where one dies, XLA
-aborts the rest, which no handler of Python's survives: so each task has a process that waits for it, and tells.
+Retrieval then uses the devices of all tasks, and a task waits for results of the others. If a task dies, XLA aborts all
+others, and Python cannot handle that. So each task has a second process that waits for it and reports the error.
 """
 
 import atexit
@@ -18,45 +18,46 @@ from typing import Any
 from experiments.errors import leave_at_once
 from experiments.settings import SettingsError
 
-INTERRUPTED = 75  # EX_TEMPFAIL of sysexits.h: to be tried again
-LOST_AFTER = 15  # seconds without a sign of life
+_INTERRUPTED = 75  # EX_TEMPFAIL of sysexits.h: try again
+_LOST_AFTER = 15  # seconds without a heartbeat
 _PR_SET_PDEATHSIG = 1  # of linux/prctl.h
-_OF_A_TASK = "MFVPR_TASK"  # set in the process that works
+_WORKER = "MFVPR_TASK"  # environment variable of the process that works
 
 
 @contextmanager
-def met(settings: Mapping[str, Any], program: str, typed: Sequence[str]) -> Iterator[None]:
-    """Around the work of a task: in the process that was started, wait for another that does it.
+def connection(settings: Mapping[str, Any], program: str, typed: Sequence[str]) -> Iterator[None]:
+    """Connect a task to the others while it works, in a second process that the first one starts and waits for.
 
     Args:
-        settings: of the task; without a coordinator nothing is done.
-        program: that was started.
+        settings: settings of the task; without a coordinator there is nothing to do.
+        program: name of the program that was started.
         typed: its settings as they were typed.
     """
     if not settings.get("coordinator"):
         yield
-    elif _OF_A_TASK not in os.environ:
-        sys.exit(_waited_for([sys.executable, "-m", f"experiments.{program}", *typed], settings))
+    elif _WORKER not in os.environ:
+        sys.exit(_run_worker([sys.executable, "-m", f"experiments.{program}", *typed], settings))
     else:
         _join(settings)
         try:
             yield
         except Exception as error:
-            _leave_without_the_others(2 if isinstance(error, SettingsError | ValueError | OSError) else 1)
+            code = 2 if isinstance(error, SettingsError | ValueError | OSError) else 1
+            atexit.register(leave_at_once, code)  # JAX would keep the process until all others end as well
             raise
 
 
-def part() -> None:
-    """The others are not needed any more."""
+def disconnect() -> None:
+    """End the connection to the other tasks."""
     import jax
 
     if jax.distributed.is_initialized():
         jax.distributed.shutdown()
 
 
-def _waited_for(command: list[str], settings: Mapping[str, Any]) -> int:
-    """The exit code of a process, to which signals are passed on."""
-    task = subprocess.Popen(command, env=os.environ | {_OF_A_TASK: "1"}, preexec_fn=_end_with_parent)
+def _run_worker(command: list[str], settings: Mapping[str, Any]) -> int:
+    """Run a command, forward signals to it, and return its exit code."""
+    task = subprocess.Popen(command, env=os.environ | {_WORKER: "1"}, preexec_fn=_end_with_parent)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda number, _: task.send_signal(number) if number == signal.SIGTERM else None)
     code = task.wait()
@@ -65,12 +66,12 @@ def _waited_for(command: list[str], settings: Mapping[str, Any]) -> int:
     if code == -signal.SIGABRT:
         print(f"error: shard={settings['shard']}: another task has ended, or cannot be reached (see {_log(settings)}); "
               "what was finished is kept: start all tasks again, which go on from there", file=sys.stderr)  # fmt: skip
-        return INTERRUPTED
+        return _INTERRUPTED
     return 128 - code
 
 
 def _end_with_parent() -> None:
-    """Of the process that works: no one who kills the other leaves it behind (Linux)."""
+    """Let Linux kill this process when the one that started it is killed."""
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
@@ -81,9 +82,9 @@ def _join(settings: Mapping[str, Any]) -> None:
     from mfvpr.storage import Shard
 
     shard = Shard.parse(settings["shard"])
-    _keep_for_python(_log(settings))
+    _redirect_libraries(_log(settings))
     jax.distributed.initialize(
-        settings["coordinator"], shard.count, shard.index, heartbeat_timeout_seconds=LOST_AFTER,
+        settings["coordinator"], shard.count, shard.index, heartbeat_timeout_seconds=_LOST_AFTER,
         initialization_timeout=max(60, int(settings["wait"])),
     )  # fmt: skip
 
@@ -94,18 +95,13 @@ def _log(settings: Mapping[str, Any]) -> Path:
     return task_folder(settings) / "log"
 
 
-def _keep_for_python(log: Path) -> None:
-    """What libraries write by themselves, stack traces and all, goes into a file."""
+def _redirect_libraries(log: Path) -> None:
+    """Write the stdout and stderr of C libraries into a file, but not those of Python."""
     log.parent.mkdir(parents=True, exist_ok=True)
     file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
     for name, handle in (("stdout", 1), ("stderr", 2)):
-        own = os.fdopen(os.dup(handle), "w", buffering=1, errors="backslashreplace")
+        python_stream = os.fdopen(os.dup(handle), "w", buffering=1, errors="backslashreplace")
         getattr(sys, name).flush()
         os.dup2(file, handle)
-        setattr(sys, name, own)
+        setattr(sys, name, python_stream)
     os.close(file)
-
-
-def _leave_without_the_others(code: int) -> None:
-    """At the end of this process, which JAX would keep until all others end as well."""
-    atexit.register(leave_at_once, code)

@@ -57,7 +57,7 @@ def evaluate(settings: dict[str, Any]) -> None:
                 done, then = ("its part", "the last shard leaves the results")
             print(f"shard {settings['shard']} has done {done}: {needs}; {then}")
             return
-        distributed_launch.part()
+        distributed_launch.disconnect()
         with sharding.last(settings) as is_last:
             if is_last:
                 with run_folder.claimed(settings, own=True, beside=[sharding.SHARDS]) as folder:

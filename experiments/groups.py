@@ -1,4 +1,4 @@
-"""The groups of conf/ that a program takes, and their choices; without Hydra, which takes a while to import."""
+"""The groups of conf/ that a program has, and their choices; without Hydra, whose import is slow."""
 
 import difflib
 from functools import cache
@@ -30,48 +30,50 @@ def _read(file: Path) -> dict[str, Any]:
 
 
 def groups(config: str) -> dict[str, str | None]:
-    """Group -> the choice that is made where the user makes none, of a program; `${scorer}` = that group's."""
-    found: dict[str, str | None] = {}
+    """Groups of a program with their default choices; `${scorer}` = the choice of that group."""
+    default_choices: dict[str, str | None] = {}
     for entry in defaults(CONF / f"{config}.yaml"):
         if isinstance(entry, dict):
             entries = {group.removeprefix("optional "): choice for group, choice in entry.items()}
-            found |= {group: choice for group, choice in entries.items() if (CONF / group).is_dir()}
+            default_choices |= {group: choice for group, choice in entries.items() if (CONF / group).is_dir()}
         elif entry != "_self_":
-            found |= groups(entry)
-    return found
+            default_choices |= groups(entry)
+    return default_choices
 
 
 def choices(group: str) -> list[str]:
-    """Of a group; none where there is no such group."""
+    """The choices of a group; empty if there is no such group."""
     return sorted(path.stem for path in (CONF / group).glob("*.yaml")) if group.isidentifier() else []
 
 
 def choices_with(group: str, name: str) -> list[str]:
-    """The choices of a group that have a setting, but for those that are made of other choices, or other scores' with
-    another value."""
-    files = (CONF / group / f"{choice}.yaml" for choice in choices(group))
-    own = (file for file in files if _read(file).get("method", file.stem) == file.stem)
-    return [file.stem for file in own if name in _read(file) and not defaults(file)]
+    """The choices of a group that have a setting, without those that combine or vary other choices."""
+    files = {choice: CONF / group / f"{choice}.yaml" for choice in choices(group)}
+    return [
+        choice
+        for choice, file in files.items()
+        if name in _read(file) and _read(file).get("method", choice) == choice and not defaults(file)
+    ]
 
 
 def check_choice(name: str, value: str, config: str) -> None:
-    """Refuse a choice that a group does not have, and a group that a program does not take.
+    """Raise a SettingsError for a choice that a group does not have, or a group that a program does not have.
 
     Args:
-        name: of a setting, which may be a group.
-        value: as it was typed; several between commas.
-        config: of the program.
+        name: setting, possibly a group.
+        value: typed choice, or several choices between commas.
+        config: name of the program's file in conf/.
     """
-    known, own = choices(name), groups(config)
-    if known and name not in own:
+    known, program_groups = choices(name), groups(config)
+    if known and name not in program_groups:
         if name in _read(CONF / f"{config}.yaml"):
             raise SettingsError(f"{name}={value}: this is a group of settings; set one of its members (see --help)")
-        others = [program for other, program in PROGRAMS.items() if name in groups(other)]
-        typed = " or ".join(f"python -m experiments.{program} {name}={value}" for program in others)
+        programs = [program for other, program in PROGRAMS.items() if name in groups(other)]
+        typed = " or ".join(f"python -m experiments.{program} {name}={value}" for program in programs)
         raise SettingsError(f"{name}={value}: experiments.{PROGRAMS[config]} has no group {name}; type {typed}")
     for choice in value.split(",") if known else []:
         if choice not in known:
             nearest = difflib.get_close_matches(choice, known, n=1)
             hint = f"; the nearest is {nearest[0]}" if nearest else ""
-            hint = "; leave it out for none" if choice == "null" and own[name] is None else hint
+            hint = "; leave it out for none" if choice == "null" and program_groups[name] is None else hint
             raise SettingsError(f"{name}={value}: expected one of {', '.join(known)}{hint}")

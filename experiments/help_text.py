@@ -1,5 +1,6 @@
-"""What `--help` prints: the files of conf/ as they are, comments and all, for the groups that were chosen."""
+"""The text of `--help`: the files of conf/ with their comments, for the chosen groups."""
 
+import itertools
 import re
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
@@ -8,18 +9,19 @@ from pathlib import Path
 from experiments.groups import check_choice, choices, defaults, groups
 from experiments.settings import CONF
 
-_WHOLE = ("system", "experiment")  # groups whose choices set values of all others
-_PLACES = {"launcher": "hydra"}  # where a group's settings are, if not in one of its name
+_WHOLE = ("system", "experiment")  # groups that set values of all other groups
+_SECTIONS = {"launcher": "hydra"}  # the section of a group's settings, if it has another name than the group
 
 
 def help_text(config: str, arguments: Sequence[str]) -> str:
-    """How to call a program, its groups, and its settings with the choices among the arguments."""
+    """Usage of a program, its groups, and its settings with the choices among the arguments."""
     typed = dict(argument.split("=", 1) for argument in arguments if "=" in argument)
     for name, value in typed.items():
         check_choice(name, value, config)
-    made = groups(config)
-    chosen = made | {group: typed[group] for group in _WHOLE if group in typed and group in made}
-    chosen |= _overridden(chosen) | {group: choice for group, choice in typed.items() if group in made}
+    chosen = groups(config)
+    typed = {group: choice for group, choice in typed.items() if group in chosen}
+    chosen |= {group: typed[group] for group in _WHOLE if group in typed}
+    chosen |= _overrides(chosen) | typed
     for group, choice in chosen.items():
         if choice and choice.startswith("${"):
             other = chosen[choice[2:-1]]
@@ -32,12 +34,11 @@ def _parts(config: str, chosen: dict[str, str | None]) -> Iterator[str]:
     if chosen:
         yield "\nGroups, each with the choice whose settings follow, and other choices:\n"
     for group, choice in chosen.items():
-        others = ", ".join(other for other in choices(group) if other != choice)
-        yield f"  {group}={choice or 'null'}".ljust(26) + others
+        yield f"  {group}={choice or 'null'}".ljust(26) + ", ".join(name for name in choices(group) if name != choice)
     yield "\nSettings:\n"
     for group, choice in chosen.items():
         if choice and group not in _WHOLE:
-            yield from [*_section(_PLACES.get(group, group), _merged(CONF / group / f"{choice}.yaml")), ""]
+            yield from [*_section(_SECTIONS.get(group, group), _merge(CONF / group / f"{choice}.yaml")), ""]
     for file in (*(entry for entry in defaults(CONF / f"{config}.yaml") if _is_file(entry)), config):
         yield from [*_body(CONF / f"{file}.yaml"), ""]
     for group in _WHOLE:
@@ -46,7 +47,7 @@ def _parts(config: str, chosen: dict[str, str | None]) -> Iterator[str]:
             yield from [f"# {group}={choice}, over the settings above:", *_header(file), *_body(file), ""]
 
 
-def _overridden(chosen: dict[str, str | None]) -> dict[str, str]:
+def _overrides(chosen: dict[str, str | None]) -> dict[str, str]:
     """The choices that a system or an experiment makes in other groups."""
     return {
         name.removeprefix("override /"): choice
@@ -61,18 +62,18 @@ def _section(name: str, lines: Iterable[str]) -> list[str]:
     return [f"{name}:", *textwrap.indent("\n".join(lines), "  ").splitlines()]
 
 
-def _merged(file: Path) -> list[str]:
-    """A choice with what it is made from; of values that stand in both, its own."""
-    own, inherited = _body(file), []
-    keys = {line.partition(":")[0] for line in own}
+def _merge(file: Path) -> list[str]:
+    """The lines of a choice and of its defaults, without the defaults that it replaces."""
+    body, inherited = _body(file), []
+    keys = {line.partition(":")[0] for line in body}
     for entry in defaults(file):
         if not _is_file(entry):
             continue
         other, _, place = entry.partition("@")
-        lines = _merged(file.with_name(f"{other}.yaml"))
+        lines = _merge(file.with_name(f"{other}.yaml"))
         lines = _section(place, lines) if place else lines
         inherited += [line for line in lines if line.startswith(("#", " ")) or line.partition(":")[0] not in keys]
-    return [*_header(file), *inherited, *own]
+    return [*_header(file), *inherited, *body]
 
 
 def _is_file(entry: object) -> bool:
@@ -80,14 +81,13 @@ def _is_file(entry: object) -> bool:
 
 
 def _header(file: Path) -> list[str]:
-    """The comment that a file begins with, without what is for Hydra or for who edits the file."""
-    text = file.read_text(encoding="utf-8")
-    found = re.match(r"(?:#.*\n)*", text)
-    return [line for line in (found[0] if found else "").splitlines() if not line.startswith(("# @", "# Made by "))]
+    """The comment that a file begins with, without the lines for Hydra or for editors of the file."""
+    lines = itertools.takewhile(lambda line: line.startswith("#"), file.read_text(encoding="utf-8").splitlines())
+    return [line for line in lines if not line.startswith(("# @", "# Made by "))]
 
 
 def _body(file: Path) -> list[str]:
-    """A file's settings with their comments: without its header, and what only Hydra reads."""
+    """A file's settings with their comments, without its header and the sections for Hydra."""
     text = re.sub(r"\A(?:#.*\n)*", "", file.read_text(encoding="utf-8"))
     text = re.sub(r"^(?:defaults|hydra):.*\n(?:[ -].*\n|\n)*", "", text, flags=re.MULTILINE)
     return text.strip("\n").splitlines()

@@ -1,19 +1,18 @@
-"""Settings as they are typed, quoted for Hydra's grammar where it would not take their values."""
+"""Quote typed settings whose values Hydra's grammar would reject."""
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 
 PATHS = {"dataset.database", "dataset.queries", "dataset.root", "dataset.index_file", "dataset.cache"}
-PATHS |= {"dataset.database_labels", "dataset.query_labels"}
-PATHS |= {"map", "images"}
+PATHS |= {"dataset.database_labels", "dataset.query_labels", "map", "images"}
 PATHS |= {"store", "out", "checkpoints", "confidence", "also", "report"}
 PATHS |= {f"{group}.{side}" for group in ("features", "retrieval") for side in ("database", "queries")}
 
 
 def as_typed(argument: str, *, several: bool = False) -> str:
-    """A setting quoted for Hydra where its grammar would not take the value as it was typed (paths, mostly).
+    """Quote the value of a typed setting if Hydra's grammar would reject it (paths, mostly).
 
-    Paths may stand in a list; where `several`, in a multirun, between commas.
+    Paths may stand in a list; if `several`, in a multirun, also between commas.
     """
     name, equals, value = argument.partition("=")
     is_path = name in PATHS and value not in ("", "null") and value[0] not in "'\""
@@ -21,10 +20,12 @@ def as_typed(argument: str, *, several: bool = False) -> str:
         return argument
     for special in ("\\", "'", "${"):
         value = value.replace(special, f"\\{special}")
-    if is_path and value[0] == "[" and value[-1] == "]":
-        return f"{name}=[" + ",".join(f"'{one}'" for one in value[1:-1].split(",")) + "]"
-    values = value.split(",") if several and is_path else [value]
-    return f"{name}=" + ",".join(f"'{one}'" for one in values)
+    is_list = is_path and value[0] == "[" and value[-1] == "]"
+    if is_list:
+        value = value[1:-1]
+    parts = value.split(",") if is_list or (several and is_path) else [value]
+    quoted = ",".join(f"'{part}'" for part in parts)
+    return f"{name}=[{quoted}]" if is_list else f"{name}={quoted}"
 
 
 def _unparsable(argument: str) -> bool:

@@ -1,34 +1,33 @@
-"""Checks every setting before any work, and before anything slow is imported.
+"""Check every setting before any work, and before anything slow is imported.
 
-Hydra knows which settings exist and of which type the file had them; what a value means is known here.
+Hydra checks which settings exist; the values are checked here.
 """
 
-import re
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from experiments.rules import Rule, axis, between, either, is_count, list_of, number, one_of, or_file, or_list
+from experiments.rules import Rule, axis, between, either, is_count, list_of, number, one_of, or_file, or_list, pattern
 
 CONF = Path(__file__).parent.parent / "conf"
 
-Program = Callable[[], Callable[[dict[str, Any]], None]]  # imports the job, which takes a while, and returns it
+Program = Callable[[], Callable[[dict[str, Any]], None]]  # imports the job, which is slow, and returns it
 
 
 class SettingsError(Exception):
-    """A setting that cannot be used; one line that names it, what was expected, and what was got."""
+    """One line for a setting that cannot be used: its name, the expected value, and its value."""
 
 
-MAX_SHOWN = 200  # characters of a value that is refused
-# Beyond these bounds float32 and int32 would fail, without a word.
+_MAX_SHOWN = 200  # characters of a value in an error
+# Beyond these bounds float32 and int32 would fail silently.
 _POSITIVE = number(1e-6, 1e12)
 _NOT_NEGATIVE = number(0, 1e12)
 _COUNT = Rule(lambda value: is_count(value) and 0 < value <= 10**6, "a whole number above 0 (at most 1000000)")
 _INDEX = Rule(lambda value: is_count(value) and 0 <= value <= 10**6, "a whole number not below 0 (at most 1000000)")
 _SIDE = between(16, 4096)
 _DISTANCE = number(1e-6, 2)
-_TEXT = Rule(lambda value: isinstance(value, str) and bool(value), "text")
+_TEXT = pattern(r"(?s).+", "text")
 _PATH = Rule(
     lambda value: isinstance(value, str) and bool(value) and "${" not in value,
     "a path, with names of variables filled in (double quotes let the shell do that)",
@@ -38,15 +37,11 @@ _FIGURES = Rule(
     lambda value: _INDEX.holds(value) or list_of(_QUERY).holds(value),
     "how many (at most 1000000), or a list of rows or names of queries",
 )
-_ADDRESS = Rule(lambda value: isinstance(value, str) and bool(re.fullmatch(r"[^\s:]+:[0-9]{1,5}", value)),
-                "HOST:PORT of the first task, such as node1:7654")  # fmt: skip
+_ADDRESS = pattern(r"[^\s:]+:[0-9]{1,5}", "HOST:PORT of the first task, such as node1:7654")
 _FLAG = one_of(True, False)
 
-
 RULES: dict[str, Rule] = {
-    "dataset.name": Rule(
-        lambda value: isinstance(value, str) and bool(re.fullmatch(r"[\w-][\w.-]*", value)), "letters, digits, - and _"
-    ),
+    "dataset.name": pattern(r"[\w-][\w.-]*", "letters, digits, - and _"),
     "features.name": one_of("sift", "d2net", "aliked", "ssm", "patch_netvlad", "selavpr", "import"),
     "retrieval.name": one_of("vlad", "mixvpr", "netvlad", "gem", "dinov2", "ssm", "same", "import", "pairs"),
     "features.image_size": either(list_of(_SIDE, 2), None),
@@ -56,7 +51,7 @@ RULES: dict[str, Rule] = {
     "root": _PATH,
     "database": _PATH,
     "queries": or_list(_PATH),
-    "ground_truth": one_of(None, "order", "index", "utm", "label", "none"),  # None: asked for, see build.dataset
+    "ground_truth": one_of(None, "order", "index", "utm", "label", "none"),  # None: an error, see build.dataset
     "index_file": either(_PATH, None),
     "widen_index": _FLAG,
     "lengths": one_of("unit", "normalize", "keep"),
@@ -68,7 +63,7 @@ RULES: dict[str, Rule] = {
     "seasons": list_of(one_of("fall", "spring", "summer", "winter"), 2),
     "orient": _FLAG,
     "bits": either(between(8, 16), None),
-    # features and filter
+    # features and retrieval
     "image_size": list_of(_SIDE, 2),
     "interpolation": one_of(
         "pil_bilinear", "pil_bicubic", "cv2_linear", "cv2_area", "cv2_cubic", "torch_bilinear", "torch_no_antialias"
@@ -120,7 +115,7 @@ RULES: dict[str, Rule] = {
     ".data": either(_PATH, None),
     ".datasets": either(list_of(_TEXT), None),
     ".systems": either(list_of(_TEXT), None),
-    # a map that is asked
+    # localization in a map
     ".map": _PATH,
     ".images": or_list(_PATH),
     "watch": _FLAG,
@@ -137,13 +132,7 @@ RULES: dict[str, Rule] = {
     "on_bad_image": one_of("fail", "skip"),
     "figures": _FIGURES,
     "out": either(_PATH, None),
-    "shard": either(
-        Rule(
-            lambda value: isinstance(value, str) and bool(re.fullmatch(r"[0-9]+/[0-9]+", value)),
-            "i/n with i from 0 to n - 1, such as 0/8",
-        ),
-        None,
-    ),
+    "shard": either(pattern(r"[0-9]+/[0-9]+", "i/n with i from 0 to n - 1, such as 0/8"), None),
     "wait": number(0, 1e9),
     "coordinator": either(_ADDRESS, None),
     # sweeps
@@ -168,43 +157,65 @@ RULES: dict[str, Rule] = {
 
 
 def check(settings: Mapping[str, Any]) -> None:
-    """Raise a SettingsError for the first value that its rule does not allow."""
+    """Raise a SettingsError for the first value that its rule, or another setting, does not allow."""
     scorer = settings.get("scorer", {})
-    method = str(scorer.get("method") or "")  # "" of several
-    methods = {name: str(one.get("method")) for name, one in scorer.items() if isinstance(one, Mapping)}
-    for path, value in _leaves(settings, ""):
-        rule = _rule(path, methods | {"scorer": method})
-        if rule is None and method and path.startswith("scorer."):
-            raise SettingsError(f"scorer={method} has no setting {path.removeprefix('scorer.')}; see --help")
-        if rule is None:
-            raise SettingsError(f"{path}={value}: this is a group of settings; set one of its members (see --help)")
-        if not rule.holds(value):
-            raise SettingsError(f"{path}={_shown(value)}: expected {rule.expected}")
-    _check_vocabulary(settings.get("retrieval", {}))
-    features = settings.get("features", {})
+    scorers = {name: values for name, values in scorer.items() if isinstance(values, Mapping)}
+    method = str(scorer.get("method") or "")  # "" if there are several
+    _check_values(settings, {name: str(values.get("method")) for name, values in scorers.items()} | {"scorer": method})
+    retrieval, features = (settings.get(group, {}) for group in ("retrieval", "features"))
+    words, samples = (retrieval.get(name, 1) for name in ("num_words", "max_samples"))
+    if samples < words:
+        raise SettingsError(f"retrieval.max_samples={samples}: expected at least retrieval.num_words={words}")
     if features.get("name") in ("sift", "ssm", "patch_netvlad", "selavpr") and features["image_size"] is None:
         raise SettingsError(f"features.image_size=null: expected width and height for features={features['name']}, "
                             "such as [336,336]")  # fmt: skip
     if method == "grid":
         _check_cells(settings)
     if features.get("name") == "patch_netvlad":
-        for path, one in [("scorer", scorer), *((f"scorer.{name}", one) for name, one in scorer.items())]:
-            if isinstance(one, Mapping) and one.get("size") is not None:
-                _check_patches(features, f"{path}.size", one["size"])
-    if settings.get("also") and not settings["report"]:
-        raise SettingsError(f"also={settings['also']}: expected report=DATASET,... as well, to learn on several data "
-                            "sets and report on others")  # fmt: skip
-    for group in ("features", "retrieval") if settings.get("report") else ():
-        if (name := settings[group]["name"]) in ("import", "pairs"):
-            raise SettingsError(f"{group}={name}: expected none with report=, since the files are of one data set")
-    if settings.get("report") and settings["split"] != "both":
-        raise SettingsError(f"split={settings['split']}: expected none with report=, since the data sets are the split")
+        for path, values in [("scorer", scorer), *((f"scorer.{name}", values) for name, values in scorers.items())]:
+            if values.get("size") is not None:
+                _check_patches(features, f"{path}.size", values["size"])
+    _check_report(settings)
     if settings.get("images") and settings["figures"] and settings["out"] is None:
         raise SettingsError(f"figures={settings['figures']}: expected out=DIR as well, where they are drawn")
     fusion = settings.get("fusion", {})
     if fusion.get("weights") and fusion["c"] != "zscore":
         raise SettingsError(f"fusion.weights={fusion['weights']}: expected fusion.c=zscore as well, or "
                             "fusion.weights=null")  # fmt: skip
+    _check_shard(settings)
+    if settings.get("threshold") is not None and settings["confidence"] is None:
+        raise SettingsError(f"threshold={settings['threshold']}: expected confidence=FILE as well, the confidence.json "
+                            "of a run on other images with ground truth")  # fmt: skip
+
+
+def _check_values(settings: Mapping[str, Any], methods: Mapping[str, str]) -> None:
+    for path, value in _leaves(settings, ""):
+        rule = _rule(path, methods)
+        if rule is None and methods["scorer"] and path.startswith("scorer."):
+            name = path.removeprefix("scorer.")
+            raise SettingsError(f"scorer={methods['scorer']} has no setting {name}; see --help")
+        if rule is None:
+            raise SettingsError(f"{path}={value}: this is a group of settings; set one of its members (see --help)")
+        if not rule.holds(value):
+            text = "null" if value is None else str(value)
+            text = text if len(text) <= _MAX_SHOWN else f"{text[: _MAX_SHOWN // 2]}..."
+            raise SettingsError(f"{path}={text}: expected {rule.expected}")
+
+
+def _check_report(settings: Mapping[str, Any]) -> None:
+    if settings.get("also") and not settings["report"]:
+        raise SettingsError(f"also={settings['also']}: expected report=DATASET,... as well, to learn on several data "
+                            "sets and report on others")  # fmt: skip
+    if not settings.get("report"):
+        return
+    for group in ("features", "retrieval"):
+        if (name := settings[group]["name"]) in ("import", "pairs"):
+            raise SettingsError(f"{group}={name}: expected none with report=, since the files are of one data set")
+    if settings["split"] != "both":
+        raise SettingsError(f"split={settings['split']}: expected none with report=, since the data sets are the split")
+
+
+def _check_shard(settings: Mapping[str, Any]) -> None:
     for name in ("coordinator", "wait"):
         if settings.get(name) and settings["shard"] is None:
             raise SettingsError(f"{name}={settings[name]}: expected shard=i/n as well, this task's part")
@@ -212,36 +223,33 @@ def check(settings: Mapping[str, Any]) -> None:
         for name in ("out", "store"):
             if settings[name] is None:
                 raise SettingsError(f"shard={settings['shard']}: expected {name}=DIR as well, the same of all shards")
-    if settings.get("threshold") is not None and settings["confidence"] is None:
-        raise SettingsError(f"threshold={settings['threshold']}: expected confidence=FILE as well, the confidence.json "
-                            "of a run on other images with ground truth")  # fmt: skip
 
 
 def _rule(path: str, methods: Mapping[str, str]) -> Rule | None:
-    """Of a setting, given the method of each system's scorer; None for a group of settings."""
+    """The rule of a setting, given the method of each system's scorer; None for a group of settings."""
     if path.startswith("fusion.weights."):  # names are checked where the scorers are
         return _POSITIVE
     *_, group, name = f".{path}".split(".")
-    scorers, method = scorer_rules(CONF / "rules.yaml"), methods["scorer"]
-    own = scorers.get(group if group in scorers else methods.get(group, ""), {})
+    scorers = scorer_rules(CONF / "rules.yaml")
     if path.startswith("scorer."):
-        return own.get(name) or (one_of(*scorers) if path == "scorer.method" else None)
+        rules = scorers.get(group if group in scorers else methods.get(group, ""), {})
+        return rules.get(name) or (one_of(*scorers) if path == "scorer.method" else None)
     if group == "grid":
-        known = (rules[name] for rules in (scorers.get(method, {}), *scorers.values(), RULES) if name in rules)
-        return next(map(axis, known), None)
+        owners = (scorers.get(methods["scorer"], {}), *scorers.values(), RULES)
+        return next((axis(rules[name]) for rules in owners if name in rules), None)
     return RULES.get(f"{group}.{name}") or RULES.get(name)
 
 
 @cache
 def scorer_rules(file: Path) -> dict[str, dict[str, Rule]]:
-    """Rules by scorer and parameter, of what `experiments.declare` wrote."""
-    import yaml  # here, since Ctrl-C is not yet answered above
+    """Rules by scorer and parameter, from the file that `experiments.declare` wrote."""
+    import yaml  # here, since Ctrl-C is not yet handled above
 
-    found = {}
+    rules = {}
     for scorer, limits in yaml.safe_load(file.read_text(encoding="utf-8")).items():
         method = Rule(one_of(scorer).holds, f"{scorer}; choose with scorer={scorer}")
-        found[scorer] = {"method": method} | {name: _within(**one) for name, one in limits.items()}
-    return found
+        rules[scorer] = {"method": method} | {name: _within(**limit) for name, limit in limits.items()}
+    return rules
 
 
 def _within(*, length: int = 0, optional: bool = False, file: str = "", **limits: list[Any]) -> Rule:
@@ -253,14 +261,8 @@ def _within(*, length: int = 0, optional: bool = False, file: str = "", **limits
     return either(rule, None) if optional else rule
 
 
-def _check_vocabulary(settings: Mapping[str, Any]) -> None:
-    words, samples = (settings.get(name, 1) for name in ("num_words", "max_samples"))
-    if samples < words:
-        raise SettingsError(f"retrieval.max_samples={samples}: expected at least retrieval.num_words={words}")
-
-
 def _check_cells(settings: Mapping[str, Any]) -> None:
-    """That features are cells of a grid, and as many as the score of such cells expects."""
+    """Check that features are the cells of a square grid, as scorer=grid expects."""
     features, side = settings["features"], settings["scorer"]["side"]
     if features["name"] not in ("ssm", "import"):
         raise SettingsError(f"scorer=grid: expected features=ssm, whose features are cells, got {features['name']}")
@@ -276,19 +278,14 @@ def _check_cells(settings: Mapping[str, Any]) -> None:
 
 
 def _check_patches(features: Mapping[str, Any], path: str, reach: list[float]) -> None:
-    """That the rapid score's reach is that of the patches, which the configurations write for their own image size."""
+    """Check the rapid score's size, which the configurations give for their own image size and patch sizes."""
     expected = [[16 * (pixels // 16 - patch) for pixels in features["image_size"]] for patch in features["patch_sizes"]]
     if min(map(min, expected)) < 0:
-        return  # there is no room for these patches, which the extractor says
+        return  # the images are too small for these patches, which is the extractor's error
     if expected != [list(reach)]:
         of_patches = f"{expected[0]}, the largest place of these patches, or" if len(expected) == 1 else "null, since"
         why = "null" if len(expected) == 1 else "each size of patches has its own"
         raise SettingsError(f"{path}={reach}: expected {of_patches} {why}")
-
-
-def _shown(value: Any) -> str:
-    text = "null" if value is None else str(value)
-    return text if len(text) <= MAX_SHOWN else f"{text[: MAX_SHOWN // 2]}..."
 
 
 def _leaves(settings: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:

@@ -1,4 +1,4 @@
-"""The library's messages in words of the settings: it knows its own parameters, a user of the programs what was set."""
+"""Translate errors of the library, which name its parameters, into errors that name settings."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -8,8 +8,8 @@ from typing import Any
 from experiments.settings import SettingsError
 
 _FILES = "(index_file|database_labels|query_labels)"
-# What is a setting in the library's words, and how it is set. GROUP is the group whose file the message is about.
-WORDS = {
+# Pattern in a message of the library -> words of the settings. GROUP stands for `features` or `retrieval`.
+_WORDS = {
     r"or skip bad images$": "or set on_bad_image=skip",
     rf"give {_FILES} as well": r"give dataset.\1=FILE as well",
     rf"given as {_FILES}, but ground_truth=": r"given as dataset.\1, but dataset.ground_truth=",
@@ -19,7 +19,7 @@ WORDS = {
     "GROUP.database_prefix=... and GROUP.query_prefix=...",
     r"called by their paths below their folder\)": "called by their paths below their folder, behind "
     "GROUP.database_prefix and GROUP.query_prefix)",
-    r"give one of this folder as well$": "choose another retrieval, or no cohort",  # others are asked for all folders
+    r"give one of this folder as well$": "choose another retrieval, or no cohort",  # not for one of several folders
     r"or lower num_words$": "or lower retrieval.num_words",
     r"extract these, or match nearest neighbors$": "set features=aliked, or matching=neighbors",
     r"give it as image_size=$": "give it as features.image_size=[W,H]",
@@ -31,26 +31,26 @@ WORDS = {
 
 @contextmanager
 def in_settings(settings: Mapping[str, Any]) -> Iterator[None]:
-    """What the library refuses, told in words of the settings."""
+    """Raise errors of the library again, in words of the settings."""
     from mfvpr.utils import InputError
 
     try:
         yield
     except InputError as error:
-        if (text := _translated(str(error), settings)) == str(error):
+        if (text := _translate(str(error), settings)) == str(error):
             raise
         raise SettingsError(text) from error
 
 
-def _translated(text: str, settings: Mapping[str, Any]) -> str:
-    own = _group(text, settings)
-    for words, ours in WORDS.items():
-        text = re.sub(words, ours.replace("GROUP", own), text)
+def _translate(text: str, settings: Mapping[str, Any]) -> str:
+    group = _group(text, settings)
+    for pattern, words in _WORDS.items():
+        text = re.sub(pattern, words.replace("GROUP", group), text)
     return text
 
 
 def _group(text: str, settings: Mapping[str, Any]) -> str:
-    """Whose file a message begins with."""
+    """The group of settings with the file that a message begins with."""
     from experiments.build import expanded
 
     retrieval = settings.get("retrieval", {})
