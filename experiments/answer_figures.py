@@ -1,4 +1,4 @@
-"""Figures of some of the answers of a map."""
+"""Figures of localized images."""
 
 from collections.abc import Mapping
 from pathlib import PurePath
@@ -15,31 +15,31 @@ from mfvpr.report.file_names import file_names
 
 
 class AnswerFigures:
-    """Those of images that settings ask for, each as soon as it is answered."""
+    """Figures of the images that `figures=` names, each drawn as soon as the image is localized."""
 
-    def __init__(self, known: Map, settings: Mapping[str, Any]) -> None:
-        """None yet.
+    def __init__(self, robot_map: Map, settings: Mapping[str, Any]) -> None:
+        """Read `figures=`, `out=` and `root=`.
 
         Raises:
-            SettingsError: the folder of the map's images is none.
+            SettingsError: `root=` is no folder.
         """
-        shown, self._known, self._failed = settings["figures"], known, 0
-        self._wanted = set(range(shown) if isinstance(shown, int) else shown)
-        self._missing = set() if isinstance(shown, int) else {*self._wanted}  # there may be fewer than so many
+        figures, self._map, self._failed = settings["figures"], robot_map, 0
+        self._wanted = set(range(figures) if isinstance(figures, int) else figures)
+        self._missing = set() if isinstance(figures, int) else {*self._wanted}  # there may be fewer images
         self._out, self._root = (settings[name] and build.expanded(settings[name]) for name in ("out", "root"))
         if self._root and not self._root.is_dir():
             raise SettingsError(f"root={self._root}: expected the folder of the map's images, got no folder")
 
-    def draw(self, number: int, name: str, pixels: np.ndarray, asked: Asked) -> dict[str, Any]:
-        """What the line of an image, the how manieth from 0, says of its figure; one that fails costs a warning."""
-        called = {number, name, PurePath(name).name}
-        if not self._wanted & called:
+    def draw(self, number: int, name: str, pixels: np.ndarray, localized: Asked) -> dict[str, Any]:
+        """Draw the figure of an image, `number` from 0, and return its entry in the line; warn if that fails."""
+        names = {number, name, PurePath(name).name}
+        if not self._wanted & names:
             return {}
-        self._missing -= called
+        self._missing -= names
         [file] = file_names([f"{number:04d}_{PurePath(name).stem}"]).values()
         path = self._out / f"{file}.png"
         try:
-            answer_figure(path, self._known, name, pixels, asked, root=self._root)
+            answer_figure(path, self._map, name, pixels, localized, root=self._root)
         except Exception as error:
             self._failed += 1
             tell(f"warning: {path}: not drawn ({error})")
@@ -47,10 +47,10 @@ class AnswerFigures:
         return {"figure": str(path)}
 
     def finish(self) -> None:
-        """Say what was asked for in vain.
+        """Check that all figures were drawn.
 
         Raises:
-            SettingsError: a figure was not drawn, or there was no such image.
+            SettingsError: a figure could not be drawn, or there was no such image.
         """
         if self._failed:
             raise SettingsError(f"{self._failed} of the figures could not be drawn; warnings say why")

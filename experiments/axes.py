@@ -1,4 +1,4 @@
-"""The settings `grid.`: which parameters of which scorer are varied, and whether that fits into memory."""
+"""The axes of a sweep from the settings `grid.`, and whether its results fit into memory."""
 
 from typing import Any
 
@@ -16,13 +16,12 @@ from mfvpr.tuning.sweeps.sweep import SETTINGS_PER_BLOCK
 from mfvpr.utils import InputError
 from mfvpr.utils.numerics import free_host_bytes
 
-OF_MATCHES = ("max_distance", "c")  # what is no parameter of a scorer
-BYTES_PER_SETTING = 2000  # of Python's own, about
-_MB = 1e6
+_NOT_OF_SCORER = ("max_distance", "c")
+_BYTES_PER_SETTING = 2000  # Python objects, about
 
 
 def as_final(settings: dict[str, Any]) -> dict[str, Any]:
-    """Where the score with the filter decides, every setting has it, with the c of the fusion if none is varied."""
+    """The settings with grid.c = [fusion.c] if the combined score decides and no c is varied."""
     grid = settings["grid"]
     if settings["final"] == "score" or grid["c"] is not None or not any(grid.values()):
         return settings
@@ -30,12 +29,12 @@ def as_final(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def axes(settings: dict[str, Any]) -> Axes:
-    """The checked axes of one scorer."""
+    """The axes of the chosen scorer, checked."""
     if "method" not in settings["scorer"]:
         raise SettingsError("scorer: a sweep takes one scorer at a time; choose with scorer=histogram, or several "
                             "with -m scorer=sum,anchor,histogram")  # fmt: skip
     [(method, scorer)] = build.scorers(settings["scorer"]).items()
-    known = {*declared(scorer), *OF_MATCHES}
+    known = {*declared(scorer), *_NOT_OF_SCORER}
     values = {name: axis for name, axis in settings["grid"].items() if axis is not None}
     for name, axis in values.items():
         if name not in known:
@@ -58,41 +57,41 @@ def axes(settings: dict[str, Any]) -> Axes:
 
 
 def searchable(settings: dict[str, Any]) -> Axes:
-    """The axes of a sweep, if they can be searched."""
-    varied = axes(settings)
+    """The axes of a sweep, if they can be searched here."""
+    grid_axes = axes(settings)
     if settings["search"] == "grid":
-        needed = varied.size * BYTES_PER_SETTING
-        _require(f"grid: {varied.size:,} settings", needed, "use fewer values, or search=optuna")
-        return varied
+        _require_bytes(f"grid: {grid_axes.size:,} settings", grid_axes.size * _BYTES_PER_SETTING,
+                       "use fewer values, or search=optuna")  # fmt: skip
+        return grid_axes
     try:
         require_optuna()
     except InputError as error:
         raise SettingsError(f"search=optuna: {error}, or search=grid") from error
-    return varied
+    return grid_axes
 
 
 def learnable(settings: dict[str, Any]) -> Axes:
-    """What the grid-searched rows vary, of a scorer that can be learned."""
+    """The axes that learning searches for comparison, if the scorer can be learned."""
     method = settings["scorer"].get("method")
     known = [name for name, scorer in SCORERS.items() if can_learn(scorer)]
     if method not in known:
-        what = f"scorer={method}" if method else "scorer"
-        raise SettingsError(f"{what}: expected one to learn, of {', '.join(known)}")
-    varied = axes(settings)
+        setting = f"scorer={method}" if method else "scorer"
+        raise SettingsError(f"{setting}: expected one to learn, of {', '.join(known)}")
+    grid_axes = axes(settings)
     if settings["split"] is None:
         raise SettingsError("split=null: what is learned is never reported on the same queries; expected first_half, "
                             "second_half or both")  # fmt: skip
-    return varied
+    return grid_axes
 
 
 def own_c(settings: dict[str, Any]) -> float | None:
-    """The filter's weight by hand, None = balanced."""
+    """The weight of the retrieval score, None = balanced."""
     c = _plain_c(settings)
     return None if c == "auto" else float(c)
 
 
 def _plain_c(settings: dict[str, Any]) -> Any:
-    """The same as it is written; a sum of several scores is for evaluations."""
+    """The setting fusion.c, which must not fuse several scores here."""
     if (c := settings["fusion"]["c"]) == "zscore":
         raise SettingsError(
             "fusion.c=zscore: expected a number or auto, as sweeps and learning add the filter to one score; set "
@@ -101,11 +100,11 @@ def _plain_c(settings: dict[str, Any]) -> Any:
     return c
 
 
-def require_memory(settings: dict[str, Any], varied: Axes, views: int, matches: MatchSet | Scales) -> None:
-    """Refuse results, or a chunk, that would not fit, before they are begun."""
+def require_memory(settings: dict[str, Any], grid_axes: Axes, views: int, matches: MatchSet | Scales) -> None:
+    """Raise a SettingsError before a sweep whose results, or one chunk, do not fit into memory."""
     queries = len(scales(matches)[0])
-    num_settings = varied.size + (dict(varied.own) not in varied.grid())
-    _require(
+    num_settings = grid_axes.size + (dict(grid_axes.own) not in grid_axes.grid())
+    _require_bytes(
         f"grid: rankings of {queries:,} queries by {num_settings:,} settings",
         sweeps.result_bytes(views, num_settings, queries, max(settings["recall"]["ks"])),
         "use fewer values, smaller recall.ks, or search=optuna",
@@ -114,17 +113,16 @@ def require_memory(settings: dict[str, Any], varied: Axes, views: int, matches: 
     if chunk["settings"] or chunk["queries"]:
         lines = min(chunk["settings"] or SETTINGS_PER_BLOCK, num_settings)
         columns = min(chunk["queries"] or 1, queries)
-        _require(
+        _require_bytes(
             f"chunk: {lines:,} settings x {columns:,} queries",
             block_bytes(matches, lines, columns),
             "use a smaller chunk.settings or chunk.queries, or leave them null",
         )
 
 
-def _require(what: str, needed: int, mend: str) -> None:
-    """Refuse what would not fit, before it is begun."""
+def _require_bytes(purpose: str, needed: int, remedy: str) -> None:
     free = free_host_bytes()
     if needed > 0.8 * free:
         raise SettingsError(
-            f"{what} would take about {needed / _MB:,.0f} MB of memory, {free / _MB:,.0f} MB are free; {mend}"
+            f"{purpose} would take about {needed / 1e6:,.0f} MB of memory, {free / 1e6:,.0f} MB are free; {remedy}"
         )

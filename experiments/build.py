@@ -1,4 +1,4 @@
-"""Checked settings -> the library's values. Plain tables of names; nothing of a user's YAML is ever called."""
+"""Turn checked settings into objects of the library, by fixed tables: nothing named in a YAML file is called."""
 
 import os
 from collections.abc import Callable, Mapping
@@ -36,12 +36,12 @@ from mfvpr.utils.fingerprints import fingerprint
 
 
 def expanded(path: str) -> Path:
-    """A path with ~ resolved, where there is such a user."""
+    """A path with ~ replaced by the home folder."""
     return Path(os.path.expanduser(path))
 
 
 def dataset(settings: dict[str, Any], progress: Callable[[int, int], None]) -> Dataset:
-    """The data set; `streets` is drawn first where the cache does not have it."""
+    """The data set; `streets` is drawn first if the cache does not have it."""
     if settings["name"] == "streets_seasons":
         root = seasons_folder(expanded(settings["cache"]), seed=settings["seed"], progress=progress)
         return sequences_dataset(
@@ -60,9 +60,9 @@ def dataset(settings: dict[str, Any], progress: Callable[[int, int], None]) -> D
         )
     if settings["ground_truth"] is None:
         raise SettingsError(f"dataset.ground_truth: nothing is assumed of your own images; set it to one of {CHOICES}")
-    options: dict[str, Any] = {n: value for n, value in settings.items() if n not in ("root", "exclude_neighbors")}
+    options = _without(settings, "root", "exclude_neighbors")
     several = isinstance(options["queries"], list)
-    if several == ("database_labels" in options):  # which several sequences do not have
+    if several == ("database_labels" in options):  # only a single sequence has labels
         expected = "DIR, or [DIR,...] with dataset=sequences" if several else "[DIR,...], or DIR with dataset=folder"
         raise SettingsError(f"dataset.queries: expected {expected}, got {settings['queries']}")
     if several:
@@ -74,8 +74,8 @@ def dataset(settings: dict[str, Any], progress: Callable[[int, int], None]) -> D
 
 
 def extractor(settings: dict[str, Any], data: Dataset | None) -> Extractor | FeatureFiles:
-    """What takes local features from images, networks with their converted weights; or files of another program."""
-    name, options = settings["name"], {name: value for name, value in settings.items() if name != "name"}
+    """The extractor of local features, or the feature files of another program."""
+    name, options = settings["name"], _without(settings, "name")
     options["image_size"] = options["image_size"] and tuple(options["image_size"])
     if name == "import":
         return FeatureFiles(_files("features", options, data), options["lengths"], options["image_size"])
@@ -87,7 +87,7 @@ def extractor(settings: dict[str, Any], data: Dataset | None) -> Extractor | Fea
     from mfvpr.features import AlikedFeatures, D2NetFeatures, PatchNetVladFeatures, SelaVprFeatures, SsmCells
     from mfvpr.features.ssm import STAGE2_FITTING
 
-    made = {
+    classes = {
         "aliked": AlikedFeatures,
         "d2net": D2NetFeatures,
         "ssm": SsmCells,
@@ -96,27 +96,31 @@ def extractor(settings: dict[str, Any], data: Dataset | None) -> Extractor | Fea
     }
     weights = options.pop("weights", None)
     if name == "ssm":
-        options["whitening"] = _fitting(options, STAGE2_FITTING)
+        options["whitening"] = _pop_fitting(options, STAGE2_FITTING)
     options = {option: tuple(value) if isinstance(value, list) else value for option, value in options.items()}
-    return made[name](_network("features", name, weights), **_only(options, made[name], f"features={name}"))
+    extractor_class = classes[name]
+    return extractor_class(_network("features", name, weights), **_only(options, extractor_class, f"features={name}"))
 
 
 def filter(settings: dict[str, Any], local: Extractor | FeatureFiles, data: Dataset | None) -> Filter:
-    """What finds candidates; VLAD takes the local features that are matched as well."""
-    if settings["name"] == "pairs":
+    """The retrieval of candidates; VLAD aggregates the local features that are matched as well."""
+    name, options = settings["name"], _without(settings, "name", "whiten")
+    if name == "pairs":
         return ShortlistFiles(_files("retrieval", {"database": None} | settings, data), settings["database_prefix"])
-    if settings["name"] == "ssm":
-        return _voting({name: value for name, value in settings.items() if name != "name"})
-    options = {name: value for name, value in settings.items() if name not in ("name", "whiten")}
+    if name == "ssm":
+        return _ssm_voting(options)
     search = ExactSearch() if settings["whiten"] is None else WhitenedSearch(settings["whiten"])
-    if settings["name"] == "same":
-        return Retrieval(_with_vectors(local), search)
-    if settings["name"] == "import":
+    if name == "same":
+        if isinstance(local, FeatureFiles) or not local.vector_size:
+            raise SettingsError("retrieval=same: expected features with a global descriptor, patch_netvlad or selavpr; "
+                                "choose another filter")  # fmt: skip
+        return Retrieval(local, search)
+    if name == "import":
         return DescriptorFiles(_files("retrieval", options, data), options["lengths"], search)
-    if settings["name"] == "vlad":
+    if name == "vlad":
         return Retrieval(Aggregated(local, VladFitting(**options)), search)
-    if settings["name"] in ("netvlad", "gem", "dinov2"):
-        return Retrieval(_described(settings["name"], options), search)
+    if name in ("netvlad", "gem", "dinov2"):
+        return Retrieval(_global_descriptor(name, options), search)
     from mfvpr.features import MixVprDescriptor
     from mfvpr.features.mixvpr import IMAGE_SIZE
 
@@ -126,14 +130,7 @@ def filter(settings: dict[str, Any], local: Extractor | FeatureFiles, data: Data
     return Retrieval(MixVprDescriptor(_network("retrieval", "mixvpr", options.pop("weights")), **options), search)
 
 
-def _with_vectors(local: Extractor | FeatureFiles) -> Extractor:
-    if isinstance(local, FeatureFiles) or not local.vector_size:
-        raise SettingsError("retrieval=same: expected features with a global descriptor, patch_netvlad or selavpr; "
-                            "choose another filter")  # fmt: skip
-    return local
-
-
-def _described(name: str, options: dict[str, Any]) -> Extractor:
+def _global_descriptor(name: str, options: dict[str, Any]) -> Extractor:
     from mfvpr.features import GlobalDescriptor
 
     networks = ("netvlad", "patch_netvlad") if name == "netvlad" else (name,)
@@ -146,8 +143,8 @@ def _described(name: str, options: dict[str, Any]) -> Extractor:
 
 
 def matching(settings: dict[str, Any]) -> Matcher:
-    """What matches a pair of images."""
-    name, options = settings["name"], {name: value for name, value in settings.items() if name != "name"}
+    """The matcher of an image pair."""
+    name, options = settings["name"], _without(settings, "name")
     weights = options.pop("weights", None)
     options = _only(options, Matching if name == "neighbors" else LightGlueMatching, f"matching={name}")
     if name == "neighbors":
@@ -155,26 +152,25 @@ def matching(settings: dict[str, Any]) -> Matcher:
     return LightGlueMatching.of(_network("matching", "lightglue", weights), **options)
 
 
-def _voting(options: dict[str, Any]) -> Filter:
+def _ssm_voting(options: dict[str, Any]) -> Filter:
     from mfvpr.features import SsmWindows
     from mfvpr.features.ssm import STAGE1_FITTING, STAGE1_SIZE
     from mfvpr.retrieval import SsmVoting
 
-    size, weights, whitening = options.pop("image_size"), options.pop("weights"), _fitting(options, STAGE1_FITTING)
+    size, weights, whitening = options.pop("image_size"), options.pop("weights"), _pop_fitting(options, STAGE1_FITTING)
     if tuple(size) != STAGE1_SIZE:
         raise SettingsError(f"retrieval.image_size={size}: SSM-VPR's filter takes {list(STAGE1_SIZE)} only")
-    describer = SsmWindows(_network("retrieval", "ssm", weights), whitening=whitening, **options)
-    return SsmVoting(describer)
+    return SsmVoting(SsmWindows(_network("retrieval", "ssm", weights), whitening=whitening, **options))
 
 
-def _fitting(options: dict[str, Any], published: Any) -> Any:
-    """How the whitening is learned, of the options that say so, which are taken out."""
-    own = {field.name for field in fields(published)} & options.keys()
-    return replace(published, **{name: options.pop(name) for name in own})
+def _pop_fitting(options: dict[str, Any], published: Any) -> Any:
+    """The published fitting of the whitening with the options that replace its fields, which are removed."""
+    names = {field.name for field in fields(published)} & options.keys()
+    return replace(published, **{name: options.pop(name) for name in names})
 
 
 def _files(group: str, settings: dict[str, Any], data: Dataset | None) -> dict[Path, File]:
-    """Files of another program by the folder whose images they are of."""
+    """Files of another program, by folder of the images."""
     if data is None:
         raise ValueError(f"{group}: files of another program belong to a data set")
     queries = settings["queries"] if isinstance(settings["queries"], list) else [settings["queries"]]
@@ -184,8 +180,8 @@ def _files(group: str, settings: dict[str, Any], data: Dataset | None) -> dict[P
     files = {} if settings["database"] is None else {
         data.database.root: File(expanded(settings["database"]), settings["database_prefix"])
     }  # fmt: skip
-    for place, sequence in enumerate(data.sequences):
-        root, path = sequence.images.root, expanded(queries[place if len(queries) > 1 else 0])
+    for index, sequence in enumerate(data.sequences):
+        root, path = sequence.images.root, expanded(queries[index if len(queries) > 1 else 0])
         file = File(path, settings["query_prefix"])
         if files.setdefault(root, file) != file:
             raise SettingsError(
@@ -196,7 +192,7 @@ def _files(group: str, settings: dict[str, Any], data: Dataset | None) -> dict[P
 
 
 def archive(settings: dict[str, Any]) -> Archive:
-    """Where what is taken from images is kept."""
+    """The archive of features, matches and all else that is computed from images."""
     root = None if settings["store"] is None else expanded(settings["store"])
     shard = None if settings.get("shard") is None else Shard.parse(settings["shard"])
     if shard is not None and settings["coordinator"]:
@@ -209,27 +205,27 @@ def where(settings: dict[str, Any]) -> dict[str, Any]:
     """Memory and devices."""
     import jax
 
-    available, asked = jax.local_devices(), settings["devices"]
-    if asked != "all" and asked > len(available):
-        raise SettingsError(f"devices={asked}: expected at most {len(available)}, as many as there are here, or all")
-    return {"memory": settings["memory"], "devices": available if asked == "all" else available[:asked]}
+    devices, number = jax.local_devices(), settings["devices"]
+    if number != "all" and number > len(devices):
+        raise SettingsError(f"devices={number}: expected at most {len(devices)}, as many as there are here, or all")
+    return {"memory": settings["memory"], "devices": devices if number == "all" else devices[:number]}
 
 
 def fusion(settings: dict[str, Any]) -> Fusion:
-    """How the filter's score, and those of further scorers, are added to another."""
+    """The fusion of a score with that of the retrieval, and with those of other scorers."""
     c, filter_score, weights = (settings["fusion"][name] for name in ("c", "filter_score", "weights"))
     c = {"auto": None, "zscore": c}[c] if isinstance(c, str) else float(c)
     return Fusion(c, filter_score, weights or {})
 
 
 def frames(settings: dict[str, Any]) -> FrameCorrelation | None:
-    """How the queries before take part; None = not at all."""
+    """The correlation with previous queries; None without them."""
     previous = settings["previous_queries"]
     return FrameCorrelation(previous) if previous else None
 
 
 def _network(group: str, names: str | tuple[str, ...], weights: str | None) -> Any:
-    """The network, one of these, with its weights, converted before."""
+    """A network of one of these names, with its converted weights."""
     from mfvpr.checkpoints import REGISTRY, load_model
 
     names = (names,) if isinstance(names, str) else names
@@ -240,12 +236,12 @@ def _network(group: str, names: str | tuple[str, ...], weights: str | None) -> A
 
 
 def by_scorer(settings: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The settings of the chosen scorer, or of all of a group, by name."""
+    """Settings of the chosen scorer, or of several, by name."""
     return {settings["method"]: settings} if "method" in settings else settings
 
 
 def described(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """The settings of scorers by name, with the content of a learned match weight, as a file may change."""
+    """Settings of the scorers by name, with the content of a learned match weight, since its file may change."""
     return {
         name: {**values, "weight_content": fingerprint(recipe_of(NAMED_WEIGHTS[values["weight"]]))}
         if values.get("weight", "fs") not in WEIGHTS
@@ -255,16 +251,19 @@ def described(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def scorers(settings: Mapping[str, Any]) -> dict[str, Scorer]:
-    """The chosen scorer, or all of a group, by name."""
+    """The chosen scorer, or several, by name."""
     return {
-        name: made(SCORERS[values["method"]], {field: plain for field, plain in values.items() if field != "method"})
+        name: made(SCORERS[values["method"]], _without(values, "method"))
         for name, values in by_scorer(settings).items()
     }
 
 
+def _without(settings: Mapping[str, Any], *names: str) -> dict[str, Any]:
+    return {name: value for name, value in settings.items() if name not in names}
+
+
 def _only(options: dict[str, Any], extractor: type, choice: str) -> dict[str, Any]:
-    """The options, which the extractor must all know: a mixture of two choices has others."""
-    foreign = options.keys() - {field.name for field in fields(extractor)}
-    if foreign:
-        raise SettingsError(f"{choice} has no setting {', '.join(sorted(foreign))}; see --help")
+    """The options, if they all are fields of the extractor; others come from a mixture of two choices."""
+    if unknown := options.keys() - {field.name for field in fields(extractor)}:
+        raise SettingsError(f"{choice} has no setting {', '.join(sorted(unknown))}; see --help")
     return options

@@ -114,7 +114,7 @@ def made(settings: Mapping[str, Any], images: Images, judged: Judged) -> dict[st
         "queries": sum(len(sequence.images) for sequence in judged.sequences),
         "right_within": right_within(settings, images),
         "candidates": num_candidates(settings, images),
-        "ground_truth": truth.described(settings, images.dataset),
+        "ground_truth": truth.description(settings, images.dataset),
         "settings": {name: settings[name] for name in _NAMES} | {"scorer": build.described(settings["scorer"])},
         "command": settings.get("command"),
         "versions": versions(),

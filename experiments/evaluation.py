@@ -120,7 +120,7 @@ def evaluated(settings: dict[str, Any]) -> Outcome:
 def ground_truth(outcome: Outcome) -> dict[str, Any]:
     """What the recall refers to."""
     dataset, thresholds = outcome.images.dataset, outcome.judged.thresholds
-    return truth.described(outcome.settings, dataset) | {"fingerprint": truth.fingerprint(dataset, thresholds)}
+    return truth.description(outcome.settings, dataset) | {"fingerprint": truth.fingerprint(dataset, thresholds)}
 
 
 def text(outcome: Outcome) -> str:
@@ -146,7 +146,7 @@ def heading(outcome: Outcome) -> str:
         f"{dataset.name}{incomplete}: {queries} queries{several}{_skipped(bad_queries)}, "
         f"{len(dataset.database)} database images{_skipped(bad_database)}, "
         f"{_num_candidates(outcome)} candidates ({settings['retrieval']['name']}), "
-        f"{settings['features']['name']} features{check}; {truth.in_words(truth.described(settings, dataset))}"
+        f"{settings['features']['name']} features{check}; {truth.in_words(truth.description(settings, dataset))}"
     )
 
 

@@ -94,7 +94,7 @@ def _prepared(settings: dict[str, Any], watch: Stopwatch) -> Prepared:
         raise ValueError("expected features of one scale, since learning knows one")
     recipe = stages.recipe(tools, images, candidates.mask.shape[1])
     part = Part(data_sets.label(settings["dataset"]), judge, matches, candidates)
-    return Prepared(part, images, recipe, truth.described(settings, images.dataset))
+    return Prepared(part, images, recipe, truth.description(settings, images.dataset))
 
 
 def check_apart(teach: list[Prepared], report: list[Prepared]) -> None:

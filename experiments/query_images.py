@@ -1,4 +1,4 @@
-"""The images that a map is asked with: files, folders, folders that are watched, and videos."""
+"""Query images of a map: files, folders, watched folders, and videos."""
 
 import stat
 import time
@@ -19,7 +19,7 @@ POLL = 0.2  # seconds between two looks at a folder
 
 
 def images(settings: Mapping[str, Any]) -> Iterator[tuple[str, Path | np.ndarray]]:
-    """(name, file or pixels), in their order; names do not depend on how a path is spelled."""
+    """(name, file or pixels) in order; names do not depend on the spelling of a path."""
     paths = settings["images"] if isinstance(settings["images"], list) else [settings["images"]]
     paths = [build.expanded(path) for path in paths]
     for path in paths:
@@ -29,7 +29,7 @@ def images(settings: Mapping[str, Any]) -> Iterator[tuple[str, Path | np.ndarray
         raise SettingsError(f"watch=true: expected images=DIR, one folder, got {settings['images']}")
     for path in paths:
         if settings["watch"]:
-            yield from ((canonical_name(image), image) for image in _watched(path))
+            yield from ((canonical_name(image), image) for image in _watch(path))
         elif path.is_dir():
             yield from ((canonical_name(image), image) for image in image_folder(path).paths)
         elif path.suffix.lower() in VIDEO_SUFFIXES:
@@ -39,10 +39,10 @@ def images(settings: Mapping[str, Any]) -> Iterator[tuple[str, Path | np.ndarray
             yield canonical_name(path), path
 
 
-def _watched(folder: Path) -> Iterator[Path]:
-    """Images of a folder, then those that come, once their files do not change any more; until Ctrl-C.
+def _watch(folder: Path) -> Iterator[Path]:
+    """Images of a folder, then new ones as soon as their files stop changing, until Ctrl-C.
 
-    One whose file changes later, as where a camera writes slowly, comes again.
+    An image whose file changes later, as when a camera writes slowly, comes again.
     """
     done: dict[str, tuple[int, int]] = {}
     before: dict[str, tuple[int, int]] = {}
@@ -59,7 +59,7 @@ def _watched(folder: Path) -> Iterator[Path]:
 
 
 def _state(path: Path) -> tuple[int, int] | None:
-    """Size and time of the last change; None if there is no regular file, as where it was removed meanwhile."""
+    """Size and modification time; None if there is no regular file, or it has been removed."""
     try:
         status = path.stat()
     except OSError:

@@ -1,4 +1,4 @@
-"""The folder of a run: claimed before the work and filled after it, the tables before any figure."""
+"""The folder of a run: claim it before the work, and fill it after, tables before figures."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -13,17 +13,17 @@ from mfvpr.report.runs import Figure
 from mfvpr.utils import InputError
 from mfvpr.utils.versions import versions
 
-_OF_THE_START = ("multirun", "command")  # what `command_line` adds to the settings
+_NO_SETTINGS = ("multirun", "command")  # added by `command_line`
 
 
 @contextmanager
-def claimed(settings: Mapping[str, Any], **how: Any) -> Iterator[Path]:
-    """The run folder that the settings name, for this run alone; `own` and `beside` as of `runs.claimed`."""
+def claimed(settings: Mapping[str, Any], **options: Any) -> Iterator[Path]:
+    """The run folder that the settings name, for this run alone; with options of `runs.claimed`."""
     out, name = settings["out"], settings["dataset"]["name"]
     folder = build.expanded(out) if out else runs.new_run_folder(Path("runs"), name)
     with ExitStack() as claim:
         try:
-            folder = claim.enter_context(runs.claimed(folder, numbered=not out, **how))
+            folder = claim.enter_context(runs.claimed(folder, numbered=not out, **options))
         except InputError as error:
             raise SettingsError(f"{error} with out=DIR") from error
         yield folder
@@ -38,15 +38,15 @@ def leave(
     write: Callable[[Path], None],
     figures: Sequence[Figure],
 ) -> None:
-    """Files, then the text on stdout, then figures: what is computed is never lost to what comes after.
+    """Write the files, then print the text, then draw the figures, so that no failure loses earlier results.
 
     Args:
-        folder: `claimed`.
-        settings: of the run.
-        ground_truth: what the recall refers to.
-        text: for the terminal; printed where the files cannot be written, too.
-        write: the files, into the folder that it is given.
-        figures: one that cannot be drawn costs a warning.
+        folder: the folder from `claimed`.
+        settings: settings of the run.
+        ground_truth: description of the ground truth.
+        text: text for the terminal, printed even if the files cannot be written.
+        write: function that writes the files into a folder.
+        figures: figures; if one cannot be drawn, there is a warning.
     """
     try:
         keep(folder, settings, ground_truth, write)
@@ -59,11 +59,17 @@ def leave(
 def keep(
     folder: Path, settings: Mapping[str, Any], ground_truth: Mapping[str, Any], write: Callable[[Path], None]
 ) -> None:
-    """The files of a run, with what made them; arguments as of `leave`."""
+    """Write the files of a run and run.json; arguments as of `leave`."""
     try:
         with runs.writing(folder) as new:
             write(new)
-            runs.write_json(new / "run.json", _about(settings, ground_truth))
+            runs.write_json(new / "run.json", {
+                "command": settings.get("command"),
+                "settings": {name: value for name, value in settings.items() if name not in _NO_SETTINGS},
+                "ground_truth": ground_truth,
+                "commit": runs.commit(Path()),
+                "versions": versions(),
+            })  # fmt: skip
     except OSError as error:
         raise SettingsError(
             f"{folder}: the results cannot be written ({error.strerror}); they are printed above, and features and "
@@ -72,35 +78,24 @@ def keep(
 
 
 def draw(folder: Path, figures: Sequence[Figure]) -> None:
-    """The figures of a run; one that cannot be drawn costs a warning."""
-    for name, drawn in console.track("figures")(figures, len(figures)):
+    """Draw the figures of a run; warn if one cannot be drawn."""
+    for name, draw_figure in console.track("figures")(figures, len(figures)):
         try:
-            drawn(folder / "figures" / name)
+            draw_figure(folder / "figures" / name)
         except Exception as error:
             console.tell(f"warning: {folder}/figures/{name}: not drawn ({error})")
 
 
 def report(folder: Path) -> None:
-    """Make the page of an evaluation that was left in a folder, and say where it is."""
+    """Write the page of an evaluation, and print its path."""
     if page := report_page(folder):
         print(f"report: {page}")
 
 
 def report_page(folder: Path) -> Path | None:
-    """The page of an evaluation, now made; one that cannot be made costs a warning, as figures do."""
+    """Write the page of an evaluation and return its path; warn and return None if that fails."""
     try:
         return one_run.write_report(folder)
     except Exception as error:
         console.tell(f"warning: {folder}: no page was made of it ({error})")
         return None
-
-
-def _about(settings: Mapping[str, Any], ground_truth: Mapping[str, Any]) -> dict[str, Any]:
-    """What made the results."""
-    return {
-        "command": settings.get("command"),
-        "settings": {name: value for name, value in settings.items() if name not in _OF_THE_START},
-        "ground_truth": ground_truth,
-        "commit": runs.commit(Path()),
-        "versions": versions(),
-    }

@@ -52,7 +52,7 @@ def sweep(settings: dict[str, Any]) -> None:
             runs.write_json(new / "results.json", _results(settings, images, outcome, watch.seconds))
             write_text(new / "summary.txt", f"{text}\n")
 
-        described = truth.described(settings, images.dataset)
+        described = truth.description(settings, images.dataset)
         run_folder.leave(folder, settings, described, text=text, write=write, figures=sweeps.figures(outcome))
     if kept is not None:
         shutil.rmtree(kept, ignore_errors=True)
@@ -72,7 +72,7 @@ def _kept(settings: dict[str, Any], tools: stages.Tools, images: stages.Images, 
 
 def _heading(settings: dict[str, Any], images: stages.Images, outcome: Outcome) -> str:
     dataset, features = images.dataset, settings["features"]
-    right = truth.in_words(truth.described(settings, dataset))
+    right = truth.in_words(truth.description(settings, dataset))
     size = " at {} x {} px".format(*features["image_size"]) if features["image_size"] else ""  # files may have others
     return (
         f"{dataset.name}: {len(dataset.queries)} queries, {outcome.judge.views[0].shape[1]} candidates of "
@@ -88,6 +88,6 @@ def _results(
         "dataset": images.dataset.name, "data_fingerprint": images.fingerprints, "reading": images.reading,
         "scorer": settings["scorer"], "features": settings["features"], "filter": settings["retrieval"],
         "matching": settings["matching"], "candidates": settings["candidates"], "fusion": settings["fusion"],
-        "final": settings["final"], "ground_truth": truth.described(settings, images.dataset),
+        "final": settings["final"], "ground_truth": truth.description(settings, images.dataset),
         **sweeps.results(outcome), "seconds": seconds, "versions": versions(),
     }  # fmt: skip

@@ -1,4 +1,4 @@
-"""Images -> features -> shortlist and matches: the stages that every program begins with."""
+"""The first stages of every program: images -> features -> shortlist and matches."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -24,33 +24,33 @@ from mfvpr.storage import Archive
 from mfvpr.types import Shortlist
 from mfvpr.utils import Stopwatch
 
-__all__ = ["Images", "Tools", "begun", "matched", "recipe"]
-
-
-_LEARNED_WITH = {"features": ("name", "weights"), "matching": ("name", "cross_check")}  # what a match weight depends on
+_LEARNED_WITH = {
+    "features": ("name", "weights"),
+    "matching": ("name", "cross_check"),
+}  # a match weight depends on these
 
 
 @dataclass(frozen=True)
 class Images:
-    """A data set with what its files hold."""
+    """A data set with the contents of its files."""
 
     dataset: Dataset
     contents: Mapping[str, Contents]  # by side
 
     @property
     def fingerprints(self) -> dict[str, str]:
-        """Of all folders, by side."""
-        return {side: found.fingerprint for side, found in self.contents.items()}
+        """Fingerprints of all folders, by side."""
+        return {side: contents.fingerprint for side, contents in self.contents.items()}
 
     @property
     def reading(self) -> dict[str, Any]:
-        """What reading does to the images, by side."""
-        return {side: found.summary() for side, found in self.contents.items()}
+        """Conversions of the images when they are read, by side."""
+        return {side: contents.summary() for side, contents in self.contents.items()}
 
 
 @dataclass(frozen=True)
 class Tools:
-    """What features, candidates and matches are made with, and where that is kept."""
+    """Extractor, retrieval and matcher, and the archive of their results."""
 
     extractor: Extractor | Source
     filter: Filter
@@ -62,47 +62,54 @@ class Tools:
 def begun(settings: dict[str, Any], watch: Stopwatch) -> tuple[Tools, Images]:
     """The tools and the data set that the settings name.
 
-    What is wrong with the tools is told before anything slow, but of files of others, which belong to images.
+    The tools come first, since their errors should come before anything slow, unless they need files about the images.
     """
     archive = build.archive(settings)
     names = {settings[group]["name"] for group in ("features", "retrieval")}
-    early = None if names & {"import", "pairs"} else _tools(settings, archive, None)
+    tools = None if names & {"import", "pairs"} else _tools(settings, archive, None)
     with watch("data"):
         images = _images(settings, archive)
-    return early or _tools(settings, archive, images.dataset), images
+    return tools or _tools(settings, archive, images.dataset), images
 
 
 def _tools(settings: dict[str, Any], archive: Archive, dataset: Dataset | None) -> Tools:
     extractor = build.extractor(settings["features"], dataset)
     retrieval = build.filter(settings["retrieval"], extractor, dataset)
     if settings.get("coordinator"):
-        retrieval = _spread(retrieval)
+        retrieval = _distribute(retrieval)
     return Tools(extractor, retrieval, build.matching(settings["matching"]), archive, build.where(settings))
 
 
-def _spread(filter: Filter) -> Filter:
-    """The same on the devices of all tasks, where it searches exactly."""
-    from mfvpr.evaluation.distributed import retrieve_everywhere  # which few need
+def _distribute(retrieval: Filter) -> Filter:
+    """The same retrieval on the devices of all tasks, if its search is exact."""
+    from mfvpr.evaluation.distributed import retrieve_everywhere  # here, since few runs need it
 
-    if not isinstance(filter, Retrieval) or not isinstance(filter.search, ExactSearch):
-        return filter
-    return replace(filter, search=replace(filter.search, spread=retrieve_everywhere))
+    if not isinstance(retrieval, Retrieval) or not isinstance(retrieval.search, ExactSearch):
+        return retrieval
+    return replace(retrieval, search=replace(retrieval.search, spread=retrieve_everywhere))
 
 
 def _images(settings: dict[str, Any], archive: Archive) -> Images:
-    """The data set that the settings name."""
+    """The data set that the settings name, without neighbors of the queries; warns about its peculiarities."""
     dataset, neighbors = dataset_of(settings["dataset"]), settings["dataset"].get("exclude_neighbors")
     sides = {"database": archive.contents(dataset.database)}
-    several, sequences, own = len(dataset.sequences) > 1, [], []
+    sequences, same_images = [], []
     for sequence in dataset.sequences:
         contents = archive.contents(sequence.images)
-        sides[f"query {sequence.name}" if several else "query"] = contents
-        own.append(own_rows(contents, sides["database"]))
+        sides[f"query {sequence.name}" if len(dataset.sequences) > 1 else "query"] = contents
+        same_images.append(own_rows(contents, sides["database"]))
         if neighbors is not None:
-            sequence = without_neighbors(sequence, len(dataset.database), own[-1], neighbors)
+            sequence = without_neighbors(sequence, len(dataset.database), same_images[-1], neighbors)
         sequences.append(sequence)
     images = Images(replace(dataset, sequences=tuple(sequences)), sides)
-    _warn_of_images(settings, images, own)
+    for difference in differences(images.dataset):
+        tell(f"warning: {dataset.name}: {difference}; its numbers are not comparable")
+    for sequence, rows in zip(sequences, same_images, strict=True):
+        _warn_of_sequence(settings, sequence, rows)
+    _warn_of_reading(images)
+    if settings["features"]["name"] == "import" and settings["matching"]["name"] == "lightglue":
+        tell("warning: matching=lightglue knows ALIKED's features alone; what features=import gives must be these")
+    _note_candidates(settings, num_candidates(settings, images))
     _warn_of_weights(settings, images)
     return images
 
@@ -110,7 +117,7 @@ def _images(settings: dict[str, Any], archive: Archive) -> Images:
 def matched(
     settings: dict[str, Any], tools: Tools, images: Images, watch: Stopwatch
 ) -> tuple[MatchSet | Scales, Shortlist]:
-    """Matches and shortlist of the only sequence, from their store where they are all there."""
+    """Matches and shortlist of the only sequence, from their store if it has all of them."""
     result = match_sequence(
         images.dataset, images.dataset.only, tools.extractor, tools.filter, settings["candidates"],
         matching=tools.matching, archive=tools.archive, watch=watch, **tools.where,
@@ -119,7 +126,7 @@ def matched(
 
 
 def recipe(tools: Tools, images: Images, num_candidates: int) -> dict[str, Any]:
-    """Of the shortlist and the matches of the only sequence, and of how several scales are fused."""
+    """Recipe of the shortlist and the matches of the only sequence, and of the fusion of several scales."""
     recipe = matches_recipe(
         images.dataset, images.dataset.only, tools.extractor, tools.filter, num_candidates, tools.matching,
         tools.archive,
@@ -129,13 +136,13 @@ def recipe(tools: Tools, images: Images, num_candidates: int) -> dict[str, Any]:
 
 
 def num_candidates(settings: Mapping[str, Any], images: Images) -> int:
-    """How many a query has at most."""
+    """The largest number of candidates of a query."""
     number = len(images.dataset.database)
     return number if settings["candidates"] == "all" else min(settings["candidates"], number)
 
 
 def dataset_of(settings: dict[str, Any]) -> Dataset:
-    """The data set, with progress where it is drawn."""
+    """The data set, with a progress bar if it must be drawn."""
     bars: list[tqdm] = []
 
     def progress(done: int, total: int) -> None:
@@ -150,27 +157,25 @@ def dataset_of(settings: dict[str, Any]) -> Dataset:
             progress_bar.close()
 
 
-def _warn_of_images(settings: dict[str, Any], images: Images, own: list[OwnRows]) -> None:
-    """What is in the data set that may give wrong numbers, and what was done about it."""
-    dataset = images.dataset
-    for difference in differences(dataset):
-        tell(f"warning: {dataset.name}: {difference}; its numbers are not comparable")
-    for sequence, rows in zip(dataset.sequences, own, strict=True):
-        _warn_of_sequence(settings, sequence, rows)
-    for side, did in images.reading.items():
-        if did["turned"]:
-            tell(f"note: {did['turned']} {side} images are turned as their EXIF orientation says")
-        if did["scaled_16bit"]:
-            tell(f"note: {did['scaled_16bit']} 16-bit {side} images are scaled to 8 bits")
-    bits, largest = dataset.database.bits, max(did["largest_16bit"] or 0 for did in images.reading.values())
+def _warn_of_reading(images: Images) -> None:
+    """Note conversions of the images, and warn of 16-bit images whose range does not fit."""
+    for side, reading in images.reading.items():
+        if reading["turned"]:
+            tell(f"note: {reading['turned']} {side} images are turned as their EXIF orientation says")
+        if reading["scaled_16bit"]:
+            tell(f"note: {reading['scaled_16bit']} 16-bit {side} images are scaled to 8 bits")
+    bits = images.dataset.database.bits
+    largest = max(reading["largest_16bit"] or 0 for reading in images.reading.values())
     used = max(largest.bit_length(), 8)
     if largest and bits is not None and not bits - 1 <= used <= bits:
         look = "dark" if used < bits else "cut off"
         tell(f"warning: the largest value of all 16-bit images is {largest}, so that they come out {look}; "
               f"dataset.bits={used} would use their range")  # fmt: skip
-    if settings["features"]["name"] == "import" and settings["matching"]["name"] == "lightglue":
-        tell("warning: matching=lightglue knows ALIKED's features alone; what features=import gives must be these")
-    candidates, available = settings["candidates"], num_candidates(settings, images)
+
+
+def _note_candidates(settings: dict[str, Any], available: int) -> None:
+    """Note that fewer candidates are available than `candidates` or `recall.ks` expect."""
+    candidates = settings["candidates"]
     if candidates != "all" and candidates > available:
         tell(f"note: candidates={candidates}, but the database has {available} images; all of them are re-ranked")
     deeper = [f"R@{k}" for k in settings["recall"]["ks"] if k > available]
@@ -180,34 +185,35 @@ def _warn_of_images(settings: dict[str, Any], images: Images, own: list[OwnRows]
 
 
 def _warn_of_weights(settings: dict[str, Any], images: Images) -> None:
-    """What a learned match weight was learned on, where that may give wrong numbers."""
-    chosen = {one.get("weight", "fs") for one in build.by_scorer(settings["scorer"]).values()}
-    for name in sorted(chosen | {*((settings.get("grid") or {}).get("weight") or ())}):
-        made = how_made(name)
-        sets = made["data_sets"] if isinstance(made.get("data_sets"), list) else [made]
-        seen = {str(folder) for one in sets for folder in _part(one, "data_fingerprint").values()}
+    """Warn of a match weight that was learned on these images, or with other features or matches."""
+    names = {values.get("weight", "fs") for values in build.by_scorer(settings["scorer"]).values()}
+    for name in sorted(names | {*((settings.get("grid") or {}).get("weight") or ())}):
+        origin = how_made(name)
+        data_sets = origin["data_sets"] if isinstance(origin.get("data_sets"), list) else [origin]
+        seen = {str(folder) for data_set in data_sets for folder in _mapping(data_set, "data_fingerprint").values()}
         if seen & {*images.fingerprints.values()}:
             tell(f"warning: weight={name} was learned on images of {images.dataset.name}, so that it flatters here")
-        for group, keys in _LEARNED_WITH.items() if made else ():
-            before, now = _part(_part(made, "settings"), group), settings[group]
+        for group, keys in _LEARNED_WITH.items() if origin else ():
+            before, now = _mapping(_mapping(origin, "settings"), group), settings[group]
             if other := [key for key in keys if before.get(key) != now.get(key)]:
                 words = ", ".join(f"{before.get(key, 'unknown')} instead of {now.get(key)}" for key in other)
                 tell(f"warning: weight={name} was learned with other {group} ({words}); it may mean nothing here")
 
 
-def _part(content: Any, name: str) -> Mapping[str, Any]:
-    """Of what a file says; empty where that is anything else."""
-    found = content.get(name) if isinstance(content, Mapping) else None
-    return found if isinstance(found, Mapping) else {}
+def _mapping(content: Any, name: str) -> Mapping[str, Any]:
+    """The mapping under a name in a file's content, which may be anything; empty if there is none."""
+    entry = content.get(name) if isinstance(content, Mapping) else None
+    return entry if isinstance(entry, Mapping) else {}
 
 
-def _warn_of_sequence(settings: dict[str, Any], sequence: QuerySequence, own: OwnRows) -> None:
-    among, excluded = sum(map(bool, own)), sequence.excluded
-    if among and excluded is None:
-        tell(f"warning: {among} of {len(own)} queries are database images themselves, so that each finds itself; set "
+def _warn_of_sequence(settings: dict[str, Any], sequence: QuerySequence, same_images: OwnRows) -> None:
+    """Warn of queries that are database images, and of thresholds without any correct prediction."""
+    queries, same, excluded = len(same_images), sum(map(bool, same_images)), sequence.excluded
+    if same and excluded is None:
+        tell(f"warning: {same} of {queries} queries are database images themselves, so that each finds itself; set "
               "dataset.exclude_neighbors=N to leave out what is within N frames of it (0 = itself alone)")  # fmt: skip
-    if excluded is not None and among < len(own):
-        tell(f"note: {len(own) - among} of {len(own)} queries are no database images; nothing is left out for them")
+    if excluded is not None and same < queries:
+        tell(f"note: {queries - same} of {queries} queries are no database images; nothing is left out for them")
     ground_truth, thresholds = sequence.truth, truth.thresholds(settings, sequence.truth)
     if ground_truth is None:
         return
@@ -216,5 +222,5 @@ def _warn_of_sequence(settings: dict[str, Any], sequence: QuerySequence, own: Ow
         tell("warning: the ground truth gives no query a right answer; every recall will be 0")
     elif without:
         words = ", ".join(threshold_words(ground_truth.unit, threshold).strip() for threshold in without)
-        mend = "larger recall.tolerances" + ", or fewer dataset.exclude_neighbors" * (excluded is not None)
-        tell(f"warning: no query has a right answer within {words}, so that recall will be 0 there; use {mend}")
+        remedy = "larger recall.tolerances" + ", or fewer dataset.exclude_neighbors" * (excluded is not None)
+        tell(f"warning: no query has a right answer within {words}, so that recall will be 0 there; use {remedy}")

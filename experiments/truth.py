@@ -1,4 +1,4 @@
-"""What a recall refers to: which ground truth, what still counts as right, and how that is written."""
+"""Ground truth of a recall: its source, its thresholds, and their words in results."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,13 +15,13 @@ _WORDS = {"order": "file order", "utm": "positions in the names", "drawn": "draw
 
 
 def thresholds(settings: Mapping[str, Any], truth: Truth | None) -> list[float]:
-    """What counts as right, in the unit of the ground truth, ascending; none without ground truth."""
+    """Thresholds of a correct prediction, ascending, in the ground truth's unit; empty without ground truth."""
     recall = settings["recall"]
     return [] if truth is None else truth.thresholds(tolerances=recall["tolerances"], radius=recall["radius"])
 
 
 def judge(settings: Mapping[str, Any], dataset: Dataset) -> Judge:
-    """What a search or a learning judges rankings by."""
+    """The judge of rankings for sweeps and learning."""
     if dataset.truth is None:
         raise SettingsError(
             "dataset.ground_truth=none: choosing settings needs a ground truth; set order, index, utm or label"
@@ -29,40 +29,39 @@ def judge(settings: Mapping[str, Any], dataset: Dataset) -> Judge:
     return evaluation.judge(dataset.truth, thresholds(settings, dataset.truth), settings["split"])
 
 
-def described(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, Any]:
-    """Kind, files, unit and thresholds of the ground truth, as results keep them."""
-    chosen, truth = settings["dataset"], dataset.sequences[0].truth
-    known = "drawn" if "cache" in chosen else "published"
-    kind = {"kind": chosen.get("ground_truth", known), "files": [chosen[name] for name in _FILES if chosen.get(name)]}
-    kind["exclude_neighbors"] = chosen.get("exclude_neighbors")
-    return kind if truth is None else kind | {"unit": truth.unit, "thresholds": thresholds(settings, truth)}
+def description(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, Any]:
+    """Kind, files, unit and thresholds of the ground truth, as results store them."""
+    choice, truth = settings["dataset"], dataset.sequences[0].truth
+    entries = {
+        "kind": choice.get("ground_truth", "drawn" if "cache" in choice else "published"),
+        "files": [choice[name] for name in _FILES if choice.get(name)],
+        "exclude_neighbors": choice.get("exclude_neighbors"),
+    }
+    return entries if truth is None else entries | {"unit": truth.unit, "thresholds": thresholds(settings, truth)}
 
 
 def fingerprint(dataset: Dataset, thresholds: Sequence[float]) -> str | None:
-    """Of what is right at these thresholds, in every sequence, whatever file says it; None without ground truth."""
-    known = [
-        [sequence.name, *(sequence.truth.positives(threshold) for threshold in thresholds)]
-        for sequence in dataset.sequences
-        if sequence.truth is not None
-    ]
-    if not known:
-        return None
-    rows = [[name, *({"rows": one.rows, "offsets": one.offsets} for one in found)] for name, *found in known]
-    return fingerprints.fingerprint(fingerprints.recipe_of(rows))
+    """Fingerprint of the positives of all sequences, independent of their file; None without ground truth."""
+    content = []
+    for sequence in dataset.sequences:
+        if sequence.truth is not None:
+            positives = [sequence.truth.positives(threshold) for threshold in thresholds]
+            content.append([sequence.name, *({"rows": each.rows, "offsets": each.offsets} for each in positives)])
+    return fingerprints.fingerprint(fingerprints.recipe_of(content)) if content else None
 
 
-def in_words(*described: Mapping[str, Any]) -> str:
-    """The same for a heading, of data sets whose thresholds are one."""
-    first = described[0]
+def in_words(*descriptions: Mapping[str, Any]) -> str:
+    """The ground truth in a heading, from descriptions of data sets with the same thresholds."""
+    first = descriptions[0]
     if "unit" not in first:
         return "no ground truth: rankings only"
-    source = ", ".join(dict.fromkeys(map(_source, described)))
+    source = ", ".join(dict.fromkeys(map(_source, descriptions)))
     if first["unit"] == "exact":
         return f"recall in %, ground truth: {source}"
     within = ", ".join(f"{threshold:g}" for threshold in first["thresholds"])
     return f"recall in %, within {within} {first['unit']} of the ground truth: {source}"
 
 
-def _source(described: Mapping[str, Any]) -> str:
-    kind, files = described["kind"], ", ".join(dict.fromkeys(described["files"]))
+def _source(description: Mapping[str, Any]) -> str:
+    kind, files = description["kind"], ", ".join(dict.fromkeys(description["files"]))
     return ("labels in " if kind == "label" else "") + (files or _WORDS.get(kind, kind))
