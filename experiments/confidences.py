@@ -1,4 +1,4 @@
-"""The confidence of answers: the file that says it, and how the one that a run leaves was made."""
+"""The confidence file of a run: read and check an earlier one, and describe the origin of a new one."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -12,107 +12,113 @@ from mfvpr.evaluation import Confidence, read_confidences
 from mfvpr.report.evaluations import Judged
 from mfvpr.utils.versions import versions
 
+# Confidences depend on these settings.
 _NAMES = ("features", "retrieval", "scorer", "matching", "candidates", "fusion", "previous_queries", "cohort")
 
 
-class Given(NamedTuple):
-    """What the settings name: the confidence of each system, and how they were made."""
+class ConfidenceFile(NamedTuple):
+    """The confidence of each system, and the run that it was fitted on."""
 
     path: str
     systems: Mapping[str, Confidence]
-    made: Mapping[str, Any]
+    origin: Mapping[str, Any]
 
 
-def read(settings: Mapping[str, Any]) -> Given | None:
-    """The file that the settings name, before anything slow; None = none."""
+def read(settings: Mapping[str, Any]) -> ConfidenceFile | None:
+    """Read the file that the settings name; None if there is none."""
     path = settings["confidence"]
-    return None if path is None else Given(path, *read_confidences(build.expanded(path)))
+    return None if path is None else ConfidenceFile(path, *read_confidences(build.expanded(path)))
 
 
-def check(given: Given | None, headline: str, settings: Mapping[str, Any], images: Images) -> Given | None:
-    """What of a file says something of this run; a file that does not know the system that decides is refused.
+def check(
+    file: ConfidenceFile | None, headline: str, settings: Mapping[str, Any], images: Images
+) -> ConfidenceFile | None:
+    """Keep the systems of a file whose settings fit this run at least as well as those of the headline system.
 
-    A line says that one of these very images flatters, what was otherwise where it was fitted, and which other systems
-    are left out because of that.
+    Warns if the file was fitted on the same images, or with other settings.
+
+    Raises:
+        SettingsError: the file has no confidence of the headline system.
     """
-    if given is None:
+    if file is None:
         return None
-    if not given.systems:
-        raise SettingsError(f"confidence={given.path}: expected p of systems, got none: the run that left it could fit "
+    if not file.systems:
+        raise SettingsError(f"confidence={file.path}: expected p of systems, got none: the run that left it could fit "
                             "none, as where there is but one candidate")  # fmt: skip
-    if headline not in given.systems:
-        raise SettingsError(f"confidence={given.path}: expected one of the system that decides, {headline}, got "
-                            f"{', '.join(given.systems)}; make it with the same scorer, final and fusion")  # fmt: skip
-    before, now = map(_of_queries, (given.made.get("data_fingerprint"), images.fingerprints))
+    if headline not in file.systems:
+        raise SettingsError(f"confidence={file.path}: expected one of the system that decides, {headline}, got "
+                            f"{', '.join(file.systems)}; make it with the same scorer, final and fusion")  # fmt: skip
+    before, now = map(_query_fingerprints, (file.origin.get("data_fingerprint"), images.fingerprints))
     if before & now:
-        tell(f"warning: confidence={given.path} was fitted on these very images, so that it flatters")
-    if not any(given.systems[headline].weights):
-        tell(f"warning: confidence={given.path} cannot tell right answers from wrong ones: p is the same for all")
-    other = {name: _otherwise(given, name, settings, images) for name in given.systems}
+        tell(f"warning: confidence={file.path} was fitted on these very images, so that it flatters")
+    if not any(file.systems[headline].weights):
+        tell(f"warning: confidence={file.path} cannot tell right answers from wrong ones: p is the same for all")
+    other = {name: _differences(file.origin, name, settings, images) for name in file.systems}
     if other[headline]:
-        tell(f"warning: confidence={given.path} was fitted with other settings of {', '.join(other[headline])}: p may "
+        tell(f"warning: confidence={file.path} was fitted with other settings of {', '.join(other[headline])}: p may "
              "mean nothing here")  # fmt: skip
-    known = {name: one for name, one in given.systems.items() if {*other[name]} <= {*other[headline]}}
-    if left := [name for name in given.systems if name not in known]:
-        tell(f"confidence={given.path}: nothing is said of {', '.join(left)}, which had other settings there")
-    return given._replace(systems=known)
+    usable = {name: system for name, system in file.systems.items() if {*other[name]} <= {*other[headline]}}
+    if unusable := [name for name in file.systems if name not in usable]:
+        tell(f"confidence={file.path}: nothing is said of {', '.join(unusable)}, which had other settings there")
+    return file._replace(systems=usable)
 
 
-def _otherwise(given: Given, system: str, settings: Mapping[str, Any], images: Images) -> list[str]:
-    """The settings that what was fitted depends on, and that were others."""
-    current = {**settings, "scorer": build.described(settings["scorer"])}
-    before, now = (_of_system(one, system) for one in (given.made.get("settings"), current))
-    names = [name for name in _NAMES if name != "candidates" and before.get(name) != now[name]]
-    counted = given.made.get("candidates") == num_candidates(settings, images)
-    within = right_within(settings, images)
-    return [
-        *names,
-        *([] if counted else ["candidates (as many as there were)"]),
-        *([] if within in (None, given.made.get("right_within")) else ["recall (what counts as right)"]),
-    ]
+def _differences(origin: Mapping[str, Any], system: str, settings: Mapping[str, Any], images: Images) -> list[str]:
+    """The settings of a run that were others when a confidence was fitted."""
+    names = _differing_groups(origin, system, settings)
+    if origin.get("candidates") != num_candidates(settings, images):
+        names.append("candidates (as many as there were)")
+    if _threshold(settings, images) not in (None, origin.get("right_within")):
+        names.append("recall (what counts as right)")
+    return names
 
 
-def other_settings(made: Mapping[str, Any], system: str, own: Mapping[str, Any]) -> list[str]:
-    """The settings of a map that its answers depend on, and that were others where a confidence was fitted."""
-    before = _of_system(made.get("settings"), system)
-    now = _of_system({**own, "scorer": build.described(own["scorer"])}, system)
-    groups = [name for name in _NAMES if name in now and name != "candidates" and before.get(name) != now[name]]
-    return groups + (["candidates"] if made.get("candidates") != own["candidates"] else [])
+def other_settings(origin: Mapping[str, Any], system: str, settings: Mapping[str, Any]) -> list[str]:
+    """The settings of a map that were others when a confidence was fitted."""
+    names = _differing_groups(origin, system, settings)
+    return names + (["candidates"] if origin.get("candidates") != settings["candidates"] else [])
 
 
-def right_within(settings: Mapping[str, Any], images: Images) -> list[Any] | None:
-    """What counts as right, and its unit; None without ground truth."""
-    right = images.dataset.sequences[0].truth
-    if right is None:
+def _differing_groups(origin: Mapping[str, Any], system: str, settings: Mapping[str, Any]) -> list[str]:
+    before = _system_settings(origin.get("settings"), system)
+    now = _system_settings({**settings, "scorer": build.described(settings["scorer"])}, system)
+    return [name for name in _NAMES if name in now and name != "candidates" and before.get(name) != now[name]]
+
+
+def _threshold(settings: Mapping[str, Any], images: Images) -> list[Any] | None:
+    """The middle threshold of a correct prediction, and its unit; None without ground truth."""
+    ground_truth = images.dataset.sequences[0].truth
+    if ground_truth is None:
         return None
-    return [middle(truth.thresholds(settings, right)), right.unit]
+    return [middle(truth.thresholds(settings, ground_truth)), ground_truth.unit]
 
 
-def _of_queries(fingerprints: Any) -> set[str]:
-    """Of the folders with queries, whatever their names; many may share a database."""
+def _query_fingerprints(fingerprints: Any) -> set[str]:
+    """Fingerprints of the folders with queries; a database may be that of many runs."""
     sides = fingerprints.items() if isinstance(fingerprints, Mapping) else ()
     return {folder for side, folder in sides if side != "database" and isinstance(folder, str)}
 
 
-def _of_system(settings: Any, system: str) -> dict[str, Any]:
-    """The settings that its scores depend on, of several scorers those that take part; files by what they hold."""
+def _system_settings(settings: Any, system: str) -> dict[str, Any]:
+    """The settings that a system's scores depend on; files of match weights are compared by content, not by name."""
     scorers = settings.get("scorer") if isinstance(settings, Mapping) else None
     if not isinstance(scorers, Mapping) or not isinstance(scorers.get("method", ""), str):
         return {}
     members = system.split(" + ")
-    parts = {name: own for name, own in build.by_scorer(scorers).items() if name in members}
-    files = {name for name, own in parts.items() if isinstance(own, Mapping) and "weight_content" in own}
-    return {**settings, "scorer": {name: {**own, "weight": None} if name in files else own
-                                   for name, own in parts.items()}}  # fmt: skip
+    parts = {name: values for name, values in build.by_scorer(scorers).items() if name in members}
+    for name, values in parts.items():
+        if isinstance(values, Mapping) and "weight_content" in values:
+            parts[name] = {**values, "weight": None}
+    return {**settings, "scorer": parts}
 
 
-def made(settings: Mapping[str, Any], images: Images, judged: Judged) -> dict[str, Any]:
-    """How the confidence of a run was made."""
+def origin(settings: Mapping[str, Any], images: Images, judged: Judged) -> dict[str, Any]:
+    """The data and settings that the confidence of a run was fitted with, for its file."""
     return {
         "dataset": images.dataset.name,
         "data_fingerprint": images.fingerprints,
         "queries": sum(len(sequence.images) for sequence in judged.sequences),
-        "right_within": right_within(settings, images),
+        "right_within": _threshold(settings, images),
         "candidates": num_candidates(settings, images),
         "ground_truth": truth.description(settings, images.dataset),
         "settings": {name: settings[name] for name in _NAMES} | {"scorer": build.described(settings["scorer"])},

@@ -1,4 +1,4 @@
-"""The main job: two folders of images in, a table of recall, rankings and figures out."""
+"""Evaluate systems: two folders of images in, a table of recall, rankings and figures out."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,8 +7,8 @@ from experiments.launch import launch
 
 
 def evaluate() -> Callable[[dict[str, Any]], None]:
-    """Every stage, the table, a run folder."""
-    from experiments import evaluation  # here, so that --help and a wrong setting need not wait for JAX
+    """The job, which is slow to import."""
+    from experiments import evaluation
 
     return evaluation.evaluate
 

@@ -1,5 +1,6 @@
-"""The main job: images -> features -> shortlist and matches -> scores -> rankings -> recall, in a run folder."""
+"""Evaluate: images -> features -> shortlist and matches -> scores -> rankings -> recall, in a run folder."""
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from mfvpr.report.confidences import Assured, confidence_figures, confidence_tab
 from mfvpr.report.differences import write_gains
 from mfvpr.report.evaluations import Figure, Judged, figures, recall_table, write_rankings, write_skipped
 from mfvpr.report.shifts import write_shifts
+from mfvpr.reranking import Fusion
 from mfvpr.reranking.results import COHORT, FILTER, FRAMES
 from mfvpr.scoring import HistogramOfShifts
 from mfvpr.storage import NotYet
@@ -24,12 +26,12 @@ from mfvpr.storage.feature_writers import open_sinks
 from mfvpr.utils import Stopwatch
 from mfvpr.utils.versions import versions
 
-_THRESHOLDS: dict[Unit, str] = {"frames": "tolerance", "m": "radius"}  # their names in results
+_THRESHOLD_NAMES: dict[Unit, str] = {"frames": "tolerance", "m": "radius"}
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Everything that one evaluation made; parameters by system, and the histogram where it decides."""
+    """The results of one evaluation; parameters by system, and the histogram if it decides."""
 
     settings: dict[str, Any]
     images: Images
@@ -42,7 +44,7 @@ class Outcome:
 
 
 def evaluate(settings: dict[str, Any]) -> None:
-    """Every stage, the table, a run folder with its page; of a shard, what it can do by now."""
+    """Run all stages, print the table, fill the run folder; a shard does what it can do by now."""
     if settings["shard"] is None:
         with run_folder.claimed(settings) as folder:
             _leave(folder, evaluated(settings))
@@ -52,10 +54,10 @@ def evaluate(settings: dict[str, Any]) -> None:
             outcome = evaluated(settings)
         except NotYet as needs:
             sharding.wait(settings, needs)
-            done, then = ("what it can", "start it again when they are there")
             if needs.is_complete:
-                done, then = ("its part", "the last shard leaves the results")
-            print(f"shard {settings['shard']} has done {done}: {needs}; {then}")
+                print(f"shard {settings['shard']} has done its part: {needs}; the last shard leaves the results")
+            else:
+                print(f"shard {settings['shard']} has done what it can: {needs}; start it again when they are there")
             return
         distributed_launch.disconnect()
         with sharding.last(settings) as is_last:
@@ -76,19 +78,18 @@ def _leave(folder: Path, outcome: Outcome) -> None:
 
 
 def evaluated(settings: dict[str, Any]) -> Outcome:
-    """The filter, each scorer, alone and with a cohort, and the best (the paper: histogram) with the filter."""
+    """Evaluate the retrieval, each scorer, alone and with a cohort, and the main scorer fused with the retrieval."""
     scorers, watch, confidence = build.scorers(settings["scorer"]), Stopwatch(), confidences.read(settings)
     fusion, main = build.fusion(settings), "histogram" if "histogram" in scorers else next(iter(scorers))
     fusion.check(main, scorers)
     tools, images = stages.begun(settings, watch)
     sharding.check_data(settings, images)
-    shown = asked_figures(settings["figures"], images.dataset)
-    combined, histogram = fusion.system(main), scorers.get("histogram")
-    headline, frames = combined if settings["final"] == "combined" else main, build.frames(settings)
-    cohort, alone = settings["cohort"], [main]
+    figure_queries = query_rows(settings["figures"], images.dataset)
+    headline, frames = fusion.system(main) if settings["final"] == "combined" else main, build.frames(settings)
+    cohort, fused_systems = settings["cohort"], [main]
     if cohort is not None and fusion.members(main) == [main]:
-        alone.append(f"{main} + {COHORT}")
-    fusions = {name: fusion.renamed(main, name) for name in alone}
+        fused_systems.append(f"{main} + {COHORT}")
+    fusions = {name: fusion.renamed(main, name) for name in fused_systems}
     confidence = confidences.check(confidence, headline, settings, images)
     result = evaluation.evaluate(
         images.dataset, tools.extractor, tools.filter, scorers, candidates=settings["candidates"],
@@ -96,35 +97,42 @@ def evaluated(settings: dict[str, Any]) -> Outcome:
         correlated={headline: frames} if frames else {}, ties=settings["ties"], archive=tools.archive, watch=watch,
         **tools.where,
     )  # fmt: skip
-    own, members = build.described(settings["scorer"]), fusion.members(main)
-    if cohort is not None:
-        own |= {f"{name} + {COHORT}": values | {"cohort": cohort} for name, values in own.items()}
-    of_members = own[main] if members == [main] else {name: own[name] for name in members}
-    fused = {
-        how.system(name): (of_members if name == main else own[name]) | settings["fusion"]
-        for name, how in fusions.items()
-    }
-    parameters = {FILTER: {}, **own, **fused}
+    parameters = _parameters(settings, main, fusions)
     if frames:
         parameters[f"{headline} + {FRAMES}"] = parameters[headline] | asdict(frames)
     thresholds = truth.thresholds(settings, images.dataset.sequences[0].truth)
     judged = Judged(result, thresholds, sorted(set(settings["recall"]["ks"])), headline)
+    histogram = scorers.get("histogram")
     histogram = histogram if isinstance(histogram, HistogramOfShifts) else None
     assured = Assured(judged, confidence and confidence.systems, settings["threshold"])
-    drawn = figures(judged, tools.extractor, shown, assured.refused_of_headline, histogram)
-    drawn += confidence_figures(assured) if shown else []
+    all_figures = figures(judged, tools.extractor, figure_queries, assured.refused_of_headline, histogram)
+    all_figures += confidence_figures(assured) if figure_queries else []
     deciding = histogram if main == "histogram" else None
-    return Outcome(settings, images, tools, judged, assured, parameters, deciding, drawn)
+    return Outcome(settings, images, tools, judged, assured, parameters, deciding, all_figures)
+
+
+def _parameters(settings: dict[str, Any], main: str, fusions: Mapping[str, Fusion]) -> dict[str, dict[str, Any]]:
+    """Parameters by system: retrieval, scorers, scorers with a cohort, fusions."""
+    scorers = build.described(settings["scorer"])
+    if (cohort := settings["cohort"]) is not None:
+        scorers |= {f"{name} + {COHORT}": values | {"cohort": cohort} for name, values in scorers.items()}
+    members = fusions[main].members(main)
+    member_parameters = scorers[main] if members == [main] else {name: scorers[name] for name in members}
+    fused = {
+        fusion.system(name): (member_parameters if name == main else scorers[name]) | settings["fusion"]
+        for name, fusion in fusions.items()
+    }
+    return {FILTER: {}, **scorers, **fused}
 
 
 def ground_truth(outcome: Outcome) -> dict[str, Any]:
-    """What the recall refers to."""
+    """Description and fingerprint of the ground truth."""
     dataset, thresholds = outcome.images.dataset, outcome.judged.thresholds
     return truth.description(outcome.settings, dataset) | {"fingerprint": truth.fingerprint(dataset, thresholds)}
 
 
 def text(outcome: Outcome) -> str:
-    """For the terminal: what was evaluated, and the table."""
+    """Heading and tables for the terminal."""
     tables = [recall_table(outcome.judged)] if outcome.judged.thresholds else []
     if tables and outcome.settings["confidence"]:
         tables.append(confidence_table(outcome.assured))
@@ -132,43 +140,43 @@ def text(outcome: Outcome) -> str:
 
 
 def heading(outcome: Outcome) -> str:
-    """One line that says what was evaluated."""
+    """Data set, numbers of images, retrieval, features and ground truth in one line."""
     settings, dataset, matched = outcome.settings, outcome.images.dataset, outcome.judged.result.matched
     queries = sum(len(sequence.images) for sequence in dataset.sequences)
-    bad_queries = sum(len(one.bad_queries) for one in matched)
-    bad_database = len({row for one in matched for row in one.bad_database})
+    bad_queries = sum(len(sequence.bad_queries) for sequence in matched)
+    bad_database = len({row for sequence in matched for row in sequence.bad_database})
     matching = settings["matching"]
     check = f"cross_check={matching['cross_check']}" if "cross_check" in matching else matching["name"]
     check = "" if check == "cross_check=mutual" else f", {check}"
     several = f" in {len(dataset.sequences)} sequences" if len(dataset.sequences) > 1 else ""
     incomplete = " (incomplete)" if any(differences(dataset)) else ""
     return (
-        f"{dataset.name}{incomplete}: {queries} queries{several}{_skipped(bad_queries)}, "
-        f"{len(dataset.database)} database images{_skipped(bad_database)}, "
+        f"{dataset.name}{incomplete}: {queries} queries{several}{_skip_note(bad_queries)}, "
+        f"{len(dataset.database)} database images{_skip_note(bad_database)}, "
         f"{_num_candidates(outcome)} candidates ({settings['retrieval']['name']}), "
         f"{settings['features']['name']} features{check}; {truth.in_words(truth.description(settings, dataset))}"
     )
 
 
-def _skipped(number: int) -> str:
+def _skip_note(number: int) -> str:
     return f" ({number} skipped)" if number else ""
 
 
 def write(folder: Path, outcome: Outcome) -> None:
-    """All files of a run folder but the figures."""
+    """Write all files of a run folder but the figures."""
     runs.write_json(folder / "results.json", result_rows(outcome))
     if outcome.judged.thresholds:
         runs.write_table(folder, recall_table(outcome.judged), heading(outcome))
     write_rankings(folder, outcome.judged, outcome.assured.refused_of_headline)
     write_gains(folder, outcome.judged)
-    write_confidence(folder, outcome.assured, confidences.made(outcome.settings, outcome.images, outcome.judged))
+    write_confidence(folder, outcome.assured, confidences.origin(outcome.settings, outcome.images, outcome.judged))
     if outcome.histogram is not None:
         write_shifts(folder, outcome.judged, outcome.histogram, outcome.assured.refused_of_headline)
     write_skipped(folder, outcome.judged.result)
 
 
 def result_rows(outcome: Outcome) -> list[dict[str, Any]]:
-    """One row per system and threshold, and sequence where there are several."""
+    """One row per system and threshold, and per sequence if there are several."""
     judged, settings, dataset = outcome.judged, outcome.settings, outcome.images.dataset
     common = {
         "filter": settings["retrieval"],
@@ -189,33 +197,37 @@ def result_rows(outcome: Outcome) -> list[dict[str, Any]]:
     rows = []
     for name, parameters in outcome.parameters.items():
         scorers = [part for part in name.split(" + ") if part not in (COHORT, FILTER, FRAMES)]
-        decides = name == judged.headline
-        system = {"system": name, "scorer": " + ".join(scorers) or "none", "decides": decides, "parameters": parameters}
-        rows += [system | judgment | common for judgment in _judgments(judged, name)]
+        system = {
+            "system": name,
+            "scorer": " + ".join(scorers) or "none",
+            "decides": name == judged.headline,
+            "parameters": parameters,
+        }
+        rows += [system | recall | common for recall in _recalls(judged, name)]
     return rows
 
 
 def _bytes_per_image(outcome: Outcome) -> int | None:
-    """The forecast of what an image's features take on disk; None where they are imported, and not kept."""
+    """Expected bytes of an image's features on disk; None for imported features, which are not stored."""
     extractor = outcome.tools.extractor
     if isinstance(extractor, Source):
         return None
     return sum(sink.forecast(1) for sink in open_sinks(None, extractor, {}, num_images=1))
 
 
-def _judgments(judged: Judged, system: str) -> list[dict[str, Any]]:
-    """Threshold, and recall by K; of several sequences, each, and their means."""
+def _recalls(judged: Judged, system: str) -> list[dict[str, Any]]:
+    """Threshold and recall by K; for several sequences, of each sequence and their mean."""
     if not judged.thresholds:
         return [{"recall_at": {}}]
     known = judged.sequences[0].truth
-    name = _THRESHOLDS.get(known.unit) if known else None
+    name = _THRESHOLD_NAMES.get(known.unit) if known else None
     several = len(judged.sequences) > 1
     return [
         ({"sequence": sequence} if several else {})
         | ({name: threshold} if name else {})
-        | {"recall_at": {str(k): round(float(value), 6) for k, value in zip(judged.ks, recall[place], strict=True)}}
+        | {"recall_at": {str(k): round(float(value), 6) for k, value in zip(judged.ks, recall[index], strict=True)}}
         for sequence, recall in judged.parts(system)
-        for place, threshold in enumerate(judged.thresholds)
+        for index, threshold in enumerate(judged.thresholds)
     ]
 
 
@@ -223,16 +235,16 @@ def _num_candidates(outcome: Outcome) -> int:
     return int(outcome.judged.result.matched[0].candidates.indices.shape[1])
 
 
-def asked_figures(asked: int | list[int | str], dataset: Dataset) -> int | list[int]:
-    """How many figures, or of which queries, as rows; what is asked for may be names."""
-    if isinstance(asked, int):
-        return asked
+def query_rows(queries: int | list[int | str], dataset: Dataset) -> int | list[int]:
+    """The rows of queries that are given by row or name; a number of queries as it is."""
+    if isinstance(queries, int):
+        return queries
     names = {name: row for row, name in enumerate(dataset.queries.names)}
-    rows = [names.get(one, -1) if isinstance(one, str) else one for one in asked]
-    for one, row in zip(asked, rows, strict=True):
+    rows = [names.get(query, -1) if isinstance(query, str) else query for query in queries]
+    for query, row in zip(queries, rows, strict=True):
         if not 0 <= row < len(names):
             raise SettingsError(
-                f"figures=[{one}]: expected rows of queries from 0 to {len(names) - 1}, or names such as "
+                f"figures=[{query}]: expected rows of queries from 0 to {len(names) - 1}, or names such as "
                 f"{dataset.queries.names[0]}"
             )
     return list(dict.fromkeys(rows))

@@ -1,4 +1,4 @@
-"""Learned scores beside hand-set and grid-searched ones, on queries that none of them was chosen on."""
+"""Learn scores, and compare them with hand-set and grid-searched ones on other queries."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,8 +7,8 @@ from experiments.launch import launch
 
 
 def learn() -> Callable[[dict[str, Any]], None]:
-    """Learning, its table, a run folder."""
-    from experiments import learning  # here, so that --help and a wrong setting need not wait for JAX
+    """The job, which is slow to import."""
+    from experiments import learning
 
     return learning.learn
 

@@ -1,4 +1,4 @@
-"""The stages of learning: what is learned on one half of the path, or on some data sets, beside what is set by hand."""
+"""Learn scores on one half of the path, or on some data sets, and compare them with hand-set and searched ones."""
 
 import itertools
 from collections.abc import Iterator
@@ -9,7 +9,7 @@ from experiments import build, console, data_sets, run_folder, stages, truth
 from experiments.axes import learnable, own_c
 from experiments.settings import SettingsError
 from experiments.stages import Images
-from mfvpr.datasets.sequences import own_rows
+from mfvpr.datasets.sequences import OwnRows, own_rows
 from mfvpr.matching import Scales
 from mfvpr.report import comparisons, runs
 from mfvpr.scoring import Scorer
@@ -27,36 +27,35 @@ _INPUTS = {"relative": RELATIVE, "absolute": ABSOLUTE}
 
 
 class Prepared(NamedTuple):
-    """A data set with its matches; `recipe` is of these, `described` of what is right."""
+    """A data set with its matches, their recipe, and a description of the ground truth."""
 
     part: Part
     images: Images
     recipe: dict[str, Any]
-    described: dict[str, Any]
+    ground_truth: dict[str, Any]
 
 
 def learn(settings: dict[str, Any]) -> None:
-    """Matches -> learned, searched and hand-set scores on what none of them saw -> table, figures, files."""
+    """Learn, search, compare on queries that were not learned on, fill the run folder."""
     with run_folder.claimed(settings) as folder:
-        varied, how, watch = learnable(settings), _options(settings), Stopwatch()
-        sets = [_prepared(one, watch) for one in _each(settings)]
-        taught, reported, whole = sets, sets[:0], sets[0].part
+        axes, options, watch = learnable(settings), _options(settings), Stopwatch()
+        teach = [_prepare(choice, watch) for choice in _each(settings)]
+        report, data = [], teach[0].part
         if settings["report"]:
-            others = len(data_sets.composed("report", settings["report"]))
-            taught, reported = sets[:-others], sets[-others:]
-            check_apart(taught, reported)
-            whole = joined(*([one.part for one in some] for some in (taught, reported)))
+            number = len(data_sets.composed("report", settings["report"]))
+            teach, report = teach[:-number], teach[-number:]
+            check_apart(teach, report)
+            data = joined([data_set.part for data_set in teach], [data_set.part for data_set in report])
         with watch("learning"):
-            options = {"checkpoints": _checkpoints(settings, varied.scorer, whole, sets), "track": console.track}
-            data = varied, whole.judge, whole.match_set, whole.candidates
-            comparison = compare(*data, how, **options)
-        heading = _heading(settings, whole, taught, reported)
+            checkpoints = _checkpoints(settings, axes.scorer, data, teach + report)
+            comparison = compare(axes, data.judge, data.match_set, data.candidates, options,
+                                 checkpoints=checkpoints, track=console.track)  # fmt: skip
+        heading = _heading(settings, data, teach, report)
         text = f"{heading}\n\n{comparisons.text(comparison)}"
         left_out = ("dataset", "store", "out", "checkpoints", "multirun", "command")
-        several = {"data_sets": [*map(_about, taught)], "reported_sets": [*map(_about, reported)]}
-        several = several if reported else _about(sets[0])
+        about = {"data_sets": [*map(_about, teach)], "reported_sets": [*map(_about, report)]}
         results = {
-            **several, **comparisons.results(comparison),
+            **(about if report else _about(teach[0])), **comparisons.results(comparison),
             "settings": {name: value for name, value in settings.items() if name not in left_out},
             "seconds": watch.seconds, "versions": versions(),
         }  # fmt: skip
@@ -64,27 +63,28 @@ def learn(settings: dict[str, Any]) -> None:
         def write(new: Path) -> None:
             runs.write_table(new, comparisons.table(comparison), heading)
             runs.write_json(new / "results.json", results)
-            made = {"command": settings.get("command"), "commit": runs.commit(Path()), **results}
-            del made["rows"], made["queries"], made["seconds"]
-            comparisons.write_weights(new / "weights", comparison, made)
+            origin = {"command": settings.get("command"), "commit": runs.commit(Path()), **results}
+            del origin["rows"], origin["queries"], origin["seconds"]
+            comparisons.write_weights(new / "weights", comparison, origin)
             write_text(new / "summary.txt", f"{text}\n")
 
         figures = comparisons.figures(comparison)
-        described = {one.part.name: one.described for one in reported} if reported else sets[0].described
-        run_folder.leave(folder, settings, described, text=text, write=write, figures=figures)
+        by_name = {data_set.part.name: data_set.ground_truth for data_set in report}
+        ground_truth = by_name if report else teach[0].ground_truth
+        run_folder.leave(folder, settings, ground_truth, text=text, write=write, figures=figures)
 
 
 def _each(settings: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """The settings of each data set: those to learn on, then those to report on."""
+    """Settings of each data set: those to learn on, then those to report on."""
     if not settings["report"]:
         yield settings
         return
-    others = [one for name in ("also", "report") if settings[name] for one in data_sets.composed(name, settings[name])]
-    for dataset in (settings["dataset"], *others):
+    more = [data_sets.composed(name, settings[name]) for name in ("also", "report") if settings[name]]
+    for dataset in (settings["dataset"], *itertools.chain(*more)):
         yield settings | {"dataset": dataset, "split": None}
 
 
-def _prepared(settings: dict[str, Any], watch: Stopwatch) -> Prepared:
+def _prepare(settings: dict[str, Any], watch: Stopwatch) -> Prepared:
     if len(sizes := settings["features"].get("patch_sizes", [])) > 1:
         raise SettingsError(f"features.patch_sizes={sizes}: expected one size, since learning knows one scale")
     tools, images = stages.begun(settings, watch)
@@ -98,26 +98,31 @@ def _prepared(settings: dict[str, Any], watch: Stopwatch) -> Prepared:
 
 
 def check_apart(teach: list[Prepared], report: list[Prepared]) -> None:
-    """Refuse to report on images that were learned on, and queries that would count twice."""
-    for one, other in itertools.product(teach, report):
-        sides = itertools.product(other.images.contents.values(), one.images.contents.values())
+    """Raise a SettingsError for reports on images that were learned on, and for queries that would count twice."""
+    for first, second in itertools.product(teach, report):
+        sides = itertools.product(second.images.contents.values(), first.images.contents.values())
         if same := sum(bool(rows) for pair in sides for rows in own_rows(*pair)):
-            raise SettingsError(f"report={other.part.name}: expected other images than those of {one.part.name}, "
+            raise SettingsError(f"report={second.part.name}: expected other images than those of {first.part.name}, "
                                 f"which is learned on; {same} are the same")  # fmt: skip
-    for one, other in (pair for sets in (teach, report) for pair in itertools.combinations(sets, 2)):
-        if same := sum(map(bool, own_rows(*(each.images.contents["query"] for each in (other, one))))):
-            raise SettingsError(f"{other.part.name}: expected other queries than those of {one.part.name}; {same} are "
-                                "the same, and would count twice")  # fmt: skip
-    for one, other in itertools.combinations(report, 2):
-        if any(own_rows(*(each.images.contents["database"] for each in (other, one)))):
-            console.tell(f"warning: {one.part.name} and {other.part.name} are of one map, but their queries are taken "
-                         "for independent, so that intervals are too narrow and p too low")  # fmt: skip
+    for first, second in (*itertools.combinations(teach, 2), *itertools.combinations(report, 2)):
+        if same := sum(map(bool, _same_images(second, first, "query"))):
+            raise SettingsError(f"{second.part.name}: expected other queries than those of {first.part.name}; {same} "
+                                "are the same, and would count twice")  # fmt: skip
+    for first, second in itertools.combinations(report, 2):
+        if any(_same_images(second, first, "database")):
+            console.tell(f"warning: {first.part.name} and {second.part.name} are of one map, but their queries are "
+                         "taken for independent, so that intervals are too narrow and p too low")  # fmt: skip
 
 
-def _about(one: Prepared) -> dict[str, Any]:
+def _same_images(first: Prepared, second: Prepared, side: str) -> OwnRows:
+    return own_rows(first.images.contents[side], second.images.contents[side])
+
+
+def _about(data_set: Prepared) -> dict[str, Any]:
+    images = data_set.images
     return {
-        "dataset": one.images.dataset.name, "ground_truth": one.described,
-        "data_fingerprint": one.images.fingerprints, "reading": one.images.reading,
+        "dataset": images.dataset.name, "ground_truth": data_set.ground_truth,
+        "data_fingerprint": images.fingerprints, "reading": images.reading,
     }  # fmt: skip
 
 
@@ -129,31 +134,31 @@ def _options(settings: dict[str, Any]) -> Options:
     )  # fmt: skip
 
 
-def _checkpoints(settings: dict[str, Any], scorer: Scorer, whole: Part, sets: list[Prepared]) -> Checkpoints | None:
-    """Where the trainings are kept, and what identifies them."""
+def _checkpoints(settings: dict[str, Any], scorer: Scorer, data: Part, sets: list[Prepared]) -> Checkpoints | None:
+    """Folder and recipe of the checkpoints; None without a folder."""
     root = settings["checkpoints"] or settings["store"]
     if root is None:
         return None
     names = ("loss", "every", "patience", "batch", "learning_rate", "hidden", "inputs", "seed")
     recipe = {
-        "matches": [one.recipe for one in sets], "scorer": recipe_of(scorer),
+        "matches": [data_set.recipe for data_set in sets], "scorer": recipe_of(scorer),
         "tolerances": settings["recall"], **{name: settings[name] for name in names},
-        "filter_score": settings["fusion"]["filter_score"], "positives": whole.judge.fingerprint,
-        "reported": dict(whole.judge.reported_sets),
+        "filter_score": settings["fusion"]["filter_score"], "positives": data.judge.fingerprint,
+        "reported": dict(data.judge.reported_sets),
         "versions": {name: versions()[name] for name in ("mfvpr", "jax", "numpy")},
     }  # fmt: skip
-    own = "" if settings["checkpoints"] else f"{settings['dataset']['name']}_learning-{fingerprint(recipe)}"
-    return Checkpoints(build.expanded(root) / own, recipe)
+    name = "" if settings["checkpoints"] else f"{settings['dataset']['name']}_learning-{fingerprint(recipe)}"
+    return Checkpoints(build.expanded(root) / name, recipe)
 
 
-def _heading(settings: dict[str, Any], whole: Part, taught: list[Prepared], reported: list[Prepared]) -> str:
-    what = f"{settings['scorer']['method']} score, {settings['features']['name']} features"
-    right = truth.in_words(*(one.described for one in reported or taught))
-    if reported:
-        learned, told = (", ".join(one.part.name for one in sets) for sets in (taught, reported))
-        return f"{learned}: {what}; what was learned here is reported on {told}; {right}"
-    queries = sum(len(half.report) for half in whole.judge.halves)
+def _heading(settings: dict[str, Any], data: Part, teach: list[Prepared], report: list[Prepared]) -> str:
+    system = f"{settings['scorer']['method']} score, {settings['features']['name']} features"
+    ground_truth = truth.in_words(*(data_set.ground_truth for data_set in report or teach))
+    if report:
+        teach_names, report_names = (", ".join(data_set.part.name for data_set in sets) for sets in (teach, report))
+        return f"{teach_names}: {system}; what was learned here is reported on {report_names}; {ground_truth}"
+    queries = sum(len(half.report) for half in data.judge.halves)
     return (
-        f"{whole.name}: {what}; each of {queries} queries is reported on by what was learned on the other half of the "
-        f"path; {right}"
+        f"{data.name}: {system}; each of {queries} queries is reported on by what was learned on the other half of the "
+        f"path; {ground_truth}"
     )

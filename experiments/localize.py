@@ -1,4 +1,4 @@
-"""Ask a map where images were taken: a line of JSON for each. `python -m experiments.localize --help`."""
+"""Localize images in a map: a line of JSON for each. `python -m experiments.localize --help`."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,8 +7,8 @@ from experiments.launch import launch
 
 
 def localize() -> Callable[[dict[str, Any]], None]:
-    """Answers as they come."""
-    from experiments import localization  # here, so that --help and a wrong setting need not wait for JAX
+    """The job, which is slow to import."""
+    from experiments import localization
 
     return localization.localize
 

@@ -1,6 +1,5 @@
 """Rules of settings: a test of the value, and the words of the error."""
 
-import numbers
 import re
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -58,7 +57,7 @@ def number(low: float, high: float) -> Rule:
         (0, 1e12): "a number not below 0 (at most 1e12)",
     }.get((low, high), f"a number from {low:g} to {high:g}")
     return Rule(
-        lambda value: isinstance(value, numbers.Real) and not isinstance(value, bool) and low <= value <= high, words
+        lambda value: isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high, words
     )
 
 

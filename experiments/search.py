@@ -1,4 +1,4 @@
-"""The stages of a sweep: matches, all settings on all queries, the best, and what it is worth on other queries."""
+"""Sweep: matches -> scores of all settings -> the best setting, and its recall on other queries."""
 
 import shutil
 from pathlib import Path
@@ -17,33 +17,32 @@ from mfvpr.utils.versions import versions
 
 
 def sweep(settings: dict[str, Any]) -> None:
-    """Matches -> rows of every setting's ranking -> the best setting -> table, heat maps, files."""
+    """Search the settings, print the table, fill the run folder."""
     settings = as_final(settings)
     with run_folder.claimed(settings) as folder:
-        varied = searchable(settings)
-        watch = Stopwatch()
+        axes, watch = searchable(settings), Stopwatch()
         tools, images = stages.begun(settings, watch)
         judge = truth.judge(settings, images.dataset)
         matches, candidates = stages.matched(settings, tools, images, watch)
-        kept = _kept(settings, tools, images, candidates)
+        blocks = _block_folder(settings, tools, images, candidates)
         options = {
             "ks": settings["recall"]["ks"], "ties": settings["ties"],
-            "filter_score": settings["fusion"]["filter_score"], "folder": kept, "track": console.track,
+            "filter_score": settings["fusion"]["filter_score"], "folder": blocks, "track": console.track,
             "devices": tools.where["devices"],
             "settings_per_block": settings["chunk"]["settings"], "queries_per_block": settings["chunk"]["queries"],
         }  # fmt: skip
-        number = varied.size if settings["search"] == "grid" else settings["trials"]
-        console.tell(f"sweep: {number:,} settings on {int(candidates.mask.sum()):,} pairs of {len(candidates.mask):,} "
-                     f"queries with their candidates, {number * int(candidates.mask.sum()):,} scores; the time left "
-                     "stands beside the progress")  # fmt: skip
+        number = axes.size if settings["search"] == "grid" else settings["trials"]
+        pairs = int(candidates.mask.sum())
+        console.tell(f"sweep: {number:,} settings on {pairs:,} pairs of {len(candidates.mask):,} queries with their "
+                     f"candidates, {number * pairs:,} scores; the time left stands beside the progress")  # fmt: skip
         with watch("sweep"):
             if settings["search"] == "grid":
-                varied.check(matches.image_sizes)
-                require_memory(settings, varied, 1 + len(judge.halves), matches)
-                outcome = sweeping.search_grid(varied, judge, matches, candidates, **options)
+                axes.check(matches.image_sizes)
+                require_memory(settings, axes, 1 + len(judge.halves), matches)
+                outcome = sweeping.search_grid(axes, judge, matches, candidates, **options)
             else:
                 trials = {"trials": settings["trials"], "seed": settings["seed"]}
-                outcome = sweeping.search_optuna(varied, judge, matches, candidates, **trials, **options)
+                outcome = sweeping.search_optuna(axes, judge, matches, candidates, **trials, **options)
         heading = _heading(settings, images, outcome)
         text = f"{heading}\n\n{sweeps.text(outcome)}"
 
@@ -52,32 +51,34 @@ def sweep(settings: dict[str, Any]) -> None:
             runs.write_json(new / "results.json", _results(settings, images, outcome, watch.seconds))
             write_text(new / "summary.txt", f"{text}\n")
 
-        described = truth.description(settings, images.dataset)
-        run_folder.leave(folder, settings, described, text=text, write=write, figures=sweeps.figures(outcome))
-    if kept is not None:
-        shutil.rmtree(kept, ignore_errors=True)
+        ground_truth = truth.description(settings, images.dataset)
+        run_folder.leave(folder, settings, ground_truth, text=text, write=write, figures=sweeps.figures(outcome))
+    if blocks is not None:
+        shutil.rmtree(blocks, ignore_errors=True)
 
 
-def _kept(settings: dict[str, Any], tools: stages.Tools, images: stages.Images, candidates: Shortlist) -> Path | None:
-    """Where an interrupted sweep goes on: its finished blocks on these matches, by this version."""
+def _block_folder(
+    settings: dict[str, Any], tools: stages.Tools, images: stages.Images, candidates: Shortlist
+) -> Path | None:
+    """The folder of finished blocks, from which an interrupted sweep goes on; None without a store."""
     if settings["store"] is None:
         return None
     recipe = stages.recipe(tools, images, candidates.mask.shape[1])
     names = ("scorer", "grid", "search", "trials", "seed", "split", "recall", "ties", "fusion")
-    own = {name: settings[name] for name in names}  # or another sweep that ends would take away what this one needs
+    sweep_settings = {name: settings[name] for name in names}  # or another sweep would remove the blocks when it ends
     software = {name: versions()[name] for name in ("mfvpr", "jax", "numpy")}
-    name = fingerprint({"matches": recipe, "sweep": own, "versions": software})
+    name = fingerprint({"matches": recipe, "sweep": sweep_settings, "versions": software})
     return build.expanded(settings["store"]) / f"{settings['dataset']['name']}_sweep-{name}"
 
 
 def _heading(settings: dict[str, Any], images: stages.Images, outcome: Outcome) -> str:
     dataset, features = images.dataset, settings["features"]
-    right = truth.in_words(truth.description(settings, dataset))
-    size = " at {} x {} px".format(*features["image_size"]) if features["image_size"] else ""  # files may have others
+    ground_truth = truth.in_words(truth.description(settings, dataset))
+    size = " at {} x {} px".format(*features["image_size"]) if features["image_size"] else ""
     return (
         f"{dataset.name}: {len(dataset.queries)} queries, {outcome.judge.views[0].shape[1]} candidates of "
         f"{len(dataset.database)} database images, {len(outcome.settings)} settings of the "
-        f"{settings['scorer']['method']} score, {features['name']} features{size}; {right}"
+        f"{settings['scorer']['method']} score, {features['name']} features{size}; {ground_truth}"
     )
 
 

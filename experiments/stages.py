@@ -24,10 +24,8 @@ from mfvpr.storage import Archive
 from mfvpr.types import Shortlist
 from mfvpr.utils import Stopwatch
 
-_LEARNED_WITH = {
-    "features": ("name", "weights"),
-    "matching": ("name", "cross_check"),
-}  # a match weight depends on these
+# A learned match weight depends on these settings.
+_LEARNED_WITH = {"features": ("name", "weights"), "matching": ("name", "cross_check")}
 
 
 @dataclass(frozen=True)

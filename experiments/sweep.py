@@ -1,4 +1,4 @@
-"""Parameter sweeps: every setting of a grid on every query, the best of them, and how sure that is."""
+"""Sweep parameters: the recall of every setting of a grid, the best setting, and its confidence interval."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,8 +7,8 @@ from experiments.launch import launch
 
 
 def sweep() -> Callable[[dict[str, Any]], None]:
-    """The search, its table, a run folder."""
-    from experiments import search  # here, so that --help and a wrong setting need not wait for JAX
+    """The job, which is slow to import."""
+    from experiments import search
 
     return search.sweep
 

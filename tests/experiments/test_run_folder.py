@@ -215,7 +215,7 @@ def test_what_does_not_count_is_never_shown_as_right(outcome):
 
 
 def test_figures_of_chosen_queries(outcome):
-    asked, dataset = evaluation.asked_figures, outcome.images.dataset
+    asked, dataset = evaluation.query_rows, outcome.images.dataset
     assert asked([5, "0002.png", 5], dataset) == [5, 2]
     assert asked(7, dataset) == 7
     for wrong in (24, -1, "nope.png"):
