@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from experiments.errors import Parser, command_parser, refuse, run_command
+from experiments.errors import Parser, refuse, run_command
 
 if TYPE_CHECKING:
     from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
@@ -21,13 +21,11 @@ _TOLERANCE, _RADIUS = 5, 25.0  # frames, meters: the widest that the paper takes
 
 def main() -> None:
     """Run the command line's command."""
-    run_command(_parser)
+    description = "Nothing is downloaded: each data set has its place and its license."
+    run_command("python -m experiments.data", description, _add_commands)
 
 
-def _parser() -> Parser:
-    parser = command_parser(
-        "python -m experiments.data", "Nothing is downloaded: each data set has its place and its license."
-    )
+def _add_commands(parser: Parser) -> None:
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     command = commands.add_parser("list", help="the published data sets, their sizes, and what their folders hold")
     command.add_argument("names", metavar="NAME", nargs="*", help="by default a table of all")
@@ -37,7 +35,6 @@ def _parser() -> Parser:
     command.add_argument("settings", metavar="root=DIR", nargs="*", help="settings of the data set, without `dataset.`")
     command.add_argument("--sheet", metavar="FILE", type=Path, help="where to draw them, by default NAME.png")
     command.set_defaults(run=check)
-    return parser
 
 
 def list_data(names: list[str]) -> None:

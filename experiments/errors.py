@@ -28,20 +28,16 @@ class Parser(argparse.ArgumentParser):
         refuse(f"{message}; see {self.prog} --help")
 
 
-def command_parser(prog: str, description: str) -> Parser:
-    """A parser that knows `--version`."""
+def run_command(prog: str, description: str, add_arguments: Callable[[Parser], None]) -> None:
+    """Parse the command line, and call the parser's default `run` with all arguments."""
     from experiments.launch import version
 
-    parser = Parser(prog=prog, description=description)
-    parser.add_argument("--version", action="version", version=version(), help="print it and exit")
-    return parser
-
-
-def run_command(parser: Callable[[], argparse.ArgumentParser]) -> None:
-    """Parse the command line and call its default `run` with all other arguments."""
     unwind_on_sigterm()
     with one_line():
-        arguments = vars(parser().parse_args())
+        parser = Parser(prog=prog, description=description)
+        parser.add_argument("--version", action="version", version=version(), help="print it and exit")
+        add_arguments(parser)
+        arguments = vars(parser.parse_args())
         arguments.pop("run")(**arguments)
 
 

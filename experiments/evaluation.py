@@ -74,7 +74,8 @@ def _leave(folder: Path, outcome: Outcome) -> None:
         folder, outcome.settings, ground_truth(outcome), text=text(outcome),
         write=lambda new: write(new, outcome), figures=outcome.figures,
     )  # fmt: skip
-    run_folder.report(folder)
+    if page := run_folder.report_page(folder):
+        print(f"report: {page}")
 
 
 def evaluated(settings: dict[str, Any]) -> Outcome:

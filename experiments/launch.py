@@ -3,6 +3,7 @@
 Nothing slow is imported before Ctrl-C is handled: Hydra and JAX come later, when they are needed.
 """
 
+import importlib
 import io
 import os
 import signal
@@ -34,6 +35,11 @@ def launch(program: Program, config: str = "config") -> None:
             from experiments import command_line
 
             command_line.run(program, config)
+
+
+def program(module: str, job: str) -> Program:
+    """A function that imports a job, so that --help and a wrong setting need not wait for JAX."""
+    return lambda: getattr(importlib.import_module(f"experiments.{module}"), job)
 
 
 def version() -> str:

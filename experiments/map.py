@@ -1,12 +1,10 @@
 """Build a map for localization, add images to it, list its content. `python -m experiments.map --help`."""
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-from experiments.errors import Parser, command_parser, run_command
-from experiments.launch import launch
+from experiments.errors import Parser, run_command
+from experiments.launch import launch, program
 
 # Functions import what they need: --help and wrong usage need not wait for JAX.
 _MAP = "python -m experiments.map"
@@ -16,21 +14,13 @@ def main() -> None:
     """Run the command line's command."""
     if sys.argv[1:2] == ["build"]:
         del sys.argv[1]
-        launch(build, "map")
+        launch(program("maps", "build_map"), "map")
         return
-    run_command(_parser)
+    run_command(_MAP, "Ask a map with python -m experiments.localize. Settings of the first command: "
+                f"{_MAP} build --help.", _add_commands)  # fmt: skip
 
 
-def build() -> Callable[[dict[str, Any]], None]:
-    """The job that maps a data set's database."""
-    from experiments import maps
-
-    return maps.build_map
-
-
-def _parser() -> Parser:
-    parser = command_parser(_MAP, "Ask a map with python -m experiments.localize. Settings of the first command: "
-                            f"{_MAP} build --help.")  # fmt: skip
+def _add_commands(parser: Parser) -> None:
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     commands.add_parser("build", help="build map=DIR dataset=...: of the database of a data set")
     command = commands.add_parser("info", help="what a map holds, and what it was made with")
@@ -41,7 +31,6 @@ def _parser() -> Parser:
     command.add_argument("images", metavar="IMAGE", nargs="+", type=Path, help="a file")
     command.add_argument("--place", help="where they were taken; by default their names")
     command.set_defaults(run=add)
-    return parser
 
 
 def info(folder: Path) -> None:

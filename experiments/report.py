@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from experiments.errors import Parser, command_parser, run_command
+from experiments.errors import Parser, run_command
 
 # Functions import what they need: --help and wrong usage need not wait for JAX.
 _COMPARISON = "comparison.html"
@@ -10,17 +10,15 @@ _COMPARISON = "comparison.html"
 
 def main() -> None:
     """Run the command line."""
-    run_command(_parser)
+    run_command("python -m experiments.report", "One HTML file that needs no other and no network: of one run folder "
+                "of experiments.evaluate, or of several beside each other.", _add_arguments)  # fmt: skip
 
 
-def _parser() -> Parser:
-    parser = command_parser("python -m experiments.report", "One HTML file that needs no other and no network: of one "
-                            "run folder of experiments.evaluate, or of several beside each other.")  # fmt: skip
+def _add_arguments(parser: Parser) -> None:
     parser.add_argument("runs", metavar="RUN", nargs="+", type=Path, help="a run folder")
     parser.add_argument("--out", metavar="FILE", type=Path,
                         help=f"by default RUN/report.html of one run, {_COMPARISON} here of several")  # fmt: skip
     parser.set_defaults(run=write)
-    return parser
 
 
 def write(runs: list[Path], out: Path | None) -> None:

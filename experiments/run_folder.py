@@ -86,12 +86,6 @@ def draw(folder: Path, figures: Sequence[Figure]) -> None:
             console.tell(f"warning: {folder}/figures/{name}: not drawn ({error})")
 
 
-def report(folder: Path) -> None:
-    """Write the page of an evaluation, and print its path."""
-    if page := report_page(folder):
-        print(f"report: {page}")
-
-
 def report_page(folder: Path) -> Path | None:
     """Write the page of an evaluation and return its path; warn and return None if that fails."""
     try:

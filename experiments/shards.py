@@ -2,16 +2,15 @@
 
 from pathlib import Path
 
-from experiments.errors import Parser, command_parser, run_command
+from experiments.errors import Parser, run_command
 
 
 def main() -> None:
     """Run the command line's command."""
-    run_command(_parser)
+    run_command("python -m experiments.shards", "Start missing tasks again until none is.", _add_commands)
 
 
-def _parser() -> Parser:
-    parser = command_parser("python -m experiments.shards", "Start missing tasks again until none is.")
+def _add_commands(parser: Parser) -> None:
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     for name, run, words in (
         ("status", status, "what each task of a run says of itself"),
@@ -20,7 +19,6 @@ def _parser() -> Parser:
         command = commands.add_parser(name, help=words)
         command.add_argument("folder", metavar="DIR", type=Path, help="out=DIR of the run")
         command.set_defaults(run=run)
-    return parser
 
 
 def status(folder: Path) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from experiments.errors import WEIGHTS, Parser, command_parser, how_to_install, refuse, run_command, with_command
+from experiments.errors import WEIGHTS, Parser, how_to_install, refuse, run_command, with_command
 
 if TYPE_CHECKING:
     from mfvpr.checkpoints.registry import Entry
@@ -18,12 +18,11 @@ _LARGE = 200  # MiB, which take some seconds to convert
 
 def main() -> None:
     """Run the command line's command."""
-    run_command(_parser)
+    run_command(WEIGHTS, "Weights live in MFVPR_WEIGHTS, by default ~/.cache/mfvpr/weights. None come with the "
+                "package; each has its own license.", _add_commands)  # fmt: skip
 
 
-def _parser() -> Parser:
-    parser = command_parser(WEIGHTS, "Weights live in MFVPR_WEIGHTS, by default ~/.cache/mfvpr/weights. None come with "
-                            "the package; each has its own license.")  # fmt: skip
+def _add_commands(parser: Parser) -> None:
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     command = commands.add_parser("list", help="all known weights, their licenses, and whether they are installed")
     command.set_defaults(run=list_weights)
@@ -37,7 +36,6 @@ def _parser() -> Parser:
     command = commands.add_parser("download", help="fetch an official checkpoint whose hash is published")
     command.add_argument("name", metavar="NAME")
     command.set_defaults(run=download)
-    return parser
 
 
 def list_weights() -> None:

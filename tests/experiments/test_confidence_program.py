@@ -1,4 +1,4 @@
-"""How sure answers are, in the run folder: curves, what is refused, and what re-ranking the unsure gives."""
+"""Confidence of predictions in the run folder: curves, refused queries, re-ranking of uncertain queries."""
 
 import csv
 import json
@@ -82,15 +82,15 @@ def test_a_run_says_how_sure_its_answers_are(evaluate):
 
 def test_below_the_threshold_the_answer_is_no_place(evaluate):
     first, *_ = evaluate("first")
-    systems, made = read_confidences(first / "confidence.json")
+    systems, origin = read_confidences(first / "confidence.json")
     assert tuple(systems) == SYSTEMS
-    assert (made["queries"], made["right_within"], made["ground_truth"]["thresholds"]) == (
+    assert (origin["queries"], origin["right_within"], origin["ground_truth"]["thresholds"]) == (
         QUERIES,
         [1, "frames"],
         [0, 1],
     )
-    given = (f"confidence={first}/confidence.json", "threshold=0.4")
-    out, code, stdout, stderr = evaluate("second", *given)
+    confidence = (f"confidence={first}/confidence.json", "threshold=0.4")
+    out, code, stdout, stderr = evaluate("second", *confidence)
     assert code == 0, stderr
     assert "was fitted on these very images" in stderr
     assert "other settings" not in stderr
@@ -122,7 +122,7 @@ def test_below_the_threshold_the_answer_is_no_place(evaluate):
         line for line in every if line["query"] not in refusing
     ]
     unknown, code, _, stderr = evaluate(
-        "third", *given, "dataset.ground_truth=none", "dataset.index_file=null", "figures=0"
+        "third", *confidence, "dataset.ground_truth=none", "dataset.index_file=null", "figures=0"
     )
     assert code == 0, stderr
     assert [{**line, "right": "", "in_database": ""} for line in answers] == rows(unknown / "answers.csv")
@@ -169,9 +169,9 @@ def test_what_cannot_say_how_sure_answers_are_is_refused(evaluate, settings, wor
 
 def test_confidence_of_other_systems_is_refused(evaluate, tmp_path):
     first, *_ = evaluate("first", "figures=0")
-    found = json.loads((first / "confidence.json").read_text())
-    del found["systems"]["histogram"]
-    (tmp_path / "other.json").write_text(json.dumps(found))
+    content = json.loads((first / "confidence.json").read_text())
+    del content["systems"]["histogram"]
+    (tmp_path / "other.json").write_text(json.dumps(content))
     _, code, _, stderr = evaluate("out", f"confidence={tmp_path}/other.json")
     assert code == 2
     words = "got filter, histogram + filter; "
@@ -181,30 +181,30 @@ def test_confidence_of_other_systems_is_refused(evaluate, tmp_path):
 @pytest.mark.slow
 def test_confidence_of_other_settings_is_said(evaluate):
     first, *_ = evaluate("first", "figures=0")
-    given = (f"confidence={first}/confidence.json", "figures=0")
-    _, code, _, stderr = evaluate("second", *given, "scorer.weight=ratio", "fusion.c=2")
+    confidence = (f"confidence={first}/confidence.json", "figures=0")
+    _, code, _, stderr = evaluate("second", *confidence, "scorer.weight=ratio", "fusion.c=2")
     assert code == 0, stderr
     assert "other settings of scorer, fusion:" in stderr
     fused = ("scorer=ratio", "fusion.c=zscore", "fusion.weights={anchor: 1}", "final=combined", "figures=0")
     other, *_ = evaluate("fused", *fused)
-    for changed, told in (("scorer.anchor.window=6", True), ("scorer.anchor.window=10", False)):
+    for changed, warns in (("scorer.anchor.window=6", True), ("scorer.anchor.window=10", False)):
         _, code, _, stderr = evaluate(changed, f"confidence={other}/confidence.json", *fused, changed)
         assert code == 0, stderr
-        assert ("other settings of scorer:" in stderr) == told
-    _, code, _, stderr = evaluate("third", *given, "scorer=paper")
+        assert ("other settings of scorer:" in stderr) == warns
+    _, code, _, stderr = evaluate("third", *confidence, "scorer=paper")
     assert code == 0, stderr
     assert "other settings" not in stderr  # the histogram is the same beside others
 
 
 def test_confidence_of_what_counted_otherwise_is_said(evaluate):
     first, *_ = evaluate("first", "figures=0", "scorer=paper")
-    given = (f"confidence={first}/confidence.json", "figures=0", "scorer=paper")
+    confidence = (f"confidence={first}/confidence.json", "figures=0", "scorer=paper")
     for changed, words in (("recall.tolerances=[0]", "recall ("),
                            ("candidates=5", "candidates (")):  # fmt: skip
-        _, code, _, stderr = evaluate(changed, *given, changed)
+        _, code, _, stderr = evaluate(changed, *confidence, changed)
         assert code == 0, stderr
         assert f"other settings of {words}" in stderr
-    out, code, _, stderr = evaluate("sum", *given, "scorer.sum.weight=fs")
+    out, code, _, stderr = evaluate("sum", *confidence, "scorer.sum.weight=fs")
     assert code == 0, stderr
     assert "nothing is said of sum" in stderr
     assert "other settings of" not in stderr
@@ -214,16 +214,16 @@ def test_confidence_of_what_counted_otherwise_is_said(evaluate):
 def test_what_it_was_fitted_on_is_known_under_any_name(evaluate, root, tmp_path):
     """The queries tell, whatever the folder is called; the database alone may be the same."""
     first, *_ = evaluate("first", "figures=0")
-    found = json.loads((first / "confidence.json").read_text())
-    for name, side, told in (("renamed", "query fwd", True), ("map", "database", False)):
-        seen = found["made"]["data_fingerprint"]
+    content = json.loads((first / "confidence.json").read_text())
+    for name, side, warns in (("renamed", "query fwd", True), ("map", "database", False)):
+        seen = content["made"]["data_fingerprint"]
         [queries] = [folder for key, folder in seen.items() if key != "database"]
-        sides = {"database": "other", side: queries} if told else {"database": seen["database"], "query": "other"}
-        changed = found | {"made": found["made"] | {"data_fingerprint": sides}}
+        sides = {"database": "other", side: queries} if warns else {"database": seen["database"], "query": "other"}
+        changed = content | {"made": content["made"] | {"data_fingerprint": sides}}
         (tmp_path / f"{name}.json").write_text(json.dumps(changed))
         _, code, _, stderr = evaluate(name, f"confidence={tmp_path}/{name}.json", "figures=0")
         assert code == 0, stderr
-        assert ("was fitted on these very images" in stderr) == told
+        assert ("was fitted on these very images" in stderr) == warns
 
 
 def test_a_single_candidate_leaves_nothing_to_say(evaluate):
@@ -237,14 +237,14 @@ def test_a_single_candidate_leaves_nothing_to_say(evaluate):
     assert "expected p of systems, got none" in stderr.splitlines()[-1]
 
 
-@pytest.mark.parametrize("made", [
+@pytest.mark.parametrize("origin", [
     {"settings": {"scorer": {"method": ["a"]}}, "data_fingerprint": ["x"]},
     {"settings": "x", "data_fingerprint": {"q": 5}}, {"settings": {"scorer": {"histogram": 5}}},
 ])  # fmt: skip
-def test_what_another_program_says_of_how_it_was_made_stops_nothing(evaluate, tmp_path, made):
+def test_what_another_program_says_of_how_it_was_made_stops_nothing(evaluate, tmp_path, origin):
     first, *_ = evaluate("first", "figures=0")
-    found = json.loads((first / "confidence.json").read_text())
-    (tmp_path / "other.json").write_text(json.dumps(found | {"made": made}))
+    content = json.loads((first / "confidence.json").read_text())
+    (tmp_path / "other.json").write_text(json.dumps(content | {"made": origin}))
     _, code, _, stderr = evaluate("out", f"confidence={tmp_path}/other.json", "figures=0")
     assert code == 0, stderr
     assert "other settings of features" in stderr
@@ -254,19 +254,19 @@ def test_a_weight_is_known_by_what_it_holds(evaluate, tmp_path):
     for name in ("one", "other"):
         shutil.copy(LEARNED, tmp_path / f"{name}.json")
     first, *_ = evaluate("first", "figures=0", f"scorer.weight={tmp_path}/one.json")
-    given = f"confidence={first}/confidence.json"
-    _, code, _, stderr = evaluate("second", "figures=0", given, f"scorer.weight={tmp_path}/other.json")
+    confidence = f"confidence={first}/confidence.json"
+    _, code, _, stderr = evaluate("second", "figures=0", confidence, f"scorer.weight={tmp_path}/other.json")
     assert code == 0, stderr
     assert "other settings" not in stderr
-    _, code, _, stderr = evaluate("third", "figures=0", given, "scorer.weight=ratio")
+    _, code, _, stderr = evaluate("third", "figures=0", confidence, "scorer.weight=ratio")
     assert "other settings of scorer" in stderr
 
 
 def test_a_confidence_that_is_the_same_for_all_is_told(evaluate, tmp_path):
     first, *_ = evaluate("first", "figures=0")
-    found = json.loads((first / "confidence.json").read_text())
-    found["systems"]["histogram"]["weights"] = [0.0, 0.0]
-    (tmp_path / "flat.json").write_text(json.dumps(found))
+    content = json.loads((first / "confidence.json").read_text())
+    content["systems"]["histogram"]["weights"] = [0.0, 0.0]
+    (tmp_path / "flat.json").write_text(json.dumps(content))
     _, code, _, stderr = evaluate("out", f"confidence={tmp_path}/flat.json", "figures=0")
     assert code == 0, stderr
     assert "flat.json cannot tell right answers from wrong ones" in stderr

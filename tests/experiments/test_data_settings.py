@@ -1,4 +1,4 @@
-"""What the programs make of data settings: what is right, what is left out, how images are read."""
+"""Data settings in the programs: ground truth, excluded images, image reading."""
 
 import csv
 import json
@@ -30,8 +30,9 @@ def run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
 
     def run(*settings, name="out"):
-        place, kept = tmp_path / name, "store=null" if not any("store=" in one for one in settings) else "scorer=sum"
-        evaluate(composed(*QUICK, kept, f"out={place}", *settings) | {"multirun": False})
+        place = tmp_path / name
+        extra = "scorer=sum" if any("store=" in setting for setting in settings) else "store=null"
+        evaluate(composed(*QUICK, extra, f"out={place}", *settings) | {"multirun": False})
         return json.loads((place / "results.json").read_text()), capsys.readouterr(), place
 
     return run
@@ -43,11 +44,11 @@ def recall(rows, **threshold):
 
 def ranked(place):
     """Database names by query, best first."""
-    found = {}
+    ranking = {}
     with (place / "predictions.csv").open(newline="") as file:
         for line in csv.DictReader(file):
-            found.setdefault(line["query"], []).append(line["database"])
-    return found
+            ranking.setdefault(line["query"], []).append(line["database"])
+    return ranking
 
 
 def same(street, *more):
@@ -70,9 +71,9 @@ def test_an_image_that_finds_itself_is_told_and_left_out(small_street, tmp_path,
     assert "database images themselves" not in printed.err
     assert set(recall(rows, tolerance=1).values()) == {0.0}  # all that is within a frame is left out
     assert 0 < recall(rows, tolerance=5)["sum"] <= 1
-    found = ranked(place)
-    assert len(found) == 10
-    for query, names in found.items():
+    rankings = ranked(place)
+    assert len(rankings) == 10
+    for query, names in rankings.items():
         assert len(names) == 4
         assert all(abs(int(name[:4]) - int(query[:4])) > 1 for name in names)
 

@@ -61,7 +61,7 @@ strict: false
 
 @pytest.fixture
 def near(tmp_path, monkeypatch):
-    """What adding a scorer takes beside its class: a line in the table, and `make conf`."""
+    """Add a scorer: its line in the table, and `make conf`."""
     monkeypatch.setitem(SCORERS, "near", Nearness)
     conf = tmp_path / "conf"
     shutil.copytree(CONF, conf)
@@ -72,18 +72,18 @@ def near(tmp_path, monkeypatch):
 
 
 def test_the_files_of_conf_are_those_that_follow_from_the_scores():
-    made = declare.files()
+    texts = declare.files()
     assert {path.name for path in (CONF / "scorer").iterdir()} == {
         f"{name}.yaml" for name in (*SCORERS, *declare._VARIANTS, "paper", "all", "compared", "demo", "ratio")
     }
-    for path, text in made.items():
+    for path, text in texts.items():
         assert (CONF / path).read_text(encoding="utf-8") == text, f"conf/{path} is not up to date: make conf"
 
 
 def test_every_field_of_a_scorer_is_a_setting_whose_default_is_its_own():
     for scorer in SCORERS.values():
         assert [*declared(scorer)] == [*scorer.__dataclass_fields__]
-        assert made(scorer, {name: one.default for name, one in declared(scorer).items()}) == scorer()
+        assert made(scorer, {name: parameter.default for name, parameter in declared(scorer).items()}) == scorer()
 
 
 def test_a_scorer_that_is_gone_leaves_no_file(near, monkeypatch):
@@ -102,8 +102,8 @@ def test_conf_and_help_follow_from_the_class(near, monkeypatch, capsys):
     for line in (summary, *lines):
         assert f"\n  {line}\n" in stdout
     assert "Made by" not in stdout
-    others = ", ".join(sorted({path.stem for path in (near / "scorer").iterdir()} - {"near"}))
-    assert f"\n  scorer=near             {others}\n" in stdout
+    other_names = ", ".join(sorted({path.stem for path in (near / "scorer").iterdir()} - {"near"}))
+    assert f"\n  scorer=near             {other_names}\n" in stdout
     assert "\n  radius: null  # near: px\n" in stdout
     assert "\n  norm: null  # near: sum, largest\n" in stdout
     assert f"\n  weight: null  # sum, anchor, histogram, near: {', '.join(NAMED_WEIGHTS)}, FILE.json\n" in stdout
@@ -142,12 +142,12 @@ def test_rules_follow_from_the_class(near, monkeypatch, capsys, program, argumen
 
 def test_all_scores_contain_it(near):
     with hydra.initialize_config_dir(str(near), version_base="1.3"):
-        found = build.scorers(
+        scorers = build.scorers(
             hydra.compose("config", ["scorer=all", "scorer.near.size=[1,2]", "scorer.near.norm=largest"])["scorer"]
         )
-    assert [*found] == [name for name in SCORERS if name not in ALONE]
-    assert found["near"] == Nearness(size=(1.0, 2.0), norm="largest")
-    assert found["near"].weight is NAMED_WEIGHTS["unit"]
+    assert [*scorers] == [name for name in SCORERS if name not in ALONE]
+    assert scorers["near"] == Nearness(size=(1.0, 2.0), norm="largest")
+    assert scorers["near"].weight is NAMED_WEIGHTS["unit"]
 
 
 @pytest.mark.slow
@@ -156,10 +156,10 @@ def test_its_parameters_are_swept(near, tmp_path_factory, tmp_path, monkeypatch,
     run = (*small(shared(tmp_path_factory)), f"out={tmp_path}/out")
     code, _, stderr = typed(monkeypatch, capsys, "sweep", *run, *axes)
     assert code == 0, stderr
-    found = results(tmp_path / "out")
-    assert found["own"] == {"radius": 30.0, "norm": "sum", "weight": "unit"}
+    content = results(tmp_path / "out")
+    assert content["own"] == {"radius": 30.0, "norm": "sum", "weight": "unit"}
     recall = {radius: set() for radius in (0.001, 20)}
-    for entry in found["settings"][:8]:
+    for entry in content["settings"][:8]:
         recall[entry["parameters"]["radius"]].add(json.dumps(entry["recall_at"]))
     assert len(recall[0.001]) == 1  # nothing is that near: the filter's order
     assert len(recall[20]) > 1

@@ -41,11 +41,11 @@ def test_every_conf_composes_and_passes_its_own_checks(group, choice):
 
 @pytest.mark.parametrize("features", ["sift", "aliked"])
 def test_features_of_a_named_system_may_be_replaced(features):
-    found = composed("system=ssm_hist", f"features={features}")
-    settings.check(found)
-    assert (found["features"]["name"], found["retrieval"]["name"]) == (features, "ssm")
-    assert found["features"]["image_size"] == [336, 336]
-    assert (found["candidates"], found["scorer"]["method"]) == (50, "histogram")
+    config = composed("system=ssm_hist", f"features={features}")
+    settings.check(config)
+    assert (config["features"]["name"], config["retrieval"]["name"]) == (features, "ssm")
+    assert config["features"]["image_size"] == [336, 336]
+    assert (config["candidates"], config["scorer"]["method"]) == (50, "histogram")
 
 
 @pytest.mark.parametrize(
@@ -187,9 +187,9 @@ def test_one_evaluation_compiles_few_programs_and_the_next_none(
     program.evaluate(composed(*common))
     assert 1 <= compilations.count <= 20
     compilations.reset()
-    others = ["scorer.histogram.sigma=9", "scorer.histogram.bin_size=14.5", "scorer.anchor.tolerance=2",
+    unused = ["scorer.histogram.sigma=9", "scorer.histogram.bin_size=14.5", "scorer.anchor.tolerance=2",
               "scorer.anchor.window=6", "fusion.c=auto"]  # fmt: skip
-    program.evaluate(composed(*common, *others))
+    program.evaluate(composed(*common, *unused))
     assert compilations.count == 0
     assert len(list((tmp_path / "runs" / "folder").iterdir())) == 2
 

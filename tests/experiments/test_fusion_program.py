@@ -30,12 +30,12 @@ def test_a_run_ranks_by_what_is_fused(root, tmp_path):
     more = ("final=combined", "previous_queries=1", "figures=1", f"out={out}")
     evaluation.evaluate(composed(*small(root), *FUSED, *more))
     rows = json.loads((out / "results.json").read_text())
-    found = {row["system"]: row for row in rows if row["tolerance"] == 1}
-    assert [*found] == ["filter", "anchor", "histogram", SYSTEM, f"{SYSTEM} + frames"]
-    assert [row["scorer"] for row in found.values()] == [
+    rows_by_system = {row["system"]: row for row in rows if row["tolerance"] == 1}
+    assert [*rows_by_system] == ["filter", "anchor", "histogram", SYSTEM, f"{SYSTEM} + frames"]
+    assert [row["scorer"] for row in rows_by_system.values()] == [
         "none", "anchor", "histogram", "histogram + anchor", "histogram + anchor",
     ]  # fmt: skip
-    parameters = {name: row["parameters"] for name, row in found.items()}
+    parameters = {name: row["parameters"] for name, row in rows_by_system.items()}
     assert parameters["anchor"]["weight"] == parameters["histogram"]["weight"] == "ratio"
     assert parameters[SYSTEM] == {
         "histogram": parameters["histogram"], "anchor": parameters["anchor"],
@@ -68,26 +68,26 @@ def test_our_system_fuses_two_scores_and_the_filter():
     for arguments, features, side, weight in (
         ([], "aliked", 320, 0.5), (["features=sift", "fusion.weights.filter=1"], "sift", 336, 1),
     ):  # fmt: skip
-        found = composed("system=mfvpr", *arguments)
-        settings.check(found)
-        assert (found["features"]["name"], found["features"]["image_size"]) == (features, [side, side])
-        fusion = build.fusion(found)
+        config = composed("system=mfvpr", *arguments)
+        settings.check(config)
+        assert (config["features"]["name"], config["features"]["image_size"]) == (features, [side, side])
+        fusion = build.fusion(config)
         assert (fusion.c, fusion.weights) == ("zscore", {"filter": weight, "anchor": 1})
         assert fusion.system("histogram") == SYSTEM
         assert build.fusion(composed("system=mfvpr", "fusion.weights=null")).system("anchor") == "anchor + filter"
     alone = ("scorer=histogram", "scorer.weight=ratio", "final=score", "grid.sigma=[10]")
-    found = composed("system=mfvpr", *alone, config="sweep")
-    settings.check(found)
-    assert axes.searchable(axes.as_final(found)).grid() == [{"sigma": 10}]
+    config = composed("system=mfvpr", *alone, config="sweep")
+    settings.check(config)
+    assert axes.searchable(axes.as_final(config)).grid() == [{"sigma": 10}]
 
 
 def test_the_weight_of_the_main_scorer_is_that_of_its_cohort_as_well(root, tmp_path):
     more = ("scorer=paper", "fusion.c=zscore", "fusion.weights={filter: 0.5, histogram: 2}", "cohort=1", "figures=0")
     evaluation.evaluate(composed(*small(root), *more, f"out={tmp_path}/out"))
-    found = {row["system"]: row for row in json.loads((tmp_path / "out" / "results.json").read_text())}
+    rows = {row["system"]: row for row in json.loads((tmp_path / "out" / "results.json").read_text())}
     name = "histogram + cohort + filter"
-    assert [*found][-2:] == ["histogram + filter", name]
-    assert found[name]["parameters"]["cohort"] == 1
+    assert [*rows][-2:] == ["histogram + filter", name]
+    assert rows[name]["parameters"]["cohort"] == 1
     with (tmp_path / "out" / "predictions" / "histogram_cohort_filter.csv").open(newline="") as file:
         fused = {(line["query"], line["database"]): float(line["score"]) for line in csv.DictReader(file)}
     parts = {part: {line[:2]: line[2] for line in ranked(tmp_path / "out", part)}
@@ -96,5 +96,5 @@ def test_the_weight_of_the_main_scorer_is_that_of_its_cohort_as_well(root, tmp_p
     for query in queries:
         pairs = [pair for pair in fused if pair[0] == query]
         scores = [np.array([parts[part][pair] for pair in pairs]) for part in parts]
-        filtered, own = ((one - one.mean()) / (one.std() or 1) for one in scores)
-        np.testing.assert_allclose([fused[pair] for pair in pairs], 0.5 * filtered + 2 * own, atol=1e-2)
+        filtered, normalized = ((values - values.mean()) / (values.std() or 1) for values in scores)
+        np.testing.assert_allclose([fused[pair] for pair in pairs], 0.5 * filtered + 2 * normalized, atol=1e-2)

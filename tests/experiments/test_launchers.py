@@ -28,14 +28,14 @@ def test_every_file_is_known_here():
 
 @pytest.mark.parametrize("launcher", PLUGINS)
 def test_a_launcher_composes_and_adds_no_setting(launcher):
-    """Of a structured configuration, which refuses what the plugin does not know."""
+    """Check a structured configuration, which refuses what the plugin does not know."""
     if f"{PLUGINS[launcher]}.yaml" not in installed():
         pytest.skip(f"pip install 'mfvpr[{EXTRAS[launcher]}]'")
     for config in ("config", "sweep", "learn"):
         with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-            found = hydra.compose(config, [f"launcher={launcher}"], return_hydra_config=True).hydra
-        assert found.job.env_set == {"PJRT_NPROC": str(found.launcher.get("cpus_per_task") or 1)}
-        assert PLUGINS[launcher].rpartition("_")[2] in found.launcher._target_.lower()
+            hydra_settings = hydra.compose(config, [f"launcher={launcher}"], return_hydra_config=True).hydra
+        assert hydra_settings.job.env_set == {"PJRT_NPROC": str(hydra_settings.launcher.get("cpus_per_task") or 1)}
+        assert PLUGINS[launcher].rpartition("_")[2] in hydra_settings.launcher._target_.lower()
         assert composed(f"launcher={launcher}", config=config) == composed(config=config)
 
 
@@ -43,9 +43,9 @@ def test_a_launcher_composes_and_adds_no_setting(launcher):
 def test_what_is_not_installed_is_told_in_one_line(launcher, monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delitem(installed(), f"{PLUGINS[launcher]}.yaml", raising=False)
-    told = f"error: {PLUGINS[launcher]}: this launcher is not installed; pip install 'mfvpr[{EXTRAS[launcher]}]'\n"
+    message = f"error: {PLUGINS[launcher]}: this launcher is not installed; pip install 'mfvpr[{EXTRAS[launcher]}]'\n"
     for setting in (f"launcher={launcher}", f"hydra/launcher={PLUGINS[launcher]}"):
-        assert typed(monkeypatch, capsys, "evaluate", "-m", setting, "candidates=4,8") == (2, "", told)
+        assert typed(monkeypatch, capsys, "evaluate", "-m", setting, "candidates=4,8") == (2, "", message)
     assert not [*tmp_path.iterdir()]
 
 

@@ -45,23 +45,23 @@ def learned(root, streets, tmp_path_factory):
 
 
 def test_the_reported_set_is_reported_as_it_is_alone(root, streets, learned, tmp_path):
-    found = learned[1]
+    content = learned[1]
     [alone] = data_sets.composed("report", streets[2])
     settings = composed(*small(root), "scorer=sum", "figures=0", f"out={tmp_path}/alone")
     evaluation.evaluate(settings | {"dataset": alone})
-    rows = {row["score"]: row for row in found["rows"]}
+    rows = {row["score"]: row for row in content["rows"]}
     expected = json.loads((tmp_path / "alone" / "results.json").read_text())
     for system, name in (("sum", "paper"), ("sum + filter", "paper + filter")):
         for row in (row for row in expected if row["system"] == system):
             recall = rows[name]["by_set"]["street2"][str(row["tolerance"])]
             assert recall == pytest.approx(row["recall_at"]["1"], abs=1e-6)
             assert rows[name]["recall_at_1"][str(row["tolerance"])] == pytest.approx(recall)
-    assert [one["dataset"] for one in found["data_sets"]] == ["folder", "street1"]
-    assert [one["dataset"] for one in found["reported_sets"]] == ["street2"]
-    sets = [*found["data_sets"], *found["reported_sets"]]
-    assert len({json.dumps(one["data_fingerprint"]) for one in sets}) == 3
-    assert found["queries"]["reported"] == [list(range(2 * QUERIES, 3 * QUERIES))]
-    assert found["queries"]["chosen_on"] == [list(range(2 * QUERIES))]
+    assert [entry["dataset"] for entry in content["data_sets"]] == ["folder", "street1"]
+    assert [entry["dataset"] for entry in content["reported_sets"]] == ["street2"]
+    sets = [*content["data_sets"], *content["reported_sets"]]
+    assert len({json.dumps(entry["data_fingerprint"]) for entry in sets}) == 3
+    assert content["queries"]["reported"] == [list(range(2 * QUERIES, 3 * QUERIES))]
+    assert content["queries"]["chosen_on"] == [list(range(2 * QUERIES))]
 
 
 def test_the_table_names_the_sets(learned):
@@ -138,7 +138,7 @@ def test_sets_of_one_map_are_not_independent(root, streets, tmp_path, capsys):
         database, queries = (data_sets.composed("report", streets[number])[0] for number in (1, of_queries))
         dataset = database | {"name": name, "queries": queries["queries"], "ground_truth": "order"}
         settings = composed(*small(root), f"out={tmp_path}/out") | {"dataset": dataset | {"index_file": None}}
-        _, images = learning.prepare.begun(settings, evaluation.Stopwatch())
+        _, images = learning.stages.begun(settings, evaluation.Stopwatch())
         several.append(learning.Prepared(SimpleNamespace(name=name), images, {}, {}))
     learning.check_apart([], several)
     assert capsys.readouterr().err.splitlines()[-1].startswith("warning: there and back ")
@@ -149,17 +149,17 @@ def test_sets_of_one_map_are_not_independent(root, streets, tmp_path, capsys):
 def test_a_learned_weight_knows_what_it_was_learned_on(root, streets, learned, tmp_path, monkeypatch, capsys):
     weight = learned[0] / "out" / "weights" / "other_sets_match_labels.json"
     on_these = "was learned on images of folder"
-    own = (*small(root), f"scorer.weight={weight}", "figures=0")
-    for number, (more, told) in enumerate([
+    common = (*small(root), f"scorer.weight={weight}", "figures=0")
+    for number, (more, warns) in enumerate([
         (["scorer=sum"], [on_these]), (["scorer=histogram"], [on_these]),
         (["scorer=histogram", "scorer.weight=learned_aliked"], ["other features (aliked instead of sift, aliked-n16 "]),
         (["scorer=histogram", "scorer.weight=ratio"], []),
     ]):  # fmt: skip
-        _, _, stderr = typed(monkeypatch, capsys, "evaluate", *own, *more, f"out={tmp_path}/{number}")
-        assert [line for line in stderr.splitlines() if "was learned" in line and any(t in line for t in told)] == [
+        _, _, stderr = typed(monkeypatch, capsys, "evaluate", *common, *more, f"out={tmp_path}/{number}")
+        assert [line for line in stderr.splitlines() if "was learned" in line and any(t in line for t in warns)] == [
             line for line in stderr.splitlines() if "was learned" in line
         ]
-        assert stderr.count("was learned") == len(told)
+        assert stderr.count("was learned") == len(warns)
     [reported] = data_sets.composed("report", streets[2])
-    learning.prepare.begun(composed(*own, "scorer=sum") | {"dataset": reported}, evaluation.Stopwatch())
+    learning.stages.begun(composed(*common, "scorer=sum") | {"dataset": reported}, evaluation.Stopwatch())
     assert "was learned" not in capsys.readouterr().err

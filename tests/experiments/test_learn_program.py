@@ -51,38 +51,38 @@ def learned(learn, tmp_path_factory):
 
 @pytest.fixture
 def untrained(monkeypatch):
-    """No training: the start is what was learned. What was asked of the training is kept."""
-    asked = []
+    """Replace the training by its start values, and record its options."""
+    calls = []
 
     def start(parameters, objective, batches, **options):
-        asked.append(options)
+        calls.append(options)
         for step in range(options["steps"]):
             batches(step)
         return Fit(parameters, 0, (Record(0, None, 1.0),), "nothing was learned")
 
     monkeypatch.setattr(teaching, "fit", start)
-    return asked
+    return calls
 
 
 def test_all_rows_in_every_file(learned):
-    out, found = learned
-    assert [row["score"] for row in found["rows"]] == ROWS
+    out, content = learned
+    assert [row["score"] for row in content["rows"]] == ROWS
     with (out / "table.csv").open() as file:
         header, *lines = csv.reader(file)
     assert header == ["score", "R@1 ±0", "R@1 ±1", "95 % at ±1", "against paper", "p", "p by blocks"]
     assert [line[0] for line in lines] == ROWS
-    for line, row in zip(lines, found["rows"], strict=True):
+    for line, row in zip(lines, content["rows"], strict=True):
         assert [float(cell) for cell in line[1:3]] == [round(100 * value, 1) for value in row["recall_at_1"].values()]
         for tolerance, (low, high) in row["interval"].items():
             assert 0 <= low <= row["recall_at_1"][tolerance] <= high <= 1
     assert all(name in (out / "summary.txt").read_text() for name in ROWS)
-    trained = [row["halves"]["first_half"] for row in found["rows"][6:10]]
-    for one in trained:
-        assert [record[0] for record in one["history"]] == [0, 2, 4]
-        assert one["steps"] in (0, 2, 4)
-        assert one["values"]["temperature"] > 0
-    assert [sorted(one["values"]) for one in trained] == 2 * [["temperature"], ["c", "temperature"]]
-    assert any(one["steps"] > 0 for one in trained)
+    trained = [row["halves"]["first_half"] for row in content["rows"][6:10]]
+    for fit in trained:
+        assert [record[0] for record in fit["history"]] == [0, 2, 4]
+        assert fit["steps"] in (0, 2, 4)
+        assert fit["values"]["temperature"] > 0
+    assert [sorted(fit["values"]) for fit in trained] == 2 * [["temperature"], ["c", "temperature"]]
+    assert any(fit["steps"] > 0 for fit in trained)
 
 
 def test_pictures_and_weights(learned):
@@ -92,10 +92,10 @@ def test_pictures_and_weights(learned):
         assert min(picture.shape) > 200
         assert picture.std() > 10
     for name in ("match_weights", "match_weights_filter", "match_labels"):
-        weight, made = read_weight(out / "weights" / f"first_half_{name}.json")
+        weight, origin = read_weight(out / "weights" / f"first_half_{name}.json")
         assert weight.hidden.shape == (5, 16)
-        assert made["settings"]["seed"] == 0
-        assert made["training"].startswith("first_half: match ")
+        assert origin["settings"]["seed"] == 0
+        assert origin["training"].startswith("first_half: match ")
 
 
 def test_hand_set_and_searched_rows_are_those_of_a_sweep(root, learned, tmp_path):
@@ -110,7 +110,7 @@ def test_hand_set_and_searched_rows_are_those_of_a_sweep(root, learned, tmp_path
 
 
 def test_nothing_that_is_reported_on_was_seen(learn, untrained, tmp_path, monkeypatch):
-    """Of both halves: neither the reported queries and places nor their neighbors, while learning or validating."""
+    """Check both halves: neither the reported queries and places nor their neighbors, while learning or validating."""
     seen, batch = [], TrainingSplit.batch
 
     def watched(split, queries, size):
@@ -118,12 +118,14 @@ def test_nothing_that_is_reported_on_was_seen(learn, untrained, tmp_path, monkey
         return batch(split, queries, size)
 
     monkeypatch.setattr(TrainingSplit, "batch", watched)
-    found = learn(tmp_path / "out", *SUM, "split=both", "steps=6", "batch=2", "fusion.filter_score=negative_euclidean")
-    reported = dict(zip(("first_half", "second_half"), found["queries"]["reported"], strict=True))
+    content = learn(
+        tmp_path / "out", *SUM, "split=both", "steps=6", "batch=2", "fusion.filter_score=negative_euclidean"
+    )
+    reported = dict(zip(("first_half", "second_half"), content["queries"]["reported"], strict=True))
     assert sorted(query for half in reported.values() for query in half) == list(range(QUERIES))
-    for chosen_on, (half, others) in zip(found["queries"]["chosen_on"], reported.items(), strict=True):
+    for chosen_on, (half, reported_rows) in zip(content["queries"]["chosen_on"], reported.items(), strict=True):
         assert len(chosen_on) >= 8
-        assert min(abs(one - other) for one in chosen_on for other in others) > 2 * WIDEST
+        assert min(abs(row - other) for row in chosen_on for other in reported_rows) > 2 * WIDEST
         taught = {int(query) for split, queries in seen if split.name == half for query in queries}
         assert len(taught) >= 5
         assert taught <= set(chosen_on)
@@ -131,7 +133,7 @@ def test_nothing_that_is_reported_on_was_seen(learn, untrained, tmp_path, monkey
         assert np.all(split.candidates.scores < 0)  # as it was asked
         places = {int(place) for query in queries for place in split.candidates.indices[query][split.usable[query]]}
         assert min(abs(place - other) for place in places for other in reported[split.name]) > WIDEST
-        assert min(abs(one - other) for one in split.train for other in split.validation) > 2 * WIDEST
+        assert min(abs(row - other) for row in split.train for other in split.validation) > 2 * WIDEST
         assert {*queries} <= {*split.train} or {*queries} <= {*split.validation}
 
 
@@ -154,22 +156,22 @@ def rows_of(results):
 
 def test_without_a_store_the_recalls_are_the_same(learn, learned, untrained, tmp_path):
     """Match weights, which look at the ratio, are begun as well. A store rounds its matches: settings may tie."""
-    found = rows_of(learn(tmp_path / "out", *SHORT, "store=null"))
-    assert list(found) == ROWS
+    rows = rows_of(learn(tmp_path / "out", *SHORT, "store=null"))
+    assert list(rows) == ROWS
     for name in ROWS[:2]:
-        assert found[name]["recall_at_1"] == rows_of(learned[1])[name]["recall_at_1"], name
+        assert rows[name]["recall_at_1"] == rows_of(learned[1])[name]["recall_at_1"], name
 
 
 @pytest.mark.parametrize(
     ("axes", "names"), [(("grid.weight=[dmf]",), {"weight"}), (("grid.weight=null", "grid.c=[auto]"), {"c"})]
 )
 def test_an_axis_that_is_not_searched_has_the_scorers_own_value(learn, untrained, tmp_path, axes, names):
-    own = ("grid.c=null", "fusion.c=0.7") if names == {"weight"} else ()
-    rows = rows_of(learn(tmp_path / "out", *SUM, *own, *axes, "split=first_half", "steps=1"))
+    extra = ("grid.c=null", "fusion.c=0.7") if names == {"weight"} else ()
+    rows = rows_of(learn(tmp_path / "out", *SUM, *extra, *axes, "split=first_half", "steps=1"))
     for filtered in ("", " + filter"):
-        found, expected = rows[f"grid search{filtered}"], rows[f"paper{filtered}"]
-        assert found["recall_at_1"] == expected["recall_at_1"]
-        assert {*found["halves"]["first_half"]["values"]} == names - ({"c"} if not filtered else set())
+        searched, expected = rows[f"grid search{filtered}"], rows[f"paper{filtered}"]
+        assert searched["recall_at_1"] == expected["recall_at_1"]
+        assert {*searched["halves"]["first_half"]["values"]} == names - ({"c"} if not filtered else set())
 
 
 def test_anchors_are_searched_over_what_they_have(learn, untrained, tmp_path):
@@ -204,18 +206,18 @@ def test_what_is_trained_already_is_not_trained_again(learn, learned, tmp_path, 
 
 
 def test_a_checkpoint_of_another_model_is_refused(root, learned, tmp_path, monkeypatch, capsys):
-    [kept] = [path.parent for path in root.glob("store/folder_learning-*/first_half-gradient/4")]
+    [folder] = [path.parent for path in root.glob("store/folder_learning-*/first_half-gradient/4")]
     before = snapshot(root)
     for change, words in (
         ("learning_rate=0.5", "learning_rate=0.05, expected 0.5"),
         ("recall.tolerances=[1]", "tolerances.tolerances[0]=0, expected 1"),
         ("loss=recall", 'loss="cross_entropy", expected "recall"'),
     ):
-        arguments = (*small(root), *SHORT, change, f"checkpoints={kept.parent}", f"out={tmp_path}/out")
+        arguments = (*small(root), *SHORT, change, f"checkpoints={folder.parent}", f"out={tmp_path}/out")
         code, stdout, stderr = typed(monkeypatch, capsys, "learn", *arguments)
         assert (code, stdout) == (2, "")
         last = stderr.splitlines()[-1]
-        assert last.startswith(f"error: {kept}: ")
+        assert last.startswith(f"error: {folder}: ")
         assert words in last
         assert "delete" in last
         assert list(tmp_path.iterdir()) == []
@@ -235,12 +237,12 @@ def test_whatever_changes_the_result_changes_the_checkpoint(root, untrained, tmp
         fixed = (*SUM, "grid.c=[1]", "split=second_half", "steps=1", f"out={tmp_path}/out")
         learning.learn(composed(*small(root), *fixed, change, config="learn"))
         shutil.rmtree(tmp_path / "out")
-    assert len({asked["folder"] for asked in untrained}) == 5 * len(changes)
-    assert len({json.dumps(asked["recipe"]) for asked in untrained}) == 5 * len(changes)
+    assert len({call["folder"] for call in untrained}) == 5 * len(changes)
+    assert len({json.dumps(call["recipe"]) for call in untrained}) == 5 * len(changes)
 
 
-@pytest.mark.parametrize(("rate", "step", "kept"), [(20, 4, " {}/4;"), (1e12, 1, "no checkpoint")])
-def test_a_loss_that_turns_infinite_is_told(root, tmp_path, monkeypatch, capsys, rate, step, kept):
+@pytest.mark.parametrize(("rate", "step", "step_kept"), [(20, 4, " {}/4;"), (1e12, 1, "no checkpoint")])
+def test_a_loss_that_turns_infinite_is_told(root, tmp_path, monkeypatch, capsys, rate, step, step_kept):
     place = tmp_path / "kept"
     few = ("grid.sigma=[10]", "grid.bin_size=null", "grid.weight=null", "grid.c=[0,1]")
     absurd = (f"learning_rate={rate}", "every=1", f"checkpoints={place}", f"out={tmp_path}/out")
@@ -249,7 +251,7 @@ def test_a_loss_that_turns_infinite_is_told(root, tmp_path, monkeypatch, capsys,
     last = stderr.splitlines()[-1]
     assert last.startswith(f"error: step {step}: ")
     assert " is not finite at numbers.sigma=" in last
-    assert kept.format(place / "first_half-gradient") in last
+    assert step_kept.format(place / "first_half-gradient") in last
     assert "learning rate" in last
     assert "Traceback" not in stderr
     assert not (tmp_path / "out").exists()
@@ -294,12 +296,12 @@ def test_too_few_queries_are_refused(root, tmp_path, monkeypatch, capsys):
 
 
 def test_what_is_not_the_papers_is_not_called_so(learn, untrained, tmp_path):
-    found = learn(tmp_path / "out", *SUM, "scorer.weight=ratio", "split=first_half", "steps=1")
-    assert [row["score"] for row in found["rows"]][:4] == [
+    content = learn(tmp_path / "out", *SUM, "scorer.weight=ratio", "split=first_half", "steps=1")
+    assert [row["score"] for row in content["rows"]][:4] == [
         "as set",
         "as set + filter",
         "1 - ratio",
         "1 - ratio + filter",
     ]
-    assert found["rows"][0]["recall_at_1"] == found["rows"][2]["recall_at_1"]
+    assert content["rows"][0]["recall_at_1"] == content["rows"][2]["recall_at_1"]
     assert "against as set" in (tmp_path / "out" / "table.md").read_text()

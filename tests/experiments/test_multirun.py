@@ -32,7 +32,7 @@ def test_a_multirun_makes_one_run_folder_per_job(root, tmp_path, monkeypatch, ca
     assert [f"results: {path.relative_to(tmp_path)}" in stdout for path in folders] == [True, True]
     assert {results(path)["scorer"]["method"] for path in folders} == {"sum", "histogram"}
     line = "error: candidates=0: expected "
-    assert [one.startswith(line) for one in stderr.splitlines()].count(True) == 3
+    assert [text.startswith(line) for text in stderr.splitlines()].count(True) == 3
     assert stderr.splitlines()[-1].startswith(line)
     assert "Traceback" not in stderr
     assert [number for number in range(4) if f"job {number}: " in stderr] == [0, 1, 2, 3]
@@ -64,19 +64,19 @@ def test_a_job_waits_for_the_matches_of_another_and_a_single_run_does_not(root, 
         assert complete.done.all()  # so others read it at the same time
         assert typed(monkeypatch, capsys, "sweep", *overrides, f"out={tmp_path}/second")[0] == 0
     next(path.glob("3-*.npz")).unlink()
-    taken, told = threading.Event(), threading.Event()
+    taken, announced = threading.Event(), threading.Event()
 
     def another():
         with match_store.open_match_store(path, recipe, num_queries=QUERIES, num_candidates=CANDIDATES):
             taken.set()
-            told.wait(timeout=60)
+            announced.wait(timeout=60)
 
     other, tell = threading.Thread(target=another), console.tell
-    monkeypatch.setattr(console, "tell", lambda text: (tell(text), "waiting until" in text and told.set()))
+    monkeypatch.setattr(console, "tell", lambda text: (tell(text), "waiting until" in text and announced.set()))
     other.start()
     assert taken.wait(timeout=60)
     code, _, stderr = typed(monkeypatch, capsys, "sweep", *overrides, f"out={tmp_path}/single")
-    assert (code, told.is_set()) == (2, False)
+    assert (code, announced.is_set()) == (2, False)
     assert stderr.startswith(f"error: {path}: in use by process {os.getpid()}; ")
     assert stderr.count("\n") == 1
     monkeypatch.chdir(tmp_path)
@@ -101,20 +101,20 @@ def test_jobs_in_several_processes(root, tmp_path):
 
 
 def test_who_waits_for_a_store_says_so_and_gets_it(tmp_path):
-    told, got = [], []
+    messages, got = [], []
 
     def another():
         with match_store.open_match_store(
-            tmp_path / "s", {}, num_queries=1, num_candidates=2, waiting=told.append
+            tmp_path / "s", {}, num_queries=1, num_candidates=2, waiting=messages.append
         ) as store:
             got.append(store.done.tolist())
 
     other = threading.Thread(target=another)
     with match_store.open_match_store(tmp_path / "s", {}, num_queries=1, num_candidates=2):
         other.start()
-        while not told and other.is_alive():
+        while not messages and other.is_alive():
             time.sleep(0.01)
         assert not got
     other.join(timeout=30)
-    assert [one.partition("; ")[0] for one in told] == [f"{tmp_path}/s: in use by process {os.getpid()}"]
+    assert [message.partition("; ")[0] for message in messages] == [f"{tmp_path}/s: in use by process {os.getpid()}"]
     assert got == [[False]]

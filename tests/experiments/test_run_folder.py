@@ -1,4 +1,4 @@
-"""What a run leaves, and what it leaves when something goes wrong: claims, full disks, foreign names."""
+"""Run folders: their files, also after errors, on full disks, and with names that are not UTF-8."""
 
 import csv
 import itertools
@@ -62,7 +62,7 @@ def rows(path):
 
 
 def test_predictions_are_long_and_agree_with_the_recall(evaluated):
-    found = json.loads((evaluated / "results.json").read_text())
+    entries = json.loads((evaluated / "results.json").read_text())
     for system in ("filter", "histogram", "histogram + filter"):
         lines = rows(evaluated / "predictions" / f"{system.replace(' + ', '_')}.csv")
         assert list(lines[0]) == ["query", "rank", "database", "score", "right"]
@@ -70,7 +70,7 @@ def test_predictions_are_long_and_agree_with_the_recall(evaluated):
         scores = np.array([float(line["score"]) for line in lines]).reshape(QUERIES, -1)
         assert np.all(np.diff(scores) <= 0)
         right = np.array([int(line["right"]) for line in lines]).reshape(QUERIES, -1)
-        recall = next(row["recall_at"] for row in found if row["system"] == system and row["tolerance"] == 1)
+        recall = next(row["recall_at"] for row in entries if row["system"] == system and row["tolerance"] == 1)
         assert right[:, 0].mean() == pytest.approx(recall["1"], abs=1e-6)
         assert right[:, :5].any(axis=1).mean() == pytest.approx(recall["5"], abs=1e-6)
     assert (evaluated / "predictions.csv").read_bytes() == (evaluated / "predictions" / "histogram.csv").read_bytes()
@@ -89,7 +89,7 @@ def test_failures_are_the_wrong_first_answers(evaluated, system):
     for line in failures:
         lines = wrong[line["query"]]
         assert line["answer"] == lines[0]["database"]
-        first = next((one for one in lines if one["right"] == "1"), None)
+        first = next((line for line in lines if line["right"] == "1"), None)
         if first is None:
             assert [line[name] for name in ("rank", "right_answer", "score", "margin")] == [""] * 4
         else:
@@ -105,7 +105,7 @@ def test_gains_are_what_the_predictions_say_of_each_query(evaluated):
     for system in SYSTEMS:
         lines = rows(evaluated / "predictions" / f"{system.replace(' + ', '_')}.csv")
         for line in gains:
-            right = [one["rank"] for one in lines if one["query"] == line["query"] and one["right"] == "1"]
+            right = [entry["rank"] for entry in lines if entry["query"] == line["query"] and entry["right"] == "1"]
             assert line[f"{system} rank"] == (right[0] if right else "")
             assert line[system] == str(int(right[:1] == ["1"]))
         hits[system] = np.array([line[system] == "1" for line in gains])
@@ -133,8 +133,8 @@ def test_without_ground_truth_nothing_is_right_or_failed(root, tmp_path):
 
 
 def test_heading_and_tables_say_the_same(evaluated, capsys):
-    found = json.loads((evaluated / "results.json").read_text())
-    truth = found[0]["ground_truth"]
+    entries = json.loads((evaluated / "results.json").read_text())
+    truth = entries[0]["ground_truth"]
     assert (truth["kind"], truth["unit"], truth["thresholds"]) == ("index", "frames", [0, 1])
     heading, _, *table = (evaluated / "table.md").read_text().splitlines()
     assert heading.endswith(f"recall in %, within 0, 1 frames of the ground truth: {truth['files'][0]}")
@@ -153,17 +153,17 @@ def test_a_run_says_how_it_was_made(root, tmp_path, monkeypatch, capsys):
     code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *small(root), "scorer=count", "figures=0", "out=a b")
     assert code == 0, stderr
     assert stdout.endswith("results: a b\nreport: a b/report.html\n")
-    found = json.loads((tmp_path / "a b" / "run.json").read_text())
-    assert found["command"].startswith("python -m experiments.evaluate dataset=folder dataset.database=")
-    assert found["command"].endswith(" scorer=count figures=0 'out=a b'")
+    content = json.loads((tmp_path / "a b" / "run.json").read_text())
+    assert content["command"].startswith("python -m experiments.evaluate dataset=folder dataset.database=")
+    assert content["command"].endswith(" scorer=count figures=0 'out=a b'")
     expected = composed(*small(root), "scorer=count", "figures=0", "out='a b'")
-    assert found["settings"] == expected
+    assert content["settings"] == expected
     head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert found["commit"] == head.stdout.strip()
-    assert {"mfvpr", "jax", "python"} <= found["versions"].keys()
+    assert content["commit"] == head.stdout.strip()
+    assert {"mfvpr", "jax", "python"} <= content["versions"].keys()
     (tmp_path / "file").write_text("x")
     subprocess.run(["git", "add", "file"], cwd=tmp_path, check=True)
-    assert runs.commit(tmp_path) == found["commit"] + "-dirty"
+    assert runs.commit(tmp_path) == content["commit"] + "-dirty"
     assert runs.commit(Path("/")) is None
 
 
@@ -175,16 +175,16 @@ def test_a_wrong_figure_has_the_right_image_below(evaluated, outcome):
 
     page = page_of(outcome)
     [ranked], right = outcome.judged.result.systems["histogram"], outcome.judged.is_right("histogram", 0)
-    found = {bool(right[query].any()): query for query in np.flatnonzero(~right[:, 0])}
+    query_by_case = {bool(right[query].any()): query for query in np.flatnonzero(~right[:, 0])}
     names = outcome.images.dataset.database.names
-    query = found[True]
+    query = query_by_case[True]
     rank = int(np.argmax(right[query]))
     [answer] = page.correct_predictions(query)
     score = f"{ranked.scores[query, rank]:.5g}"
     assert answer.caption == f"right: {names[ranked.rows[query, rank]]}, rank {rank + 1}, score {score}"
     assert float(answer.explanation.score) == pytest.approx(float(score), rel=1e-3)
-    [answer] = page.correct_predictions(found[False])
-    place = outcome.images.dataset.truth.place(found[False])
+    [answer] = page.correct_predictions(query_by_case[False])
+    place = outcome.images.dataset.truth.place(query_by_case[False])
     assert answer.caption == f"right: {names[place]}, not among the 3 candidates"
     assert answer.matches is None
 
@@ -198,7 +198,7 @@ def page_of(outcome, **changes):
 
 
 def test_what_does_not_count_is_never_shown_as_right(outcome):
-    """Where the nearest image is left out, as a neighbor in one sequence, another is; or none."""
+    """If the nearest image is excluded, the page shows another correct image, or none."""
     right = outcome.judged.is_right("histogram", 0)
     query = int(np.flatnonzero(~right.any(axis=1))[0])
     names, truth = outcome.images.dataset.database.names, outcome.images.dataset.truth
@@ -215,12 +215,12 @@ def test_what_does_not_count_is_never_shown_as_right(outcome):
 
 
 def test_figures_of_chosen_queries(outcome):
-    asked, dataset = evaluation.query_rows, outcome.images.dataset
-    assert asked([5, "0002.png", 5], dataset) == [5, 2]
-    assert asked(7, dataset) == 7
+    query_rows, dataset = evaluation.query_rows, outcome.images.dataset
+    assert query_rows([5, "0002.png", 5], dataset) == [5, 2]
+    assert query_rows(7, dataset) == 7
     for wrong in (24, -1, "nope.png"):
         with pytest.raises(SettingsError, match=r"rows .*0 to 23, .*0000"):
-            asked([0, wrong], dataset)
+            query_rows([0, wrong], dataset)
     assert list(page_of(outcome).shown([5, 2])) == [5, 2]
 
 
@@ -349,7 +349,7 @@ def test_a_figure_that_cannot_be_drawn_costs_a_warning(root, evaluated, tmp_path
 
 
 def test_a_page_that_cannot_be_made_costs_a_warning(tmp_path, capsys):
-    run_folder.report(tmp_path)
+    run_folder.report_page(tmp_path)
     stdout, stderr = capsys.readouterr()
     assert stdout == ""
     assert stderr.startswith(f"warning: {tmp_path}: no page was made of it (")
@@ -368,7 +368,7 @@ def test_ctrl_c_while_figures_are_drawn_keeps_the_tables(root, evaluated, tmp_pa
 
 
 def test_names_that_are_no_utf8_cost_nothing(root, tmp_path, monkeypatch, capsys):
-    """Of images, of their folder, and of the run folder."""
+    """Names of images, of their folder, and of the run folder."""
     street = streets_folder(root, num_frames=QUERIES, image_size=(160, 120))
     place = tmp_path / os.fsdecode(b"data\xff")
     for side in ("database", "queries"):

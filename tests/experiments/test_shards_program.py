@@ -38,18 +38,18 @@ def plain(root, settings, tmp_path_factory):
 @pytest.fixture
 def task(monkeypatch, capsys, settings, tmp_path):
     def start(shard, *more):
-        own = (f"store={tmp_path}/store", f"out={tmp_path}/out", f"shard={shard}")
-        return typed(monkeypatch, capsys, "evaluate", *settings, *own, *more)
+        shared_folders = (f"store={tmp_path}/store", f"out={tmp_path}/out", f"shard={shard}")
+        return typed(monkeypatch, capsys, "evaluate", *settings, *shared_folders, *more)
 
     return start
 
 
 @pytest.fixture
-def asked(monkeypatch, capsys, tmp_path):
-    def ask(what, place=None):
-        return typed(monkeypatch, capsys, "shards", what, place or tmp_path / "out")
+def shards_program(monkeypatch, capsys, tmp_path):
+    def run(command, place=None):
+        return typed(monkeypatch, capsys, "shards", command, place or tmp_path / "out")
 
-    return ask
+    return run
 
 
 def tables(place):
@@ -58,16 +58,16 @@ def tables(place):
     return {name: (place / f"{name}.csv").read_bytes() for name in names}
 
 
-def test_tasks_in_any_order_leave_the_results_of_one(task, asked, plain, tmp_path):
-    code, out, error = asked("missing")
+def test_tasks_in_any_order_leave_the_results_of_one(task, shards_program, plain, tmp_path):
+    code, out, error = shards_program("missing")
     assert (code, out, error.count("\n")) == (2, "", 1)
     assert error.startswith(f"error: {tmp_path}/out/shards/run.json: expected ")
     code, out, _ = task("2/3")
     assert code == 0
     assert "shard 2/3 has done what it can: database features: " in out
     assert "missing, of shards 0-1;" in out
-    assert asked("missing")[1] == "0-2\n"
-    code, out, _ = asked("status")
+    assert shards_program("missing")[1] == "0-2\n"
+    code, out, _ = shards_program("status")
     assert code == 0
     assert out.startswith("0/3: not begun\n1/3: not begun\n2/3: ended, waiting for database features: ")
     assert out.endswith("results: not yet\n")
@@ -75,22 +75,22 @@ def test_tasks_in_any_order_leave_the_results_of_one(task, asked, plain, tmp_pat
     code, out, _ = task("1/3")  # the last that takes features, so that it goes on
     assert code == 0
     assert "shard 1/3 has done its part: " in out
-    assert asked("missing")[1] == "0,2\n"
+    assert shards_program("missing")[1] == "0,2\n"
     assert task("2/3")[0] == 0
-    assert asked("missing")[1] == "0\n"
+    assert shards_program("missing")[1] == "0\n"
     code, out, _ = task("0/3")
     assert code == 0
     assert f"results: {tmp_path}/out" in out
-    assert asked("missing")[:2] == (0, "")
-    assert asked("status")[1] == "0/3: complete\n1/3: complete\n2/3: complete\n" + f"results: {tmp_path}/out\n"
-    found, expected = (json.loads((one / "results.json").read_text()) for one in (tmp_path / "out", plain))
-    assert [row | {"seconds": 0} for row in found] == [row | {"seconds": 0} for row in expected]
+    assert shards_program("missing")[:2] == (0, "")
+    assert shards_program("status")[1] == "0/3: complete\n1/3: complete\n2/3: complete\n" + f"results: {tmp_path}/out\n"
+    content, expected = (json.loads((out / "results.json").read_text()) for out in (tmp_path / "out", plain))
+    assert [row | {"seconds": 0} for row in content] == [row | {"seconds": 0} for row in expected]
     assert tables(tmp_path / "out") == tables(plain)
     code, out, _ = task("0/3")  # again
     assert (code, out) == (0, f"shard 0/3 is complete; results: {tmp_path}/out\n")
 
 
-def test_tasks_must_agree(task, asked, tmp_path, root, settings):
+def test_tasks_must_agree(task, shards_program, tmp_path, root, settings):
     assert task("0/2")[0] == 0
     code, _, error = task("0/4")
     assert code == 2
@@ -102,7 +102,9 @@ def test_tasks_must_agree(task, asked, tmp_path, root, settings):
     other = tmp_path / "other"
     shutil.copytree(root / "streets-v1-seed0-24x160x120", other)
     (other / "database" / "0003.png").write_bytes((other / "database" / "0004.png").read_bytes())
-    code, _, error = task("1/2", *(one for one in folder(other) if "=" in one and one != "dataset=folder"))
+    code, _, error = task(
+        "1/2", *(setting for setting in folder(other) if "=" in setting and setting != "dataset=folder")
+    )
     assert code == 2
     assert error.count("\n") == 1 or "data.json" in error
     assert "images.database" in error
@@ -135,7 +137,7 @@ def test_wrong_settings(task, typed_in, words):
     assert error.count("\n") == 1
 
 
-def test_a_folder_of_another_run_is_refused(task, tmp_path, asked, plain):
+def test_a_folder_of_another_run_is_refused(task, tmp_path, shards_program, plain):
     shutil.copytree(plain, tmp_path / "out")
     code, _, error = task("0/1")
     assert code == 2
@@ -143,36 +145,36 @@ def test_a_folder_of_another_run_is_refused(task, tmp_path, asked, plain):
     (tmp_path / "out" / "shards").mkdir()
     for wrong in ('{"format": "mfvpr shards 1", "shards": -2}', '{"format": "mfvpr shards 1", "shards": "x"}', "[]"):
         (tmp_path / "out" / "shards" / "run.json").write_text(wrong)
-        code, _, error = asked("missing")
+        code, _, error = shards_program("missing")
         assert code == 2
         assert error.startswith(f"error: {tmp_path}/out/shards/run.json: expected ")
 
 
 def command(settings, place, shard):
-    own = (f"store={place}/store", f"out={place}/out", f"shard={shard}")
-    return [sys.executable, "-m", "experiments.evaluate", *settings, *own]
+    shared_folders = (f"store={place}/store", f"out={place}/out", f"shard={shard}")
+    return [sys.executable, "-m", "experiments.evaluate", *settings, *shared_folders]
 
 
-def test_the_same_shard_twice_is_refused_and_killed_ones_go_on(settings, plain, tmp_path, asked):
+def test_the_same_shard_twice_is_refused_and_killed_ones_go_on(settings, plain, tmp_path, shards_program):
     """Killed at many moments, beside each other; whoever is started again goes on; clocks may differ."""
     place, delays = tmp_path, iter([3, 5, 7, 4])
 
     def work(delays):
-        while missing := asked("missing")[1].strip():
+        while missing := shards_program("missing")[1].strip():
             shards = [0, 1] if "-" in missing else [int(missing)]
             tasks = [subprocess.Popen(command(settings, place, f"{shard}/2"), cwd=ROOT, stdout=subprocess.DEVNULL,
                                       stderr=subprocess.DEVNULL) for shard in shards]  # fmt: skip
             if (delay := next(delays, None)) is not None:
                 time.sleep(delay)
-                for one in tasks:
-                    one.send_signal(signal.SIGKILL)
-            for one in tasks:
-                one.wait()
+                for process in tasks:
+                    process.send_signal(signal.SIGKILL)
+            for process in tasks:
+                process.wait()
             for path in (place / "out" / "shards").rglob("*.json"):
                 os.utime(path, (0, 4e9))  # of another clock
 
     first = subprocess.Popen(command(settings, place, "0/2"), cwd=ROOT, stderr=subprocess.DEVNULL)
-    while not asked("status")[1].startswith("0/2: at work"):
+    while not shards_program("status")[1].startswith("0/2: at work"):
         time.sleep(0.05)
     first.send_signal(signal.SIGSTOP)
     second = subprocess.run(command(settings, place, "0/2"), cwd=ROOT, capture_output=True, text=True)

@@ -52,8 +52,8 @@ def swept(sweep, tmp_path_factory):
     return out, sweep(out, *GRID, pictures=True)
 
 
-def recall_of(found, **parameters):
-    [entry] = [entry for entry in found["settings"] if entry["parameters"] == parameters]
+def recall_of(content, **parameters):
+    [entry] = [entry for entry in content["settings"] if entry["parameters"] == parameters]
     return entry["recall_at"]
 
 
@@ -75,58 +75,58 @@ def evaluated(root, out, **changes):
 @pytest.mark.slow
 @pytest.mark.parametrize(("sigma", "weight"), [(10, "unit"), (22.5, "fs")])
 def test_a_sweep_is_one_evaluation_per_setting(root, swept, tmp_path, sigma, weight):
-    own = {"scorer.sigma": sigma, "scorer.weight": weight, "fusion.c": 2}
-    expected = evaluated(root, tmp_path / "out", scorer="histogram", **own)
+    changes = {"scorer.sigma": sigma, "scorer.weight": weight, "fusion.c": 2}
+    expected = evaluated(root, tmp_path / "out", scorer="histogram", **changes)
     for system, c in (("histogram", 0), ("histogram + filter", 2)):
-        for tolerance, found in recall_of(swept[1], sigma=sigma, weight=weight, c=c).items():
-            assert found == pytest.approx(expected[system, tolerance], abs=1e-6)
+        for tolerance, recall in recall_of(swept[1], sigma=sigma, weight=weight, c=c).items():
+            assert recall == pytest.approx(expected[system, tolerance], abs=1e-6)
 
 
 @pytest.mark.parametrize(("final", "c"), [("score", 0), ("combined", 2)])
 def test_the_own_values_score_as_without_a_sweep(root, sweep, swept, tmp_path, final, c):
-    found = sweep(tmp_path / "swept", *GRID, f"final={final}")
+    content = sweep(tmp_path / "swept", *GRID, f"final={final}")
     evaluation.evaluate(
         composed(*small(root), "figures=0", "scorer=histogram", GRID[-1], f"final={final}", f"out={tmp_path}/evaluated")
     )
-    assert found["own"] == {"sigma": 22.5, "weight": "fs", "c": c}
+    assert content["own"] == {"sigma": 22.5, "weight": "fs", "c": c}
     deciding = [row for row in results_of(tmp_path / "evaluated") if row["decides"]]
-    assert recall_of(found, **found["own"]) == {f"{row['tolerance']}": row["recall_at"] for row in deciding}
+    assert recall_of(content, **content["own"]) == {f"{row['tolerance']}": row["recall_at"] for row in deciding}
 
 
 def test_every_file_tells_the_same(swept):
-    out, found = swept
+    out, content = swept
     with (out / "table.csv").open() as file:
         header, *lines = csv.reader(file)
     assert header == ["sigma", "weight", "c", "R@1 ±0", "R@1 ±1", "R@5 ±1"]
-    assert len(lines) == len(found["settings"]) == 8
-    for line, entry in zip(lines, found["settings"], strict=True):
+    assert len(lines) == len(content["settings"]) == 8
+    for line, entry in zip(lines, content["settings"], strict=True):
         assert line[:3] == [f"{value}" for value in entry["parameters"].values()]
         recall = entry["recall_at"]
         expected = [recall["0"]["1"], recall["1"]["1"], recall["1"]["5"]]
         np.testing.assert_allclose([float(cell) / 100 for cell in line[3:]], expected, atol=6e-4)
     for name in ("table.md", "table.tex"):
         assert (out / name).read_text().count("22.5") >= 4
-    assert {"mfvpr", "jax", "numpy"} <= set(found["versions"])
-    assert set(map(len, found["data_fingerprint"].values())) == {16}
-    assert found["ground_truth"]["kind"] == "index"
-    assert found["ground_truth"]["thresholds"] == [0, 1]
+    assert {"mfvpr", "jax", "numpy"} <= set(content["versions"])
+    assert set(map(len, content["data_fingerprint"].values())) == {16}
+    assert content["ground_truth"]["kind"] == "index"
+    assert content["ground_truth"]["thresholds"] == [0, 1]
     heading = (out / "summary.txt").read_text().splitlines()[0]
-    assert f"within 0, 1 frames of the ground truth: {found['ground_truth']['files'][0]}" in heading
+    assert f"within 0, 1 frames of the ground truth: {content['ground_truth']['files'][0]}" in heading
     assert (out / "table.md").read_text().startswith(f"{heading}\n\n|")
     assert (out / "table.tex").read_text().startswith(f"% {heading}\n\\begin")
-    assert (found["unit"], found["thresholds"], found["ks"]) == ("frames", [0, 1], [1, 5])
+    assert (content["unit"], content["thresholds"], content["ks"]) == ("frames", [0, 1], [1, 5])
 
 
 def test_the_best_setting_is_chosen_and_told(swept):
-    out, found = swept
-    main = {tuple(entry["parameters"].values()): entry["recall_at"]["1"]["1"] for entry in found["settings"]}
-    [chosen] = found["chosen"]
+    out, content = swept
+    main = {tuple(entry["parameters"].values()): entry["recall_at"]["1"]["1"] for entry in content["settings"]}
+    [chosen] = content["chosen"]
     assert main[tuple(chosen.values())] == max(main.values()) > min(main.values())
-    assert found["own"] == {"sigma": 22.5, "weight": "fs", "c": 0}
-    for line in found["report"]:
+    assert content["own"] == {"sigma": 22.5, "weight": "fs", "c": 0}
+    for line in content["report"]:
         tolerance = f"{line['threshold']}"
-        for name, setting in (("chosen", chosen), ("own", found["own"])):
-            assert line[name]["recall"] == pytest.approx(recall_of(found, **setting)[tolerance]["1"], abs=1e-6)
+        for name, setting in (("chosen", chosen), ("own", content["own"])):
+            assert line[name]["recall"] == pytest.approx(recall_of(content, **setting)[tolerance]["1"], abs=1e-6)
             low, high = line[name]["interval"]
             assert 0 <= low <= line[name]["recall"] <= high <= 1
         test = line["mcnemar"]
@@ -139,7 +139,7 @@ def test_the_best_setting_is_chosen_and_told(swept):
     assert f"chosen: sigma = {chosen['sigma']:g}, weight = {chosen['weight']}, c = {chosen['c']}" in text
     assert f"24 queries, {CANDIDATES} candidates of 24 database images" in text
     assert "this flatters" in text
-    flips = found["report"][1]["sign_flips"]
+    flips = content["report"][1]["sign_flips"]
     assert f"by {flips['blocks']} blocks of {flips['block']} queries p = {flips['p_value']:.2g}" in text
 
 
@@ -155,16 +155,16 @@ def test_heat_maps_are_pictures(swept):
 
 def test_split_reports_every_query_once_by_what_it_did_not_choose(sweep, swept, tmp_path):
     parts = ("first_half", "second_half", "both")
-    found = {part: sweep(tmp_path / part, *GRID[:2], "grid.c=null", f"split={part}") for part in parts}
-    first, second, both = (found[part]["report"] for part in parts)
-    assert [found[part]["report"][0]["queries"] for part in parts] == [12, 12, 24]
-    assert found["both"]["chosen"] == found["first_half"]["chosen"] + found["second_half"]["chosen"]
-    for one, other, joined in zip(first, second, both, strict=True):
+    contents = {part: sweep(tmp_path / part, *GRID[:2], "grid.c=null", f"split={part}") for part in parts}
+    first, second, both = (contents[part]["report"] for part in parts)
+    assert [contents[part]["report"][0]["queries"] for part in parts] == [12, 12, 24]
+    assert contents["both"]["chosen"] == contents["first_half"]["chosen"] + contents["second_half"]["chosen"]
+    for first_half, other, joined in zip(first, second, both, strict=True):
         for name in ("chosen", "own"):
-            assert joined[name]["recall"] == pytest.approx((one[name]["recall"] + other[name]["recall"]) / 2)
+            assert joined[name]["recall"] == pytest.approx((first_half[name]["recall"] + other[name]["recall"]) / 2)
             assert joined[name]["interval"][0] < joined[name]["interval"][1]
         for name in ("only_first", "only_second"):
-            assert joined["mcnemar"][name] == one["mcnemar"][name] + other["mcnemar"][name]
+            assert joined["mcnemar"][name] == first_half["mcnemar"][name] + other["mcnemar"][name]
     for part, halves in (("first_half", ["first_half"]), ("both", ["first_half", "second_half"])):
         text = (tmp_path / part / "summary.txt").read_text()
         assert (
@@ -183,25 +183,25 @@ def test_no_features_are_read_where_the_matches_are_stored(sweep, swept, tmp_pat
 
 @pytest.mark.parametrize("chunk", [(1, 24), (3, 5)])
 def test_chunks_change_nothing(sweep, swept, tmp_path, chunk):
-    found = sweep(tmp_path / "out", *GRID, f"chunk.settings={chunk[0]}", f"chunk.queries={chunk[1]}")
-    assert found == swept[1]
+    content = sweep(tmp_path / "out", *GRID, f"chunk.settings={chunk[0]}", f"chunk.queries={chunk[1]}")
+    assert content == swept[1]
 
 
 def test_without_a_store(root, sweep, tmp_path):
     """Nor with many ties, by another rule: most pairs have no matches."""
     common = {"store": "null", "matching.max_distance": 0.3, "ties": "index"}
     expected = evaluated(root, tmp_path / "evaluated", scorer="histogram", **common, **{"scorer.sigma": 10})
-    found = sweep(tmp_path / "swept", "grid.sigma=[10]", *(f"{name}={value}" for name, value in common.items()))
-    for tolerance, recall in recall_of(found, sigma=10).items():
+    content = sweep(tmp_path / "swept", "grid.sigma=[10]", *(f"{name}={value}" for name, value in common.items()))
+    for tolerance, recall in recall_of(content, sigma=10).items():
         assert recall == pytest.approx(expected["histogram", tolerance], abs=1e-6)
 
 
 def test_where_the_combined_score_decides_every_setting_is_combined(sweep, swept, tmp_path):
-    found = sweep(tmp_path / "final", "grid.sigma=[10]", "final=combined", "fusion.c=100")
-    given = sweep(tmp_path / "given", "grid.sigma=[10]", "grid.c=[0,100]", "fusion.c=100")
-    assert found["own"] == {"sigma": 22.5, "c": 100}
-    combined, alone = (recall_of(given, sigma=10, c=c) for c in (100, 0))
-    assert recall_of(found, sigma=10, c=100) == combined != alone
+    content = sweep(tmp_path / "final", "grid.sigma=[10]", "final=combined", "fusion.c=100")
+    explicit = sweep(tmp_path / "given", "grid.sigma=[10]", "grid.c=[0,100]", "fusion.c=100")
+    assert content["own"] == {"sigma": 22.5, "c": 100}
+    combined, alone = (recall_of(explicit, sigma=10, c=c) for c in (100, 0))
+    assert recall_of(content, sigma=10, c=100) == combined != alone
 
 
 def test_other_scores_and_their_axes(sweep, swept, tmp_path):
@@ -222,8 +222,8 @@ def test_other_scores_and_their_axes(sweep, swept, tmp_path):
     ],
 )
 def test_experiments_of_conf_run(sweep, swept, tmp_path, experiment, changes, count):
-    found = sweep(tmp_path / "out", f"experiment={experiment}", *changes, pictures=True)
-    assert len(found["settings"]) == count
+    content = sweep(tmp_path / "out", f"experiment={experiment}", *changes, pictures=True)
+    assert len(content["settings"]) == count
     assert (tmp_path / "out" / "figures").is_dir()
 
 
@@ -238,7 +238,7 @@ def test_optuna_finds_the_same_with_the_same_seed(sweep, swept, tmp_path):
     tried = [entry["parameters"] for entry in first["settings"]]
     assert tried[0] == first["own"] == {"sigma": 22.5, "weight": "fs"}
     assert len(tried) == 6
-    assert all(5 <= one["sigma"] <= 30 and one["weight"] in ("fs", "unit") for one in tried)
+    assert all(5 <= trial["sigma"] <= 30 and trial["weight"] in ("fs", "unit") for trial in tried)
     assert tried != [entry["parameters"] for entry in other["settings"]]
 
 
@@ -325,10 +325,10 @@ def test_matches_of_something_else_are_refused(root, swept, tmp_path, monkeypatc
     def place(*changes):
         return matches_path(composed(*small(root), *changes, config="sweep"))[0]
 
-    own, foreign = place(f"store={tmp_path}/store"), place(change)
-    with match_store.open_match_store(own, {"other": 1}, num_queries=24, num_candidates=8):
+    matching_place, foreign = place(f"store={tmp_path}/store"), place(change)
+    with match_store.open_match_store(matching_place, {"other": 1}, num_queries=24, num_candidates=8):
         pass
-    own.parent.joinpath(foreign.name).symlink_to(own)
+    matching_place.parent.joinpath(foreign.name).symlink_to(matching_place)
     before = snapshot(tmp_path)
     code, stdout, stderr = typed(monkeypatch, capsys, "sweep", *small(root), change, SIGMA, f"store={tmp_path}/store",
                                  f"out={tmp_path}/out")  # fmt: skip
@@ -349,13 +349,13 @@ def test_results_are_not_overwritten(root, swept, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_ctrl_c_keeps_what_is_finished_and_the_next_run_does_the_rest(root, sweep, swept, tmp_path, monkeypatch):
-    """Finished blocks are kept, and go when the whole sweep is done."""
+    """Finished blocks are store, and go when the whole sweep is done."""
     grid = ("grid.sigma=[5,10,15,20,22.5,30]", "chunk.settings=1", "chunk.queries=1")
     arguments = [*small(root), *grid, f"out={tmp_path}/out"]
     command = [sys.executable, "-m", "experiments.sweep", *arguments]
     process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
-    kept = root / "store"
-    while len(done := list(kept.glob("folder_sweep-*/[!.]*.npz"))) < 5:
+    store = root / "store"
+    while len(done := list(store.glob("folder_sweep-*/[!.]*.npz"))) < 5:
         assert process.poll() is None, process.stderr.read()
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)
@@ -365,19 +365,19 @@ def test_ctrl_c_keeps_what_is_finished_and_the_next_run_does_the_rest(root, swee
     assert "Traceback" not in stderr
     assert list(tmp_path.iterdir()) == []
 
-    done, computed = list(kept.glob("folder_sweep-*/[!.]*.npz")), []
+    done, computed = list(store.glob("folder_sweep-*/[!.]*.npz")), []
     assert 5 <= len(done) < 6 * QUERIES
     sweep(tmp_path / "other", SIGMA)  # takes nothing of another sweep away
     scores = SWEEP.block_scores
     monkeypatch.setattr(SWEEP, "block_scores", lambda *block: computed.append(1) or scores(*block))
     resumed = sweep(tmp_path / "out", *grid)
     assert len(computed) == 6 * QUERIES - len(done)
-    assert not list(kept.glob("folder_sweep-*"))
+    assert not list(store.glob("folder_sweep-*"))
     assert resumed == sweep(tmp_path / "again", *grid[:1])
 
 
 def test_a_lost_ctrl_c_comes_again():
-    """What is raised in a callback of the garbage collector, nobody can catch. It comes at once, even to who sleeps."""
+    """An exception in a garbage collection callback cannot be caught; it must come again at once, even in a sleep."""
     start = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
         launch.keep_interrupt(SimpleNamespace(exc_type=KeyboardInterrupt)) or time.sleep(20)

@@ -1,4 +1,4 @@
-"""What the library refuses, in words of the settings."""
+"""Errors of the library, in words of the settings."""
 
 import numpy as np
 import pytest
@@ -23,8 +23,8 @@ def images(tmp_path_factory):
             Image.fromarray(picture).save(root / side / f"{row}.png")
             names.append(f"{side}/{row}.png")
             features.append(make_features(rng, 5, size=SIZE))
-    whole = (root / "broken" / "1.png").read_bytes()
-    (root / "broken" / "1.png").write_bytes(whole[: len(whole) // 2])
+    content = (root / "broken" / "1.png").read_bytes()
+    (root / "broken" / "1.png").write_bytes(content[: len(content) // 2])
     write_features(root / "both.h5", names, enumerate(features))
     vectors = unit(rng.normal(size=(len(names), 4)))
     write_global_descriptors(root / "both_vectors.h5", names, vectors)
@@ -67,13 +67,14 @@ ORDER = "dataset.ground_truth=order"
 )  # fmt: skip
 def test_what_is_refused_says_which_setting_mends_it(images, tmp_path, monkeypatch, capsys, arguments, words):
     monkeypatch.chdir(tmp_path)
-    own = ("dataset=folder", f"dataset.database={images}/database", f"dataset.queries={images}/queries", "store=null",
-           "candidates=2", "scorer=count")  # fmt: skip
-    typed_here = [one.replace("ROOT", str(images)) for one in arguments]
-    given = [one for one in own if not any(one.partition("=")[0] == other.partition("=")[0] for other in typed_here)]
-    given += [] if "features=import" in typed_here else ["features.image_size=[64,64]"]
-    given += [] if {"retrieval=import", "retrieval.num_words=99"} & {*typed_here} else ["retrieval.num_words=2"]
-    code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *given, *typed_here)
+    sides = [f"dataset.{side}={images}/{side}" for side in ("database", "queries")]
+    defaults = ("dataset=folder", *sides, "store=null", "candidates=2", "scorer=count")
+    typed_here = [argument.replace("ROOT", str(images)) for argument in arguments]
+    names = {argument.partition("=")[0] for argument in typed_here}
+    settings = [default for default in defaults if default.partition("=")[0] not in names]
+    settings += [] if "features=import" in typed_here else ["features.image_size=[64,64]"]
+    settings += [] if {"retrieval=import", "retrieval.num_words=99"} & {*typed_here} else ["retrieval.num_words=2"]
+    code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *settings, *typed_here)
     assert (code, stdout) == (2, ""), stderr
     assert words in stderr.splitlines()[-1]
 
