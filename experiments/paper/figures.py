@@ -1,4 +1,4 @@
-"""The paper's figures, of what was evaluated here."""
+"""The paper's figures, of the evaluations at hand."""
 
 import csv
 import shutil
@@ -7,80 +7,79 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from experiments.paper.printed import average, printed
+from experiments.paper.printed import average, printed_tables
 from experiments.paper.systems import Row
-from experiments.paper.tables import TOLERANCES, Found, listed
-from mfvpr.datasets import Dataset, ImageFolder, QuerySequence, resize
+from experiments.paper.tables import TOLERANCES, Evaluations
+from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.report import runs
 from mfvpr.report.evaluations import sequence_folder
+from mfvpr.report.figures import with_longest_side
+from mfvpr.report.plots import panels, save_figure
 from mfvpr.utils.files import clipped, printable, replacing
 
 _MIDDLE = 1  # of the tolerances: the paper's figure
-_OURS, _THEIRS = "#2f6fb0", "#c9a227"
+_OVER_PAPERS = "printed, over the paper's six"
+_OURS, _PRINTED = "#2f6fb0", "#c9a227"
 _STEPS = {"filter": "#7a9e9f", "features": "#c98b2d", "matching": "#2f6fb0", "scores": "#7b4b94"}
 _SIDE = 300  # px of an image's longer side among the failures
-_LONGEST = 32  # characters of a name
+_NAME_LENGTH = 32  # characters
+_FAILURES = 2  # of each data set
 
 
-def figures(found: Found, best: Mapping[str, Path], growth: Mapping[str, Mapping[int, float]]) -> Iterator[runs.Figure]:
-    """Those for which there are numbers.
+def paper_figures(
+    evaluations: Evaluations, best: Mapping[str, Path], growth: Mapping[str, Mapping[int, float]]
+) -> Iterator[runs.Figure]:
+    """The figures that there are numbers for.
 
     Args:
-        found: what was evaluated.
+        evaluations: all of them.
         best: the run folder by data set whose histograms and failures are shown.
         growth: seconds of a query by title and by the size of the database.
     """
     histograms = (path for folder in best.values() for path in sorted((folder / "figures").rglob("right_*.png")))
     if histogram := next(histograms, None):
         yield "histogram.png", partial(_copy, source=histogram)
-    if bars := mean_bars(found):
-        yield "averages.png", partial(draw_averages, bars=bars, names=listed(found))
-    if found.seconds:
-        yield "speed.png", partial(draw_speed, rows=found.rows, seconds=found.seconds, about=found.timed_on)
+    if groups := mean_recalls(evaluations):
+        titles = [row.title for row in evaluations.rows if any(row.title in group for group in groups.values())]
+        yield "averages.png", partial(_draw_averages, titles=titles, groups=groups)
+    if evaluations.seconds:
+        about = evaluations.timed_on
+        yield "speed.png", partial(_draw_speed, rows=evaluations.rows, seconds=evaluations.seconds, about=about)
     if growth:
-        yield "growth.png", partial(draw_growth, growth=growth)
+        yield "growth.png", partial(_draw_growth, growth=growth)
     if best:
-        yield "failures.png", partial(draw_failures, datasets=found.datasets, best=best)
+        yield "failures.png", partial(_draw_failures, datasets=evaluations.datasets, best=best)
 
 
-def mean_bars(found: Found) -> list[tuple[str, float | None, float | None]]:
-    """(title, mean here, see `Found.means`, the printed mean) within 2 frames, of rows that have one."""
-    bars = []
-    for row in found.rows:
-        ours, theirs = found.means[1].get(row.name), average(printed()["recall"].get(row.name, {}))
-        if ours is not None or theirs is not None:
-            bars.append((row.title, *(None if one is None else float(one[_MIDDLE]) for one in (ours, theirs))))
-    return bars
+def mean_recalls(evaluations: Evaluations) -> dict[str, dict[str, float]]:
+    """Mean recall at 1 within 2 frames by title, here (see `Evaluations.means`) and printed, as far as there are."""
+    groups: dict[str, dict[str, float]] = {f"over {evaluations.averaged}": {}, _OVER_PAPERS: {}}
+    for row in evaluations.rows:
+        means = evaluations.means[1].get(row.name), average(printed_tables()["recall"].get(row.name, {}))
+        for group, mean in zip(groups.values(), means, strict=True):
+            if mean is not None:
+                group[row.title] = float(mean[_MIDDLE])
+    return {label: group for label, group in groups.items() if group}
 
 
-def draw_averages(path: Path, bars: Sequence[tuple[str, float | None, float | None]], names: str) -> None:
-    """Mean recall within 2 frames over the data sets that are named, beside the paper's over its own six."""
-    figure, axes = _canvas(9, 1.2 + 0.3 * len(bars))
-    places = np.arange(len(bars))
-    sides = [(f"over {names}", 1, _OURS), ("printed, over the paper's six", 2, _THEIRS)]
-    sides = [side for side in sides if any(bar[side[1]] is not None for bar in bars)]
-    for turn, (label, at, color) in enumerate(sides):
-        shift = 0.4 * (turn - (len(sides) - 1) / 2)
-        axes.barh(places + shift, [float(bar[at] or 0) for bar in bars], 0.38, label=label, color=color)
-        for place, bar in zip(places, bars, strict=True):
-            if (value := bar[at]) is not None:
-                axes.text(float(value) + 0.5, place + shift, f"{value:.1f}", va="center", fontsize=7)
-    axes.set_yticks(places, [bar[0] for bar in bars], fontsize=8)
-    axes.invert_yaxis()
-    axes.set_xlim(0, 108)
-    axes.set_xlabel("mean Recall@1 within 2 frames, %")
-    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False, fontsize=8)
-    _save(figure, path)
+def _draw_averages(path: Path, titles: Sequence[str], groups: Mapping[str, Mapping[str, float]]) -> None:
+    """Draw the means of `mean_recalls` side by side."""
+    figure, [axes] = panels(1, 9, 1.2 + 0.3 * len(titles))
+    for number, (label, members) in enumerate(groups.items()):
+        places = [titles.index(title) + 0.4 * (number - (len(groups) - 1) / 2) for title in members]
+        color = _PRINTED if label == _OVER_PAPERS else _OURS
+        axes.barh(places, [*members.values()], 0.38, label=label, color=color)
+        for place, value in zip(places, members.values(), strict=True):
+            axes.text(value + 0.5, place, f"{value:.1f}", va="center", fontsize=7)
+    _save_bars(figure, path, titles, "mean Recall@1 within 2 frames, %", 108)
 
 
-def draw_speed(path: Path, rows: Sequence[Row], seconds: Mapping[str, Mapping[str, float]], about: str) -> None:
-    """Seconds of a query, step by step; `about` = of what, on what."""
+def _draw_speed(path: Path, rows: Sequence[Row], seconds: Mapping[str, Mapping[str, float]], about: str) -> None:
+    """Draw the seconds of a query, step by step; `about` names the data set and the device."""
     shown = [row for row in rows if row.name in seconds]
-    figure, axes = _canvas(9, 1.2 + 0.3 * len(shown))
+    figure, [axes] = panels(1, 9, 1.2 + 0.3 * len(shown))
     left = np.zeros(len(shown))
     for step, color in _STEPS.items():
         width = np.array([seconds[row.name][step] for row in shown])
@@ -88,56 +87,55 @@ def draw_speed(path: Path, rows: Sequence[Row], seconds: Mapping[str, Mapping[st
         left += width
     for place, total in enumerate(left):
         axes.text(total, place, f" {total:.3f}", va="center", fontsize=7)
-    axes.set_yticks(np.arange(len(shown)), [row.title for row in shown], fontsize=8)
+    _save_bars(figure, path, [row.title for row in shown], f"seconds of a query of {about}", 1.12 * left.max())
+
+
+def _save_bars(figure: Figure, path: Path, titles: Sequence[str], label: str, limit: float) -> None:
+    [axes] = figure.axes
+    axes.set_yticks(np.arange(len(titles)), titles, fontsize=8)
     axes.invert_yaxis()
-    axes.set_xlim(0, 1.12 * left.max())
-    axes.set_xlabel(f"seconds of a query of {about}")
+    axes.set(xlim=(0, limit), xlabel=label)
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=len(_STEPS), frameon=False, fontsize=8)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
-def draw_growth(path: Path, growth: Mapping[str, Mapping[int, float]]) -> None:
-    """Seconds of a query as the database grows: the search grows, the rest stays."""
-    figure, axes = _canvas(7, 4.2)
+def _draw_growth(path: Path, growth: Mapping[str, Mapping[int, float]]) -> None:
+    """Draw the seconds of a query as the database grows: the search grows, the rest stays."""
+    figure, [axes] = panels(1, 7, 4.2)
     for title, by_size in growth.items():
         axes.loglog([*by_size], [*by_size.values()], marker="o", markersize=3, label=title)
-    axes.set_xlabel("images of a database, whose descriptors are made up")
-    for set_formatter in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
-        set_formatter("{x:g}")
-    axes.set_ylabel("seconds of a query")
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter("{x:g}")
+    axes.set(xlabel="images of a database, whose descriptors are made up", ylabel="seconds of a query")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
-def draw_failures(path: Path, datasets: Mapping[str, Dataset], best: Mapping[str, Path], each: int = 2) -> None:
-    """Query, answer, and the best ranked of the right images, where the answer scores higher than that."""
-    cases = [(name, *case) for name, folder in best.items() for case in _failures(folder, datasets[name], each)]
-    shown = [
-        [_small(folder, image) for folder, image in zip(_folders(datasets[name], sequence), images, strict=True)]
-        for name, sequence, *images in cases
-    ]
+def _draw_failures(path: Path, datasets: Mapping[str, Dataset], best: Mapping[str, Path]) -> None:
+    """Draw query, prediction, and the best ranked correct image of the clearest failures."""
+    cases = [(name, *case) for name, folder in best.items() for case in _failures(folder, datasets[name])]
+    shown = []
+    for name, sequence, *images in cases:
+        folders = (sequence.images, datasets[name].database, datasets[name].database)
+        shown.append([_small(folder, image) for folder, image in zip(folders, images, strict=True)])
     heights = [0.35 + 3.1 * max(image.shape[0] / image.shape[1] for image in images) for images in shown] or [1.0]
-    figure = Figure(figsize=(9.5, sum(heights)), layout="constrained")
-    FigureCanvasAgg(figure)
-    rows = figure.subplots(len(heights), 3, squeeze=False, height_ratios=heights)
-    for axes, images, (name, sequence, *names) in zip(rows, shown, cases, strict=False):
-        for one, image, file, word in zip(axes, images, names, ("query", "answer", "right"), strict=True):
-            one.imshow(image)
-            where = " ".join(dict.fromkeys((name, sequence.name))) if word == "query" else ""
-            title = f"{where} {word}: {clipped(file, _LONGEST)}".strip()
-            one.set_title(printable(title), fontsize=7, parse_math=False)
-    for one in rows.ravel():
-        one.set_axis_off()
-    _save(figure, path)
+    number = len(heights)
+    figure, axes = panels(3 * number, 9.5 / 3, sum(heights) / number, columns=3, height_ratios=heights)
+    for panel in axes:
+        panel.set_axis_off()
+    for row, (images, (name, sequence, *names)) in enumerate(zip(shown, cases, strict=True)):
+        where = " ".join(dict.fromkeys((name, sequence.name)))
+        words = f"{where} query", "answer", "right"
+        for panel, image, file, word in zip(axes[3 * row : 3 * row + 3], images, names, words, strict=True):
+            panel.imshow(image)
+            title = f"{word}: {clipped(file, _NAME_LENGTH)}"
+            panel.set_title(printable(title.strip()), fontsize=7, parse_math=False)
+    save_figure(figure, path)
 
 
-def _folders(dataset: Dataset, sequence: QuerySequence) -> tuple[ImageFolder, ImageFolder, ImageFolder]:
-    return sequence.images, dataset.database, dataset.database
-
-
-def _failures(run: Path, dataset: Dataset, number: int) -> Iterator[tuple[QuerySequence, str, str, str]]:
-    """(sequence, query, answer, right answer) of the clearest failures that the filter did not cause."""
+def _failures(run: Path, dataset: Dataset) -> Iterator[tuple[QuerySequence, str, str, str]]:
+    """(sequence, query, prediction, correct image) of the clearest failures that retrieval did not cause."""
     names, rows = [sequence.name for sequence in dataset.sequences], []
     for place, sequence in enumerate(dataset.sequences):
         file = sequence_folder(run, names, place) / "failures" / "histogram.csv"
@@ -145,11 +143,12 @@ def _failures(run: Path, dataset: Dataset, number: int) -> Iterator[tuple[QueryS
             rows += [(sequence, row) for row in csv.DictReader(lines)
                      if row["right_answer"] and _is_far(sequence, dataset.database, row)]  # fmt: skip
     rows.sort(key=lambda row: -float(row[1]["margin"]))
-    yield from ((sequence, row["query"], row["answer"], row["right_answer"]) for sequence, row in rows[:number])
+    for sequence, row in rows[:_FAILURES]:
+        yield sequence, row["query"], row["answer"], row["right_answer"]
 
 
 def _is_far(sequence: QuerySequence, database: ImageFolder, row: Mapping[str, str]) -> bool:
-    """Whether an answer is wrong within the widest of the paper's tolerances, too; of positions it is."""
+    """Whether a prediction is incorrect within the widest of the paper's tolerances, too; True for positions."""
     if sequence.truth is None or sequence.truth.unit != "frames":
         return True
     right = sequence.truth.positives(TOLERANCES[-1]).of(sequence.images.names.index(row["query"]))
@@ -162,17 +161,4 @@ def _copy(path: Path, source: Path) -> None:
 
 
 def _small(folder: ImageFolder, name: str) -> np.ndarray:
-    image = folder.read(folder.names.index(name))
-    scale = _SIDE / max(image.shape[:2])
-    return resize(image, (round(image.shape[1] * scale), round(image.shape[0] * scale)))
-
-
-def _canvas(width: float, height: float) -> tuple[Figure, Axes]:
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, figure.subplots()
-
-
-def _save(figure: Figure, path: Path) -> None:
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    return with_longest_side(folder.read(folder.names.index(name)), _SIDE)

@@ -1,4 +1,4 @@
-"""The numbers that the paper prints, and those that follow from them."""
+"""The numbers that the paper prints, and averages that follow from them."""
 
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -13,19 +13,15 @@ OTHERS = ("gardens_point", "nordland_1415", "robotcar_seasons")
 
 
 @cache
-def printed() -> Mapping[str, Any]:
-    """Tables by their name in printed.yaml, which says what each holds."""
+def printed_tables() -> Mapping[str, Any]:
+    """Tables by their names in printed.yaml, which describes them."""
     return yaml.safe_load((Path(__file__).parent / "printed.yaml").read_text(encoding="utf-8"))
 
 
 def average(recalls: Mapping[str, Sequence[float]]) -> np.ndarray | None:
-    """The paper's average recall `[tolerances]` of a system: Berlin's three count as one data set.
+    """The paper's average recall `[tolerances]`: Berlin's three count as one data set; None if one of six is missing.
 
-    Args:
-        recalls: `[tolerances]` by data set.
-
-    Returns:
-        None where one of the six is missing.
+    `recalls` are `[tolerances]` by data set.
     """
     if not {*BERLIN, *OTHERS} <= recalls.keys():
         return None
@@ -34,13 +30,13 @@ def average(recalls: Mapping[str, Sequence[float]]) -> np.ndarray | None:
 
 
 def printed_recall(row: str, dataset: str, sequence: str | None = None) -> Sequence[float] | None:
-    """Of a system, within 1, 2 and 5 frames in %, on a data set or in a sequence of RobotCar's; None = not printed."""
+    """Recall of a system within 1, 2, 5 frames in %, on a data set or a sequence of RobotCar's; None = not printed."""
     if sequence is None:
-        return printed()["recall"].get(row, {}).get(dataset)
-    return printed()["sequences"].get(row, {}).get(sequence) if dataset == "robotcar_seasons" else None
+        return printed_tables()["recall"].get(row, {}).get(dataset)
+    return printed_tables()["sequences"].get(row, {}).get(sequence) if dataset == "robotcar_seasons" else None
 
 
 def printed_settings(row: str) -> Mapping[str, Any]:
     """Sizes of images and candidates of a system, by column; empty = not printed."""
-    families = (family for family in printed()["settings"] if row.startswith(family))
-    return printed()["settings"].get(max(families, key=len, default=""), {})
+    families = (family for family in printed_tables()["settings"] if row.startswith(family))
+    return printed_tables()["settings"].get(max(families, key=len, default=""), {})

@@ -1,4 +1,4 @@
-"""What is evaluated: the rows of the tables, the evaluations that give them, and the data sets that are here."""
+"""Rows of the tables, the evaluations that give them, and the data sets at hand."""
 
 import difflib
 import os
@@ -16,12 +16,12 @@ from mfvpr.datasets.published import PUBLISHED
 from mfvpr.reranking.results import FILTER
 
 DRAWN = "streets_seasons"
-REAL = {  # those without a layout of their own, by the folders that they hold
+REAL = {  # data sets of plain folders, and their folders
     "grief_season": ("database", "queries"),
     "corridor": ("ref", "query"),
 }
 _SIDES = ("database", "queries")
-_POSITIONS = "@"  # what names of images begin with that tell where they were taken: @easting@northing@...
+_POSITIONS = "@"  # begins image names that hold coordinates: @easting@northing@...
 COMBINED = f"histogram + {FILTER}"
 
 
@@ -31,9 +31,9 @@ class Row:
 
     Attributes:
         name: of the row, in the printed numbers as well.
-        title: for people.
-        run: the evaluation that gives it.
-        ranking: which of the evaluation's; None = the one that decides.
+        title: in tables.
+        run: name of its evaluation.
+        ranking: the evaluation's system; None = the headline.
     """
 
     name: str
@@ -49,12 +49,12 @@ class Row:
 
 @dataclass(frozen=True)
 class Place:
-    """A data set that is here.
+    """A data set at hand.
 
     Attributes:
-        name: of it.
-        settings: of `experiments.evaluate`, that choose it.
-        root: its folder; None = it is drawn.
+        name: of the data set.
+        settings: of `experiments.evaluate`.
+        root: its folder; None = it is synthetic.
     """
 
     name: str
@@ -115,91 +115,79 @@ def overrides(run: str, dataset: str) -> tuple[str, ...]:
     if run.startswith("selavpr"):
         return (*chosen, "candidates=50")
     if run.startswith("patch_netvlad") and dataset == "robotcar_seasons":
-        return (*chosen, "features.image_size=[480,480]", *_reach(run))
+        size = ("scorer.size=[400,400]",) if run == "patch_netvlad_speed" else ()  # of the patches' grid
+        return (*chosen, "features.image_size=[480,480]", *size)
     return chosen
-
-
-def _reach(run: str) -> tuple[str, ...]:
-    """The largest place of patches in square images, by which the rapid score goes."""
-    return ("scorer.size=[400,400]",) if run == "patch_netvlad_speed" else ()
 
 
 def chosen_rows(names: Sequence[str] | None) -> tuple[Row, ...]:
     """Rows by name, in the order of the tables; all for None."""
-    known = [row.name for row in ROWS]
-    for name in names or ():
-        if name not in known:
-            raise SettingsError(_unknown("systems", name, known))
+    _check_names("systems", names, [row.name for row in ROWS])
     return tuple(row for row in ROWS if names is None or row.name in names)
 
 
-def _unknown(setting: str, name: str, known: Sequence[str]) -> str:
-    nearest = difflib.get_close_matches(name, known, n=1) or [one for one in known if name in one]
-    hint = f"; the nearest is {nearest[0]}" if nearest else ""
-    return f"{setting}=[{name}]: expected some of {', '.join(known)}{hint}"
+def _check_names(setting: str, names: Sequence[str] | None, known: Sequence[str]) -> None:
+    for name in names or ():
+        if name not in known:
+            nearest = difflib.get_close_matches(name, known, n=1) or [choice for choice in known if name in choice]
+            hint = f"; the nearest is {nearest[0]}" if nearest else ""
+            raise SettingsError(f"{setting}=[{name}]: expected some of {', '.join(known)}{hint}")
 
 
 def places(data: str | None, names: Sequence[str] | None) -> tuple[list[Place], list[str]]:
-    """The data sets that are here, and a line for each that is not."""
+    """The data sets that are at hand, and a line for each that is not."""
     root = None if data is None else expanded(data)
     if root is not None and not root.is_dir():
         got = "a file" if root.exists() else "nothing"
         raise SettingsError(f"data={data}: expected a folder with a folder per data set, got {got}; check the path")
-    positioned = {place.name: place for place in _positioned(root)} if root else {}
-    known = list(dict.fromkeys((DRAWN, *REAL, *PUBLISHED, *positioned)))
-    for name in names or ():
-        if name not in known:
-            raise SettingsError(_unknown("datasets", name, known))
-    found, missing = [], []
-    for name in known if names is None else [one for one in known if one in names]:
+    located = {place.name: place for place in _places_by_coordinates(root)} if root else {}
+    known = list(dict.fromkeys((DRAWN, *REAL, *PUBLISHED, *located)))
+    _check_names("datasets", names, known)
+    available, missing = [], []
+    for name in known if names is None else [name for name in known if name in names]:
         if name == DRAWN:
-            found.append(Place(name, (f"dataset={name}",)))
+            available.append(Place(name, (f"dataset={name}",)))
             if root and (root / name).is_dir():
                 missing.append(f"{root / name}: the drawn data set has this name; rename the folder")
-        elif name in positioned and name in (*REAL, *PUBLISHED):
+        elif name in located and name in (*REAL, *PUBLISHED):
             missing.append(f"{name}: needs another layout than that of names with positions; rename the folder")
-        elif name in positioned and not RULES["dataset.name"].holds(name):
+        elif name in located and not RULES["dataset.name"].holds(name):
             missing.append(f"{name}: needs a folder's name of {RULES['dataset.name'].expected}; rename it")
-        elif name in positioned:
-            found.append(positioned[name])
-        elif folder := _folder(root, name, positioned):
-            found.append(Place(name, (f"dataset={name}", as_typed(f"dataset.root={folder}")), folder))
+        elif name in located:
+            available.append(located[name])
+        elif folder := _folder(root, name, located):
+            available.append(Place(name, (f"dataset={name}", as_typed(f"dataset.root={folder}")), folder))
         else:
-            missing.append(f"{name}: {_needed(name, data)}")
-    return found, missing
+            needs = f"with {' and '.join(REAL[name])}" if name in REAL else f"({PUBLISHED[name].source})"
+            missing.append(f"{name}: needs {data or 'data=DIR'}/{name} {needs}")
+    return available, missing
 
 
-def _positioned(root: Path) -> Iterator[Place]:
-    """Folders whose names of images tell positions, as those of VPR-datasets-downloader do."""
+def _places_by_coordinates(root: Path) -> Iterator[Place]:
+    """Folders of images whose names hold coordinates, as VPR-datasets-downloader makes them."""
     for folder in sorted(path for path in root.iterdir() if path.is_dir()):
         for inside in (folder, folder / "images" / "test"):
             sides = {side: inside / side for side in _SIDES}
-            if all(side.is_dir() and _first(side).startswith(_POSITIONS) for side in sides.values()):
+            if all(side.is_dir() and _first_name(side).startswith(_POSITIONS) for side in sides.values()):
                 chosen = {"name": folder.name, **sides, "ground_truth": "utm"}
                 settings = (as_typed(f"dataset.{name}={value}") for name, value in chosen.items())
                 yield Place(folder.name, ("dataset=folder", *settings), folder)
                 break
 
 
-def _first(folder: Path) -> str:
-    """The name of some file; empty where there is none."""
+def _first_name(folder: Path) -> str:
+    """The name of some file; empty if there is none."""
     with os.scandir(folder) as entries:
         return next((entry.name for entry in entries if entry.is_file()), "")
 
 
 def _folder(root: Path | None, name: str, taken: Collection[str]) -> Path | None:
     names = PUBLISHED[name].folders if name in PUBLISHED else (name,)
-    return next((root / one for one in names if one not in taken and (root / one).is_dir()), None) if root else None
-
-
-def _needed(name: str, data: str | None) -> str:
-    where = f"{data or 'data=DIR'}/{name}"
-    if name in REAL:
-        return f"needs {where} with {' and '.join(REAL[name])}"
-    return f"needs {where} ({PUBLISHED[name].source})"
+    folders = (root / folder for folder in names if folder not in taken) if root else ()
+    return next((folder for folder in folders if folder.is_dir()), None)
 
 
 def missing_weights(settings: Mapping[str, Any]) -> list[Entry]:
-    """Of the networks that settings name, those whose weights are not installed."""
-    named = [settings[group].get("weights") for group in ("features", "retrieval", "matching")]
-    return [REGISTRY[name] for name in dict.fromkeys(named) if name in REGISTRY and not is_installed(REGISTRY[name])]
+    """Networks of the settings without installed weights."""
+    names = [settings[group].get("weights") for group in ("features", "retrieval", "matching")]
+    return [REGISTRY[name] for name in dict.fromkeys(names) if name in REGISTRY and not is_installed(REGISTRY[name])]

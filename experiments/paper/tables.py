@@ -1,13 +1,14 @@
-"""The paper's tables, of what was evaluated here, each number beside the printed one."""
+"""The paper's tables: numbers of the evaluations at hand beside the printed ones."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from experiments.paper.printed import BERLIN, OTHERS, average, printed, printed_recall, printed_settings
+from experiments.paper.printed import BERLIN, OTHERS, average, printed_recall, printed_settings, printed_tables
 from experiments.paper.systems import Row
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.datasets import MEANS
@@ -22,81 +23,93 @@ _NONE = "-"
 
 
 @dataclass(frozen=True)
-class Evaluated:
-    """What a row's ranking achieves on a data set.
+class RowResult:
+    """The result of a row's ranking on a data set.
 
     Attributes:
         recall: in %, by sequence (`OVERALL` for all), threshold and depth.
-        about: settings of the evaluation, as its results keep them.
-        asked: candidates, of which a small database has fewer; None = as many as there were.
+        about: settings of the evaluation, from its results.
+        candidates: setting, of which a small database has fewer; None = as many as there were.
     """
 
     recall: Mapping[str, Mapping[float, Mapping[int, float]]]
     about: Mapping[str, Any]
-    asked: int | str | None = None
+    candidates: int | str | None = None
 
 
 @dataclass(frozen=True)
-class Found:
-    """All that was evaluated.
+class Evaluations:
+    """All evaluations at hand.
 
     Attributes:
         rows: of the tables.
-        datasets: that are here, by name.
-        evaluated: by row and data set.
-        seconds: by row: of a query, by step; see `timing`.
+        datasets: at hand, by name.
+        results: by row and data set.
+        seconds: of a query, by row and step; see `timing`.
         sizes: by row and data set: bytes of an image's features in float32, as the paper counts them.
         timed_on: the data set and the device of the seconds, in words.
     """
 
     rows: Sequence[Row]
     datasets: Mapping[str, Dataset]
-    evaluated: Mapping[tuple[str, str], Evaluated]
+    results: Mapping[tuple[str, str], RowResult]
     seconds: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     sizes: Mapping[tuple[str, str], float] = field(default_factory=dict)
     timed_on: str = ""
 
     def title(self, name: str) -> str:
-        """A data set's name; one that lacks images is called so."""
+        """A data set's name, marked if it lacks images."""
         return name + INCOMPLETE * (next(differences(self.datasets[name]), None) is not None)
 
     @cached_property
     def means(self) -> tuple[list[str], dict[str, np.ndarray]]:
         """Data sets, and by row the mean recall `[tolerances]` over them.
 
-        They are the paper's six, as the paper averages them, where all of these are here; else all that are judged by
-        these tolerances. Rows that lack one have no mean.
+        They are the paper's six, averaged as in the paper, if all six are here; else all with the paper's tolerances.
+        Rows that lack one have no mean.
         """
-        names = [name for name in self.datasets if {*TOLERANCES} <= {*thresholds_of(self, name)}]
+        names = [name for name in self.datasets if {*TOLERANCES} <= {*self.thresholds(name)}]
         six = [name for name in names if name in (*BERLIN, *OTHERS)]
         names = six if len(six) == len(BERLIN) + len(OTHERS) else names
-        found = {}
+        means = {}
         for row in self.rows:
-            own = {name: _at(self.evaluated[row.name, name]) for name in names if (row.name, name) in self.evaluated}
-            if names and len(own) == len(names):
-                macro = average(own)
-                found[row.name] = np.mean([*own.values()], axis=0) if macro is None or names != six else macro
-        return names, found
+            results = [self.results.get((row.name, name)) for name in names]
+            recalls = {name: [result.recall[OVERALL][tolerance][1] for tolerance in TOLERANCES]
+                       for name, result in zip(names, results, strict=True) if result}  # fmt: skip
+            if names and len(recalls) == len(names):
+                macro = average(recalls)
+                is_papers = macro is not None and names == six
+                means[row.name] = macro if is_papers else np.mean([*recalls.values()], axis=0)
+        return names, means
 
-    def known(self, rows: Iterable[Row], datasets: Iterable[str]) -> list[Row]:
-        """Those that were evaluated on one of the data sets, or are printed for it."""
-        names = [*datasets]
+    @property
+    def averaged(self) -> str:
+        """The data sets of the means, in words."""
+        return ", ".join(map(self.title, self.means[0])) or "none"
+
+    def thresholds(self, dataset: str) -> list[float]:
+        """Thresholds of a data set's evaluations."""
+        recalls = (result.recall[OVERALL] for (_, name), result in self.results.items() if name == dataset)
+        return sorted(next(recalls, {}))
+
+    def rows_on(self, datasets: Sequence[str]) -> list[Row]:
+        """Rows that were evaluated on one of the data sets, or are printed for it."""
         return [
-            row for row in rows
-            if any((row.name, name) in self.evaluated or printed_recall(row.name, name) for name in names)
+            row for row in self.rows
+            if any((row.name, name) in self.results or printed_recall(row.name, name) for name in datasets)
         ]  # fmt: skip
 
 
-def evaluated(row: Row, results: Sequence[Mapping[str, Any]], asked: int | str | None = None) -> Evaluated | None:
-    """A row's part of an evaluation's results; None where it has none."""
-    own = [one for one in results if (one["decides"] if row.ranking is None else one["system"] == row.ranking)]
+def row_result(row: Row, results: Sequence[Mapping[str, Any]], candidates: int | str | None = None) -> RowResult | None:
+    """A row's part of an evaluation's results; None if it has none."""
+    parts = [part for part in results if (part["decides"] if row.ranking is None else part["system"] == row.ranking)]
     recall: dict[str, dict[float, dict[int, float]]] = {}
-    for one in own:
-        sequence, threshold = one.get("sequence", OVERALL), one.get("tolerance", one.get("radius", 0))
-        depths = {int(k): 100 * value for k, value in one["recall_at"].items()}
+    for part in parts:
+        sequence, threshold = part.get("sequence", OVERALL), part.get("tolerance", part.get("radius", 0))
+        depths = {int(k): 100 * value for k, value in part["recall_at"].items()}
         recall.setdefault(OVERALL if sequence == MEANS[0] else sequence, {})[threshold] = depths
     recall.pop(MEANS[1], None)
-    return Evaluated(recall, own[0], asked) if own and OVERALL in recall else None
+    return RowResult(recall, parts[0], candidates) if parts and OVERALL in recall else None
 
 
 def beside(ours: float | None, theirs: float | None, form: str = ".1f") -> str:
@@ -108,22 +121,22 @@ def beside(ours: float | None, theirs: float | None, form: str = ".1f") -> str:
     return f"{ours:{form}} ({theirs:{form}}, {round(ours, 1) - theirs:+{form}})"
 
 
-def tables(found: Found) -> Iterator[tuple[str, str, Table]]:
+def paper_tables(evaluations: Evaluations) -> Iterator[tuple[str, str, Table]]:
     """(name, heading, table) of each that is not empty."""
     candidates = (
-        ("data_sets", "Data sets (Table I)", data_sets(found)),
-        ("settings", "Settings (Table II)", settings(found)),
-        ("recall", "Recall@1 in %, by data set and threshold (Tables III and VII)", recalls(found)),
+        ("data_sets", "Data sets (Table I)", _data_sets(evaluations)),
+        ("settings", "Settings (Table II)", _settings(evaluations)),
+        ("recall", "Recall@1 in %, by data set and threshold (Tables III and VII)", _recalls(evaluations)),
         *(
-            (f"sequences_{name}", f"Recall@1 in %, sequences of {found.title(name)} (Table IV)", sequences(found, name))
-            for name, dataset in found.datasets.items()
-            if len(dataset.sequences) > 1
+            (f"sequences_{name}", f"Recall@1 in %, sequences of {evaluations.title(name)} (Table IV)",
+             _sequences(evaluations, name))
+            for name, dataset in evaluations.datasets.items() if len(dataset.sequences) > 1
         ),
-        ("averages", f"Average Recall@1 in % (figure 8), here over {listed(found)}", averages(found)),
-        ("depths", "Recall@1, @5 and @10 in %, by data set (Table VIII)", depths(found)),
-        ("sizes", "Size of the database in MiB, of float32 (Table V)", sizes(found)),
+        ("averages", f"Average Recall@1 in % (figure 8), here over {evaluations.averaged}", _averages(evaluations)),
+        ("depths", "Recall@1, @5 and @10 in %, by data set (Table VIII)", _depths(evaluations)),
+        ("sizes", "Size of the database in MiB, of float32 (Table V)", _sizes(evaluations)),
         ("seconds", "Seconds of a query by step (Table VI: "
-         f"RobotCar's snow, an RTX 2080 Ti; here {found.timed_on})", seconds(found)),
+         f"RobotCar's snow, an RTX 2080 Ti; here {evaluations.timed_on})", _seconds(evaluations)),
     )  # fmt: skip
     for name, heading, table in candidates:
         if table.rows:
@@ -131,147 +144,117 @@ def tables(found: Found) -> Iterator[tuple[str, str, Table]]:
             yield name, heading + "; in brackets the printed numbers and the differences" * has_printed, table
 
 
-def listed(found: Found) -> str:
-    """The data sets of the means."""
-    return ", ".join(map(found.title, found.means[0])) or "none"
-
-
-def data_sets(found: Found) -> Table:
-    """Images of reference and queries."""
+def _data_sets(evaluations: Evaluations) -> Table:
+    """Numbers of database images and queries."""
     rows = []
-    for name, dataset in found.datasets.items():
+    for name, dataset in evaluations.datasets.items():
         ours = [len(dataset.database), sum(len(sequence.images) for sequence in dataset.sequences)]
-        theirs = printed()["data_sets"].get(name, [None, None])
-        rows.append([found.title(name), *(beside(*both, form=",.0f") for both in zip(ours, theirs, strict=True))])
+        theirs = printed_tables()["data_sets"].get(name, [None, None])
+        rows.append([evaluations.title(name), *(beside(*both, form=",.0f") for both in zip(ours, theirs, strict=True))])
     return Table(["data set", "reference", "queries"], rows)
 
 
-def settings(found: Found) -> Table:
-    """Filter and features with the sizes of their images in px, and candidates."""
+def _settings(evaluations: Evaluations) -> Table:
+    """Retrieval and features with the sizes of their images in px, and candidates."""
     lines: dict[str, list[str]] = {}
-    for (name, _), one in found.evaluated.items():
-        about, theirs = one.about, printed_settings(name)
+    for (name, _), result in evaluations.results.items():
+        about, theirs = result.about, printed_settings(name)
         sides = [about[group].get("image_size") for group in ("filter", "features")]
-        sizes = [" x ".join(map(str, side)) if side else _NONE for side in sides]
-        ours = [sizes[0], sizes[1], str(one.asked or about["candidates"])]
-        beside_them = [theirs.get(column) for column in ("filter", "re_ranking", "candidates")]
-        cells = [cell if value is None else f"{cell} ({value})" for cell, value in zip(ours, beside_them, strict=True)]
+        ours = [" x ".join(map(str, side)) if side else _NONE for side in sides]
+        ours.append(str(result.candidates or about["candidates"]))
+        values = [theirs.get(column) for column in ("filter", "re_ranking", "candidates")]
+        cells = [cell if value is None else f"{cell} ({value})" for cell, value in zip(ours, values, strict=True)]
         lines[name] = [about["filter"]["name"], cells[0], about["features"]["name"], *cells[1:]]
-    rows = [[row.title, *lines[row.name]] for row in found.rows if row.name in lines]
+    rows = [[row.title, *lines[row.name]] for row in evaluations.rows if row.name in lines]
     return Table(["system", "filter", "its images", "features", "their images", "candidates"], rows, text_columns=5)
 
 
-def recalls(found: Found) -> Table:
-    """All systems by data set and threshold."""
-    columns = [(name, threshold) for name in found.datasets for threshold in thresholds_of(found, name)]
-    rows = []
-    for row in found.known(found.rows, found.datasets):
-        cells = [_cell(found, row, name, OVERALL, threshold) for name, threshold in columns]
-        rows.append([row.title, *cells])
-    return Table(
-        ["system", *(f"{found.title(name)} ±{threshold:g}" for name, threshold in columns)], rows if columns else []
-    )
+def _recalls(evaluations: Evaluations) -> Table:
+    """Recall by data set and threshold."""
+    names = list(evaluations.datasets)
+    columns = [(name, OVERALL, threshold) for name in names for threshold in evaluations.thresholds(name)]
+    header = [f"{evaluations.title(name)} ±{threshold:g}" for name, _, threshold in columns]
+    return _recall_table(evaluations, names, header, columns)
 
 
-def sequences(found: Found, dataset: str) -> Table:
-    """All systems in each sequence of a data set, and their plain mean."""
-    thresholds = thresholds_of(found, dataset)
-    parts = [sequence.name for sequence in found.datasets[dataset].sequences]
-    columns = [(part, threshold) for part in (*parts, OVERALL) for threshold in thresholds]
-    rows = [
-        [row.title, *(_cell(found, row, dataset, part, threshold) for part, threshold in columns)]
-        for row in found.known(found.rows, [dataset])
-    ]
-    return Table(
-        ["system", *(f"{part or 'mean'} ±{threshold:g}" for part, threshold in columns)], rows if columns else []
-    )
+def _sequences(evaluations: Evaluations, dataset: str) -> Table:
+    """Recall in each sequence of a data set, and their plain mean."""
+    parts = [*(sequence.name for sequence in evaluations.datasets[dataset].sequences), OVERALL]
+    columns = [(dataset, part, threshold) for part in parts for threshold in evaluations.thresholds(dataset)]
+    header = [f"{part or 'mean'} ±{threshold:g}" for _, part, threshold in columns]
+    return _recall_table(evaluations, [dataset], header, columns)
 
 
-def averages(found: Found) -> Table:
-    """Means over the data sets that are here, see `Found.means`, and the printed ones beside those of the same six."""
-    names, means = found.means
+def _recall_table(
+    evaluations: Evaluations, names: list[str], header: list[str], columns: list[tuple[str, str, float]]
+) -> Table:
+    rows = [[row.title, *(_recall_cell(evaluations, row, *column) for column in columns)]
+            for row in evaluations.rows_on(names) if columns]  # fmt: skip
+    return Table(["system", *header], rows)
+
+
+def _recall_cell(evaluations: Evaluations, row: Row, dataset: str, sequence: str, threshold: float) -> str:
+    result = evaluations.results.get((row.name, dataset))
+    ours = None if result is None else result.recall.get(sequence, {}).get(threshold, {}).get(1)
+    theirs = printed_recall(row.name, dataset, sequence or None)
+    return beside(ours, theirs[TOLERANCES.index(int(threshold))] if theirs and threshold in TOLERANCES else None)
+
+
+def _averages(evaluations: Evaluations) -> Table:
+    """Means over the data sets that are here, see `Evaluations.means`, and the printed ones beside those of all six."""
+    names, means = evaluations.means
     is_papers = {*names} == {*BERLIN, *OTHERS}
+    no_values = [None] * len(TOLERANCES)
     rows = []
-    for row in found.rows:
-        theirs, ours = average(printed()["recall"].get(row.name, {})), _or_none(means.get(row.name))
-        if row.name not in means and theirs is None:
-            continue
-        papers = zip(ours if is_papers else _or_none(None), _or_none(theirs), strict=True)
-        own = _or_none(None) if is_papers else ours
-        rows.append([row.title, *(beside(*both) for both in papers), *(beside(one, None) for one in own)])
-    header = [f"of the paper's six ±{t}" for t in TOLERANCES] + [f"of {len(names)} here ±{t}" for t in TOLERANCES]
-    return _without_empty_columns(Table(["system", *header], rows))
+    for row in evaluations.rows:
+        printed_mean = average(printed_tables()["recall"].get(row.name, {}))
+        if row.name in means or printed_mean is not None:
+            ours = means.get(row.name, no_values)
+            theirs = no_values if printed_mean is None else printed_mean
+            cells = [beside(*both) for both in zip(ours if is_papers else no_values, theirs, strict=True)]
+            rows.append([row.title, *cells, *(beside(value, None) for value in (no_values if is_papers else ours))])
+    header = ["system"] + [f"of the paper's six ±{tolerance}" for tolerance in TOLERANCES]
+    header += [f"of {len(names)} here ±{tolerance}" for tolerance in TOLERANCES]
+    filled = [place for place in range(len(header)) if not rows or any(row[place] != _NONE for row in rows)]
+    return Table([header[place] for place in filled], [[row[place] for place in filled] for row in rows])
 
 
-def _without_empty_columns(table: Table) -> Table:
-    kept = [place for place in range(len(table.header)) if any(row[place] != _NONE for row in table.rows)]
-    rows = [[row[place] for place in kept] for row in table.rows]
-    return Table([table.header[place] for place in kept], rows) if rows else table
-
-
-def depths(found: Found) -> Table:
+def _depths(evaluations: Evaluations) -> Table:
     """Recall at several depths, within the threshold in the middle; Pittsburgh's beside the printed."""
     ks = (1, 5, 10)
     rows = []
-    for row in found.rows:
-        for name in found.datasets:
-            if one := found.evaluated.get((row.name, name)):
-                recall = one.recall[OVERALL]
-                threshold = middle(sorted(recall))
-                theirs = printed()["pitts30k"].get(row.name) if name == "pitts30k_val" else None
-                cells = [beside(recall[threshold].get(k), theirs and theirs[at]) for at, k in enumerate(ks)]
-                rows.append([row.title, f"{found.title(name)} ±{threshold:g}", *cells])
+    for row, name in itertools.product(evaluations.rows, evaluations.datasets):
+        if result := evaluations.results.get((row.name, name)):
+            recall = result.recall[OVERALL]
+            threshold = middle(sorted(recall))
+            theirs = printed_tables()["pitts30k"].get(row.name) if name == "pitts30k_val" else None
+            cells = [beside(recall[threshold].get(k), theirs and theirs[place]) for place, k in enumerate(ks)]
+            rows.append([row.title, f"{evaluations.title(name)} ±{threshold:g}", *cells])
     return Table(["system", "data set", *(f"R@{k}" for k in ks)], rows, text_columns=2)
 
 
-def sizes(found: Found) -> Table:
+def _sizes(evaluations: Evaluations) -> Table:
     """Bytes of an image times images of the database."""
     rows = []
-    for row in found.rows:
-        theirs = printed()["sizes"].get(row.name, {})
+    for row in evaluations.rows:
+        theirs = printed_tables()["sizes"].get(row.name, {})
         cells = []
-        for name, dataset in found.datasets.items():
-            size = found.sizes.get((row.name, name))
+        for name, dataset in evaluations.datasets.items():
+            size = evaluations.sizes.get((row.name, name))
             cells.append(beside(None if size is None else size * len(dataset.database) / 2**20, theirs.get(name)))
         if any(cell != _NONE for cell in cells):
             rows.append([row.title, *cells])
-    return Table(["system", *map(found.title, found.datasets)], rows)
+    return Table(["system", *map(evaluations.title, evaluations.datasets)], rows)
 
 
-def seconds(found: Found) -> Table:
-    """By step, and in all."""
+def _seconds(evaluations: Evaluations) -> Table:
+    """Seconds by step, and their sum."""
     rows = []
-    for row in found.rows:
-        theirs = printed()["seconds"].get(row.name, [None] * 4)
-        if ours := found.seconds.get(row.name):
-            steps = [ours["filter"], ours["features"], ours["matching"] + ours["scores"]]
-            own = [*steps, sum(steps)]
-            cells = [_second(*both) for both in zip(own, theirs, strict=True)]
+    for row in evaluations.rows:
+        theirs = printed_tables()["seconds"].get(row.name, [None] * 4)
+        if steps := evaluations.seconds.get(row.name):
+            ours = [steps["filter"], steps["features"], steps["matching"] + steps["scores"]]
+            pairs = zip([*ours, sum(ours)], theirs, strict=True)
+            cells = [f"{value:.3f}" + ("" if known is None else f" ({known:.2f})") for value, known in pairs]
             rows.append([row.title, *cells])
     return Table(["system", "filter", "features", "matching and score", "in all"], rows)
-
-
-def _second(ours: float, theirs: float | None) -> str:
-    return f"{ours:.3f}" if theirs is None else f"{ours:.3f} ({theirs:.2f})"
-
-
-def thresholds_of(found: Found, dataset: str) -> list[float]:
-    """Of a data set's evaluations."""
-    known = (one.recall[OVERALL] for (_, name), one in found.evaluated.items() if name == dataset)
-    return sorted(next(known, {}))
-
-
-def _cell(found: Found, row: Row, dataset: str, sequence: str, threshold: float) -> str:
-    one = found.evaluated.get((row.name, dataset))
-    ours = None if one is None else one.recall.get(sequence, {}).get(threshold, {}).get(1)
-    theirs = printed_recall(row.name, dataset, sequence or None)
-    at = TOLERANCES.index(int(threshold)) if threshold in TOLERANCES else None
-    return beside(ours, theirs[at] if theirs and at is not None else None)
-
-
-def _at(one: Evaluated) -> list[float]:
-    return [one.recall[OVERALL][tolerance][1] for tolerance in TOLERANCES]
-
-
-def _or_none(values: Any) -> Sequence[float | None]:
-    return [None] * len(TOLERANCES) if values is None else list(values)

@@ -22,22 +22,22 @@ from mfvpr.utils.versions import versions
 QUERIES, DATABASE = 10, 60  # images; as many of the database as there are candidates, at least
 STEPS = ("filter", "features", "matching", "scores")
 _FLOAT = 4  # bytes of a number
-_MOST = 1 << 30  # bytes of made descriptors
+_MOST_BYTES = 1 << 30  # bytes of synthetic descriptors
 _ROUNDS = 5
 
 
-def measured(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, float]:
-    """Seconds of a query by step.
+def measure_query(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, float]:
+    """Measure the seconds of a query by step.
 
-    A part of the database is enough, as the time does not depend on its size but for the search among descriptors (see
-    `search`). What is taken from it, and all that is learned of it, is there before: the queries are asked twice, under
-    other names, which are other images to an archive, so that nothing is compiled while they are timed.
+    A part of the database is enough: only the search among descriptors depends on its size (see `search`). Queries are
+    evaluated twice under different names, so that nothing is compiled, and no feature of the database is extracted,
+    while the second pass is timed.
     """
     sequence = dataset.sequences[-1]  # RobotCar's snow, as the paper
     number = min(QUERIES, len(sequence.images))
     candidates = min(int(settings["candidates"]), len(dataset.database)) if settings["candidates"] != "all" else "all"
     least = DATABASE if candidates == "all" else max(DATABASE, candidates)
-    database = _part(dataset.database, range(min(least, len(dataset.database))))
+    database = replace(dataset.database, names=tuple(dataset.database.names[:least]))
     extractor = build.extractor(settings["features"], None)
     filter, matching = build.filter(settings["retrieval"], extractor, None), build.matching(settings["matching"])
     scorers, watch = build.scorers(settings["scorer"]), Stopwatch()
@@ -46,9 +46,8 @@ def measured(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, float]:
         archive = Archive(Path(folder) / "archive")
         for turn in ("first", "second"):
             watch = Stopwatch()
-            part = replace(
-                sequence, images=_renamed(sequence.images, number, Path(folder) / turn), truth=None, excluded=None
-            )
+            images = _link_under_new_names(sequence.images, number, Path(folder) / turn)
+            part = replace(sequence, images=images, truth=None, excluded=None)
             evaluation.evaluate(
                 Dataset(dataset.name, database, (part,)), extractor, filter, {main: scorers[main]},
                 candidates=candidates, matching=matching, archive=archive, watch=watch,
@@ -57,11 +56,11 @@ def measured(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, float]:
 
 
 def device() -> dict[str, Any]:
-    """What the seconds were measured on."""
+    """The device that the seconds are measured on, and versions."""
     return {"device": jax.devices()[0].device_kind, "cores": available_cpus(), "versions": versions()}
 
 
-def _renamed(images: ImageFolder, number: int, folder: Path) -> ImageFolder:
+def _link_under_new_names(images: ImageFolder, number: int, folder: Path) -> ImageFolder:
     """The first images under other names, in a folder of their own."""
     folder.mkdir()
     names = [f"{folder.name}{row:04d}{path.suffix}" for row, path in enumerate(images.paths[:number])]
@@ -70,26 +69,22 @@ def _renamed(images: ImageFolder, number: int, folder: Path) -> ImageFolder:
     return replace(images, root=folder, names=tuple(names))
 
 
-def _part(folder: ImageFolder, rows: range) -> ImageFolder:
-    return replace(folder, names=tuple(folder.names[row] for row in rows))
-
-
 def search(descriptor: int, largest: int = 100_000) -> dict[int, float]:
-    """Seconds that the search among made descriptors takes, by the size of the database.
+    """Measure the seconds of a search among synthetic descriptors, by the size of the database.
 
     Args:
         descriptor: bytes of one.
-        largest: database; less where descriptors would take more than `_MOST` bytes.
+        largest: database; less where descriptors would take more than `_MOST_BYTES` bytes.
     """
-    found, rng, length = {}, np.random.default_rng(0), descriptor // _FLOAT
-    for size in (size for size in (100, 1000, 10_000, largest) if size * descriptor <= _MOST):
-        known = Vectors()
+    seconds, rng, length = {}, np.random.default_rng(0), descriptor // _FLOAT
+    for size in (size for size in (100, 1000, 10_000, largest) if size * descriptor <= _MOST_BYTES):
+        database = Vectors()
         for row in range(size):
-            known.put(row, rng.standard_normal(length, np.float32))
+            database.put(row, rng.standard_normal(length, np.float32))
         query, times = rng.standard_normal(length, np.float32), []
         for _ in range(_ROUNDS + 1):
             start = time.perf_counter()
-            known.nearest(query, 50)
+            database.nearest(query, 50)
             times.append(time.perf_counter() - start)
-        found[size] = float(np.median(times[1:]))
-    return found
+        seconds[size] = float(np.median(times[1:]))
+    return seconds

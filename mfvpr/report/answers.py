@@ -1,4 +1,4 @@
-"""The figure of an answer of a map: an image beside where it was taken, and why."""
+"""The figure of one localization: an image beside the place that the map found."""
 
 from pathlib import Path
 
@@ -9,12 +9,13 @@ from mfvpr.evaluation.stages import explain
 from mfvpr.features.extractor import Extractor
 from mfvpr.localization.answers import Asked
 from mfvpr.localization.map import Map
-from mfvpr.report.figures import Answer, aspect_of_resized, histogram_figure
+from mfvpr.report.figures import Answer, histogram_figure, pixel_aspect_of
 from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import below, clipped
 
-_GRAY, _MOST = 150, 80  # of an image that is not at hand; characters of a name or a place
+_GRAY = 150  # of an image that is not at hand
+_NAME_LENGTH = 80  # characters of a name or a place
 
 
 def answer_figure(
@@ -24,39 +25,38 @@ def answer_figure(
 
     Args:
         path: PNG file to write.
-        known: the map that was asked.
+        known: the map.
         name: of the image.
         image: `[H, W, 3]` uint8 RGB.
-        asked: what the map said.
-        root: folder of the map's images, which are called by their names; a map keeps none of them, and those that
-            cannot be read are drawn gray. None = all.
+        asked: what the map answered.
+        root: folder of the map's images, by their names; an image that cannot be read is drawn gray. None = no images.
 
     Raises:
         InputError: the candidate's name leads out of the folder.
     """
     answer, extractor = asked.answer, known.extractor
-    p = "" if answer.p_right is None else f", p(right) {answer.p_right:.2f}"
-    place = f"no place ({answer.reason})" if answer.place is None else clipped(str(answer.place), _MOST)
-    beside = Answer(_gray(extractor), "no candidate", None, None)
+    place = f"no place ({answer.reason})" if answer.place is None else clipped(str(answer.place), _NAME_LENGTH)
+    candidate = Answer(_gray(extractor), "no candidate")
     if asked.matches is not None:
         best = answer.alternatives[0].name
-        shown, how = _candidate(extractor, best, root)
+        shown, note = _candidate(extractor, best, root)
         histogram = known.scorer if isinstance(known.scorer, HistogramOfShifts) else HistogramOfShifts()
-        caption = f"{clipped(best, _MOST)}{how}, score {answer.score:.5g}{p}"
-        beside = Answer(shown, caption, asked.matches, explain(histogram, asked.matches))
+        p = "" if answer.p_right is None else f", p(right) {answer.p_right:.2f}"
+        caption = f"{clipped(best, _NAME_LENGTH)}{note}, score {answer.score:.5g}{p}"
+        candidate = Answer(shown, caption, asked.matches, explain(histogram, asked.matches))
     query = resize(image, extractor.image_size, extractor.interpolation)
-    title = f"{clipped(name, _MOST)} -> {place}"
+    title = f"{clipped(name, _NAME_LENGTH)} -> {place}"
     about = {"image": name, "place": str(answer.place)}
-    histogram_figure(path, query, [beside], title=title, pixel_aspect=aspect_of_resized(image, query), about=about)
+    histogram_figure(path, query, [candidate], title=title, pixel_aspect=pixel_aspect_of(image, query), about=about)
 
 
 def _candidate(extractor: Extractor, name: str, root: Path | None) -> tuple[np.ndarray, str]:
-    """An image of the map as the detector saw it, or a gray one, which is told."""
+    """An image of the map as the detector saw it, or a gray one, and a note for its caption."""
     if root is not None:
         file = below(root, name)
         try:
             return resize(read_image(file), extractor.image_size, extractor.interpolation), ""
-        except InputError:  # it may be anywhere by now; features are what the map keeps
+        except InputError:  # the map keeps features, not images
             pass
     return _gray(extractor), " (its image is not at hand)"
 

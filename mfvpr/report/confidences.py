@@ -1,6 +1,6 @@
-"""What the first answers of an evaluation are worth with their confidence: tables, files of answers, figures."""
+"""Confidence of first predictions: tables, files of predictions, calibration, figures."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -18,8 +18,8 @@ from mfvpr.evaluation.precision import (
 )
 from mfvpr.evaluation.results import Reason
 from mfvpr.evaluation.selection import Half, halves, halves_of_map
-from mfvpr.report.confidence_figures import precision_recall_figure, reliability_figure, shares_figure
 from mfvpr.report.evaluations import Judged
+from mfvpr.report.plots import precision_recall_figure, reliability_figure, shares_figure
 from mfvpr.report.rankings import NO_PLACE, number, write_csv
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table
@@ -31,13 +31,13 @@ SHARES = tuple(share / 20 for share in range(21))
 
 @dataclass(frozen=True)
 class Assured:
-    """An evaluation whose first answers have a confidence; arrays are of the queries of all sequences.
+    """An evaluation whose first predictions have a confidence; arrays are of the queries of all sequences.
 
     Attributes:
         judged: the evaluation.
-        given: what says p(right) of systems, by name, fitted on other images; None = with ground truth each half of
-            the path is told by what was fitted on the other.
-        threshold: of p, below which the answer is `NO_PLACE`; None = all are given.
+        given: confidences by system, fitted on other images; None = with ground truth, each half of the path has the
+            confidence that was fitted on the other half.
+        threshold: of p, below which the prediction is `NO_PLACE`; None = no prediction is refused.
     """
 
     judged: Judged
@@ -46,40 +46,38 @@ class Assured:
 
     @cached_property
     def probabilities(self) -> dict[str, np.ndarray]:
-        """p(right) `[Q]` by system, NaN where there is no answer, or nothing to fit on; none for others."""
+        """p(right) `[Q]` by system, NaN without a prediction, or without anything to fit on."""
+        systems = self.judged.result.systems
         if self.given is not None:
-            known = {name: one for name, one in self.given.items() if name in self.judged.result.systems}
-            return {name: one.probability(self._inputs(name, one)) for name, one in known.items()}
-        if not self.judged.thresholds:
-            return {}
-        return {name: self._crossed(name) for name in self.judged.result.systems}
+            return {name: confidence.probability(self._inputs(name, confidence))
+                    for name, confidence in self.given.items() if name in systems}  # fmt: skip
+        return {name: self._cross_fitted_probability(name) for name in systems} if self.judged.thresholds else {}
 
     @cached_property
     def fitted(self) -> dict[str, Confidence]:
-        """On all queries, by system: for other images. None without ground truth, or without any answer."""
+        """Confidences by system for other images, fitted on all queries with ground truth; none without predictions."""
         systems = self.judged.result.systems if self.judged.thresholds else ()
         inputs = {name: self._inputs(name) for name in systems}
         return {name: fit_confidence(values, self.right(name)) for name, values in inputs.items()
                 if np.isfinite(values).all(axis=1).any()}  # fmt: skip
 
     def right(self, system: str) -> np.ndarray:
-        """`[Q]` bool, whether the first answer is right, with ground truth."""
-        return np.concatenate([
-            np.asarray(self.judged.is_right(system, place), bool)[:, 0] for place in range(len(self.judged.sequences))
-        ])  # fmt: skip
+        """`[Q]` bool, whether the first prediction is correct, with ground truth."""
+        places = range(len(self.judged.sequences))
+        return np.concatenate([np.asarray(self.judged.is_right(system, place), bool)[:, 0] for place in places])
 
     def scores(self, system: str) -> np.ndarray:
-        """`[Q]` of the first answers, NaN where there is none."""
-        ranked = self.judged.result.systems[system]
-        return np.concatenate([np.where(one.rows[:, 0] >= 0, one.scores[:, 0], np.nan) for one in ranked])
+        """`[Q]` of the first predictions, NaN without one."""
+        parts = self.judged.result.systems[system]
+        return np.concatenate([np.where(ranked.rows[:, 0] >= 0, ranked.scores[:, 0], np.nan) for ranked in parts])
 
     @cached_property
     def has_answer(self) -> np.ndarray:
         """`[Q]` bool, whether the database shows the query's place, with ground truth."""
         return np.concatenate([right.counts > 0 for right in self.judged.right if right is not None])
 
-    def refused(self, system: str) -> np.ndarray:
-        """`[Q]` bool, answered `NO_PLACE`."""
+    def refusals(self, system: str) -> np.ndarray:
+        """`[Q]` bool, whether the prediction is `NO_PLACE`."""
         if self.threshold is None:
             return np.zeros(len(self.scores(system)), bool)
         return ~(self.probabilities[system] >= self.threshold)
@@ -87,61 +85,58 @@ class Assured:
     @property
     def refused_of_headline(self) -> list[np.ndarray]:
         """`[Q]` bool of each sequence, by the system that decides."""
-        return self.by_sequence(self.refused(self.judged.headline))
+        return self.by_sequence(self.refusals(self.judged.headline))
 
     def by_sequence(self, values: np.ndarray) -> list[np.ndarray]:
-        """Values of all queries, of each sequence."""
+        """Split values of all queries into those of each sequence."""
         return np.split(values, np.cumsum([len(sequence.images) for sequence in self.judged.sequences])[:-1])
 
     def curves(self, system: str) -> dict[str, PrecisionRecall]:
-        """By the score, and by p where it is known."""
+        """Precision and recall by the score, and by p where it is known."""
         confidences = {"score": self.scores(system)}
         if system in self.probabilities:
             confidences["p"] = self.probabilities[system]
-        return {by: precision_recall(one, self.right(system), self.has_answer) for by, one in confidences.items()}
+        return {by: precision_recall(values, self.right(system), self.has_answer) for by, values in confidences.items()}
 
     def reliability(self, system: str) -> Reliability:
-        """Of p."""
+        """Reliability of p."""
         return reliability(self.probabilities[system], self.right(system))
 
     def _inputs(self, system: str, like: Confidence | None = None) -> np.ndarray:
         options = {} if like is None else {"inputs": like.inputs, "apart": like.apart}
-        systems = self.judged.result.systems
-        return np.concatenate([
-            confidence_inputs(*pair, **options) for pair in zip(systems[system], systems[FILTER], strict=True)
-        ])  # fmt: skip
+        pairs = zip(self.judged.result.systems[system], self.judged.result.systems[FILTER], strict=True)
+        return np.concatenate([confidence_inputs(*pair, **options) for pair in pairs])
 
-    def _crossed(self, system: str) -> np.ndarray:
+    def _cross_fitted_probability(self, system: str) -> np.ndarray:
         """p of each half of the path by the other, without what shows places of both."""
         inputs, right = self._inputs(system), self.right(system)
-        found = np.full(len(right), np.nan)
+        probability = np.full(len(right), np.nan)
         for half in self.path_halves():
             if np.isfinite(inputs[half.tune]).all(axis=1).any():
-                found[half.report] = fit_confidence(inputs[half.tune], right[half.tune]).probability(
-                    inputs[half.report]
-                )
-        return found
+                confidence = fit_confidence(inputs[half.tune], right[half.tune])
+                probability[half.report] = confidence.probability(inputs[half.report])
+        return probability
 
     def path_halves(self) -> tuple[Half, Half]:
-        """Of the path; of several sequences, which pass the same places in whatever order, of the database's."""
+        """Halves of the path; with several sequences, which may pass places in any order, halves of the database."""
         truths = [sequence.truth for sequence in self.judged.sequences if sequence.truth is not None]
         shown = [truth.shows_place(self.judged.thresholds[-1]) for truth in truths]
         return halves(shown[0]) if len(shown) == 1 else halves_of_map(shown, truths[0].unit)
 
 
 def confidence_table(assured: Assured) -> Table:
-    """Average precision, recall at 100 and 99 % precision, by score and by p; the calibration of p; counts of queries.
+    """Average precision, recall at 100 and 99 % precision, by score and by p; calibration of p; counts of queries.
 
-    All in percent but the counts, which are there where a threshold is. Beside the expected calibration error stands
-    the one that p would have by chance if it were perfectly calibrated.
+    All in percent but the counts, which need a threshold. "by chance" is the expected calibration error that p would
+    have by chance if it were perfectly calibrated.
     """
     header = [f"{name} by {by}" for by in ("score", "p") for name in ("AP", "R@100P", "R@99P")]
-    counted = assured.threshold is not None
-    header = ["system", *header, "ECE of p", "by chance", *(_COUNTS if counted else ())]
-    return Table(header, [_line(assured, name, counted) for name in assured.probabilities])
+    counts = () if assured.threshold is None else _COUNTS
+    rows = [_confidence_row(assured, name) for name in assured.probabilities]
+    return Table(["system", *header, "ECE of p", "by chance", *counts], rows)
 
 
-def _line(assured: Assured, system: str, counted: bool) -> list[str]:
+def _confidence_row(assured: Assured, system: str) -> list[str]:
     percent = [
         value
         for curve in assured.curves(system).values()
@@ -149,29 +144,32 @@ def _line(assured: Assured, system: str, counted: bool) -> list[str]:
     ]
     probabilities = assured.probabilities[system]
     percent += [assured.reliability(system).calibration_error, chance_calibration_error(probabilities)]
-    known = 3 if np.isnan(probabilities).all() else len(percent)  # nothing is said of a p that there is not
+    known = 3 if np.isnan(probabilities).all() else len(percent)  # p that is unknown has empty cells
     cells = [system, *(f"{100 * value:.1f}" if place < known else "" for place, value in enumerate(percent))]
-    if counted:
-        right, refused = assured.right(system), assured.refused(system)
+    if assured.threshold is not None:
+        right, refused = assured.right(system), assured.refusals(system)
         counts = (right & ~refused, ~right & ~refused, refused, refused & right)
-        cells += [str(int(one.sum())) for one in counts]
+        cells += [str(int(selection.sum())) for selection in counts]
     return cells
 
 
 def share_table(assured: Assured) -> Table:
-    """Recall at 1 of all queries where that share of them is re-ranked that the filter is the least sure of.
+    """Recall at 1 of all queries, by the share of them that is re-ranked, see `_recalls_by_share`."""
+    recalls = _recalls_by_share(assured)
+    names = [name for name in assured.judged.result.systems if name != FILTER]
+    rows = [[f"{share:.2f}", *(f"{100 * recall[place]:.1f}" for recall in recalls.values())]
+            for place, share in enumerate(SHARES) if FILTER in assured.probabilities]  # fmt: skip
+    return Table(["re-ranked", *names], rows, text_columns=0)
 
-    Empty where p of the filter is not known.
-    """
-    known, judged = FILTER in assured.probabilities, assured.judged
-    names = [name for name in judged.result.systems if name != FILTER]
-    recall = [recall_by_share(assured, name) for name in names] if known else []
-    rows = [[f"{share:.2f}", *(f"{100 * one[place]:.1f}" for one in recall)] for place, share in enumerate(SHARES)]
-    return Table(["re-ranked", *names], rows if known else [], text_columns=0)
+
+def _recalls_by_share(assured: Assured) -> dict[str, np.ndarray]:
+    """`recall_by_share` of all systems but the filter; none where p of the filter is not known."""
+    systems = assured.judged.result.systems if FILTER in assured.probabilities else ()
+    return {name: recall_by_share(assured, name) for name in systems if name != FILTER}
 
 
 def recall_by_share(assured: Assured, system: str) -> np.ndarray:
-    """`[SHARES]` recall at 1 of a system that re-ranks the queries the filter is the least sure of, with its p."""
+    """`[SHARES]` recall at 1 of a system that re-ranks the queries with the lowest p of the filter."""
     filtered, right = assured.right(FILTER), assured.right(system)
     unsure = np.argsort(np.nan_to_num(assured.probabilities[FILTER], nan=-1.0), kind="stable")
     gains = np.concatenate([[0], np.cumsum(right[unsure].astype(int) - filtered[unsure])])
@@ -180,31 +178,32 @@ def recall_by_share(assured: Assured, system: str) -> np.ndarray:
 
 
 def write_confidence(folder: Path, assured: Assured, made: Mapping[str, Any]) -> None:
-    """`answers.csv` of every sequence, where p is known; with ground truth the tables, curves, and what was fitted.
+    """Write `answers.csv` of every sequence where p is known; with ground truth, the tables, curves, and fits.
 
     Args:
         folder: of the run.
-        assured: what is written.
-        made: JSON values, how what is fitted here was made.
+        assured: the evaluation.
+        made: JSON values that say how the confidences were fitted.
     """
     judged = assured.judged
     if judged.headline in assured.probabilities:
         _write_answers(folder, assured)
     if not judged.thresholds:
         return
-    table, shares = confidence_table(assured), share_table(assured)
-    write_csv(folder / "confidence.csv", table.header, table.rows)
-    write_csv(folder / "rerank_share.csv", shares.header, shares.rows)
-    write_csv(folder / "precision_recall.csv", ["system", "by", "threshold", "precision", "recall"], _points(assured))
+    for name, table in (("confidence", confidence_table(assured)), ("rerank_share", share_table(assured))):
+        write_csv(folder / f"{name}.csv", table.header, table.rows)
+    points = [[name, by, *map(number, point)] for name in judged.result.systems
+              for by, curve in assured.curves(name).items() for point in zip(*curve, strict=True)]  # fmt: skip
+    write_csv(folder / "precision_recall.csv", ["system", "by", "threshold", "precision", "recall"], points)
     write_confidences(folder / "confidence.json", assured.fitted, made)
 
 
 def _write_answers(folder: Path, assured: Assured) -> None:
-    """`query,answer,score,p,right,reason,in_database`: score, p and `right` are of the first candidate, also where the
-    answer is `NO_PLACE`, so that calibration can be computed from the file.
+    """Write `query,answer,score,p,right,reason,in_database`.
 
-    `reason` says why the answer is `NO_PLACE`. `in_database` is 1 where the database shows the query's place: elsewhere
-    `NO_PLACE` is correct. `right` and `in_database` are empty without ground truth.
+    `score`, `p` and `right` are of the first candidate, also where the answer is `NO_PLACE`, so that calibration can be
+    computed from the file. `reason` says why the answer is `NO_PLACE`. `in_database` is 1 where the database shows the
+    query's place; elsewhere `NO_PLACE` is correct. `right` and `in_database` are empty without ground truth.
     """
     judged, name = assured.judged, assured.judged.headline
     database = judged.result.dataset.database.names
@@ -216,33 +215,23 @@ def _write_answers(folder: Path, assured: Assured) -> None:
             row, unsure = ranked.rows[query, 0], refused[place][query]
             reason: Reason | None = "no candidates" if row < 0 else "low confidence" if unsure else None
             values = (ranked.scores[query, 0], probabilities[place][query])
-            written = ["" if np.isnan(value) else number(value) for value in values]
+            numbers = ["" if np.isnan(value) else number(value) for value in values]
             right = "" if is_right is None else int(is_right[query, 0])
             in_database = "" if truth is None else int(truth.counts[query] > 0)
-            lines.append([image, NO_PLACE if reason else database[row], *written, right, reason or "", in_database])
+            lines.append([image, NO_PLACE if reason else database[row], *numbers, right, reason or "", in_database])
         header = ["query", "answer", "score", "p", "right", "reason", "in_database"]
         write_csv(judged.folder(folder, place) / "answers.csv", header, lines)
 
 
-def _points(assured: Assured) -> Iterator[Sequence[str]]:
-    for name in assured.judged.result.systems:
-        for by, curve in assured.curves(name).items():
-            for point in zip(*curve, strict=True):
-                yield [name, by, *map(number, point)]
-
-
 def confidence_figures(assured: Assured) -> list[Figure]:
-    """Precision against recall, reliability, and what re-ranking the unsure queries gives; with ground truth."""
-    judged = assured.judged
-    if not judged.thresholds:
+    """Precision against recall, reliability, and recall over the share that is re-ranked; with ground truth."""
+    if not assured.judged.thresholds:
         return []
-    names = [*judged.result.systems]
-    curves = {name: assured.curves(name) for name in names}
+    curves = {name: assured.curves(name) for name in assured.judged.result.systems}
     figures: list[Figure] = [("precision_recall.png", partial(precision_recall_figure, curves=curves))]
     if assured.probabilities:
-        reliable = {name: assured.reliability(name) for name in assured.probabilities}
-        figures.append(("reliability.png", partial(reliability_figure, reliabilities=reliable)))
+        reliabilities = {name: assured.reliability(name) for name in assured.probabilities}
+        figures.append(("reliability.png", partial(reliability_figure, reliabilities=reliabilities)))
     if FILTER in assured.probabilities:
-        recall = {name: recall_by_share(assured, name) for name in names if name != FILTER}
-        figures.append(("rerank_share.png", partial(shares_figure, shares=SHARES, recall=recall)))
+        figures.append(("rerank_share.png", partial(shares_figure, shares=SHARES, recall=_recalls_by_share(assured))))
     return figures

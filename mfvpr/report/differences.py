@@ -1,7 +1,6 @@
-"""Where systems differ: for every query whether each is right, and for every two of them whether that is luck."""
+"""Differences between systems: hits of every query, and tests of every two systems."""
 
 import itertools
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +16,7 @@ from mfvpr.utils.files import write_text
 
 
 class Difference(NamedTuple):
-    """Two systems on all queries of all sequences, by their first answers."""
+    """Tests of two systems on the first predictions of all queries of all sequences."""
 
     first: str
     second: str
@@ -26,32 +25,32 @@ class Difference(NamedTuple):
 
 
 def differences(judged: Judged) -> list[Difference]:
-    """Of every two systems, in their order; none without ground truth."""
+    """Tests of every two systems, in their order; none without ground truth."""
     if not judged.thresholds:
         return []
-    places = range(len(judged.sequences))
-    hits = {name: np.concatenate([_right(judged, name, place)[:, 0] for place in places])
+    sequences = range(len(judged.sequences))
+    hits = {name: np.concatenate([_right(judged, name, sequence)[:, 0] for sequence in sequences])
             for name in judged.result.systems}  # fmt: skip
-    shown = _places(judged)
+    places = _places(judged)
     return [
         Difference(first, second, mcnemar(hits[first], hits[second]),
-                   block_sign_flips(hits[first], hits[second], places=shown))
+                   block_sign_flips(hits[first], hits[second], places=places))
         for first, second in itertools.combinations(hits, 2)
     ]  # fmt: skip
 
 
 def _places(judged: Judged) -> np.ndarray | None:
-    """`[Q]` of the one map that all queries are of; None where these are one sequence, in the order of its path."""
-    truth, right = judged.sequences[0].truth, [one for one in judged.right if one is not None]
+    """`[Q]` places of all queries along the map; None for one sequence in the order of its path."""
+    truth, right = judged.sequences[0].truth, [positives for positives in judged.right if positives is not None]
     if truth is None or (len(judged.sequences) == 1 and truth.unit != "m"):
         return None
     return places_along_path(stacked(right), truth.unit)
 
 
 def differences_table(judged: Judged) -> Table:
-    """System x system: how many queries only that of the row gets right, and p by blocks of the path.
+    """Table system x system: queries that only the system of the row gets right, and p by blocks of the path.
 
-    Of several sequences of one database, blocks are of its places.
+    Blocks of several sequences are blocks of the database's places.
     """
     cells = {}
     for first, second, counts, flips in differences(judged):
@@ -63,20 +62,29 @@ def differences_table(judged: Judged) -> Table:
 
 
 def write_gains(folder: Path, judged: Judged) -> None:
-    """`gains.csv` of every sequence, where its predictions are, and of all `differences.csv` and `differences.md`.
+    """Write `gains.csv` of every sequence, `differences.csv` and `differences.md`; nothing without ground truth.
 
-    Nothing is written without ground truth. `place` in `gains.csv` is where along the map each query is: intervals and
-    tests across runs need to know whose neighbor it is. It is the row of the query where that is the order of the path.
+    By query and system, `gains.csv` says whether the first prediction is correct, and the rank of the first correct
+    one. Its `place` along the map says which queries are neighbors, which intervals and tests across runs need. It is
+    the row of the query where that is the order of the path.
     """
     if not judged.thresholds:
         return
     columns = [column for name in judged.result.systems for column in (name, f"{name} rank")]
-    shown = _places(judged)
     sizes = [len(sequence.images) for sequence in judged.sequences]
-    along = range(sum(sizes)) if shown is None else shown.tolist()
-    for place, start in enumerate(np.cumsum([0, *sizes[:-1]])):
-        lines = _gains(judged, place, along[start : start + sizes[place]])
+    places = _places(judged)
+    along = range(sum(sizes)) if places is None else places.tolist()
+    start = 0
+    for place, sequence in enumerate(judged.sequences):
+        rights = [_right(judged, system, place) for system in judged.result.systems]
+        lines = []
+        for query, name in enumerate(sequence.images.names):
+            line: list[str | int] = [name, along[start + query]]
+            for is_right in (right[query] for right in rights):
+                line += [int(is_right[0]), int(np.argmax(is_right)) + 1 if is_right.any() else ""]
+            lines.append(line)
         write_csv(judged.folder(folder, place) / "gains.csv", ["query", "place", *columns], lines)
+        start += sizes[place]
     write_csv(
         folder / "differences.csv",
         ["system", "other", "only_system", "only_other", "mcnemar_p", "block", "blocks", "blocks_p"],
@@ -85,16 +93,6 @@ def write_gains(folder: Path, judged: Judged) -> None:
          for first, second, counts, flips in differences(judged)],
     )  # fmt: skip
     write_text(folder / "differences.md", differences_table(judged).markdown())
-
-
-def _gains(judged: Judged, place: int, along: Sequence[int]) -> Iterator[list[str | int]]:
-    """By query: for every system whether its first answer is right, and the rank of the first right one."""
-    right = [_right(judged, system, place) for system in judged.result.systems]
-    for query, name in enumerate(judged.sequences[place].images.names):
-        line: list[str | int] = [name, along[query]]
-        for answers in (one[query] for one in right):
-            line += [int(answers[0]), int(np.argmax(answers)) + 1 if answers.any() else ""]
-        yield line
 
 
 def _right(judged: Judged, system: str, place: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""An evaluation as a table, as files of rankings, and as figures of some queries."""
+"""Reports of an evaluation: recall table, files of rankings, and figures of some queries."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +15,7 @@ from mfvpr.datasets.truth import middle, threshold_words
 from mfvpr.evaluation.results import Recall, Result
 from mfvpr.evaluation.stages import explain
 from mfvpr.features.extractor import Extractor, Source
-from mfvpr.report.figures import Answer, aspect_of_resized, histogram_figure
+from mfvpr.report.figures import Answer, histogram_figure, pixel_aspect_of
 from mfvpr.report.file_names import file_names
 from mfvpr.report.rankings import Rankings, write_failures, write_predictions
 from mfvpr.report.runs import Figure
@@ -24,18 +24,18 @@ from mfvpr.reranking.results import Matched, Ranked
 from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.utils.files import clipped, printable, write_text
 
-ABOUT: tuple[str, ...] = ("system", "sequence", "outcome", "query", "answer")  # what the file of a figure tells
-_MOST_OF_A_NAME = 40  # characters in the title of a figure
-_SEQUENCES = "sequences"  # the folder of a run in which each of several has its own
+ABOUT: tuple[str, ...] = ("system", "sequence", "outcome", "query", "answer")  # keywords in the file of a figure
+_NAME_LENGTH = 40  # characters in the title of a figure
+_SEQUENCES = "sequences"  # the folder of a run in which each of several sequences has its own
 
 
 @dataclass(frozen=True)
 class Judged:
-    """An evaluation and what it is judged by.
+    """An evaluation and the criteria of its report.
 
     Attributes:
         result: of all sequences.
-        thresholds: what counts as right, in the unit of the ground truth, ascending; none without ground truth.
+        thresholds: distances within which a prediction is correct, ascending; none without ground truth.
         ks: depths of recall.
         headline: the system of predictions.csv and of the figures.
     """
@@ -47,17 +47,17 @@ class Judged:
 
     @property
     def threshold(self) -> float:
-        """The one in the middle, which predictions, failures and figures go by."""
+        """The middle threshold, which decides in predictions, failures and figures."""
         return middle(self.thresholds)
 
     @property
     def sequences(self) -> Sequence[QuerySequence]:
-        """Of the data set."""
+        """The data set's query sequences."""
         return self.result.dataset.sequences
 
     @cached_property
     def recall(self) -> dict[str, Recall]:
-        """By system."""
+        """Recall by system."""
         return self.result.recall(self.thresholds, self.ks)
 
     def parts(self, system: str) -> Iterator[tuple[str, np.ndarray]]:
@@ -69,7 +69,7 @@ class Judged:
 
     @cached_property
     def right(self) -> Sequence[Positives | None]:
-        """By `threshold`, of each sequence."""
+        """Positives of each sequence, within `threshold`."""
         return self.result.positives(self.threshold) if self.thresholds else [None] * len(self.sequences)
 
     def is_right(self, system: str, place: int) -> np.ndarray | None:
@@ -78,12 +78,12 @@ class Judged:
         return None if right is None else right.contains(self.result.systems[system][place].rows)
 
     def folder(self, run: Path, place: int) -> Path:
-        """Where the files of the sequence at a place are."""
+        """The folder of the sequence at a place."""
         return sequence_folder(run, [sequence.name for sequence in self.sequences], place)
 
 
 def sequence_folder(run: Path, sequences: Sequence[str], place: int) -> Path:
-    """Where a run's files of one of its sequences are: of several, as a name may be that of any other file, apart."""
+    """The folder of one sequence's files: the run's, or one below it if there are several sequences."""
     return run / _SEQUENCES / file_names(sequences)[sequences[place]] if len(sequences) > 1 else run
 
 
@@ -103,43 +103,37 @@ def recall_table(judged: Judged) -> Table:
 
 
 def write_rankings(folder: Path, judged: Judged, refused: Sequence[np.ndarray] | None = None) -> None:
-    """`predictions/` and `failures/` of every system, those of the headline's in the folder itself.
+    """Write `predictions/` and `failures/` of every system, those of the headline's into the folder itself.
 
     Args:
         folder: of the run.
-        judged: what is written.
-        refused: `[Q]` bool of each sequence, what is not answered in the headline's predictions; None = none.
+        judged: the evaluation.
+        refused: `[Q]` bool of each sequence, refused in the headline's predictions; None = no query is refused.
     """
     database, files = judged.result.dataset.database.names, file_names([*judged.result.systems])
     for place, sequence in enumerate(judged.sequences):
-        own = judged.folder(folder, place)
-        for name, ranked in judged.result.systems.items():
-            answers = ranked[place]
-            rankings = Rankings(
-                sequence.images.names, database, answers.rows, answers.scores, judged.is_right(name, place)
-            )
-            file = f"{files[name]}.csv"
-            write_predictions(own / "predictions" / file, rankings)
-            write_failures(own / "failures" / file, rankings)
+        target = judged.folder(folder, place)
+        for name, parts in judged.result.systems.items():
+            ranked, right = parts[place], judged.is_right(name, place)
+            rankings = Rankings(sequence.images.names, database, ranked.rows, ranked.scores, right)
+            write_predictions(target / "predictions" / f"{files[name]}.csv", rankings)
+            write_failures(target / "failures" / f"{files[name]}.csv", rankings)
             if name == judged.headline:
                 answered = rankings if refused is None else replace(rankings, refused=refused[place])
-                write_predictions(own / "predictions.csv", answered)
-                write_failures(own / "failures.csv", rankings)
+                write_predictions(target / "predictions.csv", answered)
+                write_failures(target / "failures.csv", rankings)
 
 
 def write_skipped(folder: Path, result: Result) -> None:
-    """`skipped.csv`: images that could not be used, and why; none where all could."""
-    database = result.dataset.database
-    bad = {
-        ("database", database.names[row], why)
-        for matched in result.matched
-        for row, why in matched.bad_database.items()
-    }
-    lines = sorted(bad) + [
-        ("queries", matched.sequence.images.names[row], why)
-        for matched in result.matched
-        for row, why in matched.bad_queries.items()
-    ]
+    """Write `skipped.csv` with images that could not be used and the reasons, if there are any."""
+    lines = sorted({
+        ("database", result.dataset.database.names[row], reason)
+        for matched in result.matched for row, reason in matched.bad_database.items()
+    })  # fmt: skip
+    lines += [
+        ("queries", matched.sequence.images.names[row], reason)
+        for matched in result.matched for row, reason in matched.bad_queries.items()
+    ]  # fmt: skip
     if lines:
         write_text(folder / "skipped.csv", Table(["folder", "image", "reason"], lines).csv())
 
@@ -151,28 +145,29 @@ def figures(
     refused: Sequence[np.ndarray],
     histogram: HistogramOfShifts | None = None,
 ) -> list[Figure]:
-    """The paper's figure for a few queries, right and wrong ones, spread over each sequence.
+    """The paper's figure for a few queries, correct and incorrect ones, spread over each sequence.
 
     Args:
         judged: the evaluation.
-        extractor: whose images are shown.
-        shown: how many, or rows of queries.
+        extractor: that resizes the images.
+        shown: number of queries, or their rows.
         refused: `[Q]` bool of each sequence, queries whose confidence is below the threshold.
-        histogram: which; None = the paper's.
+        histogram: of shifts; None = the paper's.
     """
     several, folders = len(judged.sequences) > 1, file_names([sequence.name for sequence in judged.sequences])
-    return [
-        (f"{folders[sequence.name]}/{name}" if several else name, partial(page.draw, query=query, verdict=verdict))
-        for place, sequence in enumerate(judged.sequences)
-        for page in [Page(judged, place, extractor, histogram or HistogramOfShifts(), refused[place])]
-        for query, verdict in page.shown(shown).items()
-        for name in [f"{verdict}_{query:04d}.png"]
-    ]
+    drawings: list[Figure] = []
+    for place, sequence in enumerate(judged.sequences):
+        page = Page(judged, place, extractor, histogram or HistogramOfShifts(), refused[place])
+        for query, verdict in page.shown(shown).items():
+            name = f"{verdict}_{query:04d}.png"
+            draw = partial(page.draw, query=query, verdict=verdict)
+            drawings.append((f"{folders[sequence.name]}/{name}" if several else name, draw))
+    return drawings
 
 
 @dataclass(frozen=True)
 class Page:
-    """One sequence, for its figures."""
+    """The figures of one sequence."""
 
     judged: Judged
     place: int
@@ -196,16 +191,21 @@ class Page:
     def database(self) -> ImageFolder:
         return self.judged.result.dataset.database
 
-    def shown(self, asked: int | Sequence[int]) -> dict[int, str]:
-        """Queries that get a figure, with what became of them: half right, half wrong where that can be told."""
-        right = self.judged.is_right(self.judged.headline, self.place)
-        some = self.ranked.rows[:, 0] >= 0
-        verdicts = np.full(len(some), "best") if right is None else np.where(right[:, 0], "right", "wrong")
-        if not isinstance(asked, int):
-            return {query: str(verdicts[query]) for query in asked if some[query]}
-        numbers = {"best": asked} if right is None else {"right": (asked + 1) // 2, "wrong": asked // 2}
+    @property
+    def right(self) -> np.ndarray | None:
+        """`[Q, C]` bool in the order of the ranking."""
+        return self.judged.is_right(self.judged.headline, self.place)
+
+    def shown(self, selection: int | Sequence[int]) -> dict[int, str]:
+        """Verdicts of queries that get a figure: the selected rows, or so many, half of them correct if known."""
+        right = self.right
+        has_prediction = self.ranked.rows[:, 0] >= 0
+        verdicts = np.full(len(has_prediction), "best") if right is None else np.where(right[:, 0], "right", "wrong")
+        if not isinstance(selection, int):
+            return {query: str(verdicts[query]) for query in selection if has_prediction[query]}
+        numbers = {"best": selection} if right is None else {"right": (selection + 1) // 2, "wrong": selection // 2}
         return {query: verdict for verdict, number in numbers.items()
-                for query in _spread(np.flatnonzero(some & (verdicts == verdict)), number)}  # fmt: skip
+                for query in _pick_evenly(np.flatnonzero(has_prediction & (verdicts == verdict)), number)}  # fmt: skip
 
     def title(self, query: int, verdict: str) -> str:
         """The score, whether the prediction is correct within the threshold, and both names."""
@@ -216,13 +216,13 @@ class Page:
         return f"{self.judged.headline}, {verdict}{within}: {names}{note}"
 
     def draw(self, path: Path, query: int, verdict: str) -> None:
-        """What was answered; where that is wrong, below it what is right."""
+        """Draw the prediction, and below an incorrect one a correct one."""
         answers = [self._answer(query, 0, verdict), *(self.correct_predictions(query) if verdict == "wrong" else [])]
         values = self.judged.headline, self.sequence.name, verdict, self.sequence.images.names[query]
         about = dict(zip(ABOUT, (*values, self._prediction(query)), strict=True))
         original = self.sequence.images.read(query)
-        image = self._resized(original)
-        aspect = aspect_of_resized(original, image)
+        image = self._resize(original)
+        aspect = pixel_aspect_of(original, image)
         histogram_figure(path, image, answers, title=self.title(query, verdict), pixel_aspect=aspect, about=about)
 
     def _prediction(self, query: int) -> str:
@@ -234,12 +234,11 @@ class Page:
         place = int(np.flatnonzero(self.matched.candidates.indices[query] == row)[0])
         pair = jax.tree.map(lambda values: values[place], self.matched.matches[0][query])
         caption = f"{verdict}: {_short(self.database.names[row])}, rank {rank + 1}, score {score:.5g}"
-        return Answer(self._image(self.database, row), caption, pair, explain(self.histogram, pair))
+        return Answer(self._resize(self.database.read(row)), caption, pair, explain(self.histogram, pair))
 
     def correct_predictions(self, query: int) -> list[Answer]:
-        """The first right candidate; else the right image, which the filter missed; nothing where there is none."""
-        ranked, right = self.judged.is_right(self.judged.headline, self.place), self.judged.right[self.place]
-        truth = self.sequence.truth
+        """The first correct candidate, or the correct image that retrieval missed; empty if there is none."""
+        ranked, right, truth = self.right, self.judged.right[self.place], self.sequence.truth
         if ranked is None or right is None or truth is None or not right.counts[query]:
             return []
         if ranked[query].any():
@@ -248,21 +247,17 @@ class Page:
         row = nearest if nearest is not None and nearest in rows else int(rows[0])
         num_candidates = self.matched.candidates.indices.shape[1]
         caption = f"right: {_short(self.database.names[row])}, not among the {num_candidates} candidates"
-        return [Answer(self._image(self.database, row), caption, None, None)]
+        return [Answer(self._resize(self.database.read(row)), caption)]
 
-    def _image(self, folder: ImageFolder, row: int) -> np.ndarray:
-        return self._resized(folder.read(row))
-
-    def _resized(self, image: np.ndarray) -> np.ndarray:
+    def _resize(self, image: np.ndarray) -> np.ndarray:
         size = self.extractor.image_size
         return image if size is None else resize(image, size, self.extractor.interpolation)
 
 
 def _short(name: str) -> str:
-    return clipped(printable(name), _MOST_OF_A_NAME)
+    return clipped(printable(name), _NAME_LENGTH)
 
 
-def _spread(values: np.ndarray, number: int) -> list[int]:
-    """Some of the values, evenly spread."""
+def _pick_evenly(values: np.ndarray, number: int) -> list[int]:
     chosen = np.linspace(0, len(values) - 1, min(number, len(values))).round().astype(int)
-    return [int(values[place]) for place in chosen]
+    return values[chosen].tolist()

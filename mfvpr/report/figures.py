@@ -1,25 +1,24 @@
 """The paper's histogram figure: images with their matches beside the histogram of shifts, its peak marked."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
 
+from mfvpr.datasets.images import resize
 from mfvpr.evaluation.stages import Explanation
+from mfvpr.report.plots import panels, save_figure
 from mfvpr.types import Matches
-from mfvpr.utils.files import clipped, printable, replacing
+from mfvpr.utils.files import clipped, printable
 
 _AGREES, _DIFFERS = "#2fa8ff", "#ff9a1f"  # told apart by color-blind people as well
 _GAP = 12  # px between the two images
-_MOST_TITLE, _MOST_CAPTION = 140, 100  # characters that fit
+_TITLE_LENGTH, _CAPTION_LENGTH = 140, 100  # characters that fit
 
 
 @dataclass(frozen=True)
@@ -35,8 +34,8 @@ class Answer:
 
     image: np.ndarray
     caption: str
-    matches: Matches | None
-    explanation: Explanation | None
+    matches: Matches | None = None
+    explanation: Explanation | None = None
 
 
 def histogram_figure(
@@ -60,28 +59,32 @@ def histogram_figure(
         about: what it shows, for programs: text by keyword, in the file itself.
         max_lines: matches drawn, the heaviest (the paper shows 30); blue where they agree with the peak.
     """
-    figure = Figure(figsize=(12, 0.2 + 4.8 * len(answers)), layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(clipped(printable(title), _MOST_TITLE), fontsize=11, parse_math=False)  # a file's name may hold a $
+    count = len(answers)
+    figure, axes = panels(2 * count, 6, 4.8 + 0.2 / count, columns=2, width_ratios=(2, 1.15))
+    figure.suptitle(
+        clipped(printable(title), _TITLE_LENGTH), fontsize=11, parse_math=False
+    )  # a file's name may hold a $
     top = max([1e-9, *(float(answer.explanation.score) for answer in answers if answer.explanation)])
-    for (pair, heat), answer in zip(
-        figure.subplots(len(answers), 2, width_ratios=(2, 1.15), squeeze=False), answers, strict=True
-    ):
+    for pair, heat, answer in zip(axes[::2], axes[1::2], answers, strict=True):
         _draw_pair(pair, query_image, answer, max_lines)
         pair.set_aspect(pixel_aspect)
         if answer.explanation is None:
             heat.set_axis_off()
         else:
             figure.colorbar(_draw_histogram(heat, answer.explanation, top), ax=heat, label="bin score", shrink=0.8)
-    with replacing(path) as temporary, warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph .* missing")  # names in scripts that the font lacks
-        metadata = {keyword: printable(text) for keyword, text in (about or {}).items()}
-        figure.savefig(temporary, dpi=110, bbox_inches="tight", pad_inches=0.15, metadata=metadata)
+    metadata = {keyword: printable(text) for keyword, text in (about or {}).items()}
+    save_figure(figure, path, bbox_inches="tight", pad_inches=0.15, metadata=metadata)
 
 
-def aspect_of_resized(original: np.ndarray, resized: np.ndarray) -> float:
+def with_longest_side(image: np.ndarray, side: int) -> np.ndarray:
+    """Resize an image so that its longer side has so many pixels."""
+    scale = side / max(image.shape[:2])
+    return resize(image, (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))))
+
+
+def pixel_aspect_of(original: np.ndarray, smaller: np.ndarray) -> float:
     """Height of a pixel of a resized image by its width, where pixels of the original are squares."""
-    (height, width), (new_height, new_width) = original.shape[:2], resized.shape[:2]
+    (height, width), (new_height, new_width) = original.shape[:2], smaller.shape[:2]
     return (height / new_height) / (width / new_width)
 
 
@@ -96,11 +99,11 @@ def _draw_pair(axes: Axes, query: np.ndarray, answer: Answer, max_lines: int) ->
     words = "query | candidate"
     if answer.matches is not None and answer.explanation is not None:
         words = _draw_matches(axes, offset, answer.matches, answer.explanation, max_lines)
-    axes.set_title(f"{clipped(printable(answer.caption), _MOST_CAPTION)}\n{words}", fontsize=9, parse_math=False)
+    axes.set_title(f"{clipped(printable(answer.caption), _CAPTION_LENGTH)}\n{words}", fontsize=9, parse_math=False)
 
 
 def _draw_matches(axes: Axes, offset: int, matches: Matches, explanation: Explanation, max_lines: int) -> str:
-    """What was drawn, in words."""
+    """Draw the heaviest matches; return a caption."""
     count = int(matches.mask.sum())
     weights = np.where(matches.mask, explanation.weights, -np.inf)
     heaviest = np.lexsort((matches.distance, -weights))[: min(max_lines, count)]  # of equal weights the nearest

@@ -14,25 +14,25 @@ _HASHED = re.compile(r".*-[0-9a-f]{16}", re.IGNORECASE | re.DOTALL)
 
 
 def file_names(names: Sequence[str]) -> dict[str, str]:
-    """File names without suffix, by name: different ones, also where the file system ignores case.
+    """File names without suffix, by name; they differ even if the file system ignores case.
 
-    A file is called as its name, with `_` for ` + `. The file name ends in a hash instead where that is not safe on
-    every file system, too long, or the same for two names.
+    A file name is the name with `_` for ` + `. It ends in a hash instead if the name is not safe on every file system,
+    too long, or the same as another.
 
     Raises:
-        InputError: a name is there twice.
+        InputError: a name is repeated.
     """
     if repeated := [name for name, count in Counter(names).items() if count > 1]:
         raise InputError(f"names: expected different ones, got {repeated[0]} twice. Rename one.")
     plain = {name: name.replace(" + ", "_") for name in names}
-    counts = Counter(map(_compared, plain.values()))
+    counts = Counter(map(_fold_case, plain.values()))
     return {
-        name: file if _is_plain(file) and counts[_compared(file)] == 1 else _hashed_name(name)
+        name: file if _is_plain(file) and counts[_fold_case(file)] == 1 else _hashed_name(name)
         for name, file in plain.items()
     }
 
 
-def _compared(file: str) -> str:
+def _fold_case(file: str) -> str:
     return unicodedata.normalize("NFC", file.casefold())
 
 

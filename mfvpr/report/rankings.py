@@ -1,4 +1,4 @@
-"""Rankings as files: what was answered to each query, and where it went wrong."""
+"""Rankings as files: the predictions for each query, and the failures."""
 
 import csv
 from collections.abc import Iterable, Sequence
@@ -10,12 +10,12 @@ import numpy as np
 
 from mfvpr.utils.files import replacing
 
-NO_PLACE = "no place"  # the answer to a query whose place the database is thought not to show
+NO_PLACE = "no place"  # the prediction for a query whose place the database does not seem to show
 
 
 @dataclass(frozen=True)
 class Rankings:
-    """What a system answers.
+    """Rankings of one system.
 
     Attributes:
         queries: names of Q images.
@@ -35,7 +35,7 @@ class Rankings:
 
 
 def write_predictions(path: Path, rankings: Rankings) -> None:
-    """CSV with a line per query and candidate, best first: `query,rank,database,score,right`.
+    """Write a CSV line per query and candidate, best first: `query,rank,database,score,right`.
 
     `right` is 1 or 0, or empty where it is unknown. A query that is refused has one line, `NO_PLACE`, with score and
     `right` of its first candidate.
@@ -52,11 +52,10 @@ def write_predictions(path: Path, rankings: Rankings) -> None:
 
 
 def write_failures(path: Path, rankings: Rankings) -> None:
-    """CSV with a line per query whose first answer is wrong: `query,answer,rank,right_answer,score,margin`.
+    """Write a CSV line per query whose first prediction is incorrect: `query,answer,rank,right_answer,score,margin`.
 
-    `rank`, `right_answer` and `score` are of the first right candidate, empty where there is none; `margin` is how
-    much higher the first answer scores; whether it was refused does not matter. Nothing is written where it is unknown
-    what is right.
+    `rank`, `right_answer` and `score` are of the first correct candidate, empty where there is none; `margin` is how
+    much higher the first prediction scores, refused or not. Nothing is written without ground truth.
     """
     if rankings.right is None:
         return
@@ -84,7 +83,7 @@ def number(value: Any) -> str:
 
 
 def write_csv(path: Path, header: Sequence[str], lines: Iterable[Sequence[str | int]]) -> None:
-    """Names in it are the very bytes that the file system has, so that they can be looked up again.
+    """Write names as the very bytes that the file system has, so that they can be looked up again.
 
     A spreadsheet may take a name that begins with `=`, `+`, `-` or `@` for a formula: import such columns as text.
     """

@@ -1,4 +1,4 @@
-"""How far each query's image is from its first answer's: a file of dominant shifts with their intervals."""
+"""Dominant shifts between each query and its first prediction, with their intervals, as a file."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,17 +16,16 @@ HEADER = ("query", "answer", "shift_x", "shift_y", "low_x", "high_x", "low_y", "
 def write_shifts(
     folder: Path, judged: Judged, scorer: HistogramOfShifts, refused: Sequence[np.ndarray] | None = None
 ) -> None:
-    """`shifts.csv` of every sequence, of the first answers of the system that decides: candidate minus query, px.
+    """Write `shifts.csv` of every sequence: shifts of the headline's first predictions, candidate minus query, px.
 
-    How far the answer shows the middle of the query from there, by the refined dominant shift in the images that the
-    detector saw, its 95 % interval, and how much larger it shows it; empty where nothing votes. Of features of several
-    scales there is none.
+    A line has the refined dominant shift of the query's middle in the images that the detector saw, its 95 % interval,
+    and how much larger the candidate shows it; empty if no match votes. Features of several scales have no file.
 
     Args:
         folder: of the run.
-        judged: whose first answers are taken.
-        scorer: whose histogram is taken.
-        refused: `[Q]` bool of each sequence, what is not answered, and has no line; None = none.
+        judged: the evaluation.
+        scorer: the histogram of shifts.
+        refused: `[Q]` bool of each sequence, queries without a line; None = no query is refused.
     """
     names = judged.result.dataset.database.names
     sequences = zip(judged.result.matched, judged.result.systems[judged.headline], strict=True)
@@ -35,8 +34,8 @@ def write_shifts(
         if isinstance(match_set, Scales):
             continue
         answers = ranked.rows[:, 0]
-        given = answers >= 0
-        queries = np.flatnonzero(given if refused is None else given & ~refused[place])
+        has_prediction = answers >= 0
+        queries = np.flatnonzero(has_prediction if refused is None else has_prediction & ~refused[place])
         places = np.argmax(matched.candidates.indices[queries] == answers[queries, None], axis=1)
         shifts, intervals, scales = dominant_shifts(scorer, match_set, queries, places)
         numbers = np.concatenate([shifts, intervals.transpose(0, 2, 1).reshape(-1, 4), scales[:, None]], axis=1)

@@ -1,4 +1,4 @@
-"""A sweep for people: the table of all settings, the summary, rows of results, and heat maps."""
+"""Reports of a sweep: table of all settings, summary, JSON values, and heat maps."""
 
 import itertools
 from collections.abc import Iterator, Sequence
@@ -11,7 +11,7 @@ import numpy as np
 from mfvpr import evaluation
 from mfvpr.evaluation.statistics import Estimate
 from mfvpr.report.file_names import file_names
-from mfvpr.report.heat_maps import heat_map_figure
+from mfvpr.report.plots import heat_map_figure
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table, written
 from mfvpr.tuning.sweeps.outcome import Outcome
@@ -27,21 +27,18 @@ def table(outcome: Outcome, numbers: Sequence[int] | None = None) -> Table:
         outcome: of a sweep.
         numbers: of the settings; None = all.
     """
-    judge, names = outcome.judge, list(outcome.axes.values)
+    judge, (first, *deeper) = outcome.judge, outcome.ks
     numbers = range(len(outcome.settings)) if numbers is None else numbers
-    first, *others = outcome.ks
     header = [judge.label(first, threshold) for threshold in judge.thresholds]
-    header += [judge.label(k, judge.thresholds[judge.main]) for k in others]
+    header += [judge.label(k, judge.thresholds[judge.main]) for k in deeper]
     rows = outcome.rows[0][list(numbers)]
-    columns = [*judge.recall(rows, first).T, *(judge.recall(rows, k)[:, judge.main] for k in others)]
+    recalls = np.column_stack([judge.recall(rows, first), *(judge.recall(rows, k)[:, judge.main] for k in deeper)])
     lines = [
-        [
-            *(written(outcome.settings[number][name]) for name in names),
-            *(f"{100 * column[place]:.1f}" for column in columns),
-        ]
-        for place, number in enumerate(numbers)
-    ]
-    return Table([*names, *header], lines, text_columns=0)
+        [*(written(outcome.settings[number][name]) for name in outcome.axes.values),
+         *(f"{100 * value:.1f}" for value in recall)]
+        for number, recall in zip(numbers, recalls, strict=True)
+    ]  # fmt: skip
+    return Table([*outcome.axes.values, *header], lines, text_columns=0)
 
 
 def text(outcome: Outcome) -> str:
@@ -50,7 +47,7 @@ def text(outcome: Outcome) -> str:
 
 
 def results(outcome: Outcome) -> dict[str, Any]:
-    """All of it as JSON values."""
+    """The sweep as JSON values."""
     judge, ks = outcome.judge, outcome.ks
     recall = np.stack([judge.recall(outcome.rows[0], k) for k in ks], axis=-1)  # [S, thresholds, ks]
     return {
@@ -76,17 +73,17 @@ def results(outcome: Outcome) -> dict[str, Any]:
 def figures(outcome: Outcome) -> list[Figure]:
     """Heat maps of every pair of axes with several values, the others at the best setting (of all queries).
 
-    None of a space that was not searched completely.
+    A space that was not searched completely has none.
     """
     return list(_heat_maps(outcome)) if outcome.is_grid else []
 
 
 def _summary(outcome: Outcome) -> Iterator[str]:
-    judge, own = outcome.judge, outcome.own
+    judge, defaults = outcome.judge, outcome.own
     best = np.argsort(-outcome.recall[:, judge.main], kind="stable")[:TOP].tolist()
-    beside = "" if own in best else "; last: the scorer's own values"
-    yield f"Best settings by {judge.label(1, judge.thresholds[judge.main])}, all queries{beside}."
-    shown = list(dict.fromkeys([*best, own]))
+    note = "" if defaults in best else "; last: the scorer's own values"
+    yield f"Best settings by {judge.label(1, judge.thresholds[judge.main])}, all queries{note}."
+    shown = list(dict.fromkeys([*best, defaults]))
     yield table(outcome, shown).text()
     if outcome.is_grid and not judge.halves and len(shown) < len(outcome.settings):
         around = evaluation.neighbors(outcome.axes.values, outcome.chosen[0])
@@ -136,28 +133,28 @@ def _heat_maps(outcome: Outcome) -> Iterator[Figure]:
     pairs = list(itertools.combinations(names, 2)) or [(name, name) for name in names]
     flat_best = evaluation.best_setting(recall.reshape(-1), axes.values)
     best = dict(zip(values, map(int, np.unravel_index(flat_best, recall.shape)), strict=True))
-    own = {name: values[name].index(written(value)) if written(value) in values[name] else None
-           for name, value in axes.own.items()}  # fmt: skip
+    defaults = {name: values[name].index(written(value)) if written(value) in values[name] else None
+                for name, value in axes.own.items()}  # fmt: skip
     label = judge.label(1, judge.thresholds[judge.main])
     files = file_names([first if first == second else f"{first} + {second}" for first, second in pairs])
     for (first, second), file in zip(pairs[:MAX_HEAT_MAPS], files.values(), strict=False):
         single = first == second
         plane = recall[tuple(slice(None) if name in (first, second) else best[name] for name in values)]
         fixed = [f"{name} = {values[name][place]}" for name, place in best.items() if name not in (first, second)]
-        row, column = 0 if single else own[first], own[second]
+        row, column = 0 if single else defaults[first], defaults[second]
         draw = partial(
             heat_map_figure,
             recall=plane[None] if single else plane,
             rows=("", [""]) if single else (first, _short(values[first])),
             columns=(second, _short(values[second])),
             best=(0 if single else best[first], best[second]),
-            own=None if row is None or column is None else (row, column),
+            defaults=None if row is None or column is None else (row, column),
             title="; ".join([f"{label} in %", *fixed]),
         )
         yield f"{file}.png", draw
 
 
 def _short(values: list[str]) -> list[str]:
-    """Files by their names alone, where these differ."""
+    """Shorten JSON files to their stems, if these differ."""
     names = [Path(value).stem if value.endswith(".json") else value for value in values]
     return names if len({*names}) == len(names) else values

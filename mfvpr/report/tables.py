@@ -1,4 +1,4 @@
-"""One table in the four shapes people paste: terminal, Markdown, CSV, LaTeX."""
+"""Tables as text for the terminal, Markdown, CSV, and LaTeX."""
 
 import csv
 import io
@@ -18,13 +18,15 @@ class Table:
     text_columns: int = 1
 
     def text(self) -> str:
-        """For the terminal."""
+        """Text for the terminal."""
         widths = [max(map(len, column)) for column in zip(self.header, *self.rows, strict=True)]
-        lines = [self._aligned(row, widths) for row in (self.header, *self.rows)]
+        aligns = [str.ljust] * self.text_columns + [str.rjust] * (len(self.header) - self.text_columns)
+        lines = ["  ".join(align(cell, width) for align, cell, width in zip(aligns, row, widths, strict=True)).rstrip()
+                 for row in (self.header, *self.rows)]  # fmt: skip
         return "\n".join([lines[0], "-" * len(lines[0]), *lines[1:]]) + "\n"
 
     def markdown(self) -> str:
-        """GitHub's."""
+        """GitHub's Markdown."""
         rule = [":--"] * self.text_columns + ["--:"] * (len(self.header) - self.text_columns)
         escaped = ([cell.replace("|", "\\|") for cell in row] for row in (self.header, rule, *self.rows))
         return "".join(f"| {' | '.join(row)} |\n" for row in escaped)
@@ -37,17 +39,10 @@ class Table:
 
     def latex(self) -> str:
         """A `tabular` for the booktabs package."""
-        lines = [" & ".join(map(_latex_escaped, row)) + r" \\" for row in (self.header, *self.rows)]
+        lines = [" & ".join(map(_escape_latex, row)) + r" \\" for row in (self.header, *self.rows)]
         columns = "l" * self.text_columns + "r" * (len(self.header) - self.text_columns)
         body = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule", lines[0], r"\midrule", *lines[1:], r"\bottomrule"]
         return "\n".join([*body, r"\end{tabular}", ""])
-
-    def _aligned(self, row: Sequence[str], widths: Sequence[int]) -> str:
-        cells = (
-            cell.ljust(width) if place < self.text_columns else cell.rjust(width)
-            for place, (cell, width) in enumerate(zip(row, widths, strict=True))
-        )
-        return "  ".join(cells).rstrip()
 
 
 def written(value: Any) -> str:
@@ -57,7 +52,7 @@ def written(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float | np.floating) else str(value)
 
 
-def _latex_escaped(cell: str) -> str:
+def _escape_latex(cell: str) -> str:
     for plain, escaped in (("\\", r"\textbackslash "), ("&", r"\&"), ("%", r"\%"), ("_", r"\_"), ("±", r"$\pm$")):
         cell = cell.replace(plain, escaped)
     return cell

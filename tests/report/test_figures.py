@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from mfvpr.evaluation import precision_recall, reliability
-from mfvpr.report import confidence_figures, figures
+from mfvpr.report import figures, plots
 from mfvpr.report.pages.charts import lines
 
 SYSTEMS = ["filter", *(f"histogram + anchor + cohort + filter {number}" for number in range(10))]
@@ -22,7 +22,7 @@ def query():
 
 
 def drawn(path, query, name, **options):
-    answer = figures.Answer(query, f"wrong: {name}, rank 1", None, None)
+    answer = figures.Answer(query, f"wrong: {name}, rank 1")
     figures.histogram_figure(path, query, [answer], title=f"histogram: {name} -> {name}", **options)
     return pixels(path)
 
@@ -34,7 +34,7 @@ def test_a_long_name_leaves_the_figure_as_large(tmp_path, query):
 
 
 def test_images_are_drawn_in_the_shape_they_were_taken_in(tmp_path, query):
-    aspect = figures.aspect_of_resized(np.zeros((384, 1024, 3)), query)
+    aspect = figures.pixel_aspect_of(np.zeros((384, 1024, 3)), query)
     assert aspect == 384 / 1024
     rows, columns = np.nonzero(drawn(tmp_path / "a.png", query, "name", pixel_aspect=aspect) == 0)
     half = columns[columns < np.mean(columns)]  # the two images stand side by side
@@ -44,7 +44,7 @@ def test_images_are_drawn_in_the_shape_they_were_taken_in(tmp_path, query):
 
 def test_titles_of_panels_are_not_cut_off(tmp_path):
     found = {name: reliability(P, RIGHT) for name in SYSTEMS[:4]}
-    confidence_figures.reliability_figure(tmp_path / "a.png", found)
+    plots.reliability_figure(tmp_path / "a.png", found)
     image = pixels(tmp_path / "a.png")
     assert {*np.concatenate([image[:, 0], image[:, -1], image[0], image[-1]]).tolist()} == {255}
 
@@ -52,9 +52,9 @@ def test_titles_of_panels_are_not_cut_off(tmp_path):
 def test_systems_have_the_same_colors_in_figures_and_pages(tmp_path, monkeypatch):
     curve = precision_recall(P, RIGHT, np.ones(20, bool))
     saved = []
-    monkeypatch.setattr(confidence_figures, "save_figure", lambda figure, path: saved.append(figure))
-    confidence_figures.precision_recall_figure(tmp_path / "a.png", {name: {"score": curve} for name in SYSTEMS})
-    confidence_figures.shares_figure(tmp_path / "b.png", [0, 1], {name: np.zeros(2) for name in SYSTEMS[1:]})
+    monkeypatch.setattr(plots, "save_figure", lambda figure, path, **_: saved.append(figure))
+    plots.precision_recall_figure(tmp_path / "a.png", {name: {"score": curve} for name in SYSTEMS})
+    plots.shares_figure(tmp_path / "b.png", [0, 1], {name: np.zeros(2) for name in SYSTEMS[1:]})
     chart = lines("name", "title", {name: [(0, 0), (1, 1)] for name in SYSTEMS}, axes=("x", "y"))
     expected = [trace["line"]["color"] for trace in chart.figure["data"]]
     colors = [[line.get_color() for line in figure.axes[0].lines] for figure in saved]

@@ -15,7 +15,7 @@ import pytest
 from mfvpr.evaluation import mcnemar
 from mfvpr.evaluation.statistics import block_sign_flips, recall_interval
 from mfvpr.report import write_json
-from mfvpr.report.pages import one_run, sections, several_runs
+from mfvpr.report.pages import one_run, several_runs
 from mfvpr.report.pages.files import read_run
 from mfvpr.report.pages.one_run import write_report
 from mfvpr.report.pages.several_runs import write_comparison
@@ -177,7 +177,7 @@ def test_own_folders_are_the_title_of_a_page_unless_they_have_a_name(tmp_path, m
 
 
 def test_too_many_answers_are_left_to_the_files(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(sections, "MOST_ANSWERS", 7)
+    monkeypatch.setattr(one_run, "MOST_ANSWERS", 7)
     text = write_report(run, tmp_path / "page.html").read_text("utf-8")
     assert "The first 7; 23 more are in the run" in text
 
@@ -280,7 +280,7 @@ def test_what_is_no_run_is_refused_in_one_line(run, tmp_path, monkeypatch, capsy
 def edited(run, tmp_path, monkeypatch):
     """A run folder whose page is made of an edited file, but not written."""
     monkeypatch.setattr(one_run, "write_page", lambda *_, **parts: None)
-    monkeypatch.setattr(sections, "pictures", lambda *_: [])
+    monkeypatch.setattr(one_run, "pictures", lambda *_: [])
     shutil.copytree(run, tmp_path / "run")
 
     def refused(name, text):

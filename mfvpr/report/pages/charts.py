@@ -1,4 +1,4 @@
-"""Charts of runs, drawn by plotly: lines and bars of numbers that stand in the page's tables or the run's files."""
+"""Charts of runs, drawn by plotly: lines and bars of numbers from the page's tables or the run's files."""
 
 import html
 from collections.abc import Mapping, Sequence
@@ -11,7 +11,7 @@ from mfvpr.utils.files import printable
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
-# plotly is imported where it is needed, since everything else can do without.
+# plotly is imported where it is needed: the rest of the library does not depend on it.
 _POWERS = [step * 10.0**power for power in range(-4, 4) for step in (1, 2, 5)]
 _HEIGHT = 380  # px
 
@@ -30,7 +30,7 @@ class Chart:
     Attributes:
         name: of its element, a word.
         title: above it.
-        words: what it shows, for those who do not see it.
+        words: description for readers who do not see it.
         figure: as JSON values, plotly's `data` and `layout`.
     """
 
@@ -58,7 +58,7 @@ def lines(
     marked: bool = False,
     unit: str = "%",
 ) -> Chart:
-    """A curve of points (x, y) for each name; the first is what the others are compared with.
+    """A curve of points (x, y) for each name; the others are compared with the first.
 
     Args:
         name: of the chart's element.
@@ -66,67 +66,66 @@ def lines(
         curves: by name.
         axes: words of x and y.
         scale: of x.
-        marked: points are drawn, since there is nothing between them.
-        unit: of y; what is not in % has an axis in powers of ten.
+        marked: whether points are drawn, because the curve is known only there.
+        unit: of y; an axis in another unit than % has powers of ten.
     """
     from plotly import graph_objects
 
     figure, form = graph_objects.Figure(), ".1f" if unit == "%" else ".3g"
     for place, (label, points) in enumerate(curves.items()):
         figure.add_scatter(
-            x=[x for x, _ in points], y=[y for _, y in points], name=_plain(label),
+            x=[x for x, _ in points], y=[y for _, y in points], name=_escape(label),
             mode="lines+markers" if marked else "lines", line=_line(place),
             hovertemplate=f"%{{x:.4g}}: %{{y:{form}}} {unit}",
         )  # fmt: skip
-    _lay_out(figure, axes, legend=len(curves) > 1)
     figure.update_xaxes(_SCALES[scale])
     figure.update_yaxes({"range": [-2, 102]} if unit == "%" else {"type": "log", "tickvals": _POWERS})
     ends = (f"{label}: {points[0][1]:{form}} to {points[-1][1]:{form}} {unit}" for label, points in curves.items()
             if points)  # fmt: skip
-    return Chart(name, title, f"{axes[1]} against {axes[0]}. {'; '.join(ends)}.", _values(figure))
+    words = f"{axes[1]} against {axes[0]}. {'; '.join(ends)}."
+    return _chart(name, title, words, figure, axes, legend=len(curves) > 1)
 
 
 def bars(name: str, title: str, groups: Mapping[str, Mapping[str, Bar]], *, axis: str) -> Chart:
-    """Bars from the left: by the name of a color, and by that of a place, with whiskers where intervals are known.
+    """Horizontal bars by the name of a group, which has a color, and of its member; whiskers are intervals.
 
-    Of one color alone, each place has its own where there are enough colors.
+    Members of a single group have a color each if there are enough colors.
     """
     from plotly import graph_objects
 
-    figure, alone = graph_objects.Figure(), len(groups) == 1
+    figure, single = graph_objects.Figure(), len(groups) == 1
     for place, (label, members) in enumerate(groups.items()):
-        own = alone and len(members) <= 1 + len(COLORS)
-        colors = [_line(one)["color"] for one in range(len(members))] if own else _line(place + alone)["color"]
+        by_member = single and len(members) <= 1 + len(COLORS)
+        colors = [_line(member)["color"] for member in range(len(members))]
         figure.add_bar(
-            x=[bar.percent for bar in members.values()], y=[*map(_plain, members)], name=_plain(label),
-            orientation="h", marker_color=colors, error_x=_whiskers([*members.values()]),
-            hovertemplate="%{y}: %{x:.1f} %",
+            x=[bar.percent for bar in members.values()], y=[*map(_escape, members)], name=_escape(label),
+            orientation="h", marker_color=colors if by_member else _line(place + single)["color"],
+            error_x=_whiskers([*members.values()]), hovertemplate="%{y}: %{x:.1f} %",
         )  # fmt: skip
-    _lay_out(figure, (axis, ""), legend=not alone)
-    figure.update_layout(height=max(_HEIGHT, 100 + 16 * sum(map(len, groups.values()))))
     figure.update_xaxes(range=[0, 102])
     figure.update_yaxes(type="category", autorange="reversed")
-    parts = (f"{label}, {group}: {bar.percent:.1f} %" for label, some in groups.items() for group, bar in some.items())
-    return Chart(name, title, f"{axis}. {'; '.join(parts)}.", _values(figure))
+    parts = (f"{label}, {member}: {bar.percent:.1f} %" for label, members in groups.items()
+             for member, bar in members.items())  # fmt: skip
+    height = max(_HEIGHT, 100 + 16 * sum(map(len, groups.values())))
+    return _chart(name, title, f"{axis}. {'; '.join(parts)}.", figure, (axis, ""), legend=not single, height=height)
 
 
 def amounts(name: str, title: str, values: Mapping[str, float], *, axis: str) -> Chart:
-    """Bars from the left, one for each name."""
+    """Horizontal bars, one for each name."""
     from plotly import graph_objects
 
     figure = graph_objects.Figure()
     figure.add_bar(
-        x=[*values.values()], y=[*map(_plain, values)], orientation="h", marker_color=COLORS[0],
+        x=[*values.values()], y=[*map(_escape, values)], orientation="h", marker_color=COLORS[0],
         hovertemplate="%{y}: %{x:.4g}", texttemplate="%{x:.3g}", textposition="auto",
     )  # fmt: skip
-    _lay_out(figure, (axis, ""), legend=False)
     figure.update_yaxes(type="category", autorange="reversed")
     parts = "; ".join(f"{label}: {value:.3g}" for label, value in values.items())
-    return Chart(name, title, f"{axis}. {parts}.", _values(figure))
+    return _chart(name, title, f"{axis}. {parts}.", figure, (axis, ""), legend=False)
 
 
-def _plain(text: str) -> str:
-    """For plotly, whose labels understand some HTML."""
+def _escape(text: str) -> str:
+    """Escape a label: plotly's labels understand some HTML."""
     return html.escape(printable(text), quote=False)
 
 
@@ -138,20 +137,19 @@ def _line(place: int) -> dict[str, Any]:
 def _whiskers(members: Sequence[Bar]) -> dict[str, Any]:
     ends = [bar.interval or (bar.percent, bar.percent) for bar in members]
     return {
-        "type": "data",
-        "symmetric": False,
+        "type": "data", "symmetric": False, "thickness": 1.2, "width": 3,
         "visible": any(bar.interval for bar in members),
         "array": [high - bar.percent for (_, high), bar in zip(ends, members, strict=True)],
         "arrayminus": [bar.percent - low for (low, _), bar in zip(ends, members, strict=True)],
-        "thickness": 1.2,
-        "width": 3,
-    }
+    }  # fmt: skip
 
 
-def _lay_out(figure: "Figure", axes: tuple[str, str], *, legend: bool) -> None:
-    """What all charts have in common; their colors follow the page's."""
+def _chart(
+    name: str, title: str, words: str, figure: "Figure", axes: tuple[str, str], *, legend: bool, height: int = _HEIGHT
+) -> Chart:
+    """A chart in the layout of all charts; its colors follow the page's."""
     figure.update_layout(
-        template="none", paper_bgcolor="rgba(0,0,0,0)", plot_bgcolor="rgba(0,0,0,0)", dragmode=False, height=_HEIGHT,
+        template="none", paper_bgcolor="rgba(0,0,0,0)", plot_bgcolor="rgba(0,0,0,0)", dragmode=False, height=height,
         margin={"l": 56, "r": 12, "t": 12, "b": 48}, font={"family": "system-ui, sans-serif", "size": 13},
         showlegend=legend, legend={"orientation": "h", "yanchor": "bottom", "y": 1.02, "x": 0},
         hoverlabel={"namelength": -1}, barmode="group",
@@ -159,8 +157,5 @@ def _lay_out(figure: "Figure", axes: tuple[str, str], *, legend: bool) -> None:
     options = {"fixedrange": True, "automargin": True, "zeroline": False, "title_font_size": 13}
     figure.update_xaxes(title_text=axes[0], **options)
     figure.update_yaxes(title_text=axes[1], **options)
-
-
-def _values(figure: "Figure") -> dict[str, Any]:
-    found = figure.to_plotly_json()
-    return {"data": found["data"], "layout": found["layout"]}
+    values = figure.to_plotly_json()
+    return Chart(name, title, words, {"data": values["data"], "layout": values["layout"]})

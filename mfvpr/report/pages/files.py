@@ -1,4 +1,4 @@
-"""What the files of a run folder say."""
+"""Reading the files of a run folder."""
 
 import csv
 import functools
@@ -8,7 +8,7 @@ import math
 import operator
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -34,12 +34,12 @@ _TABLES = {"table.csv": 1, "differences.csv": 2, "confidence.csv": None, "rerank
 
 @dataclass(frozen=True)
 class Gains:
-    """Which systems are right about the Q queries of a sequence, or of several, one behind the other.
+    """Ranks of the first correct candidates for the Q queries of one sequence, or of several, one after the other.
 
     Attributes:
         queries: names.
         places: `[Q]` whole numbers along the map.
-        ranks: `[Q]` of the first right candidate by system, 0 = none is right.
+        ranks: `[Q]` by system, 0 = no candidate is correct.
     """
 
     queries: tuple[str, ...]
@@ -47,23 +47,17 @@ class Gains:
     ranks: Mapping[str, np.ndarray]
 
     def hits(self, system: str, k: int = 1) -> np.ndarray:
-        """`[Q]` bool in the order of the path: whether one of the first k candidates is right."""
+        """`[Q]` bool in the order of the path: whether one of the first k candidates is correct."""
         ranks = self.ranks[system]
         return ((ranks > 0) & (ranks <= k))[np.argsort(self.places, kind="stable")]
 
 
 @dataclass(frozen=True)
 class Answer:
-    """The first answer to a query; texts as they stand in the files.
+    """The first prediction of a system for a query, as texts of the files.
 
-    Attributes:
-        system: that gave it.
-        sequence: of the query.
-        query: name of its image.
-        answer: name of the database image; empty = none.
-        score: of it.
-        outcome: "right", "wrong", or "best" without ground truth.
-        rank: of the first right candidate; empty = unknown, or none.
+    `outcome` is "right", "wrong", or "best" without ground truth. `answer` and `score` are empty without a prediction.
+    `rank` is of the first correct candidate, empty if there is none or if it is unknown.
     """
 
     system: str
@@ -95,12 +89,12 @@ class Run:
 
     @property
     def common(self) -> Mapping[str, Any]:
-        """What all rows of the results say alike: the data set, seconds, versions and so on."""
+        """Values that all rows of the results share: the data set, seconds, versions and so on."""
         return self.results[0]
 
     @cached_property
     def systems(self) -> list[str]:
-        """In their order."""
+        """Names of the systems, in the order of the results."""
         return list(dict.fromkeys(row["system"] for row in self.results))
 
     @cached_property
@@ -110,54 +104,50 @@ class Run:
 
     @cached_property
     def sequences(self) -> list[str]:
-        """Names of several; one without a name of its own is called as the data set."""
+        """Names of the sequences; a single one without a name has the data set's."""
         return _sequences(self.results)
 
     @property
     def unit(self) -> Unit:
-        """Of the thresholds, with ground truth."""
+        """Unit of the thresholds, with ground truth."""
         return self.common["ground_truth"]["unit"]
 
     @property
     def thresholds(self) -> list[float]:
-        """What counts as right, ascending; none without ground truth."""
+        """Distances within which a prediction is correct, ascending; none without ground truth."""
         return self.common["ground_truth"].get("thresholds", [])
 
     @property
     def first_k(self) -> str:
-        """The smallest depth that recall is told at, with ground truth."""
+        """The smallest depth of recall, with ground truth."""
         return min(self.common["recall_at"], key=int)
 
     @property
     def within(self) -> str:
-        """What counts as right in `gains` and everything per query, as it stands behind R@K."""
+        """The threshold of `gains` and of all values per query, as it stands behind R@K."""
         return threshold_words(self.unit, middle(self.thresholds))
 
     @cached_property
     def all_gains(self) -> Gains:
-        """Of all sequences, with ground truth."""
+        """Gains of all sequences, with ground truth."""
         parts = [*self.gains.values()]
         return Gains(
-            tuple(query for one in parts for query in one.queries),
-            np.concatenate([one.places for one in parts]),
-            {name: np.concatenate([one.ranks[name] for one in parts]) for name in self.systems},
+            tuple(query for gains in parts for query in gains.queries),
+            np.concatenate([gains.places for gains in parts]),
+            {name: np.concatenate([gains.ranks[name] for gains in parts]) for name in self.systems},
         )
 
-    def table(self, name: str, text_columns: int = 1) -> Table | None:
-        """A CSV file of the folder, so many columns of it left-aligned; None where there is none."""
-        found = self.tables.get(name)
-        return found and replace(found, text_columns=text_columns)
-
     def answers(self) -> Iterator[Answer]:
-        """The first answers of all systems, those of the system that decides first."""
-        with _telling_which(self.folder):
+        """The first predictions of all systems, those of the system that decides first."""
+        with _errors_as_input_errors(self.folder):
             for system in sorted(self.systems, key=lambda name: name != self.headline):
-                for sequence in self.sequences:
-                    yield from self._answers(system, sequence)
+                for place in range(len(self.sequences)):
+                    yield from self._answers(system, place)
 
-    def _answers(self, system: str, sequence: str) -> Iterator[Answer]:
-        own = sequence_folder(self.folder, self.sequences, self.sequences.index(sequence))
-        path = own / "predictions" / f"{file_names(self.systems)[system]}.csv"
+    def _answers(self, system: str, place: int) -> Iterator[Answer]:
+        sequence = self.sequences[place]
+        folder = sequence_folder(self.folder, self.sequences, place)
+        path = folder / "predictions" / f"{file_names(self.systems)[system]}.csv"
         first = {line["query"]: line for line in _lines(path) if line["rank"] == "1"}
         if sequence not in self.gains:
             for query, line in first.items():
@@ -166,12 +156,12 @@ class Run:
         gains = self.gains[sequence]
         for query, rank in zip(gains.queries, gains.ranks[system].tolist(), strict=True):
             line, outcome = first.get(query, {}), "right" if rank == 1 else "wrong"
-            found = line.get("database", ""), line.get("score", "")
-            yield Answer(system, sequence, query, *found, outcome, str(rank or ""))
+            prediction = line.get("database", ""), line.get("score", "")
+            yield Answer(system, sequence, query, *prediction, outcome, str(rank or ""))
 
 
 def read_run(folder: Path) -> Run:
-    """The files of a run folder.
+    """Read and check the files of a run folder.
 
     Raises:
         InputError: there is no such folder, or its files are not those of an evaluation.
@@ -179,7 +169,7 @@ def read_run(folder: Path) -> Run:
     for name in ("results.json", "run.json"):
         if not (folder / name).is_file():
             raise InputError(f"{folder}: {_LEFT_BY}, got none with a {name}")
-    with _telling_which(folder):
+    with _errors_as_input_errors(folder):
         results, about = (json.loads((folder / name).read_text("utf-8")) for name in ("results.json", "run.json"))
         _check(results, about)
         sequences = _sequences(results)
@@ -189,9 +179,9 @@ def read_run(folder: Path) -> Run:
         gains = {name: _gains(path) for name, path in paths.items() if path.exists()}
         tables = {name: _table(folder / name, text) for name, text in _TABLES.items() if (folder / name).exists()}
         run = Run(folder, results, about, gains, tables)
-        if len(run.gains) != (len(sequences) if run.thresholds else 0):
+        if len(gains) != (len(sequences) if run.thresholds else 0):
             raise ValueError("each sequence with ground truth has a gains.csv, and no other")
-        if any(not {*run.systems} <= {*one.ranks} for one in run.gains.values()):
+        if any(not {*run.systems} <= {*part.ranks} for part in gains.values()):
             raise ValueError("gains.csv lacks a system")
         if "table.csv" in tables and not {row[0] for row in tables["table.csv"].rows} <= {*run.systems}:
             raise ValueError("table.csv has another system")
@@ -199,7 +189,7 @@ def read_run(folder: Path) -> Run:
 
 
 def _check(results: Any, about: Any) -> None:
-    """What pages take for granted is there."""
+    """Raise an error unless the values have what pages need."""
     if not isinstance(results, list) or not results:
         raise ValueError("results.json has no rows")
     for kinds, rows in ((_KINDS_OF_A_ROW, results), (_KINDS, results[:1]), ({"settings": dict}, [about])):
@@ -234,7 +224,7 @@ def _check_numbers(name: str, values: Iterable[Any]) -> None:
 
 
 @contextmanager
-def _telling_which(folder: Path) -> Iterator[None]:
+def _errors_as_input_errors(folder: Path) -> Iterator[None]:
     try:
         yield
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, StopIteration, csv.Error) as error:
@@ -244,7 +234,7 @@ def _telling_which(folder: Path) -> Iterator[None]:
 
 
 def _sequences(results: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Their names, without those of their means, which come last."""
+    """Names of the sequences, without those of their means, which come last."""
     first = results[0]
     if "sequence" not in first:
         return [first["dataset"]]

@@ -1,36 +1,50 @@
 """The page of one run."""
 
+import json
+from collections.abc import Iterator, Mapping
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
-from mfvpr.report.pages import sections
-from mfvpr.report.pages.files import Run, read_run
-from mfvpr.report.pages.rendering import write_page
+import numpy as np
+
+from mfvpr.datasets.datasets import MEANS
+from mfvpr.evaluation.precision import PrecisionRecall
+from mfvpr.evaluation.statistics import recall_interval
+from mfvpr.report.pages.charts import Bar, Chart, amounts, bars, lines
+from mfvpr.report.pages.files import Gains, Run, read_run
+from mfvpr.report.pages.pictures import pictures
+from mfvpr.report.pages.rendering import Gallery, Section, Sheet, write_page
+from mfvpr.report.tables import Table
 from mfvpr.reranking.results import FILTER
 
 PAGE = "report.html"  # in a run folder
+MOST_ANSWERS = 5000  # rows of a table that a browser still sorts at once
 _NAMELESS = "folder"  # the default name of a data set of own folders
+_CURVE_POINTS = 200
+_P_VALUES = (4, 7)  # columns of differences.csv
+
+Curves = Mapping[str, tuple[Run, str]]  # a run and one of its systems, by the name of their curve
 
 
 def write_report(folder: Path, path: Path | None = None) -> Path:
-    """The page of a run folder, by default in it.
+    """Write the page of a run folder, by default into it.
 
     Returns:
-        where it is.
+        The path of the page.
 
     Raises:
-        InputError: it is no run folder of an evaluation.
+        InputError: the folder is not the run folder of an evaluation.
     """
     run, path = read_run(folder), path or folder / PAGE
-    judged = [sections.recall_section(run), sections.differences_section(run)] if run.gains else []
-    parts = [*judged, sections.confidence_section(run), sections.answers_section(run), sections.costs_section(run),
-             sections.settings_section(run)]  # fmt: skip
-    write_page(path, title=_title(run), words=in_words(run), facts=_facts(run),
-               sections=[part for part in parts if part is not None])  # fmt: skip
+    sections = [_recall_section(run), *_differences_section(run)] if run.gains else []
+    sections += [*_confidence_section(run), _answers_section(run), _costs_section(run), _settings_section(run)]
+    write_page(path, title=_title(run), words=description(run), facts=_facts(run), sections=sections)
     return path
 
 
 def _title(run: Run) -> str:
-    """The name of the data set; of folders without a name of their own, the ends of their paths."""
+    """The name of the data set; of folders without a name, the ends of their paths."""
     name, dataset = run.common["dataset"], run.about["settings"].get("dataset")
     sides = [dataset.get(side) for side in ("queries", "database")] if isinstance(dataset, dict) else [None]
     if name != _NAMELESS or not all(isinstance(side, str) for side in sides):
@@ -38,7 +52,7 @@ def _title(run: Run) -> str:
     return " in ".join("/".join(Path(str(side)).parts[-2:]) for side in sides)
 
 
-def in_words(run: Run) -> str:
+def description(run: Run) -> str:
     """One line that says what was evaluated."""
     common = run.common
     several = f" in {len(run.sequences)} sequences" if len(run.sequences) > 1 else ""
@@ -54,7 +68,185 @@ def in_words(run: Run) -> str:
 def _facts(run: Run) -> dict[str, str]:
     facts = {"decides": run.headline}
     for name in dict.fromkeys((run.headline, FILTER)) if run.gains else ():
-        hits, interval = run.all_gains.hits(name), sections.interval(run.all_gains, name)
-        found = f"{100 * hits.mean():.1f} %", sections.percent(interval)
-        facts[f"{name}, R@1{run.within}"] = " ".join(words.replace(" ", "\N{NO-BREAK SPACE}") for words in found)
+        words = f"{recall_bar(run.all_gains, name).percent:.1f} %", interval_words(run.all_gains, name)
+        facts[f"{name}, R@1{run.within}"] = " ".join(word.replace(" ", "\N{NO-BREAK SPACE}") for word in words)
     return facts | {"seconds in all": f"{sum(run.common['seconds'].values()):.1f}"}
+
+
+def recall_bar(gains: Gains, system: str) -> Bar:
+    """Recall at 1 and its 95 % interval."""
+    low, high = recall_interval(gains.hits(system))
+    return Bar(100 * float(gains.hits(system).mean()), (100 * low, 100 * high))
+
+
+def interval_words(gains: Gains, system: str) -> str:
+    """The 95 % interval of recall at 1 in a cell, in %."""
+    low, high = recall_interval(gains.hits(system))
+    return f"[{100 * low:.1f}, {100 * high:.1f}]"
+
+
+def _recall_section(run: Run) -> Section:
+    several = len(run.gains) > 1
+    parts = {**run.gains, MEANS[-1]: run.all_gains} if several else {"recall": run.all_gains}
+    groups = {system: {name: recall_bar(gains, system) for name, gains in parts.items()} for system in run.systems}
+    groups = groups if several else {"recall": {system: group["recall"] for system, group in groups.items()}}
+    curves = {name: (run, name) for name in run.systems}
+    charts = [
+        bars("intervals", f"Recall at 1{run.within}, with intervals", groups, axis="recall at 1, %"),
+        *tolerance_charts(curves), depths_chart(f"Recall over K{run.within}", curves),
+    ]  # fmt: skip
+    words = f"In %. Everything told of single queries is what is right at the middle tolerance{run.within}. Intervals "
+    words += "are 95 % and know that neighbors along the path fail together."
+    sheets = []
+    if table := run.tables.get("table.csv"):
+        gains_of = [parts.get(row[1] if several else "recall") for row in table.rows]
+        cells = ["" if gains is None else interval_words(gains, row[0])
+                 for gains, row in zip(gains_of, table.rows, strict=True)]  # fmt: skip
+        rows = [[*row, cell] for row, cell in zip(table.rows, cells, strict=True)]
+        sheets = [Sheet("Recall of every system", Table([*table.header, f"R@1{run.within}, 95 %"], rows, 1 + several))]
+    return Section("recall", "Recall", words, charts, sheets)
+
+
+def depths_chart(title: str, curves: Curves) -> Chart:
+    """Recall at K from 1 to all candidates, at all small Ks and some larger ones."""
+    points = {}
+    for name, (run, system) in curves.items():
+        largest = max(run.common["candidates"], 1)
+        depths = np.unique(np.geomspace(1, largest, _CURVE_POINTS).round().astype(int)).tolist()
+        points[name] = [(k, 100 * float(run.all_gains.hits(system, k).mean())) for k in depths]
+    return lines("depths", title, points, axes=("K, the first candidates", "recall at K, %"), scale="log")
+
+
+def tolerance_charts(curves: Curves) -> list[Chart]:
+    """Recall of all queries over the threshold, a chart for each unit and depth of runs with several thresholds."""
+    by_kind: dict[tuple[str, str], dict[str, list[tuple[float, float]]]] = {}
+    for name, (run, system) in curves.items():
+        if len(run.thresholds) > 1:
+            rows = [row for row in run.results
+                    if row["system"] == system and row.get("sequence", MEANS[-1]) == MEANS[-1]]  # fmt: skip
+            points = [(row["tolerance"] if "tolerance" in row else row["radius"], 100 * row["recall_at"][run.first_k])
+                      for row in rows]  # fmt: skip
+            by_kind.setdefault((run.unit, run.first_k), {})[name] = points
+    return [
+        lines(f"tolerances-{number}" if number else "tolerances", "Recall over tolerance", points,
+              axes=(f"tolerance, {unit}", f"recall at {k}, %"), marked=True)
+        for number, ((unit, k), points) in enumerate(by_kind.items())
+    ]  # fmt: skip
+
+
+def precision_charts(curves: Curves, by: str = "score", words: str = "by the score") -> list[Chart]:
+    """Precision against recall, if the runs have them; names of curves have their average precision."""
+    points = {}
+    for name, (run, system) in curves.items():
+        table = run.tables.get("precision_recall.csv")
+        rows = [[float(cell) for cell in row[2:]] for row in (table.rows if table else ()) if row[:2] == [system, by]]
+        if rows:
+            curve = PrecisionRecall(*np.array(rows).T)
+            shown = np.unique(np.linspace(0, len(rows) - 1, _CURVE_POINTS).round().astype(int))
+            label = f"{name}: AP {100 * curve.average_precision:.1f}"
+            pairs = zip(curve.recall[shown], curve.precision[shown], strict=True)
+            points[label] = [(round(100 * x, 3), round(100 * y, 3)) for x, y in pairs]
+    axes = "recall of queries with an answer, %", "precision, %"
+    title = f"Precision and recall {words}"
+    return [lines(f"precision-{by}", title, points, axes=axes, scale="percent")] if points else []
+
+
+def paired_tests_table(kind: str, rows: list[list[str]]) -> Table:
+    """Paired tests of systems or of runs (`kind`)."""
+    columns = kind, "other", f"only {kind}", "only other", "McNemar p", "queries in a block", "blocks", "p by blocks"
+    return Table(columns, rows, text_columns=2)
+
+
+def paired_tests_words(kind: str) -> str:
+    """The explanation of `paired_tests_table`."""
+    return (
+        f"How many queries only one of two {kind}s gets right, and how probable that is if neither is better: by "
+        "McNemar's exact test, which takes queries for independent, and by blocks of neighbors along the path."
+    )
+
+
+def _differences_section(run: Run) -> Iterator[Section]:
+    table = run.tables.get("differences.csv")
+    if table and table.rows:
+        rows = [[f"{float(cell):.2g}" if column in _P_VALUES else cell for column, cell in enumerate(row)]
+                for row in table.rows]  # fmt: skip
+        sheets = [Sheet("Every two systems", paired_tests_table("system", rows))]
+        yield Section("differences", "Differences", paired_tests_words("system"), sheets=sheets)
+
+
+def _confidence_section(run: Run) -> Iterator[Section]:
+    """Precision against recall, and recall over the share that is re-ranked; with ground truth."""
+    if "precision_recall.csv" not in run.tables:
+        return
+    table, shares = run.tables.get("confidence.csv"), run.tables.get("rerank_share.csv")
+    curves = {name: (run, name) for name in run.systems}
+    charts = precision_charts(curves) + precision_charts(curves, "p", "by p(right)")
+    if shares and shares.rows and len(shares.header) > 1:
+        axes, title = ("queries re-ranked, %", "recall at 1, %"), "Re-ranking only what the filter is unsure of"
+        charts.append(lines("shares", title, _points_by_share(shares), axes=axes, scale="percent"))
+    sheets = [Sheet("Confidence of first answers, in %", table)] if table and table.rows else []
+    words = "AP is the average precision, R@100P the recall at 100 % precision, ECE the expected calibration error of "
+    yield Section("confidence", "Precision and recall", f"{words}p(right).", charts, sheets)
+
+
+def _points_by_share(shares: Table) -> dict[str, list[tuple[float, float]]]:
+    """(share of the queries re-ranked, recall) in % by system, and the recall of the filter alone."""
+    share, *recalls = [list(map(float, column)) for column in zip(*shares.rows, strict=True)]
+    points = {FILTER: [(0.0, recalls[0][0]), (100.0, recalls[0][0])]}
+    for name, recall in zip(shares.header[1:], recalls, strict=True):
+        points[name] = [(100 * x, y) for x, y in zip(share, recall, strict=True)]
+    return points
+
+
+def _costs_section(run: Run) -> Section:
+    seconds, common = run.common["seconds"], run.common
+    rows = [[stage, f"{value:.3f}", f"{value / max(common['queries'], 1):.4f}"] for stage, value in seconds.items()]
+    sizes = [["queries", f"{common['queries']}"], ["database images", f"{common['database']}"],
+             ["candidates of a query", f"{common['candidates']}"]]  # fmt: skip
+    if common["bytes_per_image"] is not None:
+        sizes.append(["bytes on disk of an image's features, about", f"{common['bytes_per_image']}"])
+    chart = amounts("seconds", "Seconds by stage", seconds, axis="seconds")
+    sheets = [Sheet("Seconds", Table(["stage", "seconds", "per query"], rows)),
+              Sheet("Sizes", Table(["what", "number"], sizes))]  # fmt: skip
+    words = "What was in the stores already was not computed again."
+    return Section("costs", "Seconds and sizes", words, [chart], sheets)
+
+
+def _answers_section(run: Run) -> Section:
+    """First predictions, with pictures of some."""
+    total = len(run.systems) * len(run.all_gains.queries) if run.gains else 0
+    answers = [*islice(run.answers(), MOST_ANSWERS)]
+    left_out = max(0, total - len(answers))
+    gallery = Gallery(run.headline, run.systems, run.sequences, pictures(run.folder), answers, left_out)
+    words = "Query and first answer with their heaviest matches, and the histogram of their shifts; below a wrong "
+    words += "answer the right one. The table has the queries without a picture, too."
+    return Section("answers", "Answers", words, gallery=gallery)
+
+
+def _settings_section(run: Run) -> Section:
+    about = {name: run.about.get(name) for name in ("command", "commit")} | {
+        "ground truth": run.common["ground_truth"], "data fingerprint": run.common["data_fingerprint"]
+    }  # fmt: skip
+    sheets = [
+        values_sheet("Run", about),
+        values_sheet("Settings", run.about["settings"]),
+        values_sheet("Versions", run.common["versions"]),
+        values_sheet("Systems", {row["system"]: row["parameters"] for row in run.results}),
+    ]
+    if skipped := run.tables.get("skipped.csv"):
+        sheets.append(Sheet("Images that could not be used", Table(skipped.header, skipped.rows, 3)))
+    return Section("settings", "Settings and versions", sheets=sheets)
+
+
+def values_sheet(caption: str, values: Mapping[str, Any]) -> Sheet:
+    """Nested values by their dotted names."""
+    return Sheet(caption, Table(["name", "value"], [*map(list, flat(values))], text_columns=2))
+
+
+def flat(values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Nested values as (dotted name, text)."""
+    for name, value in values.items():
+        if isinstance(value, Mapping) and value:
+            yield from ((f"{name}.{inner}", text) for inner, text in flat(value))
+        else:
+            yield name, value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)

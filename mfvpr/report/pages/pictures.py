@@ -1,4 +1,4 @@
-"""The figures of a run, small enough to stand in a page."""
+"""Figures of a run, small enough for a page."""
 
 import base64
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ class Picture:
     """A query's figure.
 
     Attributes:
-        system: that answered.
+        system: of the prediction.
         sequence: of the query.
         outcome: "right", "wrong", or "best" without ground truth.
         query: name of its image.
@@ -39,7 +39,7 @@ class Picture:
 
 
 def pictures(run: Path, *, most: int = MOST_PICTURES) -> list[Picture]:
-    """Those of a run folder's figures that show a query, by the names of their files; evenly chosen of too many.
+    """Figures of queries in a run folder, by the names of their files; evenly chosen if there are more than `most`.
 
     Raises:
         InputError: a figure cannot be read.
@@ -50,7 +50,7 @@ def pictures(run: Path, *, most: int = MOST_PICTURES) -> list[Picture]:
 
 
 def _pictures(path: Path) -> Iterator[Picture]:
-    """The picture of a figure; nothing where its file does not say what it shows."""
+    """The picture of a figure; empty if its file has no keywords."""
     try:
         with Image.open(path) as image:
             image.load()
@@ -58,12 +58,9 @@ def _pictures(path: Path) -> Iterator[Picture]:
             if {*ABOUT} <= {*about}:
                 small = image.convert("RGB")
                 small.thumbnail((_WIDTH, small.height))
-                yield Picture(**{name: str(about[name]) for name in ABOUT}, source=_uri(small), size=small.size)
+                file = BytesIO()
+                small.save(file, "JPEG", quality=_QUALITY, optimize=True)
+                source = f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode()}"
+                yield Picture(**{name: str(about[name]) for name in ABOUT}, source=source, size=small.size)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"{path}: expected a figure of the run ({error}); remove it, or run again") from None
-
-
-def _uri(image: Image.Image) -> str:
-    file = BytesIO()
-    image.save(file, "JPEG", quality=_QUALITY, optimize=True)
-    return f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode()}"

@@ -1,28 +1,71 @@
-"""Pages from their template: everything escaped, everything embedded, and no network that anything could reach."""
+"""Parts of a page, and pages from their template: everything escaped and embedded, without any network access."""
 
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 
-from mfvpr.report.pages.sections import Section
+from mfvpr.report.pages.charts import Chart
+from mfvpr.report.pages.files import Answer
+from mfvpr.report.pages.pictures import Picture
+from mfvpr.report.tables import Table
 from mfvpr.utils.files import write_text
 
-# Jinja2 and plotly are imported where they are needed, since everything else can do without.
+# Jinja2 and plotly are imported where they are needed: the rest of the library does not depend on them.
 _TEMPLATES = Path(__file__).parent / "templates"
 
 
-def write_page(
-    path: Path, *, title: str, words: str, facts: Mapping[str, str], sections: Sequence[Section]
-) -> None:  # fmt: skip
-    """One HTML file that needs no other; the same bytes for the same values.
+@dataclass(frozen=True)
+class Sheet:
+    """A table of a page and its caption."""
+
+    caption: str
+    table: Table
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """Predictions for queries, which can be filtered; `left_out` counts those that the page does not list."""
+
+    system: str
+    systems: Sequence[str]
+    sequences: Sequence[str]
+    pictures: Sequence[Picture]
+    answers: Sequence[Answer] = ()
+    left_out: int = 0
+
+    @property
+    def outcomes(self) -> list[str]:
+        """Outcomes that occur."""
+        return sorted({shown.outcome for shown in (*self.pictures, *self.answers)})
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of a page; `name` is a word for its element, `words` stand above everything in it.
+
+    `links` are words and the addresses of other pages, relative to the page.
+    """
+
+    name: str
+    title: str
+    words: str = ""
+    charts: Sequence[Chart] = ()
+    sheets: Sequence[Sheet] = ()
+    gallery: Gallery | None = None
+    links: Sequence[tuple[str, str]] = ()
+
+
+def write_page(path: Path, *, title: str, words: str, facts: Mapping[str, str], sections: Sequence[Section]) -> None:
+    """Write one HTML file that needs no other; the same bytes for the same values.
 
     Args:
         path: of the page.
-        title: of it.
+        title: of the page.
         words: below its title.
-        facts: what matters most, by name.
-        sections: the parts, in their order.
+        facts: the most important values, by name.
+        sections: in their order.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
@@ -34,11 +77,11 @@ def write_page(
     )  # fmt: skip
     environment.policies["json.dumps_kwargs"] = {"sort_keys": True, "allow_nan": False}
     scripts = [get_plotlyjs(), (_TEMPLATES / "script.js").read_text("utf-8")]
-    charts = {chart.name: chart.figure for section in sections for chart in section.charts}
     text = environment.get_template("page.html").render(
-        title=title, words=words, facts=facts, sections=sections, charts=charts,
-        scripts=[Markup(script) for script in scripts],  # ours and plotly's, as is the style: none of it is foreign
+        title=title, words=words, facts=facts, sections=sections,
+        charts={chart.name: chart.figure for section in sections for chart in section.charts},
+        scripts=[Markup(script) for script in scripts],  # of this package and of plotly, as is the style
         style=Markup((_TEMPLATES / "style.css").read_text("utf-8")),
-        hashes=" ".join(f"'sha256-{b64encode(sha256(one.encode()).digest()).decode()}'" for one in scripts),
+        hashes=" ".join(f"'sha256-{b64encode(sha256(script.encode()).digest()).decode()}'" for script in scripts),
     )  # fmt: skip
     write_text(path, text)

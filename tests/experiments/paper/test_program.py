@@ -140,9 +140,11 @@ def test_damaged_runs_are_told(finished, data, tmp_path, monkeypatch, capsys, na
 def test_the_plan_comes_first_and_tables_before_the_seconds(tmp_path, monkeypatch, capsys):
     """An interrupted timing costs no table."""
     place = systems.Place("streets_seasons", ("dataset=streets_seasons",))
-    monkeypatch.setattr(program.lineup, "places", lambda *_: ([place], ["corridor: needs a folder"]))
+    monkeypatch.setattr(program.systems, "places", lambda *_: ([place], ["corridor: needs a folder"]))
     monkeypatch.setattr(program, "evaluate_all", lambda *_: ({place.name: None}, []))
-    monkeypatch.setattr(program, "tables", lambda found: [("recall", "heading", Table(["system"], [["SIFT"]]))])
+    monkeypatch.setattr(
+        program, "paper_tables", lambda evaluations: [("recall", "heading", Table(["system"], [["SIFT"]]))]
+    )
 
     def interrupted(*_):
         raise KeyboardInterrupt

@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 
 from experiments.paper import systems
-from experiments.paper.figures import mean_bars
-from experiments.paper.printed import printed
+from experiments.paper.figures import mean_recalls
+from experiments.paper.printed import printed_tables
 from experiments.paper.runs import made_of, settings_of
 from experiments.paper.systems import DRAWN, ROWS, Place, chosen_rows, missing_weights, overrides, places
-from experiments.paper.tables import OVERALL, Evaluated, Found, beside, evaluated, tables
+from experiments.paper.tables import OVERALL, Evaluations, RowResult, beside, paper_tables, row_result
 from experiments.settings import SettingsError
 from experiments.truth import fingerprint
 from mfvpr.datasets import Dataset, FrameTruth, ImageFolder, QuerySequence
@@ -28,7 +28,7 @@ def made(run, place=DRAWN, root=None):
 def test_every_printed_row_is_evaluated():
     known = {row.name for row in ROWS}
     for table in ("recall", "sequences", "sizes", "seconds", "pitts30k"):
-        assert {*printed()[table]} <= known, table
+        assert {*printed_tables()[table]} <= known, table
     assert len(known) == len(ROWS) == len({row.title for row in ROWS})
 
 
@@ -140,29 +140,29 @@ def test_numbers_stand_beside_the_printed():
 def test_a_rows_ranking_is_taken_from_its_evaluation():
     rows = {row.name: row for row in ROWS}
     results = [result("filter", 0.1), result("histogram", 0.2, decides=True), result("histogram + filter", 0.3)]
-    recall = {name: evaluated(rows[name], results).recall[OVERALL][1][1]
+    recall = {name: row_result(rows[name], results).recall[OVERALL][1][1]
               for name in ("mixvpr", "mix_hist_50", "sift_hist_50", "sift_hist_comb_50")}  # fmt: skip
     assert recall == pytest.approx({"mixvpr": 10, "mix_hist_50": 20, "sift_hist_50": 20, "sift_hist_comb_50": 30})
-    assert evaluated(rows["sift_anchor"], results) is None
+    assert row_result(rows["sift_anchor"], results) is None
 
 
 def test_of_several_sequences_the_plain_mean_counts():
     row = next(row for row in ROWS if row.name == "mix_hist_50")
     results = [result("histogram", value, decides=True, sequence=name)
                for name, value in (("dawn", 0.1), ("dusk", 0.4), ("mean", 0.25), ("pooled", 0.3))]  # fmt: skip
-    one = evaluated(row, results)
+    one = row_result(row, results)
     assert {name: at[1][1] for name, at in one.recall.items()} == {"dawn": 10, "dusk": 40, OVERALL: 25}
 
 
 def test_tables_hold_both_numbers():
     row = next(row for row in ROWS if row.name == "mix_hist_50")
     recall = {at: {1: value, 5: 95.0, 10: 99.0} for at, value in ((1, 81.0), (2, 92.5), (5, 96.0))}
-    one = Evaluated({OVERALL: recall}, result("histogram", 0.8))
+    one = RowResult({OVERALL: recall}, result("histogram", 0.8))
     gardens = dataset("gardens_point", "gardens_point", database=200)
-    found = Found([row], {"gardens_point": gardens},
+    found = Evaluations([row], {"gardens_point": gardens},
                   {("mix_hist_50", "gardens_point"): one}, sizes={("mix_hist_50", "gardens_point"): 2.0**20},
                   seconds={"mix_hist_50": dict(filter=0.1, features=0.2, matching=0.3, scores=0.1)})  # fmt: skip
-    made = {name: table for name, _, table in tables(found)}
+    made = {name: table for name, _, table in paper_tables(found)}
     assert made["recall"].rows == [["Mix-hist 50", "81.0 (80.0, +1.0)", "92.5 (92.0, +0.5)", "96.0 (96.0, +0.0)"]]
     assert made["data_sets"].rows == [["gardens_point", "200 (200, +0)", "200 (200, +0)"]]
     assert made["sizes"].rows == [["Mix-hist 50", "200.0"]]
@@ -178,9 +178,9 @@ def test_tables_hold_both_numbers():
 def test_sequences_have_a_table_of_their_own():
     row = next(row for row in ROWS if row.name == "mix_hist_50")
     recall = {part: {at: {1: 90.0} for at in (1, 2, 5)} for part in ("night", "snow", OVERALL)}
-    found = Found([row], {"robotcar_seasons": dataset("robotcar_seasons", "night", "snow")},
-                  {("mix_hist_50", "robotcar_seasons"): Evaluated(recall, result("histogram", 0.9))})  # fmt: skip
-    made = {name: table for name, _, table in tables(found)}
+    found = Evaluations([row], {"robotcar_seasons": dataset("robotcar_seasons", "night", "snow")},
+                  {("mix_hist_50", "robotcar_seasons"): RowResult(recall, result("histogram", 0.9))})  # fmt: skip
+    made = {name: table for name, _, table in paper_tables(found)}
     [line] = made["sequences_robotcar_seasons"].rows
     assert line[1:4] == ["90.0 (82.0, +8.0)", "90.0 (89.6, +0.4)", "90.0 (93.4, -3.4)"]
     assert line[7:] == ["90.0 (92.8, -2.8)", "90.0 (96.9, -6.9)", "90.0 (98.5, -8.5)"]
@@ -188,38 +188,38 @@ def test_sequences_have_a_table_of_their_own():
 
 def test_averages_over_all_six_are_the_papers():
     row = next(row for row in ROWS if row.name == "mix_hist_50")
-    names = printed()["recall"]["mix_hist_50"]
+    names = printed_tables()["recall"]["mix_hist_50"]
     recalls = {name: {at: {1: value} for at, value in zip((1, 2, 5), values, strict=True)}
                for name, values in names.items()}  # fmt: skip
-    results = {("mix_hist_50", name): Evaluated({OVERALL: recall}, result("histogram", 0.5))
+    results = {("mix_hist_50", name): RowResult({OVERALL: recall}, result("histogram", 0.5))
                for name, recall in recalls.items()}  # fmt: skip
-    found = Found([row], {name: dataset(name, name) for name in names}, results)
-    [line] = {name: table for name, _, table in tables(found)}["averages"].rows
+    found = Evaluations([row], {name: dataset(name, name) for name in names}, results)
+    [line] = {name: table for name, _, table in paper_tables(found)}["averages"].rows
     assert [cell.split(" ")[0] for cell in line[1:4]] == ["87.5", "92.9", "95.0"]
     assert all(cell.endswith("+0.0)") or cell.endswith("-0.0)") for cell in line[1:4])
     assert line[4:] == []
-    assert mean_bars(found) == [(row.title, pytest.approx(92.875), pytest.approx(92.875))]
+    assert [*mean_recalls(found).values()] == 2 * [{row.title: pytest.approx(92.875)}]
 
 
 def test_rows_that_lack_a_data_set_have_no_mean():
     some = [row for row in ROWS if row.name in ("sift_hist_50", "sift_anchor")]
     recall = {at: {1: 50.0} for at in (1, 2, 5)}
-    results = {(row.name, name): Evaluated({OVERALL: recall}, result("histogram", 0.5))
+    results = {(row.name, name): RowResult({OVERALL: recall}, result("histogram", 0.5))
                for row in some for name in ("corridor", "grief_season")}  # fmt: skip
     del results["sift_anchor", "corridor"]
-    found = Found(some, {name: dataset(name, name) for name in ("corridor", "grief_season")}, results)
-    assert mean_bars(found) == [("SIFT-hist 50", 50.0, None)]
-    [line] = {name: table for name, _, table in tables(found)}["averages"].rows
+    found = Evaluations(some, {name: dataset(name, name) for name in ("corridor", "grief_season")}, results)
+    assert [*mean_recalls(found).values()] == [{"SIFT-hist 50": 50.0}]
+    [line] = {name: table for name, _, table in paper_tables(found)}["averages"].rows
     assert line == ["SIFT-hist 50", "50.0", "50.0", "50.0"]
 
 
 def test_data_sets_that_lack_images_are_called_so():
     row = next(row for row in ROWS if row.name == "mix_hist_50")
-    one = Evaluated({OVERALL: {at: {1: 90.0} for at in (1, 2, 5)}}, result("histogram", 0.9))
-    found = Found(
+    one = RowResult({OVERALL: {at: {1: 90.0} for at in (1, 2, 5)}}, result("histogram", 0.9))
+    found = Evaluations(
         [row], {"gardens_point": dataset("gardens_point", "gardens_point")}, {(row.name, "gardens_point"): one}
     )
-    headings = {name: (heading, table.header) for name, heading, table in tables(found)}
+    headings = {name: (heading, table.header) for name, heading, table in paper_tables(found)}
     assert headings["recall"][1][1] == "gardens_point (incomplete) ±1"
     assert "here over gardens_point (incomplete)" in headings["averages"][0]
     assert "brackets" not in headings["depths"][0]

@@ -1,0 +1,186 @@
+"""Figures of numbers: precision and recall, calibration, sweeps, trainings; and the canvas of all figures."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from mfvpr.evaluation.precision import PrecisionRecall, Reliability
+from mfvpr.report.colors import color_and_dash
+from mfvpr.utils.files import clipped, printable, replacing
+
+BINS = 12  # of the matches, by the value of an input
+_LINE_STYLES = {"solid": "solid", "dash": "dashed", "dot": "dotted", "dashdot": "dashdot"}  # by plotly's words
+_TITLE_LENGTH = 34  # characters that fit above a panel
+_LOSS, _MARK, _SHARE = "#2fa8ff", "#e8482c", "#888888"
+_FLAT_LENGTH = 9  # letters of a column's value that fit beside the next one's
+
+
+def panels(number: int, width: float, height: float, columns: int = 4, **options: Any) -> tuple[Figure, list[Axes]]:
+    """Make a figure of panels, each of `width` x `height` inches, in rows of at most `columns`.
+
+    `options` go to `Figure.subplots`.
+    """
+    columns = min(columns, number)
+    rows = -(-number // columns)
+    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = [*figure.subplots(rows, columns, squeeze=False, **options).flat]
+    for unused in axes[number:]:
+        unused.set_axis_off()
+    return figure, axes[:number]
+
+
+def save_figure(figure: Figure, path: Path, *, dpi: int = 110, **options: Any) -> None:
+    """Write an image file; `options` go to `Figure.savefig`."""
+    with replacing(path) as temporary, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing")  # names in scripts that the font lacks
+        figure.savefig(temporary, dpi=dpi, **options)
+
+
+def precision_recall_figure(path: Path, curves: Mapping[str, Mapping[str, PrecisionRecall]]) -> None:
+    """Draw a panel for each confidence ("score", "p"), in it the curve of each system; `curves[system][confidence]`."""
+    kinds = list(dict.fromkeys(kind for by_kind in curves.values() for kind in by_kind))
+    figure, axes = panels(len(kinds), 5.0, 5.0)
+    for panel, kind in zip(axes, kinds, strict=True):
+        for place, (name, by_kind) in enumerate(curves.items()):
+            if curve := by_kind.get(kind):
+                label = f"{_short(name)}: AP {100 * curve.average_precision:.1f}"
+                panel.plot(curve.recall, curve.precision, label=label, **_line(place))
+        panel.set_title(f"by {kind}", fontsize=9)
+        _label(panel, "recall of the queries that have an answer", "precision of the answers")
+        panel.legend(fontsize=7, loc="lower left")
+    save_figure(figure, path, bbox_inches="tight")  # titles may be wider than their panel
+
+
+def reliability_figure(path: Path, reliabilities: Mapping[str, Reliability]) -> None:
+    """Draw a panel for each system: how often predictions of a probability are correct, areas by their number."""
+    figure, axes = panels(len(reliabilities), 2.6, 2.6)
+    for place, (panel, (name, bins)) in enumerate(zip(axes, reliabilities.items(), strict=True)):
+        panel.plot([0, 1], [0, 1], color="gray", linewidth=0.8)
+        sizes = 200 * bins.count / max(bins.count.sum(), 1) + 4
+        panel.scatter(bins.probability, bins.right, s=sizes, alpha=0.8, color=color_and_dash(place)[0])
+        panel.set_title(f"{_short(name)}\nECE {100 * bins.calibration_error:.1f} %", fontsize=8, parse_math=False)
+        _label(panel, "p(right)", "right")
+    save_figure(figure, path, bbox_inches="tight")
+
+
+def shares_figure(path: Path, shares: Sequence[float], recall: Mapping[str, np.ndarray]) -> None:
+    """Draw recall at 1 (`[shares]` by system, without the filter) over the share of queries that are re-ranked."""
+    figure, [panel] = panels(1, 5.0, 5.0)
+    for place, (name, values) in enumerate(recall.items(), start=1):
+        panel.plot(shares, values, label=_short(name), **_line(place))
+    _label(panel, "share of queries re-ranked", "recall at 1")
+    panel.legend(fontsize=7)
+    save_figure(figure, path, bbox_inches="tight")
+
+
+def _line(place: int) -> dict[str, Any]:
+    color, dash = color_and_dash(place)
+    return {"color": color, "linestyle": _LINE_STYLES[dash], "linewidth": 1.2}
+
+
+def _short(name: str) -> str:
+    return clipped(printable(name), _TITLE_LENGTH)
+
+
+def _label(panel: Axes, x: str, y: str) -> None:
+    panel.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
+    panel.set_xlabel(x, fontsize=8)
+    panel.set_ylabel(y, fontsize=8)
+    panel.grid(alpha=0.3)
+
+
+def heat_map_figure(
+    path: Path,
+    recall: np.ndarray,
+    rows: tuple[str, Sequence[str]],
+    columns: tuple[str, Sequence[str]],
+    *,
+    best: tuple[int, int],
+    defaults: tuple[int, int] | None,
+    title: str,
+) -> None:
+    """Draw recall over two parameters of a sweep.
+
+    Args:
+        path: image file to write.
+        recall: `[R, C]` fractions.
+        rows: name and values of the first parameter.
+        columns: name and values of the second.
+        best: row and column of the best setting, framed.
+        defaults: row and column of the scorer's own values, marked with a circle; None = the grid lacks them.
+        title: above everything.
+    """
+    figure, [axes] = panels(1, 1.8 + 0.75 * len(columns[1]), 1.9 + 0.5 * len(rows[1]))
+    percent = 100 * recall
+    spread = max(float(percent.max() - percent.min()), 1.0)
+    image = axes.imshow(percent, cmap="viridis", aspect="auto", vmin=percent.max() - spread, vmax=percent.max())
+    for (row, column), value in np.ndenumerate(percent):
+        dark = value < percent.max() - 0.45 * spread
+        axes.text(column, row, f"{value:.1f}", ha="center", va="center", fontsize=9, color="white" if dark else "black")
+    axes.set_yticks(range(len(rows[1])), rows[1])
+    axes.set_xticks(range(len(columns[1])), columns[1])
+    axes.set(xlabel=columns[0], ylabel=rows[0])
+    if any(len(value) > _FLAT_LENGTH for value in columns[1]):
+        axes.tick_params("x", rotation=30)
+    axes.add_patch(Rectangle((best[1] - 0.5, best[0] - 0.5), 1, 1, linewidth=2.5, fill=False, edgecolor=_MARK))
+    if defaults is not None:
+        axes.plot(defaults[1], defaults[0], marker="o", markersize=30, markerfacecolor="none", markeredgecolor=_MARK)
+    axes.set_title(title, fontsize=9, parse_math=False)
+    figure.colorbar(image, ax=axes, label="%")
+    save_figure(figure, path)
+
+
+def curves_figure(path: Path, histories: Mapping[str, Sequence[tuple[int, float | None, float | None]]]) -> None:
+    """Draw loss and validation over the steps, one panel for each training.
+
+    `histories` are rows (step, mean loss since the row before, validation) by training, None where there is no value.
+    """
+    figure, axes = panels(len(histories), 3.4, 2.6)
+    for panel, (name, history) in zip(axes, histories.items(), strict=True):
+        for place, label, color in ((1, "loss", _LOSS), (2, "validation", _MARK)):
+            points = [(row[0], row[place]) for row in history if row[place] is not None]
+            panel.plot(*zip(*points, strict=True), label=label, color=color, marker=".", markersize=4)
+        panel.set_title(name, fontsize=9)
+        panel.set_xlabel("step", fontsize=8)
+        panel.grid(alpha=0.3)
+    axes[0].legend(fontsize=8)
+    save_figure(figure, path)
+
+
+def weights_figure(
+    path: Path, names: Sequence[str], inputs: np.ndarray, weights: Mapping[str, np.ndarray], right: np.ndarray
+) -> None:
+    """Draw the mean match weight over each input, and the share of matches that belong to a correct candidate.
+
+    Args:
+        path: image file to write.
+        names: of F inputs.
+        inputs: `[n, F]` of real matches, in their own units; each bin holds as many matches.
+        weights: `[n]` by training.
+        right: `[n]` bool, whether a match belongs to a correct candidate.
+    """
+    figure, axes = panels(len(names), 3.2, 2.6)
+    for panel, name, values in zip(axes, names, inputs.T, strict=True):
+        edges = np.unique(np.quantile(values, np.linspace(0, 1, BINS + 1)))
+        bin_of = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(len(edges) - 2, 0))
+        members = [bin_of == used for used in np.unique(bin_of)]
+        centers = [values[member].mean() for member in members]
+        for label, weight in weights.items():
+            panel.plot(centers, [weight[member].mean() / weight.mean() for member in members], label=label, marker=".")
+        panel.set_title(name, fontsize=9)
+        panel.grid(alpha=0.3)
+        share = panel.twinx()
+        share.plot(centers, [100 * right[member].mean() for member in members], color=_SHARE, linestyle=":")
+        share.tick_params(labelsize=7, labelcolor=_SHARE)
+    axes[0].legend(fontsize=7)
+    axes[0].set_ylabel("weight / mean weight", fontsize=8)
+    figure.suptitle("dotted: % of these matches that belong to a right candidate", fontsize=9)
+    save_figure(figure, path)
