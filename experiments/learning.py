@@ -15,7 +15,7 @@ from mfvpr.report import comparisons, runs
 from mfvpr.scoring import Scorer
 from mfvpr.scoring.learned_weight import ABSOLUTE, RELATIVE
 from mfvpr.tuning.learning.comparison import Checkpoints, compare
-from mfvpr.tuning.learning.data_sets import Part, joined
+from mfvpr.tuning.learning.data_sets import Part, join_data_sets
 from mfvpr.tuning.learning.losses import LOSSES
 from mfvpr.tuning.learning.teaching import Options
 from mfvpr.utils import Stopwatch, recipe_of
@@ -45,7 +45,7 @@ def learn(settings: dict[str, Any]) -> None:
             number = len(data_sets.composed("report", settings["report"]))
             teach, report = teach[:-number], teach[-number:]
             check_apart(teach, report)
-            data = joined([data_set.part for data_set in teach], [data_set.part for data_set in report])
+            data = join_data_sets([data_set.part for data_set in teach], [data_set.part for data_set in report])
         with watch("learning"):
             checkpoints = _checkpoints(settings, axes.scorer, data, teach + report)
             comparison = compare(axes, data.judge, data.match_set, data.candidates, options,

@@ -23,7 +23,7 @@ def claimed(settings: Mapping[str, Any], **options: Any) -> Iterator[Path]:
     folder = build.expanded(out) if out else runs.new_run_folder(Path("runs"), name)
     with ExitStack() as claim:
         try:
-            folder = claim.enter_context(runs.claimed(folder, numbered=not out, **options))
+            folder = claim.enter_context(runs.claim_run_folder(folder, numbered=not out, **options))
         except InputError as error:
             raise SettingsError(f"{error} with out=DIR") from error
         yield folder
@@ -41,7 +41,7 @@ def leave(
     """Write the files, then print the text, then draw the figures, so that no failure loses earlier results.
 
     Args:
-        folder: the folder from `claimed`.
+        folder: the folder from `claim_run_folder`.
         settings: settings of the run.
         ground_truth: description of the ground truth.
         text: text for the terminal, printed even if the files cannot be written.

@@ -20,7 +20,7 @@ from experiments.settings import SettingsError
 from experiments.stages import Images
 from mfvpr.report import runs
 from mfvpr.storage import NotYet, Shard
-from mfvpr.storage.disk import locked
+from mfvpr.storage.disk import lock_store
 from mfvpr.utils.files import write_text, written_once
 from mfvpr.utils.fingerprints import difference
 from mfvpr.utils.locks import is_locked
@@ -50,7 +50,7 @@ def joined(settings: Mapping[str, Any]) -> Iterator[None]:
     _compare(folder / "run.json", content, f"shard={shard}")
     task = task_folder(settings)
     task.mkdir(parents=True, exist_ok=True)
-    with locked(task, "the part of a run"):
+    with lock_store(task, "the part of a run"):
         yield
 
 
@@ -111,7 +111,7 @@ def check_data(settings: Mapping[str, Any], images: Images) -> None:
 def last(settings: Mapping[str, Any]) -> Iterator[bool]:
     """Whether the results are still to be written, for one task at a time."""
     folder = build.expanded(settings["out"])
-    with locked(_folder(folder), "a run", lambda line: None):
+    with lock_store(_folder(folder), "a run", lambda line: None):
         yield not (folder / runs.LAST).exists()
 
 

@@ -19,7 +19,7 @@ from mfvpr.evaluation.sequence_matching import matches_recipe
 from mfvpr.features import Extractor, Source
 from mfvpr.matching import Matcher, MatchSet, Scales
 from mfvpr.retrieval import ExactSearch, Filter, Retrieval
-from mfvpr.scoring.weight_registry import how_made
+from mfvpr.scoring.weight_registry import provenance
 from mfvpr.storage import Archive
 from mfvpr.types import Shortlist
 from mfvpr.utils import Stopwatch
@@ -186,7 +186,7 @@ def _warn_of_weights(settings: dict[str, Any], images: Images) -> None:
     """Warn of a match weight that was learned on these images, or with other features or matches."""
     names = {values.get("weight", "fs") for values in build.by_scorer(settings["scorer"]).values()}
     for name in sorted(names | {*((settings.get("grid") or {}).get("weight") or ())}):
-        origin = how_made(name)
+        origin = provenance(name)
         data_sets = origin["data_sets"] if isinstance(origin.get("data_sets"), list) else [origin]
         seen = {str(folder) for data_set in data_sets for folder in _mapping(data_set, "data_fingerprint").values()}
         if seen & {*images.fingerprints.values()}:

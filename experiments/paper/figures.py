@@ -17,7 +17,7 @@ from mfvpr.report import runs
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.figures import with_longest_side
 from mfvpr.report.plots import panels, save_figure
-from mfvpr.utils.files import clipped, printable, replacing
+from mfvpr.utils.files import clip_middle, printable, replacing
 
 _MIDDLE = 1  # of the tolerances: the paper's figure
 _OVER_PAPERS = "printed, over the paper's six"
@@ -129,7 +129,7 @@ def _draw_failures(path: Path, datasets: Mapping[str, Dataset], best: Mapping[st
         words = f"{where} query", "answer", "right"
         for panel, image, file, word in zip(axes[3 * row : 3 * row + 3], images, names, words, strict=True):
             panel.imshow(image)
-            title = f"{word}: {clipped(file, _NAME_LENGTH)}"
+            title = f"{word}: {clip_middle(file, _NAME_LENGTH)}"
             panel.set_title(printable(title.strip()), fontsize=7, parse_math=False)
     save_figure(figure, path)
 

@@ -9,7 +9,7 @@ from experiments.stages import Tools
 from mfvpr.datasets import ImageFolder
 from mfvpr.features import PatchNetVladFeatures, SelaVprFeatures
 from mfvpr.features.windows import WindowExtractor
-from mfvpr.retrieval import fitted
+from mfvpr.retrieval import fit_to_database
 
 _FLOAT, _KEYPOINT = 4, 12  # bytes of a number, and of a keypoint with its score
 _GRIDS = (WindowExtractor, PatchNetVladFeatures, SelaVprFeatures)
@@ -18,13 +18,15 @@ _GRIDS = (WindowExtractor, PatchNetVladFeatures, SelaVprFeatures)
 def bytes_of_an_image(tools: Tools, database: ImageFolder) -> dict[str, float]:
     """Average bytes of what was already extracted: `local` features, and the `descriptor` of retrieval."""
     archive = tools.archive
-    sources = archive.local(database, fitted(tools.extractor, database, archive), [])  # nothing is extracted for this
+    sources = archive.local(
+        database, fit_to_database(tools.extractor, database, archive), []
+    )  # nothing is extracted for this
     keypoint = 0 if isinstance(tools.extractor, _GRIDS) else _KEYPOINT
     local = 0.0
     for features in sources:
         counts = features.source.counts
         known = counts[counts >= 0]  # retrieval other than VLAD needs the candidates' features alone
         local += (_FLOAT * features.dimension + keypoint) * (float(known.mean()) if known.size else 0.0)
-    describer: Any = fitted(tools.filter, database, archive)  # all of the paper's have one
+    describer: Any = fit_to_database(tools.filter, database, archive)  # all of the paper's have one
     vectors = archive.vectors(database, describer.describer, database).values
     return {"local": local, "descriptor": _FLOAT * vectors.shape[1]}

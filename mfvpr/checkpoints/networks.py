@@ -130,10 +130,10 @@ def resemblance(keys: Sequence[str], expected: Network) -> str | None:
 
 def blueprint(entry: Entry) -> Blueprint:
     """Blueprint of the entry's network."""
-    return planned(network_of(entry).builder())  # imports before tracing, which would trace the module's constants
+    return plan_network(network_of(entry).builder())  # imports before tracing, which would trace the module's constants
 
 
-def planned(build: Callable[..., "nnx.Module"]) -> Blueprint:
+def plan_network(build: Callable[..., "nnx.Module"]) -> Blueprint:
     """Blueprint of the network that `build(rngs=...)` makes."""
     import jax
     from flax import nnx

@@ -171,14 +171,14 @@ class Positives:
         return np.unique(np.minimum(np.searchsorted(sizes, ends), len(self)))
 
 
-def side_by_side(parts: Sequence[Positives]) -> Positives:
+def join_positives(parts: Sequence[Positives]) -> Positives:
     """Concatenate queries and databases of independent data sets."""
     starts = np.cumsum([0, *(part.num_database for part in parts)])
     rows = np.concatenate([part.rows + int(start) for part, start in zip(parts, starts[:-1], strict=True)])
     return Positives(rows.astype(np.int32), _offsets(np.concatenate([part.counts for part in parts])), int(starts[-1]))
 
 
-def stacked(parts: Sequence[Positives]) -> Positives:
+def stack_positives(parts: Sequence[Positives]) -> Positives:
     """Concatenate queries of the same database."""
     rows = np.concatenate([part.rows for part in parts])
     return Positives(rows, _offsets(np.concatenate([part.counts for part in parts])), parts[0].num_database)

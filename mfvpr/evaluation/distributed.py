@@ -21,11 +21,11 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from mfvpr.datasets.positives import Positives
 from mfvpr.reranking.ranking import BIN_STEP, check_candidates
 from mfvpr.retrieval.search import retrieve
-from mfvpr.scoring.parameters import fit
+from mfvpr.scoring.parameters import with_capacity
 from mfvpr.scoring.scorer import Scorer, check_host, on_host
 from mfvpr.types import Array, Matches, Shortlist
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.numerics import Device, compiled, held, masked, round_up
+from mfvpr.utils.numerics import Device, compiled, masked, round_up, with_static_functions
 
 AXIS = "devices"  # the only one of a mesh
 
@@ -130,8 +130,8 @@ def score_on_mesh(scorer: Scorer, matches: Matches, *, mesh: Mesh) -> np.ndarray
                          f"got {number}; add queries without matches")  # fmt: skip
     sharding = NamedSharding(mesh, PartitionSpec(AXIS))
     sharded = jax.tree.map(lambda field: jax.make_array_from_process_local_data(sharding, np.asarray(field)), matches)
-    fitted = fit(scorer, np.asarray(matches.image_size0), np.asarray(matches.image_size1), multiple=BIN_STEP)
-    return np.asarray(score_program(mesh)(held(fitted), sharded))
+    fitted = with_capacity(scorer, np.asarray(matches.image_size0), np.asarray(matches.image_size1), multiple=BIN_STEP)
+    return np.asarray(score_program(mesh)(with_static_functions(fitted), sharded))
 
 
 @cache

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mfvpr.datasets.positives import Positives, stacked
+from mfvpr.datasets.positives import Positives, stack_positives
 from mfvpr.datasets.truth import Unit
 from mfvpr.evaluation.paths import places_along_path
 
@@ -48,7 +48,7 @@ def halves_of_map(parts: Sequence[Positives], unit: Unit) -> tuple[Half, Half]:
         parts: of each sequence, as in `halves`.
         unit: of the widest threshold.
     """
-    together = stacked(parts)
+    together = stack_positives(parts)
     places = places_along_path(together, unit)
     there = places >= 0
     middle = np.median(places[there]) if there.any() else 0

@@ -18,7 +18,7 @@ from mfvpr.features.feature_set import FeatureSet
 from mfvpr.matching.matcher import NEIGHBORS, Matcher
 from mfvpr.reranking.cohort_normalization import cohort_sequence
 from mfvpr.reranking.results import Matched
-from mfvpr.retrieval.fitting import fitted
+from mfvpr.retrieval.fitting import fit_to_database
 from mfvpr.retrieval.retriever import Filter, Filtered
 from mfvpr.storage.feature_cache import Archive
 from mfvpr.storage.matches import MatchStore
@@ -70,9 +70,9 @@ def match_sequence(
     archive, watch, database = archive or Archive(), watch or Stopwatch(), dataset.database
     archive = archive if archive.watch else replace(archive, watch=watch)
     with watch("features"):
-        extractor = fitted(extractor, database, archive)
+        extractor = fit_to_database(extractor, database, archive)
     with watch("filter"):
-        filter = fitted(filter, database, archive)
+        filter = fit_to_database(filter, database, archive)
     with ExitStack() as stack:
         stores = []
         if archive.root is not None:
@@ -231,7 +231,7 @@ def matches_recipe(
 ) -> dict[str, Any]:  # fmt: skip
     """JSON values that determine a shortlist and its matches: images and features, retrieval, and matching."""
     excluded, database = sequence.excluded, dataset.database
-    extractor, filter = fitted(extractor, database, archive), fitted(filter, database, archive)
+    extractor, filter = fit_to_database(extractor, database, archive), fit_to_database(filter, database, archive)
     return {
         "database": archive.recipe(database, extractor),
         "query": archive.recipe(sequence.images, extractor),

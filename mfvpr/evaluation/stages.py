@@ -21,13 +21,13 @@ from mfvpr.matching.matcher import NEIGHBORS, Matcher
 from mfvpr.reranking.batched_scoring import score
 from mfvpr.reranking.ranking import BIN_STEP
 from mfvpr.scoring.histogram import HistogramOfShifts, ShiftHistogram
-from mfvpr.scoring.parameters import fit
+from mfvpr.scoring.parameters import with_capacity
 from mfvpr.scoring.weights import match_weights
 from mfvpr.storage.matches import MatchStore, StoredMatches
 from mfvpr.types import Array, Matches, Shortlist
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import Device, at_least_single, compiled, device_of
-from mfvpr.utils.progress import Track, untracked
+from mfvpr.utils.progress import Track, no_progress
 
 __all__ = ["Explanation", "FeatureSet", "MatchSet", "Scales", "explain", "match", "score", "stored_matches"]
 
@@ -45,7 +45,7 @@ def match(
     devices: Sequence[Device] | None = None,
     store: MatchStore | None = None,
     rows: Sequence[int] | None = None,
-    track: Track = untracked,
+    track: Track = no_progress,
 ) -> MatchSet:
     """Match every query with its candidates; matches include their ratio, which some weights use.
 
@@ -70,7 +70,7 @@ def match(
         raise InputError(f"features: expected as many dimensions on both sides, got {queries.dimension} "
                          f"and {database.dimension} (database); extract all images alike")  # fmt: skip
     match_rows = partial(
-        batched.matched, queries, database, candidates, matcher=matcher, memory=memory,
+        batched.match_queries, queries, database, candidates, matcher=matcher, memory=memory,
         devices=devices or [device_of(())],
     )  # fmt: skip
     requested = range(len(queries)) if rows is None else rows
@@ -162,7 +162,7 @@ class Explanation:
 
 def explain(scorer: HistogramOfShifts, matches: Matches) -> Explanation:
     """The parts of one pair's score, for figures and for steering; one program for all pairs."""
-    fitted = fit(scorer, matches.image_size0, matches.image_size1, multiple=BIN_STEP)
+    fitted = with_capacity(scorer, matches.image_size0, matches.image_size1, multiple=BIN_STEP)
     return Explanation(*jax.tree.map(np.asarray, _explain(fitted, matches)), direction=scorer.direction)
 
 
@@ -189,7 +189,7 @@ def dominant_shifts(
         Refined dominant shifts `[n, 2]` (candidate minus query), their 95 % intervals `[n, 2, 2]` (low, high), and the
         scales `[n]`; NaN if no match votes.
     """
-    fitted = fit(scorer, *match_set.image_sizes, multiple=BIN_STEP)
+    fitted = with_capacity(scorer, *match_set.image_sizes, multiple=BIN_STEP)
     parts = [(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))]
     for start in range(0, len(queries), SHIFTS_AT_ONCE):
         part = slice(start, start + SHIFTS_AT_ONCE)

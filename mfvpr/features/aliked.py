@@ -12,7 +12,7 @@ from jax import Array
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale
-from mfvpr.features.network import compiled, in_batches, local_features, require_size
+from mfvpr.features.network import compile_network, in_batches, local_features, require_size
 from mfvpr.networks.aliked import Aliked
 from mfvpr.networks.aliked_detection import RADIUS, Detections
 from mfvpr.types import Features
@@ -93,7 +93,7 @@ class AlikedFeatures:
             def extract(model: Aliked, images: Array) -> tuple[Detections, Array]:
                 return model.extract(images.astype(jnp.float32) / 255, self.threshold, capacity)
 
-            return compiled(self.model, extract)
+            return compile_network(self.model, extract)
 
         return cache(program)
 

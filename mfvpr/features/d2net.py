@@ -9,7 +9,7 @@ import numpy as np
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale
-from mfvpr.features.network import compiled, in_batches, local_features, require_size
+from mfvpr.features.network import compile_network, in_batches, local_features, require_size
 from mfvpr.networks.d2net import SCALES, STRIDE, D2Net, Detections, extract, map_size
 from mfvpr.networks.imagenet import Preprocessing
 from mfvpr.types import Features
@@ -88,7 +88,7 @@ class D2NetFeatures:
     def _program(self) -> Callable[[float], Callable[..., Any]]:
         """The compiled network for a share of positions that have a keypoint slot."""
         function = partial(extract, preprocessing=self.preprocessing, scales=self._network_scales)
-        return cache(lambda share: compiled(self.model, partial(function, share=share)))
+        return cache(lambda share: compile_network(self.model, partial(function, share=share)))
 
     def _features(self, levels: tuple[Detections, ...]) -> Features:
         keypoints, descriptors, scores = (

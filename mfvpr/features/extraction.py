@@ -12,18 +12,18 @@ from mfvpr.features.extractor import Description, Extractor
 from mfvpr.features.feature_set import check_features, without_padding
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import available_cpus
-from mfvpr.utils.progress import Track, untracked
+from mfvpr.utils.progress import Track, no_progress
 from mfvpr.utils.threads import ordered_map
 
 
-def described(
+def describe_folder(
     folder: ImageFolder,
     extractor: Extractor,
     rows: Sequence[int],
     bad: dict[int, str],
     *,
     skip_bad: bool = False,
-    track: Track = untracked,
+    track: Track = no_progress,
 ) -> Iterator[dict[int, Description]]:
     """Extract descriptions of the images in `rows`, by row, batch by batch.
 
@@ -43,7 +43,7 @@ def described(
     while batch := list(itertools.islice(images, extractor.batch_size)):
         batch_rows, arrays = zip(*batch, strict=True)
         descriptions = {}
-        for row, description in zip(batch_rows, described_images(np.stack(arrays), extractor), strict=True):
+        for row, description in zip(batch_rows, describe_images(np.stack(arrays), extractor), strict=True):
             if description is None:
                 bad[row] = f"{folder.paths[row]}: features are not finite (NaN or infinite); the image ranks last"
             else:
@@ -51,7 +51,7 @@ def described(
         yield descriptions
 
 
-def described_images(images: np.ndarray, extractor: Extractor) -> list[Description | None]:
+def describe_images(images: np.ndarray, extractor: Extractor) -> list[Description | None]:
     """Extract descriptions of images `[B, H, W, 3]` of the extractor's size; None if a description is not finite.
 
     Raises:

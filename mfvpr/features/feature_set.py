@@ -230,7 +230,7 @@ class Slots:
             images = [image for _, image in itertools.islice(features, len(new))]
             slots = np.full(WRITTEN, self._recent[size].number, np.int32)
             slots[: len(new)] = slot[np.searchsorted(distinct, new)]
-            writes.append((size, slots, stacked(images, size, total=WRITTEN)))
+            writes.append((size, slots, stack_features(images, size, total=WRITTEN)))
         return Staged(capacity[inverse], slot[inverse], writes)
 
     def put(self, staged: Staged) -> Mapping[int, Features]:
@@ -256,12 +256,12 @@ def write_slots(arrays: Features, slots: np.ndarray, rows: Features) -> Features
 write_slots = compiled(write_slots, donate_argnums=0)  # the arrays may be as large as the memory allows
 
 
-def stacked(images: Sequence[Features], capacity: int, *, total: int | None = None) -> Features:
-    """Pad Features `[n, ...]` of at least one image to `[R, capacity, ...]`, NumPy; see `ragged.padded`."""
+def stack_features(images: Sequence[Features], capacity: int, *, total: int | None = None) -> Features:
+    """Pad Features `[n, ...]` of at least one image to `[R, capacity, ...]`, NumPy; see `ragged.pad_rows`."""
     rows = [{name: values for name, values in per_keypoint(image).items() if name != "mask"} for image in images]
-    arrays, mask = ragged.padded(rows, capacity, total=total)
+    arrays, mask = ragged.pad_rows(rows, capacity, total=total)
     sizes = np.stack([image.image_size for image in images])
-    return Features(**arrays, mask=mask, image_size=sizes if total is None else ragged.filled(sizes, total))
+    return Features(**arrays, mask=mask, image_size=sizes if total is None else ragged.repeat_last(sizes, total))
 
 
 def without_padding(image: Features) -> Features:

@@ -10,7 +10,7 @@ import numpy as np
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description
-from mfvpr.features.network import compiled, in_batches, require_size
+from mfvpr.features.network import compile_network, in_batches, require_size
 from mfvpr.networks.lengths import of_unit_length
 from mfvpr.utils.errors import InputError
 
@@ -86,4 +86,4 @@ class GlobalDescriptor:
             descriptors = model(model.preprocess(images))
             return descriptors if self.components is None else of_unit_length(descriptors[:, : self.components])
 
-        return compiled(self.model, describe)  # pyright: ignore[reportArgumentType]  (a module, whatever else it is)
+        return compile_network(self.model, describe)  # pyright: ignore[reportArgumentType]  (a module, whatever else it is)

@@ -10,7 +10,7 @@ import numpy as np
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description
-from mfvpr.features.network import compiled, in_batches, require_size
+from mfvpr.features.network import compile_network, in_batches, require_size
 from mfvpr.networks.mixvpr import IMAGE_SIZE, MixVPR, preprocess
 
 
@@ -50,4 +50,4 @@ class MixVprDescriptor:
         def describe(model: MixVPR, images: jax.Array) -> jax.Array:
             return model(preprocess(images))
 
-        return compiled(self.model, describe)
+        return compile_network(self.model, describe)

@@ -13,7 +13,7 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import device_bytes
 
 
-def compiled(model: nnx.Module, function: Callable[..., Any]) -> Callable[..., Any]:
+def compile_network(model: nnx.Module, function: Callable[..., Any]) -> Callable[..., Any]:
     """`function(model, ...)` as one program per shape. The weights lie on the device once, and are not constants."""
     graph, state = nnx.split(model)
     program = jax.jit(lambda state, *inputs: function(nnx.merge(graph, state), *inputs))
@@ -63,6 +63,6 @@ def in_batches(program: Callable[[Any], Any], images: np.ndarray, batch_size: in
     results = []
     for start in range(0, len(images), size):
         batch = images[start : start + size]
-        outputs = jax.tree.map(np.asarray, program(ragged.filled(batch, size)))
+        outputs = jax.tree.map(np.asarray, program(ragged.repeat_last(batch, size)))
         results += [jax.tree.map(lambda field, row=row: field[row], outputs) for row in range(len(batch))]
     return results

@@ -10,7 +10,7 @@ import numpy as np
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale
-from mfvpr.features.network import compiled, in_batches, local_features, require_network, require_size
+from mfvpr.features.network import compile_network, in_batches, local_features, require_network, require_size
 from mfvpr.networks.netvlad import VggNetVlad
 from mfvpr.networks.vgg import STRIDE
 from mfvpr.types import Features
@@ -92,7 +92,7 @@ class PatchNetVladFeatures:
         def describe(model: VggNetVlad, images: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
             return model.with_patches(model.preprocess(images), self.patch_sizes)
 
-        return compiled(self.model, describe)
+        return compile_network(self.model, describe)
 
     def _features(self, size: int, descriptors: np.ndarray) -> Features:
         columns, rows = (side - size + 1 for side in self._map_size)

@@ -10,7 +10,7 @@ import numpy as np
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale
-from mfvpr.features.network import compiled, in_batches, local_features, require_network, require_size
+from mfvpr.features.network import compile_network, in_batches, local_features, require_network, require_size
 from mfvpr.networks.selavpr import LOCAL, SelaVpr
 from mfvpr.networks.vit import PATCH, require_patches
 from mfvpr.types import Features
@@ -76,7 +76,7 @@ class SelaVprFeatures:
         def describe(model: SelaVpr, images: jax.Array) -> tuple[jax.Array, jax.Array]:
             return model(model.preprocess(images))
 
-        return compiled(self.model, describe)
+        return compile_network(self.model, describe)
 
     def _features(self, local: np.ndarray) -> Features:
         row, column = np.indices(local.shape[:2]).reshape(2, -1)

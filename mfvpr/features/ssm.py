@@ -10,7 +10,7 @@ import numpy as np
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale
-from mfvpr.features.network import compiled, in_batches, local_features
+from mfvpr.features.network import compile_network, in_batches, local_features
 from mfvpr.features.windows import WindowFitting, Windows, kernels, learned_whitening, normalize_maps, whiten_windows
 from mfvpr.networks.imagenet import Preprocessing
 from mfvpr.networks.ssm import STAGE1_STRIDE, STAGE2_STRIDE, SsmVgg
@@ -67,7 +67,7 @@ class SsmMaps:
 
     @cached_property
     def _program(self) -> Callable[..., Any]:
-        return compiled(self.model, self.compute)
+        return compile_network(self.model, self.compute)
 
 
 @dataclass(frozen=True)
@@ -194,5 +194,5 @@ def _whitening_program(extractor: SsmWindows | SsmCells) -> Callable[..., Any]:
     def describe(model: SsmVgg, images: jax.Array, kernel: jax.Array, offset: jax.Array) -> jax.Array:
         return whiten_windows(maps.compute(model, images), kernel, offset, stride=windows.stride)
 
-    program = compiled(extractor.model, describe)
+    program = compile_network(extractor.model, describe)
     return lambda images: program(images, *convolution)

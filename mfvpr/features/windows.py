@@ -153,7 +153,7 @@ def learned_whitening(extractor: WindowExtractor) -> Whitening:
     """
     name, whitening, expected = type(extractor).__name__, extractor.whitening, extractor.windows.dimension
     if not isinstance(whitening, Whitening):
-        raise InputError(f"{name}: has not seen the database; take mfvpr.retrieval.fitting.fitted(...) of it")
+        raise InputError(f"{name}: has not seen the database; take mfvpr.retrieval.fitting.fit_to_database(...) of it")
     if len(whitening.mean) != expected:
         raise InputError(f"{name}: expected a whitening of {expected} numbers, got one of {len(whitening.mean)}; learn "
                          "it from windows of these maps")  # fmt: skip

@@ -9,14 +9,14 @@ Imports types, utils.
 from mfvpr.io.descriptors import read_global_descriptors, write_global_descriptors
 from mfvpr.io.feature_files import write_features
 from mfvpr.io.features import ImportedFeatures, open_features
-from mfvpr.io.shortlists import read_shortlist, reranked, write_shortlist
+from mfvpr.io.shortlists import read_shortlist, reranked_shortlist, write_shortlist
 
 __all__ = [
     "ImportedFeatures",
     "open_features",
     "read_global_descriptors",
     "read_shortlist",
-    "reranked",
+    "reranked_shortlist",
     "write_features",
     "write_global_descriptors",
     "write_shortlist",

@@ -114,7 +114,7 @@ def write_shortlist(
     write_text(path, "\n".join(lines) + "\n")
 
 
-def reranked(shortlist: Shortlist, ranking: Ranking) -> Shortlist:
+def reranked_shortlist(shortlist: Shortlist, ranking: Ranking) -> Shortlist:
     """The shortlist in the order of a ranking, with its scores, `[Q, C]`."""
     indices, scores, mask, order = (
         np.asarray(part) for part in (shortlist.indices, ranking.scores, shortlist.mask, ranking.order)

@@ -11,13 +11,13 @@ from numpy.typing import ArrayLike
 
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.datasets.images import read_image, resize
-from mfvpr.features.extraction import described, described_images
+from mfvpr.features.extraction import describe_folder, describe_images
 from mfvpr.features.extractor import Aggregation, Description, Extractor
-from mfvpr.storage.features import as_stored
+from mfvpr.storage.features import round_as_stored
 from mfvpr.types import Features
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import recipe_of
-from mfvpr.utils.progress import Track, untracked
+from mfvpr.utils.progress import Track, no_progress
 
 Image = Path | str | ArrayLike
 Described = tuple[Features, np.ndarray]
@@ -48,7 +48,7 @@ class Describing:
         """
         pixels, name = (read_image(image), str(image)) if is_file(image) else (_pixels(image), "image")
         description = _extract(self.extractor, pixels, name)
-        features = as_stored(description.features)
+        features = round_as_stored(description.features)
         if self.describer is self.extractor:
             return features, _flat(description)
         if isinstance(describer := self.describer, Extractor):
@@ -56,7 +56,7 @@ class Describing:
         return features, describer([features])[0]
 
     def folder(
-        self, images: ImageFolder, rows: Sequence[int], track: Track = untracked
+        self, images: ImageFolder, rows: Sequence[int], track: Track = no_progress
     ) -> Iterator[dict[int, Described]]:
         """Describe some images of a folder: batches of descriptions by row.
 
@@ -64,11 +64,11 @@ class Describing:
             InputError: as `image`.
         """
         for local in _batches(images, self.extractor, rows, track):
-            features = {row: as_stored(description.features) for row, description in local.items()}
+            features = {row: round_as_stored(description.features) for row, description in local.items()}
             if self.describer is self.extractor:
                 vectors = {row: _flat(description) for row, description in local.items()}
             elif isinstance(describer := self.describer, Extractor):
-                parts = _batches(images, describer, [*features], untracked)
+                parts = _batches(images, describer, [*features], no_progress)
                 vectors = {row: _flat(description) for part in parts for row, description in part.items()}
             else:
                 vectors = dict(zip(features, describer([*features.values()]), strict=True))
@@ -94,14 +94,14 @@ def _pixels(image: Any) -> np.ndarray:
     return pixels
 
 
-def local_features(images: ImageFolder, extractor: Extractor, track: Track = untracked) -> Iterator[Features]:
+def local_features(images: ImageFolder, extractor: Extractor, track: Track = no_progress) -> Iterator[Features]:
     """Extract the local features of all images of a folder."""
     for batch in _batches(images, extractor, range(len(images)), track):
-        yield from (as_stored(description.features) for description in batch.values())
+        yield from (round_as_stored(description.features) for description in batch.values())
 
 
 def _extract(extractor: Extractor, pixels: np.ndarray, name: str) -> Description:
-    [description] = described_images(resize(pixels, extractor.image_size, extractor.interpolation)[None], extractor)
+    [description] = describe_images(resize(pixels, extractor.image_size, extractor.interpolation)[None], extractor)
     if description is None:
         raise InputError(f"{name}: features are not finite (NaN or infinite)")
     return description
@@ -111,7 +111,7 @@ def _batches(
     images: ImageFolder, extractor: Extractor, rows: Sequence[int], track: Track
 ) -> Iterator[dict[int, Description]]:
     bad: dict[int, str] = {}
-    for batch in described(images, extractor, rows, bad, track=track):
+    for batch in describe_folder(images, extractor, rows, bad, track=track):
         if bad:
             raise InputError(next(iter(bad.values())))
         yield batch

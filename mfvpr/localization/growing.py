@@ -14,14 +14,14 @@ from mfvpr.storage.maps import Entry, check_name, check_place, hold_map, settle_
 from mfvpr.types import Features
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import canonical_name
-from mfvpr.utils.progress import Track, untracked
+from mfvpr.utils.progress import Track, no_progress
 
 
 class GrowingMap(MapState):
     """A map that images are added to: the base of `mfvpr.localization.Map`."""
 
     @exclusive
-    def learn(self, images: ImageFolder, *, track: Track = untracked) -> None:
+    def learn(self, images: ImageFolder, *, track: Track = no_progress) -> None:
         """Learn the vocabulary from some images, unless the map has one.
 
         Raises:
@@ -32,7 +32,7 @@ class GrowingMap(MapState):
                 pass
 
     @exclusive
-    def build(self, images: ImageFolder, places: Sequence[Any] | None = None, *, track: Track = untracked) -> int:
+    def build(self, images: ImageFolder, places: Sequence[Any] | None = None, *, track: Track = no_progress) -> int:
         """Add the images whose names the map does not have yet; return how many were added.
 
         Args:

@@ -24,7 +24,7 @@ from mfvpr.reranking.results import Ranked
 from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.scoring.scorer import Scorer
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import clipped
+from mfvpr.utils.files import clip_middle
 
 
 class Map(GrowingMap):
@@ -147,5 +147,5 @@ def _whole_number(name: str, value: Any, least: int = 0) -> int:
             return number
     except TypeError:
         pass
-    got = clipped(" ".join(repr(value).split()), 80)
+    got = clip_middle(" ".join(repr(value).split()), 80)
     raise InputError(f"{name}: expected a whole number from {least}, got {got}. Use an `int`.")

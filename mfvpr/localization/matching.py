@@ -5,7 +5,7 @@ from functools import partial
 import jax
 import numpy as np
 
-from mfvpr.features.feature_set import stacked
+from mfvpr.features.feature_set import stack_features
 from mfvpr.matching.matcher import Matcher, match_pairs
 from mfvpr.reranking.ranking import score_candidates
 from mfvpr.scoring.scorer import Scorer
@@ -33,7 +33,7 @@ def match_and_score(
         matcher: of one pair.
         scorer: of one pair's matches.
     """
-    padded_query = stacked([query], database.mask.shape[1], total=1)
+    padded_query = stack_features([query], database.mask.shape[1], total=1)
     size = min(number, _AT_ONCE) if device_bytes(database) is None else number
     pairs = np.zeros((round_up(number, size), 2), np.int32)
     pairs[: len(slots), 1] = slots

@@ -14,7 +14,7 @@ from mfvpr.features.feature_set import (
     empty_slots,
     few_sizes,
     memory_budget,
-    stacked,
+    stack_features,
     write_slots,
 )
 from mfvpr.types import Features
@@ -74,7 +74,7 @@ class Resident:
         while batch := [*itertools.islice(read, WRITTEN)]:
             targets = np.full(WRITTEN, self._recent.number, np.int32)
             targets[: len(batch)] = [slot_of[row] for row, _ in batch]
-            images = stacked([image for _, image in batch], self.capacity, total=WRITTEN)
+            images = stack_features([image for _, image in batch], self.capacity, total=WRITTEN)
             arrays = write_slots(arrays, targets, jax.device_put(images, self._device))
         self._arrays = arrays
         return arrays, np.array(slots, np.int32)
@@ -87,7 +87,7 @@ class Resident:
             capacity = min(size for size in (self._typical, few_sizes(round_up(count, STEP))) if size >= count)
         if self._arrays is not None and capacity == self.capacity and total <= self._recent.number:
             return self._arrays
-        slot = stacked([query], capacity, total=1)
+        slot = stack_features([query], capacity, total=1)
         fitting = self._budget // sum(leaf.nbytes for leaf in jax.tree.leaves(slot))
         number = self._least
         while number < total and 2 * number <= fitting:

@@ -14,7 +14,7 @@ from mfvpr.features.extractor import Extractor
 from mfvpr.features.feature_set import FeatureSet
 from mfvpr.features.vlad import Vlad, VladFitting
 from mfvpr.localization.describing import local_features
-from mfvpr.storage.disk import told
+from mfvpr.storage.disk import disk_errors_as_input_errors
 from mfvpr.storage.features import FeatureStore, open_store
 from mfvpr.storage.maps import MAP, file_stamp, has_rows, settle_map
 from mfvpr.utils.arrays import read_arrays, write_arrays
@@ -99,7 +99,7 @@ class VocabularyFile:
                     store.write(batch)
             vocabulary = self._fitting.fit(FeatureSet(store, {}))
             settle_map(self._folder, settings)
-            with told(self._folder, MAP.content):
+            with disk_errors_as_input_errors(self._folder, MAP.content):
                 arrays = {"centers": vocabulary.centers, "power": np.array(vocabulary.power)}
                 write_arrays(self._path, arrays, self._key)
             yield store

@@ -70,12 +70,12 @@ class Sides:
             sides = arrays0[int(shape[0])], arrays1[int(shape[1])]
             for start in range(0, len(members), PAIRS):
                 positions = members[start : start + PAIRS]
-                pairs = ragged.filled(slots[positions], PAIRS)
+                pairs = ragged.repeat_last(slots[positions], PAIRS)
                 calls.append((positions, match_pairs(*sides, pairs, np.int32(len(positions)), matcher)))
         return calls
 
 
-def matched(
+def match_queries(
     queries: FeatureSet,
     database: FeatureSet,
     candidates: Shortlist,
@@ -156,7 +156,7 @@ def _collect(part: Part, positions: np.ndarray, matches: Matches) -> Iterator[tu
 def _join_candidates(pairs: Sequence[Pair | None], no_matches: Row) -> Matches:
     """Matches of all candidates, one after the other; images without a pair have 1 x 1 px."""
     matched_pairs = [pair for pair in pairs if pair is not None]
-    rows = ragged.joined([pair.matches for pair in matched_pairs] or [no_matches])
+    rows = ragged.join_rows([pair.matches for pair in matched_pairs] or [no_matches])
     unknown = np.ones(2, np.float32)
     return Matches(
         **rows,

@@ -87,13 +87,13 @@ class MatchSet:
         by_query = {query: self.matches[query] for query in np.unique(queries).tolist()}
         pairs = list(zip(queries.tolist(), places.tolist(), strict=True))
         rows = [self._row(by_query[query], query, place) for query, place in pairs]
-        entries, mask = ragged.padded(rows, capacity, total=total)
+        entries, mask = ragged.pad_rows(rows, capacity, total=total)
         pair_fields = {
             name: np.stack([_pair_value(by_query[query], name, place) for query, place in pairs])
             for name in per_pair(by_query[pairs[0][0]])
         }
         if total is not None:
-            pair_fields = {name: ragged.filled(values, total) for name, values in pair_fields.items()}
+            pair_fields = {name: ragged.repeat_last(values, total) for name, values in pair_fields.items()}
         return Matches(**entries, mask=mask, **pair_fields)
 
     @cached_property

@@ -1,9 +1,9 @@
 __all__ = [
     "Table",
-    "claimed",
+    "claim_run_folder",
     "write_json",
     "write_table",
 ]
 
-from .runs import claimed, write_json, write_table
+from .runs import claim_run_folder, write_json, write_table
 from .tables import Table

@@ -12,7 +12,7 @@ from mfvpr.localization.map import Map
 from mfvpr.report.figures import Answer, histogram_figure, pixel_aspect_of
 from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import below, clipped
+from mfvpr.utils.files import below, clip_middle
 
 _GRAY = 150  # of an image that is not at hand
 _NAME_LENGTH = 80  # characters of a name or a place
@@ -35,17 +35,17 @@ def answer_figure(
         InputError: the candidate's name leads out of the folder.
     """
     answer, extractor = asked.answer, known.extractor
-    place = f"no place ({answer.reason})" if answer.place is None else clipped(str(answer.place), _NAME_LENGTH)
+    place = f"no place ({answer.reason})" if answer.place is None else clip_middle(str(answer.place), _NAME_LENGTH)
     candidate = Answer(_gray(extractor), "no candidate")
     if asked.matches is not None:
         best = answer.alternatives[0].name
         shown, note = _candidate(extractor, best, root)
         histogram = known.scorer if isinstance(known.scorer, HistogramOfShifts) else HistogramOfShifts()
         p = "" if answer.p_right is None else f", p(right) {answer.p_right:.2f}"
-        caption = f"{clipped(best, _NAME_LENGTH)}{note}, score {answer.score:.5g}{p}"
+        caption = f"{clip_middle(best, _NAME_LENGTH)}{note}, score {answer.score:.5g}{p}"
         candidate = Answer(shown, caption, asked.matches, explain(histogram, asked.matches))
     query = resize(image, extractor.image_size, extractor.interpolation)
-    title = f"{clipped(name, _NAME_LENGTH)} -> {place}"
+    title = f"{clip_middle(name, _NAME_LENGTH)} -> {place}"
     about = {"image": name, "place": str(answer.place)}
     histogram_figure(path, query, [candidate], title=title, pixel_aspect=pixel_aspect_of(image, query), about=about)
 

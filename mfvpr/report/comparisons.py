@@ -14,7 +14,7 @@ from mfvpr.evaluation.protocol import Judge
 from mfvpr.evaluation.statistics import SignFlips, block_sign_flips, estimate, mcnemar, recall_interval
 from mfvpr.report.plots import curves_figure, weights_figure
 from mfvpr.report.runs import Figure
-from mfvpr.report.tables import Table, written
+from mfvpr.report.tables import Table, format_value
 from mfvpr.scoring.learned_weight import LearnedWeight
 from mfvpr.scoring.weight_files import write_weight
 from mfvpr.tuning.learning.comparison import Comparison, Row
@@ -119,7 +119,7 @@ def _remarks(comparison: Comparison) -> Iterator[str]:
     for name, _, halves in comparison.rows():
         for row in halves:
             if row.values:
-                values = ", ".join(f"{key} = {written(value)}" for key, value in row.values.items())
+                values = ", ".join(f"{key} = {format_value(value)}" for key, value in row.values.items())
                 steps = f"; best after {row.fitted.step} steps, {row.fitted.ended}" if row.fitted else ""
                 yield f"{name}, {row.half}: {values}{steps}"
 

@@ -11,7 +11,7 @@ from mfvpr.datasets.datasets import Dataset, QuerySequence
 from mfvpr.report.figures import with_longest_side
 from mfvpr.report.plots import panels, save_figure
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import clipped, printable
+from mfvpr.utils.files import clip_middle, printable
 
 SIDE = 320  # px of an image's longer side on the sheet
 _PAIRS_IN_A_ROW = 2
@@ -77,4 +77,4 @@ def _image(sequence: QuerySequence, row: int) -> tuple[np.ndarray | None, str]:
 def _draw(axes: Axes, image: np.ndarray | None, caption: str) -> None:
     if image is not None:
         axes.imshow(image)
-    axes.set_title(printable(clipped(caption, _CAPTION_LENGTH)), fontsize=7, parse_math=False)
+    axes.set_title(printable(clip_middle(caption, _CAPTION_LENGTH)), fontsize=7, parse_math=False)

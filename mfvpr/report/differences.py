@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mfvpr.datasets.positives import stacked
+from mfvpr.datasets.positives import stack_positives
 from mfvpr.evaluation.paths import places_along_path
 from mfvpr.evaluation.statistics import McNemar, SignFlips, block_sign_flips, mcnemar
 from mfvpr.report.evaluations import Judged
@@ -44,7 +44,7 @@ def _places(judged: Judged) -> np.ndarray | None:
     truth, right = judged.sequences[0].truth, [positives for positives in judged.right if positives is not None]
     if truth is None or (len(judged.sequences) == 1 and truth.unit != "m"):
         return None
-    return places_along_path(stacked(right), truth.unit)
+    return places_along_path(stack_positives(right), truth.unit)
 
 
 def differences_table(judged: Judged) -> Table:

@@ -22,7 +22,7 @@ from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table
 from mfvpr.reranking.results import Matched, Ranked
 from mfvpr.scoring.histogram import HistogramOfShifts
-from mfvpr.utils.files import clipped, printable, write_text
+from mfvpr.utils.files import clip_middle, printable, write_text
 
 ABOUT: tuple[str, ...] = ("system", "sequence", "outcome", "query", "answer")  # keywords in the file of a figure
 _NAME_LENGTH = 40  # characters in the title of a figure
@@ -255,7 +255,7 @@ class Page:
 
 
 def _short(name: str) -> str:
-    return clipped(printable(name), _NAME_LENGTH)
+    return clip_middle(printable(name), _NAME_LENGTH)
 
 
 def _pick_evenly(values: np.ndarray, number: int) -> list[int]:

@@ -14,7 +14,7 @@ from mfvpr.datasets.images import resize
 from mfvpr.evaluation.stages import Explanation
 from mfvpr.report.plots import panels, save_figure
 from mfvpr.types import Matches
-from mfvpr.utils.files import clipped, printable
+from mfvpr.utils.files import clip_middle, printable
 
 _AGREES, _DIFFERS = "#2fa8ff", "#ff9a1f"  # told apart by color-blind people as well
 _GAP = 12  # px between the two images
@@ -62,7 +62,7 @@ def histogram_figure(
     count = len(answers)
     figure, axes = panels(2 * count, 6, 4.8 + 0.2 / count, columns=2, width_ratios=(2, 1.15))
     figure.suptitle(
-        clipped(printable(title), _TITLE_LENGTH), fontsize=11, parse_math=False
+        clip_middle(printable(title), _TITLE_LENGTH), fontsize=11, parse_math=False
     )  # a file's name may hold a $
     top = max([1e-9, *(float(answer.explanation.score) for answer in answers if answer.explanation)])
     for pair, heat, answer in zip(axes[::2], axes[1::2], answers, strict=True):
@@ -99,7 +99,7 @@ def _draw_pair(axes: Axes, query: np.ndarray, answer: Answer, max_lines: int) ->
     words = "query | candidate"
     if answer.matches is not None and answer.explanation is not None:
         words = _draw_matches(axes, offset, answer.matches, answer.explanation, max_lines)
-    axes.set_title(f"{clipped(printable(answer.caption), _CAPTION_LENGTH)}\n{words}", fontsize=9, parse_math=False)
+    axes.set_title(f"{clip_middle(printable(answer.caption), _CAPTION_LENGTH)}\n{words}", fontsize=9, parse_math=False)
 
 
 def _draw_matches(axes: Axes, offset: int, matches: Matches, explanation: Explanation, max_lines: int) -> str:

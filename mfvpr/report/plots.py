@@ -13,7 +13,7 @@ from matplotlib.patches import Rectangle
 
 from mfvpr.evaluation.precision import PrecisionRecall, Reliability
 from mfvpr.report.colors import color_and_dash
-from mfvpr.utils.files import clipped, printable, replacing
+from mfvpr.utils.files import clip_middle, printable, replacing
 
 BINS = 12  # of the matches, by the value of an input
 _LINE_STYLES = {"solid": "solid", "dash": "dashed", "dot": "dotted", "dashdot": "dashdot"}  # by plotly's words
@@ -87,7 +87,7 @@ def _line(place: int) -> dict[str, Any]:
 
 
 def _short(name: str) -> str:
-    return clipped(printable(name), _TITLE_LENGTH)
+    return clip_middle(printable(name), _TITLE_LENGTH)
 
 
 def _label(panel: Axes, x: str, y: str) -> None:

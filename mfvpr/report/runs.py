@@ -24,12 +24,14 @@ Figure = tuple[str, Callable[[Path], None]]  # name of the file, and what draws 
 
 
 def new_run_folder(root: Path, name: str) -> Path:
-    """The path `root/name/<time>`, for `claimed`."""
+    """The path `root/name/<time>`, for `claim_run_folder`."""
     return root / name / datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
 
 
 @contextmanager
-def claimed(folder: Path, *, numbered: bool = False, own: bool = False, beside: Collection[str] = ()) -> Iterator[Path]:
+def claim_run_folder(
+    folder: Path, *, numbered: bool = False, own: bool = False, beside: Collection[str] = ()
+) -> Iterator[Path]:
     """Make and lock a new or empty folder, until the block or the process ends.
 
     An empty folder is removed at the end, with the parents that were made for it.
@@ -100,7 +102,7 @@ def _os_errors_as_input_errors(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def writing(folder: Path) -> Iterator[Path]:
-    """A temporary folder in a `claimed` one; its files move up when the block ends without an error.
+    """A temporary folder in a run folder; its files move up when the block ends without an error.
 
     `results.json` moves last: a folder that has it is complete.
     """

@@ -13,7 +13,7 @@ from mfvpr.evaluation.statistics import Estimate
 from mfvpr.report.file_names import file_names
 from mfvpr.report.plots import heat_map_figure
 from mfvpr.report.runs import Figure
-from mfvpr.report.tables import Table, written
+from mfvpr.report.tables import Table, format_value
 from mfvpr.tuning.sweeps.outcome import Outcome
 
 TOP = 10
@@ -34,7 +34,7 @@ def table(outcome: Outcome, numbers: Sequence[int] | None = None) -> Table:
     rows = outcome.rows[0][list(numbers)]
     recalls = np.column_stack([judge.recall(rows, first), *(judge.recall(rows, k)[:, judge.main] for k in deeper)])
     lines = [
-        [*(written(outcome.settings[number][name]) for name in outcome.axes.values),
+        [*(format_value(outcome.settings[number][name]) for name in outcome.axes.values),
          *(f"{100 * value:.1f}" for value in recall)]
         for number, recall in zip(numbers, recalls, strict=True)
     ]  # fmt: skip
@@ -122,18 +122,18 @@ def _with_interval(estimate: Estimate) -> str:
 
 
 def _in_words(outcome: Outcome, number: int) -> str:
-    return ", ".join(f"{name} = {written(value)}" for name, value in outcome.settings[number].items())
+    return ", ".join(f"{name} = {format_value(value)}" for name, value in outcome.settings[number].items())
 
 
 def _heat_maps(outcome: Outcome) -> Iterator[Figure]:
     axes, judge = outcome.axes, outcome.judge
-    values = {name: list(map(written, axis)) for name, axis in axes.values.items()}
+    values = {name: list(map(format_value, axis)) for name, axis in axes.values.items()}
     recall = outcome.recall[: axes.size, judge.main].reshape(*map(len, values.values()))
     names = [name for name, axis in values.items() if len(axis) > 1]
     pairs = list(itertools.combinations(names, 2)) or [(name, name) for name in names]
     flat_best = evaluation.best_setting(recall.reshape(-1), axes.values)
     best = dict(zip(values, map(int, np.unravel_index(flat_best, recall.shape)), strict=True))
-    defaults = {name: values[name].index(written(value)) if written(value) in values[name] else None
+    defaults = {name: values[name].index(format_value(value)) if format_value(value) in values[name] else None
                 for name, value in axes.own.items()}  # fmt: skip
     label = judge.label(1, judge.thresholds[judge.main])
     files = file_names([first if first == second else f"{first} + {second}" for first, second in pairs])

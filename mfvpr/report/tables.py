@@ -45,7 +45,7 @@ class Table:
         return "\n".join([*body, r"\end{tabular}", ""])
 
 
-def written(value: Any) -> str:
+def format_value(value: Any) -> str:
     """A parameter's value in a cell."""
     if value is None:
         return "none"

@@ -12,12 +12,12 @@ import numpy as np
 from mfvpr.matching.match_set import MatchSet, Scales, batches, partition, queries_that_fit, scales
 from mfvpr.reranking.grids import score_settings
 from mfvpr.reranking.ranking import BIN_STEP, fuse_scales
-from mfvpr.scoring.parameters import fit
+from mfvpr.scoring.parameters import with_capacity
 from mfvpr.scoring.scorer import Scorer, check_host, on_host, score_pairs
 from mfvpr.types import Array, Matches, Shortlist
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.numerics import Device, available_cpus, compiled, held, knows_own_context
-from mfvpr.utils.progress import Track, untracked
+from mfvpr.utils.numerics import Device, available_cpus, compiled, knows_own_context, with_static_functions
+from mfvpr.utils.progress import Track, no_progress
 from mfvpr.utils.threads import ordered_map
 
 PaddedBatch = tuple[np.ndarray, Matches]  # positions [n] of its pairs, and their Matches [P, K, ...]
@@ -25,7 +25,7 @@ PaddedBatch = tuple[np.ndarray, Matches]  # positions [n] of its pairs, and thei
 
 def score(
     scorers: Mapping[str, Scorer], match_set: MatchSet | Scales, candidates: Shortlist, *,
-    devices: Sequence[Device] | None = None, track: Track = untracked,
+    devices: Sequence[Device] | None = None, track: Track = no_progress,
 ) -> dict[str, np.ndarray]:  # fmt: skip
     """Scores `[Q, C]` float32 by name of the scorer; NaN without a candidate.
 
@@ -46,13 +46,13 @@ def score(
     num_queries, sets = len(candidates.mask), scales(match_set)
     size = queries_that_fit(match_set, len(scorers))
     parts = [range(start, min(start + size, num_queries)) for start in range(0, num_queries, size)]
-    fitted = held(fit(dict(scorers), *match_set.image_sizes, multiple=BIN_STEP))
+    fitted = with_static_functions(with_capacity(dict(scorers), *match_set.image_sizes, multiple=BIN_STEP))
     scores = {name: np.zeros((len(sets), *candidates.mask.shape), np.float32) for name in scorers}
 
     def score_parts() -> Iterator[tuple[range, np.ndarray, dict[str, np.ndarray]]]:
         for part in parts:
             part_batches = all_batches(match_set, part, settings=1)
-            for places, values in scored(_score_all, (fitted,), part_batches, devices=devices):
+            for places, values in run_batches(_score_all, (fitted,), part_batches, devices=devices):
                 yield part, places, values
 
     total = sum(len(partition(scale_set, part, settings=1)) for scale_set in sets for part in parts)
@@ -72,7 +72,7 @@ def all_batches(match_set: MatchSet | Scales, queries: range, *, settings: float
             yield scale * pairs + places, matches
 
 
-def scored(
+def run_batches(
     program: Callable[..., Any], inputs: tuple, batches: Iterable[PaddedBatch], *, devices: Sequence[Device] | None
 ) -> Iterator[tuple[np.ndarray, Any]]:
     """Run a program on every batch: (positions `[n]`, arrays `[..., n]`) in order, NumPy.

@@ -14,18 +14,18 @@ import numpy as np
 from mfvpr.matching.nearest_neighbors import filter_matches
 from mfvpr.reranking.ranking import BIN_STEP, check_candidates, matched_sizes
 from mfvpr.scoring.histogram import HistogramOfShifts
-from mfvpr.scoring.parameters import fit, numbers, whole_numbers, with_parameters
+from mfvpr.scoring.parameters import numbers, whole_numbers, with_capacity, with_parameters
 from mfvpr.scoring.scorer import check_host, on_host, require_real, score_pairs
 from mfvpr.scoring.weights import ChosenWeight, Weight, match_weights
 from mfvpr.types import Array, Matches
 from mfvpr.utils.numerics import (
     available_cpus,
     compiled,
-    held,
     holds_function,
     is_concrete,
     knows_own_context,
     platform,
+    with_static_functions,
 )
 
 WEIGHTINGS = ("weight", "max_distance")  # axes that only change how much a match counts
@@ -56,7 +56,7 @@ def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> 
     weights = _weights(scorer, axes)
     if weights:
         scorer, axes["weight"] = replace(scorer, weight=ChosenWeight(weights, 0)), np.arange(len(weights))
-    plain, scorer = holds_function(scorer), held(scorer)
+    plain, scorer = holds_function(scorer), with_static_functions(scorer)
     values = {name: _axis(scorer, name, axis) for name, axis in axes.items()}
     inner = [name for name in values if name in WEIGHTINGS]
     outer = [name for name in values if name not in WEIGHTINGS]
@@ -98,12 +98,12 @@ def by_capacity(
     """
     if not is_concrete(settings):
         first = with_parameters(scorer, {name: values[0] for name, values in settings.items()})
-        return [(fit(first, image_size0, image_size1, multiple=BIN_STEP), np.arange(num_settings))]
+        return [(with_capacity(first, image_size0, image_size1, multiple=BIN_STEP), np.arange(num_settings))]
     settings = jax.tree.map(np.asarray, settings)
     groups: dict[Any, tuple[Any, list[int]]] = {}
     for row in range(num_settings):
         varied = with_parameters(scorer, {name: values[row] for name, values in settings.items()})
-        fitted = fit(varied, image_size0, image_size1, multiple=BIN_STEP)
+        fitted = with_capacity(varied, image_size0, image_size1, multiple=BIN_STEP)
         groups.setdefault(jax.tree.structure(fitted), (fitted, []))[1].append(row)
     return [(fitted, np.array(rows)) for fitted, rows in groups.values()]
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mfvpr.scoring.parameters import fit
+from mfvpr.scoring.parameters import with_capacity
 from mfvpr.scoring.scorer import Scorer, check_host, on_host, score_pairs
 from mfvpr.types import Array, Matches, Ranking, Shortlist
 from mfvpr.utils.errors import InputError, require_word
@@ -33,7 +33,7 @@ def score_candidates(scorer: Scorer, matches: Matches) -> Array:
     check_host(scorer)
     if on_host(scorer):
         return jnp.asarray(score_pairs(scorer, matches))
-    return _score_candidates(fit(scorer, *matched_sizes(matches), multiple=BIN_STEP), matches)
+    return _score_candidates(with_capacity(scorer, *matched_sizes(matches), multiple=BIN_STEP), matches)
 
 
 @compiled
@@ -170,7 +170,7 @@ def _standardize(scores: Array, mask: Array) -> Array:
     return jnp.where(finite, (values - mean) / jnp.where(deviation > 0, deviation, 1.0), scores)
 
 
-def indexed(ties: Ties) -> bool:
+def breaks_ties_by_row(ties: Ties) -> bool:
     """Whether ties are broken by the database row.
 
     Raises:
@@ -185,7 +185,7 @@ def rank_shortlist(candidates: Shortlist, scores: np.ndarray, *, ties: Ties = "f
 
     Equal scores keep the order of the retrieval, or are ordered by database index.
     """
-    tie_break = candidates.indices if indexed(ties) else None
+    tie_break = candidates.indices if breaks_ties_by_row(ties) else None
     return np.asarray(rank(scores, candidates.mask, tie_break=tie_break))
 
 

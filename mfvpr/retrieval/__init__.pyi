@@ -8,11 +8,11 @@ __all__ = [
     "ShortlistFiles",
     "SsmVoting",
     "WhitenedSearch",
-    "fitted",
+    "fit_to_database",
     "retrieve",
 ]
 
-from .fitting import fitted
+from .fitting import fit_to_database
 from .precomputed import DescriptorFiles, FeatureFiles, ShortlistFiles
 from .retriever import Filter, Filtered, Retrieval
 from .search import ExactSearch, WhitenedSearch, retrieve

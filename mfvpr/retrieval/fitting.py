@@ -14,9 +14,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.features.extraction import described
+from mfvpr.features.extraction import describe_folder
 from mfvpr.features.windows import WindowExtractor, WindowFitting, origin
-from mfvpr.storage.disk import locked
+from mfvpr.storage.disk import lock_store
 from mfvpr.storage.feature_cache import Archive
 from mfvpr.utils.arrays import read_arrays, write_arrays
 from mfvpr.utils.fingerprints import fingerprint
@@ -28,7 +28,7 @@ _MB = 1e6
 Tool = TypeVar("Tool")
 
 
-def fitted(tool: Tool, database: ImageFolder, archive: Archive) -> Tool:
+def fit_to_database(tool: Tool, database: ImageFolder, archive: Archive) -> Tool:
     """Learn the parts of an extractor, a retrieval, or a dataclass of these that need a database.
 
     If the archive has a root, a learned part is stored there as one `.npz` file, named by a hash of the images' content
@@ -52,7 +52,7 @@ def fitted(tool: Tool, database: ImageFolder, archive: Archive) -> Tool:
     if not is_dataclass(tool) or isinstance(tool, type):
         return tool
     parts = {part.name: getattr(tool, part.name) for part in fields(tool) if part.init}
-    fitted_parts = {name: fitted(part, database, archive) for name, part in parts.items()}
+    fitted_parts = {name: fit_to_database(part, database, archive) for name, part in parts.items()}
     changed = {name: part for name, part in fitted_parts.items() if part is not parts[name]}
     return replace(tool, **changed) if changed else tool
 
@@ -75,7 +75,7 @@ def _whitening(
     about, name = fingerprint(recipe), type(extractor).__name__
     path = archive.root / f"{name}-whitening-{about}.npz"
     archive.root.mkdir(parents=True, exist_ok=True)
-    with locked(archive.root, "whitening", archive.tell) if not path.exists() else nullcontext():
+    with lock_store(archive.root, "whitening", archive.tell) if not path.exists() else nullcontext():
         if not path.exists():  # never replaced, because bits may differ between machines
             learned = _learn(extractor, fitting, database, archive)
             arrays = {"mean": learned.mean, "components": learned.components, "recipe": np.array(json.dumps(recipe))}
@@ -92,7 +92,7 @@ def _learn(extractor: WindowExtractor, fitting: WindowFitting, database: ImageFo
 
     def maps() -> Iterator[dict[int, np.ndarray]]:
         track = archive.track(f"{type(extractor).__name__} whitening")
-        for batch in described(database, extractor.maps, rows, bad, skip_bad=archive.skip_bad, track=track):
+        for batch in describe_folder(database, extractor.maps, rows, bad, skip_bad=archive.skip_bad, track=track):
             yield {
                 row: description.vector.reshape(extractor.windows.shape)
                 for row, description in batch.items() if description.vector is not None

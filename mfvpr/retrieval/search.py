@@ -13,7 +13,7 @@ from mfvpr.datasets.positives import Positives
 from mfvpr.types import Array, Shortlist
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import at_least_single, compiled, device_of, free_bytes, masked
-from mfvpr.utils.ragged import filled
+from mfvpr.utils.ragged import repeat_last
 from mfvpr.utils.whitening import Whitening, fit_whitening
 
 SHARE = 1 / 16  # of the free memory, for the similarities that exist at the same time
@@ -77,8 +77,8 @@ class ExactSearch:
         chunk_size = self._chunk_size(len(queries), min(len(database), ROWS))
         shortlists = []
         for part in _parts(len(queries), chunk_size):
-            allowed = None if excluded is None else filled(~excluded.dense(part), chunk_size)
-            shortlist = _shortlist(filled(queries[part], chunk_size), database, num_candidates, allowed)
+            allowed = None if excluded is None else repeat_last(~excluded.dense(part), chunk_size)
+            shortlist = _shortlist(repeat_last(queries[part], chunk_size), database, num_candidates, allowed)
             shortlists.append(jax.tree.map(lambda field: field[: part.stop - part.start], shortlist))  # noqa: B023
         return jax.tree.map(lambda *fields: np.concatenate(fields), *shortlists)
 

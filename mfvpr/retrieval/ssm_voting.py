@@ -7,7 +7,7 @@ import numpy as np
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence
 from mfvpr.datasets.positives import Positives
 from mfvpr.features.ssm import SsmWindows
-from mfvpr.retrieval.fitting import fitted
+from mfvpr.retrieval.fitting import fit_to_database
 from mfvpr.retrieval.retriever import Filtered
 from mfvpr.retrieval.search import EXACT, ExactSearch
 from mfvpr.storage.feature_cache import Archive
@@ -35,16 +35,16 @@ class SsmVoting:
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, archive: Archive
     ) -> Filtered:
         """See `mfvpr.retrieval.retriever.Filter`; scores are votes."""
-        describer = fitted(self.describer, database, archive)
+        describer = fit_to_database(self.describer, database, archive)
         database_vectors = archive.vectors(database, describer, database, label="database")
         query_vectors = archive.vectors(sequence.images, describer, database, label=f"query {sequence.name}")
         shape = (-1, describer.windows.count, describer.whitening.dimension)
         queries, windows = query_vectors.values.reshape(shape), database_vectors.values.reshape(shape)
-        candidates = voted(queries, windows, num_candidates, excluded=sequence.excluded, search=self.search)
+        candidates = vote(queries, windows, num_candidates, excluded=sequence.excluded, search=self.search)
         return Filtered(candidates, query_vectors.bad, database_vectors.bad)
 
 
-def voted(
+def vote(
     queries: np.ndarray,
     database: np.ndarray,
     num_candidates: int,

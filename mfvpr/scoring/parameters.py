@@ -49,7 +49,7 @@ def with_parameters(scorer: Any, values: Mapping[str, Any]) -> Any:
     return reduce(lambda varied, parameter: _replace(varied, *parameter), values.items(), scorer)
 
 
-def fit(scorer: Any, image_size0: Array, image_size1: Array, *, multiple: int = 1) -> Any:
+def with_capacity(scorer: Any, image_size0: Array, image_size1: Array, *, multiple: int = 1) -> Any:
     """The scorer with the capacities that pairs of these image sizes need.
 
     Call it before `vmap` or `jit` hide the sizes. Capacities are set by the method `fit_capacity(image_size0,

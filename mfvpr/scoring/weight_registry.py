@@ -30,7 +30,7 @@ def _learned_files() -> dict[str, Path]:
     return {path.stem: path for path in sorted(_LEARNED.glob(f"*{SUFFIX}"))}
 
 
-def how_made(name: str) -> dict[str, Any]:
+def provenance(name: str) -> dict[str, Any]:
     """Provenance of a learned weight, as `write_weight` stored it; empty for a fixed weight."""
     return {} if name in WEIGHTS else _read_by_name(name)[1]
 

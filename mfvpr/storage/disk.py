@@ -12,7 +12,7 @@ from mfvpr.utils.locks import lock
 
 
 @contextmanager
-def locked(folder: Path, content: str, waiting: Callable[[str], None] | None = None) -> Iterator[None]:
+def lock_store(folder: Path, content: str, waiting: Callable[[str], None] | None = None) -> Iterator[None]:
     """Hold the lock of a store, see `mfvpr.utils.locks`.
 
     Args:
@@ -28,7 +28,7 @@ def locked(folder: Path, content: str, waiting: Callable[[str], None] | None = N
         waiting(f"{folder}: in use by process {holder}; waiting until it is free")
 
     with ExitStack() as stack:
-        with told(folder, content):
+        with disk_errors_as_input_errors(folder, content):
             handle = stack.enter_context(lock(folder / "lock", os.O_RDWR | os.O_CREAT, on_conflict))
         with suppress(OSError):  # a full disk; the lock holds without the number of its process
             os.ftruncate(handle, 0)
@@ -39,7 +39,9 @@ def locked(folder: Path, content: str, waiting: Callable[[str], None] | None = N
 
 
 @contextmanager
-def told(folder: Path, content: str, needed: Callable[[], int] = lambda: 10**6) -> Iterator[None]:
+def disk_errors_as_input_errors(
+    folder: Path, content: str, needed: Callable[[], int] = lambda: 10**6
+) -> Iterator[None]:
     """Raise errors of the file system as an InputError of one line.
 
     Args:

@@ -18,7 +18,7 @@ import numpy as np
 
 from mfvpr.datasets.contents import Contents, contents, files_of, state_of
 from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.features.extraction import described
+from mfvpr.features.extraction import describe_folder
 from mfvpr.features.extractor import Aggregated, Aggregation, Extractor, Source
 from mfvpr.features.feature_set import FeatureSet, FeatureSource, InMemory
 from mfvpr.storage import matches as match_stores
@@ -28,7 +28,7 @@ from mfvpr.storage.rows import require_space
 from mfvpr.storage.shards import Shard
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import fingerprint, recipe_of
-from mfvpr.utils.progress import Stopwatch, Track, untracked
+from mfvpr.utils.progress import Stopwatch, Track, no_progress
 from mfvpr.utils.versions import versions
 
 DECODERS = ("mfvpr", "opencv-python-headless", "pillow")  # whose versions decide what an image becomes
@@ -69,7 +69,7 @@ class Archive:
 
     root: Path | None = None
     skip_bad: bool = False
-    track: Callable[[str], Track] = lambda label: untracked
+    track: Callable[[str], Track] = lambda label: no_progress
     tell: Callable[[str], None] = lambda line: None
     wait: bool = False
     shard: Shard | None = None
@@ -238,7 +238,9 @@ class Archive:
             state.read_bad()
             missing = state.missing(rows if self.shard is None else self.shard.rows(folder.names, rows))
             self._announce(extractor, state, missing, len(rows), len(folder), label)
-            batches = described(folder, extractor, missing, state.bad, skip_bad=self.skip_bad, track=self.track(label))
+            batches = describe_folder(
+                folder, extractor, missing, state.bad, skip_bad=self.skip_bad, track=self.track(label)
+            )
             for batch in batches:
                 for sink in state.sinks:
                     sink.keep({row: sink.pick(description) for row, description in batch.items()})

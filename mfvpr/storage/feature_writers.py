@@ -8,7 +8,7 @@ from typing import Any
 
 from mfvpr.features.extractor import Extractor, Scale
 from mfvpr.storage import features, vectors
-from mfvpr.storage.disk import told
+from mfvpr.storage.disk import disk_errors_as_input_errors
 from mfvpr.storage.manifest import VECTORS, store_path
 from mfvpr.storage.row_files import SHARDS
 from mfvpr.storage.rows import RowStore
@@ -84,7 +84,7 @@ class ExtractionState:
         store = self.sinks[0].store
         if store is None or store.shard is None:
             return
-        with told(store.folder, store.kind.content):
+        with disk_errors_as_input_errors(store.folder, store.kind.content):
             for path in sorted((store.folder / SHARDS).glob(f"*-of-*/{_BAD}")):
                 try:
                     self.bad |= {int(row): str(reason) for row, reason in json.loads(path.read_text("utf-8")).items()}
@@ -96,7 +96,7 @@ class ExtractionState:
         """Leave the bad images for other shards."""
         store = self.sinks[0].store
         if store is not None and store.shard is not None and self.bad:
-            with told(store.folder, store.kind.content):
+            with disk_errors_as_input_errors(store.folder, store.kind.content):
                 write_text(store.own / _BAD, json.dumps({str(row): why for row, why in sorted(self.bad.items())}))
 
 

@@ -50,7 +50,7 @@ def forecast_bytes(num_images: int, features_per_image: float, dimension: int) -
     return num_images * row_bytes(features_per_image * (2 * dimension + 16) + 8, _NUM_ARRAYS)
 
 
-def as_stored(features: Features) -> Features:
+def round_as_stored(features: Features) -> Features:
     """Features `[N, ...]` as they come back from a store: without padding, descriptors to 5e-4."""
     return _unpack(pack_features(features))
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import replacing
-from mfvpr.utils.fingerprints import difference, fingerprint, shortened
+from mfvpr.utils.fingerprints import difference, fingerprint, short_json
 
 MANIFEST = "manifest.json"
 _OLD_MANIFEST = "zarr.json"  # of format 1
@@ -87,7 +87,7 @@ def check_owned(folder: Path, kind: Kind) -> None:
         if foreign and not (folder / MANIFEST).exists():  # it may have appeared since
             raise InputError(
                 f"{folder}: expected a folder of {kind.content}, got one without {MANIFEST} that holds "
-                f"{shortened(foreign[0])}; choose another path"
+                f"{short_json(foreign[0])}; choose another path"
             )
 
 

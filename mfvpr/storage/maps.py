@@ -30,13 +30,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mfvpr.storage.disk import locked, told
+from mfvpr.storage.disk import disk_errors_as_input_errors, lock_store
 from mfvpr.storage.features import FeatureStore, open_store
 from mfvpr.storage.manifest import FEATURES, MANIFEST, Kind, is_settled, manifest_of, settle_manifest
 from mfvpr.storage.rows import RowStore, open_rows
 from mfvpr.types import Features
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import clipped
+from mfvpr.utils.files import clip_middle
 
 SEGMENT = 4096  # rows
 DEEPEST = 50  # levels of a place: Python's JSON reads fewer levels, the more functions are called already
@@ -61,7 +61,7 @@ class Entry(NamedTuple):
 def check_name(name: Any) -> None:
     """Refuse a name that is no text: JSON would return something else, or fail."""
     if not isinstance(name, str):
-        raise InputError(f"name: expected text, got {clipped(repr(name), 80)}. Use `str(name)`.")
+        raise InputError(f"name: expected text, got {clip_middle(repr(name), 80)}. Use `str(name)`.")
 
 
 def check_place(name: str, place: Any) -> None:
@@ -69,7 +69,7 @@ def check_place(name: str, place: Any) -> None:
     try:
         text = json.dumps(place, allow_nan=False)
         if place is None or json.loads(text) != place:
-            raise ValueError(f"{clipped(repr(place), 80)}, which JSON gives back as {clipped(text, 80)}")
+            raise ValueError(f"{clip_middle(repr(place), 80)}, which JSON gives back as {clip_middle(text, 80)}")
         if _levels(place) > DEEPEST:
             raise RecursionError
     except RecursionError:
@@ -94,9 +94,9 @@ def hold_map(folder: Path) -> Iterator[None]:
     Raises:
         InputError: another process has the lock, or the folder cannot be written.
     """
-    with told(folder, MAP.content):
+    with disk_errors_as_input_errors(folder, MAP.content):
         folder.mkdir(parents=True, exist_ok=True)
-    with locked(folder, MAP.content):
+    with lock_store(folder, MAP.content):
         yield
 
 
@@ -109,7 +109,7 @@ def settle_map(folder: Path, settings: Mapping[str, Any]) -> None:
     if _is_old(folder):
         raise InputError(f"{folder}: expected {MAP.format!r}, got {_MAP_1.format!r}, which can only be read. Build the "
                          "map anew in another folder.")  # fmt: skip
-    with told(folder, MAP.content):
+    with disk_errors_as_input_errors(folder, MAP.content):
         settle_manifest(folder, MAP, manifest_of(MAP, settings, {}))
 
 
@@ -119,7 +119,7 @@ def is_map_settled(folder: Path, settings: Mapping[str, Any]) -> bool:
     Raises:
         InputError: the map has other settings.
     """
-    with told(folder, MAP.content):
+    with disk_errors_as_input_errors(folder, MAP.content):
         return is_settled(folder, MAP, manifest_of(MAP, settings, {}))
 
 
@@ -182,7 +182,7 @@ class _Segment:
         try:
             features = self.features.pack({row: features for row, (features, _) in zip(rows, items, strict=True)})
             entries = self.entries.pack({row: entry for row, (_, entry) in zip(rows, items, strict=True)})
-            with told(self.folder, MAP.content), (self.folder / _TOKENS).open("r+b") as file:
+            with disk_errors_as_input_errors(self.folder, MAP.content), (self.folder / _TOKENS).open("r+b") as file:
                 file.truncate(rows.stop * _TOKEN.itemsize - 1)
                 os.fsync(file.fileno())  # a row must not be on disk before
                 self.features.write_packed(features)
@@ -322,7 +322,7 @@ class MapRows:
             if not segment.is_held and not segment.taken[-1]:
                 for store in (segment.features, segment.entries):
                     self._stack.enter_context(store)
-                with told(segment.folder, MAP.content):
+                with disk_errors_as_input_errors(segment.folder, MAP.content):
                     (segment.folder / _TOKENS).touch()
                 segment.is_held = True
             if not segment.taken[-1]:
@@ -367,7 +367,7 @@ class MapRows:
 
 def file_stamp(path: Path) -> tuple[int, ...] | None:
     """Size in bytes, inode and time of a file, which change when the file is replaced; None = no file."""
-    with told(path.parent, MAP.content):
+    with disk_errors_as_input_errors(path.parent, MAP.content):
         try:
             status = path.stat()
         except FileNotFoundError:
@@ -378,7 +378,7 @@ def file_stamp(path: Path) -> tuple[int, ...] | None:
 def _read_tokens(path: Path) -> tuple[np.ndarray, tuple[int, ...] | None]:
     """`[SEGMENT]` tokens, 0 beyond the end of the file, and the `file_stamp` of the file."""
     tokens, stamp = np.zeros(SEGMENT, _TOKEN), file_stamp(path)  # the stamp first: later changes are noticed
-    with told(path.parent, MAP.content):
+    with disk_errors_as_input_errors(path.parent, MAP.content):
         content = path.read_bytes() if stamp else b""
     stored = np.frombuffer(content, _TOKEN, len(content) // _TOKEN.itemsize)
     tokens[: len(stored)] = stored

@@ -15,7 +15,7 @@ from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 
-from mfvpr.storage.disk import free_bytes, locked, told, too_full, used_bytes
+from mfvpr.storage.disk import disk_errors_as_input_errors, free_bytes, lock_store, too_full, used_bytes
 from mfvpr.storage.manifest import Kind, check_owned, is_settled, leave_manifest, manifest_of, settle_manifest
 from mfvpr.storage.row_files import SHARDS, RowFiles, list_rows
 from mfvpr.storage.shards import Shard
@@ -68,14 +68,14 @@ class RowStore(Generic[Item]):
         Raises:
             InputError: in use by another process, or the folder cannot be written.
         """
-        with ExitStack() as stack, told(self.folder, self.kind.content):
+        with ExitStack() as stack, disk_errors_as_input_errors(self.folder, self.kind.content):
             if not self._blocks:
                 self.look()
             if not self._is_writable and not self.done.all():
                 if self.shard is not None:
                     leave_manifest(self.folder, self.kind, self._manifest)
                 self.own.mkdir(parents=True, exist_ok=True)
-                stack.enter_context(locked(self.own, self.kind.content, self._waiting))
+                stack.enter_context(lock_store(self.own, self.kind.content, self._waiting))
                 settle_manifest(self.own, self.kind, self._manifest)
                 self.look()
                 stack.callback(setattr, self, "_is_writable", False)
@@ -102,7 +102,7 @@ class RowStore(Generic[Item]):
         Raises:
             InputError: made from something else.
         """
-        with told(self.folder, self.kind.content):
+        with disk_errors_as_input_errors(self.folder, self.kind.content):
             num_rows, is_known = next(iter(self.sizes.values())), is_settled(self.folder, self.kind, self._manifest)
             self._files = list_rows(self.folder, num_rows, write_folder=self.own, is_known=is_known)
 
@@ -144,7 +144,7 @@ class RowStore(Generic[Item]):
         """Store the result of `pack`, as `write` does."""
         sizes = {row: row_bytes(sum(part.nbytes for part in parts.values()), len(parts)) for row, parts in rows.items()}
         missing = partial(self._missing_bytes, sizes)
-        with told(self.folder, self.kind.content, missing):
+        with disk_errors_as_input_errors(self.folder, self.kind.content, missing):
             for _ in ordered_map(self._write_row, rows.items(), workers=THREADS):
                 pass
 
@@ -196,7 +196,7 @@ class RowStore(Generic[Item]):
     def _read_parts(self, row: int) -> Parts | None:
         """Arrays by name; None if the file is damaged, or of another row, or gone."""
         path = self._files.path(row)
-        with told(self.folder, self.kind.content):
+        with disk_errors_as_input_errors(self.folder, self.kind.content):
             try:
                 return read_arrays(path, self._about(row, path))
             except (InputError, FileNotFoundError):
@@ -265,7 +265,7 @@ def open_rows(
     """
     folder = folder.absolute()  # the working directory may change
     store = RowStore(folder, kind, sizes, shard, manifest_of(kind, recipe, sizes), waiting, pack, unpack, tokens)
-    with told(folder, kind.content):
+    with disk_errors_as_input_errors(folder, kind.content):
         check_owned(folder, kind)
     store.look()
     return store

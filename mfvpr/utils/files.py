@@ -70,7 +70,7 @@ def printable(text: str) -> str:
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
-def clipped(text: str, most: int) -> str:
+def clip_middle(text: str, most: int) -> str:
     """`text` of at most `most` characters, without its middle."""
     half = (most - 1) // 2
     return text if len(text) <= most else f"{text[:half]}\N{HORIZONTAL ELLIPSIS}{text[-half:]}"
@@ -107,4 +107,6 @@ def below(root: Path, name: str) -> Path:
             return path
     except (OSError, RuntimeError, ValueError):  # links in a circle, a character that no name has
         pass
-    raise InputError(f"{clipped(name, 200)!r}: expected the name of a file below {root}, got one that leads elsewhere")
+    raise InputError(
+        f"{clip_middle(name, 200)!r}: expected the name of a file below {root}, got one that leads elsewhere"
+    )

@@ -106,12 +106,12 @@ def difference(value: Any, expected: Any, name: str = "") -> str | None:
     elif type(value) is type(expected) and value == expected:
         return None
     else:
-        return f"{name}={shortened(value)}, expected {shortened(expected)}"
+        return f"{name}={short_json(value)}, expected {short_json(expected)}"
     differences = (difference(part, expected_part, part_name) for part_name, part, expected_part in parts)
     return next(filter(None, differences), None)
 
 
-def shortened(value: Any) -> str:
+def short_json(value: Any) -> str:
     """A JSON value for a message of one line."""
     text = "nothing" if value is _ABSENT else json.dumps(value)
     return text if len(text) <= 80 else f"{text[:77]}..."

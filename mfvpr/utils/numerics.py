@@ -129,7 +129,7 @@ def compiled(function: Function, **options: Any) -> Function:
 
     With a plain function among the arguments, such as a user's scorer, it runs op by op: a cached program would keep
     the values of the function's closure from the first call (as it does for a function in a static field). For many
-    calls in a row, `held` allows compilation.
+    calls in a row, `with_static_functions` allows compilation.
     """
     programs: dict[tuple[type, ...], Any] = {}
 
@@ -161,7 +161,7 @@ def holds_function(tree: Any) -> bool:
     return any(map(callable, jax.tree.leaves(tree)))
 
 
-def held(tree: Tree) -> Tree:
+def with_static_functions(tree: Tree) -> Tree:
     """`tree` with plain functions as static parts, new ones at each call: `compiled` reuses its programs for them."""
     return jax.tree.map(lambda leaf: Partial(partial(leaf)) if callable(leaf) else leaf, tree)
 

@@ -10,7 +10,7 @@ Item = TypeVar("Item")
 Track = Callable[[Iterable[Any], int], Iterable[Any]]  # (items, their number) -> the same items
 
 
-def untracked(items: Iterable[Item], total: int) -> Iterable[Item]:
+def no_progress(items: Iterable[Item], total: int) -> Iterable[Item]:
     """No progress bar."""
     return items
 

@@ -15,7 +15,9 @@ Row = Mapping[str, np.ndarray]  # [n, ...] by name
 Tree = TypeVar("Tree")
 
 
-def padded(rows: Sequence[Row], capacity: int, *, total: int | None = None) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def pad_rows(
+    rows: Sequence[Row], capacity: int, *, total: int | None = None
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Rows `[n_i, ...]` as arrays `[R, capacity, ...]` by name, 0 beyond their ends, and the mask `[R, capacity]`.
 
     Args:
@@ -45,7 +47,7 @@ def split(flat: Row, counts: np.ndarray) -> list[dict[str, np.ndarray]]:
     ]
 
 
-def joined(rows: Sequence[Row]) -> dict[str, np.ndarray]:
+def join_rows(rows: Sequence[Row]) -> dict[str, np.ndarray]:
     """Rows one after the other, at least one."""
     return {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
 
@@ -78,7 +80,7 @@ def fitting(capacities: np.ndarray, counts: np.ndarray) -> np.ndarray:
     return capacities[np.searchsorted(capacities, counts)]
 
 
-def filled(values: np.ndarray, total: int) -> np.ndarray:
+def repeat_last(values: np.ndarray, total: int) -> np.ndarray:
     """`values` `[n, ...]`, n > 0, with its last entry repeated up to `total` entries."""
     return np.concatenate([values, np.repeat(values[-1:], total - len(values), axis=0)])
 

@@ -16,7 +16,7 @@ from mfvpr.datasets import Positives, folder_dataset, sequences_dataset
 from mfvpr.evaluation import confidence_inputs, fit_confidence, halves, match_sequence, stages
 from mfvpr.evaluation.statistics import block_sign_flips
 from mfvpr.features import Aggregated, Sift, VladFitting
-from mfvpr.features.extraction import described
+from mfvpr.features.extraction import describe_folder
 from mfvpr.io import write_features, write_global_descriptors, write_shortlist
 from mfvpr.report.confidences import Assured
 from mfvpr.report.differences import differences, write_gains
@@ -28,7 +28,7 @@ from mfvpr.retrieval.precomputed import File
 from mfvpr.storage import Archive, feature_cache
 from mfvpr.utils import InputError, progress
 from mfvpr.utils.fingerprints import fingerprint
-from mfvpr.utils.progress import untracked
+from mfvpr.utils.progress import no_progress
 from tests.programs import typed
 
 pytestmark = pytest.mark.thorough
@@ -176,7 +176,7 @@ def test_matches_are_kept_and_read_without_features(dataset, result, tmp_path):
 
     def only_scores(label):
         assert label == "scores"
-        return untracked
+        return no_progress
 
     again = mfvpr.evaluate(
         replace(dataset, name="again"), SIFT, VLAD, SCORERS, candidates=5,
@@ -356,9 +356,9 @@ def test_extraction_counts_as_features_whoever_asks_for_them(dataset, monkeypatc
 
     def slow(*arguments, **options):
         clock[0] += 10
-        yield from described(*arguments, **options)
+        yield from describe_folder(*arguments, **options)
 
-    monkeypatch.setattr(feature_cache, "described", slow)
+    monkeypatch.setattr(feature_cache, "describe_folder", slow)
     seconds = mfvpr.evaluate(dataset, SIFT, VLAD, {}, candidates=2, cohort=1).seconds
     assert seconds.pop("features") >= 20
     assert {*seconds.values()} == {0}

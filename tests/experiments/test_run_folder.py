@@ -235,7 +235,7 @@ def test_the_figure_of_a_refused_answer_says_that_there_is_no_place(outcome):
 
 def test_a_folder_in_use_is_refused_at_the_start(root, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(evaluation, "evaluated", lambda *_: pytest.fail("it was begun"))
-    with runs.claimed(tmp_path / "out"):
+    with runs.claim_run_folder(tmp_path / "out"):
         code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *small(root), f"out={tmp_path}/out")
     assert (code, stdout) == (2, "")
     assert stderr.startswith(f"error: {tmp_path}/out: another run")
@@ -244,8 +244,11 @@ def test_a_folder_in_use_is_refused_at_the_start(root, tmp_path, monkeypatch, ca
 
 
 def test_whoever_is_refused_leaves_the_folder_where_it_is(tmp_path):
-    with runs.claimed(tmp_path / "out") as first:
-        with pytest.raises(InputError, match="another run is using this folder"), runs.claimed(tmp_path / "out"):
+    with runs.claim_run_folder(tmp_path / "out") as first:
+        with (
+            pytest.raises(InputError, match="another run is using this folder"),
+            runs.claim_run_folder(tmp_path / "out"),
+        ):
             pytest.fail("it was claimed twice")
         with runs.writing(first) as new:
             (new / "table.md").write_text("whole")
@@ -260,11 +263,11 @@ def test_the_claim_of_a_killed_run_is_free(tmp_path):
                                stdout=subprocess.PIPE, text=True)  # fmt: skip
     with process:
         assert process.stdout.readline() == "held\n"
-        with pytest.raises(InputError, match="another run is using"), runs.claimed(tmp_path / "out"):
+        with pytest.raises(InputError, match="another run is using"), runs.claim_run_folder(tmp_path / "out"):
             pass
         process.send_signal(signal.SIGKILL)
     assert list((tmp_path / "out").iterdir()) != []
-    with runs.claimed(tmp_path / "out") as folder:
+    with runs.claim_run_folder(tmp_path / "out") as folder:
         assert list(folder.iterdir()) == []
         with runs.writing(folder) as new:
             (new / "results.json").write_text("all")
@@ -273,7 +276,7 @@ def test_the_claim_of_a_killed_run_is_free(tmp_path):
 
 def test_a_claimed_folder_goes_with_its_parents_when_the_run_fails(tmp_path):
     def interrupted():
-        with runs.claimed(tmp_path / "a" / "b" / "out") as folder, runs.writing(folder) as new:
+        with runs.claim_run_folder(tmp_path / "a" / "b" / "out") as folder, runs.writing(folder) as new:
             (new / "half").write_text("written")
             raise KeyboardInterrupt
 
@@ -289,7 +292,7 @@ def test_run_folders_of_one_second_differ(tmp_path, monkeypatch):
 
     def claim():
         together.wait()
-        with runs.claimed(runs.new_run_folder(tmp_path, "street"), numbered=True) as folder:
+        with runs.claim_run_folder(runs.new_run_folder(tmp_path, "street"), numbered=True) as folder:
             claimed.append(folder.name)
             together.wait()
 

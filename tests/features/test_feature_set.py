@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from mfvpr import Features, InputError
 from mfvpr.features import FeatureSet, InMemory
-from mfvpr.features.feature_set import KEPT, WRITTEN, Recent, Slots, memory_budget, stacked
+from mfvpr.features.feature_set import KEPT, WRITTEN, Recent, Slots, memory_budget, stack_features
 from mfvpr.storage.features import open_store
 from tests.builders import make_features
 
@@ -53,7 +53,7 @@ def on_device(slots, rows):
 
 def assert_are(got, images, rows):
     for one, row in zip(got, rows, strict=True):
-        expected = jax.tree.map(lambda leaf: leaf[0], stacked([images[row]], len(one.mask)))
+        expected = jax.tree.map(lambda leaf: leaf[0], stack_features([images[row]], len(one.mask)))
         for part in fields(Features):
             np.testing.assert_array_equal(getattr(one, part.name), getattr(expected, part.name))
 

@@ -11,7 +11,7 @@ import pytest
 import mfvpr
 from experiments import stages
 from mfvpr.checkpoints.conversion import convert
-from mfvpr.checkpoints.networks import planned
+from mfvpr.checkpoints.networks import plan_network
 from mfvpr.checkpoints.tables import NETVLAD
 from mfvpr.datasets import folder_dataset
 from mfvpr.features import PatchNetVladFeatures
@@ -32,7 +32,7 @@ SIZE = (160, 128)
 
 def _vacant(outputs):
     """A network that is never run."""
-    plan = planned(partial(VggNetVlad, 2, outputs))
+    plan = plan_network(partial(VggNetVlad, 2, outputs))
     return plan.filled({path: np.zeros(shape, np.float32) for path, shape in plan.shapes.items()})
 
 
@@ -41,7 +41,7 @@ SCORERS = {"count": mfvpr.MatchCount(), "histogram": mfvpr.HistogramOfShifts()}
 
 @pytest.fixture(scope="module")
 def model():
-    plan = planned(partial(VggNetVlad, 4, 16))
+    plan = plan_network(partial(VggNetVlad, 4, 16))
     return plan.filled(convert(netvlad_checkpoint(4, 16), NETVLAD, plan.shapes))
 
 

@@ -19,7 +19,7 @@ from mfvpr.features.ssm import SsmMaps
 from mfvpr.features.windows import Windows, kernels, normalize_maps, whiten_windows
 from mfvpr.matching import Matching
 from mfvpr.networks import SsmVgg
-from mfvpr.retrieval import Retrieval, SsmVoting, fitted
+from mfvpr.retrieval import Retrieval, SsmVoting, fit_to_database
 from mfvpr.retrieval.fitting import whitening_recipe
 from mfvpr.scoring import GridAnchors
 from mfvpr.storage import Archive
@@ -132,15 +132,17 @@ def test_fewer_windows_than_dimensions_are_refused(cells, dataset):
     one = ImageFolder(dataset.database.root, dataset.database.names[:1])
     few = replace(cells, whitening=WindowFitting(12))
     with pytest.raises(InputError, match=r"12 descriptors .*got 12 .*4608"):
-        fitted(few, one, Archive())
-    assert np.isfinite(fitted(replace(cells, whitening=WindowFitting(11)), one, Archive()).whitening.components).all()
+        fit_to_database(few, one, Archive())
+    assert np.isfinite(
+        fit_to_database(replace(cells, whitening=WindowFitting(11)), one, Archive()).whitening.components
+    ).all()
 
 
 # Images
 
 
 def test_cells_are_whitened_windows_at_their_places(model, cells, dataset):
-    learned = fitted(cells, dataset.database, Archive())
+    learned = fit_to_database(cells, dataset.database, Archive())
     images = np.random.default_rng(0).integers(0, 256, (2, 40, 48, 3), np.uint8)
     maps = [one.vector.reshape(5, 6, 512).astype(np.float64) for one in SsmMaps(model, 2, SMALL)(images)]
     found = Windows((5, 6, 512), 3)
@@ -202,7 +204,7 @@ def test_stores_take_little_more_than_half_of_it(cells, dataset, tmp_path):
     """Directions of cells in float16, beside their lengths, places and scores."""
     archive = Archive(tmp_path)
     [found] = archive.local(
-        dataset.database, fitted(replace(cells, whitening=WindowFitting(100)), dataset.database, archive)
+        dataset.database, fit_to_database(replace(cells, whitening=WindowFitting(100)), dataset.database, archive)
     )
     [(_, one)] = found.read([0])
     parts = pack_features(one)
@@ -229,20 +231,22 @@ def test_what_is_learned_is_kept_and_made_once(cells, dataset, tmp_path):
     def archive():
         return Archive(tmp_path, track=lambda label: labels.append(label) or (lambda items, total=None: items))
 
-    first = fitted(cells, dataset.database, archive())
+    first = fit_to_database(cells, dataset.database, archive())
     assert labels == ["SsmCells whitening"]
-    again = fitted(cells, dataset.database, archive())
+    again = fit_to_database(cells, dataset.database, archive())
     assert labels == ["SsmCells whitening"]
-    assert fitted(again, dataset.database, archive()) is again
+    assert fit_to_database(again, dataset.database, archive()) is again
     np.testing.assert_array_equal(again.whitening.components, first.whitening.components)
-    np.testing.assert_array_equal(fitted(cells, dataset.database, Archive()).whitening.mean, first.whitening.mean)
+    np.testing.assert_array_equal(
+        fit_to_database(cells, dataset.database, Archive()).whitening.mean, first.whitening.mean
+    )
     [path] = kept(tmp_path)
     assert {*np.load(path).files} == {"mean", "components", "recipe"}
 
 
 def test_it_is_of_no_other_data_network_or_settings(model, cells, dataset, tmp_path):
     archive, how, other = Archive(tmp_path), cells.whitening, network(1)
-    learned = [fitted(cells, folder, archive) for folder in (dataset.database, dataset.queries)]
+    learned = [fit_to_database(cells, folder, archive) for folder in (dataset.database, dataset.queries)]
     assert len(kept(tmp_path)) == 2
     assert not np.array_equal(*(one.whitening.components for one in learned))
     # A hash of it is part of all that is computed with it.
@@ -263,7 +267,7 @@ def test_it_is_of_no_other_data_network_or_settings(model, cells, dataset, tmp_p
 
 
 def test_it_is_refused_by_other_networks_images_and_windows(cells, dataset, tmp_path):
-    learned, image = fitted(cells, dataset.database, Archive(tmp_path)), np.zeros((1, 40, 48, 3), np.uint8)
+    learned, image = fit_to_database(cells, dataset.database, Archive(tmp_path)), np.zeros((1, 40, 48, 3), np.uint8)
     for change in (
         {"model": network(1)}, {"preprocessing": "caffe"}, {"interpolation": "cv2_area"}, {"stride": 2},
         {"image_size": (40, 48)},
@@ -271,19 +275,19 @@ def test_it_is_refused_by_other_networks_images_and_windows(cells, dataset, tmp_
         with pytest.raises(InputError, match=r"SsmCells: .*whitening .*network, images and windows"):
             replace(learned, **change)(image)
     assert len(replace(learned, batch_size=1)(image)) == 1
-    assert fitted(cells, dataset.database, Archive()).whitening.origin == learned.whitening.origin != ""
+    assert fit_to_database(cells, dataset.database, Archive()).whitening.origin == learned.whitening.origin != ""
 
 
 def test_files_that_are_damaged_or_exchanged_are_refused(cells, dataset, tmp_path):
-    fitted(cells, dataset.database, Archive(tmp_path))
+    fit_to_database(cells, dataset.database, Archive(tmp_path))
     [path] = kept(tmp_path)
-    fitted(cells, dataset.queries, Archive(tmp_path))
+    fit_to_database(cells, dataset.queries, Archive(tmp_path))
     [other] = {*kept(tmp_path)} - {path}
     content = path.read_bytes()
     for wrong in (other.read_bytes(), content[:-100] + bytes(100), b""):
         path.write_bytes(wrong)
         with pytest.raises(InputError, match="expected arrays as they were written here") as told:
-            fitted(cells, dataset.database, Archive(tmp_path))
+            fit_to_database(cells, dataset.database, Archive(tmp_path))
         assert "\n" not in str(told.value)
 
 
@@ -293,10 +297,10 @@ def test_images_that_cannot_be_read_are_left_out_only_where_they_may_be(cells, d
     (tmp_path / dataset.database.names[1]).write_bytes(b"no image")
     folder = ImageFolder(tmp_path, dataset.database.names[:3])
     with pytest.raises(InputError, match=r"0001\.png: .*read as an image .*skip"):
-        fitted(cells, folder, Archive(tmp_path / "strict"))
+        fit_to_database(cells, folder, Archive(tmp_path / "strict"))
     assert not kept(tmp_path / "strict")
-    learned = fitted(cells, folder, Archive(tmp_path / "s", skip_bad=True))
-    few = fitted(cells, ImageFolder(tmp_path, (folder.names[0], folder.names[2])), Archive())
+    learned = fit_to_database(cells, folder, Archive(tmp_path / "s", skip_bad=True))
+    few = fit_to_database(cells, ImageFolder(tmp_path, (folder.names[0], folder.names[2])), Archive())
     np.testing.assert_array_equal(learned.whitening.components, few.whitening.components)
 
 
@@ -314,9 +318,9 @@ def test_candidates_without_cells_score_zero():
 
 
 def test_parts_of_filters_are_learned_as_well(cells, model, dataset):
-    of_cells = fitted(Retrieval(Aggregated(cells, VladFitting(num_words=4))), dataset.database, Archive())
+    of_cells = fit_to_database(Retrieval(Aggregated(cells, VladFitting(num_words=4))), dataset.database, Archive())
     assert isinstance(of_cells.describer.extractor.whitening, Whitening)
-    assert fitted(FILTER, dataset.database, Archive()) is FILTER
+    assert fit_to_database(FILTER, dataset.database, Archive()) is FILTER
 
 
 # The whole way

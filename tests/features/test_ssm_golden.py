@@ -15,7 +15,7 @@ from mfvpr.features import WindowFitting
 from mfvpr.features.ssm import SsmMaps
 from mfvpr.features.windows import Windows, kernels, normalize_maps, whiten_windows
 from mfvpr.reranking import FrameCorrelation
-from mfvpr.retrieval.ssm_voting import voted
+from mfvpr.retrieval.ssm_voting import vote
 from tests.builders import make_matches
 from tests.golden.make_ssm import (
     CANDIDATES,
@@ -79,7 +79,7 @@ def assert_votes(shortlist, votes, candidates):
 def test_windows_and_their_votes(golden, case):
     database, queries = of_maps(MAPS[case], 1)
     assert_same_space(database, golden[f"{case}/windows"], 2e-4)  # which sums in float32
-    assert_votes(voted(queries, database, CANDIDATES), golden[f"{case}/votes"], golden[f"{case}/candidates"])
+    assert_votes(vote(queries, database, CANDIDATES), golden[f"{case}/votes"], golden[f"{case}/candidates"])
 
 
 @pytest.mark.parametrize("case", MAPS)
@@ -146,7 +146,7 @@ def of_images():
 def test_images_get_the_votes_of_the_public_program(golden, of_images, case):
     database, queries = of_images(case, 1)
     assert_same_space(database, golden[f"{case}/windows"], 1e-4)
-    found = voted(queries, database, min(CANDIDATES, len(database)))
+    found = vote(queries, database, min(CANDIDATES, len(database)))
     assert_votes(found, golden[f"{case}/votes"], golden[f"{case}/candidates"])
 
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import InputError, Ranking, Shortlist
-from mfvpr.io import read_shortlist, reranked, write_shortlist
+from mfvpr.io import read_shortlist, reranked_shortlist, write_shortlist
 
 QUERIES = ["q/1.jpg", "q/2.jpg", "q/my query.jpg"]
 DATABASE = ["d/1.jpg", "d/2.jpg", "d/my place.jpg", "d/x, y.jpg"]
@@ -189,7 +189,7 @@ def test_a_ranking_is_written_as_a_shortlist(tmp_path):
         indices=np.array([[3, 1, 0], [2, -1, -1]]), scores=np.zeros((2, 3)), mask=np.array([[1, 1, 1], [1, 0, 0]]) > 0
     )
     ranking = Ranking(order=np.array([[2, 0, 1], [0, 1, 2]]), scores=np.float32([[5, 3, 9], [1, 0, 0]]))
-    found = reranked(shortlist, ranking)
+    found = reranked_shortlist(shortlist, ranking)
     assert found.indices.tolist() == [[0, 3, 1], [2, -1, -1]]
     assert found.scores.tolist() == [[9, 5, 3], [1, 0, 0]]
     write_shortlist(tmp_path / "p.npz", found, QUERIES[:2], DATABASE)

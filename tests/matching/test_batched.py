@@ -349,9 +349,9 @@ def test_some_queries_are_matched_as_all_of_them():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(batched, "match_pairs", counted)
-        whole = dict(batched.matched(queries, database, listed, [0, 1, 2], **options))
+        whole = dict(batched.match_queries(queries, database, listed, [0, 1, 2], **options))
         of_all, sizes[:] = {*sizes}, []
-        alone = dict(batched.matched(queries, database, listed, [0], **options))
+        alone = dict(batched.match_queries(queries, database, listed, [0], **options))
     assert {*sizes} < of_all
     for one, other in zip(jax.tree.leaves(whole[0].matches), jax.tree.leaves(alone[0].matches), strict=True):
         np.testing.assert_array_equal(one, other)

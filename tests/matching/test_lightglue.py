@@ -10,12 +10,12 @@ import pytest
 import mfvpr
 from mfvpr import InputError, LightGlueMatching, Matching, Shortlist
 from mfvpr.checkpoints.conversion import convert
-from mfvpr.checkpoints.networks import planned
+from mfvpr.checkpoints.networks import plan_network
 from mfvpr.checkpoints.tables import LIGHTGLUE
 from mfvpr.evaluation import stages
 from mfvpr.evaluation.validation import check_matching
 from mfvpr.features import FeatureSet, Scale, Sift
-from mfvpr.features.feature_set import stacked
+from mfvpr.features.feature_set import stack_features
 from mfvpr.networks import LightGlue
 from mfvpr.networks.lightglue_assignment import assignment
 from mfvpr.storage.matches import open_match_store
@@ -32,7 +32,7 @@ OPTIONS = {"filter_threshold": 1e-3}  # random weights are sure of little
 
 @cache
 def network(seed=0, sure=None):
-    plan = planned(partial(LightGlue, *SMALL.values()))
+    plan = plan_network(partial(LightGlue, *SMALL.values()))
     return plan.filled(convert(checkpoint(seed, sure), LIGHTGLUE, plan.shapes))
 
 
@@ -46,7 +46,7 @@ matched = jax.jit(lambda matcher, features0, features1: matcher(features0, featu
 
 def slots(features, capacity, garbage=np.nan):
     """The same image with more slots, whose padding holds garbage."""
-    image = jax.tree.map(lambda leaf: leaf[0].copy(), stacked([features], capacity))
+    image = jax.tree.map(lambda leaf: leaf[0].copy(), stack_features([features], capacity))
     for values in (image.keypoints, image.descriptors, image.scores):
         values[len(features.mask) :] = garbage
     return image

@@ -13,7 +13,7 @@ from mfvpr.checkpoints.networks import blueprint
 from mfvpr.checkpoints.tables import D2NET
 from mfvpr.features import D2NetFeatures
 from mfvpr.features import d2net as features_d2net
-from mfvpr.features.network import compiled
+from mfvpr.features.network import compile_network
 from mfvpr.networks import D2Net
 from mfvpr.networks.d2net import SCALES, detect, extract, select, survey
 from mfvpr.networks.imagenet import preprocess
@@ -149,7 +149,7 @@ def test_neighbors_that_see_the_same_pixels_have_the_same_bits(model):
     wide, tall = image.copy(), image.copy()
     wide[2:94, 30:126] = 200
     tall[30:126, 2:94] = 200
-    maps = compiled(model, lambda model, images: (model(images), nnx.relu(model.vgg(images, uniform=True))))
+    maps = compile_network(model, lambda model, images: (model(images), nnx.relu(model.vgg(images, uniform=True))))
     (usual, wide, tall), (uniform, *_) = zip(
         *(maps(preprocess(image[None], "caffe")) for image in (image, wide, tall)), strict=True
     )
@@ -246,7 +246,7 @@ def test_crowded_images_are_extracted_again(small, images, monkeypatch):
 @pytest.mark.optimized
 @pytest.mark.slow
 def test_images_of_a_batch_do_not_mix(model, images):
-    extracted = compiled(model, extract)
+    extracted = compile_network(model, extract)
     order = np.array([2, 0, 1])
     (level,), (turned,) = extracted(images), extracted(images[order])
     assert level.mask.any(1).all()
@@ -320,7 +320,7 @@ def test_the_forecast_grows_with_the_map(model):
 def test_relu_is_an_option(model, images):
     open_ended = nnx.merge(*nnx.split(model))
     open_ended.relu = False
-    both = compiled(nnx.List([model, open_ended]), lambda models, images: [model(images) for model in models])
+    both = compile_network(nnx.List([model, open_ended]), lambda models, images: [model(images) for model in models])
     usual, dense = both(preprocess(images[:1, :24, :24], "caffe"))
     assert dense.min() < 0
     np.testing.assert_array_equal(usual, np.maximum(dense, 0))

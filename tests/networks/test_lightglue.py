@@ -11,7 +11,7 @@ import pytest
 from mfvpr.checkpoints import entry_of
 from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.checkpoints.conversion import convert
-from mfvpr.checkpoints.networks import blueprint, planned
+from mfvpr.checkpoints.networks import blueprint, plan_network
 from mfvpr.checkpoints.tables import LIGHTGLUE
 from mfvpr.matching import LightGlueMatching
 from mfvpr.networks import LightGlue
@@ -36,7 +36,7 @@ def golden():
 @cache
 def small(seed=0, sure=None, dtype=np.float32):
     """The packed weights of a small network, through the published keys."""
-    plan = planned(partial(LightGlue, *SMALL.values()))
+    plan = plan_network(partial(LightGlue, *SMALL.values()))
     model = plan.filled(convert(checkpoint(seed, sure), LIGHTGLUE, plan.shapes))
     return jax.jit(LightGlue.packed)(jax.tree.map(lambda leaf: leaf.astype(dtype), model))
 
@@ -162,7 +162,7 @@ def test_published_weights_assign_as_the_public_code(golden):
 
 
 def test_older_names_of_the_published_tensors_are_known():
-    plan = planned(partial(LightGlue, *SMALL.values()))
+    plan = plan_network(partial(LightGlue, *SMALL.values()))
     tensors = checkpoint(0)
     older = {
         re.sub(r"transformers\.(\d)\.(self|cross)_attn", r"\2_attn.\1", key): array for key, array in tensors.items()

@@ -10,7 +10,7 @@ from flax import nnx
 from mfvpr.checkpoints import entry_of
 from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.checkpoints.conversion import convert
-from mfvpr.checkpoints.networks import network_of, planned
+from mfvpr.checkpoints.networks import network_of, plan_network
 from mfvpr.checkpoints.tables import NETVLAD, NETVLAD_MATLAB
 from mfvpr.features import GlobalDescriptor
 from mfvpr.networks import NetVlad, VggNetVlad
@@ -31,7 +31,7 @@ def golden():
 
 
 def filled(build, table, checkpoint):
-    plan = planned(build)
+    plan = plan_network(build)
     return plan.filled(convert(checkpoint, table, plan.shapes))
 
 

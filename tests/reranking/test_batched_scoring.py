@@ -62,7 +62,7 @@ def devices_agree():
         return matches.mask.sum(axis=1)
 
     made = batched_scoring.all_batches(match_set, range(QUERIES), settings=1)
-    for places, counts in batched_scoring.scored(program, (), made, devices=devices):
+    for places, counts in batched_scoring.run_batches(program, (), made, devices=devices):
         np.testing.assert_array_equal(counts, match_set.counts.reshape(-1)[places])
     assert {device for _, device in placed} == {*devices}
     assert {shape for shape, _ in placed} == {(2, 96)}

@@ -7,7 +7,7 @@ import pytest
 
 from mfvpr.datasets import Positives
 from mfvpr.retrieval import ExactSearch
-from mfvpr.retrieval.ssm_voting import voted
+from mfvpr.retrieval.ssm_voting import vote
 
 
 def by_loops(queries, database, num_candidates, excluded=()):
@@ -44,34 +44,34 @@ def windows(seed, images, per_image=4, dimension=5):
 def test_agrees_with_the_loop(num_candidates, memory):
     queries, database = windows(0, 7), windows(0, 9)
     database[4, 1, 0], queries[2, 1, 0] = np.nan, np.inf
-    got = voted(queries, database, num_candidates, search=ExactSearch(memory))
+    got = vote(queries, database, num_candidates, search=ExactSearch(memory))
     assert_lists(got, by_loops(queries, database, num_candidates), num_candidates)
 
 
 def test_excluded_images_neither_get_votes_nor_fill_up():
     queries, database = windows(1, 5), windows(1, 8)
     excluded = [[0, 1, 2], [], [7], [*range(8)], [3]]
-    got = voted(queries, database, 8, excluded=Positives.from_rows(excluded, 8))
+    got = vote(queries, database, 8, excluded=Positives.from_rows(excluded, 8))
     assert_lists(got, by_loops(queries, database, 8, excluded), 8)
     assert not got.mask[3].any()
 
 
 def test_more_queries_than_go_together():
     queries, database = windows(2, 70), windows(2, 6)
-    got = voted(queries, database, 2, excluded=Positives.from_rows([[row % 6] for row in range(70)], 6))
+    got = vote(queries, database, 2, excluded=Positives.from_rows([[row % 6] for row in range(70)], 6))
     assert_lists(got, by_loops(queries, database, 2, [[row % 6] for row in range(70)]), 2)
 
 
 def test_equal_votes_go_by_row_and_equal_windows_by_image():
     database = np.zeros((3, 2, 4), np.float32)
-    got = voted(np.ones((1, 2, 4), np.float32), database, 3)
+    got = vote(np.ones((1, 2, 4), np.float32), database, 3)
     np.testing.assert_array_equal(got.indices, [[0, 1, 2]])
     np.testing.assert_array_equal(got.scores, [[4, 2, 0]])
 
 
 def test_a_database_of_one_image():
     for num_candidates in (1, 5):
-        got = voted(windows(3, 2), windows(3, 1), num_candidates)
+        got = vote(windows(3, 2), windows(3, 1), num_candidates)
         np.testing.assert_array_equal(got.indices[:, 0], [0, 0])
         np.testing.assert_array_equal(got.mask.sum(1), [1, 1])
         np.testing.assert_array_equal(got.scores[:, 0], [4 * min(num_candidates, 4)] * 2)

@@ -21,9 +21,9 @@ from mfvpr import (
     score_candidates,
     score_grid,
 )
-from mfvpr.scoring.parameters import fit
+from mfvpr.scoring.parameters import with_capacity
 from mfvpr.utils import InputError
-from mfvpr.utils.numerics import held
+from mfvpr.utils.numerics import with_static_functions
 from tests.builders import SIZE, per_match, random_matches
 from tests.scorers import FOREIGN, OWN, Wrapped, one_of_each_class, plain, title
 
@@ -38,7 +38,7 @@ SIZES = np.array([SIZE, SIZE], np.float32)
 
 def fitted(scorer):
     """With the capacity that the tests' images need."""
-    return held(fit(scorer, SIZES, SIZES))
+    return with_static_functions(with_capacity(scorer, SIZES, SIZES))
 
 
 def score(scorer, matches):

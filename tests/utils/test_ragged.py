@@ -23,7 +23,7 @@ COUNTS = st.lists(st.integers(0, 7), min_size=1, max_size=6)
 @given(COUNTS, st.integers(0, 3), st.integers(0, 2))
 def test_padding_keeps_every_row_and_holds_zeros(counts, more_slots, more_rows):
     rows, capacity, total = rows_of(counts), max(counts) + more_slots, len(counts) + more_rows
-    arrays, mask = ragged.padded(rows, capacity, total=total)
+    arrays, mask = ragged.pad_rows(rows, capacity, total=total)
     assert arrays["points"].shape == (total, capacity, 2)
     assert arrays["points"].dtype == np.float32
     assert arrays["index"].shape == mask.shape == (total, capacity)
@@ -39,7 +39,7 @@ def test_padding_keeps_every_row_and_holds_zeros(counts, more_slots, more_rows):
 @given(COUNTS)
 def test_rows_that_are_joined_are_split_again(counts):
     rows = rows_of(counts)
-    flat = ragged.joined(rows)
+    flat = ragged.join_rows(rows)
     assert len(flat["points"]) == sum(counts)
     for got, expected in zip(ragged.split(flat, np.array(counts)), rows, strict=True):
         for name, values in expected.items():
@@ -48,7 +48,7 @@ def test_rows_that_are_joined_are_split_again(counts):
 
 def test_a_row_longer_than_the_capacity_is_an_error():
     with pytest.raises(ValueError, match="broadcast"):
-        ragged.padded(rows_of([3]), 2)
+        ragged.pad_rows(rows_of([3]), 2)
 
 
 @given(st.lists(st.integers(0, 500), max_size=40), st.sampled_from([8, 32]))
@@ -79,8 +79,8 @@ def test_empty_rows_make_no_capacity_smaller():
 
 
 def test_filled_repeats_the_last():
-    np.testing.assert_array_equal(ragged.filled(np.array([[1, 2], [3, 4]]), 4), [[1, 2], [3, 4], [3, 4], [3, 4]])
-    np.testing.assert_array_equal(ragged.filled(np.array([5]), 1), [5])
+    np.testing.assert_array_equal(ragged.repeat_last(np.array([[1, 2], [3, 4]]), 4), [[1, 2], [3, 4], [3, 4], [3, 4]])
+    np.testing.assert_array_equal(ragged.repeat_last(np.array([5]), 1), [5])
 
 
 in_front = jax.jit(ragged.in_front, static_argnums=2)

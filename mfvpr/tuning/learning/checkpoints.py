@@ -26,7 +26,7 @@ _KEPT = 2
 
 
 @contextmanager
-def held(folder: Path) -> Iterator[None]:
+def lock_checkpoints(folder: Path) -> Iterator[None]:
     """Lock a folder of checkpoints, which is made if it is missing.
 
     Raises:
@@ -109,7 +109,7 @@ def newest(folder: Path) -> Path | None:
     return folder / str(max(steps)) if steps else None
 
 
-def named(tree: Any) -> dict[str, Any]:
+def leaves_by_path(tree: Any) -> dict[str, Any]:
     """The leaves of a pytree by their path, `weight.hidden`."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
@@ -171,7 +171,7 @@ def _holds_checkpoints(folder: Path) -> bool:
 
 def _description(recipe: Mapping[str, Any], state: Any) -> dict[str, Any]:
     """Format, recipe and shapes of arrays of a checkpoint, JSON values."""
-    arrays = {name: f"{leaf.dtype}{list(leaf.shape)}" for name, leaf in named(state).items()}
+    arrays = {name: f"{leaf.dtype}{list(leaf.shape)}" for name, leaf in leaves_by_path(state).items()}
     return json.loads(json.dumps({"format": FORMAT, "recipe": recipe or {}, "arrays": arrays}))  # tuples become lists
 
 

@@ -24,7 +24,7 @@ from mfvpr.tuning.sweeps.settings import FUSION, Setting
 from mfvpr.tuning.sweeps.sweep import sweep
 from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.progress import untracked
+from mfvpr.utils.progress import no_progress
 
 _OF_THE_PAPER = (FeatureScoreWeight, DescriptorDistanceWeight, UnitWeight)
 
@@ -182,7 +182,7 @@ class _HalfComparison:
         self, name: str, scorer: Scorer, settings: Sequence[Setting], queries: np.ndarray, seen: np.ndarray
     ) -> np.ndarray:
         """First rows `[S, q, 1]` of the rankings of the seen candidates by every setting."""
-        track = self.track(f"{self.split.name}: {name}") if len(settings) > 1 else untracked
+        track = self.track(f"{self.split.name}: {name}") if len(settings) > 1 else no_progress
         part, views = self.split.part(queries), [seen[queries]]
         return sweep(scorer, settings, *part, views=views, depth=1, ties=self.options.ties, track=track)[0]
 

@@ -6,7 +6,7 @@ from typing import Any, overload
 
 import numpy as np
 
-from mfvpr.datasets.positives import side_by_side
+from mfvpr.datasets.positives import join_positives
 from mfvpr.evaluation.protocol import Judge
 from mfvpr.evaluation.selection import Half
 from mfvpr.matching.match_set import MatchSet
@@ -31,7 +31,7 @@ class Part:
     candidates: Shortlist
 
 
-def joined(teach: Sequence[Part], report: Sequence[Part]) -> Part:
+def join_data_sets(teach: Sequence[Part], report: Sequence[Part]) -> Part:
     """Join data sets to one, whose judge learns on the first sets and reports on the others.
 
     Args:
@@ -61,8 +61,8 @@ def joined(teach: Sequence[Part], report: Sequence[Part]) -> Part:
     )  # fmt: skip
     judge = replace(
         parts[0].judge,
-        positives=[side_by_side(sets) for sets in zip(*(part.judge.positives for part in parts), strict=True)],
-        places=side_by_side([part.judge.places for part in parts]),
+        positives=[join_positives(sets) for sets in zip(*(part.judge.positives for part in parts), strict=True)],
+        places=join_positives([part.judge.places for part in parts]),
         halves=[half], split="other sets", reported_sets={part.name: len(part.match_set) for part in report},
     )  # fmt: skip
     width = max(part.match_set.counts.shape[1] for part in parts)

@@ -83,7 +83,7 @@ class TrainingSplit:
 
     def batch(self, queries: np.ndarray, size: int) -> Batch:
         """A batch of queries, padded to `size` with queries without candidates."""
-        padded = ragged.filled(queries, size)
+        padded = ragged.repeat_last(queries, size)
         places = np.argsort(~self.usable[padded], axis=1, kind="stable")[:, : self.width]
         take = partial(np.take_along_axis, indices=places, axis=1)
         mask = take(self.usable[padded]) & (np.arange(size) < len(queries))[:, None]

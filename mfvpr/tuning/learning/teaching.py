@@ -72,7 +72,7 @@ def start(
         weight = _first_weight(split, options)
     deviation = split.score_deviation(scorer)
     c = FIRST_SHARE * split.balance(deviation) if fused else None
-    return Model.of(parameters.fit(scorer, *split.match_set.image_sizes), deviation, c=c, weight=weight)
+    return Model.of(parameters.with_capacity(scorer, *split.match_set.image_sizes), deviation, c=c, weight=weight)
 
 
 def of_matches(split: TrainingSplit, scorer: Any, options: Options) -> Model:
@@ -81,8 +81,8 @@ def of_matches(split: TrainingSplit, scorer: Any, options: Options) -> Model:
     seen, _ = split.match_set.take(split.half.tune).image_sizes  # else reported images would change the labels
     sigma = TEACHER_SIGMA * float(np.max(seen))
     teacher = HistogramOfShifts(bin_size=sigma / 2, sigma=sigma, weight=RatioWeight())
-    scorer = parameters.fit(scorer, *sizes)
-    return Model.of_matches(scorer, _first_weight(split, options), parameters.fit(teacher, *sizes))
+    scorer = parameters.with_capacity(scorer, *sizes)
+    return Model.of_matches(scorer, _first_weight(split, options), parameters.with_capacity(teacher, *sizes))
 
 
 def _first_weight(split: TrainingSplit, options: Options) -> LearnedWeight:

@@ -15,7 +15,7 @@ import optax
 from mfvpr.tuning.learning import checkpoints
 from mfvpr.types import Array
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.progress import Track, untracked
+from mfvpr.utils.progress import Track, no_progress
 
 
 class TrainingError(InputError):
@@ -70,7 +70,7 @@ def fit(
     patience: int | None = None,
     folder: Path | None = None,
     recipe: Mapping[str, Any] | None = None,
-    track: Track = untracked,
+    track: Track = no_progress,
 ) -> Fit:
     """Minimize the objective.
 
@@ -99,7 +99,7 @@ def fit(
     training = _Training(update, batches, validate, steps, every, patience, folder, recipe or {}, track)
     parameters = _strong(parameters)
     start = _State(parameters, parameters, _strong(optimizer.init(parameters)))
-    with checkpoints.held(folder) if folder else nullcontext():
+    with checkpoints.lock_checkpoints(folder) if folder else nullcontext():
         state, history = training.descend(*training.begin(start))
     is_early = _is_exhausted(history, patience)
     ended = f"no gain in {patience} validations" if is_early else f"all {steps} steps are done"
@@ -179,7 +179,7 @@ class _Training:
         batch = self.batches(step)
         parameters, memory, loss, gradient, finite = self.update(state.parameters, state.optimizer, batch)
         if not finite:
-            suspects = checkpoints.named({"loss": loss, "gradient": gradient, "updated": parameters})
+            suspects = checkpoints.leaves_by_path({"loss": loss, "gradient": gradient, "updated": parameters})
             culprit = next(name for name, leaf in suspects.items() if not np.all(np.isfinite(leaf)))
             raise self.error(f"{culprit} of batch {step}", state.parameters, step)
         return _State(parameters, state.best, memory), float(loss)
@@ -193,7 +193,7 @@ class _Training:
         return value
 
     def error(self, what: str, parameters: Any, step: int) -> TrainingError:
-        leaves = checkpoints.named(parameters).items()
+        leaves = checkpoints.leaves_by_path(parameters).items()
         scalars = [f"{name or 'parameter'}={float(leaf):.6g}" for name, leaf in leaves if leaf.ndim == 0]
         values = f" at {', '.join(scalars)}" if scalars else ""
         saved = self.folder and checkpoints.newest(self.folder)

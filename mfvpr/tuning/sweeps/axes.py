@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mfvpr.scoring.fields import declared
-from mfvpr.scoring.parameters import fit, with_parameters
+from mfvpr.scoring.parameters import with_capacity, with_parameters
 from mfvpr.scoring.scorer import Scorer
 from mfvpr.tuning.sweeps.settings import FUSION, Setting, grid
 from mfvpr.utils.errors import InputError
@@ -67,7 +67,7 @@ class Axes:
         if {*self.own} != {*self.values}:
             raise InputError(f"own: expected a value of each of {', '.join(self.values)}, got {', '.join(self.own)}")
         for setting in grid({name: self.values[name] for name in CAPACITY if name in self.values}):
-            fit(with_parameters(self.scorer, setting), *image_sizes)
+            with_capacity(with_parameters(self.scorer, setting), *image_sizes)
 
     def _value(self, name: str, value: Any) -> Any:
         if name == FUSION:

@@ -14,7 +14,7 @@ from mfvpr.tuning.sweeps.outcome import Outcome
 from mfvpr.tuning.sweeps.sweep import sweep
 from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.progress import Track, untracked
+from mfvpr.utils.progress import Track, no_progress
 
 if TYPE_CHECKING:
     import optuna
@@ -27,7 +27,7 @@ Stages = Callable[[str], Track]  # the name of a stage -> its progress
 
 def untracked_stages(stage: str) -> Track:
     """No progress bars."""
-    return untracked
+    return no_progress
 
 
 def search_grid(

@@ -12,7 +12,7 @@ from mfvpr.reranking.grids import WEIGHTINGS
 from mfvpr.scoring import parameters
 from mfvpr.scoring.parameters import with_parameters
 from mfvpr.scoring.weights import ChosenWeight
-from mfvpr.utils.numerics import held
+from mfvpr.utils.numerics import with_static_functions
 
 Setting = Mapping[str, Any]
 
@@ -80,7 +80,7 @@ def groups(scorer: Any, settings: Sequence[Setting], image_sizes: tuple[np.ndarr
         chosen = with_parameters(scorer, choices)
         if weights:
             chosen = replace(chosen, weight=ChosenWeight(tuple(weights), 0))
-        chosen = held(chosen)
+        chosen = with_static_functions(chosen)
         for rows in _products(settings, members):
             values = _arrays([settings[row] for row in rows[:, 0]], weights, integers, without={*choices, *WEIGHTINGS})
             weightings = _arrays(

@@ -19,8 +19,8 @@ import numpy as np
 
 from mfvpr.matching.match_set import MatchSet, Scales, queries_that_fit, scales, shapes
 from mfvpr.reranking import grids, ranking
-from mfvpr.reranking.batched_scoring import PaddedBatch, all_batches, fuse_all, scored
-from mfvpr.reranking.ranking import FilterScore, Ties, filter_scores, indexed
+from mfvpr.reranking.batched_scoring import PaddedBatch, all_batches, fuse_all, run_batches
+from mfvpr.reranking.ranking import FilterScore, Ties, breaks_ties_by_row, filter_scores
 from mfvpr.scoring.scorer import check_host, on_host
 from mfvpr.tuning.sweeps.settings import FUSION, Group, Setting, distinct, groups
 from mfvpr.types import Array, Matches, Shortlist, per_match, per_pair
@@ -28,7 +28,7 @@ from mfvpr.utils.arrays import read_arrays, write_arrays
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import content_hash
 from mfvpr.utils.numerics import Device, compiled
-from mfvpr.utils.progress import Track, untracked
+from mfvpr.utils.progress import Track, no_progress
 
 SETTINGS_PER_BLOCK = 64
 _ALONE = "alone"  # the c of a score that is not fused
@@ -81,7 +81,7 @@ def sweep(
     views: Sequence[np.ndarray] | None = None, depth: int = 10, ties: Ties = "filter",
     filter_score: FilterScore = "cosine",
     settings_per_block: int | None = None, queries_per_block: int | None = None,
-    folder: Path | None = None, devices: Sequence[Device] | None = None, track: Track = untracked,
+    folder: Path | None = None, devices: Sequence[Device] | None = None, track: Track = no_progress,
 ) -> np.ndarray:  # fmt: skip
     """The first rows of every query's ranking by every setting.
 
@@ -166,7 +166,7 @@ def block_scores(
     """Scores `[S, G, W, q, C]` of every scale; a pair without matches scores 0."""
     scores = np.zeros((*block.rows.shape, math.prod(shape)), np.float32)
     inputs = block.scorer, block.settings, block.weightings
-    for places, values in scored(_score_settings, inputs, batches, devices=devices):
+    for places, values in run_batches(_score_settings, inputs, batches, devices=devices):
         scores[..., places] = values
     return np.moveaxis(scores.reshape(*block.rows.shape, *shape), 2, 0)
 
@@ -183,7 +183,7 @@ def _first_rows(part: Work, scores: np.ndarray, cs: Sequence[Any], view: np.ndar
     for kind in np.unique(kinds):
         members = np.flatnonzero(kinds == kind)
         c = np.array([cs[int(member)] for member in members], np.float32) if kind == "given" else None
-        tie_break = indices if indexed(part.ties) else None
+        tie_break = indices if breaks_ties_by_row(part.ties) else None
         order = np.asarray(_orders(of_filter, scores[members], c, view, tie_break, fused=kind != "alone"))
         order = order[..., : part.depth]
         ranked = np.where(np.take_along_axis(view[None], order, -1), np.take_along_axis(indices[None], order, -1), -1)

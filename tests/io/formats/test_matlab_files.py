@@ -10,7 +10,7 @@ import pytest
 from mfvpr.checkpoints import entry_of
 from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.checkpoints.conversion import convert
-from mfvpr.checkpoints.networks import network_of, planned
+from mfvpr.checkpoints.networks import network_of, plan_network
 from mfvpr.checkpoints.tables import NETVLAD_MATLAB
 from mfvpr.utils import InputError
 from tests.random_checkpoints import matlab_netvlad, matlab_shapes, random_checkpoint, write_matlab
@@ -57,10 +57,10 @@ def test_signs_and_axes(tmp_path):
     """The centers are stored with the other sign, all else as inputs, then outputs."""
     read = read_checkpoint(write_matlab(tmp_path / "a.mat", matlab_netvlad(4, 3)))
     with pytest.raises(InputError, match="of another shape"):
-        convert(read, NETVLAD_MATLAB, planned(network_of(entry_of("netvlad_pitts30k")).builder()).shapes)
+        convert(read, NETVLAD_MATLAB, plan_network(network_of(entry_of("netvlad_pitts30k")).builder()).shapes)
     from mfvpr.networks import VggNetVlad
 
-    plan = planned(lambda rngs: VggNetVlad(4, 3, original=True, rngs=rngs))
+    plan = plan_network(lambda rngs: VggNetVlad(4, 3, original=True, rngs=rngs))
     found = convert(read, NETVLAD_MATLAB, plan.shapes)
     np.testing.assert_array_equal(found["pool.centers"], -read["net.layers.30.weights.1"].T)
     np.testing.assert_array_equal(found["pool.assignment.kernel"][0, 0], read["net.layers.30.weights.0"])
@@ -139,6 +139,6 @@ def test_other_versions(tmp_path):
 def test_another_networks_file_is_told(tmp_path):
     other = {"net": {"layers": cell({"weights": cell(*random_checkpoint({"a": (3, 3, 3, 4)}).values())})}}
     read = read_checkpoint(write_matlab(tmp_path / "a.mat", other))
-    plan = planned(network_of(entry_of("netvlad_tokyotm")).builder())
+    plan = plan_network(network_of(entry_of("netvlad_tokyotm")).builder())
     with pytest.raises(InputError, match=r"keys do not fit the network: .*missing"):
         convert(read, NETVLAD_MATLAB, plan.shapes)

@@ -8,9 +8,9 @@ import pytest
 
 from mfvpr import HistogramOfShifts, InputError
 from mfvpr.datasets import Positives
-from mfvpr.datasets.positives import side_by_side
+from mfvpr.datasets.positives import join_positives
 from mfvpr.tuning.learning import comparison
-from mfvpr.tuning.learning.data_sets import Part, joined
+from mfvpr.tuning.learning.data_sets import Part, join_data_sets
 from mfvpr.tuning.learning.splits import VALIDATION, training_splits
 from mfvpr.tuning.learning.teaching import Options
 from mfvpr.tuning.sweeps import Axes
@@ -40,7 +40,7 @@ def parts():
 
 @pytest.fixture(scope="module")
 def whole(parts):
-    return joined(parts[:2], parts[2:])
+    return join_data_sets(parts[:2], parts[2:])
 
 
 def test_every_query_keeps_its_own(parts, whole):
@@ -100,7 +100,7 @@ def _halved(one):
 
 def test_databases_stand_side_by_side():
     first, second = Positives.from_rows([[0, 2], []], 3), Positives.from_rows([[1], [0], []], 2)
-    both = side_by_side([first, second])
+    both = join_positives([first, second])
     assert [both.of(query).tolist() for query in range(5)] == [[0, 2], [], [4], [3], []]
     assert both.num_database == 5
 
@@ -108,10 +108,10 @@ def test_databases_stand_side_by_side():
 def test_sets_that_do_not_go_together_are_refused(parts):
     a, b, c = parts
     with pytest.raises(InputError, match=r"learn on .*report on, got 3 and 0"):
-        joined(parts, [])
+        join_data_sets(parts, [])
     with pytest.raises(InputError, match=r"names, got a, b, a"):
-        joined([a, b], [replace(c, name="a")])
+        join_data_sets([a, b], [replace(c, name="a")])
     with pytest.raises(InputError, match=r"c: .*unit of a, frames, got m;"):
-        joined([a], [replace(c, judge=replace(c.judge, unit="m"))])
+        join_data_sets([a], [replace(c, judge=replace(c.judge, unit="m"))])
     with pytest.raises(InputError, match=r"c: .*thresholds of a, \(0, 1, 2\), got \(0, 1, 3\);"):
-        joined([a], [replace(c, judge=replace(c.judge, thresholds=(0, 1, 3)))])
+        join_data_sets([a], [replace(c, judge=replace(c.judge, thresholds=(0, 1, 3)))])
