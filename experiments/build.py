@@ -30,7 +30,7 @@ from mfvpr.scoring import SCORERS, Scorer
 from mfvpr.scoring.fields import made
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS
 from mfvpr.scoring.weights import WEIGHTS
-from mfvpr.storage import Archive, Shard
+from mfvpr.storage import FeatureCache, Shard
 from mfvpr.utils import recipe_of
 from mfvpr.utils.fingerprints import fingerprint
 
@@ -191,13 +191,13 @@ def _files(group: str, settings: dict[str, Any], data: Dataset | None) -> dict[P
     return files
 
 
-def archive(settings: dict[str, Any]) -> Archive:
-    """The archive of features, matches and all else that is computed from images."""
+def cache(settings: dict[str, Any]) -> FeatureCache:
+    """The cache of features, matches and all else that is computed from images."""
     root = None if settings["store"] is None else expanded(settings["store"])
     shard = None if settings.get("shard") is None else Shard.parse(settings["shard"])
     if shard is not None and settings["coordinator"]:
         shard = replace(shard, meets=True)
-    return Archive(root, skip_bad=settings["on_bad_image"] == "skip", track=console.track, tell=console.tell,
+    return FeatureCache(root, skip_bad=settings["on_bad_image"] == "skip", track=console.track, tell=console.tell,
                    wait=settings.get("multirun", False), shard=shard, patience=settings.get("wait", 0))  # fmt: skip
 
 

@@ -69,12 +69,12 @@ def check(name: str, settings: list[str], sheet: Path | None) -> None:
     from mfvpr.datasets.published import differences
     from mfvpr.report import Table
     from mfvpr.report.contact_sheets import contact_sheet
-    from mfvpr.storage import Archive
+    from mfvpr.storage import FeatureCache
 
     [chosen] = data_sets.composed("check", ":".join([name, *settings]))
     dataset = dataset_of(chosen)
-    archive = Archive(None)
-    database, *contents = map(archive.contents, [dataset.database, *(part.images for part in dataset.sequences)])
+    cache = FeatureCache(None)
+    database, *contents = map(cache.contents, [dataset.database, *(part.images for part in dataset.sequences)])
     counts, unreadable = list(_counts(dataset)), list(_unreadable(dataset))
     rows = [[*row, f"{len(reasons):,}"] for row, reasons in zip(counts, unreadable, strict=True)]
     print(Table(["images of", "there", "published", "unreadable"], rows).text())

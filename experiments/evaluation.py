@@ -95,7 +95,7 @@ def evaluated(settings: dict[str, Any]) -> Outcome:
     result = evaluation.evaluate(
         images.dataset, tools.extractor, tools.filter, scorers, candidates=settings["candidates"],
         matching=tools.matching, fused=fusions, cohort=cohort,
-        correlated={headline: frames} if frames else {}, ties=settings["ties"], archive=tools.archive, watch=watch,
+        correlated={headline: frames} if frames else {}, ties=settings["ties"], cache=tools.cache, watch=watch,
         **tools.where,
     )  # fmt: skip
     parameters = _parameters(settings, main, fusions)

@@ -20,7 +20,7 @@ from mfvpr.features import Extractor, Source
 from mfvpr.matching import Matcher, MatchSet, Scales
 from mfvpr.retrieval import ExactSearch, Filter, Retrieval
 from mfvpr.scoring.weight_registry import provenance
-from mfvpr.storage import Archive
+from mfvpr.storage import FeatureCache
 from mfvpr.types import Shortlist
 from mfvpr.utils import Stopwatch
 
@@ -48,12 +48,12 @@ class Images:
 
 @dataclass(frozen=True)
 class Tools:
-    """Extractor, retrieval and matcher, and the archive of their results."""
+    """Extractor, retrieval and matcher, and the cache of their results."""
 
     extractor: Extractor | Source
     filter: Filter
     matching: Matcher
-    archive: Archive
+    cache: FeatureCache
     where: Mapping[str, Any]  # memory and devices
 
 
@@ -62,20 +62,20 @@ def begun(settings: dict[str, Any], watch: Stopwatch) -> tuple[Tools, Images]:
 
     The tools come first, since their errors should come before anything slow, unless they need files about the images.
     """
-    archive = build.archive(settings)
+    cache = build.cache(settings)
     names = {settings[group]["name"] for group in ("features", "retrieval")}
-    tools = None if names & {"import", "pairs"} else _tools(settings, archive, None)
+    tools = None if names & {"import", "pairs"} else _tools(settings, cache, None)
     with watch("data"):
-        images = _images(settings, archive)
-    return tools or _tools(settings, archive, images.dataset), images
+        images = _images(settings, cache)
+    return tools or _tools(settings, cache, images.dataset), images
 
 
-def _tools(settings: dict[str, Any], archive: Archive, dataset: Dataset | None) -> Tools:
+def _tools(settings: dict[str, Any], cache: FeatureCache, dataset: Dataset | None) -> Tools:
     extractor = build.extractor(settings["features"], dataset)
     retrieval = build.filter(settings["retrieval"], extractor, dataset)
     if settings.get("coordinator"):
         retrieval = _distribute(retrieval)
-    return Tools(extractor, retrieval, build.matching(settings["matching"]), archive, build.where(settings))
+    return Tools(extractor, retrieval, build.matching(settings["matching"]), cache, build.where(settings))
 
 
 def _distribute(retrieval: Filter) -> Filter:
@@ -87,13 +87,13 @@ def _distribute(retrieval: Filter) -> Filter:
     return replace(retrieval, search=replace(retrieval.search, spread=retrieve_everywhere))
 
 
-def _images(settings: dict[str, Any], archive: Archive) -> Images:
+def _images(settings: dict[str, Any], cache: FeatureCache) -> Images:
     """The data set that the settings name, without neighbors of the queries; warns about its peculiarities."""
     dataset, neighbors = dataset_of(settings["dataset"]), settings["dataset"].get("exclude_neighbors")
-    sides = {"database": archive.contents(dataset.database)}
+    sides = {"database": cache.contents(dataset.database)}
     sequences, same_images = [], []
     for sequence in dataset.sequences:
-        contents = archive.contents(sequence.images)
+        contents = cache.contents(sequence.images)
         sides[f"query {sequence.name}" if len(dataset.sequences) > 1 else "query"] = contents
         same_images.append(own_rows(contents, sides["database"]))
         if neighbors is not None:
@@ -118,7 +118,7 @@ def matched(
     """Matches and shortlist of the only sequence, from their store if it has all of them."""
     result = match_sequence(
         images.dataset, images.dataset.only, tools.extractor, tools.filter, settings["candidates"],
-        matching=tools.matching, archive=tools.archive, watch=watch, **tools.where,
+        matching=tools.matching, cache=tools.cache, watch=watch, **tools.where,
     )  # fmt: skip
     return result.by_scale, result.candidates
 
@@ -127,7 +127,7 @@ def recipe(tools: Tools, images: Images, num_candidates: int) -> dict[str, Any]:
     """Recipe of the shortlist and the matches of the only sequence, and of the fusion of several scales."""
     recipe = matches_recipe(
         images.dataset, images.dataset.only, tools.extractor, tools.filter, num_candidates, tools.matching,
-        tools.archive,
+        tools.cache,
     )  # fmt: skip
     scales = tools.extractor.scales
     return recipe | ({"scale_weights": [scale.weight for scale in scales]} if len(scales) > 1 else {})

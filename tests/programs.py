@@ -69,7 +69,7 @@ def matches_path(settings):
     """Where a program keeps the matches of its data set, and their recipe."""
     tools, images = stages.begun(settings, stages.Stopwatch())
     recipe = stages.recipe(tools, images, settings["candidates"])
-    return store_path(tools.archive.root, "matches", recipe, MATCHES), recipe
+    return store_path(tools.cache.root, "matches", recipe, MATCHES), recipe
 
 
 def typed(monkeypatch, capsys, program, *arguments):

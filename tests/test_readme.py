@@ -16,7 +16,7 @@ from experiments.settings import CONF, RULES, check, scorer_rules
 from mfvpr.datasets import image_folder
 from mfvpr.features import Sift
 from mfvpr.io import write_features
-from mfvpr.storage import Archive
+from mfvpr.storage import FeatureCache
 from tests import random_checkpoints
 from tests.builders import make_matches
 from tests.programs import QUICK, ROOT, composed, typed
@@ -67,7 +67,7 @@ def test_commands_run(command, small_street, weights, tmp_path, monkeypatch, cap
     if "features=import" in arguments:
         for side in ("database", "queries"):
             images = image_folder(root / side)
-            [features] = Archive().local(images, Sift(max_keypoints=60))
+            [features] = FeatureCache().local(images, Sift(max_keypoints=60))
             write_features(tmp_path / f"{side}.npz", images.names, features.read(range(len(images))))
     known = "vlad" if "mixvpr" not in command and "system" not in command else "mixvpr"
     quick = [setting for setting in QUICK if known == "vlad" or not setting.startswith("retrieval.")]

@@ -23,7 +23,7 @@ from mfvpr.reranking.ranking import rank_shortlist
 from mfvpr.reranking.results import FILTER
 from mfvpr.retrieval import Retrieval
 from mfvpr.scoring import Scorer
-from mfvpr.storage import Archive
+from mfvpr.storage import FeatureCache
 from mfvpr.utils import InputError
 
 FOLDERS = {"grief_season": ("database", "queries"), "corridor": ("ref", "query")}
@@ -35,14 +35,14 @@ def run(rounds: int | None, out: Path, data: Path | None = None) -> None:
     """Score SIFT's and ALIKED n16's matches with all images of both data sets below `data`."""
     if data is None:
         raise InputError(f"--data: expected a folder that has {' and '.join(FOLDERS)}, got none")
-    cache = build.expanded(os.environ.get("MFVPR_CACHE") or "~/.cache/mfvpr")  # as in conf/common.yaml
-    archive, scorers = Archive(cache / "features", track=track, tell=tell), compared_scorers()
+    folder = build.expanded(os.environ.get("MFVPR_CACHE") or "~/.cache/mfvpr")  # as in conf/common.yaml
+    cache, scorers = FeatureCache(folder / "features", track=track, tell=tell), compared_scorers()
     parts, tables = [], []
     for name, folders in FOLDERS.items():
         dataset = folder_dataset(*(data / name / folder for folder in folders), name=name, ground_truth="order")
         for features, extractor in extractors().items():
             retrieval = Retrieval(Aggregated(extractor, VladFitting()))
-            matched = match_sequence(dataset, dataset.only, extractor, retrieval, "all", archive=archive)
+            matched = match_sequence(dataset, dataset.only, extractor, retrieval, "all", cache=cache)
             rows = [measure(matched, score, scorers, rounds or 1) for score in (FILTER, *scorers)]
             tables.append({"matches": f"{name}, {features}", "rows": rows})
             parts += [f"{name}, {features}, {np.mean(matched.matches[0].counts):.0f} matches a pair", _table(rows)]

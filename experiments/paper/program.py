@@ -117,10 +117,10 @@ def evaluate_all(
         try:
             chosen = runs.settings_of(names[0], place, settings)
             dataset = dataset_of(chosen["dataset"])
-            archive = build.archive(chosen)
+            cache = build.cache(chosen)
             folders = {sequence.name: sequence.images for sequence in dataset.sequences}
             folders |= {"the database": dataset.database}
-            images = {side: archive.contents(folder).fingerprint for side, folder in folders.items()}
+            images = {side: cache.contents(folder).fingerprint for side, folder in folders.items()}
             right = truth.fingerprint(dataset, truth.thresholds(chosen, dataset.sequences[0].truth))
         except InputError as error:
             fail(f"{place.name}: {error}")

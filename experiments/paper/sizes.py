@@ -17,9 +17,9 @@ _GRIDS = (WindowExtractor, PatchNetVladFeatures, SelaVprFeatures)
 
 def bytes_of_an_image(tools: Tools, database: ImageFolder) -> dict[str, float]:
     """Average bytes of what was already extracted: `local` features, and the `descriptor` of retrieval."""
-    archive = tools.archive
-    sources = archive.local(
-        database, fit_to_database(tools.extractor, database, archive), []
+    cache = tools.cache
+    sources = cache.local(
+        database, fit_to_database(tools.extractor, database, cache), []
     )  # nothing is extracted for this
     keypoint = 0 if isinstance(tools.extractor, _GRIDS) else _KEYPOINT
     local = 0.0
@@ -27,6 +27,6 @@ def bytes_of_an_image(tools: Tools, database: ImageFolder) -> dict[str, float]:
         counts = features.source.counts
         known = counts[counts >= 0]  # retrieval other than VLAD needs the candidates' features alone
         local += (_FLOAT * features.dimension + keypoint) * (float(known.mean()) if known.size else 0.0)
-    describer: Any = fit_to_database(tools.filter, database, archive)  # all of the paper's have one
-    vectors = archive.vectors(database, describer.describer, database).values
+    describer: Any = fit_to_database(tools.filter, database, cache)  # all of the paper's have one
+    vectors = cache.vectors(database, describer.describer, database).values
     return {"local": local, "descriptor": _FLOAT * vectors.shape[1]}

@@ -14,7 +14,7 @@ from experiments import build
 from mfvpr.datasets import Dataset, ImageFolder
 from mfvpr.evaluation import evaluation
 from mfvpr.localization.vectors import Vectors
-from mfvpr.storage import Archive
+from mfvpr.storage import FeatureCache
 from mfvpr.utils import Stopwatch
 from mfvpr.utils.numerics import available_cpus
 from mfvpr.utils.versions import versions
@@ -43,14 +43,14 @@ def measure_query(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, fl
     scorers, watch = build.scorers(settings["scorer"]), Stopwatch()
     main = "histogram" if "histogram" in scorers else next(iter(scorers))
     with tempfile.TemporaryDirectory(prefix="mfvpr-timing-") as folder:
-        archive = Archive(Path(folder) / "archive")
+        cache = FeatureCache(Path(folder) / "cache")
         for turn in ("first", "second"):
             watch = Stopwatch()
             images = _link_under_new_names(sequence.images, number, Path(folder) / turn)
             part = replace(sequence, images=images, truth=None, excluded=None)
             evaluation.evaluate(
                 Dataset(dataset.name, database, (part,)), extractor, filter, {main: scorers[main]},
-                candidates=candidates, matching=matching, archive=archive, watch=watch,
+                candidates=candidates, matching=matching, cache=cache, watch=watch,
             )  # fmt: skip
     return {step: watch.seconds.get(step, 0.0) / number for step in STEPS}
 

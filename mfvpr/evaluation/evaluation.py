@@ -5,7 +5,7 @@
                             {"histogram": mfvpr.HistogramOfShifts()}, candidates=50)
     print(result.recall([0.0])["histogram"].pooled)
 
-Features, shortlist and matches are kept in the folder of an archive, if it has one.
+Features, shortlist and matches are kept in the folder of a cache, if it has one.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -29,7 +29,7 @@ from mfvpr.reranking.ranking import Ties
 from mfvpr.reranking.results import COHORT, Matched
 from mfvpr.retrieval.retriever import Filter
 from mfvpr.scoring.scorer import Scorer
-from mfvpr.storage.feature_cache import Archive
+from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.manifest import SCORES, store_path
 from mfvpr.storage.scores import QueryScores, ScoreStore, open_score_store
 from mfvpr.storage.shards import Shard, together
@@ -53,7 +53,7 @@ def evaluate(
     correlated: Mapping[str, FrameCorrelation] | None = None,
     cohort: int | None = None,
     ties: Ties = "filter",
-    archive: Archive | None = None,
+    cache: FeatureCache | None = None,
     memory: float | None = None,
     devices: Sequence[Device] | None = None,
     watch: Stopwatch | None = None,
@@ -75,7 +75,7 @@ def evaluate(
             much (`mfvpr.reranking.cohort_normalization`). The number says how many frames on both sides of an image
             show its place, and are left out; None = no cohort.
         ties: equal scores keep the order of the retrieval, or go by the row of the database: "filter", "index".
-        archive: where features and matches are kept; None = in memory.
+        cache: where features and matches are kept; None = in memory.
         memory: GB that features of the database may take on the devices, and matches that are kept in memory; None = a
             third of what is free.
         devices: that share the queries; None = the one that JAX takes.
@@ -90,12 +90,12 @@ def evaluate(
     fused, correlated = fused or {}, correlated or {}
     check_request(scorers, fused, correlated, ties, memory, cohort=cohort is not None)
     watch = watch or Stopwatch()
-    archive = replace(archive or Archive(), watch=watch)
+    cache = replace(cache or FeatureCache(), watch=watch)
     tools = (extractor, filter, candidates)
-    options = {"matching": matching, "archive": archive, "memory": memory, "devices": devices}
+    options = {"matching": matching, "cache": cache, "memory": memory, "devices": devices}
     calls = [partial(_score, dataset, sequence, tools, scorers, watch, **options) for sequence in dataset.sequences]
     if cohort is not None:
-        sequence = cohort_sequence(archive.contents(dataset.database), cohort)
+        sequence = cohort_sequence(cache.contents(dataset.database), cohort)
         calls.insert(0, partial(_score_cohort, dataset, sequence, tools, scorers, watch, **options))
     scored: list[Scored] = together(*calls)
     strengths = {} if cohort is None else _hubness(*scored.pop(0), len(dataset.database))
@@ -104,7 +104,7 @@ def evaluate(
         rank_sequence(sequence, scores, fused, correlated, ties, hubness=strengths) for sequence, scores in scored
     ]
     for line in score_warnings(matched, ranked, scorers):
-        archive.warn(line)
+        cache.warn(line)
     systems = {name: [by_system[name] for by_system in ranked] for name in ranked[0]}
     return Result(dataset, matched, systems, watch.seconds)
 
@@ -116,34 +116,34 @@ def _score(
     scorers: Mapping[str, Scorer],
     watch: Stopwatch,
     *,
-    archive: Archive,
+    cache: FeatureCache,
     label: str = "",
     **options: Any,
 ) -> Scored:
     """Match and score a sequence; a shard computes scores of its own queries and reads those of other shards."""
 
     def match(rows: Sequence[int] | None = None) -> Matched:
-        tracked: dict[str, Any] = options | ({"track": archive.track(f"{label}matching")} if label else {})
-        return match_sequence(dataset, sequence, *tools, archive=archive, watch=watch, rows=rows, **tracked)
+        tracked: dict[str, Any] = options | ({"track": cache.track(f"{label}matching")} if label else {})
+        return match_sequence(dataset, sequence, *tools, cache=cache, watch=watch, rows=rows, **tracked)
 
     def score(matched: Matched) -> dict[str, np.ndarray]:
         with watch("scores"):
-            track = archive.track(f"{label}scores")
+            track = cache.track(f"{label}scores")
             return stages.score(scorers, matched.by_scale, matched.candidates, devices=options["devices"], track=track)
 
-    if archive.shard is None or archive.root is None:
+    if cache.shard is None or cache.root is None:
         matched = match()
         return matched, score(matched)
     scorer_names = sorted(scorers)
-    with _score_store(dataset, sequence, tools, scorers, options["matching"], archive) as store:
-        _write_scores(store, archive.shard, sequence.images.names, scorer_names, match, score)
+    with _score_store(dataset, sequence, tools, scorers, options["matching"], cache) as store:
+        _write_scores(store, cache.shard, sequence.images.names, scorer_names, match, score)
 
         def missing_rows() -> Sequence[int]:
             store.look()
             return np.flatnonzero(~store.done).tolist()
 
-        archive.shard.wait(
-            missing_rows, sequence.images.names, f"{sequence.name} scores", patience=archive.patience, is_complete=True
+        cache.shard.wait(
+            missing_rows, sequence.images.names, f"{sequence.name} scores", patience=cache.patience, is_complete=True
         )
         stored = [query for _, query in store.read()]
     matched = match()
@@ -173,24 +173,24 @@ def _write_scores(
 
 def _score_store(
     dataset: Dataset, sequence: QuerySequence, tools: Tools, scorers: Mapping[str, Scorer], matching: Matcher,
-    archive: Archive,
+    cache: FeatureCache,
 ) -> ScoreStore:  # fmt: skip
     """Open a shard's store of scores. Its recipe covers the code of the scorers, but not of functions they call."""
-    if archive.root is None or not scorers:
+    if cache.root is None or not scorers:
         raise InputError("scorers: expected at least one, got none; a shard keeps their scores")
     recipes, extractor = {}, tools[0]
     for name, scorer in scorers.items():
         try:
-            recipes[name] = archive.recipe_of(scorer)
+            recipes[name] = cache.recipe_of(scorer)
         except TypeError as error:
             raise InputError(f"{name}: a shard keeps scores, and must know what makes them: {error}") from None
     recipe = {
-        "matches": matches_recipe(dataset, sequence, *tools, matching, archive),
+        "matches": matches_recipe(dataset, sequence, *tools, matching, cache),
         "scorers": recipes,
         "scale weights": [scale.weight for scale in extractor.scales],
     }
-    path = store_path(archive.root, "scores", recipe, SCORES)
-    return open_score_store(path, recipe, num_queries=len(sequence.images), **archive.store_options)
+    path = store_path(cache.root, "scores", recipe, SCORES)
+    return open_score_store(path, recipe, num_queries=len(sequence.images), **cache.store_options)
 
 
 def _hubness(matched: Matched, scores: Mapping[str, np.ndarray], num_database: int) -> dict[str, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Matches of a sequence: images -> features -> shortlist -> matches, kept in the folder of an archive, if any."""
+"""Matches of a sequence: images -> features -> shortlist -> matches, kept in the folder of a cache, if any."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,7 +20,7 @@ from mfvpr.reranking.cohort_normalization import cohort_sequence
 from mfvpr.reranking.results import Matched
 from mfvpr.retrieval.fitting import fit_to_database
 from mfvpr.retrieval.retriever import Filter, Filtered
-from mfvpr.storage.feature_cache import Archive
+from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.matches import MatchStore
 from mfvpr.storage.shards import together
 from mfvpr.types import Shortlist
@@ -42,14 +42,14 @@ def match_sequence(
     candidates: int | Literal["all"] = 50,
     *,
     matching: Matcher = NEIGHBORS,
-    archive: Archive | None = None,
+    cache: FeatureCache | None = None,
     watch: Stopwatch | None = None,
     rows: Sequence[int] | None = None,
     **where: Any,
 ) -> Matched:
     """Find and match the candidates of one sequence's queries; features of other database images are not extracted.
 
-    If the archive has a root, matches are kept below it. If they are all there, nothing else is read.
+    If the cache has a root, matches are kept below it. If they are all there, nothing else is read.
     Arguments not listed here are those of `evaluate`.
 
     Args:
@@ -67,44 +67,45 @@ def match_sequence(
     check_matching(candidates, extractor, matching)
     if rows is not None and not all(0 <= row < len(sequence.images) for row in rows):
         raise InputError(f"rows: expected rows of {len(sequence.images)} queries, got {[*rows][:9]}")
-    archive, watch, database = archive or Archive(), watch or Stopwatch(), dataset.database
-    archive = archive if archive.watch else replace(archive, watch=watch)
+    cache, watch, database = cache or FeatureCache(), watch or Stopwatch(), dataset.database
+    cache = cache if cache.watch else replace(cache, watch=watch)
     with watch("features"):
-        extractor = fit_to_database(extractor, database, archive)
+        extractor = fit_to_database(extractor, database, cache)
     with watch("filter"):
-        filter = fit_to_database(filter, database, archive)
+        filter = fit_to_database(filter, database, cache)
     with ExitStack() as stack:
         stores = []
-        if archive.root is not None:
-            recipe = matches_recipe(dataset, sequence, extractor, filter, candidates, matching, archive)
-            stores = [stack.enter_context(store) for store in _match_stores(sequence, extractor, recipe, archive)]
-        is_joint = rows is not None and archive.shard is not None and archive.shard.meets
-        matched = None if is_joint else _read_matches(sequence, stores, rows, archive, watch, where.get("memory"))
+        if cache.root is not None:
+            recipe = matches_recipe(dataset, sequence, extractor, filter, candidates, matching, cache)
+            stores = [stack.enter_context(store) for store in _match_stores(sequence, extractor, recipe, cache)]
+        is_joint = rows is not None and cache.shard is not None and cache.shard.meets
+        matched = None if is_joint else _read_matches(sequence, stores, rows, cache, watch, where.get("memory"))
         if matched is None:
             with watch("filter"):
-                filtered = _find_candidates(sequence, database, filter, candidates, archive, stores)
-            options = {"matcher": matching, "rows": rows, "track": archive.track("matching"), **where}
-            matched = _match(dataset, sequence, extractor, filtered, stores, archive, watch, **options)
+                filtered = _find_candidates(sequence, database, filter, candidates, cache, stores)
+            options = {"matcher": matching, "rows": rows, "track": cache.track("matching"), **where}
+            matched = _match(dataset, sequence, extractor, filtered, stores, cache, watch, **options)
     if rows is None:
-        _warn_of_queries_without_candidates(matched, archive)
+        _warn_of_queries_without_candidates(matched, cache)
     return replace(matched, weights=tuple(scale.weight for scale in extractor.scales))
 
 
 def _find_candidates(
-    sequence: QuerySequence, database: ImageFolder, filter: Filter, candidates: int | Literal["all"], archive: Archive,
+    sequence: QuerySequence, database: ImageFolder, filter: Filter, candidates: int | Literal["all"],
+    cache: FeatureCache,
     stores: Sequence[MatchStore],
 ) -> Filtered:  # fmt: skip
     """The shortlist; all shards use that of the first, since near ties may come out differently on other machines."""
 
     def retrieve() -> Filtered:
         number = _number(candidates, database)
-        filtered = filter.shortlist(sequence, database, number, archive)
+        filtered = filter.shortlist(sequence, database, number, cache)
         return validate_candidates(filtered, type(filter).__name__, len(sequence.images), len(database), number)
 
-    if archive.shard is None:
+    if cache.shard is None:
         return retrieve()
     path, key = stores[0].folder / _SHORTLIST, stores[0].folder.name
-    if archive.shard.meets or not path.exists():
+    if cache.shard.meets or not path.exists():
         shortlist, *bad = retrieve()
         arrays = {"indices": shortlist.indices, "scores": shortlist.scores, "bad": np.array(json.dumps(bad))}
         with placing(path) as temporary:
@@ -117,12 +118,12 @@ def _find_candidates(
 
 def _match(
     dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, filtered: Filtered,
-    stores: Sequence[MatchStore], archive: Archive, watch: Stopwatch, *, rows: Sequence[int] | None, **options: Any,
+    stores: Sequence[MatchStore], cache: FeatureCache, watch: Stopwatch, *, rows: Sequence[int] | None, **options: Any,
 ) -> Matched:  # fmt: skip
     """Extract features and match all scales."""
     with watch("features"):
-        sides, remarks = _extract(dataset, sequence, extractor, filtered, archive)
-    _write_remarks(stores, archive, remarks)
+        sides, remarks = _extract(dataset, sequence, extractor, filtered, cache)
+    _write_remarks(stores, cache, remarks)
     shortlist = filtered.candidates
     with watch("matching"):
         matches = tuple(
@@ -141,7 +142,7 @@ def match_cohort(
     filter: Filter,
     candidates: int | Literal["all"] = 50,
     *,
-    archive: Archive | None = None,
+    cache: FeatureCache | None = None,
     **how: Any,
 ) -> Matched:
     """Match the database images among each other, once for all sequences.
@@ -152,20 +153,20 @@ def match_cohort(
         dataset: its database, in the order of the drive.
         neighbors: frames on both sides of an image that show its place, and are never its candidates.
     """
-    archive = archive or Archive()
-    sequence = cohort_sequence(archive.contents(dataset.database), neighbors)
-    how = {"track": archive.track("cohort matching")} | how
-    return match_sequence(dataset, sequence, extractor, filter, candidates, archive=archive, **how)
+    cache = cache or FeatureCache()
+    sequence = cohort_sequence(cache.contents(dataset.database), neighbors)
+    how = {"track": cache.track("cohort matching")} | how
+    return match_sequence(dataset, sequence, extractor, filter, candidates, cache=cache, **how)
 
 
 def _extract(
-    dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, filtered: Filtered, archive: Archive
+    dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, filtered: Filtered, cache: FeatureCache
 ) -> tuple[list[tuple[FeatureSet, FeatureSet]], dict[str, Any]]:
     """Features of the queries and of all candidates by scale, and remarks on bad images of both sides."""
     rows = np.unique(filtered.candidates.indices[filtered.candidates.mask])
     database, queries = together(
-        partial(archive.local, dataset.database, extractor, rows.tolist(), label="database"),
-        partial(archive.local, sequence.images, extractor, label=f"query {sequence.name}"),
+        partial(cache.local, dataset.database, extractor, rows.tolist(), label="database"),
+        partial(cache.local, sequence.images, extractor, label=f"query {sequence.name}"),
     )
     bad = {
         "queries": _by_row(filtered.bad_queries, queries[0].bad),
@@ -178,11 +179,11 @@ def _extract(
     return list(zip(queries, database, strict=True)), bad | {"warnings": warnings}
 
 
-def _warn_of_queries_without_candidates(matched: Matched, archive: Archive) -> None:
+def _warn_of_queries_without_candidates(matched: Matched, cache: FeatureCache) -> None:
     missing = [row for row in np.flatnonzero(~matched.candidates.mask.any(axis=1)) if row not in matched.bad_queries]
     if missing:
         images = matched.sequence.images
-        archive.warn(f"{images.paths[missing[0]]}: no candidates ({len(missing)} such queries of {len(images)}), which "
+        cache.warn(f"{images.paths[missing[0]]}: no candidates ({len(missing)} such queries of {len(images)}), which "
                      "counts as a failure")  # fmt: skip
 
 
@@ -195,7 +196,7 @@ def _by_row(*reasons: Mapping[Any, str]) -> dict[int, str]:
 
 
 def _read_matches(
-    sequence: QuerySequence, stores: Sequence[MatchStore], rows: Sequence[int] | None, archive: Archive,
+    sequence: QuerySequence, stores: Sequence[MatchStore], rows: Sequence[int] | None, cache: FeatureCache,
     watch: Stopwatch, memory: float | None,
 ) -> Matched | None:  # fmt: skip
     """Matches of all scales from the stores; None if some are missing."""
@@ -213,44 +214,44 @@ def _read_matches(
     if any((shortlist.indices != shortlists[0].indices).any() for shortlist in shortlists):
         return None  # scales with different shortlists: matching will raise
     for line in warnings:
-        archive.warn(line)
+        cache.warn(line)
     return Matched(sequence, shortlists[0], match_sets, queries, database)
 
 
-def _write_remarks(stores: Sequence[MatchStore], archive: Archive, remarks: Mapping[str, Any]) -> None:
+def _write_remarks(stores: Sequence[MatchStore], cache: FeatureCache, remarks: Mapping[str, Any]) -> None:
     """Warn of bad images, and keep the warnings for later runs, which read the matches and nothing else."""
     for store in stores[:1]:
         write_text(store.folder / _REMARKS, json.dumps(remarks))
     for line in remarks["warnings"]:
-        archive.warn(line)
+        cache.warn(line)
 
 
 def matches_recipe(
     dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, filter: Filter,
-    candidates: int | Literal["all"], matching: Matcher, archive: Archive,
+    candidates: int | Literal["all"], matching: Matcher, cache: FeatureCache,
 ) -> dict[str, Any]:  # fmt: skip
     """JSON values that determine a shortlist and its matches: images and features, retrieval, and matching."""
     excluded, database = sequence.excluded, dataset.database
-    extractor, filter = fit_to_database(extractor, database, archive), fit_to_database(filter, database, archive)
+    extractor, filter = fit_to_database(extractor, database, cache), fit_to_database(filter, database, cache)
     return {
-        "database": archive.recipe(database, extractor),
-        "query": archive.recipe(sequence.images, extractor),
-        "filter": archive.recipe_of(filter),
+        "database": cache.recipe(database, extractor),
+        "query": cache.recipe(sequence.images, extractor),
+        "filter": cache.recipe_of(filter),
         "candidates": _number(candidates, database),
-        "matching": archive.recipe_of(matching),
-        "skip_bad": archive.skip_bad,
+        "matching": cache.recipe_of(matching),
+        "skip_bad": cache.skip_bad,
         "excluded": None if excluded is None else recipe_of([excluded.rows, excluded.offsets]),
     }
 
 
 def _match_stores(
-    sequence: QuerySequence, extractor: Extractor | Source, recipe: Mapping[str, Any], archive: Archive
+    sequence: QuerySequence, extractor: Extractor | Source, recipe: Mapping[str, Any], cache: FeatureCache
 ) -> Iterator[AbstractContextManager[MatchStore]]:
     """One store of matches per scale."""
     several = len(extractor.scales) > 1
     share = 1 if recipe["matching"].get("cross_check") in ("none", "candidate") else 3
     for number, scale in enumerate(extractor.scales):
-        yield archive.matches(
+        yield cache.matches(
             {**recipe, "scale": number} if several else recipe, sequence.images.names, recipe["candidates"],
             typical=scale.typical_count // share, label=f"{sequence.name} matches",
         )  # fmt: skip

@@ -1,6 +1,6 @@
 """Learn the parts of extractors and retrievals that depend on the database, and store them.
 
-    cells = fitted(SsmCells(model), database, archive)
+    cells = fitted(SsmCells(model), database, cache)
 
 `mfvpr.evaluate` does this for its extractor and its retrieval.
 """
@@ -17,7 +17,7 @@ from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.features.extraction import describe_folder
 from mfvpr.features.windows import WindowExtractor, WindowFitting, origin
 from mfvpr.storage.disk import lock_store
-from mfvpr.storage.feature_cache import Archive
+from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.arrays import read_arrays, write_arrays
 from mfvpr.utils.fingerprints import fingerprint
 from mfvpr.utils.whitening import Whitening
@@ -28,16 +28,16 @@ _MB = 1e6
 Tool = TypeVar("Tool")
 
 
-def fit_to_database(tool: Tool, database: ImageFolder, archive: Archive) -> Tool:
+def fit_to_database(tool: Tool, database: ImageFolder, cache: FeatureCache) -> Tool:
     """Learn the parts of an extractor, a retrieval, or a dataclass of these that need a database.
 
-    If the archive has a root, a learned part is stored there as one `.npz` file, named by a hash of the images' content
+    If the cache has a root, a learned part is stored there as one `.npz` file, named by a hash of the images' content
     and of all settings; this hash is part of the recipe of everything that is computed with it.
 
     Args:
         tool: parts that are learned already stay the same, even if they were learned from another database.
         database: images to learn from.
-        archive: see `Archive`.
+        cache: see `FeatureCache`.
 
     Returns:
         A copy of the tool, or the tool itself if there is nothing to learn.
@@ -47,52 +47,52 @@ def fit_to_database(tool: Tool, database: ImageFolder, archive: Archive) -> Tool
     """
     if isinstance(tool, WindowExtractor) and isinstance(tool.whitening, WindowFitting):
         fitting = tool.whitening
-        whitening = archive.once("whitening", lambda: _whitening(tool, fitting, database, archive), database, tool)
+        whitening = cache.once("whitening", lambda: _whitening(tool, fitting, database, cache), database, tool)
         return replace(tool, whitening=whitening)  # pyright: ignore[reportArgumentType, reportCallIssue, reportReturnType]
     if not is_dataclass(tool) or isinstance(tool, type):
         return tool
     parts = {part.name: getattr(tool, part.name) for part in fields(tool) if part.init}
-    fitted_parts = {name: fit_to_database(part, database, archive) for name, part in parts.items()}
+    fitted_parts = {name: fit_to_database(part, database, cache) for name, part in parts.items()}
     changed = {name: part for name, part in fitted_parts.items() if part is not parts[name]}
     return replace(tool, **changed) if changed else tool
 
 
 def whitening_recipe(
-    extractor: WindowExtractor, fitting: WindowFitting, database: ImageFolder, archive: Archive
+    extractor: WindowExtractor, fitting: WindowFitting, database: ImageFolder, cache: FeatureCache
 ) -> dict[str, Any]:
     """Recipe of a whitening: images, network and its input, windows, and samples."""
-    parts = {"windows": archive.recipe_of(extractor.windows), "whitening": archive.recipe_of(fitting)}
-    return {"format": FORMAT} | archive.recipe(database, extractor.maps) | parts
+    parts = {"windows": cache.recipe_of(extractor.windows), "whitening": cache.recipe_of(fitting)}
+    return {"format": FORMAT} | cache.recipe(database, extractor.maps) | parts
 
 
 def _whitening(
-    extractor: WindowExtractor, fitting: WindowFitting, database: ImageFolder, archive: Archive
+    extractor: WindowExtractor, fitting: WindowFitting, database: ImageFolder, cache: FeatureCache
 ) -> Whitening:
-    """Whitening from the archive, learned and stored there if it is missing."""
-    if archive.root is None:
-        return _learn(extractor, fitting, database, archive)
-    recipe = whitening_recipe(extractor, fitting, database, archive)
+    """Whitening from the cache, learned and stored there if it is missing."""
+    if cache.root is None:
+        return _learn(extractor, fitting, database, cache)
+    recipe = whitening_recipe(extractor, fitting, database, cache)
     about, name = fingerprint(recipe), type(extractor).__name__
-    path = archive.root / f"{name}-whitening-{about}.npz"
-    archive.root.mkdir(parents=True, exist_ok=True)
-    with lock_store(archive.root, "whitening", archive.tell) if not path.exists() else nullcontext():
+    path = cache.root / f"{name}-whitening-{about}.npz"
+    cache.root.mkdir(parents=True, exist_ok=True)
+    with lock_store(cache.root, "whitening", cache.tell) if not path.exists() else nullcontext():
         if not path.exists():  # never replaced, because bits may differ between machines
-            learned = _learn(extractor, fitting, database, archive)
+            learned = _learn(extractor, fitting, database, cache)
             arrays = {"mean": learned.mean, "components": learned.components, "recipe": np.array(json.dumps(recipe))}
             write_arrays(path, arrays, about)
-            archive.tell(
+            cache.tell(
                 f"{name}: whitening of {learned.dimension} dimensions: {path.stat().st_size / _MB:.1f} MB in {path}"
             )
     arrays = read_arrays(path, about)
     return Whitening(arrays["mean"], arrays["components"], origin(extractor))
 
 
-def _learn(extractor: WindowExtractor, fitting: WindowFitting, database: ImageFolder, archive: Archive) -> Whitening:
+def _learn(extractor: WindowExtractor, fitting: WindowFitting, database: ImageFolder, cache: FeatureCache) -> Whitening:
     rows, bad = fitting.drawn(len(database)), {}
 
     def maps() -> Iterator[dict[int, np.ndarray]]:
-        track = archive.track(f"{type(extractor).__name__} whitening")
-        for batch in describe_folder(database, extractor.maps, rows, bad, skip_bad=archive.skip_bad, track=track):
+        track = cache.track(f"{type(extractor).__name__} whitening")
+        for batch in describe_folder(database, extractor.maps, rows, bad, skip_bad=cache.skip_bad, track=track):
             yield {
                 row: description.vector.reshape(extractor.windows.shape)
                 for row, description in batch.items() if description.vector is not None

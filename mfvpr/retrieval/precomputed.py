@@ -1,6 +1,6 @@
 """Files of other programs in place of extractors and retrievals.
 
-The cache identifies these files by their content, see `Archive.recipe_of`, not by their path.
+The cache identifies these files by their content, see `FeatureCache.recipe_of`, not by their path.
 """
 
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ from mfvpr.io.names import ImageOfEntry, require_one_image
 from mfvpr.io.shortlists import read_with_entries as read_shortlist
 from mfvpr.retrieval.retriever import Filtered
 from mfvpr.retrieval.search import EXACT, Search
-from mfvpr.storage.feature_cache import Archive
+from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError
 
@@ -93,11 +93,11 @@ class DescriptorFiles:
     )
 
     def shortlist(
-        self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, archive: Archive
+        self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache
     ) -> Filtered:
         """See `mfvpr.retrieval.retriever.Filter`."""
-        database_vectors = archive.once("vectors", lambda: self._read(database), database, self)
-        search = archive.once("search", lambda: self.search.fit(database_vectors), database, self)
+        database_vectors = cache.once("vectors", lambda: self._read(database), database, self)
+        search = cache.once("search", lambda: self.search.fit(database_vectors), database, self)
         query_vectors = self._read(sequence.images)
         shortlist = search.shortlist(query_vectors, database_vectors, num_candidates, excluded=sequence.excluded)
         return Filtered(shortlist, {}, {})
@@ -122,7 +122,7 @@ class ShortlistFiles:
     database_prefix: str = ""
 
     def shortlist(
-        self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, archive: Archive
+        self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache
     ) -> Filtered:
         """See `mfvpr.retrieval.retriever.Filter`; candidates that the sequence excludes are removed."""
         file = _file_of(self.files, sequence.images)

@@ -10,7 +10,7 @@ import numpy as np
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence
 from mfvpr.features.extractor import Aggregated, Extractor
 from mfvpr.retrieval.search import EXACT, Search
-from mfvpr.storage.feature_cache import Archive
+from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.shards import together
 from mfvpr.types import Shortlist
 
@@ -30,7 +30,7 @@ class Filter(Protocol):
     """
 
     def shortlist(
-        self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, archive: Archive
+        self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache
     ) -> Filtered:
         """Best candidates of each query, without database images that the sequence excludes.
 
@@ -38,7 +38,7 @@ class Filter(Protocol):
             sequence: Q queries.
             database: N images.
             num_candidates: C.
-            archive: cache of features of the images.
+            cache: cache of features of the images.
         """
         ...
 
@@ -56,16 +56,16 @@ class Retrieval:
     search: Search = EXACT
 
     def shortlist(
-        self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, archive: Archive
+        self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache
     ) -> Filtered:
         """See `Filter`."""
         database_vectors, query_vectors = together(
-            partial(archive.vectors, database, self.describer, database, label="database"),
-            partial(archive.vectors, sequence.images, self.describer, database, label=f"query {sequence.name}"),
+            partial(cache.vectors, database, self.describer, database, label="database"),
+            partial(cache.vectors, sequence.images, self.describer, database, label=f"query {sequence.name}"),
         )
         # An image without features has the descriptor 0, which is equally similar to all.
         is_zero = ~query_vectors.values.any(axis=1, keepdims=True)
-        search = archive.once("search", lambda: self.search.fit(database_vectors.values), database, self)
+        search = cache.once("search", lambda: self.search.fit(database_vectors.values), database, self)
         candidates = search.shortlist(
             np.where(is_zero, np.nan, query_vectors.values),
             database_vectors.values,

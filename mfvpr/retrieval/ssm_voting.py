@@ -10,7 +10,7 @@ from mfvpr.features.ssm import SsmWindows
 from mfvpr.retrieval.fitting import fit_to_database
 from mfvpr.retrieval.retriever import Filtered
 from mfvpr.retrieval.search import EXACT, ExactSearch
-from mfvpr.storage.feature_cache import Archive
+from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.types import Shortlist
 
 QUERIES = 64  # searched at a time
@@ -32,12 +32,12 @@ class SsmVoting:
     search: ExactSearch = EXACT
 
     def shortlist(
-        self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, archive: Archive
+        self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache
     ) -> Filtered:
         """See `mfvpr.retrieval.retriever.Filter`; scores are votes."""
-        describer = fit_to_database(self.describer, database, archive)
-        database_vectors = archive.vectors(database, describer, database, label="database")
-        query_vectors = archive.vectors(sequence.images, describer, database, label=f"query {sequence.name}")
+        describer = fit_to_database(self.describer, database, cache)
+        database_vectors = cache.vectors(database, describer, database, label="database")
+        query_vectors = cache.vectors(sequence.images, describer, database, label=f"query {sequence.name}")
         shape = (-1, describer.windows.count, describer.whitening.dimension)
         queries, windows = query_vectors.values.reshape(shape), database_vectors.values.reshape(shape)
         candidates = vote(queries, windows, num_candidates, excluded=sequence.excluded, search=self.search)

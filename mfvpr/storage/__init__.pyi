@@ -1,8 +1,8 @@
 __all__ = [
-    "Archive",
+    "FeatureCache",
     "NotYet",
     "Shard",
 ]
 
-from .feature_cache import Archive
+from .feature_cache import FeatureCache
 from .shards import NotYet, Shard

@@ -1,8 +1,8 @@
 """A cache of the features and global descriptors of images, on disk or in memory.
 
-    archive = Archive(Path("~/.cache/mfvpr/features").expanduser())
-    [features] = archive.local(folder, Sift())
-    vectors = archive.vectors(folder, MixVprDescriptor(model))
+    cache = FeatureCache(Path("~/.cache/mfvpr/features").expanduser())
+    [features] = cache.local(folder, Sift())
+    vectors = cache.vectors(folder, MixVprDescriptor(model))
 
 The content of the images and the recipe of the extractor name a store, not the data set, so that a database which
 several data sets share is extracted once.
@@ -52,7 +52,7 @@ class Vectors:
 
 
 @dataclass
-class Archive:
+class FeatureCache:
     """Features, global descriptors and matches in stores below a folder, or in the memory of this process.
 
     Attributes:
@@ -85,8 +85,8 @@ class Archive:
 
     def contents(self, folder: ImageFolder) -> Contents:
         """Hashes of the files of a folder; with a root, later runs read them from there."""
-        cache = None if self.root is None else self.root / "contents"
-        return self.once("contents", lambda: contents(folder, cache), folder, None)
+        records = None if self.root is None else self.root / "contents"
+        return self.once("contents", lambda: contents(folder, records), folder, None)
 
     def once(self, name: str, compute: Callable[[], Value], folder: ImageFolder, by: Any) -> Value:
         """The result of `compute`, called once in this process while the files and the recipe of `by` stay the same.
@@ -190,7 +190,7 @@ class Archive:
             label: of the images in messages.
         """
         if self.root is None:
-            raise ValueError("nothing is kept on disk: this archive has no root")
+            raise ValueError("nothing is kept on disk: this cache has no root")
         path = store_path(self.root, "matches", recipe, MATCHES)
         sizes = {"num_queries": len(names), "num_candidates": num_candidates}
         rows = range(len(names)) if self.shard is None else self.shard.rows(names)

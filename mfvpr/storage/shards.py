@@ -1,7 +1,7 @@
 """Shards of one evaluation on many machines: a hash of its name assigns every image and query to a shard.
 
-    archive = Archive(root, shard=Shard(2, 8))
-    mfvpr.evaluate(dataset, extractor, filter, scorers, archive=archive)  # NotYet, until all eight are done
+    cache = FeatureCache(root, shard=Shard(2, 8))
+    mfvpr.evaluate(dataset, extractor, filter, scorers, cache=cache)  # NotYet, until all eight are done
 
 Each shard extracts its own images, then matches and scores its own queries. It raises `NotYet` when it needs rows that
 other shards have not written; started again, it goes on from there. The last shard finds all rows and returns the

@@ -25,7 +25,7 @@ from mfvpr.reranking import FrameCorrelation, Fusion
 from mfvpr.reranking.fusion import rank_sequence
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, ShortlistFiles, WhitenedSearch
 from mfvpr.retrieval.precomputed import File
-from mfvpr.storage import Archive, feature_cache
+from mfvpr.storage import FeatureCache, feature_cache
 from mfvpr.utils import InputError, progress
 from mfvpr.utils.fingerprints import fingerprint
 from mfvpr.utils.progress import no_progress
@@ -141,7 +141,7 @@ def test_answers_of_sequences_are_as_sure_as_those_of_one_path(dataset, split, s
 def test_the_database_is_described_once_for_all_sequences(split, small_street, tmp_path):
     several = sequences_dataset(small_street / "database", split, ground_truth="none")
     lines = []
-    mfvpr.evaluate(several, SIFT, VLAD, SCORERS, candidates=5, archive=Archive(tmp_path, tell=lines.append))
+    mfvpr.evaluate(several, SIFT, VLAD, SCORERS, candidates=5, cache=FeatureCache(tmp_path, tell=lines.append))
     assert [line for line in lines if "10 of 10 images to do" in line and "database" in line] == lines[1:2]
     assert sum("images to do" in line for line in lines) == 3
 
@@ -161,18 +161,18 @@ class Vectors:
 
 def test_only_candidates_are_extracted(dataset, tmp_path):
     few = replace(dataset.only, images=replace(dataset.queries, names=dataset.queries.names[:2]), truth=None)
-    feature_cache, lines = Archive(tmp_path), []
+    feature_cache, lines = FeatureCache(tmp_path), []
     feature_cache.tell = lines.append
-    matched = match_sequence(dataset, few, SIFT, Retrieval(Vectors()), 3, archive=feature_cache)
+    matched = match_sequence(dataset, few, SIFT, Retrieval(Vectors()), 3, cache=feature_cache)
     wanted = np.unique(matched.candidates.indices)
     assert len(wanted) < 7
-    [features] = Archive(tmp_path).local(dataset.database, SIFT, [])
+    [features] = FeatureCache(tmp_path).local(dataset.database, SIFT, [])
     assert np.flatnonzero(features.counts).tolist() == wanted.tolist()
     assert f"database features: {len(wanted)} of 10 images to do" in "\n".join(lines)
 
 
 def test_matches_are_kept_and_read_without_features(dataset, result, tmp_path):
-    found = mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=5, archive=Archive(tmp_path))
+    found = mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=5, cache=FeatureCache(tmp_path))
 
     def only_scores(label):
         assert label == "scores"
@@ -180,7 +180,7 @@ def test_matches_are_kept_and_read_without_features(dataset, result, tmp_path):
 
     again = mfvpr.evaluate(
         replace(dataset, name="again"), SIFT, VLAD, SCORERS, candidates=5,
-        archive=Archive(tmp_path, track=only_scores), memory=1e-5,
+        cache=FeatureCache(tmp_path, track=only_scores), memory=1e-5,
     )  # fmt: skip
     for name, system in itertools.product(again.systems, (found, again)):
         [ranked], [expected] = system.systems[name], result.systems[name]
@@ -208,7 +208,7 @@ def test_whitening_is_fitted_on_the_database():
 @pytest.fixture(scope="module")
 def files(dataset, tmp_path_factory):
     """What another program would have left of the data set, exactly."""
-    root, feature_cache = tmp_path_factory.mktemp("files"), Archive()
+    root, feature_cache = tmp_path_factory.mktemp("files"), FeatureCache()
     for side, folder in (("database", dataset.database), ("queries", dataset.queries)):
         names = [f"{side}/{name}" for name in folder.names]
         [features] = feature_cache.local(folder, SIFT)
@@ -245,7 +245,7 @@ def test_imported_shortlists_leave_out_what_is_excluded(dataset, files):
     sequence = replace(dataset.only, excluded=excluded)
     listed = ShortlistFiles({dataset.queries.root: File(files / "pairs.npz")})
     for width in (2, 7):
-        found = listed.shortlist(sequence, dataset.database, width, Archive()).candidates
+        found = listed.shortlist(sequence, dataset.database, width, FeatureCache()).candidates
         assert found.indices.shape == (10, width)
         assert not excluded.contains(found.indices).any()
         for row, mask in zip(found.indices, found.mask, strict=True):
@@ -261,24 +261,26 @@ def test_queries_without_candidates_are_told(dataset, tmp_path):
     listed = ShortlistFiles({dataset.queries.root: File(pairs)})
     for _ in range(2):
         lines = []
-        mfvpr.evaluate(dataset, SIFT, listed, SCORERS, candidates=2, archive=Archive(tmp_path / "s", tell=lines.append))
+        mfvpr.evaluate(
+            dataset, SIFT, listed, SCORERS, candidates=2, cache=FeatureCache(tmp_path / "s", tell=lines.append)
+        )
         [line] = [line for line in lines if "no candidates" in line]
         assert "0001.png: no candidates (8 such queries of 10)" in line
 
 
 def test_files_are_known_by_content(dataset, files, tmp_path):
-    feature_cache, before = Archive(tmp_path / "s"), FeatureFiles(at(dataset, files, ".npz"))
+    feature_cache, before = FeatureCache(tmp_path / "s"), FeatureFiles(at(dataset, files, ".npz"))
     recipe = feature_cache.recipe(dataset.database, before)
     moved = tmp_path / "elsewhere"
     shutil.copytree(files, moved)
     assert feature_cache.recipe(dataset.database, FeatureFiles(at(dataset, moved, ".npz"))) == recipe
     shutil.copy(files / "queries.npz", moved / "database.npz")
-    assert Archive(tmp_path / "s").recipe(dataset.database, FeatureFiles(at(dataset, moved, ".npz"))) != recipe
+    assert FeatureCache(tmp_path / "s").recipe(dataset.database, FeatureFiles(at(dataset, moved, ".npz"))) != recipe
 
 
 def test_what_is_read_of_files_is_part_of_the_recipe(dataset, files, tmp_path):
     """Which file belongs to which folder, and the prefixes; also within an aggregation."""
-    feature_cache, sides = Archive(tmp_path), at(dataset, files, ".npz")
+    feature_cache, sides = FeatureCache(tmp_path), at(dataset, files, ".npz")
     (one, first), (other, second) = sides.items()
     changed = [sides, {one: second, other: first}, sides | {one: replace(first, prefix="other/")}]
     for wrap in (
@@ -308,8 +310,8 @@ def test_bad_images_of_the_database_are_told_once(split, small_street, tmp_path)
     several, lines = sequences_dataset(tmp_path / "database", split, ground_truth="none"), []
     for root in (None, tmp_path / "s", tmp_path / "s"):  # the last reads matches alone
         lines.clear()
-        feature_cache = Archive(root, skip_bad=True, tell=lines.append)
-        found = mfvpr.evaluate(several, SIFT, VLAD, SCORERS, candidates="all", archive=feature_cache)
+        feature_cache = FeatureCache(root, skip_bad=True, tell=lines.append)
+        found = mfvpr.evaluate(several, SIFT, VLAD, SCORERS, candidates="all", cache=feature_cache)
         assert all(list(one.bad_database) == [4] for one in found.matched)
         warned = [line for line in lines if line.startswith("warning: ")]
         assert len(warned) == 2

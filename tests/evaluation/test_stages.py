@@ -18,7 +18,7 @@ from mfvpr.matching import match_set as match_sets
 from mfvpr.reranking import ranking
 from mfvpr.retrieval import Retrieval
 from mfvpr.retrieval.search import EXACT
-from mfvpr.storage import Archive
+from mfvpr.storage import FeatureCache
 from mfvpr.storage.matches import StoredMatches, open_match_store
 from mfvpr.tuning.sweeps import sweep
 from mfvpr.types import Shortlist
@@ -39,13 +39,13 @@ def street(small_street):
 
 @pytest.fixture(scope="module")
 def features(street):
-    return [Archive().local(folder, SIFT)[0] for folder in (street.database, street.queries)]
+    return [FeatureCache().local(folder, SIFT)[0] for folder in (street.database, street.queries)]
 
 
 @pytest.fixture(scope="module")
 def candidates(street):
     filtered = Retrieval(Aggregated(SIFT, VladFitting(num_words=8))).shortlist(
-        street.only, street.database, 6, Archive()
+        street.only, street.database, 6, FeatureCache()
     )
     return filtered.candidates
 
@@ -211,11 +211,11 @@ def mixed(tmp_path, small_street):
 
 
 def test_skipped_images_are_listed_and_never_shortlisted(mixed, opened):
-    archive, vlad = Archive(skip_bad=True), Aggregated(SIFT, VladFitting(num_words=4))
-    [found] = archive.local(mixed, SIFT)
+    cache, vlad = FeatureCache(skip_bad=True), Aggregated(SIFT, VladFitting(num_words=4))
+    [found] = cache.local(mixed, SIFT)
     assert sorted(found.bad) == [1, 2]
     assert not found.counts[[1, 2, 3]].any()
-    descriptors = archive.vectors(mixed, vlad, mixed).values
+    descriptors = cache.vectors(mixed, vlad, mixed).values
     candidates = EXACT.shortlist(descriptors, descriptors, 5)
     np.testing.assert_array_equal(candidates.indices[0], [0, 4, 3, -1, -1])
     np.testing.assert_array_equal(candidates.indices[1], [-1] * 5)
@@ -245,11 +245,11 @@ def test_features_that_are_not_finite_are_named_and_rank_last(street, value):
             Broken.calls += 1
             return described
 
-    archive, extractor = Archive(), Broken()
-    [found] = archive.local(street.database, extractor)
+    cache, extractor = FeatureCache(), Broken()
+    [found] = cache.local(street.database, extractor)
     assert list(found.bad) == [1]
     assert "0001.png" in found.bad[1]
-    descriptors = archive.vectors(street.database, Aggregated(extractor, VladFitting(num_words=4)), street.database)
+    descriptors = cache.vectors(street.database, Aggregated(extractor, VladFitting(num_words=4)), street.database)
     candidates = EXACT.shortlist(descriptors.values, descriptors.values, 10)
     assert (candidates.indices != 1).all()
 

@@ -16,7 +16,7 @@ from mfvpr.matching import Matching
 from mfvpr.reranking import FrameCorrelation, Fusion
 from mfvpr.retrieval import Filtered, Retrieval, WhitenedSearch
 from mfvpr.retrieval.search import EXACT
-from mfvpr.storage import Archive
+from mfvpr.storage import FeatureCache
 from mfvpr.types import Shortlist
 from mfvpr.utils import InputError
 
@@ -39,7 +39,7 @@ class Fixed:
     indices: tuple
     scores: float = 0.5
 
-    def shortlist(self, sequence, database, num_candidates, archive):
+    def shortlist(self, sequence, database, num_candidates, cache):
         indices = np.tile(np.array(self.indices, np.int32), (len(sequence.images), 1))
         return Filtered(Shortlist(indices, np.full(indices.shape, self.scores, np.float32), indices != -1), {}, {})
 
@@ -138,8 +138,8 @@ def test_what_cannot_be_used_is_told(dataset, options, words):
 def test_padding_of_ones_own_extractor_is_dropped(dataset, tmp_path):
     counts = [
         match.counts
-        for extractor, archive in ((SIFT, None), (Own("padded"), None), (Own("padded"), Archive(tmp_path)))
-        for match in evaluated(dataset, extractor, archive=archive).matched[0].matches
+        for extractor, cache in ((SIFT, None), (Own("padded"), None), (Own("padded"), FeatureCache(tmp_path)))
+        for match in evaluated(dataset, extractor, cache=cache).matched[0].matches
     ]
     np.testing.assert_array_equal(counts[1], counts[0])
     np.testing.assert_array_equal(counts[2], counts[0])
@@ -179,11 +179,11 @@ def test_scores_that_are_nan_are_told(dataset):
         return jnp.where(count > few, jnp.nan, count)
 
     scorers = {"n": scorer}
-    evaluated(dataset, scorers=scorers, archive=Archive(tell=lines.append))
+    evaluated(dataset, scorers=scorers, cache=FeatureCache(tell=lines.append))
     assert any("of n are NaN" in line for line in lines)
     lines.clear()  # of a single candidate every z-score is 0
     options = {"chosen": Fixed((4,)), "candidates": 1, "fused": {"n": Fusion("zscore")}}
-    evaluated(dataset, scorers=scorers, archive=Archive(tell=lines.append), **options)
+    evaluated(dataset, scorers=scorers, cache=FeatureCache(tell=lines.append), **options)
     assert any("of n + filter are NaN" in line for line in lines)
 
 
@@ -226,5 +226,5 @@ def test_images_of_nothing_have_no_shortlist(dataset, tmp_path):
     shutil.copy(dataset.queries.paths[3], tmp_path / "1.png")
     sequence = replace(dataset.only, images=image_folder(tmp_path))
     described = Retrieval(Aggregated(SIFT, VladFitting(num_words=4)))
-    found = described.shortlist(sequence, dataset.database, 3, Archive()).candidates
+    found = described.shortlist(sequence, dataset.database, 3, FeatureCache()).candidates
     assert found.mask.tolist() == [[False] * 3, [True] * 3]

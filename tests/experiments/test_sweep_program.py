@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from experiments import axes, evaluation, launch, search
-from mfvpr.storage import Archive
+from mfvpr.storage import FeatureCache
 from mfvpr.storage import matches as match_store
 from tests.programs import CANDIDATES, QUERIES, ROOT, composed, matches_path, results, shared, small, snapshot, typed
 
@@ -173,7 +173,7 @@ def test_split_reports_every_query_once_by_what_it_did_not_choose(sweep, swept, 
 
 
 def test_no_features_are_read_where_the_matches_are_stored(sweep, swept, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(Archive, "local", lambda *_, **options: pytest.fail("features were read"))
+    monkeypatch.setattr(FeatureCache, "local", lambda *_, **options: pytest.fail("features were read"))
     sweep(tmp_path / "out", *GRID)
     stderr = capsys.readouterr().err
     assert "folder matches: all 24 queries from" in stderr

@@ -18,7 +18,7 @@ from mfvpr.features import PatchNetVladFeatures
 from mfvpr.networks import VggNetVlad
 from mfvpr.reranking import fuse_scales
 from mfvpr.retrieval import Retrieval
-from mfvpr.storage import Archive, features, vectors
+from mfvpr.storage import FeatureCache, features, vectors
 from mfvpr.utils import InputError
 from tests.golden import make_patch_scores as patch_scores
 from tests.golden.make_netvlad import GOLDEN, POSITIONS, image, name
@@ -97,14 +97,14 @@ def test_scales_are_standardized_weighted_and_summed(model, dataset, tmp_path):
     sizes, weights = (2, 3, 5), (0.45, 0.15, 0.4)
     extractor = PatchNetVladFeatures(model, SIZE, patch_sizes=sizes, scale_weights=weights)
     lines = []
-    archive = partial(Archive, tmp_path, tell=lines.append)
-    options = {"candidates": 6, "archive": archive()}
+    cache = partial(FeatureCache, tmp_path, tell=lines.append)
+    options = {"candidates": 6, "cache": cache()}
     found = mfvpr.evaluate(dataset, extractor, Retrieval(extractor), SCORERS, **options)
     assert sum("images to do" in line for line in lines) == 2  # one pass a side: descriptors and patches
     single = []
     for size in sizes:  # out of stores as well, which round descriptors
-        one, kept = replace(extractor, patch_sizes=(size,), scale_weights=None), Archive(tmp_path / str(size))
-        single.append(mfvpr.evaluate(dataset, one, Retrieval(one), SCORERS, candidates=6, archive=kept))
+        one, kept = replace(extractor, patch_sizes=(size,), scale_weights=None), FeatureCache(tmp_path / str(size))
+        single.append(mfvpr.evaluate(dataset, one, Retrieval(one), SCORERS, candidates=6, cache=kept))
     for scorer in SCORERS:
         expected = 0.0
         for weight, alone in zip(weights, single, strict=True):
@@ -114,9 +114,9 @@ def test_scales_are_standardized_weighted_and_summed(model, dataset, tmp_path):
         [ranked] = found.systems[scorer]
         actual = np.take_along_axis(ranked.scores, np.argsort(ranked.rows, axis=1), axis=1)
         np.testing.assert_allclose(actual, expected, atol=1e-4)
-    again = mfvpr.evaluate(dataset, extractor, Retrieval(extractor), SCORERS, candidates=6, archive=archive())
+    again = mfvpr.evaluate(dataset, extractor, Retrieval(extractor), SCORERS, candidates=6, cache=cache())
     other = replace(extractor, scale_weights=(1.0, 2.0, 3.0))
-    changed = mfvpr.evaluate(dataset, other, Retrieval(other), SCORERS, candidates=6, archive=archive())
+    changed = mfvpr.evaluate(dataset, other, Retrieval(other), SCORERS, candidates=6, cache=cache())
     assert sum("images to do" in line for line in lines) == 2  # weights are no part of what is kept
     for scorer in SCORERS:
         np.testing.assert_array_equal(again.systems[scorer][0].scores, found.systems[scorer][0].scores)

@@ -22,7 +22,7 @@ from mfvpr.networks import SsmVgg
 from mfvpr.retrieval import Retrieval, SsmVoting, fit_to_database
 from mfvpr.retrieval.fitting import whitening_recipe
 from mfvpr.scoring import GridAnchors
-from mfvpr.storage import Archive
+from mfvpr.storage import FeatureCache
 from mfvpr.storage.features import forecast_bytes, pack_features
 from mfvpr.utils import InputError
 from mfvpr.utils.fingerprints import difference, fingerprint
@@ -132,9 +132,9 @@ def test_fewer_windows_than_dimensions_are_refused(cells, dataset):
     one = ImageFolder(dataset.database.root, dataset.database.names[:1])
     few = replace(cells, whitening=WindowFitting(12))
     with pytest.raises(InputError, match=r"12 descriptors .*got 12 .*4608"):
-        fit_to_database(few, one, Archive())
+        fit_to_database(few, one, FeatureCache())
     assert np.isfinite(
-        fit_to_database(replace(cells, whitening=WindowFitting(11)), one, Archive()).whitening.components
+        fit_to_database(replace(cells, whitening=WindowFitting(11)), one, FeatureCache()).whitening.components
     ).all()
 
 
@@ -142,7 +142,7 @@ def test_fewer_windows_than_dimensions_are_refused(cells, dataset):
 
 
 def test_cells_are_whitened_windows_at_their_places(model, cells, dataset):
-    learned = fit_to_database(cells, dataset.database, Archive())
+    learned = fit_to_database(cells, dataset.database, FeatureCache())
     images = np.random.default_rng(0).integers(0, 256, (2, 40, 48, 3), np.uint8)
     maps = [one.vector.reshape(5, 6, 512).astype(np.float64) for one in SsmMaps(model, 2, SMALL)(images)]
     found = Windows((5, 6, 512), 3)
@@ -202,9 +202,9 @@ def test_databases_are_of_the_published_size(model, images, printed, tmp_path):
 
 def test_stores_take_little_more_than_half_of_it(cells, dataset, tmp_path):
     """Directions of cells in float16, beside their lengths, places and scores."""
-    archive = Archive(tmp_path)
-    [found] = archive.local(
-        dataset.database, fit_to_database(replace(cells, whitening=WindowFitting(100)), dataset.database, archive)
+    cache = FeatureCache(tmp_path)
+    [found] = cache.local(
+        dataset.database, fit_to_database(replace(cells, whitening=WindowFitting(100)), dataset.database, cache)
     )
     [(_, one)] = found.read([0])
     parts = pack_features(one)
@@ -228,29 +228,29 @@ def kept(root):
 def test_what_is_learned_is_kept_and_made_once(cells, dataset, tmp_path):
     labels = []
 
-    def archive():
-        return Archive(tmp_path, track=lambda label: labels.append(label) or (lambda items, total=None: items))
+    def cache():
+        return FeatureCache(tmp_path, track=lambda label: labels.append(label) or (lambda items, total=None: items))
 
-    first = fit_to_database(cells, dataset.database, archive())
+    first = fit_to_database(cells, dataset.database, cache())
     assert labels == ["SsmCells whitening"]
-    again = fit_to_database(cells, dataset.database, archive())
+    again = fit_to_database(cells, dataset.database, cache())
     assert labels == ["SsmCells whitening"]
-    assert fit_to_database(again, dataset.database, archive()) is again
+    assert fit_to_database(again, dataset.database, cache()) is again
     np.testing.assert_array_equal(again.whitening.components, first.whitening.components)
     np.testing.assert_array_equal(
-        fit_to_database(cells, dataset.database, Archive()).whitening.mean, first.whitening.mean
+        fit_to_database(cells, dataset.database, FeatureCache()).whitening.mean, first.whitening.mean
     )
     [path] = kept(tmp_path)
     assert {*np.load(path).files} == {"mean", "components", "recipe"}
 
 
 def test_it_is_of_no_other_data_network_or_settings(model, cells, dataset, tmp_path):
-    archive, how, other = Archive(tmp_path), cells.whitening, network(1)
-    learned = [fit_to_database(cells, folder, archive) for folder in (dataset.database, dataset.queries)]
+    cache, how, other = FeatureCache(tmp_path), cells.whitening, network(1)
+    learned = [fit_to_database(cells, folder, cache) for folder in (dataset.database, dataset.queries)]
     assert len(kept(tmp_path)) == 2
     assert not np.array_equal(*(one.whitening.components for one in learned))
     # A hash of it is part of all that is computed with it.
-    recipes = [archive.recipe(dataset.database, replace(cells, whitening=one.whitening)) for one in learned]
+    recipes = [cache.recipe(dataset.database, replace(cells, whitening=one.whitening)) for one in learned]
     assert "whitening" in difference(*recipes)
     variants = [
         cells, replace(cells, model=other), replace(cells, preprocessing="caffe"), replace(cells, stride=2),
@@ -260,14 +260,17 @@ def test_it_is_of_no_other_data_network_or_settings(model, cells, dataset, tmp_p
             {"dtype": "float64"},
         )),
     ]  # fmt: skip
-    recipes = [whitening_recipe(one, one.whitening, dataset.database, archive) for one in variants]
+    recipes = [whitening_recipe(one, one.whitening, dataset.database, cache) for one in variants]
     assert len({*map(fingerprint, recipes)}) == len(variants)
     same = replace(cells, batch_size=1)
-    assert whitening_recipe(same, how, dataset.database, archive) == recipes[0]
+    assert whitening_recipe(same, how, dataset.database, cache) == recipes[0]
 
 
 def test_it_is_refused_by_other_networks_images_and_windows(cells, dataset, tmp_path):
-    learned, image = fit_to_database(cells, dataset.database, Archive(tmp_path)), np.zeros((1, 40, 48, 3), np.uint8)
+    learned, image = (
+        fit_to_database(cells, dataset.database, FeatureCache(tmp_path)),
+        np.zeros((1, 40, 48, 3), np.uint8),
+    )
     for change in (
         {"model": network(1)}, {"preprocessing": "caffe"}, {"interpolation": "cv2_area"}, {"stride": 2},
         {"image_size": (40, 48)},
@@ -275,19 +278,19 @@ def test_it_is_refused_by_other_networks_images_and_windows(cells, dataset, tmp_
         with pytest.raises(InputError, match=r"SsmCells: .*whitening .*network, images and windows"):
             replace(learned, **change)(image)
     assert len(replace(learned, batch_size=1)(image)) == 1
-    assert fit_to_database(cells, dataset.database, Archive()).whitening.origin == learned.whitening.origin != ""
+    assert fit_to_database(cells, dataset.database, FeatureCache()).whitening.origin == learned.whitening.origin != ""
 
 
 def test_files_that_are_damaged_or_exchanged_are_refused(cells, dataset, tmp_path):
-    fit_to_database(cells, dataset.database, Archive(tmp_path))
+    fit_to_database(cells, dataset.database, FeatureCache(tmp_path))
     [path] = kept(tmp_path)
-    fit_to_database(cells, dataset.queries, Archive(tmp_path))
+    fit_to_database(cells, dataset.queries, FeatureCache(tmp_path))
     [other] = {*kept(tmp_path)} - {path}
     content = path.read_bytes()
     for wrong in (other.read_bytes(), content[:-100] + bytes(100), b""):
         path.write_bytes(wrong)
         with pytest.raises(InputError, match="expected arrays as they were written here") as told:
-            fit_to_database(cells, dataset.database, Archive(tmp_path))
+            fit_to_database(cells, dataset.database, FeatureCache(tmp_path))
         assert "\n" not in str(told.value)
 
 
@@ -297,10 +300,10 @@ def test_images_that_cannot_be_read_are_left_out_only_where_they_may_be(cells, d
     (tmp_path / dataset.database.names[1]).write_bytes(b"no image")
     folder = ImageFolder(tmp_path, dataset.database.names[:3])
     with pytest.raises(InputError, match=r"0001\.png: .*read as an image .*skip"):
-        fit_to_database(cells, folder, Archive(tmp_path / "strict"))
+        fit_to_database(cells, folder, FeatureCache(tmp_path / "strict"))
     assert not kept(tmp_path / "strict")
-    learned = fit_to_database(cells, folder, Archive(tmp_path / "s", skip_bad=True))
-    few = fit_to_database(cells, ImageFolder(tmp_path, (folder.names[0], folder.names[2])), Archive())
+    learned = fit_to_database(cells, folder, FeatureCache(tmp_path / "s", skip_bad=True))
+    few = fit_to_database(cells, ImageFolder(tmp_path, (folder.names[0], folder.names[2])), FeatureCache())
     np.testing.assert_array_equal(learned.whitening.components, few.whitening.components)
 
 
@@ -318,9 +321,9 @@ def test_candidates_without_cells_score_zero():
 
 
 def test_parts_of_filters_are_learned_as_well(cells, model, dataset):
-    of_cells = fit_to_database(Retrieval(Aggregated(cells, VladFitting(num_words=4))), dataset.database, Archive())
+    of_cells = fit_to_database(Retrieval(Aggregated(cells, VladFitting(num_words=4))), dataset.database, FeatureCache())
     assert isinstance(of_cells.describer.extractor.whitening, Whitening)
-    assert fit_to_database(FILTER, dataset.database, Archive()) is FILTER
+    assert fit_to_database(FILTER, dataset.database, FeatureCache()) is FILTER
 
 
 # The whole way
@@ -328,10 +331,10 @@ def test_parts_of_filters_are_learned_as_well(cells, model, dataset):
 
 def test_the_database_is_looked_at_once_for_all_sequences(cells, small_street, dataset, tmp_path):
     labels = []
-    archive = Archive(tmp_path, track=lambda label: labels.append(label) or (lambda items, total=None: items))
+    cache = FeatureCache(tmp_path, track=lambda label: labels.append(label) or (lambda items, total=None: items))
     root = small_street / "queries"
     several = sequences_dataset(small_street / "database", [root, small_street / "database"], ground_truth="none")
-    options = {"candidates": 3, "matching": CANDIDATE, "archive": archive}
+    options = {"candidates": 3, "matching": CANDIDATE, "cache": cache}
     found = mfvpr.evaluate(several, cells, FILTER, {"count": mfvpr.MatchCount()}, **options)
     assert labels.count("SsmCells whitening") == 1
     [first, second] = found.matched
@@ -347,13 +350,13 @@ def test_an_image_is_found_by_itself_with_every_cell(model, dataset, tmp_path):
     """4 x 4 cells, each of which is nearest to itself, so that each agrees with all others."""
     square = SsmCells(model, SMALL[:1] * 2, whitening=WindowFitting(15))
     own = replace(dataset, sequences=(replace(dataset.only, images=dataset.database),))
-    options = {"matching": CANDIDATE, "archive": Archive(tmp_path)}
+    options = {"matching": CANDIDATE, "cache": FeatureCache(tmp_path)}
     found = mfvpr.evaluate(own, square, FILTER, {"grid": GridAnchors(4, 3)}, candidates=4, **options)
     [ranked] = found.systems["grid"]
     np.testing.assert_array_equal(ranked.rows[:, 0], np.arange(10))
     np.testing.assert_array_equal(ranked.scores[:, 0], np.full(10, (2 + 3 + 3 + 2) ** 2))
-    recipes = [matches_recipe(own, own.only, square, FILTER, 4, CANDIDATE, Archive(tmp_path))]
-    recipes.append(recipes[0] | {"database": Archive().recipe(own.database, square)})
+    recipes = [matches_recipe(own, own.only, square, FILTER, 4, CANDIDATE, FeatureCache(tmp_path))]
+    recipes.append(recipes[0] | {"database": FeatureCache().recipe(own.database, square)})
     assert "whitening" in difference(*recipes)
 
 
@@ -362,7 +365,7 @@ def test_the_only_votes_of_the_nearest_windows_are_an_images_own(model, dataset,
     few = ImageFolder(dataset.database.root, dataset.database.names[:3])
     sequence = replace(dataset.only, images=ImageFolder(few.root, few.names[1:2]))
     filter = SsmVoting(SsmWindows(model, whitening=WindowFitting(20)))
-    [candidates] = filter.shortlist(sequence, few, 1, Archive(tmp_path)).candidates.indices
+    [candidates] = filter.shortlist(sequence, few, 1, FeatureCache(tmp_path)).candidates.indices
     assert candidates == [1]
     assert len(kept(tmp_path)) == 1
     found = match_sequence(replace(dataset, database=few), sequence, FILTER.describer.extractor, filter, 3)

@@ -26,7 +26,7 @@ from mfvpr.localization import matching as map_matching
 from mfvpr.localization.evidence import LEAST_MATCHES, MapStrength
 from mfvpr.localization.resident import Resident
 from mfvpr.retrieval import Retrieval
-from mfvpr.storage import Archive
+from mfvpr.storage import FeatureCache
 from mfvpr.storage import maps as map_store
 from mfvpr.types import Features
 from mfvpr.utils import InputError
@@ -61,7 +61,7 @@ def test_answers_are_those_of_an_evaluation_with_a_store(dataset, folder, tmp_pa
     own, sampled = mfvpr.HistogramOfShifts(), scorers.Sampled(jax.random.key(0))
     systems = {"histogram": own, "plain": scorers.plain, "sampled": sampled, "host": mfvpr.OpenCvHomography()}
     filter = Retrieval(Aggregated(SIFT, VLAD))
-    result = mfvpr.evaluate(dataset, SIFT, filter, systems, candidates=5, archive=Archive(tmp_path))
+    result = mfvpr.evaluate(dataset, SIFT, filter, systems, candidates=5, cache=FeatureCache(tmp_path))
     for name, scorer in systems.items():
         [ranked], known = result.systems[name], asked(folder, scorer=scorer)
         for query, path in enumerate(dataset.queries.paths):

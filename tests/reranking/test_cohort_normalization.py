@@ -15,7 +15,7 @@ from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.reranking import FrameCorrelation, Fusion
 from mfvpr.reranking.cohort_normalization import PRIOR, by_hubness, cohort_sequence, hubness
 from mfvpr.retrieval import Retrieval
-from mfvpr.storage import Archive
+from mfvpr.storage import FeatureCache
 from mfvpr.types import Shortlist
 from mfvpr.utils import InputError
 from tests.programs import QUERIES, composed, folder, shared, small, typed
@@ -156,7 +156,7 @@ def result(dataset, kept):
         return lambda items, total: items
 
     found = mfvpr.evaluate(
-        both, SIFT, VLAD, SCORERS, candidates=5, cohort=2, archive=Archive(kept, tell=lines.append, track=track),
+        both, SIFT, VLAD, SCORERS, candidates=5, cohort=2, cache=FeatureCache(kept, tell=lines.append, track=track),
         fused={"histogram + cohort": Fusion(10.0)}, correlated={"count + cohort": FrameCorrelation(1)},
     )  # fmt: skip
     return found, lines, tracked
@@ -166,11 +166,11 @@ def test_every_scorer_is_ranked_with_the_cohort_as_well(dataset, kept, result):
     found, *_ = result
     more = ["histogram + cohort", "count + cohort", "histogram + cohort + filter", "count + cohort + frames"]
     assert [*found.systems] == ["filter", "histogram", "count", *more]
-    without = mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=5, archive=Archive(kept))
+    without = mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=5, cache=FeatureCache(kept))
     for name, [ranked] in without.systems.items():
         np.testing.assert_array_equal(found.systems[name][0].rows, ranked.rows)
         np.testing.assert_array_equal(found.systems[name][0].scores, ranked.scores)
-    others = match_cohort(dataset, 2, SIFT, VLAD, 5, archive=Archive(kept))
+    others = match_cohort(dataset, 2, SIFT, VLAD, 5, cache=FeatureCache(kept))
     candidates = others.candidates
     assert (np.abs(candidates.indices - np.arange(10)[:, None])[candidates.mask] > 2).all()
     for name, scores in stages.score(SCORERS, others.by_scale, candidates).items():
@@ -192,7 +192,7 @@ def test_sequences_share_a_cohort_that_is_told_and_kept(dataset, kept, result):
     assert {"cohort matching", "cohort scores"} <= {*tracked}
     assert found.seconds["cohort"] > 0
     again = []
-    mfvpr.evaluate(dataset, SIFT, VLAD, {}, candidates=5, cohort=2, archive=Archive(kept, tell=again.append))
+    mfvpr.evaluate(dataset, SIFT, VLAD, {}, candidates=5, cohort=2, cache=FeatureCache(kept, tell=again.append))
     assert again[0].startswith("cohort matches: all 10 queries from ")
 
 

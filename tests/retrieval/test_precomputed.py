@@ -11,7 +11,7 @@ from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.io import write_features, write_global_descriptors
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles, ShortlistFiles
 from mfvpr.retrieval.precomputed import File
-from mfvpr.storage import Archive
+from mfvpr.storage import FeatureCache
 from mfvpr.utils import InputError
 from tests.io.other_programs import feature
 
@@ -24,8 +24,10 @@ def folder(root, count=3):
     "read",
     [
         lambda files, other: FeatureFiles(files).opened(other, partial=False),
-        lambda files, other: DescriptorFiles(files).shortlist(QuerySequence("a", other, None), other, 2, Archive()),
-        lambda files, other: ShortlistFiles(files).shortlist(QuerySequence("a", other, None), other, 2, Archive()),
+        lambda files, other: DescriptorFiles(files).shortlist(
+            QuerySequence("a", other, None), other, 2, FeatureCache()
+        ),
+        lambda files, other: ShortlistFiles(files).shortlist(QuerySequence("a", other, None), other, 2, FeatureCache()),
     ],
 )
 def test_a_folder_without_a_file_is_refused_with_those_that_have_one(tmp_path, read):
@@ -65,7 +67,7 @@ def read_both(database, queries, files):
     """Read the database, then the queries."""
     if "global" in files[database.root].path.name:
         sequence = QuerySequence("q", queries, None)
-        return DescriptorFiles(files).shortlist(sequence, database, 1, Archive())
+        return DescriptorFiles(files).shortlist(sequence, database, 1, FeatureCache())
     source = FeatureFiles(files)
     return [source.opened(folder, partial=False) for folder in (database, queries)]
 
@@ -121,7 +123,11 @@ def test_pairs_within_the_database_are_not_of_queries(tmp_path):
     def candidates(names, images=queries, **prefixes):
         pairs.write_text("{} {}\n".format(*names))
         files = ShortlistFiles({images.root: File(pairs, prefixes.get("query", ""))}, prefixes.get("database", ""))
-        return files.shortlist(QuerySequence("q", images, None), database, 1, Archive()).candidates.indices[0].tolist()
+        return (
+            files.shortlist(QuerySequence("q", images, None), database, 1, FeatureCache())
+            .candidates.indices[0]
+            .tolist()
+        )
 
     with pytest.raises(InputError, match=r"db/0\.png for .*database/0\.png and for .*queries/0\.png; "):
         candidates(["db/0.png", "db/0.png"])

@@ -14,7 +14,7 @@ from mfvpr.datasets import image_folder
 from mfvpr.evaluation import stages
 from mfvpr.features import Aggregated, Description, Scale, Sift, VladFitting
 from mfvpr.retrieval.search import EXACT
-from mfvpr.storage import Archive, vectors
+from mfvpr.storage import FeatureCache, vectors
 from mfvpr.storage import feature_cache as archive_module
 from mfvpr.storage.features import forecast_bytes, open_store
 from mfvpr.types import Features
@@ -95,10 +95,10 @@ def assert_same_features(got, expected):
 
 
 def test_what_was_extracted_is_read_ever_after(folder, tmp_path):
-    [plain] = Archive().local(folder, SIFT)
+    [plain] = FeatureCache().local(folder, SIFT)
     extractor, feature_sets = Counted(), []
     for _ in range(2):
-        [features] = Archive(tmp_path).local(folder, extractor)
+        [features] = FeatureCache(tmp_path).local(folder, extractor)
         feature_sets.append(features)
     assert extractor.seen == len(folder)
     assert_same_features(*feature_sets)
@@ -110,15 +110,15 @@ def test_what_was_extracted_is_read_ever_after(folder, tmp_path):
 
 @pytest.mark.parametrize("on_disk", [True, False])
 def test_only_what_is_asked_for_is_extracted_and_nothing_twice(folder, tmp_path, on_disk):
-    extractor, archive = Counted(), Archive(tmp_path if on_disk else None)
+    extractor, cache = Counted(), FeatureCache(tmp_path if on_disk else None)
     for rows, seen in (([7, 2], 2), ([2], 2), ([2, 3, 7], 3), ([], 3)):
-        [features] = archive.local(folder, extractor, rows)
+        [features] = cache.local(folder, extractor, rows)
         assert extractor.seen == seen
         assert len(features) == len(folder)
     assert sorted(np.flatnonzero(features.counts).tolist()) == [2, 3, 7]
-    [all_features] = archive.local(folder, extractor)
+    [all_features] = cache.local(folder, extractor)
     assert extractor.seen == len(folder)
-    assert_same_features(all_features, Archive(tmp_path if on_disk else None).local(folder, SIFT)[0])
+    assert_same_features(all_features, FeatureCache(tmp_path if on_disk else None).local(folder, SIFT)[0])
 
 
 @dataclass
@@ -138,50 +138,50 @@ class Fewer:
 
 @pytest.mark.parametrize("on_disk", [True, False])
 def test_an_extractor_that_was_changed_is_another_one(folder, tmp_path, on_disk):
-    extractor, archive = Fewer(5), Archive(tmp_path if on_disk else None)
+    extractor, cache = Fewer(5), FeatureCache(tmp_path if on_disk else None)
     for number in (5, 9, 5):
         extractor.number = number
-        [features] = archive.local(folder, extractor)
+        [features] = cache.local(folder, extractor)
         assert features.counts.tolist() == [number] * len(folder)
 
 
 def test_what_another_version_decodes_are_other_images(folder, monkeypatch):
-    known, recipe = archive_module.versions(), Archive().recipe(folder, SIFT)
+    known, recipe = archive_module.versions(), FeatureCache().recipe(folder, SIFT)
     for name in ("mfvpr", "opencv-python-headless", "pillow"):
         monkeypatch.setattr(archive_module, "versions", lambda name=name: {**known, name: "0"})
-        assert Archive().recipe(folder, SIFT) != recipe
+        assert FeatureCache().recipe(folder, SIFT) != recipe
 
 
 @pytest.mark.parametrize("on_disk", [True, False])
 def test_files_that_were_changed_are_looked_at_again(tmp_path, on_disk, small_street, monkeypatch):
     root = tmp_path / "images"
     shutil.copytree(small_street / "database", root)
-    archive, folder = Archive(tmp_path / "s" if on_disk else None), image_folder(root)
-    [before] = archive.local(folder, SIFT, [0, 1])
+    cache, folder = FeatureCache(tmp_path / "s" if on_disk else None), image_folder(root)
+    [before] = cache.local(folder, SIFT, [0, 1])
     before = before[1]
     for row in range(len(folder)):
         shutil.copy(small_street / "queries" / f"{9 - row:04d}.png", root / f"{row:04d}.png")
-    [after] = archive.local(folder, SIFT)
-    [expected] = Archive(tmp_path / "other" if on_disk else None).local(folder, SIFT)
+    [after] = cache.local(folder, SIFT)
+    [expected] = FeatureCache(tmp_path / "other" if on_disk else None).local(folder, SIFT)
     assert_same_features(after, expected)
     assert not np.array_equal(before.keypoints, after[1].keypoints)
     monkeypatch.chdir(small_street)
     here = replace(folder, root=Path("database"))
-    [first] = archive.local(here, SIFT)
+    [first] = cache.local(here, SIFT)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "images").rename(tmp_path / "database")
-    [second] = archive.local(here, SIFT)
+    [second] = cache.local(here, SIFT)
     assert_same_features(second, expected)
     assert not np.array_equal(first[1].keypoints, second[1].keypoints)
 
 
 def test_one_pass_gives_a_vector_and_several_scales(folder, tmp_path):
     for root in (None, tmp_path, tmp_path):
-        extractor, archive = Both(), Archive(root)
-        vectors = archive.vectors(folder, extractor, folder)
+        extractor, cache = Both(), FeatureCache(root)
+        vectors = cache.vectors(folder, extractor, folder)
         assert vectors.values.shape == (len(folder), 3)
         np.testing.assert_array_equal(vectors.values[:4, 0], [0, 1, 2, 0])
-        first, second = archive.local(folder, extractor, [1, 4])
+        first, second = cache.local(folder, extractor, [1, 4])
         assert (second.counts == -(-first.counts // 2)).all()
         np.testing.assert_array_equal(second[4].keypoints, first[4].keypoints[::2])
         assert extractor.seen == (0 if root and (tmp_path / "seen").exists() else len(folder))
@@ -192,11 +192,11 @@ def test_one_pass_gives_a_vector_and_several_scales(folder, tmp_path):
 def test_an_interrupted_extraction_goes_on_where_it_was(folder, tmp_path):
     interrupted, resumed = Counted(limit=7), Counted()
     with pytest.raises(KeyboardInterrupt):
-        Archive(tmp_path).local(folder, interrupted)
-    [features] = Archive(tmp_path).local(folder, resumed)
+        FeatureCache(tmp_path).local(folder, interrupted)
+    [features] = FeatureCache(tmp_path).local(folder, resumed)
     assert interrupted.seen == 6
     assert resumed.seen == len(folder) - 6
-    [expected] = Archive(tmp_path / "uninterrupted").local(folder, SIFT)
+    [expected] = FeatureCache(tmp_path / "uninterrupted").local(folder, SIFT)
     assert_same_features(features, expected)
 
 
@@ -207,11 +207,11 @@ def test_bad_images_are_tried_again_by_the_next_run(tmp_path):
         Image.effect_noise((64, 64), 80).convert("RGB").save(images / f"{name}.png")
     good = (images / "b.png").read_bytes()
     (images / "b.png").write_bytes(b"")
-    folder, archive = image_folder(images), Archive(tmp_path / "s", skip_bad=True)
+    folder, cache = image_folder(images), FeatureCache(tmp_path / "s", skip_bad=True)
     for _ in range(2):
-        assert list(archive.local(folder, SIFT)[0].bad) == [1]
+        assert list(cache.local(folder, SIFT)[0].bad) == [1]
     (images / "b.png").write_bytes(good)
-    [features] = Archive(tmp_path / "s", skip_bad=True).local(folder, SIFT)
+    [features] = FeatureCache(tmp_path / "s", skip_bad=True).local(folder, SIFT)
     assert features.bad == {}
     assert features.counts.all()
 
@@ -219,9 +219,9 @@ def test_bad_images_are_tried_again_by_the_next_run(tmp_path):
 def test_bad_images_fail_by_default_with_the_mend(tmp_path):
     (tmp_path / "a.png").write_bytes(b"")
     with pytest.raises(InputError, match=r"a\.png.*0 bytes.*, or skip bad images"):
-        Archive().local(image_folder(tmp_path), SIFT)
+        FeatureCache().local(image_folder(tmp_path), SIFT)
     with pytest.raises(InputError, match=r"none of 1 images .*a\.png"):
-        Archive(skip_bad=True).local(image_folder(tmp_path), SIFT)
+        FeatureCache(skip_bad=True).local(image_folder(tmp_path), SIFT)
 
 
 @pytest.fixture
@@ -237,8 +237,8 @@ def colors(tmp_path):
 
 def test_global_descriptors_are_stored_as_well(colors, tmp_path):
     mean = Mean()
-    plain = Archive(skip_bad=True).vectors(colors, mean, colors)
-    runs = [Archive(tmp_path / "s", skip_bad=True).vectors(colors, mean, colors) for _ in range(2)]
+    plain = FeatureCache(skip_bad=True).vectors(colors, mean, colors)
+    runs = [FeatureCache(tmp_path / "s", skip_bad=True).vectors(colors, mean, colors) for _ in range(2)]
     assert mean.seen == 3 + 3
     for descriptors in runs:
         np.testing.assert_array_equal(descriptors.values, plain.values)
@@ -259,7 +259,7 @@ class Dark(Mean):
 
 @pytest.mark.parametrize("on_disk", [True, False])
 def test_images_without_a_global_descriptor_are_listed(colors, tmp_path, on_disk):
-    descriptors = Archive(tmp_path / "s" if on_disk else None, skip_bad=True).vectors(colors, Dark(), colors)
+    descriptors = FeatureCache(tmp_path / "s" if on_disk else None, skip_bad=True).vectors(colors, Dark(), colors)
     assert sorted(descriptors.bad) == [1, 2]
     assert "b.png: features are not finite" in descriptors.bad[1]
     assert np.isnan(descriptors.values).any(axis=1).tolist() == [False, True, True, False]
@@ -270,7 +270,7 @@ def test_stores_are_found_by_content_whatever_folders_are_called(folder, tmp_pat
     shutil.copytree(small_street / "database", copy)
     lines, extractor = [], Counted()
     for images, label in ((folder, "summer"), (image_folder(copy), "winter")):
-        Archive(tmp_path / "s", tell=lines.append).local(images, extractor, label=label)
+        FeatureCache(tmp_path / "s", tell=lines.append).local(images, extractor, label=label)
     assert extractor.seen == len(folder)
     [path] = [path for path in (tmp_path / "s").iterdir() if path.name != "contents"]
     assert lines[0].startswith(
@@ -283,13 +283,13 @@ def test_stores_are_found_by_content_whatever_folders_are_called(folder, tmp_pat
 
 def test_aggregations_are_fitted_on_the_database(folder, small_street, tmp_path):
     queries, describer = image_folder(small_street / "queries"), Aggregated(SIFT, VladFitting(num_words=4))
-    archive = Archive(tmp_path)
-    [local] = archive.local(folder, SIFT)
+    cache = FeatureCache(tmp_path)
+    [local] = cache.local(folder, SIFT)
     expected = VladFitting(num_words=4).fit(local)(all_of(local))
-    np.testing.assert_allclose(archive.vectors(folder, describer, folder).values, expected, atol=1e-6)
-    [query_features] = archive.local(queries, SIFT)
+    np.testing.assert_allclose(cache.vectors(folder, describer, folder).values, expected, atol=1e-6)
+    [query_features] = cache.local(queries, SIFT)
     np.testing.assert_allclose(
-        archive.vectors(queries, describer, folder).values,
+        cache.vectors(queries, describer, folder).values,
         VladFitting(num_words=4).fit(local)(all_of(query_features)), atol=1e-6,
     )  # fmt: skip
 

@@ -17,7 +17,7 @@ from mfvpr.evaluation import match_sequence
 from mfvpr.features import Aggregated, Description, Scale, Sift, VladFitting
 from mfvpr.reranking import FrameCorrelation, Fusion
 from mfvpr.retrieval import Filtered, Retrieval
-from mfvpr.storage import Archive, NotYet, Shard
+from mfvpr.storage import FeatureCache, NotYet, Shard
 from mfvpr.storage.shards import shard_of
 from mfvpr.storage.vectors import open_vector_store
 from mfvpr.types import Shortlist
@@ -65,7 +65,7 @@ def dataset(small_street):
 
 @pytest.fixture(scope="module")
 def plain(dataset, tmp_path_factory):
-    return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, archive=Archive(tmp_path_factory.mktemp("plain")), **HOW)
+    return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, cache=FeatureCache(tmp_path_factory.mktemp("plain")), **HOW)
 
 
 def shared(root, count, run, seed=0):
@@ -75,7 +75,7 @@ def shared(root, count, run, seed=0):
     while not results:
         for index in random.sample(range(count), count):
             try:
-                results.append(run(Archive(root, shard=Shard(index, count))))
+                results.append(run(FeatureCache(root, shard=Shard(index, count))))
             except NotYet as wait:
                 waits.append(str(wait))
         assert len(waits) < 8 * count
@@ -98,8 +98,8 @@ def test_shards_give_what_one_machine_gives(dataset, plain, tmp_path, count):
     extractor = Counted()
     filter = Retrieval(Aggregated(extractor, VladFitting(num_words=8)))
 
-    def run(archive):
-        return mfvpr.evaluate(dataset, extractor, filter, SCORERS, archive=archive, **HOW)
+    def run(cache):
+        return mfvpr.evaluate(dataset, extractor, filter, SCORERS, cache=cache, **HOW)
 
     results, waits = shared(tmp_path, count, run)
     for result in results:
@@ -107,7 +107,7 @@ def test_shards_give_what_one_machine_gives(dataset, plain, tmp_path, count):
     assert extractor.seen == len(dataset.database) + len(dataset.queries)  # each image once, by whomever
     assert bool(waits) == (count > 1)
     assert all(re.search(r"of \d+ are missing, of shards \d", wait) for wait in waits)
-    again = mfvpr.evaluate(dataset, extractor, filter, SCORERS, archive=Archive(tmp_path), **HOW)
+    again = mfvpr.evaluate(dataset, extractor, filter, SCORERS, cache=FeatureCache(tmp_path), **HOW)
     assert_same(again, plain)  # of anybody who is no shard: nothing is done again
     assert extractor.seen == len(dataset.database) + len(dataset.queries)
 
@@ -115,9 +115,9 @@ def test_shards_give_what_one_machine_gives(dataset, plain, tmp_path, count):
 def test_local_features_are_those_of_candidates_only(dataset, tmp_path):
     """With a filter of its own descriptors, as for a single machine."""
     filter, plain_root = Retrieval(Mean()), tmp_path / "plain"
-    expected = mfvpr.evaluate(dataset, SIFT, filter, SCORERS, candidates=2, archive=Archive(plain_root))
+    expected = mfvpr.evaluate(dataset, SIFT, filter, SCORERS, candidates=2, cache=FeatureCache(plain_root))
     results, _ = shared(
-        tmp_path / "s", 3, lambda archive: mfvpr.evaluate(dataset, SIFT, filter, SCORERS, candidates=2, archive=archive)
+        tmp_path / "s", 3, lambda cache: mfvpr.evaluate(dataset, SIFT, filter, SCORERS, candidates=2, cache=cache)
     )
     assert_same(results[0], expected)
 
@@ -150,26 +150,28 @@ def test_several_sequences_and_scales_and_more_shards_than_images(small_street, 
     )
     extractor = TwoScales()
     how = {"candidates": 3, "memory": 1e-4}
-    expected = mfvpr.evaluate(several, extractor, Retrieval(extractor), SCORERS, archive=Archive(tmp_path / "s"), **how)
+    expected = mfvpr.evaluate(
+        several, extractor, Retrieval(extractor), SCORERS, cache=FeatureCache(tmp_path / "s"), **how
+    )
     for count in (3, 17):
         results, _ = shared(
             tmp_path / f"s{count}", count,
-            lambda archive: mfvpr.evaluate(several, extractor, Retrieval(extractor), SCORERS, archive=archive, **how),
+            lambda cache: mfvpr.evaluate(several, extractor, Retrieval(extractor), SCORERS, cache=cache, **how),
         )  # fmt: skip
         assert_same(results[0], expected)
 
 
 @pytest.mark.parametrize("store", ["Sift", "matches", "scores"])
 def test_damaged_rows_of_any_shard_are_made_again(dataset, tmp_path, store):
-    def run(archive):
+    def run(cache):
         try:
-            return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, archive=archive)
+            return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, cache=cache)
         except InputError as error:  # the row is removed, and its shard makes it again
             messages.append(str(error))
             raise NotYet(str(error)) from None
 
     messages = []
-    expected = run(Archive(tmp_path / "plain"))
+    expected = run(FeatureCache(tmp_path / "plain"))
     shared(tmp_path / "s", 2, run)
     rows = [path for path in (tmp_path / "s").glob(f"{store}-*/shards/*/[0-9]*-*.npz") if "-0.npz" not in path.name]
     rows[0].write_bytes(b"damaged")
@@ -187,23 +189,23 @@ def test_damaged_rows_of_any_shard_are_made_again(dataset, tmp_path, store):
 
 def test_scores_are_known_by_their_scorers_and_candidates(dataset, split, small_street, tmp_path):
     """Whatever the order of the scorers, and the weights of the scales, which no feature depends on."""
-    archive = Archive(tmp_path, shard=Shard(0, 1))
-    first = mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, archive=archive)
-    turned = mfvpr.evaluate(dataset, SIFT, VLAD, dict(reversed(SCORERS.items())), candidates=3, archive=archive)
+    cache = FeatureCache(tmp_path, shard=Shard(0, 1))
+    first = mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, cache=cache)
+    turned = mfvpr.evaluate(dataset, SIFT, VLAD, dict(reversed(SCORERS.items())), candidates=3, cache=cache)
     assert [*turned.systems] == ["filter", "count", "histogram"]
     assert_same(turned, first)
     for weight in (1.0, 5.0):
         extractor = TwoScales()
         extractor.scales = (Scale(128, 60), Scale(128, 30, weight=weight))
         how = (dataset, extractor, Retrieval(extractor), SCORERS)
-        assert_same(mfvpr.evaluate(*how, archive=archive), mfvpr.evaluate(*how, archive=Archive(tmp_path / "plain")))
+        assert_same(mfvpr.evaluate(*how, cache=cache), mfvpr.evaluate(*how, cache=FeatureCache(tmp_path / "plain")))
     for path in tmp_path.glob("matches-*/shortlist.npz"):
         arrays = read_arrays(path, path.parent.name)
         write_arrays(path, arrays | {"indices": np.roll(arrays["indices"], 1, axis=0)}, path.parent.name)
     for path in tmp_path.glob("matches-*/shards/*/*.npz"):
         path.unlink()
     with pytest.raises(InputError, match=r"scores .*candidates.*shortlist"):
-        mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, archive=archive)
+        mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, cache=cache)
 
 
 class Drawn:
@@ -211,7 +213,7 @@ class Drawn:
 
     recipe = "drawn"
 
-    def shortlist(self, sequence, database, num_candidates, archive):
+    def shortlist(self, sequence, database, num_candidates, cache):
         rng = np.random.default_rng()
         indices = np.array([rng.permutation(len(database))[:num_candidates] for _ in sequence.images.names], np.int32)
         return Filtered(Shortlist(indices, np.ones(indices.shape, np.float32), indices >= 0), {}, {})
@@ -219,7 +221,7 @@ class Drawn:
 
 def test_candidates_are_those_of_the_first_shard(dataset, tmp_path):
     results, _ = shared(
-        tmp_path, 3, lambda archive: mfvpr.evaluate(dataset, SIFT, Drawn(), SCORERS, candidates=3, archive=archive)
+        tmp_path, 3, lambda cache: mfvpr.evaluate(dataset, SIFT, Drawn(), SCORERS, candidates=3, cache=cache)
     )
     paths = [path for path in tmp_path.glob("matches-*/shortlist.npz")]
     indices = read_arrays(paths[0], paths[0].parent.name)["indices"]
@@ -238,7 +240,7 @@ UNKNOWN = {"own": lambda matches: matches.mask.sum() * 1.0}
 @pytest.mark.parametrize("scorers, words", [({}, "scorers: expected at least one"), (UNKNOWN, "own: a shard keeps")])
 def test_scorers_that_no_store_can_know(dataset, tmp_path, scorers, words):
     with pytest.raises(InputError, match=words):
-        mfvpr.evaluate(dataset, SIFT, VLAD, scorers, candidates=3, archive=Archive(tmp_path, shard=Shard(0, 1)))
+        mfvpr.evaluate(dataset, SIFT, VLAD, scorers, candidates=3, cache=FeatureCache(tmp_path, shard=Shard(0, 1)))
 
 
 def test_what_was_bad_once_stays_so(small_street, tmp_path, monkeypatch):
@@ -254,12 +256,12 @@ def test_what_was_bad_once_stays_so(small_street, tmp_path, monkeypatch):
 
     monkeypatch.setattr(type(dataset.database), "read", flaky)
 
-    def run(archive):
+    def run(cache):
         try:
-            archive = replace(archive, skip_bad=True)
-            return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=5, archive=archive)
+            cache = replace(cache, skip_bad=True)
+            return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=5, cache=cache)
         finally:
-            broken[0] = False if archive.shard.index == shard_of("0003.png", 2) else broken[0]
+            broken[0] = False if cache.shard.index == shard_of("0003.png", 2) else broken[0]
 
     results, _ = shared(tmp_path, 2, run)
     for result in results:
@@ -268,10 +270,10 @@ def test_what_was_bad_once_stays_so(small_street, tmp_path, monkeypatch):
 
 
 def test_stores_of_shards_have_the_same_rows_byte_by_byte(dataset, tmp_path):
-    def run(archive):
-        return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, archive=archive)
+    def run(cache):
+        return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, cache=cache)
 
-    run(Archive(tmp_path / "plain"))
+    run(FeatureCache(tmp_path / "plain"))
     shared(tmp_path / "shards", 2, run)
 
     def hashes(root):
@@ -294,11 +296,11 @@ def test_a_bad_image_of_one_shard_is_known_to_all(small_street, tmp_path):
     (tmp_path / "database" / "0002.png").write_bytes(b"no image")
     dataset = folder_dataset(tmp_path / "database", tmp_path / "queries", ground_truth="order")
 
-    def run(archive):
-        archive = replace(archive, skip_bad=True)
-        return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, archive=archive)
+    def run(cache):
+        cache = replace(cache, skip_bad=True)
+        return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, cache=cache)
 
-    expected = run(Archive(tmp_path / "plain"))
+    expected = run(FeatureCache(tmp_path / "plain"))
     for count in (2, 4):
         results, _ = shared(tmp_path / f"s{count}", count, run)
         assert_same(results[0], expected)
@@ -306,7 +308,7 @@ def test_a_bad_image_of_one_shard_is_known_to_all(small_street, tmp_path):
     [bad] = (tmp_path / "s2").glob("Sift*/shards/*/bad.json")
     bad.write_text("[]")
     with pytest.raises(InputError, match=r"bad\.json: expected reasons by row"):
-        run(Archive(tmp_path / "s2", shard=Shard(0, 3)))
+        run(FeatureCache(tmp_path / "s2", shard=Shard(0, 3)))
 
 
 def test_stores_of_two_shards_are_written_at_the_same_time_those_of_one_are_not(tmp_path):
@@ -330,4 +332,4 @@ def test_stores_of_two_shards_are_written_at_the_same_time_those_of_one_are_not(
 
 def test_a_shard_needs_a_folder():
     with pytest.raises(InputError, match="shard=0/2: expected a root as well"):
-        Archive(shard=Shard(0, 2))
+        FeatureCache(shard=Shard(0, 2))
