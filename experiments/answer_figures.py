@@ -26,7 +26,7 @@ class AnswerFigures:
         figures, self._map, self._failed = settings["figures"], robot_map, 0
         self._wanted = set(range(figures) if isinstance(figures, int) else figures)
         self._missing = set() if isinstance(figures, int) else {*self._wanted}  # there may be fewer images
-        self._out, self._root = (settings[name] and build.expanded(settings[name]) for name in ("out", "root"))
+        self._out, self._root = (settings[name] and build.expand_user(settings[name]) for name in ("out", "root"))
         if self._root and not self._root.is_dir():
             raise SettingsError(f"root={self._root}: expected the folder of the map's images, got no folder")
 

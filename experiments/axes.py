@@ -7,7 +7,7 @@ from experiments.settings import SettingsError
 from mfvpr.matching import MatchSet, Scales
 from mfvpr.matching.match_set import block_bytes, scales
 from mfvpr.scoring import SCORERS
-from mfvpr.scoring.fields import declared
+from mfvpr.scoring.fields import parameters_of
 from mfvpr.tuning import sweeps
 from mfvpr.tuning.learning.parameters import can_learn
 from mfvpr.tuning.sweeps import Axes
@@ -34,7 +34,7 @@ def axes(settings: dict[str, Any]) -> Axes:
         raise SettingsError("scorer: a sweep takes one scorer at a time; choose with scorer=histogram, or several "
                             "with -m scorer=sum,anchor,histogram")  # fmt: skip
     [(method, scorer)] = build.scorers(settings["scorer"]).items()
-    known = {*declared(scorer), *_NOT_OF_SCORER}
+    known = {*parameters_of(scorer), *_NOT_OF_SCORER}
     values = {name: axis for name, axis in settings["grid"].items() if axis is not None}
     for name, axis in values.items():
         if name not in known:

@@ -27,7 +27,7 @@ from mfvpr.retrieval import (
 )
 from mfvpr.retrieval.precomputed import File
 from mfvpr.scoring import SCORERS, Scorer
-from mfvpr.scoring.fields import made
+from mfvpr.scoring.fields import from_values
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS
 from mfvpr.scoring.weights import WEIGHTS
 from mfvpr.storage import FeatureCache, Shard
@@ -35,7 +35,7 @@ from mfvpr.utils import recipe_of
 from mfvpr.utils.fingerprints import fingerprint
 
 
-def expanded(path: str) -> Path:
+def expand_user(path: str) -> Path:
     """A path with ~ replaced by the home folder."""
     return Path(os.path.expanduser(path))
 
@@ -43,20 +43,22 @@ def expanded(path: str) -> Path:
 def dataset(settings: dict[str, Any], progress: Callable[[int, int], None]) -> Dataset:
     """The data set; `streets` is drawn first if the cache does not have it."""
     if settings["name"] == "streets_seasons":
-        root = seasons_folder(expanded(settings["cache"]), seed=settings["seed"], progress=progress)
+        root = seasons_folder(expand_user(settings["cache"]), seed=settings["seed"], progress=progress)
         return sequences_dataset(
             root / "database", [root / name for name in CONDITIONS], name="streets_seasons", ground_truth="index",
             index_file=TRUTH, widen_index=True,
         )  # fmt: skip
     if "cache" in settings:
-        root = streets_folder(expanded(settings["cache"]), seed=settings["seed"], progress=progress)
+        root = streets_folder(expand_user(settings["cache"]), seed=settings["seed"], progress=progress)
         return folder_dataset(
             root / "database", root / "queries", name="streets", ground_truth="index",
             index_file=root / "ground_truth.csv", widen_index=True,
         )  # fmt: skip
     if "ground_truth" not in settings:
         return published_dataset(
-            settings["name"], expanded(settings["root"]), seasons=settings.get("seasons") and tuple(settings["seasons"])
+            settings["name"],
+            expand_user(settings["root"]),
+            seasons=settings.get("seasons") and tuple(settings["seasons"]),
         )
     if settings["ground_truth"] is None:
         raise SettingsError(f"dataset.ground_truth: nothing is assumed of your own images; set it to one of {CHOICES}")
@@ -66,10 +68,10 @@ def dataset(settings: dict[str, Any], progress: Callable[[int, int], None]) -> D
         expected = "DIR, or [DIR,...] with dataset=sequences" if several else "[DIR,...], or DIR with dataset=folder"
         raise SettingsError(f"dataset.queries: expected {expected}, got {settings['queries']}")
     if several:
-        queries, images = [expanded(path) for path in options.pop("queries")], expanded(options.pop("database"))
+        queries, images = [expand_user(path) for path in options.pop("queries")], expand_user(options.pop("database"))
         return sequences_dataset(images, queries, **options)
     for name in ("database", "queries", "index_file", "database_labels", "query_labels"):
-        options[name] = expanded(options[name]) if options[name] else None
+        options[name] = expand_user(options[name]) if options[name] else None
     return folder_dataset(**options)
 
 
@@ -178,10 +180,10 @@ def _files(group: str, settings: dict[str, Any], data: Dataset | None) -> dict[P
         raise SettingsError(f"{group}.queries: expected one file, or one for each of {len(data.sequences)} sequences, "
                             f"got {len(queries)}")  # fmt: skip
     files = {} if settings["database"] is None else {
-        data.database.root: File(expanded(settings["database"]), settings["database_prefix"])
+        data.database.root: File(expand_user(settings["database"]), settings["database_prefix"])
     }  # fmt: skip
     for index, sequence in enumerate(data.sequences):
-        root, path = sequence.images.root, expanded(queries[index if len(queries) > 1 else 0])
+        root, path = sequence.images.root, expand_user(queries[index if len(queries) > 1 else 0])
         file = File(path, settings["query_prefix"])
         if files.setdefault(root, file) != file:
             raise SettingsError(
@@ -193,7 +195,7 @@ def _files(group: str, settings: dict[str, Any], data: Dataset | None) -> dict[P
 
 def cache(settings: dict[str, Any]) -> FeatureCache:
     """The cache of features, matches and all else that is computed from images."""
-    root = None if settings["store"] is None else expanded(settings["store"])
+    root = None if settings["store"] is None else expand_user(settings["store"])
     shard = None if settings.get("shard") is None else Shard.parse(settings["shard"])
     if shard is not None and settings["coordinator"]:
         shard = replace(shard, meets=True)
@@ -240,7 +242,7 @@ def by_scorer(settings: Mapping[str, Any]) -> Mapping[str, Any]:
     return {settings["method"]: settings} if "method" in settings else settings
 
 
-def described(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def describe_settings(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Settings of the scorers by name, with the content of a learned match weight, since its file may change."""
     return {
         name: {**values, "weight_content": fingerprint(recipe_of(NAMED_WEIGHTS[values["weight"]]))}
@@ -253,7 +255,7 @@ def described(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 def scorers(settings: Mapping[str, Any]) -> dict[str, Scorer]:
     """The chosen scorer, or several, by name."""
     return {
-        name: made(SCORERS[values["method"]], _without(values, "method"))
+        name: from_values(SCORERS[values["method"]], _without(values, "method"))
         for name, values in by_scorer(settings).items()
     }
 

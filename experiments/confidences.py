@@ -9,7 +9,7 @@ from experiments.settings import SettingsError
 from experiments.stages import Images, num_candidates
 from mfvpr.datasets.truth import middle
 from mfvpr.evaluation import Confidence, read_confidences
-from mfvpr.report.evaluations import Judged
+from mfvpr.report.evaluations import EvaluationReport
 from mfvpr.utils.versions import versions
 
 # Confidences depend on these settings.
@@ -27,7 +27,7 @@ class ConfidenceFile(NamedTuple):
 def read(settings: Mapping[str, Any]) -> ConfidenceFile | None:
     """Read the file that the settings name; None if there is none."""
     path = settings["confidence"]
-    return None if path is None else ConfidenceFile(path, *read_confidences(build.expanded(path)))
+    return None if path is None else ConfidenceFile(path, *read_confidences(build.expand_user(path)))
 
 
 def check(
@@ -81,7 +81,7 @@ def other_settings(origin: Mapping[str, Any], system: str, settings: Mapping[str
 
 def _differing_groups(origin: Mapping[str, Any], system: str, settings: Mapping[str, Any]) -> list[str]:
     before = _system_settings(origin.get("settings"), system)
-    now = _system_settings({**settings, "scorer": build.described(settings["scorer"])}, system)
+    now = _system_settings({**settings, "scorer": build.describe_settings(settings["scorer"])}, system)
     return [name for name in _NAMES if name in now and name != "candidates" and before.get(name) != now[name]]
 
 
@@ -112,7 +112,7 @@ def _system_settings(settings: Any, system: str) -> dict[str, Any]:
     return {**settings, "scorer": parts}
 
 
-def origin(settings: Mapping[str, Any], images: Images, judged: Judged) -> dict[str, Any]:
+def origin(settings: Mapping[str, Any], images: Images, judged: EvaluationReport) -> dict[str, Any]:
     """The data and settings that the confidence of a run was fitted with, for its file."""
     return {
         "dataset": images.dataset.name,
@@ -121,7 +121,7 @@ def origin(settings: Mapping[str, Any], images: Images, judged: Judged) -> dict[
         "right_within": _threshold(settings, images),
         "candidates": num_candidates(settings, images),
         "ground_truth": truth.description(settings, images.dataset),
-        "settings": {name: settings[name] for name in _NAMES} | {"scorer": build.described(settings["scorer"])},
+        "settings": {name: settings[name] for name in _NAMES} | {"scorer": build.describe_settings(settings["scorer"])},
         "command": settings.get("command"),
         "versions": versions(),
     }

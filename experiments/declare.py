@@ -47,7 +47,7 @@ def files() -> dict[str, str]:
     }  # fmt: skip
     texts["axes.yaml"] = "\n".join(_axes())
     limits = {
-        name: {field: parameter.limits for field, parameter in fields.declared(scorer).items()}
+        name: {field: parameter.limits for field, parameter in fields.parameters_of(scorer).items()}
         for name, scorer in SCORERS.items()
     }
     texts["rules.yaml"] = yaml.safe_dump(limits, sort_keys=False, default_flow_style=None).strip()
@@ -66,7 +66,7 @@ def write(conf: Path) -> None:
 def _scorer(method: str, values: Mapping[str, Any]) -> Iterator[str]:
     yield f"# {fields.summary(SCORERS[method])}"
     yield f"method: {method}"
-    for field, parameter in fields.declared(SCORERS[method]).items():
+    for field, parameter in fields.parameters_of(SCORERS[method]).items():
         comment = "; ".join(filter(None, (parameter.unit, parameter.note, parameter.words)))
         yield _line(field, values.get(field, parameter.default), comment)
 
@@ -81,7 +81,7 @@ def _axes() -> Iterator[str]:
     """Lines of the parameters that can be swept: of one scorer each, then those that several scorers share."""
     owners: dict[str, dict[str, str]] = {}
     for name, scorer in SCORERS.items():
-        for field, parameter in fields.declared(scorer).items():
+        for field, parameter in fields.parameters_of(scorer).items():
             if parameter.swept:
                 owners.setdefault(field, {})[name] = parameter.unit or parameter.words
     yield "grid:  # lists of values of the scorer's parameters; null = its own value"

@@ -14,9 +14,9 @@ from mfvpr.datasets.truth import Unit
 from mfvpr.evaluation import evaluation
 from mfvpr.features import Source
 from mfvpr.report import runs
-from mfvpr.report.confidences import Assured, confidence_figures, confidence_table, write_confidence
+from mfvpr.report.confidences import CalibratedPredictions, confidence_figures, confidence_table, write_confidence
 from mfvpr.report.differences import write_gains
-from mfvpr.report.evaluations import Figure, Judged, figures, recall_table, write_rankings, write_skipped
+from mfvpr.report.evaluations import EvaluationReport, Figure, figures, recall_table, write_rankings, write_skipped
 from mfvpr.report.shifts import write_shifts
 from mfvpr.reranking import Fusion
 from mfvpr.reranking.results import COHORT, FILTER, FRAMES
@@ -36,8 +36,8 @@ class Outcome:
     settings: dict[str, Any]
     images: Images
     tools: Tools
-    judged: Judged
-    assured: Assured
+    judged: EvaluationReport
+    assured: CalibratedPredictions
     parameters: dict[str, dict[str, Any]]
     histogram: HistogramOfShifts | None
     figures: list[Figure]
@@ -47,11 +47,11 @@ def evaluate(settings: dict[str, Any]) -> None:
     """Run all stages, print the table, fill the run folder; a shard does what it can do by now."""
     if settings["shard"] is None:
         with run_folder.claimed(settings) as folder:
-            _leave(folder, evaluated(settings))
+            _leave(folder, evaluation_of(settings))
         return
     with sharding.joined(settings):
         try:
-            outcome = evaluated(settings)
+            outcome = evaluation_of(settings)
         except NotYet as needs:
             sharding.wait(settings, needs)
             if needs.is_complete:
@@ -78,7 +78,7 @@ def _leave(folder: Path, outcome: Outcome) -> None:
         print(f"report: {page}")
 
 
-def evaluated(settings: dict[str, Any]) -> Outcome:
+def evaluation_of(settings: dict[str, Any]) -> Outcome:
     """Evaluate the retrieval, each scorer, alone and with a cohort, and the main scorer fused with the retrieval."""
     scorers, watch, confidence = build.scorers(settings["scorer"]), Stopwatch(), confidences.read(settings)
     fusion, main = build.fusion(settings), "histogram" if "histogram" in scorers else next(iter(scorers))
@@ -102,10 +102,10 @@ def evaluated(settings: dict[str, Any]) -> Outcome:
     if frames:
         parameters[f"{headline} + {FRAMES}"] = parameters[headline] | asdict(frames)
     thresholds = truth.thresholds(settings, images.dataset.sequences[0].truth)
-    judged = Judged(result, thresholds, sorted(set(settings["recall"]["ks"])), headline)
+    judged = EvaluationReport(result, thresholds, sorted(set(settings["recall"]["ks"])), headline)
     histogram = scorers.get("histogram")
     histogram = histogram if isinstance(histogram, HistogramOfShifts) else None
-    assured = Assured(judged, confidence and confidence.systems, settings["threshold"])
+    assured = CalibratedPredictions(judged, confidence and confidence.systems, settings["threshold"])
     all_figures = figures(judged, tools.extractor, figure_queries, assured.refused_of_headline, histogram)
     all_figures += confidence_figures(assured) if figure_queries else []
     deciding = histogram if main == "histogram" else None
@@ -114,7 +114,7 @@ def evaluated(settings: dict[str, Any]) -> Outcome:
 
 def _parameters(settings: dict[str, Any], main: str, fusions: Mapping[str, Fusion]) -> dict[str, dict[str, Any]]:
     """Parameters by system: retrieval, scorers, scorers with a cohort, fusions."""
-    scorers = build.described(settings["scorer"])
+    scorers = build.describe_settings(settings["scorer"])
     if (cohort := settings["cohort"]) is not None:
         scorers |= {f"{name} + {COHORT}": values | {"cohort": cohort} for name, values in scorers.items()}
     members = fusions[main].members(main)
@@ -216,7 +216,7 @@ def _bytes_per_image(outcome: Outcome) -> int | None:
     return sum(sink.forecast(1) for sink in open_sinks(None, extractor, {}, num_images=1))
 
 
-def _recalls(judged: Judged, system: str) -> list[dict[str, Any]]:
+def _recalls(judged: EvaluationReport, system: str) -> list[dict[str, Any]]:
     """Threshold and recall by K; for several sequences, of each sequence and their mean."""
     if not judged.thresholds:
         return [{"recall_at": {}}]

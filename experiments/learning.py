@@ -89,7 +89,7 @@ def _prepare(settings: dict[str, Any], watch: Stopwatch) -> Prepared:
         raise SettingsError(f"features.patch_sizes={sizes}: expected one size, since learning knows one scale")
     tools, images = stages.begun(settings, watch)
     judge = truth.judge(settings, images.dataset)
-    matches, candidates = stages.matched(settings, tools, images, watch)
+    matches, candidates = stages.match_data_set(settings, tools, images, watch)
     if isinstance(matches, Scales):
         raise ValueError("expected features of one scale, since learning knows one")
     recipe = stages.recipe(tools, images, candidates.mask.shape[1])
@@ -148,7 +148,7 @@ def _checkpoints(settings: dict[str, Any], scorer: Scorer, data: Part, sets: lis
         "versions": {name: versions()[name] for name in ("mfvpr", "jax", "numpy")},
     }  # fmt: skip
     name = "" if settings["checkpoints"] else f"{settings['dataset']['name']}_learning-{fingerprint(recipe)}"
-    return Checkpoints(build.expanded(root) / name, recipe)
+    return Checkpoints(build.expand_user(root) / name, recipe)
 
 
 def _heading(settings: dict[str, Any], data: Part, teach: list[Prepared], report: list[Prepared]) -> str:

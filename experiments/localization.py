@@ -22,8 +22,8 @@ from mfvpr.utils.files import printable
 
 def localize(settings: dict[str, Any]) -> None:
     """Print a line for every image as soon as it is localized; errors of an image stand in its line."""
-    robot_map = maps.opened(
-        build.expanded(settings["map"]), confidence=_confidence(settings), threshold=settings["threshold"],
+    robot_map = maps.open_map(
+        build.expand_user(settings["map"]), confidence=_confidence(settings), threshold=settings["threshold"],
         memory=settings["memory"],
     )  # fmt: skip
     drive, figures, failed = _Drive(robot_map, settings), AnswerFigures(robot_map, settings), 0
@@ -88,8 +88,8 @@ def _confidence(settings: Mapping[str, Any]) -> Confidence | None:
     """The confidence of the score that the map was made with."""
     if settings["confidence"] is None:
         return None
-    systems, origin = read_confidences(build.expanded(settings["confidence"]))
-    map_settings = maps.read(build.expanded(settings["map"]))
+    systems, origin = read_confidences(build.expand_user(settings["confidence"]))
+    map_settings = maps.read(build.expand_user(settings["map"]))
     name = map_settings["scorer"]["method"]
     if name not in systems:
         raise SettingsError(f"confidence={settings['confidence']}: expected p of {name}, which the map scores by, got "

@@ -40,7 +40,7 @@ def info(folder: Path) -> None:
     from experiments import maps
     from mfvpr.storage.disk import used_bytes
 
-    settings, robot_map = maps.read(folder), maps.opened(folder)
+    settings, robot_map = maps.read(folder), maps.open_map(folder)
     print(f"{folder}: {len(robot_map)} images, {used_bytes(folder) / 1e6:.1f} MB")
     print(json.dumps(settings, indent=1, ensure_ascii=False))
 
@@ -50,7 +50,7 @@ def add(folder: Path, images: list[Path], place: str | None) -> None:
     from experiments import maps
     from mfvpr.utils.files import printable
 
-    robot_map = maps.opened(folder)
+    robot_map = maps.open_map(folder)
     for path in images:
         robot_map.add(path, path.name if place is None else place)
         print(printable(f"{path}: added, {len(robot_map)} images"), flush=True)

@@ -20,18 +20,18 @@ _GROUPS = ("features", "retrieval", "matching", "scorer", "candidates")
 
 def build_map(settings: Mapping[str, Any]) -> None:
     """Map the database of a data set."""
-    robot_map = made(settings)
+    robot_map = map_of_settings(settings)
     added = robot_map.build(dataset_of(settings["dataset"]).database, track=track("images"))
     print(f"{robot_map.folder}: {len(robot_map)} images, {added} of them new")
 
 
-def made(settings: Mapping[str, Any]) -> Map:
+def map_of_settings(settings: Mapping[str, Any]) -> Map:
     """The map in the folder of the settings, which is created if it is not there.
 
     Raises:
         SettingsError: the folder holds a map with other settings, or the settings do not allow a map.
     """
-    folder, map_settings = build.expanded(settings["map"]), {name: settings[name] for name in _GROUPS}
+    folder, map_settings = build.expand_user(settings["map"]), {name: settings[name] for name in _GROUPS}
     _check(map_settings)
     if (folder / SETTINGS).exists():
         _compare(folder, map_settings)
@@ -44,7 +44,7 @@ def made(settings: Mapping[str, Any]) -> Map:
     return robot_map
 
 
-def opened(folder: Path, **options: Any) -> Map:
+def open_map(folder: Path, **options: Any) -> Map:
     """The map in a folder, with options of `Map`."""
     return map_of(folder, read(folder), **options)
 

@@ -21,7 +21,7 @@ POLL = 0.2  # seconds between two looks at a folder
 def images(settings: Mapping[str, Any]) -> Iterator[tuple[str, Path | np.ndarray]]:
     """(name, file or pixels) in order; names do not depend on the spelling of a path."""
     paths = settings["images"] if isinstance(settings["images"], list) else [settings["images"]]
-    paths = [build.expanded(path) for path in paths]
+    paths = [build.expand_user(path) for path in paths]
     for path in paths:
         if not path.exists():
             raise SettingsError(f"images={path}: expected an image, a folder or a video, got nothing")

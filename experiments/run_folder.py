@@ -20,7 +20,7 @@ _NO_SETTINGS = ("multirun", "command")  # added by `command_line`
 def claimed(settings: Mapping[str, Any], **options: Any) -> Iterator[Path]:
     """The run folder that the settings name, for this run alone; with options of `runs.claimed`."""
     out, name = settings["out"], settings["dataset"]["name"]
-    folder = build.expanded(out) if out else runs.new_run_folder(Path("runs"), name)
+    folder = build.expand_user(out) if out else runs.new_run_folder(Path("runs"), name)
     with ExitStack() as claim:
         try:
             folder = claim.enter_context(runs.claim_run_folder(folder, numbered=not out, **options))

@@ -23,7 +23,7 @@ def sweep(settings: dict[str, Any]) -> None:
         axes, watch = searchable(settings), Stopwatch()
         tools, images = stages.begun(settings, watch)
         judge = truth.judge(settings, images.dataset)
-        matches, candidates = stages.matched(settings, tools, images, watch)
+        matches, candidates = stages.match_data_set(settings, tools, images, watch)
         blocks = _block_folder(settings, tools, images, candidates)
         options = {
             "ks": settings["recall"]["ks"], "ties": settings["ties"],
@@ -68,7 +68,7 @@ def _block_folder(
     sweep_settings = {name: settings[name] for name in names}  # or another sweep would remove the blocks when it ends
     software = {name: versions()[name] for name in ("mfvpr", "jax", "numpy")}
     name = fingerprint({"matches": recipe, "sweep": sweep_settings, "versions": software})
-    return build.expanded(settings["store"]) / f"{settings['dataset']['name']}_sweep-{name}"
+    return build.expand_user(settings["store"]) / f"{settings['dataset']['name']}_sweep-{name}"
 
 
 def _heading(settings: dict[str, Any], images: stages.Images, outcome: Outcome) -> str:

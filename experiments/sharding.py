@@ -46,7 +46,7 @@ def joined(settings: Mapping[str, Any]) -> Iterator[None]:
     shared = {name: value for name, value in settings.items() if name not in _LOCAL}
     _check_empty(folder)
     content = {"shards": shard.count, "dataset": settings["dataset"]["name"], "settings": shared}
-    content["store"] = _identity(build.expanded(settings["store"]))
+    content["store"] = _identity(build.expand_user(settings["store"]))
     _compare(folder / "run.json", content, f"shard={shard}")
     task = task_folder(settings)
     task.mkdir(parents=True, exist_ok=True)
@@ -73,7 +73,7 @@ def _identity(store: Path) -> str:
 
 def task_folder(settings: Mapping[str, Any]) -> Path:
     """The folder of a task: its state and its lock."""
-    return _folder(build.expanded(settings["out"])) / Shard.parse(settings["shard"]).folder
+    return _folder(build.expand_user(settings["out"])) / Shard.parse(settings["shard"]).folder
 
 
 def wait(settings: Mapping[str, Any], needs: NotYet) -> None:
@@ -103,14 +103,14 @@ def check_data(settings: Mapping[str, Any], images: Images) -> None:
     thresholds = truth.thresholds(settings, images.dataset.sequences[0].truth)
     ground_truth = truth.fingerprint(images.dataset, thresholds)
     content = {"images": images.fingerprints, "ground truth": ground_truth, "versions": versions()}
-    folder = _folder(build.expanded(settings["out"]))
+    folder = _folder(build.expand_user(settings["out"]))
     _compare(folder / "data.json", content, f"shard={settings['shard']}")
 
 
 @contextmanager
 def last(settings: Mapping[str, Any]) -> Iterator[bool]:
     """Whether the results are still to be written, for one task at a time."""
-    folder = build.expanded(settings["out"])
+    folder = build.expand_user(settings["out"])
     with lock_store(_folder(folder), "a run", lambda line: None):
         yield not (folder / runs.LAST).exists()
 

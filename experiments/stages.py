@@ -112,7 +112,7 @@ def _images(settings: dict[str, Any], cache: FeatureCache) -> Images:
     return images
 
 
-def matched(
+def match_data_set(
     settings: dict[str, Any], tools: Tools, images: Images, watch: Stopwatch
 ) -> tuple[MatchSet | Scales, Shortlist]:
     """Matches and shortlist of the only sequence, from their store if it has all of them."""

@@ -51,9 +51,9 @@ def _translate(text: str, settings: Mapping[str, Any]) -> str:
 
 def _group(text: str, settings: Mapping[str, Any]) -> str:
     """The group of settings with the file that a message begins with."""
-    from experiments.build import expanded
+    from experiments.build import expand_user
 
     retrieval = settings.get("retrieval", {})
     queries = retrieval.get("queries", [])
     files = [retrieval.get("database"), *(queries if isinstance(queries, list) else [queries])]
-    return "retrieval" if any(file and text.startswith(f"{expanded(file)}:") for file in files) else "features"
+    return "retrieval" if any(file and text.startswith(f"{expand_user(file)}:") for file in files) else "features"

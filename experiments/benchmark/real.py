@@ -35,7 +35,7 @@ def run(rounds: int | None, out: Path, data: Path | None = None) -> None:
     """Score SIFT's and ALIKED n16's matches with all images of both data sets below `data`."""
     if data is None:
         raise InputError(f"--data: expected a folder that has {' and '.join(FOLDERS)}, got none")
-    folder = build.expanded(os.environ.get("MFVPR_CACHE") or "~/.cache/mfvpr")  # as in conf/common.yaml
+    folder = build.expand_user(os.environ.get("MFVPR_CACHE") or "~/.cache/mfvpr")  # as in conf/common.yaml
     cache, scorers = FeatureCache(folder / "features", track=track, tell=tell), compared_scorers()
     parts, tables = [], []
     for name, folders in FOLDERS.items():

@@ -110,7 +110,7 @@ def is_done(folder: Path, expected: Mapping[str, str]) -> bool:
 def evaluate(settings: Mapping[str, Any], made_of: Mapping[str, str]) -> None:
     """Evaluate into the run folder, without a table in the terminal."""
     with run_folder.claimed(settings, own=True) as folder:
-        outcome = evaluation.evaluated(dict(settings))
+        outcome = evaluation.evaluation_of(dict(settings))
 
         def write(new: Path) -> None:
             evaluation.write(new, outcome)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments.build import expanded
+from experiments.build import expand_user
 from experiments.quoting import as_typed
 from experiments.settings import RULES, SettingsError
 from mfvpr.checkpoints import REGISTRY, is_installed
@@ -136,7 +136,7 @@ def _check_names(setting: str, names: Sequence[str] | None, known: Sequence[str]
 
 def places(data: str | None, names: Sequence[str] | None) -> tuple[list[Place], list[str]]:
     """The data sets that are at hand, and a line for each that is not."""
-    root = None if data is None else expanded(data)
+    root = None if data is None else expand_user(data)
     if root is not None and not root.is_dir():
         got = "a file" if root.exists() else "nothing"
         raise SettingsError(f"data={data}: expected a folder with a folder per data set, got {got}; check the path")

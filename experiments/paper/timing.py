@@ -23,6 +23,7 @@ QUERIES, DATABASE = 10, 60  # images; as many of the database as there are candi
 STEPS = ("filter", "features", "matching", "scores")
 _FLOAT = 4  # bytes of a number
 _MOST_BYTES = 1 << 30  # bytes of synthetic descriptors
+_DATABASES = (100, 1000, 10_000, 100_000)  # images
 _ROUNDS = 5
 
 
@@ -69,15 +70,13 @@ def _link_under_new_names(images: ImageFolder, number: int, folder: Path) -> Ima
     return replace(images, root=folder, names=tuple(names))
 
 
-def search(descriptor: int, largest: int = 100_000) -> dict[int, float]:
+def search(descriptor: int) -> dict[int, float]:
     """Measure the seconds of a search among synthetic descriptors, by the size of the database.
 
-    Args:
-        descriptor: bytes of one.
-        largest: database; less where descriptors would take more than `_MOST_BYTES` bytes.
+    `descriptor` is the size of one in bytes; all of a database take at most `_MOST_BYTES`.
     """
     seconds, rng, length = {}, np.random.default_rng(0), descriptor // _FLOAT
-    for size in (size for size in (100, 1000, 10_000, largest) if size * descriptor <= _MOST_BYTES):
+    for size in (size for size in _DATABASES if size * descriptor <= _MOST_BYTES):
         database = Vectors()
         for row in range(size):
             database.put(row, rng.standard_normal(length, np.float32))

@@ -195,7 +195,7 @@ def _score_store(
 
 def _hubness(matched: Matched, scores: Mapping[str, np.ndarray], num_database: int) -> dict[str, np.ndarray]:
     """Hubness `[N]` of the database images by name of the scorer, from the matches and scores of the cohort."""
-    return {name: hubness(matched.candidates, values, num_database, who=name) for name, values in scores.items()}
+    return {name: hubness(matched.candidates, values, num_database, name=name) for name, values in scores.items()}
 
 
 def _score_cohort(

@@ -19,7 +19,7 @@ _NAME_LENGTH = 80  # characters of a name or a place
 
 
 def answer_figure(
-    path: Path, known: Map, name: str, image: np.ndarray, asked: Asked, *, root: Path | None = None
+    path: Path, known: Map, name: str, image: np.ndarray, localization: Asked, *, root: Path | None = None
 ) -> None:
     """Write the figure of one answer: the image beside the best candidate, their matches, the histogram of shifts.
 
@@ -28,22 +28,22 @@ def answer_figure(
         known: the map.
         name: of the image.
         image: `[H, W, 3]` uint8 RGB.
-        asked: what the map answered.
+        localization: what the map answered.
         root: folder of the map's images, by their names; an image that cannot be read is drawn gray. None = no images.
 
     Raises:
         InputError: the candidate's name leads out of the folder.
     """
-    answer, extractor = asked.answer, known.extractor
+    answer, extractor = localization.answer, known.extractor
     place = f"no place ({answer.reason})" if answer.place is None else clip_middle(str(answer.place), _NAME_LENGTH)
     candidate = Answer(_gray(extractor), "no candidate")
-    if asked.matches is not None:
+    if localization.matches is not None:
         best = answer.alternatives[0].name
         shown, note = _candidate(extractor, best, root)
         histogram = known.scorer if isinstance(known.scorer, HistogramOfShifts) else HistogramOfShifts()
         p = "" if answer.p_right is None else f", p(right) {answer.p_right:.2f}"
         caption = f"{clip_middle(best, _NAME_LENGTH)}{note}, score {answer.score:.5g}{p}"
-        candidate = Answer(shown, caption, asked.matches, explain(histogram, asked.matches))
+        candidate = Answer(shown, caption, localization.matches, explain(histogram, localization.matches))
     query = resize(image, extractor.image_size, extractor.interpolation)
     title = f"{clip_middle(name, _NAME_LENGTH)} -> {place}"
     about = {"image": name, "place": str(answer.place)}

@@ -91,10 +91,10 @@ def results(comparison: Comparison) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def write_weights(folder: Path, comparison: Comparison, made: Mapping[str, Any]) -> None:
+def write_weights(folder: Path, comparison: Comparison, provenance: Mapping[str, Any]) -> None:
     """Write every learned match weight by name, with how it was learned; see `mfvpr.scoring.weight_files`."""
     for name, weight in _weights(comparison).items():
-        write_weight(folder / f"{re.sub(r'[^a-z]+', '_', name)}.json", weight, {**made, "training": name})
+        write_weight(folder / f"{re.sub(r'[^a-z]+', '_', name)}.json", weight, {**provenance, "training": name})
 
 
 def figures(comparison: Comparison) -> list[Figure]:

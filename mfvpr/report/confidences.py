@@ -18,7 +18,7 @@ from mfvpr.evaluation.precision import (
 )
 from mfvpr.evaluation.results import Reason
 from mfvpr.evaluation.selection import Half, halves, halves_of_map
-from mfvpr.report.evaluations import Judged
+from mfvpr.report.evaluations import EvaluationReport
 from mfvpr.report.plots import precision_recall_figure, reliability_figure, shares_figure
 from mfvpr.report.rankings import NO_PLACE, number, write_csv
 from mfvpr.report.runs import Figure
@@ -30,27 +30,27 @@ SHARES = tuple(share / 20 for share in range(21))
 
 
 @dataclass(frozen=True)
-class Assured:
+class CalibratedPredictions:
     """An evaluation whose first predictions have a confidence; arrays are of the queries of all sequences.
 
     Attributes:
         judged: the evaluation.
-        given: confidences by system, fitted on other images; None = with ground truth, each half of the path has the
+        confidences: by system, fitted on other images; None = with ground truth, each half of the path has the
             confidence that was fitted on the other half.
         threshold: of p, below which the prediction is `NO_PLACE`; None = no prediction is refused.
     """
 
-    judged: Judged
-    given: Mapping[str, Confidence] | None = None
+    judged: EvaluationReport
+    confidences: Mapping[str, Confidence] | None = None
     threshold: float | None = None
 
     @cached_property
     def probabilities(self) -> dict[str, np.ndarray]:
         """p(right) `[Q]` by system, NaN without a prediction, or without anything to fit on."""
         systems = self.judged.result.systems
-        if self.given is not None:
+        if self.confidences is not None:
             return {name: confidence.probability(self._inputs(name, confidence))
-                    for name, confidence in self.given.items() if name in systems}  # fmt: skip
+                    for name, confidence in self.confidences.items() if name in systems}  # fmt: skip
         return {name: self._cross_fitted_probability(name) for name in systems} if self.judged.thresholds else {}
 
     @cached_property
@@ -124,7 +124,7 @@ class Assured:
         return halves(shown[0]) if len(shown) == 1 else halves_of_map(shown, truths[0].unit)
 
 
-def confidence_table(assured: Assured) -> Table:
+def confidence_table(assured: CalibratedPredictions) -> Table:
     """Average precision, recall at 100 and 99 % precision, by score and by p; calibration of p; counts of queries.
 
     All in percent but the counts, which need a threshold. "by chance" is the expected calibration error that p would
@@ -136,7 +136,7 @@ def confidence_table(assured: Assured) -> Table:
     return Table(["system", *header, "ECE of p", "by chance", *counts], rows)
 
 
-def _confidence_row(assured: Assured, system: str) -> list[str]:
+def _confidence_row(assured: CalibratedPredictions, system: str) -> list[str]:
     percent = [
         value
         for curve in assured.curves(system).values()
@@ -153,7 +153,7 @@ def _confidence_row(assured: Assured, system: str) -> list[str]:
     return cells
 
 
-def share_table(assured: Assured) -> Table:
+def share_table(assured: CalibratedPredictions) -> Table:
     """Recall at 1 of all queries, by the share of them that is re-ranked, see `_recalls_by_share`."""
     recalls = _recalls_by_share(assured)
     names = [name for name in assured.judged.result.systems if name != FILTER]
@@ -162,13 +162,13 @@ def share_table(assured: Assured) -> Table:
     return Table(["re-ranked", *names], rows, text_columns=0)
 
 
-def _recalls_by_share(assured: Assured) -> dict[str, np.ndarray]:
+def _recalls_by_share(assured: CalibratedPredictions) -> dict[str, np.ndarray]:
     """`recall_by_share` of all systems but the filter; none where p of the filter is not known."""
     systems = assured.judged.result.systems if FILTER in assured.probabilities else ()
     return {name: recall_by_share(assured, name) for name in systems if name != FILTER}
 
 
-def recall_by_share(assured: Assured, system: str) -> np.ndarray:
+def recall_by_share(assured: CalibratedPredictions, system: str) -> np.ndarray:
     """`[SHARES]` recall at 1 of a system that re-ranks the queries with the lowest p of the filter."""
     filtered, right = assured.right(FILTER), assured.right(system)
     unsure = np.argsort(np.nan_to_num(assured.probabilities[FILTER], nan=-1.0), kind="stable")
@@ -177,13 +177,13 @@ def recall_by_share(assured: Assured, system: str) -> np.ndarray:
     return (filtered.sum() + gains[counts]) / len(right)
 
 
-def write_confidence(folder: Path, assured: Assured, made: Mapping[str, Any]) -> None:
+def write_confidence(folder: Path, assured: CalibratedPredictions, provenance: Mapping[str, Any]) -> None:
     """Write `answers.csv` of every sequence where p is known; with ground truth, the tables, curves, and fits.
 
     Args:
         folder: of the run.
         assured: the evaluation.
-        made: JSON values that say how the confidences were fitted.
+        provenance: JSON values that say how the confidences were fitted.
     """
     judged = assured.judged
     if judged.headline in assured.probabilities:
@@ -195,10 +195,10 @@ def write_confidence(folder: Path, assured: Assured, made: Mapping[str, Any]) ->
     points = [[name, by, *map(number, point)] for name in judged.result.systems
               for by, curve in assured.curves(name).items() for point in zip(*curve, strict=True)]  # fmt: skip
     write_csv(folder / "precision_recall.csv", ["system", "by", "threshold", "precision", "recall"], points)
-    write_confidences(folder / "confidence.json", assured.fitted, made)
+    write_confidences(folder / "confidence.json", assured.fitted, provenance)
 
 
-def _write_answers(folder: Path, assured: Assured) -> None:
+def _write_answers(folder: Path, assured: CalibratedPredictions) -> None:
     """Write `query,answer,score,p,right,reason,in_database`.
 
     `score`, `p` and `right` are of the first candidate, also where the answer is `NO_PLACE`, so that calibration can be
@@ -223,7 +223,7 @@ def _write_answers(folder: Path, assured: Assured) -> None:
         write_csv(judged.folder(folder, place) / "answers.csv", header, lines)
 
 
-def confidence_figures(assured: Assured) -> list[Figure]:
+def confidence_figures(assured: CalibratedPredictions) -> list[Figure]:
     """Precision against recall, reliability, and recall over the share that is re-ranked; with ground truth."""
     if not assured.judged.thresholds:
         return []

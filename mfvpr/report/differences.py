@@ -9,7 +9,7 @@ import numpy as np
 from mfvpr.datasets.positives import stack_positives
 from mfvpr.evaluation.paths import places_along_path
 from mfvpr.evaluation.statistics import McNemar, SignFlips, block_sign_flips, mcnemar
-from mfvpr.report.evaluations import Judged
+from mfvpr.report.evaluations import EvaluationReport
 from mfvpr.report.rankings import number, write_csv
 from mfvpr.report.tables import Table
 from mfvpr.utils.files import write_text
@@ -24,7 +24,7 @@ class Difference(NamedTuple):
     sign_flips: SignFlips
 
 
-def differences(judged: Judged) -> list[Difference]:
+def differences(judged: EvaluationReport) -> list[Difference]:
     """Tests of every two systems, in their order; none without ground truth."""
     if not judged.thresholds:
         return []
@@ -39,7 +39,7 @@ def differences(judged: Judged) -> list[Difference]:
     ]  # fmt: skip
 
 
-def _places(judged: Judged) -> np.ndarray | None:
+def _places(judged: EvaluationReport) -> np.ndarray | None:
     """`[Q]` places of all queries along the map; None for one sequence in the order of its path."""
     truth, right = judged.sequences[0].truth, [positives for positives in judged.right if positives is not None]
     if truth is None or (len(judged.sequences) == 1 and truth.unit != "m"):
@@ -47,7 +47,7 @@ def _places(judged: Judged) -> np.ndarray | None:
     return places_along_path(stack_positives(right), truth.unit)
 
 
-def differences_table(judged: Judged) -> Table:
+def differences_table(judged: EvaluationReport) -> Table:
     """Table system x system: queries that only the system of the row gets right, and p by blocks of the path.
 
     Blocks of several sequences are blocks of the database's places.
@@ -61,7 +61,7 @@ def differences_table(judged: Judged) -> Table:
     return Table(["only this is right, not", *names], rows)
 
 
-def write_gains(folder: Path, judged: Judged) -> None:
+def write_gains(folder: Path, judged: EvaluationReport) -> None:
     """Write `gains.csv` of every sequence, `differences.csv` and `differences.md`; nothing without ground truth.
 
     By query and system, `gains.csv` says whether the first prediction is correct, and the rank of the first correct
@@ -95,6 +95,6 @@ def write_gains(folder: Path, judged: Judged) -> None:
     write_text(folder / "differences.md", differences_table(judged).markdown())
 
 
-def _right(judged: Judged, system: str, place: int) -> np.ndarray:
+def _right(judged: EvaluationReport, system: str, place: int) -> np.ndarray:
     """`[Q, C]` bool in the order of a system's ranking, with ground truth."""
     return np.asarray(judged.is_right(system, place), bool)

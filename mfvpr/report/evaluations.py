@@ -30,7 +30,7 @@ _SEQUENCES = "sequences"  # the folder of a run in which each of several sequenc
 
 
 @dataclass(frozen=True)
-class Judged:
+class EvaluationReport:
     """An evaluation and the criteria of its report.
 
     Attributes:
@@ -87,7 +87,7 @@ def sequence_folder(run: Path, sequences: Sequence[str], place: int) -> Path:
     return run / _SEQUENCES / file_names(sequences)[sequences[place]] if len(sequences) > 1 else run
 
 
-def recall_table(judged: Judged) -> Table:
+def recall_table(judged: EvaluationReport) -> Table:
     """R@first k at every threshold, and all ks at the middle one; a line for each system, and sequence."""
     truth, ks, main = judged.sequences[0].truth, judged.ks, len(judged.thresholds) // 2
     cells = [(place, 0) for place in range(len(judged.thresholds))] + [(main, depth) for depth in range(1, len(ks))]
@@ -102,7 +102,7 @@ def recall_table(judged: Judged) -> Table:
     return Table(["system", *(["sequence"] if several else []), *labels], lines, text_columns=1 + several)
 
 
-def write_rankings(folder: Path, judged: Judged, refused: Sequence[np.ndarray] | None = None) -> None:
+def write_rankings(folder: Path, judged: EvaluationReport, refused: Sequence[np.ndarray] | None = None) -> None:
     """Write `predictions/` and `failures/` of every system, those of the headline's into the folder itself.
 
     Args:
@@ -139,7 +139,7 @@ def write_skipped(folder: Path, result: Result) -> None:
 
 
 def figures(
-    judged: Judged,
+    judged: EvaluationReport,
     extractor: Extractor | Source,
     shown: int | Sequence[int],
     refused: Sequence[np.ndarray],
@@ -169,7 +169,7 @@ def figures(
 class Page:
     """The figures of one sequence."""
 
-    judged: Judged
+    judged: EvaluationReport
     place: int
     extractor: Extractor | Source
     histogram: HistogramOfShifts

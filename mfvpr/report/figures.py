@@ -17,6 +17,7 @@ from mfvpr.types import Matches
 from mfvpr.utils.files import clip_middle, printable
 
 _AGREES, _DIFFERS = "#2fa8ff", "#ff9a1f"  # told apart by color-blind people as well
+_MATCHES = 30  # drawn, the heaviest, as in the paper
 _GAP = 12  # px between the two images
 _TITLE_LENGTH, _CAPTION_LENGTH = 140, 100  # characters that fit
 
@@ -46,7 +47,6 @@ def histogram_figure(
     title: str,
     pixel_aspect: float = 1.0,
     about: Mapping[str, str] | None = None,
-    max_lines: int = 30,
 ) -> None:
     """Write the figure of one query.
 
@@ -57,7 +57,6 @@ def histogram_figure(
         title: above everything.
         pixel_aspect: height of a pixel by its width, so that images are drawn in the shape that they were taken in.
         about: what it shows, for programs: text by keyword, in the file itself.
-        max_lines: matches drawn, the heaviest (the paper shows 30); blue where they agree with the peak.
     """
     count = len(answers)
     figure, axes = panels(2 * count, 6, 4.8 + 0.2 / count, columns=2, width_ratios=(2, 1.15))
@@ -66,7 +65,7 @@ def histogram_figure(
     )  # a file's name may hold a $
     top = max([1e-9, *(float(answer.explanation.score) for answer in answers if answer.explanation)])
     for pair, heat, answer in zip(axes[::2], axes[1::2], answers, strict=True):
-        _draw_pair(pair, query_image, answer, max_lines)
+        _draw_pair(pair, query_image, answer)
         pair.set_aspect(pixel_aspect)
         if answer.explanation is None:
             heat.set_axis_off()
@@ -88,7 +87,7 @@ def pixel_aspect_of(original: np.ndarray, smaller: np.ndarray) -> float:
     return (height / new_height) / (width / new_width)
 
 
-def _draw_pair(axes: Axes, query: np.ndarray, answer: Answer, max_lines: int) -> None:
+def _draw_pair(axes: Axes, query: np.ndarray, answer: Answer) -> None:
     offset = query.shape[1] + _GAP
     height = max(len(query), len(answer.image))
     canvas = np.full((height, offset + answer.image.shape[1], 3), 255, np.uint8)
@@ -98,15 +97,15 @@ def _draw_pair(axes: Axes, query: np.ndarray, answer: Answer, max_lines: int) ->
     axes.set_axis_off()
     words = "query | candidate"
     if answer.matches is not None and answer.explanation is not None:
-        words = _draw_matches(axes, offset, answer.matches, answer.explanation, max_lines)
+        words = _draw_matches(axes, offset, answer.matches, answer.explanation)
     axes.set_title(f"{clip_middle(printable(answer.caption), _CAPTION_LENGTH)}\n{words}", fontsize=9, parse_math=False)
 
 
-def _draw_matches(axes: Axes, offset: int, matches: Matches, explanation: Explanation, max_lines: int) -> str:
+def _draw_matches(axes: Axes, offset: int, matches: Matches, explanation: Explanation) -> str:
     """Draw the heaviest matches; return a caption."""
     count = int(matches.mask.sum())
     weights = np.where(matches.mask, explanation.weights, -np.inf)
-    heaviest = np.lexsort((matches.distance, -weights))[: min(max_lines, count)]  # of equal weights the nearest
+    heaviest = np.lexsort((matches.distance, -weights))[: min(_MATCHES, count)]  # of equal weights the nearest
     start, end = matches.points0[heaviest], matches.points1[heaviest] + [offset, 0]
     colors = np.where(explanation.agrees[heaviest], _AGREES, _DIFFERS)
     lines = np.stack([start, end], axis=1)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from mfvpr.evaluation.stages import Scales, dominant_shifts
-from mfvpr.report.evaluations import Judged
+from mfvpr.report.evaluations import EvaluationReport
 from mfvpr.report.rankings import number, write_csv
 from mfvpr.scoring.histogram import HistogramOfShifts
 
@@ -14,7 +14,7 @@ HEADER = ("query", "answer", "shift_x", "shift_y", "low_x", "high_x", "low_y", "
 
 
 def write_shifts(
-    folder: Path, judged: Judged, scorer: HistogramOfShifts, refused: Sequence[np.ndarray] | None = None
+    folder: Path, judged: EvaluationReport, scorer: HistogramOfShifts, refused: Sequence[np.ndarray] | None = None
 ) -> None:
     """Write `shifts.csv` of every sequence: shifts of the headline's first predictions, candidate minus query, px.
 

@@ -46,7 +46,7 @@ def cohort_sequence(database: Contents, neighbors: int) -> QuerySequence:
     return without_neighbors(QuerySequence("cohort", database.folder, None), number, equal_rows, int(neighbors))
 
 
-def hubness(candidates: Shortlist, scores: np.ndarray, num_database: int, *, who: str = "a scorer") -> np.ndarray:
+def hubness(candidates: Shortlist, scores: np.ndarray, num_database: int, *, name: str = "a scorer") -> np.ndarray:
     """Hubness of each database image, `[N]` float64 above 0.
 
     The hubness is the mean score of the image with other places, over the mean of all scores. `PRIOR` average scores
@@ -56,21 +56,21 @@ def hubness(candidates: Shortlist, scores: np.ndarray, num_database: int, *, who
         candidates: `[M, C]` of the cohort's images.
         scores: `[M, C]` of the candidates; scores that are not finite are ignored.
         num_database: N.
-        who: name of the scorer, for the error.
+        name: name of the scorer, for the error.
 
     Raises:
         InputError: a score is below 0.
     """
     known = np.asarray(candidates.mask) & np.isfinite(scores)
     rows, values = np.asarray(candidates.indices)[known], np.asarray(scores, np.float64)[known]
-    _require_positive(values, who)
+    _require_positive(values, name)
     if not values.any():
         return np.ones(num_database)
     sums = np.bincount(rows, values / values.mean(), num_database)
     return (sums + PRIOR) / (np.bincount(rows, minlength=num_database) + PRIOR)
 
 
-def by_hubness(candidates: Shortlist, scores: np.ndarray, hubness: np.ndarray, *, who: str = "a scorer") -> np.ndarray:
+def by_hubness(candidates: Shortlist, scores: np.ndarray, hubness: np.ndarray, *, name: str = "a scorer") -> np.ndarray:
     """Scores `[Q, C]` divided by the hubness of the candidates, NumPy float32.
 
     A hubness below 1 does not count: an image that hardly matches anything would gain by every match. NaN stays NaN.
@@ -79,12 +79,12 @@ def by_hubness(candidates: Shortlist, scores: np.ndarray, hubness: np.ndarray, *
         candidates: `[Q, C]` of a sequence.
         scores: `[Q, C]` of the candidates.
         hubness: `[N]`, see the function `hubness`.
-        who: name of the scorer, for the error.
+        name: name of the scorer, for the error.
 
     Raises:
         InputError: a score is below 0; division would increase it.
     """
-    _require_positive(scores, who)
+    _require_positive(scores, name)
     return (scores / np.maximum(hubness, 1)[candidates.indices]).astype(np.float32)
 
 

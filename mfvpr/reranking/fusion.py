@@ -102,7 +102,7 @@ def rank_sequence(
     """
     candidates, scores = matched.candidates, {**scores}
     scores |= {
-        f"{name} + {COHORT}": by_hubness(candidates, scores[name], strengths, who=name)
+        f"{name} + {COHORT}": by_hubness(candidates, scores[name], strengths, name=name)
         for name, strengths in (hubness or {}).items()
     }
     scores |= {fusion.system(name): fusion(name, candidates, scores) for name, fusion in fused.items()}

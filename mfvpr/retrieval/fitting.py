@@ -1,6 +1,6 @@
 """Learn the parts of extractors and retrievals that depend on the database, and store them.
 
-    cells = fitted(SsmCells(model), database, cache)
+    cells = fit_to_database(SsmCells(model), database, cache)
 
 `mfvpr.evaluate` does this for its extractor and its retrieval.
 """

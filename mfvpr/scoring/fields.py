@@ -125,14 +125,14 @@ def named(values: Mapping[str, Any], default: str, note: str = "", *, file: str 
     return _field(values[default], Parameter(default, note=note, choices=tuple(values), named=values, file=file))
 
 
-def declared(method: Any) -> dict[str, Parameter]:
+def parameters_of(method: Any) -> dict[str, Parameter]:
     """Parameters of a class, or of an instance, by name of the field."""
     return {f.name: f.metadata[_KEY] for f in fields(method) if _KEY in f.metadata}
 
 
-def made(method: type, values: Mapping[str, Any]) -> Any:
+def from_values(method: type, values: Mapping[str, Any]) -> Any:
     """Create an instance from plain values by field."""
-    parameters = declared(method)
+    parameters = parameters_of(method)
     return method(**{name: parameters[name].value(plain) for name, plain in values.items()})
 
 
@@ -143,7 +143,7 @@ def summary(method: type) -> str:
 
 def check_choices(method: Any) -> None:
     """Raise a ValueError if a field holds a word that is not one of its choices."""
-    for name, parameter in declared(method).items():
+    for name, parameter in parameters_of(method).items():
         choices, value = parameter.choices, getattr(method, name)
         if choices and parameter.named is None and value not in choices:
             expected = ", ".join(map(str, choices))
@@ -152,7 +152,7 @@ def check_choices(method: Any) -> None:
 
 def check_bounds(method: Any) -> None:
     """Raise an InputError if a field holds a number out of bounds; no number may be traced."""
-    for name, parameter in declared(method).items():
+    for name, parameter in parameters_of(method).items():
         value, (low, high) = getattr(method, name), parameter.bounds
         if parameter.choices or value is None:
             continue

@@ -31,7 +31,8 @@ from mfvpr.utils.fingerprints import fingerprint, recipe_of
 from mfvpr.utils.progress import Stopwatch, Track, no_progress
 from mfvpr.utils.versions import versions
 
-DECODERS = ("mfvpr", "opencv-python-headless", "pillow")  # whose versions decide what an image becomes
+DECODERS = ("opencv-python-headless", "pillow")  # their versions decide which pixels an image file becomes
+DECODING = "0.2.0"  # raise it to the version of mfvpr that decodes or resizes a file to other pixels
 AGGREGATED = 16  # images at a time
 _MB = 1e6
 
@@ -118,7 +119,7 @@ class FeatureCache:
 
     def recipe(self, folder: ImageFolder, extractor: Extractor | Aggregated | Source) -> dict[str, Any]:
         """Everything that changes the features of a folder's images: extractor, images, versions of decoders."""
-        decoders = {name: versions()[name] for name in DECODERS}
+        decoders = {"mfvpr": DECODING} | {name: versions()[name] for name in DECODERS}
         return {
             "extractor": self.recipe_of(extractor),
             "images": self.contents(folder).fingerprint,

@@ -13,7 +13,7 @@ from scipy import special
 
 from mfvpr.datasets import Positives
 from mfvpr.evaluation import confidence_inputs, fit_confidence, read_confidences, write_confidences
-from mfvpr.report.confidences import Assured, recall_by_share
+from mfvpr.report.confidences import CalibratedPredictions, recall_by_share
 from mfvpr.reranking import Ranked
 from mfvpr.utils import InputError
 
@@ -199,7 +199,7 @@ def test_halves_of_drives_there_and_back_share_no_place():
                  for one in shown]  # fmt: skip
     judged: Any = SimpleNamespace(thresholds=[1], sequences=sequences)
     reported = []
-    for half in Assured(judged).path_halves():
+    for half in CalibratedPredictions(judged).path_halves():
         places = [{place for row in part for place in rows[row]} for part in (half.tune, half.report)]
         assert not places[0] & places[1]
         assert min(map(len, places)) >= 9

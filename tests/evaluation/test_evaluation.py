@@ -18,9 +18,9 @@ from mfvpr.evaluation.statistics import block_sign_flips
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.features.extraction import describe_folder
 from mfvpr.io import write_features, write_global_descriptors, write_shortlist
-from mfvpr.report.confidences import Assured
+from mfvpr.report.confidences import CalibratedPredictions
 from mfvpr.report.differences import differences, write_gains
-from mfvpr.report.evaluations import Judged, recall_table, write_rankings
+from mfvpr.report.evaluations import EvaluationReport, recall_table, write_rankings
 from mfvpr.reranking import FrameCorrelation, Fusion
 from mfvpr.reranking.fusion import rank_sequence
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, ShortlistFiles, WhitenedSearch
@@ -85,7 +85,7 @@ def test_frame_correlation_is_a_ranking_more(result):
 
 
 def test_gains_say_where_on_the_path_each_query_is(result, tmp_path):
-    write_gains(tmp_path, Judged(result, [0, 1], [1], "count"))
+    write_gains(tmp_path, EvaluationReport(result, [0, 1], [1], "count"))
     with (tmp_path / "gains.csv").open() as file:
         assert [line["place"] for line in csv.DictReader(file)] == [*map(str, range(10))]
 
@@ -102,7 +102,7 @@ def test_sequences_are_evaluated_by_themselves_with_their_means(dataset, split, 
     np.testing.assert_allclose(recall.pooled, result.recall([0, 1], [1])["count"].pooled)
     np.testing.assert_allclose(recall.mean, recall.by_sequence.mean(axis=0))
     assert recall.queries.tolist() == [3, 7]
-    judged = Judged(found, [0, 1], [1], "count")
+    judged = EvaluationReport(found, [0, 1], [1], "count")
     table = recall_table(judged)
     assert [line[:2] for line in table.rows[:4]] == [["filter", name] for name in ("first", "second", "mean", "pooled")]
     write_gains(tmp_path, judged)
@@ -126,7 +126,7 @@ def test_answers_of_sequences_are_as_sure_as_those_of_one_path(dataset, split, s
         small_street / "database", split, ground_truth="index", index_file="truth.csv", widen_index=True
     )
     found = mfvpr.evaluate(several, SIFT, VLAD, SCORERS, candidates=10)
-    assured = Assured(Judged(found, [0, 1], [1], "count"))
+    assured = CalibratedPredictions(EvaluationReport(found, [0, 1], [1], "count"))
     answers, filtered = found.systems["count"], found.systems["filter"]
     inputs = np.concatenate([confidence_inputs(*pair) for pair in zip(answers, filtered, strict=True)])
     right, halved = assured.right("count"), halves(dataset.truth.positives(1))
@@ -369,7 +369,7 @@ def test_extraction_counts_as_features_whoever_asks_for_them(dataset, monkeypatc
 def test_predictions_of_systems_of_any_names_are_all_there(result, tmp_path):
     names = ["count_filter", "count + filter", "../../up", "count"]
     systems = dict(zip(names, [*result.systems.values()] * 2, strict=False))
-    write_rankings(tmp_path / "out", Judged(replace(result, systems=systems), [0], [1], "count"))
+    write_rankings(tmp_path / "out", EvaluationReport(replace(result, systems=systems), [0], [1], "count"))
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     for kind in ("predictions", "failures"):
         assert len([*(tmp_path / "out" / kind).iterdir()]) == len(names)
@@ -393,7 +393,7 @@ def test_sequences_of_any_name_leave_all_of_their_files(split, small_street, tmp
     several = sequences_dataset(small_street / "database", folders, ground_truth="none")
     assert [sequence.name for sequence in several.sequences] == [*names, "real", "second"]
     found = mfvpr.evaluate(several, SIFT, VLAD, {"count": mfvpr.MatchCount()}, candidates=2)
-    write_rankings(tmp_path / "out", Judged(found, [], [1], "count"))
+    write_rankings(tmp_path / "out", EvaluationReport(found, [], [1], "count"))
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["sequences"]
     for name in (*names, "real", "second"):
         own = tmp_path / "out" / "sequences" / name

@@ -13,7 +13,7 @@ from experiments import build, command_line, declare, groups, help_text, setting
 from experiments.settings import CONF
 from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, value
 from mfvpr.scoring import ALONE, SCORERS, match_shifts
-from mfvpr.scoring.fields import check_choices, choice, declared, flag, made, named, number, numbers, whole
+from mfvpr.scoring.fields import check_choices, choice, flag, from_values, named, number, numbers, parameters_of, whole
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, SUFFIX
 from mfvpr.scoring.weights import UnitWeight, Weight, match_weights
 from mfvpr.tuning.learning.parameters import can_learn, starts
@@ -82,8 +82,11 @@ def test_the_files_of_conf_are_those_that_follow_from_the_scores():
 
 def test_every_field_of_a_scorer_is_a_setting_whose_default_is_its_own():
     for scorer in SCORERS.values():
-        assert [*declared(scorer)] == [*scorer.__dataclass_fields__]
-        assert made(scorer, {name: parameter.default for name, parameter in declared(scorer).items()}) == scorer()
+        assert [*parameters_of(scorer)] == [*scorer.__dataclass_fields__]
+        assert (
+            from_values(scorer, {name: parameter.default for name, parameter in parameters_of(scorer).items()})
+            == scorer()
+        )
 
 
 def test_a_scorer_that_is_gone_leaves_no_file(near, monkeypatch):
@@ -167,7 +170,7 @@ def test_its_parameters_are_swept(near, tmp_path_factory, tmp_path, monkeypatch,
 
 def test_plain_values_become_the_fields(near):
     plain = {"radius": 3.0, "most": None, "size": [1, 2], "weight": "unit", "strict": True}
-    assert made(Nearness, plain) == Nearness(3.0, None, size=(1.0, 2.0), weight=UnitWeight(), strict=True)
+    assert from_values(Nearness, plain) == Nearness(3.0, None, size=(1.0, 2.0), weight=UnitWeight(), strict=True)
     with pytest.raises(ValueError, match=r"Nearness\(norm='both'\): .*sum, largest"):
         Nearness(norm="both")
 

@@ -50,7 +50,7 @@ def evaluated(root, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def outcome(root):
-    return evaluation.evaluated(composed(*small(root), *LINES, "candidates=3"))
+    return evaluation.evaluation_of(composed(*small(root), *LINES, "candidates=3"))
 
 
 def rows(path):
@@ -234,7 +234,7 @@ def test_the_figure_of_a_refused_answer_says_that_there_is_no_place(outcome):
 
 
 def test_a_folder_in_use_is_refused_at_the_start(root, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(evaluation, "evaluated", lambda *_: pytest.fail("it was begun"))
+    monkeypatch.setattr(evaluation, "evaluation_of", lambda *_: pytest.fail("it was begun"))
     with runs.claim_run_folder(tmp_path / "out"):
         code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *small(root), f"out={tmp_path}/out")
     assert (code, stdout) == (2, "")
@@ -257,7 +257,7 @@ def test_whoever_is_refused_leaves_the_folder_where_it_is(tmp_path):
 
 def test_the_claim_of_a_killed_run_is_free(tmp_path):
     code = ("import sys; from pathlib import Path; from mfvpr.report import runs\n"
-            "with runs.claimed(Path(sys.argv[1])) as folder, runs.writing(folder) as new:\n"
+            "with runs.claim_run_folder(Path(sys.argv[1])) as folder, runs.writing(folder) as new:\n"
             "    (new / 'half').write_text('written'); print('held', flush=True); sys.stdin.read()")  # fmt: skip
     process = subprocess.Popen([sys.executable, "-c", code, tmp_path / "out"], cwd=ROOT, stdin=subprocess.PIPE,
                                stdout=subprocess.PIPE, text=True)  # fmt: skip

@@ -174,12 +174,12 @@ def test_settings_that_another_build_wrote_meanwhile_stay(tmp_path, monkeypatch)
 
     def build_other_first(*arguments):
         monkeypatch.undo()
-        maps.made(settings[1])
+        maps.map_of_settings(settings[1])
         return open_map(*arguments)
 
     monkeypatch.setattr(maps, "map_of", build_other_first)
     with pytest.raises(SettingsError, match="was made with other candidates"):
-        maps.made(settings[0])
+        maps.map_of_settings(settings[0])
     assert maps.read(tmp_path / "map")["candidates"] == 6
 
 
@@ -223,7 +223,7 @@ def test_so_many_answers_are_drawn_and_those_without_a_candidate(folder, tmp_pat
 def test_a_map_shows_nothing_outside_of_its_folder(small_street, tmp_path, monkeypatch, capsys):
     """Its names are data: of a map that somebody gave away they may say anything."""
     code, *_ = built(tmp_path / "map", small_street, monkeypatch, capsys)
-    known = maps.opened(tmp_path / "map")
+    known = maps.open_map(tmp_path / "map")
     known.add(small_street / "queries/0004.png", "there", name=f"..{small_street}/queries/0004.png")
     code, stdout, stderr = called(
         monkeypatch, capsys, "localize", f"map={tmp_path}/map", f"images={small_street}/queries/0004.png", "figures=1",
@@ -302,11 +302,11 @@ def test_a_drive_finds_where_it_was_before(twice, small_street, tmp_path, monkey
     assert [line["place"] for line in first[8:]] == [*names[:8], None]  # the second time, where it was the first
     for number, line in enumerate(first):  # nothing of the newest three, nor of itself
         assert all(one["row"] < 2 + number - 3 for one in line["alternatives"])
-    assert maps.opened(tmp_path / "map").names[2:] == names
+    assert maps.open_map(tmp_path / "map").names[2:] == names
     _, stdout, _ = called(monkeypatch, capsys, "localize", *drive)
     assert without_seconds(lines(stdout)) == without_seconds(first)
     assert not any(line["added"] for line in lines(stdout))
-    assert len(maps.opened(tmp_path / "map")) == 19
+    assert len(maps.open_map(tmp_path / "map")) == 19
 
 
 def test_a_drive_that_was_interrupted_goes_on(twice, folder, monkeypatch, capsys):
@@ -365,7 +365,7 @@ def test_confidences_of_other_settings_are_told(folder, small_street, tmp_path, 
     sure = Confidence(("margin", "height"), 1, (0.0, 0.0), (1.0, 1.0), (1.0, 1.0), 0.0)
     for candidates in (own["candidates"], own["candidates"] + 1):
         same = {name: own[name] for name in ("features", "retrieval", "matching")}
-        made = {"settings": same | {"scorer": build.described(own["scorer"])}}
+        made = {"settings": same | {"scorer": build.describe_settings(own["scorer"])}}
         write_confidences(tmp_path / "c.json", {"histogram": sure}, made | {"candidates": candidates})
         code, stdout, stderr = called(
             monkeypatch, capsys, "localize", f"map={folder}", f"images={small_street}/database/0001.png",

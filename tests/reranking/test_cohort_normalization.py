@@ -107,8 +107,8 @@ def test_scores_below_0_are_refused():
     candidates, scores = Shortlist(rows, rows * 0.0, rows >= 0), np.array([[3, -0.5]], np.float32)
     words = r"cohort: .*from 0, .*got -0.5 of grid"
     for refused in (
-        lambda: hubness(candidates, scores, 2, who="grid"),
-        lambda: by_hubness(candidates, scores, np.ones(2), who="grid"),
+        lambda: hubness(candidates, scores, 2, name="grid"),
+        lambda: by_hubness(candidates, scores, np.ones(2), name="grid"),
     ):
         with pytest.raises(InputError, match=words):
             refused()

@@ -48,7 +48,7 @@ def test_two_files_of_one_folder_are_refused(tmp_path, change, refused):
                               {"whiten": None})):  # fmt: skip
         settings = {"name": "import"} | common | own | change
         if not refused:
-            assert made(settings, data).files == {tmp_path: File(build.expanded("a.h5"))}
+            assert made(settings, data).files == {tmp_path: File(build.expand_user("a.h5"))}
             continue
         with pytest.raises(SettingsError, match=rf"^{group}\.queries={refused}: .*file .*prefix"):
             made(settings, data)

@@ -12,7 +12,7 @@ import pytest
 
 import mfvpr
 from mfvpr import HistogramOfShifts, InputError
-from mfvpr.scoring.fields import made
+from mfvpr.scoring.fields import from_values
 from mfvpr.scoring.learned_weight import RELATIVE, LearnedWeight
 from mfvpr.scoring.weight_files import read_weight, write_weight
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS
@@ -61,7 +61,7 @@ def test_what_ships_says_how_it_was_made_and_weighs(name):
 
 
 def test_a_file_of_ones_own(file, weight, monkeypatch):
-    scorer = made(HistogramOfShifts, {"weight": str(file)})
+    scorer = from_values(HistogramOfShifts, {"weight": str(file)})
     jax.tree.map(np.testing.assert_array_equal, scorer.weight, weight)
     assert float(scorer(MATCHES)) == float(HistogramOfShifts(weight=weight)(MATCHES)) > 0
     assert NAMED_WEIGHTS[str(file)] is scorer.weight

@@ -14,8 +14,7 @@ from mfvpr.datasets import image_folder
 from mfvpr.evaluation import stages
 from mfvpr.features import Aggregated, Description, Scale, Sift, VladFitting
 from mfvpr.retrieval.search import EXACT
-from mfvpr.storage import FeatureCache, vectors
-from mfvpr.storage import feature_cache as archive_module
+from mfvpr.storage import FeatureCache, feature_cache, vectors
 from mfvpr.storage.features import forecast_bytes, open_store
 from mfvpr.types import Features
 from mfvpr.utils import InputError, recipe_of
@@ -146,10 +145,14 @@ def test_an_extractor_that_was_changed_is_another_one(folder, tmp_path, on_disk)
 
 
 def test_what_another_version_decodes_are_other_images(folder, monkeypatch):
-    known, recipe = archive_module.versions(), FeatureCache().recipe(folder, SIFT)
-    for name in ("mfvpr", "opencv-python-headless", "pillow"):
-        monkeypatch.setattr(archive_module, "versions", lambda name=name: {**known, name: "0"})
+    known, recipe = feature_cache.versions(), FeatureCache().recipe(folder, SIFT)
+    for name in ("opencv-python-headless", "pillow"):
+        monkeypatch.setattr(feature_cache, "versions", lambda name=name: {**known, name: "0"})
         assert FeatureCache().recipe(folder, SIFT) != recipe
+    monkeypatch.setattr(feature_cache, "versions", lambda: {**known, "mfvpr": "0"})  # a release decodes as the last one
+    assert FeatureCache().recipe(folder, SIFT) == recipe
+    monkeypatch.setattr(feature_cache, "DECODING", "0")
+    assert FeatureCache().recipe(folder, SIFT) != recipe
 
 
 @pytest.mark.parametrize("on_disk", [True, False])

@@ -25,14 +25,7 @@ _SCALES: dict[Scale, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart of a page.
-
-    Attributes:
-        name: of its element, a word.
-        title: above it.
-        words: description for readers who do not see it.
-        figure: as JSON values, plotly's `data` and `layout`.
-    """
+    """A chart of a page: plotly's `data` and `layout` as JSON values; `words` are for readers who do not see it."""
 
     name: str
     title: str

@@ -99,10 +99,10 @@ def _recall_section(run: Run) -> Section:
     words += "are 95 % and know that neighbors along the path fail together."
     sheets = []
     if table := run.tables.get("table.csv"):
-        gains_of = [parts.get(row[1] if several else "recall") for row in table.rows]
-        cells = ["" if gains is None else interval_words(gains, row[0])
-                 for gains, row in zip(gains_of, table.rows, strict=True)]  # fmt: skip
-        rows = [[*row, cell] for row, cell in zip(table.rows, cells, strict=True)]
+        rows = []
+        for row in table.rows:
+            gains = parts.get(row[1] if several else "recall")
+            rows.append([*row, "" if gains is None else interval_words(gains, row[0])])
         sheets = [Sheet("Recall of every system", Table([*table.header, f"R@1{run.within}, 95 %"], rows, 1 + several))]
     return Section("recall", "Recall", words, charts, sheets)
 
@@ -122,11 +122,11 @@ def tolerance_charts(curves: Curves) -> list[Chart]:
     by_kind: dict[tuple[str, str], dict[str, list[tuple[float, float]]]] = {}
     for name, (run, system) in curves.items():
         if len(run.thresholds) > 1:
-            rows = [row for row in run.results
-                    if row["system"] == system and row.get("sequence", MEANS[-1]) == MEANS[-1]]  # fmt: skip
-            points = [(row["tolerance"] if "tolerance" in row else row["radius"], 100 * row["recall_at"][run.first_k])
-                      for row in rows]  # fmt: skip
-            by_kind.setdefault((run.unit, run.first_k), {})[name] = points
+            by_kind.setdefault((run.unit, run.first_k), {})[name] = [
+                (row["tolerance"] if "tolerance" in row else row["radius"], 100 * row["recall_at"][run.first_k])
+                for row in run.results
+                if row["system"] == system and row.get("sequence", MEANS[-1]) == MEANS[-1]
+            ]
     return [
         lines(f"tolerances-{number}" if number else "tolerances", "Recall over tolerance", points,
               axes=(f"tolerance, {unit}", f"recall at {k}, %"), marked=True)

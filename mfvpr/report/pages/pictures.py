@@ -17,17 +17,7 @@ _WIDTH, _QUALITY = 1000, 75  # px, of JPEG: some 60 kB each
 
 @dataclass(frozen=True)
 class Picture:
-    """A query's figure.
-
-    Attributes:
-        system: of the prediction.
-        sequence: of the query.
-        outcome: "right", "wrong", or "best" without ground truth.
-        query: name of its image.
-        answer: name of the database image.
-        source: the picture as a `data:` URI.
-        size: width and height, px.
-    """
+    """The figure of a query and its prediction, as a `data:` URI; `size` is width and height, px."""
 
     system: str
     sequence: str

@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from mfvpr.scoring.fields import SCORE, declared
+from mfvpr.scoring.fields import SCORE, parameters_of
 from mfvpr.types import Array
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import as_float
@@ -14,7 +14,7 @@ from mfvpr.utils.numerics import as_float
 
 def can_learn(scorer: Any) -> bool:
     """Whether a scorer, or a class of scorers, has fields that are declared to be learned."""
-    return any(parameter.learned for parameter in declared(scorer).values())
+    return any(parameter.learned for parameter in parameters_of(scorer).values())
 
 
 def starts(scorer: Any, spread: float) -> dict[str, float]:
@@ -25,7 +25,7 @@ def starts(scorer: Any, spread: float) -> dict[str, float]:
         spread: standard deviation of its scores.
     """
     values = {}
-    for name, field in declared(scorer).items():
+    for name, field in parameters_of(scorer).items():
         if field.learned:
             default = field.start * (spread if field.unit == SCORE else 1.0)
             value = getattr(scorer, name)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mfvpr.scoring.fields import declared
+from mfvpr.scoring.fields import parameters_of
 from mfvpr.scoring.parameters import with_capacity, with_parameters
 from mfvpr.scoring.scorer import Scorer
 from mfvpr.tuning.sweeps.settings import FUSION, Setting, grid
@@ -74,7 +74,7 @@ class Axes:
             return None if value == "auto" else float(value)
         if name == MAX_DISTANCE:
             return math.inf if value is None else value
-        parameter = declared(self.scorer).get(name)
+        parameter = parameters_of(self.scorer).get(name)
         if parameter is None:
             return value
         if parameter.named is not None and value not in parameter.named:

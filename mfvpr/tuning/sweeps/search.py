@@ -8,7 +8,7 @@ import numpy as np
 
 from mfvpr.evaluation.protocol import Judge
 from mfvpr.matching.match_set import MatchSet, Scales
-from mfvpr.scoring.fields import declared
+from mfvpr.scoring.fields import parameters_of
 from mfvpr.tuning.sweeps.axes import Axes
 from mfvpr.tuning.sweeps.outcome import Outcome
 from mfvpr.tuning.sweeps.sweep import sweep
@@ -112,7 +112,7 @@ def _ranker(
 
 def suggest_setting(trial: "optuna.Trial", axes: Axes) -> dict[str, Any]:
     """Draw a plain value of every axis."""
-    integers = {name for name, parameter in declared(axes.scorer).items() if parameter.whole}
+    integers = {name for name, parameter in parameters_of(axes.scorer).items() if parameter.whole}
     return {name: _suggest(trial, name, values, is_integer=name in integers) for name, values in axes.values.items()}
 
 
