@@ -113,7 +113,7 @@ def weights(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def small_street(tmp_path_factory) -> Path:
-    """Ten frames of the drawn street: database/, queries/, ground_truth.csv."""
+    """Ten frames of the synthetic street: database/, queries/, ground_truth.csv."""
     return streets_folder(tmp_path_factory.mktemp("cache"), num_frames=10, image_size=(320, 240))
 
 

@@ -46,7 +46,7 @@ def _composed(config, overrides):
 
 
 def folder(street, *more):
-    """Settings of a drawn street's folder."""
+    """Settings of a synthetic street's folder."""
     index = ("dataset.ground_truth=index", f"dataset.index_file={street}/ground_truth.csv", "dataset.widen_index=true")
     return ("dataset=folder", f"dataset.database={street}/database", f"dataset.queries={street}/queries", *index, *more)
 

@@ -40,6 +40,7 @@ LIBRARIES = {
     "safetensors": {"checkpoints"},
     "optax": {"tuning"},
     "orbax": {"tuning"},
+    "filelock": {"utils"},
     "h5py": {"io"},
     "matplotlib": {"report"},
     "plotly": {"report"},

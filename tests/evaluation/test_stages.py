@@ -1,4 +1,4 @@
-"""The way over a data set, stage by stage, on a drawn street and on broken images."""
+"""The way over a data set, stage by stage, on a synthetic street and on broken images."""
 
 import itertools
 from contextlib import contextmanager

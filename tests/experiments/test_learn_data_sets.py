@@ -16,7 +16,7 @@ SHORT = ("scorer=sum", "steps=2", "every=1", "batch=4", "grid.c=[1]", "grid.weig
 
 
 def as_text(street, name):
-    """A drawn street's folder, in the words of a list of data sets."""
+    """A synthetic street's folder, in the words of a list of data sets."""
     index = f"ground_truth=index:index_file={street}/ground_truth.csv:widen_index=true"
     return f"folder:name={name}:database={street}/database:queries={street}/queries:{index}"
 

@@ -69,6 +69,7 @@ def assert_same_rows(found, expected):
         np.testing.assert_allclose(found[name], values, rtol=0, atol=1e-5, err_msg=name)
 
 
+@pytest.mark.optimized
 def test_matches_are_the_largest_of_their_row_and_column_and_above_the_threshold():
     features0, features1 = pair(COUNTS, INPUTS, 0)
     matches = matched(matcher(), features0, features1)

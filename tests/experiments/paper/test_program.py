@@ -27,7 +27,7 @@ QUERIES = 8
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    """A folder with one data set: frames of the drawn street under the names of another."""
+    """A folder with one data set: frames of the synthetic street under the names of another."""
     from mfvpr.datasets.streets import draw_streets
 
     folder = tmp_path_factory.mktemp("data") / "grief_season"
