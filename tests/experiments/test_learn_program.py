@@ -146,8 +146,8 @@ def test_the_papers_rows_are_an_evaluation(root, learn, untrained, tmp_path, cha
     names = {"sum": "paper", "sum + filter": "paper + filter"}
     for row in expected:
         if row["system"] in names:
-            found = rows[names[row["system"]]]["recall_at_1"][f"{row['tolerance']}"]
-            assert found == pytest.approx(row["recall_at"]["1"], abs=1e-6)
+            recall = rows[names[row["system"]]]["recall_at_1"][f"{row['tolerance']}"]
+            assert recall == pytest.approx(row["recall_at"]["1"], abs=1e-6)
 
 
 def rows_of(results):
