@@ -77,7 +77,7 @@ def free_address():
 @pytest.mark.slow
 def test_two_processes_of_four_devices_find_what_one_finds(tmp_path):
     address = free_address()
-    code = "import sys; from tests.test_distributed import process; process(*sys.argv[1:])"
+    code = "import sys; from tests.evaluation.test_distributed import process; process(*sys.argv[1:])"
     started = [
         subprocess.Popen([sys.executable, "-c", code, address, str(index), f"{tmp_path}/{index}.npz"], cwd=ROOT,
                          env=os.environ | FLAGS) for index in (0, 1)

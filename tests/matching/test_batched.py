@@ -245,7 +245,7 @@ def on_devices(out):
 
 @pytest.mark.slow
 def test_eight_devices_give_what_one_gives(tmp_path):
-    call = f"from tests.test_pair_matching import on_devices; on_devices({str(tmp_path / 'out.json')!r})"
+    call = f"from tests.matching.test_batched import on_devices; on_devices({str(tmp_path / 'out.json')!r})"
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=8"
     done = subprocess.run(
         [sys.executable, "-c", call],
