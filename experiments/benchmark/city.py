@@ -20,8 +20,9 @@ from mfvpr.features import FeatureSet
 from mfvpr.report import Table
 from mfvpr.reranking import rank
 from mfvpr.retrieval.search import EXACT
-from mfvpr.storage.features import FeatureStore, forecast_bytes, open_store, require_space
+from mfvpr.storage.features import FeatureStore, forecast_bytes, open_store
 from mfvpr.storage.manifest import store_path
+from mfvpr.storage.rows import require_space
 from mfvpr.types import Shortlist
 
 DATA = MadeUp(100_000, 200, 700, 128, views=1, likeness=0.18)  # so that the filter often fails

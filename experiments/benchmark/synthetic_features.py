@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from experiments.console import bar
-from mfvpr.storage.features import FeatureStore, forecast_bytes, open_store, require_space
+from mfvpr.storage.features import FeatureStore, forecast_bytes, open_store
 from mfvpr.storage.manifest import store_path
+from mfvpr.storage.rows import require_space
 from mfvpr.types import Features
 from mfvpr.utils.threads import ordered_map
 

@@ -18,10 +18,8 @@ from typing import Any
 import numpy as np
 
 from mfvpr.storage.manifest import FEATURES, Kind
-from mfvpr.storage.rows import RowStore, open_rows, require_space, row_bytes
+from mfvpr.storage.rows import RowStore, open_rows, row_bytes
 from mfvpr.types import Features
-
-__all__ = ["FeatureStore", "forecast_bytes", "open_store", "require_space"]
 
 FeatureStore = RowStore[Features]
 _NUM_ARRAYS = 5

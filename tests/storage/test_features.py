@@ -11,8 +11,9 @@ import pytest
 
 from mfvpr import Features, InputError
 from mfvpr.storage import rows
-from mfvpr.storage.features import forecast_bytes, open_store, require_space
+from mfvpr.storage.features import forecast_bytes, open_store
 from mfvpr.storage.manifest import recipe_fingerprint, store_path
+from mfvpr.storage.rows import require_space
 from tests.builders import make_features
 from tests.storage.synthetic_features import RECIPE, assert_same, digests, features_of, fill, read_all
 
