@@ -7,11 +7,16 @@ never matters, NaN included. Every field may carry leading batch axes. Arrays ma
 
 from collections.abc import Callable
 from dataclasses import Field, dataclass, field, fields, is_dataclass
-from typing import Any, TypeVar, dataclass_transform
+from typing import TYPE_CHECKING, Any, TypeVar, dataclass_transform
 
 import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int, Num
 
-Array = Any  # jax.Array or np.ndarray: the host prepares arrays with NumPy, devices compute with JAX
+if TYPE_CHECKING:
+    Array = Any  # pyright takes neither kind of array for the other
+else:
+    Array = jax.Array | np.ndarray | np.generic  # the host prepares arrays with NumPy, devices compute with JAX
 Class = TypeVar("Class", bound=type)
 
 
@@ -71,11 +76,11 @@ class Features:
         image_size: `[..., 2]` (width, height), px.
     """
 
-    keypoints: Array  # [..., N, 2]
-    descriptors: Array  # [..., N, D]
-    scores: Array  # [..., N]
-    mask: Array  # [..., N]
-    image_size: Array = field(metadata={"per_image": True})  # [..., 2]
+    keypoints: Num[Array, "*batch keypoints 2"]
+    descriptors: Num[Array, "*batch keypoints dimensions"]
+    scores: Num[Array, "*batch keypoints"]
+    mask: Bool[Array, "*batch keypoints"]
+    image_size: Num[Array, "*batch 2"] = field(metadata={"per_image": True})
 
 
 def per_keypoint(features: Features) -> dict[str, Array]:
@@ -103,22 +108,25 @@ class Matches:
         index1: `[..., K]` int32, number of the match's keypoint in the candidate; None = unknown.
         count0: `[...]` int32, number of keypoints of the query, matched or not; None = unknown.
         count1: `[...]` int32, number of keypoints of the candidate, matched or not; None = unknown.
+
+    In a `MatchSet`, the slots of one query hold the matches with all C candidates: `image_size1` is `[C, 2]` and
+    `count1` `[C]` there.
     """
 
-    points0: Array  # [..., K, 2]
-    points1: Array  # [..., K, 2]
-    distance: Array  # [..., K]
-    scores0: Array  # [..., K]
-    scores1: Array  # [..., K]
-    mask: Array  # [..., K]
-    image_size0: Array = field(metadata={"per_pair": True})  # [..., 2]
-    image_size1: Array = field(metadata={"per_pair": True})  # [..., 2]
-    ratio: Array | None = None  # [..., K]
-    confidence: Array | None = None  # [..., K]
-    index0: Array | None = None  # [..., K]
-    index1: Array | None = None  # [..., K]
-    count0: Array | None = field(default=None, metadata={"per_pair": True})  # [...]
-    count1: Array | None = field(default=None, metadata={"per_pair": True})  # [...]
+    points0: Num[Array, "*batch slots 2"]
+    points1: Num[Array, "*batch slots 2"]
+    distance: Num[Array, "*batch slots"]
+    scores0: Num[Array, "*batch slots"]
+    scores1: Num[Array, "*batch slots"]
+    mask: Bool[Array, "*batch slots"]
+    image_size0: Num[Array, "*batch 2"] = field(metadata={"per_pair": True})
+    image_size1: Num[Array, "*pairs 2"] = field(metadata={"per_pair": True})
+    ratio: Num[Array, "*batch slots"] | None = None
+    confidence: Num[Array, "*batch slots"] | None = None
+    index0: Int[Array, "*batch slots"] | None = None
+    index1: Int[Array, "*batch slots"] | None = None
+    count0: Int[Array, "*batch"] | None = field(default=None, metadata={"per_pair": True})
+    count1: Int[Array, "*pairs"] | None = field(default=None, metadata={"per_pair": True})
 
 
 INDICES = ("index0", "index1")  # integer fields, which take part in no arithmetic
@@ -149,9 +157,9 @@ class Shortlist:
         mask: `[Q, C]` bool, False where the index is -1.
     """
 
-    indices: Array  # [Q, C]
-    scores: Array  # [Q, C]
-    mask: Array  # [Q, C]
+    indices: Int[Array, "queries candidates"]
+    scores: Float[Array, "queries candidates"]
+    mask: Bool[Array, "queries candidates"]
 
 
 @value
@@ -163,5 +171,5 @@ class Ranking:
         scores: `[Q, C]` re-ranking scores in the shortlist's order (not sorted).
     """
 
-    order: Array  # [Q, C]
-    scores: Array  # [Q, C]
+    order: Int[Array, "queries candidates"]
+    scores: Float[Array, "queries candidates"]

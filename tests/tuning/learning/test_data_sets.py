@@ -25,7 +25,8 @@ def part(name, seed, width=QUERIES):
     judge = replace(judge, halves=(), split=None)
     keep = [int(ends[width - 1]) for ends in np.cumsum(matches.counts, axis=1)]
     flat = [
-        replace(one, image_size1=one.image_size1[:width], **{n: values[:end] for n, values in per_match(one).items()},
+        replace(one, image_size1=one.image_size1[:width], count1=one.count1[:width],
+                **{n: values[:end] for n, values in per_match(one).items()},
                 mask=one.mask[:end])
         for one, end in zip(matches.matches, keep, strict=True)
     ]  # fmt: skip

@@ -164,7 +164,7 @@ def test_finished_blocks_are_read_and_damaged_ones_computed_again(data, tmp_path
     turned[len(turned) // 2] ^= 1  # a row of the right shape, but another
     kept[2].write_bytes(turned)
     computed = []
-    module = sweeps.sweep.__globals__
+    module = vars(sys.modules["mfvpr.tuning.sweeps.sweep"])
     scores = module["block_scores"]
     monkeypatch.setitem(module, "block_scores", lambda *inputs: computed.append(1) or scores(*inputs))
     np.testing.assert_array_equal(sweeps.sweep(scorer, settings, *data, **chunks), expected)
@@ -373,7 +373,7 @@ def test_pairs_score_the_same_in_a_smaller_set(data, scorer, monkeypatch):
     match_set, candidates = data
     few = replace(match_set, matches=match_set.matches[:2], counts=match_set.counts[:2])
     assert shapes(few) == shapes(match_set)
-    found, module = [], sweeps.sweep.__globals__
+    found, module = [], vars(sys.modules["mfvpr.tuning.sweeps.sweep"])
     scores = module["block_scores"]
     monkeypatch.setitem(module, "block_scores", lambda *inputs: found.append(scores(*inputs)) or found[-1])
     for one in (match_set, few):
