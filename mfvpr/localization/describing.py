@@ -47,13 +47,10 @@ class Describing:
             InputError: the image cannot be read or has another format, or its features are not finite.
         """
         pixels, name = (read_image(image), str(image)) if is_file(image) else (_pixels(image), "image")
-        description = _extract(self.extractor, pixels, name)
-        features = round_as_stored(description.features)
-        if self.describer is self.extractor:
-            return features, _flat(description)
-        if isinstance(describer := self.describer, Extractor):
-            return features, _flat(_extract(describer, pixels, name))
-        return features, describer([features])[0]
+        descriptions = [_extract(extractor, pixels, name) for extractor in self._extractors]
+        features = round_as_stored(descriptions[0].features)
+        [vector] = self._vectors([features], descriptions[-1:])
+        return features, vector
 
     def folder(
         self, images: ImageFolder, rows: Sequence[int], track: Track = no_progress
@@ -63,16 +60,27 @@ class Describing:
         Raises:
             InputError: as `image`.
         """
-        for local in _batches(images, self.extractor, rows, track):
-            features = {row: round_as_stored(description.features) for row, description in local.items()}
-            if self.describer is self.extractor:
-                vectors = {row: _flat(description) for row, description in local.items()}
-            elif isinstance(describer := self.describer, Extractor):
-                parts = _batches(images, describer, [*features], no_progress)
-                vectors = {row: _flat(description) for part in parts for row, description in part.items()}
-            else:
-                vectors = dict(zip(features, describer([*features.values()]), strict=True))
-            yield {row: (features[row], vectors[row]) for row in features}
+        for batch in _batches(images, self.extractor, rows, track):
+            features = [round_as_stored(description.features) for description in batch.values()]
+            descriptions = [*batch.values()]
+            for describer in self._extractors[1:]:
+                parts = _batches(images, describer, [*batch], no_progress)
+                descriptions = [description for part in parts for description in part.values()]
+            vectors = self._vectors(features, descriptions)
+            yield dict(zip(batch, zip(features, vectors, strict=True), strict=True))
+
+    @property
+    def _extractors(self) -> list[Extractor]:
+        """The extractor, and the describer if it is another extractor."""
+        describer = self.describer
+        is_another = isinstance(describer, Extractor) and describer is not self.extractor
+        return [self.extractor, describer] if is_another else [self.extractor]
+
+    def _vectors(self, features: Sequence[Features], descriptions: Sequence[Description]) -> Sequence[np.ndarray]:
+        """Global descriptors of images: aggregated features, or those in the descriptions."""
+        if isinstance(describer := self.describer, Extractor):
+            return [_flat(description) for description in descriptions]
+        return describer(features)
 
 
 def is_file(image: Image) -> TypeGuard[Path | str]:

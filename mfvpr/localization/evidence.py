@@ -11,7 +11,7 @@ sooner if images are enlarged for the detector, or if the map's images have few 
 
 import numpy as np
 
-from mfvpr.localization.resident import Rows
+from mfvpr.storage.maps import MapRows
 from mfvpr.types import Features
 
 # Round numbers, not fitted. They were chosen with two real sets in view, a park path and a corridor: results on those
@@ -29,7 +29,7 @@ def strength(features: Features) -> float:
 class MapStrength:
     """Mean strength of a map's images, estimated from rows that are spread evenly over the map."""
 
-    def __init__(self, rows: Rows) -> None:
+    def __init__(self, rows: MapRows) -> None:
         """Read nothing yet.
 
         Args:

@@ -1,6 +1,6 @@
 """Adding images to a map, one process at a time: from a folder, one by one, or with features that are there already."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -10,7 +10,8 @@ from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.localization.describing import Described, Image, is_file
 from mfvpr.localization.state import DescribedMap, MapState, exclusive
 from mfvpr.storage.features import FeatureStore
-from mfvpr.storage.maps import Entry, check_name, check_place, hold_map, settle_map
+from mfvpr.storage.map_entries import Entry, check_entry
+from mfvpr.storage.maps import MapImage, lock_map, write_settings
 from mfvpr.types import Features
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import canonical_name
@@ -28,7 +29,7 @@ class GrowingMap(MapState):
             InputError: images cannot be read, or have too few features, or another process adds.
         """
         if self._described is None:
-            with hold_map(self.folder), self._learning(images, track):
+            with lock_map(self.folder), self._learning(images, track):
                 pass
 
     @exclusive
@@ -48,16 +49,15 @@ class GrowingMap(MapState):
         if len(places) != len(images):
             raise InputError(f"expected a place of each of {len(images)} images, got {len(places)}")
         for name, place in zip(images.names, places, strict=True):
-            check_name(name)
-            check_place(name, place)
-        with hold_map(self.folder), self._learning(images, track) as features, self._adding() as described:
+            check_entry(name, place)
+        with lock_map(self.folder), self._learning(images, track) as features, self._adding() as (described, add):
             missing = [row for row, name in enumerate(images.names) if name not in self._row_of_name]
             if features is None:
                 batches = described.describing.folder(images, missing, track)
             else:
                 batches = _aggregate(described.describing.describer, features, missing, self.extractor.batch_size)
             for batch in batches:
-                described.rows.add([
+                add([
                     (features, Entry(images.names[row], places[row], vector))
                     for row, (features, vector) in batch.items()
                 ])  # fmt: skip
@@ -96,9 +96,8 @@ class GrowingMap(MapState):
         if len(entries) != len(features):
             raise InputError(f"expected features of each of {len(entries)} images, got {len(features)}")
         for name, place, _ in entries:
-            check_name(name)
-            check_place(name, place)
-        with hold_map(self.folder), self._adding() as described:
+            check_entry(name, place)
+        with lock_map(self.folder), self._adding() as (_, add):
             new_names, length = set[str](), self._vectors.length
             for name, _, vector in entries:
                 length = np.size(vector) if length is None else length
@@ -108,12 +107,12 @@ class GrowingMap(MapState):
                 if name in self._row_of_name or name in new_names:
                     raise InputError(f"{name}: the map has an image of this name; choose another")
                 new_names.add(name)
-            described.rows.add([*zip(features, entries, strict=True)])
+            add([*zip(features, entries, strict=True)])
         self.refresh()
 
     @contextmanager
     def _learning(self, images: ImageFolder, track: Track) -> Iterator[FeatureStore | None]:
-        """Learn the vocabulary if it is missing, within `hold_map`; yield the features it was learned from, or None."""
+        """Learn the vocabulary if it is missing, within `lock_map`; yield the features it was learned from, or None."""
         self.refresh()
         if self._described is not None or self._vocabulary is None:
             yield None
@@ -123,14 +122,14 @@ class GrowingMap(MapState):
             yield features
 
     @contextmanager
-    def _adding(self) -> Iterator[DescribedMap]:
-        """Hold the rows, so that no other process adds any, and know those that other processes added."""
+    def _adding(self) -> Iterator[tuple[DescribedMap, Callable[[Sequence[MapImage]], None]]]:
+        """Lock the rows, and read those that other processes added; yield a function that adds images as well."""
         described = self._require_described()
         self.refresh()  # first: nothing of this map goes into one that replaced it
-        settle_map(self.folder, self._settings)
-        with described.rows.adding():
+        write_settings(self.folder, self._settings)
+        with described.rows.adding() as add:
             self.refresh()
-            yield described
+            yield described, add
 
 
 def _aggregate(

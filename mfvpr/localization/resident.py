@@ -1,8 +1,7 @@
 """Features of the recently used images of a map, on the device: as many as the memory allows."""
 
 import itertools
-from collections.abc import Iterator, Sequence
-from typing import Protocol
+from collections.abc import Sequence
 
 import jax
 import numpy as np
@@ -17,22 +16,11 @@ from mfvpr.features.feature_set import (
     stack_features,
     write_slots,
 )
+from mfvpr.storage.maps import MapRows
 from mfvpr.types import Features
 from mfvpr.utils.numerics import device_of, round_up
 
 _LEAST = 256  # slots, twice as many as a query's candidates at least
-
-
-class Rows(Protocol):
-    """The features of a map on disk."""
-
-    def counts(self, rows: Sequence[int]) -> np.ndarray:
-        """`[n]` keypoints, -1 = there is no such row."""
-        ...
-
-    def features(self, rows: Sequence[int]) -> Iterator[tuple[int, Features]]:
-        """Pairs of a row and its features."""
-        ...
 
 
 class Resident:
@@ -41,7 +29,7 @@ class Resident:
     The number of slots and the capacity grow in few steps, so that a growing map compiles few programs.
     """
 
-    def __init__(self, rows: Rows, *, typical: int, candidates: int, memory: float | None) -> None:
+    def __init__(self, rows: MapRows, *, typical: int, candidates: int, memory: float | None) -> None:
         """Read nothing yet.
 
         Args:

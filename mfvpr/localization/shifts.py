@@ -1,7 +1,5 @@
 """The shift between a query and a candidate, for steering, if the scorer is a histogram of shifts."""
 
-from typing import NamedTuple
-
 import numpy as np
 
 from mfvpr.evaluation.stages import pair_shifts
@@ -14,22 +12,14 @@ from mfvpr.types import Matches
 Point = tuple[float, float]
 
 
-class Shift(NamedTuple):
-    """The fields of the same names of `mfvpr.localization.Answer`."""
-
-    shift: Point | None = None
-    interval: tuple[Point, Point] | None = None
-    scale: float | None = None
-
-
-def shift_of(scorer: Scorer, pair: Matches) -> Shift:
-    """The shift of one pair, from its matches `[1, K, ...]`."""
+def shift_of(scorer: Scorer, pair: Matches) -> tuple[Point | None, tuple[Point, Point] | None, float | None]:
+    """`shift`, `shift_interval` and `scale` of an `Answer`, from the matches `[1, K, ...]` of a pair."""
     if not isinstance(scorer, HistogramOfShifts):
-        return Shift()
-    fitted = with_capacity(scorer, pair.image_size0, pair.image_size1, multiple=BIN_STEP)
-    shift, interval, scale = (np.asarray(values)[0] for values in pair_shifts(fitted, pair))
+        return None, None, None
+    scorer = with_capacity(scorer, pair.image_size0, pair.image_size1, multiple=BIN_STEP)
+    shift, interval, scale = (np.asarray(values)[0] for values in pair_shifts(scorer, pair))
     low, high = _point(interval[0]), _point(interval[1])
-    return Shift(_point(shift), (low, high) if low and high else None, float(scale) if np.isfinite(scale) else None)
+    return _point(shift), (low, high) if low and high else None, float(scale) if np.isfinite(scale) else None
 
 
 def _point(values: np.ndarray) -> Point | None:

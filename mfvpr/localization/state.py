@@ -15,7 +15,8 @@ from mfvpr.localization.evidence import MapStrength
 from mfvpr.localization.resident import Resident
 from mfvpr.localization.vectors import Vectors
 from mfvpr.localization.vocabulary import VocabularyFile
-from mfvpr.storage.maps import Entry, MapRows, is_map_settled
+from mfvpr.storage.map_entries import Entry
+from mfvpr.storage.maps import MapRows, has_settings
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import recipe_of
 
@@ -115,7 +116,7 @@ class MapState:
             InputError: the map was made with other settings, is damaged, or was replaced since it was opened.
         """
         before = len(self)
-        self._is_settled = self._is_settled or is_map_settled(self.folder, self._settings)
+        self._is_settled = self._is_settled or has_settings(self.folder, self._settings)
         if self._vocabulary is not None and self._described is not None:
             self._vocabulary.check_unchanged()
         elif self._vocabulary is not None and (vocabulary := self._vocabulary.find()) is not None:

@@ -16,7 +16,7 @@ from mfvpr.features.vlad import Vlad, VladFitting
 from mfvpr.localization.describing import local_features
 from mfvpr.storage.disk import disk_errors_as_input_errors
 from mfvpr.storage.features import FeatureStore, open_store
-from mfvpr.storage.maps import MAP, file_stamp, has_rows, settle_map
+from mfvpr.storage.maps import MAP, file_stamp, has_rows, write_settings
 from mfvpr.utils.arrays import read_arrays, write_arrays
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import fingerprint, recipe_of
@@ -80,7 +80,7 @@ class VocabularyFile:
 
     @contextmanager
     def learn(self, images: ImageFolder, settings: Mapping[str, Any], track: Track) -> Iterator[FeatureStore]:
-        """Learn and write the vocabulary, within `hold_map`; yield the local features, which are deleted afterwards.
+        """Learn and write the vocabulary, within `lock_map`; yield the local features, which are deleted afterwards.
 
         Args:
             images: to learn from.
@@ -98,7 +98,7 @@ class VocabularyFile:
                 while batch := dict(itertools.islice(features, self._extractor.batch_size)):
                     store.write(batch)
             vocabulary = self._fitting.fit(FeatureSet(store, {}))
-            settle_map(self._folder, settings)
+            write_settings(self._folder, settings)
             with disk_errors_as_input_errors(self._folder, MAP.content):
                 arrays = {"centers": vocabulary.centers, "power": np.array(vocabulary.power)}
                 write_arrays(self._path, arrays, self._key)

@@ -209,7 +209,7 @@ class FeatureCache:
 
     @property
     def store_options(self) -> dict[str, Any]:
-        """The arguments `waiting` and `shard` of `storage.rows.open_rows`."""
+        """The arguments `waiting` and `shard` of `storage.rows.RowStore`."""
         return {"waiting": self.tell if self.wait else None, "shard": self.shard}
 
     def _content_of(self, path: PurePath) -> Any:

@@ -115,7 +115,7 @@ def open_sinks(
         extractor: gives the descriptions.
         recipe: of its features of these images.
         num_images: M.
-        **how: `waiting` and `shard` of `storage.rows.open_rows`.
+        **how: `waiting` and `shard` of `storage.rows.RowStore`.
     """
     name, size = type(extractor).__name__, extractor.vector_size
     options: dict[str, Any] = {"num_images": num_images} | how

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from mfvpr.storage.manifest import FEATURES, Kind
-from mfvpr.storage.rows import RowStore, open_rows, row_bytes
+from mfvpr.storage.rows import RowStore, row_bytes
 from mfvpr.types import Features
 
 FeatureStore = RowStore[Features]
@@ -35,12 +35,12 @@ def open_store(
         recipe: of the features (JSON values only): weights, settings, images. Kept in plain text.
         num_images: M.
         kind: with other messages, for a store that is part of a map.
-        **options: `waiting`, `shard` and `tokens` of `rows.open_rows`.
+        **options: `waiting`, `shard` and `tokens` of `rows.RowStore`.
 
     Raises:
         InputError: made from something else, or no store at all.
     """
-    return open_rows(folder, kind, recipe, {"num_images": num_images}, pack=pack_features, unpack=_unpack, **options)
+    return RowStore(folder, kind, recipe, {"num_images": num_images}, pack=pack_features, unpack=_unpack, **options)
 
 
 def forecast_bytes(num_images: int, features_per_image: float, dimension: int) -> int:

@@ -68,7 +68,7 @@ def store_path(root: Path, name: str, recipe: Mapping[str, Any], kind: Kind = FE
     return root / f"{re.sub(r'[^A-Za-z0-9._-]', '_', name)[:100]}-{recipe_fingerprint(recipe, kind)}"
 
 
-def check_owned(folder: Path, kind: Kind) -> None:
+def check_folder(folder: Path, kind: Kind) -> None:
     """Refuse a folder that is neither new or empty, nor a store, nor left by an interrupted start.
 
     Raises:
@@ -103,7 +103,7 @@ def manifest_of(kind: Kind, recipe: Mapping[str, Any], sizes: Mapping[str, int])
     return json.loads(json.dumps(content))  # tuples become lists
 
 
-def is_settled(folder: Path, kind: Kind, manifest: Mapping[str, Any]) -> bool:
+def has_manifest(folder: Path, kind: Kind, manifest: Mapping[str, Any]) -> bool:
     """Whether the store has its manifest.
 
     Raises:
@@ -119,26 +119,20 @@ def is_settled(folder: Path, kind: Kind, manifest: Mapping[str, Any]) -> bool:
     return True
 
 
-def settle_manifest(folder: Path, kind: Kind, manifest: Mapping[str, Any]) -> None:
-    """Remove temporary files of a killed process, and write the manifest if it is not there. The caller has the lock.
-
-    Raises:
-        InputError: as `is_settled`.
-        OSError: it cannot be read or written.
-    """
+def remove_leftovers(folder: Path) -> None:
+    """Remove temporary files of a killed process. The caller has the lock of the store."""
     for leftover in filter(_is_leftover, folder.iterdir()):
         leftover.unlink()
-    leave_manifest(folder, kind, manifest)
 
 
-def leave_manifest(folder: Path, kind: Kind, manifest: Mapping[str, Any]) -> None:
+def write_manifest(folder: Path, kind: Kind, manifest: Mapping[str, Any]) -> None:
     """Write the manifest if it is not there; several processes may do so.
 
     Raises:
-        InputError: as `is_settled`.
+        InputError: as `has_manifest`.
         OSError: it cannot be read or written.
     """
-    if not is_settled(folder, kind, manifest):
+    if not has_manifest(folder, kind, manifest):
         with replacing(folder / MANIFEST) as temporary, temporary.open("w", encoding="utf-8") as file:
             file.write(json.dumps(manifest, indent=1, sort_keys=True, allow_nan=False))
             file.flush()

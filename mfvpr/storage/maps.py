@@ -1,10 +1,10 @@
 """The rows of a map on disk: for every image its features, its global descriptor, its name and its place.
 
     rows = MapRows(folder, recipe)
-    with hold_map(folder):
-        settle_map(folder, settings)
-        with rows.adding():
-            rows.add([(features, Entry(name, place, vector)), ...])
+    with lock_map(folder):
+        write_settings(folder, settings)
+        with rows.adding() as add:
+            add([(features, Entry(name, place, vector)), ...])
     for row, entry in rows.new():  # since the last time, whoever added them
         ...
 
@@ -20,75 +20,41 @@ the tokens are written it lacks one byte: its size changes with every new row, e
 A map of format 1 has no tokens, and no manifest beside its segments. It can be read, but not added to.
 """
 
-import json
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from mfvpr.storage.disk import disk_errors_as_input_errors, lock_store
 from mfvpr.storage.features import FeatureStore, open_store
-from mfvpr.storage.manifest import FEATURES, MANIFEST, Kind, is_settled, manifest_of, settle_manifest
-from mfvpr.storage.rows import RowStore, open_rows
+from mfvpr.storage.manifest import (
+    FEATURES,
+    MANIFEST,
+    Kind,
+    has_manifest,
+    manifest_of,
+    remove_leftovers,
+    write_manifest,
+)
+from mfvpr.storage.map_entries import Entry, EntryStore, open_entry_store
 from mfvpr.types import Features
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import clip_middle
 
 SEGMENT = 4096  # rows
-DEEPEST = 50  # levels of a place: Python's JSON reads fewer levels, the more functions are called already
 MAP = Kind("map", 2, "places", "images", None, compress=False)
 _MAP_1, _FEATURES = replace(MAP, version=1), replace(FEATURES, remake=None)
 _TOKENS, _TOKEN = "tokens", np.dtype("<u8")
 
-
-class Entry(NamedTuple):
-    """The data of an image in a map, without its features.
-
-    name: of the image.
-    place: of the image: any JSON value.
-    vector: `[D]` global descriptor, float32.
-    """
-
-    name: str
-    place: Any
-    vector: np.ndarray
-
-
-def check_name(name: Any) -> None:
-    """Refuse a name that is no text: JSON would return something else, or fail."""
-    if not isinstance(name, str):
-        raise InputError(f"name: expected text, got {clip_middle(repr(name), 80)}. Use `str(name)`.")
-
-
-def check_place(name: str, place: Any) -> None:
-    """Refuse None, and a place that JSON would change: it returns a tuple as a list."""
-    try:
-        text = json.dumps(place, allow_nan=False)
-        if place is None or json.loads(text) != place:
-            raise ValueError(f"{clip_middle(repr(place), 80)}, which JSON gives back as {clip_middle(text, 80)}")
-        if _levels(place) > DEEPEST:
-            raise RecursionError
-    except RecursionError:
-        raise InputError(
-            f"{name}: expected a place of at most {DEEPEST} levels, got a deeper one; flatten it"
-        ) from None
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: expected a place that JSON can say, and not null, got {error}; use text, numbers, "
-                         "lists, and dictionaries by text") from None  # fmt: skip
-
-
-def _levels(place: Any) -> int:
-    """Depth of nested lists and dictionaries."""
-    parts = place.values() if isinstance(place, dict) else place if isinstance(place, list) else None
-    return 0 if parts is None else 1 + max(map(_levels, parts), default=0)
+MapImage = tuple[Features, Entry]
 
 
 @contextmanager
-def hold_map(folder: Path) -> Iterator[None]:
+def lock_map(folder: Path) -> Iterator[None]:
     """Lock a map, which may be missing: no other process learns its vocabulary or adds images.
 
     Raises:
@@ -100,8 +66,8 @@ def hold_map(folder: Path) -> Iterator[None]:
         yield
 
 
-def settle_map(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Write the settings of a map, unless they are there; within `hold_map`.
+def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:
+    """Write the settings of a map, unless they are there; within `lock_map`.
 
     Raises:
         InputError: the map has other settings, or format 1, or the folder cannot be written.
@@ -110,17 +76,18 @@ def settle_map(folder: Path, settings: Mapping[str, Any]) -> None:
         raise InputError(f"{folder}: expected {MAP.format!r}, got {_MAP_1.format!r}, which can only be read. Build the "
                          "map anew in another folder.")  # fmt: skip
     with disk_errors_as_input_errors(folder, MAP.content):
-        settle_manifest(folder, MAP, manifest_of(MAP, settings, {}))
+        remove_leftovers(folder)
+        write_manifest(folder, MAP, manifest_of(MAP, settings, {}))
 
 
-def is_map_settled(folder: Path, settings: Mapping[str, Any]) -> bool:
+def has_settings(folder: Path, settings: Mapping[str, Any]) -> bool:
     """Whether the settings of a map are written.
 
     Raises:
         InputError: the map has other settings.
     """
     with disk_errors_as_input_errors(folder, MAP.content):
-        return is_settled(folder, MAP, manifest_of(MAP, settings, {}))
+        return has_manifest(folder, MAP, manifest_of(MAP, settings, {}))
 
 
 def has_rows(folder: Path) -> bool:
@@ -146,14 +113,14 @@ class _Segment:
         entries: names, places and global descriptors.
         tokens: `[SEGMENT]` of the rows that exist; 0 = no row.
         stamp: `file_stamp` of the file of tokens.
-        is_held: rows may be added.
+        known: `[SEGMENT]` bool, rows that `MapRows.new` gave.
     """
 
     features: FeatureStore
-    entries: RowStore[Entry]
+    entries: EntryStore
     tokens: np.ndarray
     stamp: tuple[int, ...] | None
-    is_held: bool = False
+    known: np.ndarray
 
     @property
     def folder(self) -> Path:
@@ -172,16 +139,22 @@ class _Segment:
     @property
     def is_current(self) -> bool:
         """Whether nothing was added or replaced since: that changes the file of tokens."""
-        return self.is_held or self.stamp == file_stamp(self.folder / _TOKENS)
+        return self.entries.is_writable or self.stamp == file_stamp(self.folder / _TOKENS)
 
-    def add(self, first: int, items: Sequence[tuple[Features, Entry]]) -> range:
-        """Write images to disk, from row `first` on; returns their rows."""
-        rows = range(first, first + len(items))
-        new = np.random.default_rng().integers(1, 2**64 - 1, len(items), np.uint64)
+    @property
+    def first_free(self) -> int:
+        """The row behind those that are taken."""
+        return int(np.max(np.flatnonzero(self.taken), initial=-1)) + 1
+
+    def add(self, images: Sequence[MapImage]) -> None:
+        """Write images to disk, behind the rows that are taken."""
+        first = self.first_free
+        rows = range(first, first + len(images))
+        new = np.random.default_rng().integers(1, 2**64 - 1, len(images), np.uint64)
         self.tokens[first : rows.stop] = new
         try:
-            features = self.features.pack({row: features for row, (features, _) in zip(rows, items, strict=True)})
-            entries = self.entries.pack({row: entry for row, (_, entry) in zip(rows, items, strict=True)})
+            features = self.features.pack({row: features for row, (features, _) in zip(rows, images, strict=True)})
+            entries = self.entries.pack({row: entry for row, (_, entry) in zip(rows, images, strict=True)})
             with disk_errors_as_input_errors(self.folder, MAP.content), (self.folder / _TOKENS).open("r+b") as file:
                 file.truncate(rows.stop * _TOKEN.itemsize - 1)
                 os.fsync(file.fileno())  # a row must not be on disk before
@@ -195,7 +168,6 @@ class _Segment:
             self.tokens[first : rows.stop] = 0
             raise
         self.stamp = file_stamp(self.folder / _TOKENS)
-        return rows
 
     def check(self) -> None:
         """Compare the files with the tokens.
@@ -224,7 +196,7 @@ class _Segment:
 
 @dataclass(eq=False)
 class MapRows:
-    """The rows of the map in a folder, which may be missing until the first is added, within `hold_map`.
+    """The rows of the map in a folder, which may be missing until the first is added, within `lock_map`.
 
     Attributes:
         folder: of the map.
@@ -234,8 +206,6 @@ class MapRows:
     folder: Path
     recipe: Mapping[str, Any]
     _segments: list[_Segment] = field(default_factory=list, repr=False)
-    _known: list[np.ndarray] = field(default_factory=list, repr=False)  # by segment, the rows that `new` gave
-    _stack: ExitStack | None = field(default=None, repr=False)  # of stores that are entered, within `adding`
 
     def __post_init__(self) -> None:
         self.folder = self.folder.absolute()  # the working directory may change
@@ -248,11 +218,12 @@ class MapRows:
         """
         if self._segments:
             self._open(0)  # all maps have this segment: it shows whether the map was replaced
-        number = next((number for number, known in enumerate(self._known) if not known.all()), len(self._known))
+        growing = (number for number, segment in enumerate(self._segments) if not segment.known.all())
+        number = next(growing, len(self._segments))
         while self._open(number):
-            segment, known = self._segments[number], self._known[number]
-            for row, entry in segment.entries.read(np.flatnonzero(segment.done & ~known).tolist()):
-                known[row] = True
+            segment = self._segments[number]
+            for row, entry in segment.entries.read(np.flatnonzero(segment.done & ~segment.known).tolist()):
+                segment.known[row] = True
                 yield number * SEGMENT + row, entry
             if not segment.taken[-1]:
                 break
@@ -284,50 +255,35 @@ class MapRows:
                 yield number * SEGMENT + row, features
 
     @contextmanager
-    def adding(self) -> Iterator[None]:
-        """Lock the rows for `add`.
+    def adding(self) -> Iterator[Callable[[Sequence[MapImage]], None]]:
+        """Lock the rows; yields a function that writes images to disk, behind all other rows.
 
         Raises:
-            InputError: another process has the lock, the map has another recipe, or its folder cannot be written.
+            InputError: another process has the lock, the map has another recipe, or its folder cannot be written; or
+                the disk is full: earlier rows stay.
         """
-        with ExitStack() as self._stack:
-            try:
-                self._hold_last()
-                yield
-            finally:
-                self._stack = None
-                for segment in self._segments:
-                    segment.is_held = False
+        with ExitStack() as stack:
+            self._lock_last(stack)
+            yield partial(self._add, stack)
 
-    def add(self, items: Sequence[tuple[Features, Entry]]) -> list[int]:
-        """Write images to disk, within `adding`; returns their rows.
+    def _add(self, stack: ExitStack, images: Sequence[MapImage]) -> None:
+        while images:
+            segment = self._lock_last(stack)
+            number = SEGMENT - segment.first_free
+            segment.add(images[:number])
+            images = images[number:]
 
-        Raises:
-            InputError: the disk is full, or cannot be written. Earlier rows stay.
-        """
-        rows: list[int] = []
-        while len(rows) < len(items):
-            number, free = self._hold_last()
-            part = items[len(rows) : len(rows) + SEGMENT - free]
-            rows += [number * SEGMENT + row for row in self._segments[number].add(free, part)]
-        return rows
-
-    def _hold_last(self) -> tuple[int, int]:
-        """Lock the last segment; returns its number and its first free row."""
-        if self._stack is None:
-            raise ValueError(f"{self.folder}: rows are added within `adding`")
+    def _lock_last(self, stack: ExitStack) -> _Segment:
+        """Lock the last segment, or a new one if it is full."""
         number = max(0, len(self._segments) - 1)
-        while True:
-            segment = self._reopen(number)
-            if not segment.is_held and not segment.taken[-1]:
-                for store in (segment.features, segment.entries):
-                    self._stack.enter_context(store)
-                with disk_errors_as_input_errors(segment.folder, MAP.content):
-                    (segment.folder / _TOKENS).touch()
-                segment.is_held = True
-            if not segment.taken[-1]:
-                return number, int(np.max(np.flatnonzero(segment.taken), initial=-1)) + 1
+        while (segment := self._reopen(number)).taken[-1]:
             number += 1
+        if not segment.entries.is_writable:
+            for store in (segment.features, segment.entries):
+                stack.enter_context(store)
+            with disk_errors_as_input_errors(segment.folder, MAP.content):
+                (segment.folder / _TOKENS).touch()
+        return segment
 
     def _open(self, number: int) -> bool:
         """Open a segment, unless it is current; False if there never was one."""
@@ -341,27 +297,24 @@ class MapRows:
     def _reopen(self, number: int) -> _Segment:
         """Read the state of a segment on disk."""
         before = self._segments[number] if number < len(self._segments) else None
-        if before is not None and before.is_held:
+        if before is not None and before.entries.is_writable:
             return before
         folder, is_old = _segment_folder(self.folder, number), _is_old(self.folder)
         tokens, stamp = _read_tokens(folder / _TOKENS)  # before the names of files, which come first on disk
         options: dict[str, Any] = {"tokens": None if is_old else tokens}
-        entries = open_rows(folder / "entries", _MAP_1 if is_old else MAP, self.recipe, {"num_images": SEGMENT},
-                            pack=pack_entry, unpack=unpack_entry, **options)  # fmt: skip
+        kind = _MAP_1 if is_old else MAP
+        entries = open_entry_store(folder / "entries", self.recipe, num_images=SEGMENT, kind=kind, **options)
         features = open_store(folder / "features", self.recipe, num_images=SEGMENT, kind=_FEATURES, **options)
-        segment = _Segment(features, entries, tokens, stamp)
+        known = np.zeros(SEGMENT, bool) if before is None else before.known
+        segment = _Segment(features, entries, tokens, stamp, known)
         if is_old:
             tokens[entries.done] = 1
         else:
             segment.check()
-        if before is not None and (before.tokens != tokens)[self._known[number]].any():
+        if before is not None and (before.tokens != tokens)[known].any():
             raise InputError(f"{self.folder}: expected the map that was opened, got another one that replaced it, or "
                              "none. Open the map again.")  # fmt: skip
-        if before is None:
-            self._segments.append(segment)
-            self._known.append(np.zeros(SEGMENT, bool))
-        else:
-            self._segments[number] = segment
+        self._segments[number : number + 1] = [segment]
         return segment
 
 
@@ -383,13 +336,3 @@ def _read_tokens(path: Path) -> tuple[np.ndarray, tuple[int, ...] | None]:
     stored = np.frombuffer(content, _TOKEN, len(content) // _TOKEN.itemsize)
     tokens[: len(stored)] = stored
     return tokens, stamp
-
-
-def pack_entry(entry: Entry) -> dict[str, np.ndarray]:
-    text = json.dumps([entry.name, entry.place], allow_nan=False)
-    return {"vector": np.asarray(entry.vector, np.float32), "text": np.frombuffer(text.encode("ascii"), np.uint8)}
-
-
-def unpack_entry(parts: Mapping[str, np.ndarray]) -> Entry:
-    name, place = json.loads(parts["text"].tobytes().decode("ascii"))
-    return Entry(name, place, parts["vector"])

@@ -20,7 +20,7 @@ import numpy as np
 
 from mfvpr.matching.match_set import QueryMatches
 from mfvpr.storage.manifest import MATCHES
-from mfvpr.storage.rows import RowStore, open_rows, row_bytes
+from mfvpr.storage.rows import RowStore, row_bytes
 from mfvpr.types import Matches
 
 _OF_QUERY = ("counts", "indices", "filter_scores")
@@ -45,13 +45,13 @@ def open_match_store(
         recipe: of the matches (JSON values only): features, shortlist, settings. Kept in plain text.
         num_queries: Q.
         num_candidates: C.
-        **options: `waiting` and `shard` of `rows.open_rows`.
+        **options: `waiting` and `shard` of `rows.RowStore`.
 
     Raises:
         InputError: made from something else, or no store at all.
     """
     sizes, pack = {"num_queries": num_queries, "num_candidates": num_candidates}, partial(_pack, num_candidates)
-    return open_rows(folder, MATCHES, recipe, sizes, pack=pack, unpack=_unpack, **options)
+    return RowStore(folder, MATCHES, recipe, sizes, pack=pack, unpack=_unpack, **options)
 
 
 class StoredMatches(Sequence[Matches]):

@@ -8,16 +8,14 @@ Shards write stores of their own in the folder `shards` of a store; readers see 
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 
 from mfvpr.storage.disk import disk_errors_as_input_errors, free_bytes, lock_store, too_full, used_bytes
-from mfvpr.storage.manifest import Kind, check_owned, is_settled, leave_manifest, manifest_of, settle_manifest
-from mfvpr.storage.row_files import SHARDS, RowFiles, list_rows
+from mfvpr.storage.manifest import Kind, check_folder, has_manifest, manifest_of, remove_leftovers, write_manifest
+from mfvpr.storage.row_files import SHARDS, RowFiles
 from mfvpr.storage.shards import Shard
 from mfvpr.utils.arrays import read_arrays, write_arrays
 from mfvpr.utils.errors import InputError
@@ -32,9 +30,8 @@ Item = TypeVar("Item")
 Parts = Mapping[str, np.ndarray]
 
 
-@dataclass(eq=False)
 class RowStore(Generic[Item]):
-    """A store, see `open_rows`.
+    """A store in a folder, which may be missing until the first row is written.
 
     Any process may read it, also while another one writes. Rows are written `with store:`, which locks a store that is
     not complete.
@@ -44,23 +41,48 @@ class RowStore(Generic[Item]):
         kind: of its content.
         sizes: lengths of axes by name, first M.
         shard: that writes, into a folder of its own; None = one process writes the whole store.
-        tokens: `[M]` a number of each row that its file knows as well: a file of the same name that was written with
-            another number is a damaged one. None = names alone tell rows apart.
+        is_writable: whether rows may be written.
     """
 
-    folder: Path
-    kind: Kind
-    sizes: Mapping[str, int]
-    shard: Shard | None
-    _manifest: Mapping[str, Any] = field(repr=False)
-    _waiting: Callable[[str], None] | None = field(repr=False)
-    _pack: Callable[[Item], Parts] = field(repr=False)
-    _unpack: Callable[[Parts], Item] = field(repr=False)
-    tokens: np.ndarray | None = field(default=None, repr=False)
-    _files: RowFiles = field(init=False, repr=False)
-    _layout: dict[str, str] | None = field(default=None, repr=False)
-    _is_writable: bool = field(default=False, repr=False)
-    _blocks: list[ExitStack] = field(default_factory=list, repr=False)  # that are entered
+    def __init__(
+        self,
+        folder: Path,
+        kind: Kind,
+        recipe: Mapping[str, Any],
+        sizes: Mapping[str, int],
+        *,
+        pack: Callable[[Item], Parts],
+        unpack: Callable[[Parts], Item],
+        waiting: Callable[[str], None] | None = None,
+        shard: Shard | None = None,
+        tokens: np.ndarray | None = None,
+    ) -> None:
+        """Open the store, and find the rows that are done.
+
+        Args:
+            folder: see `manifest.store_path`.
+            kind: of its content.
+            recipe: of the rows (JSON values only). Kept in plain text.
+            sizes: lengths of axes by name, the first is the number of rows.
+            pack: item -> arrays by name; the first has a value for each of the row's entries.
+            unpack: arrays by name -> item.
+            waiting: called with one line that names the process that a writer waits for; None = refuse a store in use.
+            shard: that writes, beside others.
+            tokens: `[M]` a number of each row that its file knows as well: a file of the same name that was written
+                with another number is a damaged one. None = names alone tell rows apart.
+
+        Raises:
+            InputError: made from something else, or no store at all.
+        """
+        self.folder = folder.absolute()  # the working directory may change
+        self.kind, self.sizes, self.shard, self.is_writable = kind, sizes, shard, False
+        self._manifest, self._waiting, self._tokens = manifest_of(kind, recipe, sizes), waiting, tokens
+        self._pack, self._unpack = pack, unpack
+        self._layout: dict[str, str] | None = None
+        self._blocks: list[ExitStack] = []  # that are entered
+        with disk_errors_as_input_errors(self.folder, kind.content):
+            check_folder(self.folder, kind)
+        self.look()
 
     def __enter__(self) -> Self:
         """Lock the store, unless all rows are done, and find the rows that were written meanwhile.
@@ -71,15 +93,16 @@ class RowStore(Generic[Item]):
         with ExitStack() as stack, disk_errors_as_input_errors(self.folder, self.kind.content):
             if not self._blocks:
                 self.look()
-            if not self._is_writable and not self.done.all():
+            if not self.is_writable and not self.done.all():
                 if self.shard is not None:
-                    leave_manifest(self.folder, self.kind, self._manifest)
-                self.own.mkdir(parents=True, exist_ok=True)
-                stack.enter_context(lock_store(self.own, self.kind.content, self._waiting))
-                settle_manifest(self.own, self.kind, self._manifest)
+                    write_manifest(self.folder, self.kind, self._manifest)
+                self.write_folder.mkdir(parents=True, exist_ok=True)
+                stack.enter_context(lock_store(self.write_folder, self.kind.content, self._waiting))
+                remove_leftovers(self.write_folder)
+                write_manifest(self.write_folder, self.kind, self._manifest)
                 self.look()
-                stack.callback(setattr, self, "_is_writable", False)
-                self._is_writable = True
+                stack.callback(setattr, self, "is_writable", False)
+                self.is_writable = True
             self._blocks.append(stack.pop_all())
         return self
 
@@ -87,7 +110,7 @@ class RowStore(Generic[Item]):
         self._blocks.pop().close()
 
     @property
-    def own(self) -> Path:
+    def write_folder(self) -> Path:
         """The folder in which rows are written."""
         return self.folder if self.shard is None else self.folder / SHARDS / self.shard.folder
 
@@ -103,8 +126,12 @@ class RowStore(Generic[Item]):
             InputError: made from something else.
         """
         with disk_errors_as_input_errors(self.folder, self.kind.content):
-            num_rows, is_known = next(iter(self.sizes.values())), is_settled(self.folder, self.kind, self._manifest)
-            self._files = list_rows(self.folder, num_rows, write_folder=self.own, is_known=is_known)
+            exists = has_manifest(self.folder, self.kind, self._manifest)
+            shards = [path for path in (self.folder / SHARDS).glob("*-of-*") if path.is_dir()]
+            folders = [self.folder, *sorted({self.write_folder, *shards} - {self.folder})]
+            self._files = RowFiles(next(iter(self.sizes.values())), folders)
+            if exists:
+                self._files.find()
 
     @property
     def done(self) -> np.ndarray:
@@ -134,17 +161,25 @@ class RowStore(Generic[Item]):
         """Check a batch of rows and pack it for `write_packed`, without a write; raises as `write`."""
         if refused := [row for row in items if not 0 <= row < len(self.counts) or self.counts[row] >= 0]:
             raise ValueError(f"{self.folder}: row {refused[0]} is done or does not exist")
-        if not self._is_writable:
+        if not self.is_writable:
             raise ValueError(f"{self.folder}: is read only, or was complete; write `with store:`")
-        rows = {row: self._pack_row(row, item) for row, item in items.items()}
+        rows: dict[int, Parts] = {}
+        for row, item in items.items():
+            try:
+                rows[row] = self._pack(item)
+            except ValueError as error:
+                raise ValueError(f"{self.folder}: row {row}: {error}") from None
         self._check_layouts(rows)
         return rows
 
     def write_packed(self, rows: Mapping[int, Parts]) -> None:
         """Store the result of `pack`, as `write` does."""
         sizes = {row: row_bytes(sum(part.nbytes for part in parts.values()), len(parts)) for row, parts in rows.items()}
-        missing = partial(self._missing_bytes, sizes)
-        with disk_errors_as_input_errors(self.folder, self.kind.content, missing):
+
+        def missing_bytes() -> int:
+            return sum(size for row, size in sizes.items() if self.counts[row] < 0)
+
+        with disk_errors_as_input_errors(self.folder, self.kind.content, missing_bytes):
             for _ in ordered_map(self._write_row, rows.items(), workers=THREADS):
                 pass
 
@@ -170,24 +205,15 @@ class RowStore(Generic[Item]):
             raise InputError(self._remove(damaged))
 
     def _about(self, row: int, path: Path) -> str:
-        token = "" if self.tokens is None else f" {self.tokens[row]:x}"
+        token = "" if self._tokens is None else f" {self._tokens[row]:x}"
         return f"{self._manifest['fingerprint']} {path.name}{token}"
-
-    def _pack_row(self, row: int, item: Item) -> Parts:
-        try:
-            return self._pack(item)
-        except ValueError as error:
-            raise ValueError(f"{self.folder}: row {row}: {error}") from None
-
-    def _missing_bytes(self, sizes: Mapping[int, int]) -> int:
-        return sum(size for row, size in sizes.items() if self.counts[row] < 0)
 
     def _write_row(self, row_parts: tuple[int, Parts]) -> None:
         row, parts = row_parts
         count = len(next(iter(parts.values())))
-        path = self._files.add(row, count, self.own)
+        path = self.write_folder / f"{row}-{count}.npz"
         write_arrays(path, parts, self._about(row, path), compress=self.kind.compress)
-        self.counts[row] = count
+        self._files.add(row, count, self.write_folder)
 
     def _read_item(self, row: int) -> Item | None:
         parts = self._read_parts(row)
@@ -233,42 +259,6 @@ class RowStore(Generic[Item]):
             f"{self.folder}: {self.kind.content} of {len(damaged)} {self.kind.rows} are damaged on disk, the first in "
             f"row {row} ({path.name}); {mend}"
         )
-
-
-def open_rows(
-    folder: Path,
-    kind: Kind,
-    recipe: Mapping[str, Any],
-    sizes: Mapping[str, int],
-    *,
-    pack: Callable[[Item], Parts],
-    unpack: Callable[[Parts], Item],
-    waiting: Callable[[str], None] | None = None,
-    shard: Shard | None = None,
-    tokens: np.ndarray | None = None,
-) -> RowStore[Item]:
-    """The store in `folder`, which may be missing until the first row is written, and read-only when all are.
-
-    Args:
-        folder: see `manifest.store_path`.
-        kind: of its content.
-        recipe: of the rows (JSON values only). Kept in plain text.
-        sizes: lengths of axes by name, the first is the number of rows.
-        pack: item -> arrays by name; the first has a value for each of the row's entries.
-        unpack: arrays by name -> item.
-        waiting: called with one line that names the process that a writer waits for; None = refuse a store in use.
-        shard: that writes, beside others.
-        tokens: see `RowStore`.
-
-    Raises:
-        InputError: made from something else, or no store at all.
-    """
-    folder = folder.absolute()  # the working directory may change
-    store = RowStore(folder, kind, sizes, shard, manifest_of(kind, recipe, sizes), waiting, pack, unpack, tokens)
-    with disk_errors_as_input_errors(folder, kind.content):
-        check_owned(folder, kind)
-    store.look()
-    return store
 
 
 def row_bytes(num_bytes: float, num_arrays: int) -> int:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mfvpr.storage.manifest import SCORES
-from mfvpr.storage.rows import RowStore, open_rows
+from mfvpr.storage.rows import RowStore
 
 
 class QueryScores(NamedTuple):
@@ -26,7 +26,7 @@ ScoreStore = RowStore[QueryScores]
 
 def open_score_store(folder: Path, recipe: Mapping[str, Any], *, num_queries: int, **options: Any) -> ScoreStore:
     """The store in `folder`; see `features.open_store`."""
-    return open_rows(folder, SCORES, recipe, {"num_queries": num_queries}, pack=_pack, unpack=_unpack, **options)
+    return RowStore(folder, SCORES, recipe, {"num_queries": num_queries}, pack=_pack, unpack=_unpack, **options)
 
 
 def _pack(query: QueryScores) -> dict[str, np.ndarray]:

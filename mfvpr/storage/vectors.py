@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 from mfvpr.storage.manifest import VECTORS
-from mfvpr.storage.rows import RowStore, open_rows, row_bytes
+from mfvpr.storage.rows import RowStore, row_bytes
 
 VectorStore = RowStore[np.ndarray]
 
 
 def open_vector_store(folder: Path, recipe: Mapping[str, Any], *, num_images: int, **options: Any) -> VectorStore:
     """The store in `folder`; see `features.open_store`."""
-    return open_rows(folder, VECTORS, recipe, {"num_images": num_images}, pack=_pack, unpack=_unpack, **options)
+    return RowStore(folder, VECTORS, recipe, {"num_images": num_images}, pack=_pack, unpack=_unpack, **options)
 
 
 def forecast_bytes(num_images: int, size: int) -> int:

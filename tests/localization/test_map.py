@@ -28,6 +28,7 @@ from mfvpr.localization.resident import Resident
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache
 from mfvpr.storage import maps as map_store
+from mfvpr.storage.map_entries import DEEPEST, check_entry
 from mfvpr.types import Features
 from mfvpr.utils import InputError
 from tests import scorers
@@ -301,14 +302,14 @@ def test_rows_that_cannot_be_read_leave_no_others_in_their_slots():
 
 def test_a_row_that_is_added_while_its_segment_is_opened_comes_whole_or_later(dataset, folder, tmp_path, monkeypatch):
     shutil.copytree(folder, tmp_path / "map")
-    adding, number, open_rows = asked(tmp_path / "map"), len(dataset.database), map_store.open_rows
+    adding, number, open_entry_store = asked(tmp_path / "map"), len(dataset.database), map_store.open_entry_store
 
     def add_and_open(*arguments, **options):
         monkeypatch.undo()
         adding.add(dataset.queries.paths[0], "new", name="new")
-        return open_rows(*arguments, **options)
+        return open_entry_store(*arguments, **options)
 
-    monkeypatch.setattr(map_store, "open_rows", add_and_open)
+    monkeypatch.setattr(map_store, "open_entry_store", add_and_open)
     other = asked(tmp_path / "map")
     assert len(other) == number
     assert other.localize(dataset.queries.paths[0]).place == "new"
@@ -329,7 +330,7 @@ def test_places_are_what_json_can_say(dataset, tmp_path, place):
     "place", ["here", 3, 1.5, True, np.float64(0.1), [1, [2.5, "b"]], {"x": {"y": [None]}}, "\udcff"]
 )
 def test_places_come_back_as_they_are(place):
-    map_store.check_place("a.jpg", place)
+    check_entry("a.jpg", place)
     assert json.loads(json.dumps(place)) == place
 
 
@@ -345,12 +346,12 @@ def nested(levels):
     ({"at": [(1, 2)]}, "which JSON gives back as"),
     ({3: "room"}, "which JSON gives back as"),
     (10**5000, "expected a place that JSON can say"),
-    (nested(map_store.DEEPEST + 1), "expected a place of at most"),
+    (nested(DEEPEST + 1), "expected a place of at most"),
     (nested(100_000), "expected a place of at most"),
 ], ids=["tuple", "tuple inside", "number as key", "digits", "deep", "very deep"])  # fmt: skip
 def test_places_that_would_come_back_as_others(place, words):
     with pytest.raises(InputError, match=re.escape(words)) as error:
-        map_store.check_place("a.jpg", place)
+        check_entry("a.jpg", place)
     assert "\n" not in str(error.value)
     assert len(str(error.value)) < 400
 
@@ -366,7 +367,7 @@ def test_two_do_not_add_at_the_same_time(dataset, tmp_path):
     first, second = asked(tmp_path / "map"), asked(tmp_path / "map")
     first.learn(dataset.database)
     second.refresh()
-    with map_store.hold_map(first.folder), pytest.raises(InputError, match="in use by process"):
+    with map_store.lock_map(first.folder), pytest.raises(InputError, match="in use by process"):
         second.add(dataset.database.paths[0], 0)
     second.add(dataset.database.paths[0], 0)
     assert first.localize(dataset.database.paths[0]).place == 0

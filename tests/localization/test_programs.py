@@ -18,7 +18,7 @@ from experiments.settings import SettingsError
 from mfvpr.datasets import read_image
 from mfvpr.datasets.videos import frames
 from mfvpr.evaluation import Confidence, write_confidences
-from mfvpr.storage.maps import hold_map
+from mfvpr.storage.maps import lock_map
 from mfvpr.utils import InputError
 from tests.programs import ROOT, composed, typed
 
@@ -352,7 +352,7 @@ def test_a_file_that_vanishes_while_its_folder_is_listed_does_not_end_the_watch(
 
 
 def test_two_do_not_add_their_drives_at_the_same_time(twice, folder, monkeypatch, capsys):
-    with hold_map(folder):
+    with lock_map(folder):
         code, stdout, stderr = called(monkeypatch, capsys, "localize", f"map={folder}", f"images={twice}", "add=true")
     assert (code, stdout) == (2, "")
     assert "in use by process" in stderr

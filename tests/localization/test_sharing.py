@@ -14,7 +14,8 @@ from mfvpr.localization import Map
 from mfvpr.localization.describing import Describing
 from mfvpr.storage import maps as map_store
 from mfvpr.storage.features import open_store
-from mfvpr.storage.rows import RowStore, open_rows
+from mfvpr.storage.map_entries import Entry, open_entry_store
+from mfvpr.storage.rows import RowStore
 from mfvpr.utils import InputError, recipe_of
 from tests.localization.test_map import Constant
 from tests.storage.synthetic_features import file_of
@@ -172,7 +173,7 @@ def test_nothing_is_written_of_rows_that_cannot_be_stored(images, folder):
     features, vector = known.describing.image(images.paths[6])
     files = sorted(folder.rglob("*"))
     for bad, words in ((vector[:5], r"^bad: .*\[36\], got \[5\]"), (vector.astype(str) + "x", r"row 7: could not")):
-        entries = [map_store.Entry("good", 0, vector), map_store.Entry("bad", 1, bad)]
+        entries = [Entry("good", 0, vector), Entry("bad", 1, bad)]
         with pytest.raises(ValueError, match=words):
             known.add_described(entries, [features] * 2)
         assert sorted(folder.rglob("*")) == files
@@ -265,13 +266,12 @@ def test_a_map_of_format_1_is_read_but_not_added_to(images, tmp_path):
     extractor = Constant()
     recipe, sizes = {"extractor": recipe_of(extractor), "describer": recipe_of(extractor)}, {"num_images": 4096}
     kind, folder = replace(map_store.MAP, version=1), tmp_path / "map/0000"
-    options = {"pack": map_store.pack_entry, "unpack": map_store.unpack_entry}
     with open_store(folder / "features", recipe, **sizes) as features, \
-            open_rows(folder / "entries", kind, recipe, sizes, **options) as entries:  # fmt: skip
+            open_entry_store(folder / "entries", recipe, kind=kind, **sizes) as entries:  # fmt: skip
         for row, path in enumerate(images.paths[:4]):
             local, vector = Describing(extractor, extractor).image(path)
             features.write({row: local})
-            entries.write({row: map_store.Entry(images.names[row], row, vector)})
+            entries.write({row: Entry(images.names[row], row, vector)})
     files = sorted(folder.rglob("*"))
     known = opened(tmp_path / "map", extractor)
     assert [known.localize(path).place for path in images.paths[:4]] == [0, 1, 2, 3]
