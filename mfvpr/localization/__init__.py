@@ -8,9 +8,9 @@
 
 Other processes may read a map while one process adds to it, and several threads may share one `Map`.
 
-Read first: map (localize one image), growing (add images), state (the images that this process knows), answers. Then
-their parts: vocabulary, describing, vectors, matching, resident (features on the device), evidence (too few features or
-matches), shifts, route (a drive through a map).
+Read first: map (localize one image), images (the images of a map, and how they are added), answers. Then their parts:
+vocabulary, describing, vectors, matching, resident (features on the device), evidence (too few features or matches),
+route (a drive through a map).
 
 Imports datasets, evaluation, features, matching, reranking, scoring, storage, types, utils.
 """

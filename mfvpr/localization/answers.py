@@ -15,9 +15,9 @@ class Alternative:
 
     Attributes:
         row: of the map.
-        name: of its image.
+        name: of the image in this row.
         place: where the image was taken.
-        score: of the candidate; larger = more similar.
+        score: larger = more similar.
     """
 
     row: int

@@ -13,7 +13,7 @@ from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.datasets.images import read_image, resize
 from mfvpr.features.extraction import describe_folder, describe_images
 from mfvpr.features.extractor import Aggregation, Description, Extractor
-from mfvpr.storage.features import round_as_stored
+from mfvpr.storage.features import FeatureStore, round_as_stored
 from mfvpr.types import Features
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import recipe_of
@@ -68,6 +68,14 @@ class Describing:
                 descriptions = [description for part in parts for description in part.values()]
             vectors = self._vectors(features, descriptions)
             yield dict(zip(batch, zip(features, vectors, strict=True), strict=True))
+
+    def stored(self, store: FeatureStore, rows: Sequence[int]) -> Iterator[dict[int, Described]]:
+        """Describe images whose local features are in a store, by an aggregation, as `folder` describes images."""
+        size = self.extractor.batch_size
+        for start in range(0, len(rows), size):
+            images = dict(store.read(rows[start : start + size]))
+            vectors = self._vectors([*images.values()], [])
+            yield dict(zip(images, zip(images.values(), vectors, strict=True), strict=True))
 
     @property
     def _extractors(self) -> list[Extractor]:

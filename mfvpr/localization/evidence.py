@@ -30,11 +30,6 @@ class MapStrength:
     """Mean strength of a map's images, estimated from rows that are spread evenly over the map."""
 
     def __init__(self, rows: MapRows) -> None:
-        """Read nothing yet.
-
-        Args:
-            rows: of the map.
-        """
         self._rows, self._strengths = rows, {}
 
     def __call__(self, end: int) -> float:

@@ -15,10 +15,8 @@ from mfvpr.features.vlad import VladFitting
 from mfvpr.localization.answers import Alternative, Answer, Asked, refusal
 from mfvpr.localization.describing import Image
 from mfvpr.localization.evidence import LEAST_MATCHES, LEAST_STRENGTH, strength
-from mfvpr.localization.growing import GrowingMap
-from mfvpr.localization.matching import match_and_score
-from mfvpr.localization.shifts import shift_of
-from mfvpr.localization.state import exclusive
+from mfvpr.localization.images import MapImages, exclusive
+from mfvpr.localization.matching import match_and_score, shift_of
 from mfvpr.matching.matcher import NEIGHBORS, Matcher
 from mfvpr.reranking.results import Ranked
 from mfvpr.scoring.histogram import HistogramOfShifts
@@ -27,7 +25,7 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import clip_middle
 
 
-class Map(GrowingMap):
+class Map(MapImages):
     """Images with their places in a folder, in which one image at a time is localized.
 
         known = Map("map", Sift(), VladFitting())
@@ -120,7 +118,10 @@ class Map(GrowingMap):
             return refusal("too few matches", description)
         ranking = Ranked(rows[order][None], scores[order][None])
         p = self._probability(ranking, Ranked(rows[None], similarities[None]))
-        alternatives = self._alternatives(ranking)
+        alternatives = tuple(
+            Alternative(row, self._entries[row].name, self._entries[row].place, score)
+            for row, score in zip(rows[order].tolist(), scores[order].tolist(), strict=True)
+        )
         answer = Answer(alternatives[0].place, alternatives, alternatives[0].score, p, *shift_of(self.scorer, best))
         if self.threshold is not None and not (p is not None and p >= self.threshold):
             answer = replace(answer, place=None, shift=None, shift_interval=None, scale=None, reason="low confidence")
@@ -130,14 +131,6 @@ class Map(GrowingMap):
         """Probability that the top prediction is correct; None without a confidence or a finite score."""
         p = math.nan if self.confidence is None else float(self.confidence(ranking, retrieval)[0])
         return None if math.isnan(p) else p
-
-    def _alternatives(self, ranking: Ranked) -> tuple[Alternative, ...]:
-        rows, scores = ranking.rows[0].tolist(), ranking.scores[0].tolist()
-        entries = [self._entries[row] for row in rows]
-        return tuple(
-            Alternative(row, entry.name, entry.place, score)
-            for row, entry, score in zip(rows, entries, scores, strict=True)
-        )
 
 
 def _whole_number(name: str, value: Any, least: int = 0) -> int:

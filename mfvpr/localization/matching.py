@@ -1,17 +1,22 @@
-"""Match a query with its candidates on the device, and score the matches, on all cores."""
+"""Match a query with its candidates on the device, score the matches on all cores, and measure the shift of a pair."""
 
 from functools import partial
 
 import jax
 import numpy as np
 
+from mfvpr.evaluation.stages import pair_shifts
 from mfvpr.features.feature_set import stack_features
 from mfvpr.matching.matcher import Matcher, match_pairs
-from mfvpr.reranking.ranking import score_candidates
+from mfvpr.reranking.ranking import BIN_STEP, score_candidates
+from mfvpr.scoring.histogram import HistogramOfShifts
+from mfvpr.scoring.parameters import with_capacity
 from mfvpr.scoring.scorer import Scorer
 from mfvpr.types import Features, Matches
 from mfvpr.utils.numerics import available_cpus, device_bytes, knows_own_context, round_up
 from mfvpr.utils.threads import ordered_map
+
+Point = tuple[float, float]
 
 _AT_ONCE = 25  # pairs; with ten an answer takes 8 ms longer
 
@@ -48,3 +53,17 @@ def match_and_score(
     parts = list(map_parts(match_part, range(0, len(pairs), size)))
     matches, scores = jax.tree.map(lambda *fields: np.concatenate(fields)[:number], *parts)
     return matches, scores[: len(slots)]
+
+
+def shift_of(scorer: Scorer, pair: Matches) -> tuple[Point | None, tuple[Point, Point] | None, float | None]:
+    """`shift`, `shift_interval` and `scale` of an `Answer`, from the matches `[1, K, ...]` of a pair."""
+    if not isinstance(scorer, HistogramOfShifts):
+        return None, None, None
+    scorer = with_capacity(scorer, pair.image_size0, pair.image_size1, multiple=BIN_STEP)
+    shift, interval, scale = (np.asarray(values)[0] for values in pair_shifts(scorer, pair))
+    low, high = _point(interval[0]), _point(interval[1])
+    return _point(shift), (low, high) if low and high else None, float(scale) if np.isfinite(scale) else None
+
+
+def _point(values: np.ndarray) -> Point | None:
+    return (float(values[0]), float(values[1])) if np.isfinite(values).all() else None

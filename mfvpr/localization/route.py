@@ -72,7 +72,6 @@ class Route:
     """The belief, updated with every image. Rows may be added to the map between two images."""
 
     def __init__(self, drive: Drive) -> None:
-        """Start without knowledge: the robot may be anywhere."""
         self._drive, self.belief = drive, np.zeros(FIRST_ROWS, np.float32)
         self._motion = motion(drive.advance, drive.spread)
 

@@ -18,9 +18,7 @@ class Vectors:
     """
 
     def __init__(self) -> None:
-        """Start without rows."""
-        self._values = np.zeros((0, 0), np.float32)
-        self._there = np.zeros(0, bool)
+        self._values, self._is_candidate = np.zeros((0, 0), np.float32), np.zeros(0, bool)
         self.total = 0
 
     @property
@@ -30,14 +28,14 @@ class Vectors:
 
     def put(self, row: int, vector: np.ndarray) -> None:
         """Store the descriptor `[D]` of a row."""
-        if not self._values.size:
-            self._values, self._there = np.zeros((_FIRST, len(vector)), np.float32), np.zeros(_FIRST, bool)
-        while row >= len(self._there):
-            self._values = np.concatenate([self._values, np.zeros_like(self._values)])
-            self._there = np.concatenate([self._there, np.zeros_like(self._there)])
+        while row >= len(self._values):
+            more = max(_FIRST, len(self._values))
+            values = self._values.reshape(-1, len(vector))
+            self._values = np.concatenate([values, np.zeros((more, len(vector)), np.float32)])
+            self._is_candidate = np.concatenate([self._is_candidate, np.zeros(more, bool)])
         self._values[row] = vector
         # An image without features has a zero descriptor and is never a candidate, as in `mfvpr.retrieval.Retrieval`.
-        self._there[row] = bool(np.isfinite(vector).all() and vector.any())
+        self._is_candidate[row] = bool(np.isfinite(vector).all() and vector.any())
         self.total = max(self.total, row + 1)
 
     def nearest(self, query: np.ndarray, number: int, *, before: int | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -49,7 +47,7 @@ class Vectors:
             before: rows from this one on are left out; None = no such limit.
         """
         total = self.total if before is None else max(0, min(self.total, before))
-        rows = np.flatnonzero(self._there[:total])
+        rows = np.flatnonzero(self._is_candidate[:total])
         if not len(rows) or not query.any():
             return rows[:0], np.zeros(0, np.float32)
         products = _products(self._values[:total], query)

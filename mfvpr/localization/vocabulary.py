@@ -30,13 +30,6 @@ class VocabularyFile:
     """The vocabulary of one map."""
 
     def __init__(self, folder: Path, extractor: Extractor, fitting: VladFitting) -> None:
-        """Read nothing yet.
-
-        Args:
-            folder: of the map.
-            extractor: of the local features.
-            fitting: learns the vocabulary.
-        """
         self._folder, self._path = folder, folder / _VOCABULARY
         self._extractor, self._fitting = extractor, fitting
         self._key = fingerprint({"extractor": recipe_of(extractor), "vocabulary": recipe_of(fitting)})
@@ -56,11 +49,7 @@ class VocabularyFile:
         return None
 
     def read(self) -> Vlad:
-        """Read the vocabulary.
-
-        Raises:
-            InputError: it is missing or damaged, or has other settings.
-        """
+        """Read the vocabulary; raises `InputError` if it is missing or damaged, or has other settings."""
         self._stamp = file_stamp(self._path)  # first: a file that replaces this one is noticed
         try:
             arrays = read_arrays(self._path, self._key)
@@ -80,12 +69,9 @@ class VocabularyFile:
 
     @contextmanager
     def learn(self, images: ImageFolder, settings: Mapping[str, Any], track: Track) -> Iterator[FeatureStore]:
-        """Learn and write the vocabulary, within `lock_map`; yield the local features, which are deleted afterwards.
+        """Learn and write the vocabulary of a map with these settings, within `lock_map`.
 
-        Args:
-            images: to learn from.
-            settings: of the map.
-            track: progress.
+        Yields the local features, which are deleted afterwards.
 
         Raises:
             InputError: images cannot be read or have too few features, or the disk is full.

@@ -17,7 +17,7 @@ def lock_store(folder: Path, content: str, waiting: Callable[[str], None] | None
 
     Args:
         folder: of the store.
-        content: what it holds.
+        content: of the store, for messages.
         waiting: called with one line that names the process that this waits for; None = refuse a store in use.
     """
 
@@ -46,14 +46,14 @@ def disk_errors_as_input_errors(
 
     Args:
         folder: of the store.
-        content: what it holds.
+        content: of the store, for messages.
         needed: gives the bytes that are still to be written when the disk is full.
     """
     try:
         yield
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise InputError(too_full(folder, needed(), free_bytes(folder))) from None
+            raise full_disk_error(folder, needed()) from None
         raise InputError(
             f"{folder}: cannot hold {content} ({error.strerror}); check the path, its permissions and its disk"
         ) from None
@@ -74,8 +74,7 @@ def free_bytes(folder: Path) -> int:
     return shutil.disk_usage(next(path for path in (folder, *folder.parents) if path.exists())).free
 
 
-def too_full(folder: Path, needed: int, free: int) -> str:
-    return (
-        f"{folder}: expected about {needed / 1e6:.1f} MB of free disk space, got {free / 1e6:.1f} MB; free some space "
-        "and run again, which goes on from here"
-    )
+def full_disk_error(folder: Path, needed: int) -> InputError:
+    free = free_bytes(folder)
+    return InputError(f"{folder}: expected about {needed / 1e6:.1f} MB of free disk space, got {free / 1e6:.1f} MB; "
+                      "free some space and run again, which goes on from here")  # fmt: skip

@@ -11,6 +11,7 @@ several data sets share is extracted once.
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
@@ -22,7 +23,7 @@ from mfvpr.features.extraction import describe_folder
 from mfvpr.features.extractor import Aggregated, Aggregation, Extractor, Source
 from mfvpr.features.feature_set import FeatureSet, FeatureSource, InMemory
 from mfvpr.storage import matches as match_stores
-from mfvpr.storage.feature_writers import ExtractionState, Sink, open_sinks, size_lines
+from mfvpr.storage.feature_writers import ExtractionState, open_sinks, size_lines
 from mfvpr.storage.manifest import MATCHES, store_path
 from mfvpr.storage.rows import require_space
 from mfvpr.storage.shards import Shard
@@ -90,13 +91,9 @@ class FeatureCache:
         return self.once("contents", lambda: contents(folder, records), folder, None)
 
     def once(self, name: str, compute: Callable[[], Value], folder: ImageFolder, by: Any) -> Value:
-        """The result of `compute`, called once in this process while the files and the recipe of `by` stay the same.
+        """The result of `compute`, called once in this process while the images and the recipe of `by` stay the same.
 
-        Args:
-            name: of the result.
-            compute: gives it.
-            folder: of images.
-            by: extractor or retrieval that computes it; without a recipe, its `id` counts.
+        Without a recipe, the `id` of `by` counts: the extractor or retrieval that computes the result called `name`.
         """
         try:
             recipe = fingerprint(recipe_of(by, lambda path: [str(path), *map(state_of, files_of(path).paths)]))
@@ -139,7 +136,7 @@ class FeatureCache:
         Args:
             folder: the images.
             extractor: gives the features, or has them already.
-            rows: images that are needed; those that are missing are extracted. None = all.
+            rows: images that are needed. None = all.
             label: of the images in messages.
 
         Raises:
@@ -150,11 +147,9 @@ class FeatureCache:
             source = self.once("opened", lambda: self._open_source(folder, extractor, label), folder, extractor)
             missing = np.flatnonzero(np.asarray(source.counts) < 0).tolist()
             return (FeatureSet(source, {row: f"{folder.paths[row]}: no features were imported" for row in missing}),)
-        rows = range(len(folder)) if rows is None else [*rows]
-        state = self._extract(folder, extractor, rows, f"{label} features")
+        state = self._extract(folder, extractor, range(len(folder)) if rows is None else [*rows], f"{label} features")
         return tuple(
-            FeatureSet(InMemory(sink.items, len(folder)) if sink.store is None else sink.store, dict(state.bad))
-            for sink in state.sinks[bool(extractor.vector_size) :]
+            FeatureSet(sink.store or InMemory(sink.items, len(folder)), dict(state.bad)) for sink in state.of_scales
         )
 
     def vectors(self, folder: ImageFolder, describer: Extractor | Aggregated, database: ImageFolder, *,
@@ -173,15 +168,14 @@ class FeatureCache:
         if not isinstance(describer, Aggregated) and not describer.vector_size:
             raise InputError(f"{type(describer).__name__}: gives no global descriptor; expected one that does, or "
                              "Aggregated(extractor, VladFitting())")  # fmt: skip
-        if folder != database:
-            return self._vectors(folder, describer, database, label)
-        return self.once("vectors", lambda: self._vectors(folder, describer, database, label), folder, describer)
+        compute = partial(self._vectors, folder, describer, database, label)
+        return self.once("vectors", compute, folder, describer) if folder == database else compute()
 
     @contextmanager
     def matches(
         self, recipe: Mapping[str, Any], names: Sequence[str], num_candidates: int, *, typical: int, label: str
     ) -> Iterator[match_stores.MatchStore]:
-        """The store of the matches of a recipe, locked while queries are missing; needs a root.
+        """The store of the matches of queries by name, locked while queries are missing; needs a root.
 
         Args:
             recipe: of the matches.
@@ -202,9 +196,8 @@ class FeatureCache:
                 self.tell(f"{label}: {missing} of {len(names)} queries to match with {num_candidates} candidates: "
                           f"about {needed / _MB:.1f} MB in {store.folder}")  # fmt: skip
             else:
-                self.tell(
-                    f"{label}: {'all' if store.done.all() else 'its part of'} {len(names)} queries from {store.folder}"
-                )
+                amount = "all" if store.done.all() else "its part of"
+                self.tell(f"{label}: {amount} {len(names)} queries from {store.folder}")
             yield store
 
     @property
@@ -228,7 +221,7 @@ class FeatureCache:
 
     def _extract(self, folder: ImageFolder, extractor: Extractor, rows: Sequence[int], label: str) -> ExtractionState:
         """Run the extractor on the rows that are missing."""
-        state = self.once("state", lambda: ExtractionState(self._sinks(folder, extractor)), folder, extractor)
+        state = self.once("state", lambda: self._open_state(folder, extractor), folder, extractor)
         with ExitStack() as stack:
             if self.watch is not None and extractor.scales:
                 stack.enter_context(self.watch("features"))
@@ -239,15 +232,13 @@ class FeatureCache:
             state.read_bad()
             missing = state.missing(rows if self.shard is None else self.shard.rows(folder.names, rows))
             self._announce(extractor, state, missing, len(rows), len(folder), label)
-            batches = describe_folder(
-                folder, extractor, missing, state.bad, skip_bad=self.skip_bad, track=self.track(label)
-            )
-            for batch in batches:
+            options = {"skip_bad": self.skip_bad, "track": self.track(label)}
+            for batch in describe_folder(folder, extractor, missing, state.bad, **options):
                 for sink in state.sinks:
-                    sink.keep({row: sink.pick(description) for row, description in batch.items()})
+                    sink.write(batch)
             if missing:
                 state.write_bad()
-                for line in size_lines(state.sinks[bool(extractor.vector_size) :], extractor.scales):
+                for line in size_lines(state.of_scales, extractor.scales):
                     self.tell(f"{label}: {line}")
         if self.shard is not None:
             self.shard.wait(lambda: state.look(rows), folder.names, label, patience=self.patience)
@@ -256,9 +247,10 @@ class FeatureCache:
                              f"{state.bad[min(state.bad)]}")  # fmt: skip
         return state
 
-    def _sinks(self, folder: ImageFolder, extractor: Extractor) -> list[Sink]:
+    def _open_state(self, folder: ImageFolder, extractor: Extractor) -> ExtractionState:
         recipe = self.recipe(folder, extractor) if self.root is not None else {}
-        return open_sinks(self.root, extractor, recipe, num_images=len(folder), **self.store_options)
+        sinks = open_sinks(self.root, extractor, recipe, num_images=len(folder), **self.store_options)
+        return ExtractionState(sinks, sinks[bool(extractor.vector_size) :])
 
     def _announce(
         self, extractor: Extractor, state: ExtractionState, missing: Sequence[int], count: int, total: int, label: str
@@ -274,9 +266,9 @@ class FeatureCache:
             return
         needed = sum(sink.forecast(len(missing)) for sink in state.sinks)
         require_space(stores[0].folder, needed)
-        each = ", ".join(f"about {scale.typical_count} features of {scale.dimension} dimensions each"
-                         for scale in extractor.scales)  # fmt: skip
-        each = each or f"descriptors of {extractor.vector_size} numbers"
+        scales = [f"about {scale.typical_count} features of {scale.dimension} dimensions each"
+                  for scale in extractor.scales]  # fmt: skip
+        each = ", ".join(scales) or f"descriptors of {extractor.vector_size} numbers"
         self.tell(f"{label}: {len(missing)} of {total} images to do, {each}: about {needed / _MB:.1f} MB in {where}")
 
     def _vectors(
@@ -285,23 +277,22 @@ class FeatureCache:
         if isinstance(describer, Aggregated):
             return self._aggregate(folder, describer, database, label)
         state = self._extract(folder, describer, range(len(folder)), f"{label} descriptors")
-        values, sink = np.full((len(folder), describer.vector_size), np.nan, np.float32), state.sinks[0]
-        for row, vector in sink.items.items() if sink.store is None else sink.store.read():
+        values = np.full((len(folder), describer.vector_size), np.nan, np.float32)
+        for row, vector in state.sinks[0].read():
             values[row] = vector
         return Vectors(values, dict(state.bad))
 
     def _aggregate(self, folder: ImageFolder, describer: Aggregated, database: ImageFolder, label: str) -> Vectors:
         [features] = self.local(folder, describer.extractor, label=label)
-        aggregation = self.once("aggregation", lambda: self._fit(describer, database), database, describer)
+
+        def fit() -> Aggregation:
+            return describer.fitting.fit(*self.local(database, describer.extractor, label="database"))
+
+        aggregation = self.once("aggregation", fit, database, describer)
         values = np.zeros((len(folder), aggregation.vector_size), np.float32)
-        rows = range(len(folder))
-        for start in self.track(f"{label} descriptors")(range(0, len(rows), AGGREGATED), -(-len(rows) // AGGREGATED)):
-            images = dict(features.read(rows[start : start + AGGREGATED]))
-            if images:
+        starts = range(0, len(folder), AGGREGATED)
+        for start in self.track(f"{label} descriptors")(starts, len(starts)):
+            if images := dict(features.read(range(len(folder))[start : start + AGGREGATED])):
                 values[list(images)] = aggregation(list(images.values()))
         values[list(features.bad)] = np.nan
         return Vectors(values, features.bad)
-
-    def _fit(self, describer: Aggregated, database: ImageFolder) -> Aggregation:
-        [features] = self.local(database, describer.extractor, label="database")
-        return describer.fitting.fit(features)

@@ -1,12 +1,12 @@
 """Writers of an extractor's features: each part of a description to a store, or to memory."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mfvpr.features.extractor import Extractor, Scale
+from mfvpr.features.extractor import Description, Extractor, Scale
 from mfvpr.storage import features, vectors
 from mfvpr.storage.disk import disk_errors_as_input_errors
 from mfvpr.storage.manifest import VECTORS, store_path
@@ -30,23 +30,26 @@ class Sink:
         forecast: number of images -> bytes on disk.
     """
 
-    pick: Callable[[Any], Any]
+    pick: Callable[[Description], Any]
     store: RowStore[Any] | None
     forecast: Callable[[int], int]
     items: dict[int, Any] = field(default_factory=dict)
 
-    def missing(self, rows: Sequence[int]) -> list[int]:
+    def missing(self, rows: Iterable[int]) -> list[int]:
         """The rows that are not here."""
-        if self.store is None:
-            return [row for row in rows if row not in self.items]
-        return [row for row in rows if not self.store.done[row]]
+        return [row for row in rows if (row not in self.items if self.store is None else not self.store.done[row])]
 
-    def keep(self, batch: Mapping[int, Any]) -> None:
-        """Keep a batch of rows; with a store, they are on disk when this returns."""
+    def write(self, batch: Mapping[int, Description]) -> None:
+        """Write the missing rows of a batch; with a store, they are on disk when this returns."""
+        parts = {row: self.pick(batch[row]) for row in self.missing(batch)}
         if self.store is None:
-            self.items |= batch
+            self.items |= parts
         else:
-            self.store.write({row: batch[row] for row in self.missing([*batch])})
+            self.store.write(parts)
+
+    def read(self) -> Iterable[tuple[int, Any]]:
+        """(row, part) of all rows that are here."""
+        return self.items.items() if self.store is None else self.store.read()
 
 
 @dataclass
@@ -55,11 +58,13 @@ class ExtractionState:
 
     Attributes:
         sinks: of the parts of its descriptions.
+        of_scales: the sinks of local features.
         bad: row -> reason, for images without features.
         is_announced: whether the user was told where the features are.
     """
 
     sinks: list[Sink]
+    of_scales: list[Sink]
     bad: dict[int, str] = field(default_factory=dict)
     is_announced: bool = False
 
@@ -97,16 +102,11 @@ class ExtractionState:
         store = self.sinks[0].store
         if store is not None and store.shard is not None and self.bad:
             with disk_errors_as_input_errors(store.folder, store.kind.content):
-                write_text(store.own / _BAD, json.dumps({str(row): why for row, why in sorted(self.bad.items())}))
+                write_text(store.write_folder / _BAD, json.dumps({str(row): why for row, why in sorted(self.bad.items())}))
 
 
 def open_sinks(
-    root: Path | None,
-    extractor: Extractor,
-    recipe: Mapping[str, Any],
-    *,
-    num_images: int,
-    **how: Any,
+    root: Path | None, extractor: Extractor, recipe: Mapping[str, Any], *, num_images: int, **options: Any
 ) -> list[Sink]:
     """Open the sinks of an extractor: of its global descriptor, if it gives one, then of each scale.
 
@@ -115,10 +115,10 @@ def open_sinks(
         extractor: gives the descriptions.
         recipe: of its features of these images.
         num_images: M.
-        **how: `waiting` and `shard` of `storage.rows.RowStore`.
+        **options: `waiting` and `shard` of `storage.rows.RowStore`.
     """
     name, size = type(extractor).__name__, extractor.vector_size
-    options: dict[str, Any] = {"num_images": num_images} | how
+    options["num_images"] = num_images
     sinks = []
     if size:
         path = None if root is None else store_path(root, name, recipe, VECTORS)

@@ -69,12 +69,7 @@ def store_path(root: Path, name: str, recipe: Mapping[str, Any], kind: Kind = FE
 
 
 def check_folder(folder: Path, kind: Kind) -> None:
-    """Refuse a folder that is neither new or empty, nor a store, nor left by an interrupted start.
-
-    Raises:
-        InputError: `folder` is a file, or holds something else than a store.
-        OSError: it cannot be read.
-    """
+    """Raise `InputError` unless a folder is new or empty, a store, or left by an interrupted start."""
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of {kind.content}, got a file; choose another path")
     if folder.is_dir() and not (folder / MANIFEST).exists():
@@ -92,24 +87,13 @@ def check_folder(folder: Path, kind: Kind) -> None:
 
 
 def manifest_of(kind: Kind, recipe: Mapping[str, Any], sizes: Mapping[str, int]) -> dict[str, Any]:
-    """The content of a manifest (JSON values).
-
-    Args:
-        kind: of the store.
-        recipe: of its rows.
-        sizes: lengths of its axes by name.
-    """
+    """The content of a manifest (JSON values): kind, recipe of the rows, and lengths of the store's axes by name."""
     content = {"format": kind.format, **sizes, "recipe": recipe, "fingerprint": recipe_fingerprint(recipe, kind)}
     return json.loads(json.dumps(content))  # tuples become lists
 
 
 def has_manifest(folder: Path, kind: Kind, manifest: Mapping[str, Any]) -> bool:
-    """Whether the store has its manifest.
-
-    Raises:
-        InputError: the store has another recipe, or a damaged manifest.
-        OSError: it cannot be read.
-    """
+    """Whether the store has its manifest; raises `InputError` if that has another recipe, or is damaged."""
     path = folder / MANIFEST
     if not path.exists():
         return False
@@ -126,12 +110,7 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def write_manifest(folder: Path, kind: Kind, manifest: Mapping[str, Any]) -> None:
-    """Write the manifest if it is not there; several processes may do so.
-
-    Raises:
-        InputError: as `has_manifest`.
-        OSError: it cannot be read or written.
-    """
+    """Write the manifest if it is not there, as several processes may do; raises as `has_manifest`."""
     if not has_manifest(folder, kind, manifest):
         with replacing(folder / MANIFEST) as temporary, temporary.open("w", encoding="utf-8") as file:
             file.write(json.dumps(manifest, indent=1, sort_keys=True, allow_nan=False))

@@ -34,11 +34,9 @@ class Entry(NamedTuple):
 EntryStore = RowStore[Entry]
 
 
-def open_entry_store(
-    folder: Path, recipe: Mapping[str, Any], *, num_images: int, kind: Kind, **options: Any
-) -> EntryStore:
+def open_entry_store(folder: Path, recipe: Mapping[str, Any], *, num_images: int, kind: Kind, **how: Any) -> EntryStore:
     """The store in `folder`; see `features.open_store`."""
-    return RowStore(folder, kind, recipe, {"num_images": num_images}, pack=_pack, unpack=_unpack, **options)
+    return RowStore(folder, kind, recipe, {"num_images": num_images}, pack=_pack, unpack=_unpack, **how)
 
 
 def check_entry(name: Any, place: Any) -> None:
@@ -52,9 +50,8 @@ def check_entry(name: Any, place: Any) -> None:
         if _levels(place) > DEEPEST:
             raise RecursionError
     except RecursionError:
-        raise InputError(
-            f"{name}: expected a place of at most {DEEPEST} levels, got a deeper one; flatten it"
-        ) from None
+        message = f"{name}: expected a place of at most {DEEPEST} levels, got a deeper one; flatten it"
+        raise InputError(message) from None
     except (TypeError, ValueError) as error:
         raise InputError(f"{name}: expected a place that JSON can say, and not null, got {error}; use text, numbers, "
                          "lists, and dictionaries by text") from None  # fmt: skip

@@ -32,15 +32,7 @@ import numpy as np
 
 from mfvpr.storage.disk import disk_errors_as_input_errors, lock_store
 from mfvpr.storage.features import FeatureStore, open_store
-from mfvpr.storage.manifest import (
-    FEATURES,
-    MANIFEST,
-    Kind,
-    has_manifest,
-    manifest_of,
-    remove_leftovers,
-    write_manifest,
-)
+from mfvpr.storage.manifest import FEATURES, MANIFEST, Kind, has_manifest, manifest_of, remove_leftovers, write_manifest
 from mfvpr.storage.map_entries import Entry, EntryStore, open_entry_store
 from mfvpr.types import Features
 from mfvpr.utils.errors import InputError
@@ -81,11 +73,7 @@ def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:
 
 
 def has_settings(folder: Path, settings: Mapping[str, Any]) -> bool:
-    """Whether the settings of a map are written.
-
-    Raises:
-        InputError: the map has other settings.
-    """
+    """Whether the settings of a map are written; raises `InputError` if the map has other settings."""
     with disk_errors_as_input_errors(folder, MAP.content):
         return has_manifest(folder, MAP, manifest_of(MAP, settings, {}))
 
@@ -170,11 +158,7 @@ class _Segment:
         self.stamp = file_stamp(self.folder / _TOKENS)
 
     def check(self) -> None:
-        """Compare the files with the tokens.
-
-        Raises:
-            InputError: one of the two files of a row is gone, or the file of tokens is gone or was cut.
-        """
+        """Raise `InputError` if one of the two files of a row is gone, or the file of tokens is gone or was cut."""
         path = self.folder / _TOKENS
         stamp = file_stamp(path)  # the rows were listed earlier, and an add grows this file before it writes rows
         if self.entries.done.any() and stamp is None:
@@ -239,11 +223,7 @@ class MapRows:
         return counts
 
     def features(self, rows: Sequence[int]) -> Iterator[tuple[int, Features]]:
-        """(row, features) of existing rows, in no order.
-
-        Raises:
-            InputError: rows are damaged, or were removed.
-        """
+        """(row, features) of existing rows, in no order; raises `InputError` if rows are damaged or were removed."""
         segments: dict[int, list[int]] = {}
         for row in rows:
             segments.setdefault(row // SEGMENT, []).append(row % SEGMENT)

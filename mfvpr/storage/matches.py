@@ -31,25 +31,9 @@ MatchStore = RowStore[QueryMatches]
 
 
 def open_match_store(
-    folder: Path,
-    recipe: Mapping[str, Any],
-    *,
-    num_queries: int,
-    num_candidates: int,
-    **options: Any,
+    folder: Path, recipe: Mapping[str, Any], *, num_queries: int, num_candidates: int, **options: Any
 ) -> MatchStore:
-    """The store in `folder`. `with store:` locks it for writing, unless it is complete.
-
-    Args:
-        folder: see `manifest.store_path`, with the kind `MATCHES`.
-        recipe: of the matches (JSON values only): features, shortlist, settings. Kept in plain text.
-        num_queries: Q.
-        num_candidates: C.
-        **options: `waiting` and `shard` of `rows.RowStore`.
-
-    Raises:
-        InputError: made from something else, or no store at all.
-    """
+    """The store in `folder` of the matches of Q queries with C candidates each; see `features.open_store`."""
     sizes, pack = {"num_queries": num_queries, "num_candidates": num_candidates}, partial(_pack, num_candidates)
     return RowStore(folder, MATCHES, recipe, sizes, pack=pack, unpack=_unpack, **options)
 
@@ -58,7 +42,6 @@ class StoredMatches(Sequence[Matches]):
     """Matches of queries of a store, as in QueryMatches: every access reads them."""
 
     def __init__(self, store: MatchStore, rows: Sequence[int]) -> None:
-        """Take the rows, which are done, of the queries."""
         self._store, self._rows = store, rows
 
     def __len__(self) -> int:

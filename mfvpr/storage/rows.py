@@ -13,7 +13,7 @@ from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 
-from mfvpr.storage.disk import disk_errors_as_input_errors, free_bytes, lock_store, too_full, used_bytes
+from mfvpr.storage.disk import disk_errors_as_input_errors, free_bytes, full_disk_error, lock_store, used_bytes
 from mfvpr.storage.manifest import Kind, check_folder, has_manifest, manifest_of, remove_leftovers, write_manifest
 from mfvpr.storage.row_files import SHARDS, RowFiles
 from mfvpr.storage.shards import Shard
@@ -85,11 +85,7 @@ class RowStore(Generic[Item]):
         self.look()
 
     def __enter__(self) -> Self:
-        """Lock the store, unless all rows are done, and find the rows that were written meanwhile.
-
-        Raises:
-            InputError: in use by another process, or the folder cannot be written.
-        """
+        """Lock the store, unless all rows are done, and find the rows that were written meanwhile."""
         with ExitStack() as stack, disk_errors_as_input_errors(self.folder, self.kind.content):
             if not self._blocks:
                 self.look()
@@ -120,11 +116,7 @@ class RowStore(Generic[Item]):
         return self._files.counts
 
     def look(self) -> None:
-        """Find the rows that are done by now.
-
-        Raises:
-            InputError: made from something else.
-        """
+        """Find the rows that are done by now; raises `InputError` if they were made from something else."""
         with disk_errors_as_input_errors(self.folder, self.kind.content):
             exists = has_manifest(self.folder, self.kind, self._manifest)
             shards = [path for path in (self.folder / SHARDS).glob("*-of-*") if path.is_dir()]
@@ -144,10 +136,7 @@ class RowStore(Generic[Item]):
         return used_bytes(self.folder)
 
     def write(self, items: Mapping[int, Item]) -> None:
-        """Store a batch of rows. When this returns they are done, and on disk.
-
-        Args:
-            items: by row.
+        """Store a batch of items by row. When this returns they are done, and on disk.
 
         Raises:
             InputError: the disk is full, or cannot be written: rows done before stay intact. Or a row has other arrays
@@ -175,11 +164,9 @@ class RowStore(Generic[Item]):
     def write_packed(self, rows: Mapping[int, Parts]) -> None:
         """Store the result of `pack`, as `write` does."""
         sizes = {row: row_bytes(sum(part.nbytes for part in parts.values()), len(parts)) for row, parts in rows.items()}
-
-        def missing_bytes() -> int:
-            return sum(size for row, size in sizes.items() if self.counts[row] < 0)
-
-        with disk_errors_as_input_errors(self.folder, self.kind.content, missing_bytes):
+        with disk_errors_as_input_errors(
+            self.folder, self.kind.content, lambda: sum(size for row, size in sizes.items() if self.counts[row] < 0)
+        ):
             for _ in ordered_map(self._write_row, rows.items(), workers=THREADS):
                 pass
 
@@ -230,17 +217,16 @@ class RowStore(Generic[Item]):
 
     def _check_layouts(self, rows: Mapping[int, Parts]) -> None:
         """Refuse rows whose arrays differ from the other rows: they could not be put together."""
-        layouts = {row: _layout_of(parts) for row, parts in rows.items()}
-        expected = self._layout or self._stored_layout() or next(iter(layouts.values()))
-        for row, layout in layouts.items():
-            if differs := difference(layout, expected):
+        if self._layout is None:
+            stored = filter(None, map(self._read_parts, np.flatnonzero(self.done).tolist()))
+            layout = _layout_of(next(stored, next(iter(rows.values()))))
+        else:
+            layout = self._layout
+        for row, parts in rows.items():
+            if differs := difference(_layout_of(parts), layout):
                 advice = self.kind.advice("describe all of them alike")
                 raise InputError(f"{self.folder}: row {row}: {differs} as in the other {self.kind.rows}; {advice}")
-        self._layout = expected
-
-    def _stored_layout(self) -> dict[str, str] | None:
-        rows = map(self._read_parts, np.flatnonzero(self.done).tolist())
-        return next((_layout_of(parts) for parts in rows if parts), None)
+        self._layout = layout
 
     def _remove(self, damaged: Mapping[int, Path]) -> str:
         """Remove damaged rows if a run can make them again; returns the message."""
@@ -267,14 +253,9 @@ def row_bytes(num_bytes: float, num_arrays: int) -> int:
 
 
 def require_space(folder: Path, num_bytes: int) -> None:
-    """Refuse to start a write that will not fit.
-
-    Raises:
-        InputError: less than `num_bytes` are free on the disk of `folder`.
-    """
-    free = free_bytes(folder)
-    if free < num_bytes:
-        raise InputError(too_full(folder, num_bytes, free))
+    """Raise `InputError` if less than `num_bytes` are free on the disk of `folder`."""
+    if free_bytes(folder) < num_bytes:
+        raise full_disk_error(folder, num_bytes)
 
 
 def _layout_of(parts: Parts) -> dict[str, str]:
