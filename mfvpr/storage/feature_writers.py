@@ -102,7 +102,7 @@ class ExtractionState:
         store = self.sinks[0].store
         if store is not None and store.shard is not None and self.bad:
             with disk_errors_as_input_errors(store.folder, store.kind.content):
-                write_text(store.write_folder / _BAD, json.dumps({str(row): why for row, why in sorted(self.bad.items())}))
+                write_text(store.write_folder / _BAD, json.dumps(dict(sorted(self.bad.items()))))
 
 
 def open_sinks(

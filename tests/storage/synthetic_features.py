@@ -5,15 +5,17 @@ import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
+import pytest
 
 from mfvpr import Features, Matches
 from mfvpr.storage import manifest as store_manifest
-from mfvpr.storage.features import open_store
+from mfvpr.storage.features import open_store, round_as_stored
 from mfvpr.storage.matches import QueryMatches, open_match_store
 from tests.builders import make_features
 
@@ -30,9 +32,15 @@ def features_of(row: int, count: int = 40, dimension: int = 16) -> Features:
     return make_features(np.random.default_rng(row), count, dimension=dimension)
 
 
-def assert_same(got: Features, expected: Features) -> None:
-    for part in fields(Features):
-        np.testing.assert_array_equal(getattr(got, part.name), getattr(expected, part.name))
+def assert_same(got: Features | QueryMatches, expected: Features | QueryMatches) -> None:
+    """The very same bits: shapes, types, and NaN included."""
+    (arrays, structure), (expected_arrays, expected_structure) = (
+        jax.tree.flatten(vars(row)) for row in (got, expected)
+    )
+    assert structure == expected_structure
+    for values, expected_values in zip(arrays, expected_arrays, strict=True):
+        assert (values.shape, values.dtype) == (expected_values.shape, expected_values.dtype)
+        assert values.tobytes() == expected_values.tobytes()
 
 
 def matches_of(row: int, counts: tuple[int, ...] = (30, 0, 25, 5), **more: Any) -> QueryMatches:
@@ -64,17 +72,23 @@ class Subject:
 
     open: Callable[[Path, int], AbstractContextManager[Any]]
     row_of: Callable[..., Any]
+    round_as_stored: Callable[[Any], Any]
     kind: store_manifest.Kind
 
 
 FEATURES = Subject(
-    lambda folder, rows: open_store(folder, RECIPE, num_images=rows), features_of, store_manifest.FEATURES
+    lambda folder, rows: open_store(folder, RECIPE, num_images=rows),
+    features_of,
+    round_as_stored,
+    store_manifest.FEATURES,
 )
 MATCHES = Subject(
     lambda folder, rows: open_match_store(folder, MATCH_RECIPE, num_queries=rows, num_candidates=4),
     matches_of,
+    lambda row: row,
     store_manifest.MATCHES,
 )
+of_both_kinds = pytest.mark.parametrize("subject", [FEATURES, MATCHES], ids=["features", "matches"])
 
 
 def fill(folder: Path, num_rows: int = 3, batch: int = 2, subject: Subject = FEATURES) -> list[int]:
