@@ -122,6 +122,7 @@ DAMAGE: dict[str, Callable[[Path], Any]] = {
     "half": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
     "long": lambda path: path.write_bytes(path.read_bytes() + b"abc"),
     "flipped": lambda path: flip(path, path.stat().st_size // 2),
+    "gone": lambda path: path.unlink(),
     "another's": lambda path: path.write_bytes(file_of(path.parent, 0).read_bytes()),
 }
 

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from tests.storage.synthetic_features import (
     file_of,
     fill,
     matches_of,
+    of_both_kinds,
     read_all,
     run_here,
 )
@@ -45,16 +47,24 @@ def hold(folder: str) -> None:
         time.sleep(60)
 
 
-def test_a_second_process_is_told_and_a_killed_one_leaves_no_lock(tmp_path):
+@pytest.fixture
+def holder(tmp_path):
+    """A process that has the store `s` open, in which one row is done."""
     call = f"from tests.storage.test_faults import *; hold({str(tmp_path / 's')!r})"
-    with subprocess.Popen([sys.executable, "-c", call], cwd=ROOT, stdout=subprocess.PIPE) as holder:
+    with subprocess.Popen([sys.executable, "-c", call], cwd=ROOT, stdout=subprocess.PIPE) as process:
         try:
-            assert holder.stdout is not None
-            assert holder.stdout.readline() == b"open\n"
-            with pytest.raises(InputError, match=rf"s: in use by process {holder.pid}\b"):
-                fill(tmp_path / "s")
+            assert process.stdout is not None
+            assert process.stdout.readline() == b"open\n"
+            yield process
         finally:
-            holder.kill()
+            process.kill()
+
+
+def test_a_second_process_is_refused_and_a_killed_one_leaves_no_lock(tmp_path, holder):
+    with pytest.raises(InputError, match=rf"s: in use by process {holder.pid}\b"):
+        fill(tmp_path / "s")
+    holder.kill()
+    holder.wait()
     assert fill(tmp_path / "s") == [1, 2]
 
 
@@ -76,7 +86,7 @@ def read_whole(folder: str) -> None:
     print(*read_all(Path(folder)))
 
 
-@pytest.mark.parametrize("subject", [FEATURES, MATCHES], ids=["features", "matches"])
+@of_both_kinds
 def test_a_complete_store_is_read_by_any_number_at_the_same_time(tmp_path, subject):
     fill(tmp_path / "s", subject=subject)
     with subject.open(tmp_path / "s", 3) as first, subject.open(tmp_path / "s", 3) as second:
@@ -86,26 +96,22 @@ def test_a_complete_store_is_read_by_any_number_at_the_same_time(tmp_path, subje
             assert run_here(f"read_whole({str(tmp_path / 's')!r})").split() == ["0", "1", "2"]
 
 
-def test_a_store_is_read_while_another_process_writes_it(tmp_path):
-    """And what that has done meanwhile is done for whoever opens the store again, or enters it."""
-    call = f"from tests.storage.test_faults import *; hold({str(tmp_path / 's')!r})"
+def test_a_store_is_read_while_another_process_writes_it(tmp_path, request):
+    """The rows of that process are done for whoever opens the store again, or enters it."""
     before = open_store(tmp_path / "s", RECIPE, num_images=3)
-    with subprocess.Popen([sys.executable, "-c", call], cwd=ROOT, stdout=subprocess.PIPE) as holder:
-        try:
-            assert holder.stdout is not None
-            assert holder.stdout.readline() == b"open\n"
-            store = open_store(tmp_path / "s", RECIPE, num_images=3)
-            assert store.counts.tolist() == [40, -1, -1]
-            [(row, features)] = store.read()
-            assert row == 0
-            np.testing.assert_array_equal(features.keypoints, features_of(0).keypoints)
-            with pytest.raises(ValueError, match="row 1 is not done"):
-                list(store.read([1]))
-            with pytest.raises(ValueError, match="write `with store:`"):
-                store.write({1: features_of(1)})
-            assert not before.done.any()
-        finally:
-            holder.kill()
+    holder = request.getfixturevalue("holder")
+    store = open_store(tmp_path / "s", RECIPE, num_images=3)
+    assert store.counts.tolist() == [40, -1, -1]
+    [(row, features)] = store.read()
+    assert row == 0
+    np.testing.assert_array_equal(features.keypoints, features_of(0).keypoints)
+    with pytest.raises(ValueError, match="row 1 is not done"):
+        list(store.read([1]))
+    with pytest.raises(ValueError, match="write `with store:`"):
+        store.write({1: features_of(1)})
+    assert not before.done.any()
+    holder.kill()
+    holder.wait()
     with before:
         assert before.done.tolist() == [True, False, False]
 
@@ -131,13 +137,13 @@ def test_a_complete_store_is_not_written(tmp_path):
 
 
 @pytest.mark.parametrize("damage", DAMAGE)
-@pytest.mark.parametrize("subject", [FEATURES, MATCHES], ids=["features", "matches"])
-def test_a_damaged_row_is_told_and_made_anew(tmp_path, subject, damage):
+@of_both_kinds
+def test_a_damaged_row_is_named_and_made_anew(tmp_path, subject, damage):
     folder, words = tmp_path / "s", subject.kind
     fill(folder, subject=subject)
     before = digests(folder)
-    DAMAGE[damage](file_of(folder))
     with subject.open(folder, 3) as store:
+        DAMAGE[damage](file_of(folder))
         assert store.done.all()
         rows = store.read()
         assert next(rows)[0] == 0
@@ -151,18 +157,7 @@ def test_a_damaged_row_is_told_and_made_anew(tmp_path, subject, damage):
     assert len(read_all(folder, subject=subject)) == 3
 
 
-@pytest.mark.parametrize("subject", [FEATURES, MATCHES], ids=["features", "matches"])
-def test_a_row_that_is_gone_is_made_anew(tmp_path, subject):
-    folder = tmp_path / "s"
-    fill(folder, subject=subject)
-    with subject.open(folder, 3) as store:
-        file_of(folder, 2).unlink()
-        with pytest.raises(InputError, match=r"damaged.*row 2"):
-            list(store.read())
-    assert fill(folder, subject=subject) == [2]
-
-
-@pytest.mark.parametrize("subject", [FEATURES, MATCHES], ids=["features", "matches"])
+@of_both_kinds
 def test_exchanged_rows_are_noticed(tmp_path, subject):
     """Whole files, each with its checksum, in each other's place."""
     folder = tmp_path / "s"
@@ -282,8 +277,8 @@ def test_killed_processes_end_in_the_same_files(tmp_path, kind, rounds):
 
 
 def full_disk(root: str) -> None:
-    """A store on a disk of 5 MB, which then grows: what is told, and what is left. Prints JSON."""
-    disk, report = Path(root), {}
+    """Fill a store on a disk of 5 MB, which then grows. Prints messages and rows as JSON."""
+    disk = Path(root)
     mount(disk, "-o", "size=5m")
 
     def extract() -> list[int]:
@@ -293,15 +288,16 @@ def full_disk(root: str) -> None:
                 store.write({row: features_of(row, 700, 512)})
         return todo
 
-    for name in ("first", "second"):
-        try:
-            extract()
-        except InputError as error:
-            report[name] = str(error)
-    rows = read_all(disk / "s", 12)
-    report["kept"] = [
-        row for row, features in rows.items() if (features.scores == features_of(row, 700, 512).scores).all()
-    ]
+    def message_of(call: Callable[..., object], *arguments: object) -> str:
+        with pytest.raises(InputError) as error:
+            call(*arguments)
+        return str(error.value)
+
+    report: dict[str, object] = {"first": message_of(extract), "second": message_of(extract)}
+    report["done"] = [
+        row for row, features in read_all(disk / "s", 12).items()
+        if (features.scores == features_of(row, 700, 512).scores).all()
+    ]  # fmt: skip
     mount(disk, "-o", "remount,size=12m")
     report["resumed"] = extract()
     report["all"] = len(read_all(disk / "s", 12))
@@ -309,24 +305,18 @@ def full_disk(root: str) -> None:
     report["read_when_full"] = len(read_all(disk / "s", 12))
     mount(disk, "-o", "remount,ro")
     report["read_when_read_only"] = len(read_all(disk / "s", 12))
-    try:
-        read_all(disk / "new", 12)
-    except InputError as error:
-        report["new"] = str(error)
+    report["new"] = message_of(read_all, disk / "new", 12)
     mount(disk, "-o", "remount,rw")
     DAMAGE["flipped"](file_of(disk / "s", 3))
     mount(disk, "-o", "remount,ro")
-    try:
-        read_all(disk / "s", 12)
-    except InputError as error:
-        report["damaged"] = str(error)
+    report["damaged"] = message_of(read_all, disk / "s", 12)
     print(json.dumps(report))
 
 
-def test_a_full_disk_is_told_and_extraction_goes_on_when_it_is_not(tmp_path):
+def test_a_full_disk_is_named_and_extraction_goes_on_when_it_is_not(tmp_path):
     need_small_disks(tmp_path)
     report = json.loads(run_here(f"full_disk({str(tmp_path)!r})", prefix=UNSHARE))
-    done = report["kept"]
+    done = report["done"]
     assert 5 <= len(done) <= 8
     for name in ("first", "second"):
         needed = forecast_bytes(1, 700, 512) / 1e6  # of the row that was being written

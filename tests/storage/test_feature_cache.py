@@ -9,16 +9,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mfvpr import match
 from mfvpr.datasets import image_folder
-from mfvpr.evaluation import stages
 from mfvpr.features import Aggregated, Description, Scale, Sift, VladFitting
-from mfvpr.retrieval.search import EXACT
 from mfvpr.storage import FeatureCache, feature_cache, vectors
 from mfvpr.storage.features import forecast_bytes, open_store
 from mfvpr.types import Features
 from mfvpr.utils import InputError, recipe_of
-from tests.builders import make_features
 from tests.storage.synthetic_features import assert_same
 
 pytestmark = pytest.mark.thorough
@@ -317,42 +313,3 @@ def test_a_forecast_is_not_exceeded(folder, tmp_path):
         forecast = forecast_bytes(len(folder), 700, 512)
         assert 0.8 * forecast < store.size_bytes <= forecast + 100_000  # folders and what describes the arrays
         assert store.size_bytes <= 0.55 * 2064 * 700 * len(folder)
-
-
-def test_features_of_ones_own_are_matched_as_they_are():
-    """As hloc keeps them: half precision, another number in every image; and padded ones."""
-    rng = np.random.default_rng(0)
-    images = [make_features(rng, count, capacity=40) for count in (7, 0, 40, 33)]
-    images[2] = replace(images[2], descriptors=images[2].descriptors.astype(np.float16).astype(np.float32))
-    feature_set = stages.FeatureSet.of(images)
-    assert len(feature_set) == 4
-    assert feature_set.counts.tolist() == [7, 0, 40, 33]
-    candidates = EXACT.shortlist(np.eye(4, dtype=np.float32), np.ones((4, 4), np.float32) / 2, 4)
-    matches = stages.match(feature_set, feature_set, candidates)
-    for query, row in ((0, 2), (2, 3), (3, 0), (1, 2)):
-        alone = match(images[query], images[row])
-        place = candidates.indices[query].tolist().index(row)
-        assert matches.counts[query, place] == alone.mask.sum()
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"descriptors": np.ones((16, 5), np.float32)}, r"image 0: expected keypoints .* transpose descriptors"),
-        ({"mask": np.ones(5)}, r"mask \[N\] bool"),
-        ({"descriptors": np.full((5, 16), 7.0, np.float32)}, "unit length, got 28; divide"),
-    ],
-)
-def test_features_of_ones_own_that_do_not_fit_are_told(change, words):
-    image = replace(make_features(np.random.default_rng(0), 5), **change)
-    with pytest.raises(InputError, match=words):
-        stages.FeatureSet.of([image])
-    with pytest.raises(InputError, match="at least one image"):
-        stages.FeatureSet.of([])
-
-
-def test_descriptors_are_of_unit_length_only_where_that_is_asked():
-    image = make_features(np.random.default_rng(0), 5)
-    longer = replace(image, descriptors=3 * image.descriptors)
-    feature_set = stages.FeatureSet.of([longer], unit_length=False)
-    np.testing.assert_array_equal(feature_set[0].descriptors, longer.descriptors)
