@@ -4,75 +4,20 @@ import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 from PIL import Image
 
 from mfvpr.datasets import image_folder
-from mfvpr.features import Aggregated, Description, Scale, Sift, VladFitting
+from mfvpr.datasets.images import resize
+from mfvpr.features import Aggregated, Description, VladFitting
 from mfvpr.storage import FeatureCache, feature_cache, vectors
 from mfvpr.storage.features import forecast_bytes, open_store
-from mfvpr.types import Features
-from mfvpr.utils import InputError, recipe_of
-from tests.storage.synthetic_features import assert_same
+from mfvpr.utils import InputError
+from tests.storage.extractors import SIFT, Counted, Mean, TwoScales, first_features
+from tests.storage.synthetic_features import assert_same, features_of
 
 pytestmark = pytest.mark.thorough
-
-SIFT = Sift(max_keypoints=60, batch_size=3)
-
-
-class Counted:
-    """SIFT that counts its images, and is killed after some."""
-
-    image_size, interpolation, batch_size = SIFT.image_size, SIFT.interpolation, SIFT.batch_size
-    vector_size, scales, recipe = SIFT.vector_size, SIFT.scales, recipe_of(SIFT)
-
-    def __init__(self, limit=100):
-        self.seen, self.limit = 0, limit
-
-    def __call__(self, images):
-        if self.seen + len(images) > self.limit:
-            raise KeyboardInterrupt
-        self.seen += len(images)
-        return SIFT(images)
-
-
-class Mean:
-    """A global descriptor: the mean color, of unit length."""
-
-    image_size, interpolation, batch_size, vector_size, scales = (16, 16), "pil_bilinear", 4, 3, ()
-    recipe = "mean"
-
-    def __init__(self):
-        self.seen = 0
-
-    def __call__(self, images):
-        self.seen += len(images)
-        mean = images.mean((1, 2)).astype(np.float32) + 1
-        return [Description(vector / np.linalg.norm(vector)) for vector in mean]
-
-
-class Both:
-    """A global descriptor, and local features of two scales, from one pass."""
-
-    image_size, interpolation, batch_size, vector_size = SIFT.image_size, SIFT.interpolation, 3, 3
-    scales, recipe = (Scale(128, 60), Scale(128, 30)), "both"
-
-    def __init__(self):
-        self.seen = 0
-
-    def __call__(self, images):
-        self.seen += len(images)
-        local = SIFT(images)
-        return [
-            Description(np.full(3, row, np.float32), (description.features, jax.tree.map(half, description.features)))
-            for row, description in enumerate(local)
-        ]
-
-
-def half(values):
-    return values if values.shape == (2,) else values[::2]
 
 
 @pytest.fixture(scope="module")
@@ -125,10 +70,7 @@ class Fewer:
     vector_size, scales = SIFT.vector_size, SIFT.scales
 
     def __call__(self, images):
-        return [Description(None, (jax.tree.map(self.first, description.features),)) for description in SIFT(images)]
-
-    def first(self, values):
-        return values if values.shape == (2,) else values[: self.number]
+        return [Description(None, (first_features(each.features, self.number),)) for each in SIFT(images)]
 
 
 @pytest.mark.parametrize("on_disk", [True, False])
@@ -175,17 +117,15 @@ def test_files_that_were_changed_are_looked_at_again(tmp_path, on_disk, small_st
 
 
 def test_one_pass_gives_a_vector_and_several_scales(folder, tmp_path):
-    for root in (None, tmp_path, tmp_path):
-        extractor, cache = Both(), FeatureCache(root)
+    images = np.stack([resize(folder.read(row), SIFT.image_size, SIFT.interpolation) for row in range(len(folder))])
+    for root, seen in ((None, len(folder)), (tmp_path, len(folder)), (tmp_path, 0)):
+        extractor, cache = Counted(TwoScales()), FeatureCache(root)
         vectors = cache.vectors(folder, extractor, folder)
-        assert vectors.values.shape == (len(folder), 3)
-        np.testing.assert_array_equal(vectors.values[:4, 0], [0, 1, 2, 0])
+        np.testing.assert_array_equal(vectors.values, [mean.vector for mean in Mean()(images)])
         first, second = cache.local(folder, extractor, [1, 4])
         assert (second.counts == -(-first.counts // 2)).all()
         np.testing.assert_array_equal(second[4].keypoints, first[4].keypoints[::2])
-        assert extractor.seen == (0 if root and (tmp_path / "seen").exists() else len(folder))
-        if root:
-            (tmp_path / "seen").mkdir(exist_ok=True)
+        assert extractor.seen == seen
 
 
 def test_an_interrupted_extraction_goes_on_where_it_was(folder, tmp_path):
@@ -235,7 +175,7 @@ def colors(tmp_path):
 
 
 def test_global_descriptors_are_stored_as_well(colors, tmp_path):
-    mean = Mean()
+    mean = Counted(Mean())
     plain = FeatureCache(skip_bad=True).vectors(colors, mean, colors)
     runs = [FeatureCache(tmp_path / "s", skip_bad=True).vectors(colors, mean, colors) for _ in range(2)]
     assert mean.seen == 3 + 3
@@ -302,14 +242,9 @@ def test_the_papers_databases_take_about_half(images, features, paper, readme):
 
 def test_a_forecast_is_not_exceeded(folder, tmp_path):
     """Random descriptors, which compress worst."""
-    rng = np.random.default_rng(0)
     with open_store(tmp_path / "s", {}, num_images=len(folder)) as store:
         for row in range(len(folder)):
-            descriptors = rng.normal(size=(700, 512)).astype(np.float32)
-            descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
-            points, scores = rng.uniform(0, 336, (700, 2)).astype(np.float32), rng.uniform(size=700).astype(np.float32)
-            size = np.full(2, 336, np.float32)
-            store.write({row: Features(points, descriptors, scores, np.ones(700, bool), size)})
+            store.write({row: features_of(row, 700, 512)})
         forecast = forecast_bytes(len(folder), 700, 512)
         assert 0.8 * forecast < store.size_bytes <= forecast + 100_000  # folders and what describes the arrays
         assert store.size_bytes <= 0.55 * 2064 * 700 * len(folder)

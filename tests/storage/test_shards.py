@@ -5,57 +5,31 @@ import json
 import random
 import re
 import shutil
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-import jax
 import numpy as np
 import pytest
 
 import mfvpr
 from mfvpr.datasets import folder_dataset, sequences_dataset
 from mfvpr.evaluation import match_sequence
-from mfvpr.features import Aggregated, Description, Scale, Sift, VladFitting
+from mfvpr.features import Aggregated, VladFitting
 from mfvpr.reranking import FrameCorrelation, Fusion
 from mfvpr.retrieval import Filtered, Retrieval
 from mfvpr.storage import FeatureCache, NotYet, Shard
 from mfvpr.storage.shards import shard_of
 from mfvpr.storage.vectors import open_vector_store
 from mfvpr.types import Shortlist
-from mfvpr.utils import InputError, recipe_of
+from mfvpr.utils import InputError
 from mfvpr.utils.arrays import read_arrays, write_arrays
+from tests.storage.extractors import SIFT, Counted, Mean, TwoScales
 
 pytestmark = pytest.mark.thorough
 
-SIFT = Sift(max_keypoints=60, image_size=(160, 120))
 VLAD = Retrieval(Aggregated(SIFT, VladFitting(num_words=8)))
 SCORERS = {"histogram": mfvpr.HistogramOfShifts(), "count": mfvpr.MatchCount()}
 HOW = {"candidates": 4, "fused": {"histogram": Fusion("zscore")}, "cohort": 1,
        "correlated": {"count": FrameCorrelation(1)}}  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Mean:
-    """A global descriptor: the mean color, of unit length."""
-
-    image_size, interpolation, batch_size, vector_size, scales = (16, 16), "pil_bilinear", 4, 3, ()
-
-    def __call__(self, images):
-        mean = images.mean((1, 2)).astype(np.float32) + 1
-        return [Description(vector / np.linalg.norm(vector)) for vector in mean]
-
-
-class Counted:
-    """SIFT that counts its images."""
-
-    image_size, interpolation, batch_size = SIFT.image_size, SIFT.interpolation, 2
-    vector_size, scales, recipe = SIFT.vector_size, SIFT.scales, recipe_of(SIFT)
-
-    def __init__(self):
-        self.seen = 0
-
-    def __call__(self, images):
-        self.seen += len(images)
-        return SIFT(images)
 
 
 @pytest.fixture(scope="module")
@@ -127,21 +101,6 @@ def test_local_features_are_those_of_candidates_only(dataset, tmp_path):
     assert files(tmp_path / "s") == files(plain_root)
 
 
-class TwoScales:
-    """A global descriptor and local features of two scales from one pass."""
-
-    image_size, interpolation, batch_size, vector_size = SIFT.image_size, SIFT.interpolation, 3, 3
-    scales, recipe = (Scale(128, 60), Scale(128, 30, weight=0.5)), "two scales"
-
-    def __call__(self, images):
-        vectors = [description.vector for description in Mean()(images)]
-        every = [description.features for description in SIFT(images)]
-        halves = [
-            jax.tree.map(lambda field: field if field.shape == (2,) else field[::2], features) for features in every
-        ]
-        return [Description(*parts) for parts in zip(vectors, zip(every, halves, strict=True), strict=True)]
-
-
 @pytest.mark.slow
 def test_several_sequences_and_scales_and_more_shards_than_images(small_street, split, tmp_path):
     """On matches that memory does not hold."""
@@ -195,8 +154,7 @@ def test_scores_are_known_by_their_scorers_and_candidates(dataset, split, small_
     assert [*turned.systems] == ["filter", "count", "histogram"]
     assert_same(turned, first)
     for weight in (1.0, 5.0):
-        extractor = TwoScales()
-        extractor.scales = (Scale(128, 60), Scale(128, 30, weight=weight))
+        extractor = TwoScales(weight)
         how = (dataset, extractor, Retrieval(extractor), SCORERS)
         assert_same(mfvpr.evaluate(*how, cache=cache), mfvpr.evaluate(*how, cache=FeatureCache(tmp_path / "plain")))
     for path in tmp_path.glob("matches-*/shortlist.npz"):
