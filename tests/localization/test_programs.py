@@ -1,4 +1,4 @@
-"""A map as programs make and ask it."""
+"""A map as programs build it and localize images in it."""
 
 import json
 import shutil
@@ -25,73 +25,104 @@ from tests.programs import ROOT, composed, typed
 pytestmark = pytest.mark.thorough
 
 QUICK = ["features.max_keypoints=60", "features.image_size=[160,120]", "retrieval.num_words=8", "candidates=5"]
-
-
+NAMES = [f"{row:04d}.png" for row in range(10)]
 WAIT = "10 images in the map; the first answer takes seconds more: programs compile\n"
 
 
-def called(monkeypatch, capsys, program, *arguments):
-    """Exit code, output and errors, without the line that says why the first answer takes long."""
-    code, stdout, stderr = typed(monkeypatch, capsys, program, *map(str, arguments))
-    return code, stdout, "".join(line for line in stderr.splitlines(True) if not line.endswith(WAIT[10:]))
+@pytest.fixture
+def called(monkeypatch, capsys):
+    """Exit code, output and errors of a program, without the line that says why the first answer takes long."""
 
+    def call(program, *arguments):
+        code, stdout, stderr = typed(monkeypatch, capsys, program, *map(str, arguments))
+        return code, stdout, "".join(line for line in stderr.splitlines(True) if not line.endswith(WAIT[10:]))
 
-def built(folder, street, monkeypatch, capsys, *more):
-    data = ["dataset=folder", f"dataset.database={street}/database", f"dataset.queries={street}/queries",
-            "dataset.ground_truth=none"]  # fmt: skip
-    return called(monkeypatch, capsys, "map", "build", f"map={folder}", *data, *QUICK, *more)
+    return call
 
 
 @pytest.fixture
-def folder(small_street, tmp_path, monkeypatch, capsys):
-    code, stdout, stderr = built(tmp_path / "map", small_street, monkeypatch, capsys)
+def built(called):
+    """Exit code, output and errors of the program that builds a map of a street."""
+
+    def call(folder, street, *more):
+        data = ["dataset=folder", f"dataset.database={street}/database", f"dataset.queries={street}/queries",
+                "dataset.ground_truth=none"]  # fmt: skip
+        return called("map", "build", f"map={folder}", *data, *QUICK, *more)
+
+    return call
+
+
+@pytest.fixture
+def folder(small_street, tmp_path, built):
+    code, stdout, stderr = built(tmp_path / "map", small_street)
     assert code == 0, stderr
     assert stdout == f"{tmp_path}/map: 10 images, 10 of them new\n"
     return tmp_path / "map"
 
 
-def lines(stdout):
-    return [json.loads(line) for line in stdout.splitlines()]
+@pytest.fixture
+def localized(called, tmp_path):
+    """Exit code, lines and errors of the program that localizes images."""
+
+    def call(images, *more, folder=tmp_path / "map"):
+        code, stdout, stderr = called("localize", f"map={folder}", f"images={images}", *more)
+        return code, [json.loads(line) for line in stdout.splitlines()], stderr
+
+    return call
 
 
-def test_a_folder_is_asked(folder, small_street, monkeypatch, capsys):
-    asked = [f"map={folder}", f"images={small_street}/database", "alternatives=2"]
-    code, stdout, stderr = typed(monkeypatch, capsys, "localize", *asked)
+@pytest.fixture
+def queries(tmp_path):
+    """An empty folder."""
+    (tmp_path / "queries").mkdir()
+    return tmp_path / "queries"
+
+
+def values_of(name, lines):
+    return [line[name] for line in lines]
+
+
+def write_gray(path, size=(20, 30)):
+    """An image without features."""
+    Image.fromarray(np.full((*size, 3), 90, np.uint8)).save(path)
+
+
+def test_images_of_a_folder_are_localized(folder, small_street, monkeypatch, capsys):
+    arguments = [f"map={folder}", f"images={small_street}/database", "alternatives=2"]
+    code, stdout, stderr = typed(monkeypatch, capsys, "localize", *arguments)
     assert (code, stderr) == (0, WAIT)
-    found = lines(stdout)
-    assert [line["place"] for line in found] == [f"{row:04d}.png" for row in range(10)]
-    assert {len(line["alternatives"]) for line in found} == {2}
-    assert all(line["p_right"] is None and line["seconds"] > 0 and len(line["shift"]) == 2 for line in found)
+    lines = [json.loads(line) for line in stdout.splitlines()]
+    assert values_of("place", lines) == NAMES
+    assert {len(line["alternatives"]) for line in lines} == {2}
+    assert all(line["p_right"] is None and line["seconds"] > 0 and len(line["shift"]) == 2 for line in lines)
 
 
-def test_what_is_there_is_not_added_again(folder, small_street, monkeypatch, capsys):
-    code, stdout, _ = built(folder, small_street, monkeypatch, capsys)
+def test_images_of_the_map_are_not_added_again(folder, small_street, called, built):
+    code, stdout, _ = built(folder, small_street)
     assert (code, stdout) == (0, f"{folder}: 10 images, 0 of them new\n")
-    code, stdout, _ = called(monkeypatch, capsys, "map", "info", folder)
+    code, stdout, _ = called("map", "info", folder)
     assert code == 0
     assert stdout.startswith(f"{folder}: 10 images, 0.")
     assert json.loads(stdout.partition("\n")[2])["candidates"] == 5
 
 
-def test_images_are_added(folder, small_street, monkeypatch, capsys):
+def test_images_are_added(folder, small_street, called, localized):
     image = small_street / "queries" / "0009.png"
-    code, stdout, _ = called(monkeypatch, capsys, "map", "add", folder, shutil.copy(image, folder.parent / "new.png"),
-                             "--place", "the last")  # fmt: skip
-    assert (code, stdout) == (0, f"{folder.parent}/new.png: added, 11 images\n")
-    code, stdout, _ = called(monkeypatch, capsys, "localize", f"map={folder}", f"images={image}")
-    assert lines(stdout)[0]["place"] == "the last"
-    code, stdout, _ = called(monkeypatch, capsys, "localize", f"map={folder}", f"images={image}", "recent=1")
-    assert lines(stdout)[0]["place"] != "the last"
-    code, _, stderr = called(monkeypatch, capsys, "map", "add", folder, folder.parent / "new.png")
+    new = shutil.copy(image, folder.parent / "new.png")
+    code, stdout, _ = called("map", "add", folder, new, "--place", "the last")
+    assert (code, stdout) == (0, f"{new}: added, 11 images\n")
+    assert localized(image)[1][0]["place"] == "the last"
+    assert localized(image, "recent=1")[1][0]["place"] != "the last"
+    code, _, stderr = called("map", "add", folder, new)
     assert code == 2
     assert "new.png: the map has an image" in stderr
-    assert called(monkeypatch, capsys, "map", "add", folder, image)[0] == 0  # another image of the name 0009.png
+    assert called("map", "add", folder, image)[0] == 0  # another image of the name 0009.png
 
 
 @pytest.fixture
 def video(small_street, tmp_path):
     path = tmp_path / "drive.avi"
-    images = [read_image(one) for one in sorted((small_street / "database").iterdir())]
+    images = [read_image(file) for file in sorted((small_street / "database").iterdir())]
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 5, images[0].shape[1::-1])
     for image in images:
         writer.write(image[..., ::-1])
@@ -99,10 +130,10 @@ def video(small_street, tmp_path):
     return path
 
 
-def test_a_video_is_asked(folder, video, small_street, monkeypatch, capsys):
-    code, stdout, _ = called(monkeypatch, capsys, "localize", f"map={folder}", f"images={video}", "every=3")
+def test_frames_of_a_video_are_localized(folder, video, small_street, localized):
+    code, lines, _ = localized(video, "every=3")
     assert code == 0
-    assert [(line["image"], line["place"]) for line in lines(stdout)] == [
+    assert [(line["image"], line["place"]) for line in lines] == [
         (f"{video}:{row}", f"{row:04d}.png") for row in (0, 3, 6, 9)
     ]
     [(_, first), *_] = frames(video)
@@ -111,20 +142,18 @@ def test_a_video_is_asked(folder, video, small_street, monkeypatch, capsys):
     assert np.abs(first.astype(int) - expected).mean() < 4  # a JPEG of it
 
 
-def test_what_is_no_video(tmp_path):
+def test_files_that_are_no_video(tmp_path):
     (tmp_path / "a.mp4").write_text("text")
     for path, words in ((tmp_path / "a.mp4", "without frames"), (tmp_path, "a folder"), (tmp_path / "no", "nothing")):
         with pytest.raises(InputError, match=words):
             list(frames(path))
 
 
-def test_an_image_that_cannot_be_read_stops_no_other(folder, small_street, tmp_path, monkeypatch, capsys):
-    (tmp_path / "asked").mkdir()
-    (tmp_path / "asked/0.png").write_text("no image")
-    shutil.copy(small_street / "database/0004.png", tmp_path / "asked/1.png")
-    code, stdout, stderr = called(monkeypatch, capsys, "localize", f"map={folder}", f"images={tmp_path}/asked")
+def test_an_image_that_cannot_be_read_stops_no_other(folder, small_street, queries, localized):
+    (queries / "0.png").write_text("no image")
+    shutil.copy(small_street / "database/0004.png", queries / "1.png")
+    code, (first, second), stderr = localized(queries)
     assert code == 2
-    first, second = lines(stdout)
     assert "0.png: " in first["error"]
     assert second["place"] == "0004.png"
     assert "1 of the images could not be answered" in stderr
@@ -145,9 +174,8 @@ def test_an_image_that_cannot_be_read_stops_no_other(folder, small_street, tmp_p
     (["map=MAP", "images=MAP", "route=fast"], "route=fast: expected a number from -1000 to 1000"),
     (["map=MAP", "images=MAP", "add=1"], "add=1: expected one of true, false"),
 ])  # fmt: skip
-def test_mistakes_are_one_line(folder, monkeypatch, capsys, arguments, words):
-    arguments = [one.replace("MAP", str(folder)) for one in arguments]
-    code, stdout, stderr = called(monkeypatch, capsys, "localize", *arguments)
+def test_mistakes_are_one_line(folder, called, arguments, words):
+    code, stdout, stderr = called("localize", *(argument.replace("MAP", str(folder)) for argument in arguments))
     assert (code, stdout) == (2, "")
     assert words in stderr
     assert stderr.count("\n") == 1
@@ -161,9 +189,8 @@ def test_mistakes_are_one_line(folder, monkeypatch, capsys, arguments, words):
     (["scorer=paper"], "scorer=histogram, got several"),
     (["map=STREET"], "expected a new or empty folder, or a map"),
 ])  # fmt: skip
-def test_other_settings_are_refused(folder, small_street, monkeypatch, capsys, more, words):
-    more = [one.replace("STREET", str(small_street)) for one in more]
-    code, _, stderr = built(folder, small_street, monkeypatch, capsys, *more)
+def test_other_settings_are_refused(folder, small_street, built, more, words):
+    code, _, stderr = built(folder, small_street, *(setting.replace("STREET", str(small_street)) for setting in more))
     assert code == 2
     assert words in stderr
 
@@ -183,54 +210,39 @@ def test_settings_that_another_build_wrote_meanwhile_stay(tmp_path, monkeypatch)
     assert maps.read(tmp_path / "map")["candidates"] == 6
 
 
-def drawn(path):
-    """Pixels of a figure, and what it tells programs."""
-    with Image.open(path) as image:
-        return np.asarray(image.convert("RGB")), image.text
-
-
 @pytest.mark.slow
-def test_answers_are_drawn(folder, small_street, tmp_path, monkeypatch, capsys):
+def test_answers_are_drawn(folder, small_street, tmp_path, localized):
     queries, pictures = small_street / "queries", {}
     for name, root in (("gray", "null"), ("shown", f"{small_street}/database"), ("elsewhere", str(tmp_path))):
-        code, stdout, stderr = called(
-            monkeypatch, capsys, "localize", f"map={folder}", f"images={queries}", "figures=[0003.png,5]",
-            f"out={tmp_path}/{name}", f"root={root}",
-        )  # fmt: skip
+        code, lines, stderr = localized(queries, "figures=[0003.png,5]", f"out={tmp_path}/{name}", f"root={root}")
         assert (code, stderr) == (0, "")
         paths = [tmp_path / name / "0003_0003.png", tmp_path / name / "0005_0005.png"]
-        assert [line["figure"] for line in lines(stdout) if "figure" in line] == [*map(str, paths)]
+        assert [line["figure"] for line in lines if "figure" in line] == [*map(str, paths)]
         assert sorted((tmp_path / name).iterdir()) == paths
-        pictures[name], told = drawn(paths[0])
-        assert told["image"] == f"{queries}/0003.png"
-        assert told["place"] == lines(stdout)[3]["place"]
+        with Image.open(paths[0]) as image:
+            pictures[name] = np.asarray(image.convert("RGB"))
+            assert image.text["image"] == f"{queries}/0003.png"
+            assert image.text["place"] == lines[3]["place"]
     np.testing.assert_array_equal(pictures["gray"], pictures["elsewhere"])
     gray = {name: np.mean((picture == 150).all(axis=2)) for name, picture in pictures.items()}
     assert gray["shown"] < 0.01 < 0.1 < gray["gray"]
 
 
-def test_so_many_answers_are_drawn_and_those_without_a_candidate(folder, tmp_path, monkeypatch, capsys):
-    (tmp_path / "asked").mkdir()
+def test_so_many_answers_are_drawn_and_those_without_a_candidate(folder, tmp_path, queries, localized):
     for name in ("a b.png", "c.png", "d.png"):
-        Image.fromarray(np.full((20, 30, 3), 90, np.uint8)).save(tmp_path / "asked" / name)
-    code, stdout, stderr = called(monkeypatch, capsys, "localize", f"map={folder}", f"images={tmp_path}/asked",
-                                  "figures=2", f"out={tmp_path}/out")  # fmt: skip
+        write_gray(queries / name)
+    code, lines, stderr = localized(queries, "figures=2", f"out={tmp_path}/out")
     assert (code, stderr) == (0, "")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["0000_a b.png", "0001_c.png"]
-    assert [(line["place"], line["reason"]) for line in lines(stdout)] == [(None, "too few features")] * 3
+    assert [(line["place"], line["reason"]) for line in lines] == [(None, "too few features")] * 3
 
 
-def test_a_map_shows_nothing_outside_of_its_folder(small_street, tmp_path, monkeypatch, capsys):
+def test_a_map_shows_nothing_outside_of_its_folder(folder, small_street, tmp_path, localized):
     """Its names are data: of a map that somebody gave away they may say anything."""
-    code, *_ = built(tmp_path / "map", small_street, monkeypatch, capsys)
-    known = maps.open_map(tmp_path / "map")
-    known.add(small_street / "queries/0004.png", "there", name=f"..{small_street}/queries/0004.png")
-    code, stdout, stderr = called(
-        monkeypatch, capsys, "localize", f"map={tmp_path}/map", f"images={small_street}/queries/0004.png", "figures=1",
-        f"out={tmp_path}/out", f"root={small_street}/database",
-    )  # fmt: skip
+    query = small_street / "queries/0004.png"
+    maps.open_map(folder).add(query, "there", name=f"..{query}")
+    code, [line], stderr = localized(query, "figures=1", f"out={tmp_path}/out", f"root={small_street}/database")
     assert code == 2
-    [line] = lines(stdout)
     assert (line["place"], line["figure"]) == ("there", None)
     warning, error = stderr.splitlines()
     assert warning.startswith(f"warning: {tmp_path}/out/0000_0004.png: not drawn ('..")
@@ -239,37 +251,36 @@ def test_a_map_shows_nothing_outside_of_its_folder(small_street, tmp_path, monke
     assert not (tmp_path / "out").exists()
 
 
-def test_figures_of_what_was_not_asked(folder, small_street, tmp_path, monkeypatch, capsys):
-    code, stdout, stderr = called(monkeypatch, capsys, "localize", f"map={folder}", "figures=[no.png,0003.png,10]",
-                                  f"images={small_street}/database", f"out={tmp_path}/out")  # fmt: skip
+def test_figures_of_images_that_were_not_localized(folder, small_street, tmp_path, localized):
+    figures = ("figures=[no.png,0003.png,10]", f"out={tmp_path}/out")
+    code, lines, stderr = localized(small_street / "database", *figures)
     assert code == 2
-    assert len(lines(stdout)) == 10
+    assert len(lines) == 10
     assert stderr.startswith("error: figures=[10,no.png]: expected rows")
     assert len([*(tmp_path / "out").iterdir()]) == 1
 
 
-def test_one_wrong_image_does_not_lead_off_the_route(folder, small_street, tmp_path, monkeypatch, capsys):
-    shutil.copytree(small_street / "database", tmp_path / "asked")
-    shutil.copy(tmp_path / "asked/0000.png", tmp_path / "asked/0006.png")
-    asked, names = [f"map={folder}", f"images={tmp_path}/asked"], [f"{row:04d}.png" for row in range(10)]
-    code, stdout, _ = called(monkeypatch, capsys, "localize", *asked, "route=1")
+def test_one_wrong_image_does_not_lead_off_the_route(folder, small_street, tmp_path, localized):
+    drive = shutil.copytree(small_street / "database", tmp_path / "drive")
+    shutil.copy(drive / "0000.png", drive / "0006.png")
+    code, lines, _ = localized(drive, "route=1")
     assert code == 0
-    assert [line["place"] for line in lines(stdout)] == [*names[:6], names[0], *names[7:]]
-    assert [line["route"]["place"] for line in lines(stdout)] == names
-    assert all(0 < line["route"]["p"] <= 1 for line in lines(stdout))
-    _, plain, _ = called(monkeypatch, capsys, "localize", *asked)
-    assert [line["place"] for line in lines(plain)] == [line["place"] for line in lines(stdout)]
-    assert all("route" not in line and "added" not in line for line in lines(plain))
+    assert values_of("place", lines) == [*NAMES[:6], NAMES[0], *NAMES[7:]]
+    assert [line["route"]["place"] for line in lines] == NAMES
+    assert all(0 < line["route"]["p"] <= 1 for line in lines)
+    _, plain, _ = localized(drive)
+    assert values_of("place", plain) == values_of("place", lines)
+    assert all("route" not in line and "added" not in line for line in plain)
 
 
-def test_a_route_goes_on_where_an_image_says_nothing(folder, small_street, tmp_path, monkeypatch, capsys):
-    shutil.copytree(small_street / "database", tmp_path / "asked")
-    (tmp_path / "asked/0004.png").write_text("no image")
-    Image.fromarray(np.full((20, 30, 3), 90, np.uint8)).save(tmp_path / "asked/0006.png")
-    code, stdout, _ = called(monkeypatch, capsys, "localize", f"map={folder}", f"images={tmp_path}/asked", "route=1")
+def test_a_route_goes_on_where_an_image_says_nothing(folder, small_street, tmp_path, localized):
+    drive = shutil.copytree(small_street / "database", tmp_path / "drive")
+    (drive / "0004.png").write_text("no image")
+    write_gray(drive / "0006.png")
+    code, lines, _ = localized(drive, "route=1")
     assert code == 2
-    assert "error" in lines(stdout)[4]
-    assert [line["route"]["place"] for line in lines(stdout)] == [f"{row:04d}.png" for row in range(10)]
+    assert "error" in lines[4]
+    assert [line["route"]["place"] for line in lines] == NAMES
 
 
 @pytest.fixture
@@ -281,118 +292,110 @@ def twice(small_street, tmp_path):
     return tmp_path / "drive"
 
 
-def without_seconds(found):
-    return [{name: value for name, value in line.items() if name not in ("seconds", "added")} for line in found]
+def without_seconds(lines):
+    return [{name: value for name, value in line.items() if name not in ("seconds", "added")} for line in lines]
 
 
-def test_a_drive_finds_where_it_was_before(twice, small_street, tmp_path, monkeypatch, capsys):
+def test_a_drive_finds_where_it_was_before(twice, small_street, tmp_path, built, localized):
     start = tmp_path / "start"
     (start / "database").mkdir(parents=True)
     shutil.copytree(twice, start / "queries")
     for number in (8, 9):  # which the drive does not pass
         shutil.copy(small_street / f"database/{number:04d}.png", start / "database")
-    assert built(tmp_path / "map", start, monkeypatch, capsys)[0] == 0
-    Image.fromarray(np.full((240, 320, 3), 90, np.uint8)).save(twice / "16.png")  # which has no features
-    drive = [f"map={tmp_path}/map", f"images={twice}", "add=true", "recent=3", "route=1"]
-    code, stdout, stderr = called(monkeypatch, capsys, "localize", *drive)
+    assert built(tmp_path / "map", start)[0] == 0
+    write_gray(twice / "16.png", (240, 320))
+    settings = ("add=true", "recent=3", "route=1")
+    code, first, stderr = localized(twice, *settings)
     assert (code, stderr) == (0, "")
-    first, names = lines(stdout), [f"{twice}/{number:02d}.png" for number in range(17)]
-    assert [line["image"] for line in first] == names
-    assert all(line["added"] for line in first)
-    assert [line["place"] for line in first[8:]] == [*names[:8], None]  # the second time, where it was the first
+    names = [f"{twice}/{number:02d}.png" for number in range(17)]
+    assert values_of("image", first) == names
+    assert all(values_of("added", first))
+    assert values_of("place", first)[8:] == [*names[:8], None]  # the second time, where it was the first
     for number, line in enumerate(first):  # nothing of the newest three, nor of itself
-        assert all(one["row"] < 2 + number - 3 for one in line["alternatives"])
+        assert all(alternative["row"] < 2 + number - 3 for alternative in line["alternatives"])
     assert maps.open_map(tmp_path / "map").names[2:] == names
-    _, stdout, _ = called(monkeypatch, capsys, "localize", *drive)
-    assert without_seconds(lines(stdout)) == without_seconds(first)
-    assert not any(line["added"] for line in lines(stdout))
+    _, again, _ = localized(twice, *settings)
+    assert without_seconds(again) == without_seconds(first)
+    assert not any(values_of("added", again))
     assert len(maps.open_map(tmp_path / "map")) == 19
 
 
-def test_a_drive_that_was_interrupted_goes_on(twice, folder, monkeypatch, capsys):
-    shutil.copytree(folder, folder.parent / "other")
-    drive, first = [f"images={twice}", "add=true", "recent=2"], [f"images=[{twice}/00.png,{twice}/01.png]"]
-    _, whole, _ = called(monkeypatch, capsys, "localize", f"map={folder}", *drive)
-    called(monkeypatch, capsys, "localize", f"map={folder.parent}/other", *first, "add=true", "recent=2")
-    _, again, _ = called(monkeypatch, capsys, "localize", f"map={folder.parent}/other", *drive)
-    assert without_seconds(lines(again)) == without_seconds(lines(whole))
-    assert [line["added"] for line in lines(again)] == [False, False, *[True] * 14]
+def test_a_drive_that_was_interrupted_goes_on(twice, folder, localized):
+    other, settings = shutil.copytree(folder, folder.parent / "other"), ("add=true", "recent=2")
+    _, uninterrupted, _ = localized(twice, *settings)
+    localized(f"[{twice}/00.png,{twice}/01.png]", *settings, folder=other)
+    _, resumed, _ = localized(twice, *settings, folder=other)
+    assert without_seconds(resumed) == without_seconds(uninterrupted)
+    assert values_of("added", resumed) == [False, False, *[True] * 14]
 
 
 def test_names_do_not_depend_on_the_spelling_of_a_path(small_street, video, tmp_path, monkeypatch):
     (tmp_path / "link").symlink_to(small_street)
     monkeypatch.chdir(small_street)
-    expected = [str(small_street / f"queries/{row:04d}.png") for row in range(10)]
+    expected = [str(small_street / "queries" / name) for name in NAMES]
     for folder in ("queries", small_street / "queries", "./database/../queries/", tmp_path / "link/queries"):
-        found = query_images.images({"images": str(folder), "watch": False})
-        assert [name for name, _ in found] == expected
+        images = query_images.images({"images": str(folder), "watch": False})
+        assert [name for name, _ in images] == expected
     monkeypatch.chdir(tmp_path)
     name, _ = next(query_images.images({"images": video.name, "watch": False, "every": 1}))
     assert name == f"{video}:0"
 
 
-def test_a_drive_is_not_added_again_under_another_spelling_of_its_path(folder, small_street, monkeypatch, capsys):
+def test_a_drive_is_not_added_again_under_another_spelling_of_its_path(folder, small_street, monkeypatch, localized):
     monkeypatch.chdir(small_street)
     for root, is_new in ((small_street, True), (".", False)):
-        images = f"images=[{root}/queries/0000.png,{root}/queries/0001.png]"
-        code, stdout, _ = called(monkeypatch, capsys, "localize", f"map={folder}", images, "add=true", "recent=2")
+        code, lines, _ = localized(f"[{root}/queries/0000.png,{root}/queries/0001.png]", "add=true", "recent=2")
         assert code == 0
-        assert [line["added"] for line in lines(stdout)] == [is_new] * 2
-        assert not any(line["place"] == line["image"] for line in lines(stdout))
+        assert values_of("added", lines) == [is_new] * 2
+        assert not any(line["place"] == line["image"] for line in lines)
 
 
 def test_a_file_that_vanishes_while_its_folder_is_listed_does_not_end_the_watch(tmp_path, monkeypatch):
     (tmp_path / "a.png").symlink_to("gone")
     (tmp_path / "b.png").write_bytes(b"image")
     (tmp_path / "c.png").mkdir()
-    monkeypatch.setattr(Path, "is_file", lambda _: True)  # as it was when it was asked
+    monkeypatch.setattr(Path, "is_file", lambda _: True)  # as it was when it was listed
     monkeypatch.setattr(query_images, "POLL", 0)
     name, path = next(query_images.images({"images": str(tmp_path), "watch": True}))
     assert (name, path) == (str(tmp_path / "b.png"), tmp_path / "b.png")
 
 
-def test_two_do_not_add_their_drives_at_the_same_time(twice, folder, monkeypatch, capsys):
+def test_two_do_not_add_their_drives_at_the_same_time(twice, folder, localized):
     with lock_map(folder):
-        code, stdout, stderr = called(monkeypatch, capsys, "localize", f"map={folder}", f"images={twice}", "add=true")
-    assert (code, stdout) == (2, "")
+        code, lines, stderr = localized(twice, "add=true")
+    assert (code, lines) == (2, [])
     assert "in use by process" in stderr
     assert stderr.count("\n") == 1
 
 
-def test_confidences_of_other_settings_are_told(folder, small_street, tmp_path, monkeypatch, capsys):
-    """Those of an evaluation with the map's settings are not."""
-    own = json.loads((folder / "settings.json").read_text())
+def test_confidences_of_other_settings_are_named(folder, small_street, tmp_path, localized):
+    """An evaluation with the map's settings gives no warning."""
+    settings = json.loads((folder / "settings.json").read_text())
     sure = Confidence(("margin", "height"), 1, (0.0, 0.0), (1.0, 1.0), (1.0, 1.0), 0.0)
-    for candidates in (own["candidates"], own["candidates"] + 1):
-        same = {name: own[name] for name in ("features", "retrieval", "matching")}
-        made = {"settings": same | {"scorer": build.describe_settings(own["scorer"])}}
-        write_confidences(tmp_path / "c.json", {"histogram": sure}, made | {"candidates": candidates})
-        code, stdout, stderr = called(
-            monkeypatch, capsys, "localize", f"map={folder}", f"images={small_street}/database/0001.png",
-            f"confidence={tmp_path}/c.json",
-        )  # fmt: skip
+    for candidates in (settings["candidates"], settings["candidates"] + 1):
+        same = {name: settings[name] for name in ("features", "retrieval", "matching")}
+        origin = {"settings": same | {"scorer": build.describe_settings(settings["scorer"])}, "candidates": candidates}
+        write_confidences(tmp_path / "c.json", {"histogram": sure}, origin)
+        code, [line], stderr = localized(small_street / "database/0001.png", f"confidence={tmp_path}/c.json")
         assert code == 0
-        assert 0 <= json.loads(stdout)["p_right"] <= 1
-        told = "other settings of candidates" in stderr
-        assert told == (candidates != own["candidates"])
+        assert 0 <= line["p_right"] <= 1
+        assert ("other settings of candidates" in stderr) == (candidates != settings["candidates"])
 
 
 @pytest.mark.slow
-def test_a_folder_is_watched(folder, small_street, tmp_path):
-    asked = tmp_path / "asked"
-    asked.mkdir()
-    command = [sys.executable, "-m", "experiments.localize", f"map={folder}", f"images={asked}", "watch=true"]
+def test_new_images_of_a_folder_are_localized(folder, small_street, queries):
+    command = [sys.executable, "-m", "experiments.localize", f"map={folder}", f"images={queries}", "watch=true"]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
-        assert running.stderr.readline() == f"watching {asked}; end with Ctrl-C\n"
+        assert running.stderr.readline() == f"watching {queries}; end with Ctrl-C\n"
         for row in (3, 5):
             content = (small_street / f"database/{row:04d}.png").read_bytes()
-            with (asked / f"{row}.png").open("wb") as file:
+            with (queries / f"{row}.png").open("wb") as file:
                 file.write(content[:2000])
                 file.flush()
                 time.sleep(0.05)
                 file.write(content[2000:])
             assert json.loads(running.stdout.readline())["place"] == f"{row:04d}.png"
-        slow = asked / "slow.png"  # by a writer that rests: told, and asked again when it is whole
+        slow = queries / "slow.png"  # by a writer that rests: an error, and localized when it is whole
         slow.write_bytes(content[:2000])
         assert "slow.png" in json.loads(running.stdout.readline())["error"]
         slow.write_bytes(content)

@@ -12,10 +12,10 @@ from mfvpr.datasets import image_folder
 from mfvpr.datasets.images import resize
 from mfvpr.features import Aggregated, Description, VladFitting
 from mfvpr.storage import FeatureCache, feature_cache, vectors
-from mfvpr.storage.features import forecast_bytes, open_store
+from mfvpr.storage.features import forecast_bytes
 from mfvpr.utils import InputError
 from tests.storage.extractors import SIFT, Counted, Mean, TwoScales, first_features
-from tests.storage.synthetic_features import assert_same, features_of
+from tests.storage.synthetic_features import assert_same
 
 pytestmark = pytest.mark.thorough
 
@@ -238,13 +238,3 @@ def test_the_papers_databases_take_about_half(images, features, paper, readme):
     ours = (forecast_bytes(images, features, 512) + vectors.forecast_bytes(images, 4096)) / 2**20
     assert ours <= 0.55 * paper
     assert round(ours) == readme
-
-
-def test_a_forecast_is_not_exceeded(folder, tmp_path):
-    """Random descriptors, which compress worst."""
-    with open_store(tmp_path / "s", {}, num_images=len(folder)) as store:
-        for row in range(len(folder)):
-            store.write({row: features_of(row, 700, 512)})
-        forecast = forecast_bytes(len(folder), 700, 512)
-        assert 0.8 * forecast < store.size_bytes <= forecast + 100_000  # folders and what describes the arrays
-        assert store.size_bytes <= 0.55 * 2064 * 700 * len(folder)

@@ -59,7 +59,8 @@ def test_size_on_disk(tmp_path):
         size = store.size_bytes
     apparent = sum(path.stat().st_size for path in (tmp_path / "s").rglob("*") if path.is_file())
     assert apparent <= size < 0.52 * 2064 * sum(counts)
-    assert 0.95 * size < forecast_bytes(len(counts), np.mean(counts), 512) < 1.2 * size
+    forecast = forecast_bytes(len(counts), np.mean(counts), 512)
+    assert 0.83 * forecast < size <= forecast + 100_000  # random descriptors compress worst
 
 
 def test_a_global_descriptor_takes_the_space_of_one(tmp_path):

@@ -83,16 +83,6 @@ def test_another_shortlist_is_refused_before_anything_is_written(drawn, candidat
         np.testing.assert_array_equal(stages.stored_matches(store)[1].indices, candidates.indices)
 
 
-def test_matching_without_a_store_is_the_same(drawn, candidates, opened):
-    """To the last bit, the ratio too."""
-    plain = stages.match(drawn, drawn, candidates)
-    assert plain.matches[0].ratio is not None
-    for _ in range(2):
-        with opened() as store:
-            stored = stages.match(drawn, drawn, candidates, store=store)
-        assert_same(stored, plain)
-
-
 # The programs' stores
 
 
@@ -105,11 +95,9 @@ def settings_of(folder, *changes):
     )  # fmt: skip
 
 
-def test_matches_belong_to_images_whatever_their_data_set_is_called(small_street, tmp_path):
-    paths = {
-        matches_path(settings_of(small_street, f"store={tmp_path}", f"dataset.name={name}"))[0]
-        for name in ("one", "two")
-    }
+@pytest.mark.parametrize("changes", [("dataset.name=one", "dataset.name=two"), ("memory=1", "devices=all")])
+def test_matches_do_not_depend_on_names_and_devices(small_street, tmp_path, changes):
+    paths = {matches_path(settings_of(small_street, f"store={tmp_path}", change))[0] for change in changes}
     assert len(paths) == 1
 
 
@@ -125,11 +113,3 @@ def test_matches_of_other_settings_are_kept_apart(small_street, tmp_path, change
         shutil.copytree(small_street / "database", street / side)
     plain, other = (matches_path(settings_of(street, f"store={tmp_path}/s", *more))[0] for more in ((), (change,)))
     assert plain != other
-
-
-def test_matches_do_not_depend_on_how_they_are_computed(small_street, tmp_path):
-    paths = {
-        matches_path(settings_of(small_street, f"store={tmp_path}", change))[0]
-        for change in ("memory=1", "devices=all")
-    }
-    assert len(paths) == 1
