@@ -11,9 +11,9 @@ from mfvpr.utils import InputError
 
 
 def answer(scores, p=None):
-    """Of scores by row."""
-    found = tuple(Alternative(row, str(row), row, score) for row, score in scores.items())
-    return Answer(None, found, 0.0, p, None, None, None)
+    """An answer with scores by row."""
+    alternatives = tuple(Alternative(row, str(row), row, score) for row, score in scores.items())
+    return Answer(None, alternatives, 0.0, p, None, None, None)
 
 
 def sharp(row, p=1.0):
@@ -35,7 +35,7 @@ def stepped_by_loops(belief, there, advance, spread, kidnapped, scores, p, sharp
                 before[row + k] += belief[row] * weight / sum(moves.values())
     total, anywhere = sum(before), [is_there / len(rows) for is_there in there]
     moved = [value / total for value in before] if total else anywhere
-    before = [(1 - kidnapped) * one + kidnapped * other for one, other in zip(moved, anywhere, strict=True)]
+    before = [(1 - kidnapped) * stay + kidnapped * jump for stay, jump in zip(moved, anywhere, strict=True)]
     mean = sum(scores.values()) / len(scores)
     above = {row: max(0.0, score - mean) ** sharpness for row, score in scores.items()}
     after = []
@@ -47,7 +47,7 @@ def stepped_by_loops(belief, there, advance, spread, kidnapped, scores, p, sharp
 
 def test_it_is_the_filter_that_its_first_lines_state():
     rng, drive = np.random.default_rng(0), Drive(1.3, 0.8, 0.05, 0.4, 3.0)
-    there, found = np.ones(40, bool), Route(drive)
+    there, drive_route = np.ones(40, bool), Route(drive)
     there[[5, 17]] = False
     belief = [0.0] * 40
     for turn in range(30):
@@ -55,10 +55,10 @@ def test_it_is_the_filter_that_its_first_lines_state():
         scores = dict(zip(rows, rng.exponential(size=8).tolist(), strict=True))
         p = None if turn % 3 else float(rng.uniform())
         belief = stepped_by_loops(belief, there, 1.3, 0.8, 0.05, scores, 0.4 if p is None else p, 3.0)
-        row, near = found(answer(scores, p), there)
+        row, near = drive_route(answer(scores, p), there)
         assert row == np.argmax(belief)
         assert near == pytest.approx(sum(belief[max(0, row - 2) : row + 3]), rel=1e-4)
-        np.testing.assert_allclose(found.belief[:40], belief, rtol=1e-3, atol=1e-7)
+        np.testing.assert_allclose(drive_route.belief[:40], belief, rtol=1e-3, atol=1e-7)
 
 
 def test_without_motion_and_news_the_belief_stays():
@@ -70,30 +70,30 @@ def test_without_motion_and_news_the_belief_stays():
 
 
 @pytest.mark.parametrize("advance", [3, -2, 0])
-def test_a_sure_robot_moves_as_it_is_told(advance):
-    there, found = np.ones(60, bool), Route(Drive(advance, 0.05, 0.0))
-    assert found(sharp(30), there) == (30, 1)
+def test_a_sure_robot_moves_as_its_drive_says(advance):
+    there, drive_route = np.ones(60, bool), Route(Drive(advance, 0.05, 0.0))
+    assert drive_route(sharp(30), there) == (30, 1)
     for turn in range(1, 6):
-        assert found(None, there) == (30 + turn * advance, 1)
+        assert drive_route(None, there) == (30 + turn * advance, 1)
 
 
 def test_half_a_row_is_half_a_row():
     """The mean of the belief moves by the mean of the motion."""
-    there, found = np.ones(100, bool), Route(Drive(0.5, 1.0, 0.0))
-    found(sharp(20), there)
+    there, drive_route = np.ones(100, bool), Route(Drive(0.5, 1.0, 0.0))
+    drive_route(sharp(20), there)
     for _ in range(20):
-        found(None, there)
-    np.testing.assert_allclose(found.belief[:100] @ np.arange(100), 30, atol=0.05)
-    np.testing.assert_allclose(found.belief[:100] @ (np.arange(100) - 30) ** 2, 20, rtol=0.05)  # variances add
+        drive_route(None, there)
+    np.testing.assert_allclose(drive_route.belief[:100] @ np.arange(100), 30, atol=0.05)
+    np.testing.assert_allclose(drive_route.belief[:100] @ (np.arange(100) - 30) ** 2, 20, rtol=0.05)  # variances add
 
 
 def test_it_finds_a_robot_that_was_carried_away():
-    there, found = np.ones(200, bool), Route(Drive())
+    there, drive_route = np.ones(200, bool), Route(Drive())
     for turn in range(20):
-        assert found(sharp(turn, 0.5), there).row == turn
-    assert found(sharp(150, 0.5), there).row == 20  # one image may err
+        assert drive_route(sharp(turn, 0.5), there).row == turn
+    assert drive_route(sharp(150, 0.5), there).row == 20  # one image may err
     for turn in range(1, 4):
-        located = found(sharp(150 + turn, 0.5), there)
+        located = drive_route(sharp(150 + turn, 0.5), there)
     assert located.row == 153
     assert located.p > 0.9
     stuck = Route(Drive(kidnapped=0.0))
@@ -103,50 +103,50 @@ def test_it_finds_a_robot_that_was_carried_away():
 
 
 def test_a_sum_of_one_and_never_nan():
-    there, found = np.ones(30, bool), Route(Drive(1, 0.1, 0.0))
+    there, drive_route = np.ones(30, bool), Route(Drive(1, 0.1, 0.0))
     for says in (sharp(3), sharp(20), None, answer({4: math.nan}, 1.0), answer({4: math.inf, 5: 1.0}, 1.0), sharp(0)):
-        located = found(says, there)
-        assert found.belief.sum() == pytest.approx(1, abs=1e-5)
+        located = drive_route(says, there)
+        assert drive_route.belief.sum() == pytest.approx(1, abs=1e-5)
         assert 0 <= located.p <= 1
     for _ in range(200):  # beyond the end of the map, where nothing is left
-        located = found(None, there)
-        assert found.belief.sum() == pytest.approx(1, abs=1e-5)
+        located = drive_route(None, there)
+        assert drive_route.belief.sum() == pytest.approx(1, abs=1e-5)
 
 
 def test_what_image_and_motion_exclude_is_left_to_the_motion():
-    there, found = np.ones(30, bool), Route(Drive(1, 0.1, 0.0))
-    found(sharp(3), there)
-    assert found(sharp(20), there) == (4, 1)
+    there, drive_route = np.ones(30, bool), Route(Drive(1, 0.1, 0.0))
+    drive_route(sharp(3), there)
+    assert drive_route(sharp(20), there) == (4, 1)
 
 
 def test_nothing_is_known_of_images_that_come():
     rng, there = np.random.default_rng(0), np.ones(50, bool)
     answers = [answer(dict(zip(rng.choice(50, 5).tolist(), rng.exponential(size=5).tolist(), strict=True)))
                for _ in range(12)]  # fmt: skip
-    whole, part = Route(Drive()), Route(Drive())
-    located = [whole(one, there) for one in answers]
-    assert [part(one, there) for one in answers[:5]] == located[:5]
+    long, short = Route(Drive()), Route(Drive())
+    located = [long(each, there) for each in answers]
+    assert [short(each, there) for each in answers[:5]] == located[:5]
 
 
 def test_the_map_may_grow_and_costs_few_programs(compilations):
-    found = Route(Drive())
-    assert found(sharp(0), np.zeros(0, bool)) is None
-    assert found(sharp(0), np.zeros(4, bool)) is None
-    assert found(sharp(2), np.ones(3, bool)).row == 2
+    drive_route = Route(Drive())
+    assert drive_route(sharp(0), np.zeros(0, bool)) is None
+    assert drive_route(sharp(0), np.zeros(4, bool)) is None
+    assert drive_route(sharp(2), np.ones(3, bool)).row == 2
     compilations.reset()
     for rows in range(4, 1000, 50):
-        assert found(sharp(rows - 1), np.ones(rows, bool)).row < rows
+        assert drive_route(sharp(rows - 1), np.ones(rows, bool)).row < rows
     assert compilations.count == 0
-    assert found(sharp(1500), np.ones(1600, bool)).row == 1500
-    assert len(found.belief) == 2 * route.FIRST_ROWS
+    assert drive_route(sharp(1500), np.ones(1600, bool)).row == 1500
+    assert len(drive_route.belief) == 2 * route.FIRST_ROWS
 
 
 def test_rows_that_are_not_there_are_no_place():
-    there, found = np.ones(20, bool), Route(Drive(1, 0.5, 0.01))
+    there, drive_route = np.ones(20, bool), Route(Drive(1, 0.5, 0.01))
     there[11] = False
-    found(sharp(10), there)
-    assert found(None, there).row != 11
-    assert found.belief[11] == 0
+    drive_route(sharp(10), there)
+    assert drive_route(None, there).row != 11
+    assert drive_route.belief[11] == 0
 
 
 @pytest.mark.parametrize(("scores", "expected"), [
@@ -159,11 +159,11 @@ def test_shares(scores, expected):
 
 def test_motions_are_probabilities():
     for advance, spread in ((0, 1), (1, 0.01), (0.5, 0.01), (-3.4, 2), (1000, 1)):
-        found = motion(advance, spread)
-        assert len(found) % 2 == 1
-        assert found.sum() == pytest.approx(1, abs=1e-5)
-        steps = np.arange(len(found)) - len(found) // 2
-        assert found @ steps == pytest.approx(advance, abs=0.01 + (0.5 if spread < 0.1 else 0) * (advance % 1 > 0))
+        weights = motion(advance, spread)
+        assert len(weights) % 2 == 1
+        assert weights.sum() == pytest.approx(1, abs=1e-5)
+        steps = np.arange(len(weights)) - len(weights) // 2
+        assert weights @ steps == pytest.approx(advance, abs=0.01 + (0.5 if spread < 0.1 else 0) * (advance % 1 > 0))
 
 
 @pytest.mark.parametrize("wrong", [
