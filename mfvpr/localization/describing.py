@@ -55,11 +55,7 @@ class Describing:
     def folder(
         self, images: ImageFolder, rows: Sequence[int], track: Track = no_progress
     ) -> Iterator[dict[int, Described]]:
-        """Describe some images of a folder: batches of descriptions by row.
-
-        Raises:
-            InputError: as `image`.
-        """
+        """Describe some images of a folder: batches of descriptions by row; raises as `image`."""
         for batch in _batches(images, self.extractor, rows, track):
             features = [round_as_stored(description.features) for description in batch.values()]
             descriptions = [*batch.values()]

@@ -35,10 +35,8 @@ class MapStrength:
     def __call__(self, end: int) -> float:
         """Mean strength of rows 0 to `end` - 1, or 0 if there are none.
 
-        The sampled rows depend on `end` alone. A growing map costs one more read for every few images.
-
-        Raises:
-            InputError: a sampled row is damaged.
+        The sampled rows depend on `end` alone. A growing map costs one more read for every few images. Raises
+        `InputError` if a sampled row is damaged.
         """
         step = 1 << max(0, (end // _SAMPLE).bit_length() - 1)
         sample = range(0, end, step)

@@ -85,12 +85,8 @@ class MapImages:
 
     @property
     def describing(self) -> Describing:
-        """The extractor and the describer of the images.
-
-        Raises:
-            InputError: the map has no vocabulary yet.
-        """
-        return self._require_described().describing
+        """The extractor and the describer of the images; raises `InputError` if the map has no vocabulary yet."""
+        return self._open_parts().describing
 
     @property
     @exclusive
@@ -236,7 +232,7 @@ class MapImages:
     @contextmanager
     def _adding(self) -> Iterator[tuple[DescribedMap, Callable[[Sequence[MapImage]], None]]]:
         """Lock the rows, and read those that other processes added; yield a function that adds images as well."""
-        described = self._require_described()
+        described = self._open_parts()
         self.refresh()  # first: nothing of this map goes into one that replaced it
         write_settings(self.folder, self._settings)
         with described.rows.adding() as add:
@@ -251,7 +247,7 @@ class MapImages:
         resident = Resident(rows, typical=typical, **self._resident_options)
         self._described = DescribedMap(describing, rows, resident, MapStrength(rows))
 
-    def _require_described(self) -> DescribedMap:
+    def _open_parts(self) -> DescribedMap:
         if self._described is None:
             raise InputError(f"{self.folder}: this map has no vocabulary yet; learn it from some images first "
                              "(`learn`)")  # fmt: skip

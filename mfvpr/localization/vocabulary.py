@@ -36,11 +36,7 @@ class VocabularyFile:
         self._stamp = None  # of the file that was read
 
     def find(self) -> Vlad | None:
-        """Read the vocabulary; None if it is not learned yet.
-
-        Raises:
-            InputError: the map has rows but no vocabulary, or the vocabulary has other settings or is damaged.
-        """
+        """Read the vocabulary; None if it is not learned yet. Raises `InputError` if rows lack it, and as `read`."""
         expects_vocabulary = has_rows(self._folder)  # looked at first: another process may be making the map
         if self._path.exists():
             return self.read()

@@ -81,11 +81,7 @@ class ExtractionState:
         return self.missing(rows)
 
     def read_bad(self) -> None:
-        """Add the bad images of all shards, which stay bad: all shards evaluate the same images.
-
-        Raises:
-            InputError: a file is damaged.
-        """
+        """Add the bad images of all shards, which stay bad: all shards evaluate the same images."""
         store = self.sinks[0].store
         if store is None or store.shard is None:
             return

@@ -49,8 +49,7 @@ MapImage = tuple[Features, Entry]
 def lock_map(folder: Path) -> Iterator[None]:
     """Lock a map, which may be missing: no other process learns its vocabulary or adds images.
 
-    Raises:
-        InputError: another process has the lock, or the folder cannot be written.
+    Raises `InputError` if another process has the lock, or the folder cannot be written.
     """
     with disk_errors_as_input_errors(folder, MAP.content):
         folder.mkdir(parents=True, exist_ok=True)
@@ -146,8 +145,8 @@ class _Segment:
             with disk_errors_as_input_errors(self.folder, MAP.content), (self.folder / _TOKENS).open("r+b") as file:
                 file.truncate(rows.stop * _TOKEN.itemsize - 1)
                 os.fsync(file.fileno())  # a row must not be on disk before
-                self.features.write_packed(features)
-                self.entries.write_packed(entries)
+                self.features.write_parts(features)
+                self.entries.write_parts(entries)
                 file.seek(first * _TOKEN.itemsize)
                 file.write(new.astype(_TOKEN).tobytes())
                 file.flush()
@@ -197,8 +196,7 @@ class MapRows:
     def new(self) -> Iterator[tuple[int, Entry]]:
         """(row, entry) of all rows since the last call, in their order.
 
-        Raises:
-            InputError: the map has another recipe, is damaged, or was replaced.
+        Raises `InputError` if the map has another recipe, is damaged, or was replaced.
         """
         if self._segments:
             self._open(0)  # all maps have this segment: it shows whether the map was replaced

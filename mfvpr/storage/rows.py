@@ -144,10 +144,10 @@ class RowStore(Generic[Item]):
             ValueError: a row is done or does not exist, an item cannot be stored, or the store is not entered.
         """
         if items:
-            self.write_packed(self.pack(items))
+            self.write_parts(self.pack(items))
 
     def pack(self, items: Mapping[int, Item]) -> dict[int, Parts]:
-        """Check a batch of rows and pack it for `write_packed`, without a write; raises as `write`."""
+        """Check a batch of rows and pack it for `write_parts`, without a write; raises as `write`."""
         if refused := [row for row in items if not 0 <= row < len(self.counts) or self.counts[row] >= 0]:
             raise ValueError(f"{self.folder}: row {refused[0]} is done or does not exist")
         if not self.is_writable:
@@ -161,7 +161,7 @@ class RowStore(Generic[Item]):
         self._check_layouts(rows)
         return rows
 
-    def write_packed(self, rows: Mapping[int, Parts]) -> None:
+    def write_parts(self, rows: Mapping[int, Parts]) -> None:
         """Store the result of `pack`, as `write` does."""
         sizes = {row: row_bytes(sum(part.nbytes for part in parts.values()), len(parts)) for row, parts in rows.items()}
         with disk_errors_as_input_errors(

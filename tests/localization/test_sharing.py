@@ -145,7 +145,7 @@ class Killed(BaseException):
 
 def add_killed(monkeypatch, part, folder, images):
     """Add an image, and end where one of the two stores of the segment is written."""
-    write = RowStore.write_packed
+    write = RowStore.write_parts
 
     def end(store, rows):
         if store.folder.name == part:
@@ -153,7 +153,7 @@ def add_killed(monkeypatch, part, folder, images):
         write(store, rows)
 
     with monkeypatch.context() as patch:
-        patch.setattr(RowStore, "write_packed", end)
+        patch.setattr(RowStore, "write_parts", end)
         with pytest.raises(Killed):
             opened(folder).add(images.paths[6], "lost", name="lost")
 
@@ -234,7 +234,7 @@ def test_tokens_that_were_cut_are_missed(images, folder, size):
 
 def test_a_map_can_be_opened_whenever_another_process_is_adding(images, folder, monkeypatch):
     """Between any two of its steps; and after it was killed there."""
-    lengths, write, sync = [], RowStore.write_packed, os.fsync
+    lengths, write, sync = [], RowStore.write_parts, os.fsync
 
     def look(call):
         def step(*arguments):
@@ -245,7 +245,7 @@ def test_a_map_can_be_opened_whenever_another_process_is_adding(images, folder, 
         return step
 
     with monkeypatch.context() as patch:
-        patch.setattr(RowStore, "write_packed", look(write))
+        patch.setattr(RowStore, "write_parts", look(write))
         patch.setattr(os, "fsync", look(sync))
         opened(folder).build(first(images, 8))
     assert set(lengths) == {6, 8}
