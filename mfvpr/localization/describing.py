@@ -76,15 +76,15 @@ class Describing:
     @property
     def _extractors(self) -> list[Extractor]:
         """The extractor, and the describer if it is another extractor."""
-        describer = self.describer
-        is_another = isinstance(describer, Extractor) and describer is not self.extractor
-        return [self.extractor, describer] if is_another else [self.extractor]
+        if isinstance(describer := self.describer, Extractor) and describer is not self.extractor:
+            return [self.extractor, describer]
+        return [self.extractor]
 
     def _vectors(self, features: Sequence[Features], descriptions: Sequence[Description]) -> Sequence[np.ndarray]:
         """Global descriptors of images: aggregated features, or those in the descriptions."""
         if isinstance(describer := self.describer, Extractor):
             return [_flat(description) for description in descriptions]
-        return describer(features)
+        return [*describer(features)]
 
 
 def is_file(image: Image) -> TypeGuard[Path | str]:

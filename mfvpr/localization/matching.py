@@ -59,8 +59,8 @@ def shift_of(scorer: Scorer, pair: Matches) -> tuple[Point | None, tuple[Point, 
     """`shift`, `shift_interval` and `scale` of an `Answer`, from the matches `[1, K, ...]` of a pair."""
     if not isinstance(scorer, HistogramOfShifts):
         return None, None, None
-    scorer = with_capacity(scorer, pair.image_size0, pair.image_size1, multiple=BIN_STEP)
-    shift, interval, scale = (np.asarray(values)[0] for values in pair_shifts(scorer, pair))
+    histogram = with_capacity(scorer, pair.image_size0, pair.image_size1, multiple=BIN_STEP)
+    shift, interval, scale = (np.asarray(values)[0] for values in pair_shifts(histogram, pair))
     low, high = _point(interval[0]), _point(interval[1])
     return _point(shift), (low, high) if low and high else None, float(scale) if np.isfinite(scale) else None
 
