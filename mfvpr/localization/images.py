@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+from jaxtyping import Bool
 
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.features.extractor import Aggregation, Extractor
@@ -96,8 +97,8 @@ class MapImages:
 
     @property
     @exclusive
-    def there(self) -> np.ndarray:
-        """`[rows]` bool, which rows have an image: a process that was killed may have left some out."""
+    def there(self) -> Bool[np.ndarray, " rows"]:
+        """Which rows have an image: a process that was killed may have left some out."""
         has_image = np.zeros(self._vectors.total, bool)
         has_image[[*self._entries]] = True
         return has_image

@@ -4,6 +4,7 @@ from functools import partial
 
 import jax
 import numpy as np
+from jaxtyping import Float, Int
 
 from mfvpr.evaluation.stages import pair_shifts
 from mfvpr.features.feature_set import stack_features
@@ -22,9 +23,9 @@ _AT_ONCE = 25  # pairs; with ten an answer takes 8 ms longer
 
 
 def match_and_score(
-    query: Features, database: Features, slots: np.ndarray, number: int, matcher: Matcher, scorer: Scorer
-) -> tuple[Matches, np.ndarray]:
-    """Matches `[C, K, ...]` and scores `[n]`, NumPy; a pair's result does not depend on the other pairs.
+    query: Features, database: Features, slots: Int[np.ndarray, " n"], number: int, matcher: Matcher, scorer: Scorer
+) -> tuple[Matches, Float[np.ndarray, " n"]]:
+    """Matches `[C, K, ...]` and scores, NumPy; a pair's result does not depend on the other pairs.
 
     A pair's product keeps all cores busy, but the steps after it keep one busy. So each core takes a few pairs at a
     time. Their number is the same for any number of cores, since the last bits of scores depend on it. A device with
@@ -33,7 +34,7 @@ def match_and_score(
     Args:
         query: unpadded.
         database: `[S, N, ...]` on the device.
-        slots: `[n]` of the candidates.
+        slots: of the candidates.
         number: C; beyond n there are no matches.
         matcher: of one pair.
         scorer: of one pair's matches.

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import jax
 import numpy as np
+from jaxtyping import Int
 
 from mfvpr.features.feature_set import (
     STEP,
@@ -44,8 +45,8 @@ class Resident:
         self._recent, self.capacity = Recent(0), 0
         self._arrays: Features | None = None
 
-    def hold(self, rows: Sequence[int], query: Features, total: int) -> tuple[Features, np.ndarray]:
-        """Put rows on the device; return all slots `[S, N, ...]` and the slots of the rows `[n]`.
+    def hold(self, rows: Sequence[int], query: Features, total: int) -> tuple[Features, Int[np.ndarray, " rows"]]:
+        """Put rows on the device; return all slots `[S, N, ...]` and the slots of the rows.
 
         Both are valid until the next call.
 

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 
 from mfvpr.localization.answers import Answer
 from mfvpr.types import Array
@@ -75,12 +76,12 @@ class Route:
         self._drive, self.belief = drive, np.zeros(FIRST_ROWS, np.float32)
         self._motion = motion(drive.advance, drive.spread)
 
-    def __call__(self, answer: Answer | None, there: np.ndarray) -> Located | None:
+    def __call__(self, answer: Answer | None, there: Bool[np.ndarray, " rows"]) -> Located | None:
         """Update the belief with the next image; return the position, or None if there is no row.
 
         Args:
             answer: of the next image; None = the image gives no evidence, but the robot has moved.
-            there: `[R]` bool, rows where the robot may be.
+            there: rows where the robot may be.
         """
         if not there.any():
             return None
@@ -103,8 +104,8 @@ class Route:
         return Located(row, min(1.0, float(self.belief[max(0, row - NEAR) : row + NEAR + 1].sum())))
 
 
-def motion(advance: float, spread: float) -> np.ndarray:
-    """`[2 R + 1]` probabilities of a motion by -R .. R rows, a Gaussian up to four of its standard deviations."""
+def motion(advance: float, spread: float) -> Float[np.ndarray, " steps"]:
+    """Probabilities of a motion by -R .. R rows, a Gaussian up to four of its standard deviations."""
     reach = math.ceil(abs(advance) + _REACH * spread)
     steps = np.arange(-reach, reach + 1)
     exponents = -((steps - advance) ** 2) / (2 * spread**2)
@@ -112,8 +113,8 @@ def motion(advance: float, spread: float) -> np.ndarray:
     return (weights / weights.sum()).astype(np.float32)
 
 
-def shares(scores: np.ndarray, sharpness: float) -> np.ndarray:
-    """Shares `[C]` of a query's candidates: (score - mean)^sharpness, or 0 below the mean, divided by their sum.
+def shares(scores: Float[np.ndarray, " candidates"], sharpness: float) -> Float[np.ndarray, " candidates"]:
+    """Shares of a query's candidates: (score - mean)^sharpness, or 0 below the mean, divided by their sum.
 
     Shares are equal if all scores are equal. Scores that are not finite have the share 0.
     """
@@ -127,19 +128,22 @@ def shares(scores: np.ndarray, sharpness: float) -> np.ndarray:
 
 
 @compiled
-def step(belief: Array, there: Array, motion: Array, kidnapped: Array, share: Array, p_right: Array) -> Array:
+def step(
+    belief: Float[Array, " rows"], there: Bool[Array, " rows"], motion: Float[Array, " steps"],
+    kidnapped: Float[Array, ""], share: Float[Array, " rows"], p_right: Float[Array, ""],
+) -> Float[Array, " rows"]:  # fmt: skip
     """The belief after the next image.
 
     Args:
-        belief: `[N]` after the previous image; all 0 = nothing is known yet.
-        there: `[N]` bool, rows where the robot may be.
-        motion: `[2 R + 1]` probabilities of -R .. R rows. Belief that leaves the map is shared by the rest.
-        kidnapped: `[]` probability that the robot may be anywhere.
-        share: `[N]` shares of the rows if the image's answer is correct; all 0 = no evidence.
-        p_right: `[]` probability that the answer is correct.
+        belief: after the previous image; all 0 = nothing is known yet.
+        there: rows where the robot may be.
+        motion: probabilities of -R .. R rows, 2 R + 1 steps. Belief that leaves the map is shared by the rest.
+        kidnapped: probability that the robot may be anywhere.
+        share: shares of the rows if the image's answer is correct; all 0 = no evidence.
+        p_right: probability that the answer is correct.
 
     Returns:
-        `[N]` with the sum 1, if there is any row. If image and motion exclude each other, the motion decides.
+        Belief with the sum 1, if there is any row. If image and motion exclude each other, the motion decides.
     """
     anywhere = there.astype(belief.dtype)
     anywhere /= jnp.maximum(anywhere.sum(), 1)

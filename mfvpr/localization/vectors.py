@@ -3,6 +3,7 @@
 from functools import partial
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from mfvpr.utils.numerics import available_cpus
 from mfvpr.utils.threads import ordered_map
@@ -26,8 +27,8 @@ class Vectors:
         """D; None = there is no descriptor yet."""
         return self._values.shape[1] if self._values.size else None
 
-    def put(self, row: int, vector: np.ndarray) -> None:
-        """Store the descriptor `[D]` of a row."""
+    def put(self, row: int, vector: Float[np.ndarray, " dimensions"]) -> None:
+        """Store the descriptor of a row."""
         while row >= len(self._values):
             more = max(_FIRST, len(self._values))
             values = self._values.reshape(-1, len(vector))
@@ -38,8 +39,10 @@ class Vectors:
         self._is_candidate[row] = bool(np.isfinite(vector).all() and vector.any())
         self.total = max(self.total, row + 1)
 
-    def nearest(self, query: np.ndarray, number: int, *, before: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """The most similar rows and their products with the query `[D]`, best first; the lowest row wins a tie.
+    def nearest(
+        self, query: Float[np.ndarray, " dimensions"], number: int, *, before: int | None = None
+    ) -> tuple[Int[np.ndarray, " candidates"], Float[np.ndarray, " candidates"]]:
+        """The most similar rows and their products with the query, best first; the lowest row wins a tie.
 
         Args:
             query: a descriptor; the zero descriptor of an image without features has no similar rows.

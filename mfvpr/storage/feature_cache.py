@@ -16,6 +16,7 @@ from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
 import numpy as np
+from jaxtyping import Float
 
 from mfvpr.datasets.contents import Contents, contents, files_of, state_of
 from mfvpr.datasets.datasets import ImageFolder
@@ -45,11 +46,11 @@ class Vectors:
     """Global descriptors of all images of a folder.
 
     Attributes:
-        values: `[M, D]` float32; NaN for bad images, which no shortlist contains.
+        values: float32; NaN for bad images, which no shortlist contains.
         bad: row -> reason, for images without a usable descriptor.
     """
 
-    values: np.ndarray
+    values: Float[np.ndarray, "_ dimensions"]
     bad: Mapping[int, str]
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from mfvpr.storage.manifest import Kind
 from mfvpr.storage.rows import RowStore
@@ -23,12 +24,12 @@ class Entry(NamedTuple):
 
     name: of the image.
     place: of the image: any JSON value.
-    vector: `[D]` global descriptor, float32.
+    vector: global descriptor, float32.
     """
 
     name: str
     place: Any
-    vector: np.ndarray
+    vector: Float[np.ndarray, " dimensions"]
 
 
 EntryStore = RowStore[Entry]

@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Int
 
 from mfvpr.storage.disk import disk_errors_as_input_errors, lock_store
 from mfvpr.storage.features import FeatureStore, open_store
@@ -211,8 +212,8 @@ class MapRows:
                 break
             number += 1
 
-    def counts(self, rows: Iterable[int]) -> np.ndarray:
-        """`[n]` numbers of keypoints of rows, -1 = no such row."""
+    def counts(self, rows: Iterable[int]) -> Int[np.ndarray, " rows"]:
+        """Numbers of keypoints of rows, -1 = no such row."""
         row_numbers = np.fromiter(rows, int)
         counts = np.full(len(row_numbers), -1)
         for number in np.unique(row_numbers // SEGMENT):

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
+from jaxtyping import Bool, Int
 
 from mfvpr.storage.disk import disk_errors_as_input_errors, free_bytes, full_disk_error, lock_store, used_bytes
 from mfvpr.storage.manifest import Kind, check_folder, has_manifest, manifest_of, remove_leftovers, write_manifest
@@ -111,8 +112,8 @@ class RowStore(Generic[Item]):
         return self.folder if self.shard is None else self.folder / SHARDS / self.shard.folder
 
     @property
-    def counts(self) -> np.ndarray:
-        """`[M]` int32 entries of each row, -1 = not done, when the store was last opened, entered or looked at."""
+    def counts(self) -> Int[np.ndarray, " rows"]:
+        """Entries of each row, -1 = not done, when the store was last opened, entered or looked at."""
         return self._files.counts
 
     def look(self) -> None:
@@ -126,8 +127,8 @@ class RowStore(Generic[Item]):
                 self._files.find()
 
     @property
-    def done(self) -> np.ndarray:
-        """`[M]` bool, the rows that are on disk."""
+    def done(self) -> Bool[np.ndarray, " rows"]:
+        """Which rows are on disk."""
         return self.counts >= 0
 
     @property

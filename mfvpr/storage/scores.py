@@ -9,16 +9,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from mfvpr.storage.manifest import SCORES
 from mfvpr.storage.rows import RowStore
 
 
 class QueryScores(NamedTuple):
-    """The scores and candidates of one query: `[S, C]` and `[C]`."""
+    """The scores and candidates of one query."""
 
-    scores: np.ndarray
-    indices: np.ndarray
+    scores: Float[np.ndarray, "scorers candidates"]
+    indices: Int[np.ndarray, " candidates"]
 
 
 ScoreStore = RowStore[QueryScores]
