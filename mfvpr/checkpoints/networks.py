@@ -1,7 +1,7 @@
 """Networks of the published files, and their blueprints, which take the weights."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import accumulate
@@ -9,21 +9,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from mfvpr.checkpoints import tables
 from mfvpr.checkpoints.conversion import Rule, Table, convert, known_share
 from mfvpr.checkpoints.registry import REGISTRY, Entry
-from mfvpr.checkpoints.tables import (
-    ALIKED,
-    D2NET,
-    DINOV2,
-    GEM_RESNET50,
-    GEM_VGG16,
-    LIGHTGLUE,
-    MIXVPR,
-    NETVLAD,
-    NETVLAD_MATLAB,
-    SELAVPR,
-    SSM,
-)
 from mfvpr.io.formats.pickles import excerpt
 
 if TYPE_CHECKING:
@@ -39,14 +27,13 @@ class Network(NamedTuple):
     table: Table
 
 
-def _constructor(name: str, *arguments: Any, **options: Any) -> Callable[..., "nnx.Module"]:
-    from mfvpr import networks
-
-    return partial(getattr(networks, name), *arguments, **options)
-
-
 def _network(table: Table, name: str, *arguments: Any, **options: Any) -> Network:
-    return Network(partial(_constructor, name, *arguments, **options), table)
+    def builder() -> Callable[..., "nnx.Module"]:
+        from mfvpr import networks
+
+        return partial(getattr(networks, name), *arguments, **options)
+
+    return Network(builder, table)
 
 
 _ALIKED = ("aliked-t16", "aliked-n16", "aliked-n16rot", "aliked-n32")
@@ -56,30 +43,30 @@ _MAX_PREFIX = 4  # parts between dots
 
 # Names in the registry -> networks.
 NETWORKS: dict[str, Network] = {
-    **{name: _network(D2NET, "D2Net") for name in ("d2_tf", "d2_ots", "d2_tf_no_phototourism")},
-    "mixvpr_4096": _network(MIXVPR, "MixVPR", out_channels=1024, out_rows=4),
-    "mixvpr_512": _network(MIXVPR, "MixVPR", out_channels=256, out_rows=2),
-    "mixvpr_128": _network(MIXVPR, "MixVPR", out_channels=64, out_rows=2),
-    "vgg16_places365": _network(SSM, "SsmVgg"),
-    **{name: _network(ALIKED, "Aliked", name) for name in _ALIKED},
-    "aliked_lightglue": _network(LIGHTGLUE, "LightGlue"),
-    "netvlad_pitts30k": _network(NETVLAD_MATLAB, "VggNetVlad", 64, 4096, original=True),
-    "netvlad_tokyotm": _network(NETVLAD_MATLAB, "VggNetVlad", 64, 4096, original=True),
-    "netvlad_pytorch": _network(NETVLAD, "VggNetVlad", 64, None),
+    **{name: _network(tables.D2NET, "D2Net") for name in ("d2_tf", "d2_ots", "d2_tf_no_phototourism")},
+    "mixvpr_4096": _network(tables.MIXVPR, "MixVPR", out_channels=1024, out_rows=4),
+    "mixvpr_512": _network(tables.MIXVPR, "MixVPR", out_channels=256, out_rows=2),
+    "mixvpr_128": _network(tables.MIXVPR, "MixVPR", out_channels=64, out_rows=2),
+    "vgg16_places365": _network(tables.SSM, "SsmVgg"),
+    **{name: _network(tables.ALIKED, "Aliked", name) for name in _ALIKED},
+    "aliked_lightglue": _network(tables.LIGHTGLUE, "LightGlue"),
+    "netvlad_pitts30k": _network(tables.NETVLAD_MATLAB, "VggNetVlad", 64, 4096, original=True),
+    "netvlad_tokyotm": _network(tables.NETVLAD_MATLAB, "VggNetVlad", 64, 4096, original=True),
+    "netvlad_pytorch": _network(tables.NETVLAD, "VggNetVlad", 64, None),
     **{
-        f"patchnetvlad_{training}_{outputs}": _network(NETVLAD, "VggNetVlad", clusters, outputs)
+        f"patchnetvlad_{training}_{outputs}": _network(tables.NETVLAD, "VggNetVlad", clusters, outputs)
         for training, clusters in (("mapillary", 16), ("pitts", 64), ("landmarks", 64))
         for outputs in ((4096,) if training == "landmarks" else (128, 512, 4096))
     },
-    "cosplace_vgg16_512": _network(GEM_VGG16, "Gem", "vgg16", 512),
-    "cosplace_resnet50_512": _network(GEM_RESNET50, "Gem", "resnet50", 512),
-    "cosplace_resnet50_2048": _network(GEM_RESNET50, "Gem", "resnet50", 2048),
-    "dinov2_vits14": _network(DINOV2, "VisionTransformer", 384, 12, 6),
-    "dinov2_vitb14": _network(DINOV2, "VisionTransformer", 768, 12, 12),
-    "dinov2_vitl14": _network(DINOV2, "VisionTransformer", 1024, 24, 16),
-    "selavpr_pitts30k": _network(SELAVPR, "SelaVpr", registers=0),
-    "selavpr_msls": _network(SELAVPR, "SelaVpr", registers=0),
-    "selavpr_msls_registers": _network(SELAVPR, "SelaVpr", registers=4),
+    "cosplace_vgg16_512": _network(tables.GEM_VGG16, "Gem", "vgg16", 512),
+    "cosplace_resnet50_512": _network(tables.GEM_RESNET50, "Gem", "resnet50", 512),
+    "cosplace_resnet50_2048": _network(tables.GEM_RESNET50, "Gem", "resnet50", 2048),
+    "dinov2_vits14": _network(tables.DINOV2, "VisionTransformer", 384, 12, 6),
+    "dinov2_vitb14": _network(tables.DINOV2, "VisionTransformer", 768, 12, 12),
+    "dinov2_vitl14": _network(tables.DINOV2, "VisionTransformer", 1024, 24, 16),
+    "selavpr_pitts30k": _network(tables.SELAVPR, "SelaVpr", registers=0),
+    "selavpr_msls": _network(tables.SELAVPR, "SelaVpr", registers=0),
+    "selavpr_msls_registers": _network(tables.SELAVPR, "SelaVpr", registers=4),
 }
 
 
@@ -100,17 +87,18 @@ class Blueprint:
         """
         import jax
         from flax import nnx
+        from flax.traverse_util import unflatten_dict
 
         arrays = convert(arrays, _RUNTIME, self.shapes)
+        values = {_keys(path): jax.numpy.asarray(array) for path, array in arrays.items()}
         state = jax.tree.map(lambda leaf: leaf, self._state)  # a copy, which the next line changes
-        nnx.replace_by_pure_dict(state, _nest({path: jax.numpy.asarray(array) for path, array in arrays.items()}))
+        nnx.replace_by_pure_dict(state, unflatten_dict(values))
         module = nnx.merge(self._graph, state)
         module.eval()
         return module
 
 
 def network_of(entry: Entry) -> Network:
-    """Network of an entry."""
     return NETWORKS[entry.name]
 
 
@@ -137,30 +125,16 @@ def plan_network(build: Callable[..., "nnx.Module"]) -> Blueprint:
     """Blueprint of the network that `build(rngs=...)` makes."""
     import jax
     from flax import nnx
+    from flax.traverse_util import flatten_dict
 
     with jax.numpy_dtype_promotion("standard"):  # Flax's initializers mix types
         module = nnx.eval_shape(lambda: build(rngs=nnx.Rngs(0)))
     graph, state = nnx.split(module)
-    shapes = {path: leaf.shape for path, leaf in _leaves(nnx.to_pure_dict(state), "")}
-    trained = _leaves(nnx.to_pure_dict(nnx.state(module, nnx.Param)), "")
-    return Blueprint(shapes, sum(math.prod(leaf.shape) for _, leaf in trained), graph, state)
+    shapes = {".".join(map(str, keys)): leaf.shape for keys, leaf in flatten_dict(nnx.to_pure_dict(state)).items()}
+    parameters = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(nnx.state(module, nnx.Param)))
+    return Blueprint(shapes, parameters, graph, state)
 
 
-def _leaves(tree: Mapping[Any, Any], prefix: str) -> Iterator[tuple[str, Any]]:
-    for key, value in tree.items():
-        if isinstance(value, Mapping):
-            yield from _leaves(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
-
-
-def _nest(flat: Mapping[str, Any]) -> dict[Any, Any]:
-    """Nested dictionaries of values by dotted path; digits are positions in a list."""
-    tree: dict[Any, Any] = {}
-    for path, value in flat.items():
-        *parents, last = (int(part) if part.isdigit() else part for part in path.split("."))
-        node = tree
-        for part in parents:
-            node = node.setdefault(part, {})
-        node[last] = value
-    return tree
+def _keys(path: str) -> tuple[int | str, ...]:
+    """Keys of a dotted path; digits are positions in a list."""
+    return tuple(int(part) if part.isdigit() else part for part in path.split("."))

@@ -27,167 +27,109 @@ class Entry:
         return f"code {self.code_license}, weights {self.weights_license}"
 
 
+# fmt: off
+_PAPERS = {  # network -> licenses of the code and of the weights, and the paper
+    "d2net": ("BSD-3-Clause-Clear", "none stated", "Dusmanu et al., D2-Net: A Trainable CNN for Joint Description and "
+              "Detection of Local Features, CVPR 2019"),
+    "mixvpr": ("none stated", "none stated", "Ali-bey, Chaib-draa, Giguere, MixVPR: Feature Mixing for Visual Place "
+               "Recognition, WACV 2023"),
+    "aliked": ("BSD-3-Clause", "BSD-3-Clause", "Zhao et al., ALIKED: A Lighter Keypoint and Descriptor Extraction "
+               "Network via Deformable Transformation, IEEE TIM 2023"),
+    "lightglue": ("Apache-2.0", "Apache-2.0", "Lindenberger, Sarlin, Pollefeys, LightGlue: Local Feature Matching at "
+                  "Light Speed, ICCV 2023"),
+    "ssm": ("MIT (SSM-VPR)", "CC BY (Places365)", "Zhou et al., Places: A 10 Million Image Database for Scene "
+            "Recognition, TPAMI 2017"),
+    "netvlad": ("MIT", "MIT", "Arandjelovic et al., NetVLAD: CNN Architecture for Weakly Supervised Place Recognition, "
+                "CVPR 2016"),
+    "patch_netvlad": ("MIT", "MIT", "Hausler et al., Patch-NetVLAD: Multi-Scale Fusion of Locally-Global Descriptors "
+                      "for Place Recognition, CVPR 2021"),
+    "gem": ("MIT", "MIT", "Berton, Masone, Caputo, Rethinking Visual Geo-localization for Large-Scale Applications, "
+            "CVPR 2022"),
+    "dinov2": ("Apache-2.0", "Apache-2.0", "Oquab et al., DINOv2: Learning Robust Visual Features without Supervision, "
+               "TMLR 2024"),
+    "selavpr": ("MIT, Apache-2.0", "none stated", "Lu et al., Towards Seamless Adaptation of Pre-trained Models for "
+                "Visual Place Recognition, ICLR 2024"),
+}
+# fmt: on
+_VGG16 = 14_714_688  # parameters of its convolutions
+_HLOC = "https://cvg-data.inf.ethz.ch/hloc/netvlad"
+_NANNE = "vgg16_netvlad_checkpoint.zip at https://drive.google.com/open?id=17luTjZFCX639guSVy00OUtzfTQo4AMF2"
+_PLACES365 = (
+    "https://imr.ciirc.cvut.cz/uploads/Datasets/checkpoints.zip, or the Caffe model it was made from, "
+    "http://places2.csail.mit.edu/models_places365/vgg16_places365.caffemodel"
+)
+
+
+def _entry(
+    network: str,
+    name: str,
+    file: str,
+    source: str,
+    parameters: int,
+    *,
+    size: int | None = None,
+    sha256: str | None = None,
+    license: str | None = None,
+) -> Entry:
+    """Entry with the paper's licenses, or with `license` for both."""
+    code_license, weights_license, cite = _PAPERS[network]
+    licenses = (license or code_license, license or weights_license)
+    return Entry(name, network, file, source, size, sha256, *licenses, cite, parameters)
+
+
 def _d2net(name: str) -> Entry:
-    return Entry(
-        name=name,
-        network="d2net",
-        file=f"{name}.pth",
-        source=f"https://dusmanu.com/files/d2-net/{name}.pth",
-        size=None,
-        sha256=None,
-        code_license="BSD-3-Clause-Clear",
-        weights_license="none stated",
-        cite="Dusmanu et al., D2-Net: A Trainable CNN for Joint Description and Detection of Local Features, CVPR 2019",
-        parameters=7_635_264,
-    )
+    return _entry("d2net", name, f"{name}.pth", f"https://dusmanu.com/files/d2-net/{name}.pth", 7_635_264)
 
 
 def _mixvpr(channels: int, rows: int, drive_id: str, parameters: int) -> Entry:
     width = channels * rows
-    return Entry(
-        name=f"mixvpr_{width}",
-        network="mixvpr",
-        file=f"resnet50_MixVPR_{width}_channels({channels})_rows({rows}).ckpt",
-        source=f"https://drive.google.com/file/d/{drive_id}/view",
-        size=None,
-        sha256=None,
-        code_license="none stated",
-        weights_license="none stated",
-        cite="Ali-bey, Chaib-draa, Giguere, MixVPR: Feature Mixing for Visual Place Recognition, WACV 2023",
-        parameters=parameters,
-    )
+    file = f"resnet50_MixVPR_{width}_channels({channels})_rows({rows}).ckpt"
+    return _entry("mixvpr", f"mixvpr_{width}", file, _drive(drive_id), parameters)
 
 
 def _aliked(variant: str, parameters: int, size: int, sha256: str) -> Entry:
-    return Entry(
-        name=f"aliked-{variant}",
-        network="aliked",
-        file=f"aliked-{variant}.pth",
-        source=f"https://github.com/Shiaoming/ALIKED/raw/main/models/aliked-{variant}.pth",
-        size=size,
-        sha256=sha256,
-        code_license="BSD-3-Clause",
-        weights_license="BSD-3-Clause",
-        cite="Zhao et al., ALIKED: A Lighter Keypoint and Descriptor Extraction Network via Deformable Transformation, "
-        "IEEE TIM 2023",
-        parameters=parameters,
-    )
+    file = f"aliked-{variant}.pth"
+    source = f"https://github.com/Shiaoming/ALIKED/raw/main/models/{file}"
+    return _entry("aliked", f"aliked-{variant}", file, source, parameters, size=size, sha256=sha256)
 
 
-def _lightglue() -> Entry:
-    return Entry(
-        name="aliked_lightglue",
-        network="lightglue",
-        file="aliked_lightglue.pth",
-        source="https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/aliked_lightglue.pth",
-        size=47_632_827,
-        sha256="d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
-        code_license="Apache-2.0",
-        weights_license="Apache-2.0",
-        cite="Lindenberger, Sarlin, Pollefeys, LightGlue: Local Feature Matching at Light Speed, ICCV 2023",
-        parameters=11_884_625,
-    )
-
-
-def _ssm() -> Entry:
-    return Entry(
-        name="vgg16_places365",
-        network="ssm",
-        file="vgg16_places365.npy",
-        source="https://imr.ciirc.cvut.cz/uploads/Datasets/checkpoints.zip, or the Caffe model it was made from, "
-        "http://places2.csail.mit.edu/models_places365/vgg16_places365.caffemodel",
-        size=None,
-        sha256=None,
-        code_license="MIT (SSM-VPR)",
-        weights_license="CC BY (Places365)",
-        cite="Zhou et al., Places: A 10 Million Image Database for Scene Recognition, TPAMI 2017",
-        parameters=12_354_880,
-    )
+def _netvlad(name: str, file: str, source: str, outputs: int | None, license: str | None = None) -> Entry:
+    parameters = _netvlad_parameters(64, outputs)
+    return _entry("netvlad", f"netvlad_{name}", file, source, parameters, license=license)
 
 
 def _patchnetvlad(training: str, outputs: int, size: int | None, sha256: str) -> Entry:
-    clusters = 16 if training == "mapillary" else 64
-    vgg, vlad, projection = 14_714_688, 2 * 512 * clusters, (512 * clusters + 1) * outputs
-    return Entry(
-        name=f"patchnetvlad_{training}_{outputs}",
-        network="patch_netvlad",
-        file=f"{training}_WPCA{outputs}.pth.tar",
-        source=f"https://huggingface.co/TobiasRobotics/Patch-NetVLAD/resolve/main/{training}_WPCA{outputs}.pth.tar",
-        size=size,
-        sha256=sha256,
-        code_license="MIT",
-        weights_license="MIT",
-        cite="Hausler et al., Patch-NetVLAD: Multi-Scale Fusion of Locally-Global Descriptors for Place Recognition, "
-        "CVPR 2021",
-        parameters=vgg + vlad + projection,
-    )
+    file = f"{training}_WPCA{outputs}.pth.tar"
+    source = f"https://huggingface.co/TobiasRobotics/Patch-NetVLAD/resolve/main/{file}"
+    parameters = _netvlad_parameters(16 if training == "mapillary" else 64, outputs)
+    name = f"patchnetvlad_{training}_{outputs}"
+    return _entry("patch_netvlad", name, file, source, parameters, size=size, sha256=sha256)
 
 
-_HLOC = "https://cvg-data.inf.ethz.ch/hloc/netvlad"
-_NANNE = "vgg16_netvlad_checkpoint.zip at https://drive.google.com/open?id=17luTjZFCX639guSVy00OUtzfTQo4AMF2"
-
-
-def _netvlad(name: str, file: str, source: str, license: str, outputs: int | None) -> Entry:
-    return Entry(
-        name=f"netvlad_{name}",
-        network="netvlad",
-        file=file,
-        source=source,
-        size=None,
-        sha256=None,
-        code_license=license,
-        weights_license=license,
-        cite="Arandjelovic et al., NetVLAD: CNN Architecture for Weakly Supervised Place Recognition, CVPR 2016",
-        parameters=14_714_688 + 2 * 512 * 64 + (512 * 64 + 1) * (outputs or 0),
-    )
+def _netvlad_parameters(clusters: int, outputs: int | None) -> int:
+    return _VGG16 + 2 * 512 * clusters + (512 * clusters + 1) * (outputs or 0)
 
 
 def _cosplace(backbone: str, outputs: int) -> Entry:
     file = f"{backbone}_{outputs}_cosplace.pth"
-    convolutions, channels = {"VGG16": (14_714_688, 512), "ResNet50": (23_508_032, 2048)}[backbone]
-    return Entry(
-        name=f"cosplace_{backbone.lower()}_{outputs}",
-        network="gem",
-        file=file,
-        source=f"https://github.com/gmberton/CosPlace/releases/download/v1.0/{file}",
-        size=None,
-        sha256=None,
-        code_license="MIT",
-        weights_license="MIT",
-        cite="Berton, Masone, Caputo, Rethinking Visual Geo-localization for Large-Scale Applications, CVPR 2022",
-        parameters=convolutions + 1 + (channels + 1) * outputs,
-    )
+    source = f"https://github.com/gmberton/CosPlace/releases/download/v1.0/{file}"
+    convolutions, channels = {"VGG16": (_VGG16, 512), "ResNet50": (23_508_032, 2048)}[backbone]
+    parameters = convolutions + 1 + (channels + 1) * outputs
+    return _entry("gem", f"cosplace_{backbone.lower()}_{outputs}", file, source, parameters)
 
 
 def _dinov2(name: str, parameters: int) -> Entry:
-    file = f"dinov2_{name}_pretrain.pth"
-    return Entry(
-        name=f"dinov2_{name}",
-        network="dinov2",
-        file=file,
-        source=f"https://dl.fbaipublicfiles.com/dinov2/dinov2_{name}/{file}",
-        size=None,
-        sha256=None,
-        code_license="Apache-2.0",
-        weights_license="Apache-2.0",
-        cite="Oquab et al., DINOv2: Learning Robust Visual Features without Supervision, TMLR 2024",
-        parameters=parameters,
-    )
+    name, file = f"dinov2_{name}", f"dinov2_{name}_pretrain.pth"
+    return _entry("dinov2", name, file, f"https://dl.fbaipublicfiles.com/dinov2/{name}/{file}", parameters)
 
 
 def _selavpr(training: str, file: str, drive_id: str, registers: int = 0) -> Entry:
-    return Entry(
-        name=f"selavpr_{training}",
-        network="selavpr",
-        file=file,
-        source=f"https://drive.google.com/file/d/{drive_id}/view",
-        size=None,
-        sha256=None,
-        code_license="MIT, Apache-2.0",
-        weights_license="none stated",
-        cite="Lu et al., Towards Seamless Adaptation of Pre-trained Models for Visual Place Recognition, ICLR 2024",
-        parameters=357_427_585 + 1024 * registers,  # without the training's mask token
-    )
+    parameters = 357_427_585 + 1024 * registers  # without the training's mask token
+    return _entry("selavpr", f"selavpr_{training}", file, _drive(drive_id), parameters)
+
+
+def _drive(file_id: str) -> str:
+    return f"https://drive.google.com/file/d/{file_id}/view"
 
 
 # fmt: off
@@ -202,11 +144,13 @@ _ENTRIES = (
     _aliked("n16", 677_356, 2_738_091, "5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2"),
     _aliked("n16rot", 677_356, 2_738_325, "ddf3abbf38e86f6a74540d214e1a9712c54b2d8551abc864542199f2347d7332"),
     _aliked("n32", 979_500, 3_946_667, "055283fd1624d3ab46a05c3b617b1a79a3f28d1f551737eef2d653e8c8232890"),
-    _lightglue(),
-    _ssm(),
-    _netvlad("pitts30k", "Pitts30K_struct.mat", f"{_HLOC}/Pitts30K_struct.mat", "MIT", 4096),
-    _netvlad("tokyotm", "TokyoTM_struct.mat", f"{_HLOC}/TokyoTM_struct.mat", "MIT", 4096),
-    _netvlad("pytorch", "checkpoint.pth.tar", _NANNE, "none stated", None),
+    _entry("lightglue", "aliked_lightglue", "aliked_lightglue.pth",
+           "https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/aliked_lightglue.pth", 11_884_625,
+           size=47_632_827, sha256="d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503"),
+    _entry("ssm", "vgg16_places365", "vgg16_places365.npy", _PLACES365, 12_354_880),
+    _netvlad("pitts30k", "Pitts30K_struct.mat", f"{_HLOC}/Pitts30K_struct.mat", 4096),
+    _netvlad("tokyotm", "TokyoTM_struct.mat", f"{_HLOC}/TokyoTM_struct.mat", 4096),
+    _netvlad("pytorch", "checkpoint.pth.tar", _NANNE, None, "none stated"),
     _cosplace("VGG16", 512),
     _cosplace("ResNet50", 512),
     _cosplace("ResNet50", 2048),

@@ -1,26 +1,29 @@
 """Tables from the keys of published checkpoints to the parameters of our networks."""
 
 from collections.abc import Mapping
+from itertools import chain
 
 from mfvpr.checkpoints.conversion import Layout, Rule, Table
 
 _COUNTERS = r".*\.num_batches_tracked"
 
 
-def _batch_norm(source: str, target: str) -> tuple[Rule, ...]:
-    names = {"weight": "scale", "bias": "bias", "running_mean": "mean", "running_var": "var"}
-    return tuple(Rule(rf"{source}\.{theirs}", f"{target}.{ours}") for theirs, ours in names.items())
-
-
-def _linear(source: str, target: str) -> tuple[Rule, ...]:
-    return Rule(rf"{source}\.weight", f"{target}.kernel", Layout.LINEAR), Rule(rf"{source}\.bias", f"{target}.bias")
+def _linear(source: str, target: str, layout: Layout = Layout.LINEAR) -> tuple[Rule, ...]:
+    return Rule(rf"{source}\.weight", f"{target}.kernel", layout), Rule(rf"{source}\.bias", f"{target}.bias")
 
 
 def _convolution(source: str, target: str) -> tuple[Rule, ...]:
-    return (
-        Rule(rf"{source}\.weight", f"{target}.kernel", Layout.CONV),
-        Rule(rf"{source}\.bias", f"{target}.bias"),
-    )
+    return _linear(source, target, Layout.CONV)
+
+
+def _norm(source: str, target: str) -> tuple[Rule, ...]:
+    return Rule(rf"{source}\.weight", f"{target}.scale"), Rule(rf"{source}\.bias", f"{target}.bias")
+
+
+def _batch_norm(source: str, target: str) -> tuple[Rule, ...]:
+    statistics = {"running_mean": "mean", "running_var": "var"}
+    rules = (Rule(rf"{source}\.{theirs}", f"{target}.{ours}") for theirs, ours in statistics.items())
+    return *_norm(source, target), *rules
 
 
 # Positions of VGG16's convolutions in the public Sequential; pooling and ReLU lie between.
@@ -32,7 +35,7 @@ _VGG = {
 
 def _vgg(source: str, target: str = "vgg") -> tuple[Rule, ...]:
     layers = (_convolution(rf"{source}\.{position}", f"{target}.{name}") for position, name in _VGG.items())
-    return tuple(rule for rules in layers for rule in rules)
+    return tuple(chain.from_iterable(layers))
 
 
 D2NET = Table(_vgg(r"dense_feature_extraction\.model"))
@@ -73,8 +76,7 @@ MIXVPR = Table(
             r"backbone\.model\.bn1",
             {rf"backbone\.model\.layer{number}": f"layer{number}" for number in (1, 2, 3)},
         ),
-        Rule(r"aggregator\.mix\.(\d)\.mix\.0\.weight", r"mix.\1.norm.scale"),
-        Rule(r"aggregator\.mix\.(\d)\.mix\.0\.bias", r"mix.\1.norm.bias"),
+        *_norm(r"aggregator\.mix\.(\d)\.mix\.0", r"mix.\1.norm"),
         *_linear(r"aggregator\.mix\.(\d)\.mix\.1", r"mix.\1.linear1"),
         *_linear(r"aggregator\.mix\.(\d)\.mix\.3", r"mix.\1.linear2"),
         *_linear(r"aggregator\.channel_proj", "channel_proj"),
@@ -89,20 +91,16 @@ ALIKED = Table(
     (
         Rule(rf"{_CONV}\.weight", r"\1.kernel", Layout.CONV),
         Rule(r"(block\d\.conv\d)\.regular_conv\.weight", r"\1.kernel", Layout.CONV),  # the deformable convolution's
-        Rule(r"(block\d\.conv\d)\.offset_conv\.weight", r"\1.offset.kernel", Layout.CONV),
-        Rule(r"(block\d\.conv\d)\.offset_conv\.bias", r"\1.offset.bias"),
+        *_convolution(r"(block\d\.conv\d)\.offset_conv", r"\1.offset"),
         *_batch_norm(r"(block\d\.bn\d)", r"\1"),
-        Rule(r"(block\d)\.downsample\.weight", r"\1.shortcut.kernel", Layout.CONV),
-        Rule(r"(block\d)\.downsample\.bias", r"\1.shortcut.bias"),
+        *_convolution(r"(block\d)\.downsample", r"\1.shortcut"),
         *(
             Rule(rf"score_head\.{position}\.weight", f"score_head.{place}.kernel", Layout.CONV)
             for place, position in enumerate((0, 2, 4, 6))
         ),
         Rule(r"desc_head\.agg_weights", "desc_head.agg_weights"),
-        Rule(r"desc_head\.offset_conv\.0\.weight", "desc_head.offset1.kernel", Layout.CONV),
-        Rule(r"desc_head\.offset_conv\.0\.bias", "desc_head.offset1.bias"),
-        Rule(r"desc_head\.offset_conv\.2\.weight", "desc_head.offset2.kernel", Layout.CONV),
-        Rule(r"desc_head\.offset_conv\.2\.bias", "desc_head.offset2.bias"),
+        *_convolution(r"desc_head\.offset_conv\.0", "desc_head.offset1"),
+        *_convolution(r"desc_head\.offset_conv\.2", "desc_head.offset2"),
         Rule(r"desc_head\.sf_conv\.weight", "desc_head.sample.kernel", Layout.CONV),
     ),
     ignored=(_COUNTERS,),
@@ -115,12 +113,7 @@ def _attention(source: str, target: str, parts: dict[str, str]) -> tuple[Rule, .
     layer, ours = _LAYER.format(source), rf"layers.\1\2.{target}"
     parts = parts | {r"ffn\.0": "feed_forward.hidden", r"ffn\.3": "feed_forward.update"}
     linear = (_linear(rf"{layer}\.{theirs}", f"{ours}.{name}") for theirs, name in parts.items())
-    norm = rf"{layer}\.ffn\.1", f"{ours}.feed_forward.norm"
-    return (
-        *(rule for rules in linear for rule in rules),
-        Rule(rf"{norm[0]}\.weight", f"{norm[1]}.scale"),
-        Rule(rf"{norm[0]}\.bias", f"{norm[1]}.bias"),
-    )
+    return *chain.from_iterable(linear), *_norm(rf"{layer}\.ffn\.1", f"{ours}.feed_forward.norm")
 
 
 LIGHTGLUE = Table(
@@ -142,8 +135,7 @@ NETVLAD = Table(
         *_vgg(r"encoder(?:\.module)?"),
         Rule(r"pool(?:\.module)?\.conv\.weight", "pool.assignment.kernel", Layout.POINTWISE),
         Rule(r"pool(?:\.module)?\.centroids", "pool.centers"),
-        Rule(r"WPCA\.0\.weight", "projection.kernel", Layout.POINTWISE),
-        Rule(r"WPCA\.0\.bias", "projection.bias"),
+        *_linear(r"WPCA\.0", "projection", Layout.POINTWISE),
     )
 )
 
@@ -164,10 +156,7 @@ NETVLAD_MATLAB = Table(
     ignored=(r"net\.(?!layers\.\d+\.weights|meta\.normalization\.averageImage).*",),  # settings of the training
 )
 
-_GEM = (
-    Rule(r"aggregation\.1\.p", "pool.power"),
-    *_linear(r"aggregation\.3", "projection"),
-)
+_GEM = (Rule(r"aggregation\.1\.p", "pool.power"), *_linear(r"aggregation\.3", "projection"))
 GEM_VGG16 = Table((*_vgg("backbone", "backbone"), *_GEM))
 GEM_RESNET50 = Table(
     (
@@ -192,10 +181,8 @@ def _transformer(source: str, target: str) -> tuple[Rule, ...]:
         *_linear(rf"{block}\.mlp\.fc1", f"{ours}.perceptron.hidden"),
         *_linear(rf"{block}\.mlp\.fc2", f"{ours}.perceptron.output"),
         Rule(rf"{block}\.ls(\d)\.gamma", rf"{ours}.scale\2"),
-        Rule(rf"{block}\.norm(\d)\.weight", rf"{ours}.norm\2.scale"),
-        Rule(rf"{block}\.norm(\d)\.bias", rf"{ours}.norm\2.bias"),
-        Rule(rf"{source}norm\.weight", f"{target}norm.scale"),
-        Rule(rf"{source}norm\.bias", f"{target}norm.bias"),
+        *_norm(rf"{block}\.norm(\d)", rf"{ours}.norm\2"),
+        *_norm(rf"{source}norm", f"{target}norm"),
     )
 
 
@@ -213,8 +200,7 @@ SELAVPR = Table(
         *_linear(rf"{_SELA}{_BLOCK}\.adapter2\.D_fc1", r"backbone.blocks.\1.parallel.down"),
         *_linear(rf"{_SELA}{_BLOCK}\.adapter2\.D_fc2", r"backbone.blocks.\1.parallel.up"),
         Rule(rf"{_SELA}aggregation\.1\.p", "pool.power"),
-        Rule(rf"{_SELA}LocalAdapt\.upconv(\d)\.weight", r"upsampling\1.kernel", Layout.UPSAMPLING),
-        Rule(rf"{_SELA}LocalAdapt\.upconv(\d)\.bias", r"upsampling\1.bias"),
+        *_linear(rf"{_SELA}LocalAdapt\.upconv(\d)", r"upsampling\1", Layout.UPSAMPLING),
     ),
     ignored=(rf"{_SELA}backbone\.{_MASK}",),
 )
