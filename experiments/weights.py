@@ -58,7 +58,7 @@ def convert(file: Path, name: str | None) -> None:
     from mfvpr.checkpoints import install
     from mfvpr.checkpoints.files import read_manifest
 
-    entry = _entry(file, name)
+    entry = _entry_of(file, name)
     if file.is_file() and (megabytes := file.stat().st_size >> 20) > _LARGE:
         print(f"{file}: {megabytes:,} MiB to convert, some {max(1, megabytes // 50)} s", file=sys.stderr)
     path = install(file, entry.name)
@@ -73,7 +73,7 @@ def verify(names: Iterable[str]) -> None:
     from mfvpr.utils import InputError
 
     entries = [entry_of(name) for name in names]
-    entries = entries or [entry for entry in REGISTRY.values() if _has_runtime_file(entry) or _has_original(entry)]
+    entries = entries or [entry for entry in REGISTRY.values() if any(_present_files(entry))]
     if not entries:
         print(f"nothing is installed in {weights_folder()}")
     bad = 0
@@ -109,17 +109,15 @@ def download(name: str) -> None:
 
 
 def _fetch(entry: "Entry", target: Path) -> None:
-    import hashlib
     from http.client import HTTPException
     from urllib.request import urlopen
 
     from tqdm import tqdm
 
-    from mfvpr.checkpoints.files import check_sha256
+    from mfvpr.checkpoints.files import check_sha256, file_sha256
     from mfvpr.utils import InputError
     from mfvpr.utils.files import replacing
 
-    digest = hashlib.sha256()
     try:
         with (
             replacing(target) as temporary,
@@ -128,18 +126,17 @@ def _fetch(entry: "Entry", target: Path) -> None:
             tqdm(total=entry.size, unit="B", unit_scale=True, desc=entry.file) as bar,
         ):
             while chunk := response.read(_CHUNK):
-                digest.update(chunk)
                 bar.update(file.write(chunk))
                 if entry.size and bar.n > entry.size:
                     break  # the hash will differ
             file.flush()
-            check_sha256(digest.hexdigest(), entry, entry.source)
+            check_sha256(file_sha256(temporary), entry, entry.source)
     except (OSError, HTTPException) as error:
         reason = getattr(error, "reason", None) or error
         raise InputError(f"{entry.source}: could not be downloaded to {target.parent}: {reason}") from error
 
 
-def _entry(file: Path, name: str | None) -> "Entry":
+def _entry_of(file: Path, name: str | None) -> "Entry":
     from mfvpr.checkpoints import REGISTRY, entry_of
     from mfvpr.utils import InputError
 
@@ -152,41 +149,35 @@ def _entry(file: Path, name: str | None) -> "Entry":
     raise InputError(f"{file}: no official file name; say what it is with --as NAME, one of {', '.join(REGISTRY)}")
 
 
-def _has_runtime_file(entry: "Entry") -> bool:
+def _present_files(entry: "Entry") -> tuple[bool, bool]:
+    """Whether the weights folder has the entry's checkpoint, if its hash is published, and its runtime file."""
     from mfvpr.checkpoints import weights_folder
 
-    return any((weights_folder() / f"{entry.name}{suffix}").exists() for suffix in (".safetensors", ".json"))
-
-
-def _has_original(entry: "Entry") -> bool:
-    from mfvpr.checkpoints import weights_folder
-
-    return entry.sha256 is not None and (weights_folder() / entry.file).exists()
+    folder = weights_folder()
+    has_runtime_file = any((folder / f"{entry.name}{suffix}").exists() for suffix in (".safetensors", ".json"))
+    return entry.sha256 is not None and (folder / entry.file).exists(), has_runtime_file
 
 
 def _verify(entry: "Entry") -> str:
-    """Check the files of an entry and list the checks in words.
-
-    Raises:
-        InputError: a check fails.
-    """
+    """Check the files of an entry and list the checks in words; raise an InputError if a check fails."""
     from mfvpr.checkpoints import load_model, weights_folder
     from mfvpr.checkpoints.files import check_published, read_manifest
     from mfvpr.utils import InputError
 
-    good = []
-    if _has_original(entry):
+    has_checkpoint, has_runtime_file = _present_files(entry)
+    checks = []
+    if has_checkpoint:
         check_published(weights_folder() / entry.file, entry)
-        good.append(f"{entry.file} has the published hash")
-    if not good or _has_runtime_file(entry):
+        checks.append(f"{entry.file} has the published hash")
+    if has_runtime_file or not has_checkpoint:
         load_model(entry.name)
         manifest = read_manifest(entry.name)
         if manifest.parameters != entry.parameters:
             raise InputError(f"expected {entry.parameters:,} parameters, got {manifest.parameters:,}")
-        good.append(f"{manifest.parameters:,} parameters as converted")
+        checks.append(f"{manifest.parameters:,} parameters as converted")
         if entry.sha256 is None:
-            good.append(f"from a {entry.file} of sha256 {manifest.source_sha256[:12]}..., which nobody published")
-    return "good, " + ", ".join(good)
+            checks.append(f"from a {entry.file} of sha256 {manifest.source_sha256[:12]}..., which nobody published")
+    return "good, " + ", ".join(checks)
 
 
 if __name__ == "__main__":

@@ -41,11 +41,7 @@ def read_checkpoint(path: Path | str) -> dict[str, np.ndarray]:
 
 
 def require_checkpoint(path: Path) -> bytes:
-    """Read the first bytes, which must be those of a checkpoint.
-
-    Raises:
-        InputError: the file cannot be read or is no checkpoint.
-    """
+    """Read the first bytes; raise an InputError unless they are those of a checkpoint."""
     again = "download it again"
     if path.exists() and not path.is_file():  # opening a pipe would block
         raise InputError(f"{path}: expected a checkpoint file, got {'a folder' if path.is_dir() else 'no plain file'}")

@@ -78,11 +78,7 @@ def install(checkpoint: Path, name: str, folder: Path | None = None) -> Path:
 
 
 def check_published(checkpoint: Path, entry: Entry) -> None:
-    """Compare a file with the published hash, if there is one.
-
-    Raises:
-        InputError: the hash differs, or the file cannot be read.
-    """
+    """Raise an InputError if a file has another hash than the published one, or cannot be read."""
     if entry.sha256 is None:
         return
     try:
@@ -93,11 +89,7 @@ def check_published(checkpoint: Path, entry: Entry) -> None:
 
 
 def check_sha256(sha256: str, entry: Entry, origin: object) -> None:
-    """Compare a hash with the published one; `origin` begins the message.
-
-    Raises:
-        InputError: the hash differs.
-    """
+    """Raise an InputError that begins with `origin` unless the hash is the published one."""
     if sha256 != entry.sha256:
         names = [other.name for other in REGISTRY.values() if other.sha256 == sha256]
         got = f"that of {names[0]}" if names else f"{sha256[:12]}...: damaged, or another file"
@@ -119,8 +111,7 @@ def save(
         name: name of the registry's entry.
         arrays: arrays by dotted path.
         source: the checkpoint of the arrays.
-        parameters: number of the network's parameters.
-        rounded: number of the source's tensors that were rounded from float64.
+        parameters, rounded: see `Manifest`.
         folder: `weights_folder()` by default.
 
     Raises:
@@ -183,15 +174,6 @@ def load_model(name: str, folder: Path | None = None) -> "nnx.Module":
         raise WeightsError(f"{_path(entry, folder)}: {error}; {_MEND}", entry) from error
 
 
-def fingerprint(name: str, folder: Path | None = None) -> str:
-    """The sha256 of the runtime file, from its manifest.
-
-    Raises:
-        WeightsError: the weights are not installed, or have no manifest.
-    """
-    return read_manifest(name, folder).sha256
-
-
 def read_manifest(name: str, folder: Path | None = None) -> Manifest:
     """Read the manifest of an installed runtime file, but not the file.
 
@@ -201,11 +183,8 @@ def read_manifest(name: str, folder: Path | None = None) -> Manifest:
     entry = entry_of(name)
     path = _path(entry, folder).with_suffix(".json")
     if not path.with_suffix(".safetensors").is_file():
-        raise WeightsError(
-            f"{name}: not installed in {folder or weights_folder()}; get {entry.file} from {entry.source} "
-            f"({entry.license}) and install it",
-            entry,
-        )
+        source = f"{entry.file} from {entry.source} ({entry.license})"
+        raise WeightsError(f"{name}: not installed in {path.parent}; get {source} and install it", entry)
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
         manifest = Manifest(**values)

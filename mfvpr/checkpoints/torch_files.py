@@ -21,16 +21,11 @@ Order = Literal["little", "big"]
 
 _WRAPPERS = ("model", "state_dict", "model_state_dict")
 _ORDERS: dict[bytes, Order] = {b"little": "little", b"big": "big"}
-_DTYPES = {
-    "FloatStorage": np.dtype("f4"),
-    "DoubleStorage": np.dtype("f8"),
-    "LongStorage": np.dtype("i8"),  # this and the following hold counters
-    "IntStorage": np.dtype("i4"),
-    "ShortStorage": np.dtype("i2"),
-    "CharStorage": np.dtype("i1"),
-    "ByteStorage": np.dtype("u1"),
-    "BoolStorage": np.dtype("?"),
-}
+_DTYPES = {  # types of weights, then of counters
+    "FloatStorage": np.dtype("f4"), "DoubleStorage": np.dtype("f8"), "LongStorage": np.dtype("i8"),
+    "IntStorage": np.dtype("i4"), "ShortStorage": np.dtype("i2"), "CharStorage": np.dtype("i1"),
+    "ByteStorage": np.dtype("u1"), "BoolStorage": np.dtype("?"),
+}  # fmt: skip
 _MAGIC, _PROTOCOL = 0x1950A86A20F9469CFC6C, 1001  # the start of files from before torch 1.6, which are not zip files
 _NOTES = {  # the command line and the losses, in checkpoints of D2-Net's training
     "argparse.Namespace",
@@ -150,10 +145,8 @@ def read_legacy(file: BinaryIO) -> dict[str, np.ndarray]:
 def _arrays(content: Any, order: Order, read_values: Callable[[Storage], bytes]) -> dict[str, np.ndarray]:
     """Arrays of the tensors in a pickle's content; `order` is the byte order of their values."""
     read_values = cache(read_values)
-    for key in _WRAPPERS:
-        if isinstance(content, dict) and isinstance(content.get(key), dict):
-            content = content[key]
-            break
+    if isinstance(content, dict):
+        content = next((content[key] for key in _WRAPPERS if isinstance(content.get(key), dict)), content)
     if not isinstance(content, dict) or not content:
         kind = "an empty dict" if content == {} else type(content).__name__
         raise InputError(f"expected tensors by name, got {kind}; use the official file")

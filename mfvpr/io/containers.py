@@ -76,6 +76,4 @@ def shorten(text: str, limit: int = 60) -> str:
 def require_plain(where: str, dtype: np.dtype) -> None:
     """Raise an InputError for arrays of Python objects, which need a pickle, and of records."""
     if dtype.hasobject or dtype.kind in "OV":
-        raise InputError(
-            f"{where}: expected an array of numbers or text, got objects or records; they are never loaded"
-        )
+        raise InputError(f"{where}: expected an array of numbers or text, got objects or records, which are not loaded")

@@ -48,8 +48,7 @@ def read_with_entries(
     if path.suffix.lower() not in readers:
         raise InputError(f"{path}: expected a file named {', '.join(readers)}, got {path.suffix or 'no suffix'}")
     entries, values = readers[path.suffix.lower()](path, names)
-    if values.ndim != 2 or len(values) != len(names) or not values.shape[1]:
-        raise InputError(f"{path}: expected descriptors [{len(names)}, D] of the images, got {list(values.shape)}")
+    _require_rows(path, values, names)
     values = with_length(str(path), as_float32(str(path), values), lengths)
     return values, [FileEntry(path, entry) for entry in entries]
 
@@ -68,8 +67,7 @@ def write_global_descriptors(
     path = Path(path)
     require_different(path, names)
     values = as_float(str(path), np.asarray(descriptors), half)
-    if values.ndim != 2 or len(values) != len(names):
-        raise InputError(f"{path}: expected descriptors [{len(names)}, D] to write, got {list(values.shape)}")
+    _require_rows(path, values, names)
     suffix = path.suffix.lower()
     if suffix == ".npy":
         with replacing(path) as temporary, temporary.open("wb") as file:
@@ -98,24 +96,18 @@ def _from_npz(path: Path, names: Sequence[str]) -> Rows:
     if file_names is None:
         return _from_name_order(path, names, descriptors)
     if file_names.dtype.kind != "U" or file_names.shape != descriptors.shape[:1]:
-        raise InputError(
-            f"{path}: expected names as text [M] and descriptors [M, D], got {file_names.dtype}"
-            f"{list(file_names.shape)} and {list(descriptors.shape)}"
-        )
+        got = f"{file_names.dtype}{list(file_names.shape)} and {list(descriptors.shape)}"
+        raise InputError(f"{path}: expected names as text [M] and descriptors [M, D], got {got}")
     rows = {name: row for row, name in enumerate(file_names.tolist())}
     if len(rows) < len(file_names):
         raise InputError(f"{path}: expected different names, got {len(file_names) - len(rows)} again; keep one of each")
-    matched = match_names(path, names, rows)
-    require_all(path, names, matched, "descriptors")
-    images = [image for image in matched if image is not None]
+    images = require_all(path, names, match_names(path, names, rows), "descriptors")
     return images, descriptors[[rows[image] for image in images]]
 
 
 def _from_h5(path: Path, names: Sequence[str]) -> Rows:
     file = H5File(path)
-    matched = match_names(path, names, file.images)
-    require_all(path, names, matched, "descriptors")
-    images = [image for image in matched if image is not None]
+    images = require_all(path, names, match_names(path, names, file.images), "descriptors")
     rows = []
     for image, parts in zip(images, file.arrays(images, (PART,)), strict=True):
         if PART not in parts or parts[PART].shape != (rows[0] if rows else parts[PART].reshape(-1)).shape:
@@ -125,9 +117,13 @@ def _from_h5(path: Path, names: Sequence[str]) -> Rows:
     return images, np.stack(rows) if rows else np.zeros((0, 0), np.float32)
 
 
-def _from_name_order(path: Path, names: Sequence[str], descriptors: np.ndarray) -> Rows:
-    if descriptors.ndim != 2 or len(descriptors) != len(names):
+def _require_rows(path: Path, descriptors: np.ndarray, names: Sequence[str]) -> None:
+    if descriptors.ndim != 2 or len(descriptors) != len(names) or not descriptors.shape[1]:
         raise InputError(f"{path}: expected descriptors [{len(names)}, D] of the images, got {list(descriptors.shape)}")
+
+
+def _from_name_order(path: Path, names: Sequence[str], descriptors: np.ndarray) -> Rows:
+    _require_rows(path, descriptors, names)
     rows = np.argsort(_sorted_rows(names))
     return [f"row {row}" for row in rows.tolist()], descriptors[rows]
 

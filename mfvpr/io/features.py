@@ -100,18 +100,15 @@ class ImportedFeatures:
             scores = as_float32(f"{where}: {part}", parts[part]).reshape(-1)
         has_shape = descriptors.shape == shape if count else not descriptors.size  # [D, 0], [0, D] or [0] if count = 0
         if len(keypoints) != count or len(scores) != count or not has_shape or self.scored != (part is not None):
-            raise InputError(
-                f"{where}: expected {count} keypoints with scores and descriptors of "
-                f"{self.dimension} numbers, got {len(keypoints)}, {len(scores)} and {list(descriptors.shape)}; is the "
-                "file damaged, or has it changed since it was opened?"
-            )
+            got = f"{len(keypoints)}, {len(scores)} and {list(descriptors.shape)}"
+            raise InputError(f"{where}: expected {count} keypoints with scores and descriptors of {self.dimension} "
+                             f"numbers, got {got}; has the file changed since it was opened?")  # fmt: skip
         size = _image_size(where, parts.get("image_size"), None if self._sizes is None else self._sizes[row])
         _require_inside(where, keypoints, size)
+        descriptors = with_length(f"{where}: descriptors", descriptors.reshape(shape), self._lengths)
         return Features(
             keypoints=np.ascontiguousarray(keypoints),
-            descriptors=np.ascontiguousarray(
-                with_length(f"{where}: descriptors", descriptors.reshape(shape), self._lengths)
-            ),
+            descriptors=np.ascontiguousarray(descriptors),
             scores=scores,
             mask=np.ones(count, bool),
             image_size=size,
@@ -148,16 +145,15 @@ def open_features(
     images = match_names(path, names, container.images)
     if not partial or not any(images):
         require_all(path, names, images, "features")
-    matched_rows = [row for row, image in enumerate(images) if image is not None]
-    matched = [image for image in images if image is not None]
-    contents = dict(zip(matched, container.contents(matched, ("keypoints", "descriptors")), strict=True))
+    rows = {image: row for row, image in enumerate(images) if image is not None}
+    contents = dict(zip(rows, container.contents(rows, ("keypoints", "descriptors")), strict=True))
     counts = np.full(len(names), -1, np.int32)
-    for row, (image, image_contents) in zip(matched_rows, contents.items(), strict=True):
-        counts[row] = _count(f"{path}: {shorten(image)}", image_contents, needs_size=sizes is None)
+    for image, row in rows.items():
+        counts[row] = _count(f"{path}: {shorten(image)}", contents[image], needs_size=sizes is None)
     transposed, dimension = _layout(path, contents, container.transposed)
     return ImportedFeatures(
         path=path,
-        paths=tuple(dict.fromkeys(container.entry(image).file for image in matched)),
+        paths=tuple(dict.fromkeys(container.entry(image).file for image in rows)),
         counts=counts,
         dimension=dimension,
         scored=_has_scores(path, contents),
@@ -190,9 +186,7 @@ def _count(where: str, contents: Contents, *, needs_size: bool) -> int:
     _require_parts(where, contents.names)
     shape = contents.shapes["keypoints"]
     if len(shape) != 2 or not 2 <= shape[1] <= 4 or shape[0] > np.iinfo(np.int32).max:
-        raise InputError(
-            f"{where}: keypoints: expected [N, 2], (x, y), with at most scale and angle, got {list(shape)}"
-        )
+        raise InputError(f"{where}: keypoints: expected [N, 2], or scale and angle as well, got {list(shape)}")
     if needs_size and "image_size" not in contents.names:
         raise InputError(f"{where}: expected image_size (width, height) in the file, got none; give it as image_size=")
     return shape[0]
@@ -211,22 +205,17 @@ def _layout(path: Path, contents: Mapping[str, Contents], default: bool) -> tupl
     }
     for image, (count, shape) in shapes.items():
         if len(shape) != 2 or count not in shape:
-            raise InputError(
-                f"{path}: {shorten(image)}: descriptors: expected [{count}, D] or [D, {count}] as there are "
-                f"keypoints, got {list(shape)}"
-            )
+            expected = f"[{count}, D] or [D, {count}] like the keypoints"
+            raise InputError(f"{path}: {shorten(image)}: descriptors: expected {expected}, got {list(shape)}")
         if shape[0] != shape[1]:
             votes.setdefault(shape[1] == count, image)
     if len(votes) == 2:
-        raise InputError(
-            f"{path}: expected descriptors of one layout, got [D, N] for {shorten(votes[True])} and [N, D] for "
-            f"{shorten(votes[False])}"
-        )
+        got = f"[D, N] for {shorten(votes[True])} and [N, D] for {shorten(votes[False])}"
+        raise InputError(f"{path}: expected descriptors of one layout, got {got}")
     transposed = next(iter(votes), default)
-    dimension = 0
-    for image, (_, shape) in shapes.items():
-        numbers = shape[0 if transposed else 1]
-        dimension = dimension or numbers
+    dimensions = {image: shape[0 if transposed else 1] for image, (_, shape) in shapes.items()}
+    dimension = next(iter(dimensions.values()), 0)
+    for image, numbers in dimensions.items():
         if numbers != dimension:
             raise InputError(f"{path}: {shorten(image)}: descriptors: expected {dimension} numbers each, got {numbers}")
     return transposed, dimension
@@ -248,10 +237,8 @@ def _explicit_sizes(image_size: Any, count: int) -> np.ndarray:
     """`[M, 2]`."""
     sizes = np.asarray(image_size, np.float32)
     if sizes.shape not in ((2,), (count, 2)) or not (np.isfinite(sizes) & (sizes > 0)).all():
-        raise InputError(
-            f"image_size: expected (width, height) in pixels, or [{count}, 2] of them, got shape {list(sizes.shape)} "
-            "or sizes that are not positive"
-        )
+        got = f"shape {list(sizes.shape)} or sizes that are not positive"
+        raise InputError(f"image_size: expected (width, height) in pixels, or [{count}, 2] of them, got {got}")
     return np.broadcast_to(sizes, (count, 2))
 
 
@@ -276,7 +263,5 @@ def _require_inside(where: str, keypoints: np.ndarray, size: np.ndarray) -> None
     outside = ((keypoints < -margin) | (keypoints > size - 1 + margin)).any(axis=1)
     if outside.any():
         x, y = keypoints[int(outside.argmax())].tolist()
-        raise InputError(
-            f"{where}: expected keypoints (x, y) in an image of {size[0]:g} x {size[1]:g} pixels, got ({x:g}, {y:g}); "
-            "is image_size (width, height) of the image that they are in?"
-        )
+        raise InputError(f"{where}: expected keypoints (x, y) in an image of {size[0]:g} x {size[1]:g} pixels, "
+                         f"got ({x:g}, {y:g}); check image_size (width, height)")  # fmt: skip

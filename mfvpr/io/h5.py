@@ -92,7 +92,6 @@ def _images(path: Path, file: Any) -> Iterator[str]:
 
 
 def _open_dataset(path: Path, image: str, group: Any, part: str) -> Any:
-    """Low-level dataset of this name."""
     name, where = _encode(part), f"{image}/{part}"
     if not _is_hard(path, group, name):
         raise _link_error(path, _encode(where))
@@ -110,9 +109,7 @@ def _read(path: Path, image: str, group: Any, part: str) -> np.ndarray:
     where, dataset = f"{path}: {shorten(image)}/{part}", _h5py(path).Dataset(_open_dataset(path, image, group, part))
     require_plain(where, dataset.dtype)
     if dataset.external or dataset.is_virtual:
-        raise InputError(
-            f"{where}: expected data in this file, got storage in others, which is not read; copy the data"
-        )
+        raise InputError(f"{where}: expected data in this file, got storage in others, which is not read; copy it")
     if dataset.size and not _has_all_values(dataset):
         raise InputError(f"{where}: expected data, got a dataset that was not written; extract this image again")
     return dataset[()]

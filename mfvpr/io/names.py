@@ -47,22 +47,18 @@ def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> lis
 def require_different(path: Path, names: Sequence[str]) -> None:
     """Raise an InputError if two images have the same name, or the same name as text in a file."""
     if twice := [name for name, count in Counter(map(printable, names)).items() if count > 1]:
-        raise InputError(
-            f"{path}: expected images with different names, got {shorten(twice[0])} twice; rename one of the images"
-        )
+        raise InputError(f"{path}: expected different names, got {shorten(twice[0])} twice; rename one of the images")
 
 
-def require_all(path: Path, names: Sequence[str], matched: Sequence[str | None], what: str) -> None:
-    """Raise an InputError if a file lacks images."""
+def require_all(path: Path, names: Sequence[str], matched: Sequence[str | None], content: str) -> list[str]:
+    """Return the result of `match_names`; raise an InputError if the file lacks the `content` of an image."""
     missing = [name for name, match in zip(names, matched, strict=True) if match is None]
     if missing:
         raise InputError(
-            f"{path}: expected {what} of all {len(names)} images, got {len(names) - len(missing)}; the first without "
-            f"is {shorten(missing[0])} (images are called by their paths below their folder)"
+            f"{path}: expected {content} of all {len(names)} images, got {len(names) - len(missing)}; the first "
+            f"without is {shorten(missing[0])} (images are called by their paths below their folder)"
         )
-
-
-Variants = Callable[[str], list[str]]
+    return [match for match in matched if match is not None]
 
 
 def require_one_image(
@@ -101,7 +97,7 @@ def adds_folders(name: str, match: str) -> bool:
 class _Ends:
     """Index of foreign names by the whole name and by every end of it."""
 
-    def __init__(self, foreign: Iterable[str], variants: Variants) -> None:
+    def __init__(self, foreign: Iterable[str], variants: Callable[[str], list[str]]) -> None:
         self.variants = variants
         self.by_variant: dict[str, set[str]] = defaultdict(set)
         self.by_end: dict[str, set[str]] = defaultdict(set)

@@ -34,10 +34,8 @@ class NpzFile:
         self.images = tuple(dict.fromkeys(name.rpartition("/")[0] for name in members if "/" in name))
         if not self.images:
             got = shorten(", ".join(members)) or "none"
-            raise InputError(
-                f"{path}: expected arrays named by images (a.jpg/keypoints), got {got}; where every image has a file "
-                "of its own, give their folder"
-            )
+            raise InputError(f"{path}: expected arrays named by images (a.jpg/keypoints), got {got}; "
+                             "if every image has its own file, give their folder")  # fmt: skip
 
     def contents(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Contents]:
         with _open_archive(self.path) as archive:
@@ -69,9 +67,7 @@ class NpzFolder:
         for file in sorted(_files_below(path)):
             image = file.relative_to(path).as_posix().removesuffix(file.suffix)
             if image in self._paths:
-                raise InputError(
-                    f"{file}: {self._paths[image].name} beside it is of the same image; remove one of them"
-                )
+                raise InputError(f"{file}: {self._paths[image].name} beside it is of the same image; remove either")
             self._paths[image] = file
         self.images = tuple(self._paths)
         if not self.images:

@@ -1,6 +1,6 @@
 """Read and write shortlists and rankings of other programs."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -9,13 +9,14 @@ import numpy as np
 from mfvpr.io.containers import FileEntry, shorten
 from mfvpr.io.names import adds_folders, match_names, require_different
 from mfvpr.io.npz import read_npz, write_npz
-from mfvpr.io.pairs import Pair, read_pairs, require_lines
+from mfvpr.io.pairs import read_pairs, require_lines
 from mfvpr.types import Ranking, Shortlist
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_file, write_text
 
 PairLayout = Literal["hloc", "kapture"]
-Candidates = list[tuple[int, float | None]]  # database rows and scores of one query, best first
+Candidates = dict[int, float | None]  # database rows and scores of one query, best first
+Scored = tuple[int, int, float | None]  # rows of a query and a database image, and their score
 
 
 def read_shortlist(
@@ -56,15 +57,18 @@ def read_with_entries(
         raise InputError(f"num_candidates={num_candidates}: expected at least 1")
     queries, database = {}, {}
     if path.suffix.lower() == ".npz":
-        candidates = _from_npz(path, len(query_names), len(database_names))
+        pairs = _from_npz(path, len(query_names), len(database_names))
     else:
-        pairs = read_pairs(path, query_names, database_names)
-        queries = _rows(path, query_names, dict.fromkeys(pair.query for pair in pairs), "query")
-        database = _rows(path, database_names, dict.fromkeys(pair.database for pair in pairs), "database")
-        candidates = _from_pairs(pairs, queries, database, len(query_names))
+        names = read_pairs(path, query_names, database_names)
+        queries = _rows(path, query_names, dict.fromkeys(pair.query for pair in names), "query")
+        database = _rows(path, database_names, dict.fromkeys(pair.database for pair in names), "database")
+        pairs = ((queries[query], database[image], score) for query, image, score in names)
+    candidates: list[Candidates] = [{} for _ in query_names]
+    for query, row, score in pairs:
+        candidates[query].setdefault(row, score)  # of several scores, the first counts
     if not any(candidates):
         raise InputError(f"{path}: expected candidates of {len(query_names)} queries, got none at all")
-    shortlist = _shortlist(path, [_without_repetitions(rows) for rows in candidates], query_names, num_candidates)
+    shortlist = _shortlist(path, candidates, query_names, num_candidates)
     return shortlist, _entries(path, query_names, queries), _entries(path, database_names, database)
 
 
@@ -116,14 +120,13 @@ def write_shortlist(
 
 def reranked_shortlist(shortlist: Shortlist, ranking: Ranking) -> Shortlist:
     """The shortlist in the order of a ranking, with its scores, `[Q, C]`."""
-    indices, scores, mask, order = (
-        np.asarray(part) for part in (shortlist.indices, ranking.scores, shortlist.mask, ranking.order)
-    )
-    indices, scores, mask = (np.take_along_axis(part, order, 1) for part in (indices, scores, mask))
+    order = np.asarray(ranking.order)
+    parts = (shortlist.indices, ranking.scores, shortlist.mask)
+    indices, scores, mask = (np.take_along_axis(np.asarray(part), order, 1) for part in parts)
     return Shortlist(indices=np.where(mask, indices, -1), scores=np.where(mask, scores, 0), mask=mask)
 
 
-def _from_npz(path: Path, num_queries: int, num_database: int) -> list[Candidates]:
+def _from_npz(path: Path, num_queries: int, num_database: int) -> Iterator[Scored]:
     arrays = read_npz(path, ("predictions", "scores"))
     predictions, scores = arrays.get("predictions"), arrays.get("scores")
     if predictions is None or predictions.ndim != 2 or predictions.dtype.kind not in "iu":
@@ -134,28 +137,14 @@ def _from_npz(path: Path, num_queries: int, num_database: int) -> list[Candidate
     wrong = (predictions >= num_database) | (predictions < -1)
     if wrong.any():
         query, position = np.argwhere(wrong)[0].tolist()
-        raise InputError(
-            f"{path}: predictions of query {query}: expected database rows from 0 to {num_database - 1}, or -1 "
-            f"for none, got {predictions[query, position]}"
-        )
+        raise InputError(f"{path}: predictions of query {query}: expected database rows from 0 to {num_database - 1}, "
+                         f"or -1 for none, got {predictions[query, position]}")  # fmt: skip
     if scores is not None and (scores.shape != predictions.shape or scores.dtype.kind not in "fiu"):
-        raise InputError(
-            f"{path}: expected scores {list(predictions.shape)} of numbers, got {scores.dtype}{list(scores.shape)}"
-        )
+        got = f"{scores.dtype}{list(scores.shape)}"
+        raise InputError(f"{path}: expected scores {list(predictions.shape)} of numbers, got {got}")
     values = [[None] * predictions.shape[1]] * num_queries if scores is None else scores.tolist()
-    return [
-        [(row, score) for row, score in zip(rows, row_scores, strict=True) if row >= 0]
-        for rows, row_scores in zip(predictions.tolist(), values, strict=True)
-    ]
-
-
-def _from_pairs(
-    pairs: Sequence[Pair], queries: dict[str, int], database: dict[str, int], num_queries: int
-) -> list[Candidates]:
-    candidates: list[Candidates] = [[] for _ in range(num_queries)]
-    for pair in pairs:
-        candidates[queries[pair.query]].append((database[pair.database], pair.score))
-    return candidates
+    for query, (rows, row_scores) in enumerate(zip(predictions.tolist(), values, strict=True)):
+        yield from ((query, row, score) for row, score in zip(rows, row_scores, strict=True) if row >= 0)
 
 
 def _rows(path: Path, names: Sequence[str], foreign: dict[str, None], side: str) -> dict[str, int]:
@@ -163,10 +152,9 @@ def _rows(path: Path, names: Sequence[str], foreign: dict[str, None], side: str)
     rows = {name: row for row, name in enumerate(match_names(path, names, foreign)) if name is not None}
     for name in foreign:
         if name not in rows:
-            raise InputError(
-                f"{path}: expected the relative path of a {side} image, got {shorten(name)!r}, which none of the "
-                f"{len(names)} has, or one has by its full path; give names with their folders as the file has them"
-            )
+            raise InputError(f"{path}: expected the relative path of a {side} image, got {shorten(name)!r}, which "
+                             f"none of the {len(names)} has, or one has by its full path; give names with their "
+                             "folders as the file has them")  # fmt: skip
     return rows
 
 
@@ -178,25 +166,18 @@ def _entries(path: Path, names: Sequence[str], rows: dict[str, int]) -> list[Fil
     return entries
 
 
-def _without_repetitions(candidates: Candidates) -> Candidates:
-    first_scores: dict[int, float | None] = {}
-    for row, score in candidates:
-        first_scores.setdefault(row, score)
-    return list(first_scores.items())
-
-
 def _shortlist(path: Path, candidates: list[Candidates], names: Sequence[str], num_candidates: int | None) -> Shortlist:
     depth = num_candidates or max(map(len, candidates))
     indices = np.full((len(candidates), depth), -1, np.int32)
     scores = np.zeros((len(candidates), depth), np.float32)
-    has_score = {score is not None for rows in candidates for _, score in rows}
+    has_score = {score is not None for rows in candidates for score in rows.values()}
     if len(has_score) == 2:
         raise InputError(f"{path}: expected scores of all pairs or of none, got some without")
     for query, rows in enumerate(candidates):
         count = min(len(rows), depth)
-        indices[query, :count] = [row for row, _ in rows[:count]]
+        indices[query, :count] = list(rows)[:count]
         if has_score == {True}:
-            values = _descending(f"{path}: {shorten(names[query])}", [score for _, score in rows])
+            values = _descending(f"{path}: {shorten(names[query])}", list(rows.values()))
             scores[query, :count] = values[:count]
         else:
             scores[query, :count] = np.arange(depth, depth - count, -1)
@@ -210,8 +191,6 @@ def _descending(where: str, scores: Any) -> np.ndarray:
     if not np.isfinite(values).all():
         raise InputError(f"{where}: expected finite scores, got others")
     if (np.diff(values) > 0).any():
-        raise InputError(
-            f"{where}: expected scores, larger = better, that descend from the first candidate on, got ascending ones; "
-            "sort the candidates, and negate distances"
-        )
+        raise InputError(f"{where}: expected scores, larger = better, that descend, got ascending ones; sort the "
+                         "candidates, and negate distances")  # fmt: skip
     return values

@@ -69,8 +69,9 @@ def _variables(file: BinaryIO, order: str) -> Iterator[_Element]:
             content = _unpack(element.content, room + 1)
             room -= len(content)
             if room < 0:
-                raise InputError(f"expected at most {_MAX_RATIO} times its {size:,} bytes, got what is much larger "
-                                 "when it is unpacked; use the official file")  # fmt: skip
+                raise InputError(
+                    f"expected at most {_MAX_RATIO} times its {size:,} bytes of content; use the official file"
+                )
             [element] = _elements(memoryview(content), order)
         if element.kind == _MATRIX:
             yield element
@@ -117,12 +118,12 @@ def _arrays(path: str, content: memoryview, order: str, depth: int) -> Iterator[
         raise ValueError("too many axes")
     name = bytes(_next(parts, _NAMES)).decode("ascii")
     path, kind, number = path or name, flags & 0xFF, math.prod(shape)
+    if kind in (_CELL, _STRUCTURE) and number > len(content) // 8:  # an element takes at least eight bytes
+        raise ValueError("more elements than bytes")
     if kind == _CELL:
-        _require_room(number, content)
         yield from _parts([f"{path}.{place}" for place in range(number)], parts, order, depth)
     elif kind == _STRUCTURE:
         fields = _fields(parts, order)
-        _require_room(number, content)
         owners = [f"{path}.{place}" for place in range(number)] if number > 1 else [path] * number
         yield from _parts([f"{owner}.{field}" for owner in owners for field in fields], parts, order, depth)
     elif kind in _NUMBERS and number and not flags & _COMPLEX:
@@ -161,11 +162,6 @@ def _next(parts: Iterator[_Element], kind: int) -> memoryview:
     if element is None or element.kind != kind:
         raise ValueError("an element of another type")
     return element.content
-
-
-def _require_room(number: int, content: memoryview) -> None:
-    if number > len(content) // 8:  # an element takes at least eight bytes
-        raise ValueError("more elements than bytes")
 
 
 def _integers(content: memoryview, order: str) -> tuple[int, ...]:

@@ -41,10 +41,7 @@ class Array:
         return math.prod(self.shape) * self._dtype(where).itemsize
 
     def numbers(self, where: str = "") -> np.ndarray:
-        """The numbers, read-only, in the file's own type.
-
-        Args:
-            where: place of the array in the file, for messages.
+        """The numbers, read-only, in the file's own type; `where` ends the message of an error.
 
         Raises:
             InputError: the array does not hold numbers.

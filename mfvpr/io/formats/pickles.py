@@ -16,11 +16,12 @@ from mfvpr.utils.errors import InputError
 
 MEND = "nothing was executed, use the official file"
 MAX_INSTRUCTIONS = 1 << 20  # each makes at most one object; strings are no longer than the file
+_HASH_MODULUS = 2**61 - 1  # integers that differ by it have one hash; many of them take a dictionary years
 _STANDARD = """
 PROTO STOP MARK NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 FLOAT BINFLOAT
 UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8 BINSTRING SHORT_BINSTRING BINBYTES SHORT_BINBYTES BINBYTES8
 EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 EMPTY_LIST LIST APPEND APPENDS EMPTY_DICT
-PUT BINPUT LONG_BINPUT MEMOIZE GET BINGET LONG_BINGET GLOBAL STACK_GLOBAL BINPERSID
+BINPUT LONG_BINPUT MEMOIZE GET BINGET LONG_BINGET GLOBAL STACK_GLOBAL BINPERSID
 """
 _Unpickler: Any = pickle._Unpickler  # type: ignore[attr-defined]  # in Python
 
@@ -68,11 +69,7 @@ class DataUnpickler(_Unpickler):
         return Name(module, name)
 
     def call(self, name: Name, arguments: tuple) -> Any:
-        """Return what stands for the result of this call.
-
-        Raises:
-            InputError: the name may not be called.
-        """
+        """Return what stands for the result of this call; raise an InputError if the name may not be called."""
         raise NotImplementedError
 
     def build(self, instance: Any, state: Any) -> None:
@@ -89,6 +86,12 @@ class DataUnpickler(_Unpickler):
     def load_build(self) -> None:
         state = self.stack.pop()
         self.build(self.stack[-1], state)
+
+    def load_put(self) -> None:
+        index = int(self.readline())
+        if not 0 <= index < _HASH_MODULUS:
+            raise ValueError("an index of the memo out of range")
+        self.memo[index] = self.stack[-1]
 
     def load_dict(self) -> None:
         keys_and_values = self.pop_mark()  # which replaces self.append
@@ -124,6 +127,7 @@ _HANDLERS = {
     pickle.REDUCE[0]: DataUnpickler.load_call,
     pickle.NEWOBJ[0]: DataUnpickler.load_call,
     pickle.BUILD[0]: DataUnpickler.load_build,
+    pickle.PUT[0]: DataUnpickler.load_put,
     pickle.DICT[0]: DataUnpickler.load_dict,
     pickle.SETITEM[0]: DataUnpickler.load_setitem,
     pickle.SETITEMS[0]: DataUnpickler.load_setitems,
@@ -131,7 +135,10 @@ _HANDLERS = {
 
 
 def _dictionary(keys_and_values: list[Any]) -> dict[int | str, Any]:
-    keys = [key if type(key) is int else of_type(str, key) for key in keys_and_values[::2]]
+    keys = keys_and_values[::2]
+    for key in keys:
+        if not (type(key) is int and abs(key) < _HASH_MODULUS):
+            of_type(str, key)
     return dict(zip(keys, keys_and_values[1::2], strict=True))
 
 
@@ -155,7 +162,6 @@ def excerpt(text: str) -> str:
 
 
 def name_error(name: Name, expected: str) -> InputError:
-    """Error for a pickle that asks for this name."""
     return InputError(f"it asks for {excerpt(str(name))}, where {expected} are expected; {MEND}")
 
 
