@@ -60,7 +60,10 @@ def _computed(clone: str, channels: int, rows: int, checkpoint: Mapping) -> dict
     prefix = "aggregator."
     aggregator.load_state_dict({key.removeprefix(prefix): checkpoint[key] for key in checkpoint if prefix in key})
     aggregator.double().eval()
-    maps = resnet(lambda key: checkpoint[key].double(), torch.from_numpy(images()).double().permute(0, 3, 1, 2))
+    pixels = torch.from_numpy(images()).double().permute(0, 3, 1, 2)
+    backbone = "backbone.model"
+    layers = tuple(f"{backbone}.layer{place}" for place in (1, 2, 3))
+    maps = resnet(lambda key: checkpoint[key].double(), pixels, f"{backbone}.conv1", f"{backbone}.bn1", layers)
     faint = torch.from_numpy(faint_maps()).double().permute(0, 3, 1, 2)
     width = channels * rows
     golden = {f"{width}/descriptors": aggregator(maps), f"{width}/faint": aggregator(faint)}

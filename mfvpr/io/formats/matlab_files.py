@@ -69,9 +69,8 @@ def _variables(file: BinaryIO, order: str) -> Iterator[_Element]:
             content = _unpack(element.content, room + 1)
             room -= len(content)
             if room < 0:
-                raise InputError(
-                    f"expected at most {_MAX_RATIO} times its {size:,} bytes of content; use the official file"
-                )
+                most = f"at most {_MAX_RATIO} times its {size:,} bytes"
+                raise InputError(f"expected {most} when it is unpacked; use the official file")
             [element] = _elements(memoryview(content), order)
         if element.kind == _MATRIX:
             yield element
