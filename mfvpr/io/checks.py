@@ -7,15 +7,8 @@ import numpy as np
 from mfvpr.utils.errors import InputError
 
 Lengths = Literal["unit", "normalize", "keep"]
-LENGTHS = ("unit", "normalize", "keep")
 TOLERANCE = 0.01  # of unit length, relative; the error of float16 is 5e-4
 EXACT = 1e-6  # the error of float32
-
-
-def require_lengths(lengths: str) -> None:
-    """Raise an InputError unless `lengths` is one of `LENGTHS`."""
-    if lengths not in LENGTHS:
-        raise InputError(f"lengths={lengths}: expected one of {', '.join(LENGTHS)}")
 
 
 def as_float32(where: str, array: np.ndarray, kinds: str = "f") -> np.ndarray:

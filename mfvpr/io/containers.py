@@ -1,13 +1,14 @@
 """Common interface of files with arrays by image: hloc's h5, npz, folders of npz."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import require_file
 
 
 class Contents(NamedTuple):
@@ -29,8 +30,8 @@ class FileEntry(NamedTuple):
     name: str
 
 
-class Container(Protocol):
-    """Arrays of several images; reads only the requested arrays.
+class Container:
+    """Base class of readers of several images, which read only the requested arrays.
 
     Attributes:
         path: file or folder, for messages.
@@ -40,19 +41,27 @@ class Container(Protocol):
 
     path: Path
     images: tuple[str, ...]
-    transposed: bool
+    transposed = False
 
     def contents(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Contents]:
         """For each image, the names of all arrays and the shapes of those in `parts`; reads no values."""
-        ...
+        raise NotImplementedError
 
     def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:
         """For each image, its arrays among `parts`."""
-        ...
+        raise NotImplementedError
 
     def entry(self, image: str) -> FileEntry:
         """Place of an image's arrays."""
-        ...
+        return FileEntry(self.path, image)
+
+
+def choose_reader(path: Path, readers: Mapping[str, Callable]) -> Callable:
+    """The reader for a file's suffix; raise an InputError for a path that is no file, or has another suffix."""
+    require_file(path)
+    if path.suffix.lower() not in readers:
+        raise InputError(f"{path}: expected a file named {', '.join(readers)}, got {path.suffix or 'no suffix'}")
+    return readers[path.suffix.lower()]
 
 
 @contextmanager

@@ -5,14 +5,14 @@ from pathlib import Path
 
 import numpy as np
 
-from mfvpr.io.checks import Lengths, as_float32, require_lengths, with_length
-from mfvpr.io.containers import FileEntry, reading, shorten
+from mfvpr.io.checks import Lengths, as_float32, with_length
+from mfvpr.io.containers import FileEntry, choose_reader, reading, shorten
 from mfvpr.io.feature_files import as_float
 from mfvpr.io.h5 import H5File, write_h5
 from mfvpr.io.names import match_names, require_all, require_different
 from mfvpr.io.npz import parse_npy, read_npz, write_npz
-from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import printable, replacing, require_file
+from mfvpr.utils.errors import InputError, require_word
+from mfvpr.utils.files import printable, replacing
 
 PART = "global_descriptor"  # hloc's name
 
@@ -42,12 +42,9 @@ def read_with_entries(
 ) -> tuple[np.ndarray, list[FileEntry]]:
     """Descriptors as `read_global_descriptors` returns them, and `[M]` the entry of each image."""
     path = Path(path)
-    require_lengths(lengths)
+    require_word("lengths", lengths, Lengths)
     readers = {".npy": _from_npy, ".npz": _from_npz, ".h5": _from_h5, ".hdf5": _from_h5}
-    require_file(path)
-    if path.suffix.lower() not in readers:
-        raise InputError(f"{path}: expected a file named {', '.join(readers)}, got {path.suffix or 'no suffix'}")
-    entries, values = readers[path.suffix.lower()](path, names)
+    entries, values = choose_reader(path, readers)(path, names)
     _require_rows(path, values, names)
     values = with_length(str(path), as_float32(str(path), values), lengths)
     return values, [FileEntry(path, entry) for entry in entries]

@@ -24,14 +24,13 @@ from typing import Any
 
 import numpy as np
 
-from mfvpr.io.checks import Lengths, as_float32, require_lengths, with_length
-from mfvpr.io.containers import Container, Contents, FileEntry, shorten
+from mfvpr.io.checks import Lengths, as_float32, with_length
+from mfvpr.io.containers import Container, Contents, FileEntry, choose_reader, shorten
 from mfvpr.io.h5 import H5File
 from mfvpr.io.names import match_names, require_all
 from mfvpr.io.npz import NpzFile, NpzFolder
 from mfvpr.types import Features
-from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import require_file
+from mfvpr.utils.errors import InputError, require_word
 
 SCORES = ("scores", "keypoint_scores")
 PARTS = ("keypoints", "descriptors", *SCORES, "image_size")
@@ -95,9 +94,8 @@ class ImportedFeatures:
         keypoints = as_float32(f"{where}: keypoints", parts["keypoints"], "fiu")[:, :2]
         descriptors = as_float32(f"{where}: descriptors", parts["descriptors"])
         descriptors = descriptors.T if self._transposed else descriptors
-        scores = np.ones(count, np.float32)
-        if part := _score_part(parts):
-            scores = as_float32(f"{where}: {part}", parts[part]).reshape(-1)
+        part = _score_part(parts)
+        scores = as_float32(f"{where}: {part}", parts[part]).reshape(-1) if part else np.ones(count, np.float32)
         has_shape = descriptors.shape == shape if count else not descriptors.size  # [D, 0], [0, D] or [0] if count = 0
         if len(keypoints) != count or len(scores) != count or not has_shape or self.scored != (part is not None):
             got = f"{len(keypoints)}, {len(scores)} and {list(descriptors.shape)}"
@@ -139,7 +137,7 @@ def open_features(
             fit each other.
     """
     path = Path(path)
-    require_lengths(lengths)
+    require_word("lengths", lengths, Lengths)
     sizes = None if image_size is None else _explicit_sizes(image_size, len(names))
     container = open_container(path)
     images = match_names(path, names, container.images)
@@ -169,11 +167,7 @@ def open_container(path: Path) -> Container:
     """Open a folder, or a file by its suffix."""
     if path.is_dir():
         return NpzFolder(path)
-    require_file(path)
-    readers = {".h5": H5File, ".hdf5": H5File, ".npz": NpzFile}
-    if path.suffix.lower() not in readers:
-        raise InputError(f"{path}: expected a folder or a file named {', '.join(readers)}, got {path.suffix or 'none'}")
-    return readers[path.suffix.lower()](path)
+    return choose_reader(path, {".h5": H5File, ".hdf5": H5File, ".npz": NpzFile})(path)
 
 
 def _require_parts(where: str, parts: Collection[str]) -> None:

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from mfvpr.io.containers import Contents, FileEntry, reading, require_plain, shorten
+from mfvpr.io.containers import Container, Contents, reading, require_plain, shorten
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import printable, replacing, require_file
 
 
-class H5File:
+class H5File(Container):
     """Reader of an hloc file, which is open only during a call."""
 
     transposed = True
@@ -44,9 +44,6 @@ class H5File:
             for image in images:
                 group = h5py.h5g.open(file.id, _encode(image))
                 yield {part: _read(self.path, image, group, part) for part in parts if _encode(part) in group}
-
-    def entry(self, image: str) -> FileEntry:
-        return FileEntry(self.path, image)
 
 
 def write_h5(path: Path, groups: Iterable[tuple[str, Mapping[str, np.ndarray]]]) -> None:

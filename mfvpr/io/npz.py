@@ -12,20 +12,18 @@ from typing import IO
 
 import numpy as np
 
-from mfvpr.io.containers import Contents, FileEntry, reading, require_plain, shorten
+from mfvpr.io.containers import Container, Contents, FileEntry, reading, require_plain, shorten
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import printable, replacing, require_file
 
 SUFFIXES = (".npz", ".d2-net")  # of files in a folder; D2-Net's code writes `.d2-net`
 
 
-class NpzFile:
+class NpzFile(Container):
     """Reader of one archive for all images, with arrays named `image/part`: `a/1.jpg/keypoints`.
 
     Every call reads the directory, which takes half a second for 10,000 images: request many images at once.
     """
-
-    transposed = False
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -52,14 +50,9 @@ class NpzFile:
             for image in images:
                 yield {part: _array(archive, name) for part, name in _members(members, f"{image}/", parts)}
 
-    def entry(self, image: str) -> FileEntry:
-        return FileEntry(self.path, image)
 
-
-class NpzFolder:
+class NpzFolder(Container):
     """Reader of a folder with an archive for each image: `a/1.jpg.npz` or `a/1.jpg.d2-net`."""
-
-    transposed = False
 
     def __init__(self, path: Path) -> None:
         self.path = path

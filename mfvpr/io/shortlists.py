@@ -11,7 +11,7 @@ from mfvpr.io.names import adds_folders, match_names, require_different
 from mfvpr.io.npz import read_npz, write_npz
 from mfvpr.io.pairs import read_pairs, require_lines
 from mfvpr.types import Ranking, Shortlist
-from mfvpr.utils.errors import InputError
+from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.files import require_file, write_text
 
 PairLayout = Literal["hloc", "kapture"]
@@ -93,8 +93,7 @@ def write_shortlist(
         InputError: names are missing or do not fit a line; written scores are not finite, or ascending.
     """
     path = Path(path)
-    if layout not in ("hloc", "kapture"):
-        raise InputError(f"layout={layout}: expected hloc or kapture")
+    require_word("layout", layout, PairLayout)
     indices, scores, mask = (np.asarray(part) for part in (shortlist.indices, shortlist.scores, shortlist.mask))
     if len(indices) != len(query_names):
         raise InputError(f"{path}: expected the names of {len(indices)} queries, got {len(query_names)}")

@@ -224,7 +224,7 @@ def test_lengths_of_descriptors(path):
     append_hloc(path, "zero.jpg", spoiled("descriptors", 0, row=slice(None))(parts))
     with pytest.raises(InputError, match=r"zero\.jpg: descriptors: .*got zeros at 0"):
         list(open_features(path, ["zero.jpg"], lengths="normalize").read())
-    with pytest.raises(InputError, match=r"lengths=l2: .*unit, normalize, keep"):
+    with pytest.raises(InputError, match=r"lengths='l2': .*unit, normalize, keep"):
         open_features(path, ["a.jpg"], lengths="l2")  # type: ignore[arg-type]
 
 

@@ -214,7 +214,7 @@ def test_what_cannot_be_written(tmp_path):
     ):
         with pytest.raises(InputError, match=message):
             write_shortlist(path, shortlist, *names)
-    with pytest.raises(InputError, match=r"layout=csv: .*hloc .*kapture"):
+    with pytest.raises(InputError, match=r"layout='csv': .*hloc, kapture"):
         write_shortlist(path, shortlist, QUERIES[:1], DATABASE, layout="csv")  # type: ignore[arg-type]
     wrong = Shortlist(indices=np.array([[0, 1]]), scores=np.array([[0.5, np.nan]]), mask=np.ones((1, 2), bool))
     ascending = Shortlist(indices=np.array([[0, 1]]), scores=np.array([[0.5, 0.7]]), mask=np.ones((1, 2), bool))
