@@ -91,12 +91,11 @@ def download(name: str) -> None:
     """Download an official checkpoint into the weights folder, under its name only if its hash is the published one."""
     from mfvpr.checkpoints import entry_of, weights_folder
     from mfvpr.checkpoints.files import file_sha256
-    from mfvpr.utils import InputError
 
     entry = entry_of(name)
     if entry.sha256 is None:
-        raise InputError(f"{name}: no hash is published, so it cannot be fetched safely; get {entry.file} from "
-                         f"{entry.source}, then: {how_to_install(entry)}")  # fmt: skip
+        refuse(f"{name}: no hash is published, so it cannot be fetched safely; get {entry.file} from {entry.source}, "
+               f"then: {how_to_install(entry)}")  # fmt: skip
     target = weights_folder() / entry.file
     size = f"{entry.size:,} bytes" if entry.size else "size not published"
     print(f"{entry.file}: {entry.source}, {size}, {entry.license}", flush=True)
@@ -115,7 +114,6 @@ def _fetch(entry: "Entry", target: Path) -> None:
     from tqdm import tqdm
 
     from mfvpr.checkpoints.files import check_sha256, file_sha256
-    from mfvpr.utils import InputError
     from mfvpr.utils.files import replacing
 
     try:
@@ -133,20 +131,19 @@ def _fetch(entry: "Entry", target: Path) -> None:
             check_sha256(file_sha256(temporary), entry, entry.source)
     except (OSError, HTTPException) as error:
         reason = getattr(error, "reason", None) or error
-        raise InputError(f"{entry.source}: could not be downloaded to {target.parent}: {reason}") from error
+        refuse(f"{entry.source}: could not be downloaded to {target.parent}: {reason}")
 
 
 def _entry_of(file: Path, name: str | None) -> "Entry":
     from mfvpr.checkpoints import REGISTRY, entry_of
-    from mfvpr.utils import InputError
 
     if name is not None:
         return entry_of(name)
     if known := [entry for entry in REGISTRY.values() if entry.file == file.name]:
         return known[0]
     if not file.exists():
-        raise InputError(f"{file}: no such file")
-    raise InputError(f"{file}: no official file name; say what it is with --as NAME, one of {', '.join(REGISTRY)}")
+        refuse(f"{file}: no such file")
+    refuse(f"{file}: no official file name; say what it is with --as NAME, one of {', '.join(REGISTRY)}")
 
 
 def _present_files(entry: "Entry") -> tuple[bool, bool]:

@@ -125,7 +125,7 @@ def _is_hard(path: Path, group: Any, name: bytes) -> bool:
 
 
 def _link_error(path: Path, where: bytes) -> InputError:
-    """Error for any link: a link inside the file may lead to one that leaves it."""
+    # Also for a link inside the file, which may lead to one that leaves it.
     return InputError(f"{path}: {_decode(where)}: expected data, got a link, which is not followed; copy the data")
 
 

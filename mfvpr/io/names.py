@@ -12,6 +12,7 @@ from mfvpr.utils.files import IMAGE_SUFFIXES, printable
 Prefix = tuple[tuple[str, ...], tuple[str, ...]]  # folders only in the file's names, only in the images' names
 ImageOfEntry = dict[tuple[int, int, str], Path]  # device, inode and name of an entry -> image
 _NO_PREFIX: Prefix = ((), ())
+_FULL_NAMES = "give names with their folders as the file has them"
 
 
 def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> list[str | None]:
@@ -36,7 +37,7 @@ def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> lis
     foreign = dict.fromkeys(foreign)
     texts = {printable(name): name for name in foreign} | {printable(name): name for name in names if name in foreign}
     matched = [texts.get(printable(name)) for name in names]
-    for variants in (_whole, _stems):
+    for variants in (lambda name: [name], _stems):
         free = foreign.keys() - set(matched)
         rows = [row for row, match in enumerate(matched) if match is None]
         if free and rows:
@@ -54,26 +55,20 @@ def require_all(path: Path, names: Sequence[str], matched: Sequence[str | None],
     """Return the result of `match_names`; raise an InputError if the file lacks the `content` of an image."""
     missing = [name for name, match in zip(names, matched, strict=True) if match is None]
     if missing:
-        raise InputError(
-            f"{path}: expected {content} of all {len(names)} images, got {len(names) - len(missing)}; the first "
-            f"without is {shorten(missing[0])} (images are called by their paths below their folder)"
-        )
+        raise InputError(f"{path}: expected {content} of all {len(names)} images, got {len(names) - len(missing)}; "
+                         f"the first without is {shorten(missing[0])} (names are paths below the folder)")  # fmt: skip
     return [match for match in matched if match is not None]
 
 
 def require_one_image(
     path: Path, images: Sequence[Path], entries: Sequence[FileEntry | None], known: ImageOfEntry
 ) -> None:
-    """Raise an InputError if an entry stands for images of two folders.
+    """Raise an InputError if an entry of a file stands for two images, unless both paths lead to one file.
 
     Args:
         path: file or folder, for messages.
-        images: `[M]` paths of a folder's images.
-        entries: `[M]` their entries; None = the file lacks the image.
+        images, entries: `[M]` paths of a folder's images, and their entries; None = the file lacks the image.
         known: images of the entries of earlier folders; the images of this folder are added.
-
-    Raises:
-        InputError: an entry has another image in `known`, unless both paths lead to one file.
     """
     for image, entry in zip(images, entries, strict=True):
         if entry is None:
@@ -83,10 +78,8 @@ def require_one_image(
         if other != image and os.path.realpath(other) != os.path.realpath(image):
             name = shorten(entry.name or entry.file.name)
             first, second = (shorten(str(file), 300) for file in (other, image))
-            raise InputError(
-                f"{path}: expected one image for each entry, got {name} for {first} and for {second}; "
-                "give names with their folders as the file has them, or a file for each folder"
-            )
+            raise InputError(f"{path}: expected one image for each entry, got {name} for {first} and for {second}; "
+                             f"{_FULL_NAMES}, or a file for each folder")  # fmt: skip
 
 
 def adds_folders(name: str, match: str) -> bool:
@@ -135,18 +128,14 @@ def _match_ends(path: Path, names: Sequence[str], rows: list[int], ends: _Ends, 
             continue
         if len(row_candidates) > 1 or num_images[next(iter(row_candidates))] > 1:
             several = " and ".join(shorten(name) for name in sorted(row_candidates)[:2])
-            raise InputError(
-                f"{path}: {shorten(names[row])}: expected its relative path in the file, got {several}, which may "
-                "mean other images as well; give names with their folders as the file has them"
-            )
+            raise InputError(f"{path}: {shorten(names[row])}: expected its relative path in the file, got {several}, "
+                             f"which may mean other images as well; {_FULL_NAMES}")  # fmt: skip
         matched[row] = match = next(iter(row_candidates))
         examples.setdefault(_prefix(names[row], match), (names[row], match))
     if len(examples) > 1:
         pairs = " but ".join(f"{shorten(match)} for {shorten(name)}" for name, match in [*examples.values()][:2])
-        raise InputError(
-            f"{path}: expected names with one prefix for all images of a folder, got {pairs}; give the prefix of the "
-            "folder, or name the images by their relative paths"
-        )
+        raise InputError(f"{path}: expected names with one prefix for all images of a folder, got {pairs}; give the "
+                         "prefix of the folder, or name the images by their relative paths")  # fmt: skip
 
 
 def _prefix(name: str, match: str) -> Prefix:
@@ -154,10 +143,6 @@ def _prefix(name: str, match: str) -> Prefix:
     ours, theirs = (tuple(_parts(text)) for text in (name, match))
     shared = min(len(ours), len(theirs))
     return theirs[: len(theirs) - shared], ours[: len(ours) - shared]
-
-
-def _whole(name: str) -> list[str]:
-    return [name]
 
 
 def _stems(name: str) -> list[str]:

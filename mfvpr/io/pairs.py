@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
@@ -23,14 +24,14 @@ class Pair(NamedTuple):
 
 
 class _Names:
-    """Names of the query or database images, and the file names and stems that may stand for them."""
+    """Paths of the query or database images, and the file names and stems that may stand for them."""
 
     def __init__(self, names: Sequence[str]) -> None:
-        self.whole = {printable(name) for name in names}
-        bases = {PurePosixPath(name).name for name in self.whole}
-        self.ends = bases | {PurePosixPath(name).stem for name in bases}
+        self.paths = {printable(name) for name in names}
+        paths = [PurePosixPath(name) for name in self.paths]
+        self.ends = {path.name for path in paths} | {path.stem for path in paths}
 
-    def ends_of(self, text: str) -> bool:
+    def has_end(self, text: str) -> bool:
         return PurePosixPath(text).name in self.ends
 
 
@@ -58,11 +59,11 @@ def read_pairs(path: Path, query_names: Sequence[str], database_names: Sequence[
 
 def _pair(where: str, line: str, queries: _Names, database: _Names) -> Pair | None:
     words = line.split()
-    if len(words) == 2 and words[0] in queries.whole and words[1] in database.whole:
+    if len(words) == 2 and words[0] in queries.paths and words[1] in database.paths:
         return Pair(words[0], words[1])  # nearly every line of hloc
     splits = list(_splits(line))
-    pairs = [pair for pair in splits if pair.query in queries.whole and pair.database in database.whole]
-    pairs = pairs or [pair for pair in splits if queries.ends_of(pair.query) and database.ends_of(pair.database)]
+    pairs = [pair for pair in splits if pair.query in queries.paths and pair.database in database.paths]
+    pairs = pairs or [pair for pair in splits if queries.has_end(pair.query) and database.has_end(pair.database)]
     if len(pairs) == 1:
         return pairs[0]
     if not pairs and line.startswith("#"):
@@ -76,15 +77,9 @@ def _splits(line: str) -> Iterator[Pair]:
     for separator in _SEPARATOR.finditer(line):
         query, database = line[: separator.start()], line[separator.end() :]
         yield Pair(query, database)
-        if (scored := _SCORED.fullmatch(database)) and (score := _number(scored[2])) is not None:
-            yield Pair(query, scored[1], score)
-
-
-def _number(text: str) -> float | None:
-    try:
-        return parse_number(text)
-    except ValueError:
-        return None
+        if scored := _SCORED.fullmatch(database):
+            with suppress(ValueError):  # the last word is no number
+                yield Pair(query, scored[1], parse_number(scored[2]))
 
 
 def require_lines(path: Path, names: Collection[str]) -> None:
