@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import safetensors.numpy
 
 from mfvpr.checkpoints.checkpoint import read_checkpoint, require_checkpoint
 from mfvpr.checkpoints.conversion import convert, is_ignored
+from mfvpr.checkpoints.networks import blueprint, network_of, resemblance
 from mfvpr.checkpoints.registry import REGISTRY, Entry, entry_of
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import replacing, write_text
@@ -59,8 +61,6 @@ def install(checkpoint: Path, name: str, folder: Path | None = None) -> Path:
     Raises:
         InputError: the name is unknown, or the file is no checkpoint, not the published one, or of another network.
     """
-    from mfvpr.checkpoints.networks import blueprint, network_of, resemblance
-
     entry = entry_of(name)
     network = network_of(entry)
     require_checkpoint(checkpoint)  # first, since "a web page" helps more than another hash
@@ -117,13 +117,11 @@ def save(
     Raises:
         InputError: the name is unknown, or values are not finite.
     """
-    from safetensors.numpy import save as serialized
-
     entry = entry_of(name)
     for path, array in arrays.items():
         if not np.isfinite(array).all():
             raise InputError(f"{source}: expected finite values, got NaN or infinity in {path}; use the official file")
-    content = serialized({path: np.ascontiguousarray(array) for path, array in arrays.items()})
+    content = safetensors.numpy.save({path: np.ascontiguousarray(array) for path, array in arrays.items()})
     target = _path(entry, folder)
     with replacing(target) as temporary:
         temporary.write_bytes(content)
@@ -140,9 +138,6 @@ def load(name: str, folder: Path | None = None) -> dict[str, np.ndarray]:
         InputError: the name is unknown.
         WeightsError: the weights are not installed, the manifest is missing or of other weights, or a file is damaged.
     """
-    from safetensors import SafetensorError
-    from safetensors.numpy import load as deserialized
-
     entry = entry_of(name)
     manifest = read_manifest(name, folder)
     path = _path(entry, folder)
@@ -152,8 +147,8 @@ def load(name: str, folder: Path | None = None) -> dict[str, np.ndarray]:
     if hashlib.sha256(content).hexdigest() != manifest.sha256:
         raise WeightsError(f"{path}: the file has changed since it was written (sha256 differs); {_MEND}", entry)
     try:
-        return deserialized(content)
-    except (SafetensorError, KeyError, ValueError, TypeError) as error:
+        return safetensors.numpy.load(content)
+    except (safetensors.SafetensorError, KeyError, ValueError, TypeError) as error:
         raise WeightsError(f"{path}: expected a safetensors file, got: {error}; {_MEND}", entry) from error
 
 
@@ -164,8 +159,6 @@ def load_model(name: str, folder: Path | None = None) -> "nnx.Module":
         InputError: the name is unknown.
         WeightsError: as `load`; or the arrays do not fit the network.
     """
-    from mfvpr.checkpoints.networks import blueprint
-
     entry = entry_of(name)
     arrays = load(name, folder)
     try:

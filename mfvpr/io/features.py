@@ -114,12 +114,7 @@ class ImportedFeatures:
 
 
 def open_features(
-    path: Path | str,
-    names: Sequence[str],
-    *,
-    image_size: Any = None,
-    lengths: Lengths = "unit",
-    partial: bool = False,
+    path: Path | str, names: Sequence[str], *, image_size: Any = None, lengths: Lengths = "unit", partial: bool = False
 ) -> ImportedFeatures:
     """Open the features of the images `names`; reads only the headers of their arrays.
 
