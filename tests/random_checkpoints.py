@@ -229,8 +229,8 @@ def netvlad_shapes(clusters: int = 16, outputs: int | None = 4096) -> dict[str, 
 
 def netvlad_checkpoint(clusters: int = 16, outputs: int | None = 4096, seed: int = 0) -> dict[str, np.ndarray]:
     """Random weights that assign as decidedly as published ones."""
-    found = random_checkpoint(netvlad_shapes(clusters, outputs), seed)
-    return found | {"pool.conv.weight": 40 * found["pool.conv.weight"]}
+    tensors = random_checkpoint(netvlad_shapes(clusters, outputs), seed)
+    return tensors | {"pool.conv.weight": 40 * tensors["pool.conv.weight"]}
 
 
 def gem_checkpoint(backbone: str = "resnet50", outputs: int = 2048, seed: int = 0) -> dict[str, np.ndarray]:
@@ -261,15 +261,15 @@ def dinov2_shapes(
         shapes["register_tokens"] = (1, registers, width)
     linear = {"attn.qkv": (3, 1), "attn.proj": (1, 1), "mlp.fc1": (4, 1), "mlp.fc2": (1, 4)}
     if adapted:
-        adapters = (f"adapter{one}.D_fc{place}" for one in (1, 2) for place in (1, 2))
+        adapters = (f"adapter{number}.D_fc{place}" for number in (1, 2) for place in (1, 2))
         linear |= {name: (0.5, 1) if name.endswith("1") else (1, 0.5) for name in adapters}
     for block in (f"blocks.{place}" for place in range(depth)):
         for name, (outputs, inputs) in linear.items():
             shapes[f"{block}.{name}.weight"] = (int(outputs * width), int(inputs * width))
             shapes[f"{block}.{name}.bias"] = (int(outputs * width),)
-        for one in (1, 2):
-            shapes[f"{block}.ls{one}.gamma"] = (width,)
-            shapes |= {f"{block}.norm{one}.{part}": (width,) for part in ("weight", "bias")}
+        for number in (1, 2):
+            shapes[f"{block}.ls{number}.gamma"] = (width,)
+            shapes |= {f"{block}.norm{number}.{part}": (width,) for part in ("weight", "bias")}
     return {f"{prefix}{name}": shape for name, shape in shapes.items()}
 
 
@@ -285,13 +285,13 @@ def selavpr_shapes(
 
 def transformer_checkpoint(shapes: Mapping[str, tuple[int, ...]], seed: int = 0) -> dict[str, np.ndarray]:
     """Random weights of these tensors, in which positions and registers count as much as the patches do."""
-    found = random_checkpoint(shapes, seed)
-    for name, tensor in found.items():
+    tensors = random_checkpoint(shapes, seed)
+    for name, tensor in tensors.items():
         if name.endswith(("pos_embed", "register_tokens")):
-            found[name] = tensor / tensor.std() / 2
+            tensors[name] = tensor / tensor.std() / 2
         if name.endswith("aggregation.1.p"):
-            found[name] = np.float32([2.875])
-    return found
+            tensors[name] = np.float32([2.875])
+    return tensors
 
 
 def matlab_shapes(clusters: int = 64, outputs: int = 4096) -> dict[str, tuple[int, ...]]:
@@ -316,14 +316,14 @@ def matlab_netvlad(clusters: int = 64, outputs: int = 4096, seed: int = 0) -> di
     for position in range(35):
         layer: dict[str, Any] = {"name": f"layer{position}", "type": "conv" if position in weights else "relu"}
         if position in weights:
-            layer["weights"] = _cell(weights[position])
+            layer["weights"] = cell(weights[position])
         layers[0, position] = layer
     average = np.broadcast_to(np.float32([123.68, 116.779, 103.939]), (6, 5, 3)).copy()
     meta = {"normalization": {"averageImage": average, "imageSize": np.float64([[5, 6, 3]])}, "classes": "none"}
     return {"net": {"layers": layers, "meta": meta}}
 
 
-def _cell(parts: list[Any]) -> np.ndarray:
+def cell(parts: list[Any]) -> np.ndarray:
     cell = np.empty((1, len(parts)), object)
     for place, part in enumerate(parts):
         cell[0, place] = part

@@ -42,17 +42,17 @@ def refused(path):
 
 
 def refused_content(path, content):
-    """What is said of this content in a zip file; in an old one the same is said."""
+    """Message for this content in a zip file; the one for an old file is the same."""
     old = refused(write_legacy(path, content))
     assert refused(write_zip(path, content)) == old
     return old
 
 
-def assert_same(found, expected):
-    assert list(found) == list(expected)
+def assert_same(arrays, expected):
+    assert list(arrays) == list(expected)
     for key, array in expected.items():
-        np.testing.assert_array_equal(found[key], array)
-        assert (found[key].dtype, found[key].shape) == (array.dtype, array.shape)
+        np.testing.assert_array_equal(arrays[key], array)
+        assert (arrays[key].dtype, arrays[key].shape) == (array.dtype, array.shape)
 
 
 @pytest.fixture
@@ -81,28 +81,23 @@ def test_layouts_of_checkpoints(path, arrays, wrap, write):
 
 @WRITERS
 def test_strided_views_of_storages(path, write):
-    whole = np.arange(24, dtype=np.float32)
+    values = np.arange(24, dtype=np.float32)
     views = {
-        "part": View(whole, 2, (2, 3), (6, 2)),
+        "part": View(values, 2, (2, 3), (6, 2)),
         "transposed": np.arange(6.0).reshape(2, 3).T,
-        "last": View(whole, 23, (), ()),
-        "none": View(whole, 24, (0, 5), (5, 1)),
-        "ends": View(whole, 3, (4,), (7,), count=25, key="9"),
+        "last": View(values, 23, (), ()),
+        "none": View(values, 24, (0, 5), (5, 1)),
     }
-    with pytest.raises(InputError, match="damaged"):
-        read_checkpoint(write(path, views))
-    del views["ends"]
-    found = read_checkpoint(write(path, views))
-    np.testing.assert_array_equal(found["part"], [[2, 4, 6], [8, 10, 12]])
-    np.testing.assert_array_equal(found["transposed"], [[0, 3], [1, 4], [2, 5]])
-    assert found["last"] == 23
-    assert found["none"].shape == (0, 5)
+    assert "damaged" in refused(write(path, views | {"ends": View(values, 3, (4,), (7,), count=25, key="9")}))
+    arrays = read_checkpoint(write(path, views))
+    np.testing.assert_array_equal(arrays["part"], [[2, 4, 6], [8, 10, 12]])
+    np.testing.assert_array_equal(arrays["transposed"], [[0, 3], [1, 4], [2, 5]])
+    assert arrays["last"] == 23
+    assert arrays["none"].shape == (0, 5)
 
 
 def test_both_byte_orders(path, arrays):
     assert_same(read_checkpoint(write_zip(path, arrays, order="big")), arrays)
-    with pytest.raises(ValueError, match=r"byte.*order|middle"):
-        write_zip(path, arrays, order="middle")
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("file/data.pkl", Writer().pickled({}))
         archive.writestr("file/byteorder", "middle")
@@ -174,27 +169,25 @@ def test_notes_are_known_without_torch(path, arrays, write):
 
 
 def test_types_are_refused_by_key(path):
-    for dtype in (np.float16, np.complex64):
-        assert f"got {'Half' if dtype is np.float16 else 'ComplexFloat'} at net.a" in refused(
-            write_zip(path, {"net.a": np.zeros(3, dtype)})
-        )
+    for dtype, name in ((np.float16, "Half"), (np.complex64, "ComplexFloat")):
+        assert f"got {name} at net.a" in refused(write_zip(path, {"net.a": np.zeros(3, dtype)}))
     assert "got Q" in refused(write_zip(path, {"a": View(np.zeros(3), kind="QInt8Storage")}))
 
 
 def test_code_is_refused_and_not_executed(path, tmp_path):
-    made = tmp_path / "made"
+    marker = tmp_path / "made"
     for content in (
-        Call(Global("os", "mkdir"), (str(made),)),
-        {"a": np.zeros(3), "b": Call(Global("builtins", "exec"), (f"import os; os.mkdir({str(made)!r})",))},
-        {"optimizer": [Call(Global("posix", "system"), (f"mkdir {made}",))]},
+        Call(Global("os", "mkdir"), (str(marker),)),
+        {"a": np.zeros(3), "b": Call(Global("builtins", "exec"), (f"import os; os.mkdir({str(marker)!r})",))},
+        {"optimizer": [Call(Global("posix", "system"), (f"mkdir {marker}",))]},
         Call(Global("collections", "OrderedDict"), ([("a", 1)],)),
         Call(Global("torch._utils", "_rebuild_tensor_v2"), (Global("os", "mkdir"), 0, (), (), False, None)),
-        Call(Global("torch._utils", "_rebuild_parameter"), (str(made), True, {})),
+        Call(Global("torch._utils", "_rebuild_parameter"), (str(marker), True, {})),
         {"a": View(np.zeros(3), module="os")},
     ):
         assert "asks for" in (message := refused_content(path, content)) or "damaged" in message
-    assert "it asks for os.mkdir" in refused(write_zip(path, Call(Global("os", "mkdir"), (str(made),))))
-    assert not made.exists()
+    assert "it asks for os.mkdir" in refused(write_zip(path, Call(Global("os", "mkdir"), (str(marker),))))
+    assert not marker.exists()
 
 
 @pytest.mark.parametrize("protocol", range(1, pickle.HIGHEST_PROTOCOL + 1))
@@ -219,6 +212,9 @@ MKDIR = b"cos\nmkdir\n"
         MKDIR + b"X\x01\0\0\0x\x85\x81",  # NEWOBJ
         MKDIR + b"}b",  # BUILD on what is no dictionary
         b"}" + MKDIR + b"K\x01s",  # a name as a key
+        b"}\x8a\x08" + (2**61 - 1).to_bytes(8, "little") + b"Ns",  # keys of one hash, which fill a dictionary slowly
+        b"}\x8a\x09" + (-(2**64)).to_bytes(9, "little", signed=True) + b"Ns",
+        b"Np%d\n" % (2**61 - 1),  # the same in the memo
         b"}" + 60 * b"2\x86" + b"K\x01s",  # a tuple of tuples of ..., whose hash takes years
         b"K\x01q\0" + 60 * b"h\0h\0\x86q\0" + b"}h\0K\x01s",  # the same by the memo
         b"K\x01q\0" + 60 * b"h\0h\0\x86q\0" + b"(h\0K\x01d",  # and in DICT
@@ -306,61 +302,67 @@ def flipped(content, place):
     return content[:place] + bytes([content[place] ^ 16]) + content[place + 1 :]
 
 
+def random_changes(content, start):
+    """400 copies with up to three other bytes behind `start`."""
+    rng = np.random.default_rng(0)
+    for _ in range(400):
+        changed = bytearray(content)
+        for place in rng.integers(start, len(content), rng.integers(1, 4)):
+            changed[place] = rng.integers(256)
+        yield bytes(changed)
+
+
+def assert_arrays_or_one_line(path):
+    with suppress(InputError):
+        assert all(isinstance(array, np.ndarray) for array in read_checkpoint(path).values())
+
+
 def test_a_flipped_bit_is_refused(path, arrays):
-    whole = write_zip(path, arrays).read_bytes()
+    intact = write_zip(path, arrays).read_bytes()
     values = arrays["net.conv.weight"].tobytes()
-    for place in (
-        whole.index(values),
-        whole.index(values) + 101,
-        whole.index(b"net.conv.weight"),
-        whole.index(b"little"),
-    ):
-        path.write_bytes(flipped(whole, place))
+    start = intact.index(values)
+    for place in (start, start + 101, intact.index(b"net.conv.weight"), intact.index(b"little")):
+        path.write_bytes(flipped(intact, place))
         assert "the checksum of file/" in refused(path)
 
 
 def test_damage_is_refused_wherever_it_is(path):
     """In every third byte of a small file: what is read in spite of it is what was written."""
     expected = {"a": np.arange(5, dtype=np.float32)}
-    whole = write_zip(path, expected).read_bytes()
-    for place in range(0, len(whole), 3):
-        path.write_bytes(flipped(whole, place))
+    intact = write_zip(path, expected).read_bytes()
+    for place in range(0, len(intact), 3):
+        path.write_bytes(flipped(intact, place))
         with suppress(InputError):
             assert_same(read_checkpoint(path), expected)
-    for length in range(1, len(whole), 7):
-        path.write_bytes(whole[:length])
+    for length in range(1, len(intact), 7):
+        path.write_bytes(intact[:length])
         assert "truncated" in (message := refused(path)) or "expected" in message
 
 
 def test_damaged_pickles_give_arrays_or_one_line(path):
-    rng = np.random.default_rng(0)
     writer = Writer()
-    pickled = bytearray(writer.pickled({"a": np.zeros((2, 3), np.float32), "state_dict": {"b": np.zeros(3)}}))
-    for _ in range(400):
-        changed = pickled.copy()
-        for place in rng.integers(2, len(pickled), rng.integers(1, 4)):
-            changed[place] = rng.integers(256)
+    pickled = writer.pickled({"a": np.zeros((2, 3), np.float32), "state_dict": {"b": np.zeros(3)}})
+    for changed in random_changes(pickled, 2):
         with zipfile.ZipFile(path, "w") as archive:
-            archive.writestr("file/data.pkl", bytes(changed))
+            archive.writestr("file/data.pkl", changed)
             for key, array in writer.storages.items():
                 archive.writestr(f"file/data/{key}", array.tobytes())
-        with suppress(InputError):
-            assert all(isinstance(array, np.ndarray) for array in read_checkpoint(path).values())
+        assert_arrays_or_one_line(path)
 
 
 def test_damaged_old_files(path, arrays):
-    whole = write_legacy(path, arrays).read_bytes()
-    for content in (whole[:-1], whole + b"\0", whole[: len(whole) // 2], whole[:20], whole[:3]):
+    intact = write_legacy(path, arrays).read_bytes()
+    for content in (intact[:-1], intact + b"\0", intact[: len(intact) // 2], intact[:20], intact[:3]):
         path.write_bytes(content)
         assert "damaged; download it again" in refused(path)
     size = struct.pack("<q", arrays["net.bn.bias"].size)
-    path.write_bytes(size.join(whole.rsplit(size, 1)).replace(b"\x01e.", b"\x02e.") + bytes(4))
+    path.write_bytes(size.join(intact.rsplit(size, 1)).replace(b"\x01e.", b"\x02e.") + bytes(4))
     assert "damaged; download it again" in refused(path)
     path.write_bytes(Writer().pickled(1) + Writer().pickled(2))
     assert "expected a torch checkpoint, got another pickle" in refused(path)
 
 
-def test_zip_files_of_other_making(path, arrays, tmp_path):
+def test_zip_files_of_other_making_are_refused(path, arrays):
     once = "once and uncompressed"
     assert once in refused(write_zip(path, arrays, compression=zipfile.ZIP_DEFLATED))
     write_zip(path, arrays)
@@ -376,11 +378,13 @@ def test_zip_files_of_other_making(path, arrays, tmp_path):
     with zipfile.ZipFile(path, "a") as archive:  # all entries on the same bytes
         for number in range(20):
             archive.filelist.append(zipfile.ZipInfo(f"file/again{number}"))
-            copied = archive.getinfo("file/data/0")
             for field in ("header_offset", "CRC", "compress_size", "file_size"):
-                setattr(archive.filelist[-1], field, getattr(copied, field))
+                setattr(archive.filelist[-1], field, getattr(archive.getinfo("file/data/0"), field))
         archive._didModify = True
     assert once in refused(path)
+
+
+def test_zip_files_with_other_entries(path, arrays, tmp_path):
     write_zip(path, arrays)
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("../outside", "text")

@@ -1,4 +1,4 @@
-"""Every key once, every target once, every type and shape; and what is wrong in one short message."""
+"""Conversion of checkpoints: every key and target once, every type and shape, errors in one short message."""
 
 import hashlib
 
@@ -10,53 +10,29 @@ from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.checkpoints.conversion import Layout, Rule, Table, convert
 from mfvpr.checkpoints.networks import NETWORKS, blueprint, resemblance
 from mfvpr.utils import InputError
+from tests import random_checkpoints as checkpoints
 from tests.checkpoints.conftest import PARAMETERS, SHAPES, SOURCE_SHAPES, TABLE, tiny_entry
-from tests.random_checkpoints import (
-    ALIKED,
-    LIGHTGLUE,
-    d2net_shapes,
-    dinov2_shapes,
-    gem_shapes,
-    lightglue_shapes,
-    matlab_shapes,
-    mixvpr_shapes,
-    netvlad_shapes,
-    places365_shapes,
-    random_checkpoint,
-    selavpr_shapes,
-)
+from tests.random_checkpoints import ALIKED, LIGHTGLUE, d2net_shapes, mixvpr_shapes, places365_shapes, random_checkpoint
 
 pytestmark = pytest.mark.thorough
 
-_NETVLAD = (
-    (16, 4096, "mapillary_4096"),
-    (16, 512, "mapillary_512"),
-    (16, 128, "mapillary_128"),
-    (64, 4096, "pitts_4096"),
-    (64, 512, "pitts_512"),
-    (64, 128, "pitts_128"),
-    (64, 4096, "landmarks_4096"),
-)
 PUBLIC = {
     "d2_tf": d2net_shapes(),
-    "mixvpr_4096": mixvpr_shapes(1024, 4),
-    "mixvpr_512": mixvpr_shapes(256, 2),
-    "mixvpr_128": mixvpr_shapes(64, 2),
+    "mixvpr_4096": mixvpr_shapes(1024, 4), "mixvpr_512": mixvpr_shapes(256, 2), "mixvpr_128": mixvpr_shapes(64, 2),
     "vgg16_places365": places365_shapes(),
-    "aliked_lightglue": lightglue_shapes(),
-    **{f"patchnetvlad_{name}": netvlad_shapes(clusters, outputs) for clusters, outputs, name in _NETVLAD},
-    "netvlad_pytorch": netvlad_shapes(64, None),
-    "cosplace_vgg16_512": gem_shapes("vgg16", 512),
-    "cosplace_resnet50_512": gem_shapes("resnet50", 512),
-    "cosplace_resnet50_2048": gem_shapes(),
-    **{f"netvlad_{training}": matlab_shapes() for training in ("pitts30k", "tokyotm")},
-    "dinov2_vits14": dinov2_shapes(384, 12),
-    "dinov2_vitb14": dinov2_shapes(768, 12),
-    "dinov2_vitl14": dinov2_shapes(1024, 24),
-    "selavpr_pitts30k": selavpr_shapes(),
-    "selavpr_msls": selavpr_shapes(),
-    "selavpr_msls_registers": selavpr_shapes(registers=4),
-}
+    "aliked_lightglue": checkpoints.lightglue_shapes(),
+    **{f"patchnetvlad_mapillary_{outputs}": checkpoints.netvlad_shapes(16, outputs) for outputs in (4096, 512, 128)},
+    **{f"patchnetvlad_pitts_{outputs}": checkpoints.netvlad_shapes(64, outputs) for outputs in (4096, 512, 128)},
+    "patchnetvlad_landmarks_4096": checkpoints.netvlad_shapes(64, 4096),
+    "netvlad_pytorch": checkpoints.netvlad_shapes(64, None),
+    **{f"netvlad_{training}": checkpoints.matlab_shapes() for training in ("pitts30k", "tokyotm")},
+    "cosplace_vgg16_512": checkpoints.gem_shapes("vgg16", 512),
+    **{f"cosplace_resnet50_{outputs}": checkpoints.gem_shapes("resnet50", outputs) for outputs in (512, 2048)},
+    **{f"dinov2_vit{size}14": checkpoints.dinov2_shapes(width, depth)
+       for size, width, depth in (("s", 384, 12), ("b", 768, 12), ("l", 1024, 24))},
+    **{f"selavpr_{training}": checkpoints.selavpr_shapes() for training in ("pitts30k", "msls")},
+    "selavpr_msls_registers": checkpoints.selavpr_shapes(registers=4),
+}  # fmt: skip
 
 
 @pytest.fixture
@@ -65,12 +41,12 @@ def source():
 
 
 def test_layouts(source):
-    found = convert(source, TABLE, SHAPES)
-    assert {path: array.shape for path, array in found.items()} == SHAPES
-    assert all(array.dtype == np.float32 and array.flags.c_contiguous for array in found.values())
-    np.testing.assert_array_equal(found["conv.kernel"][1, 2, 0, 3], source["net.conv.weight"][3, 0, 1, 2])
-    np.testing.assert_array_equal(found["mix.1.kernel"], source["net.mix.1.weight"].T)
-    np.testing.assert_array_equal(found["bn.var"], source["net.bn.running_var"])
+    parameters = convert(source, TABLE, SHAPES)
+    assert {path: array.shape for path, array in parameters.items()} == SHAPES
+    assert all(array.dtype == np.float32 and array.flags.c_contiguous for array in parameters.values())
+    np.testing.assert_array_equal(parameters["conv.kernel"][1, 2, 0, 3], source["net.conv.weight"][3, 0, 1, 2])
+    np.testing.assert_array_equal(parameters["mix.1.kernel"], source["net.mix.1.weight"].T)
+    np.testing.assert_array_equal(parameters["bn.var"], source["net.bn.running_var"])
 
 
 def message(source, table=TABLE, shapes=SHAPES):
@@ -88,11 +64,11 @@ def test_what_is_wrong_is_counted_by_kind_with_an_example_of_each(source):
     source["net.bn.weight"] = np.zeros(7, np.float32)
     source["net.mix.0.weight"] = source["net.mix.0.weight"].T
     source["net.mix.1.weight"] = np.zeros((2, 5, 1), np.float32)
-    told = message(source)
-    assert told.startswith("keys do not fit the network: ")
-    assert "2 unknown (net.conv.kernel)" in told
-    assert "2 missing (conv.kernel)" in told
-    assert "3 of another shape (net.bn.weight: expected (4,), got (7,))" in told
+    text = message(source)
+    assert text.startswith("keys do not fit the network: ")
+    assert "2 unknown (net.conv.kernel)" in text
+    assert "2 missing (conv.kernel)" in text
+    assert "3 of another shape (net.bn.weight: expected (4,), got (7,))" in text
     source = random_checkpoint(SOURCE_SHAPES)
     source["net.mix.0.weight"] = source["net.mix.0.weight"].T
     assert "1 of another shape (net.mix.0.weight: expected (5, 4), got (4, 5))" in message(source)
@@ -100,10 +76,10 @@ def test_what_is_wrong_is_counted_by_kind_with_an_example_of_each(source):
 
 def test_filled_twice_and_ambiguous_rules(source):
     twice = Table((*TABLE.rules, Rule(r"copy", "conv.bias"), Rule(r"net\.bn\.bi.*", "bn.bias")), TABLE.ignored)
-    told = message(source | {"copy": np.zeros(4)}, twice)
-    assert "1 twice (copy and net.conv.bias)" in told
-    assert "1 with several rules (net.bn.bias)" in told
-    assert "1 missing (bn.bias)" in told
+    text = message(source | {"copy": np.zeros(4)}, twice)
+    assert "1 twice (copy and net.conv.bias)" in text
+    assert "1 with several rules (net.bn.bias)" in text
+    assert "1 missing (bn.bias)" in text
 
 
 def test_a_message_stays_short(source):
@@ -124,42 +100,33 @@ def test_other_types_than_float32_and_float64_are_refused(source, dtype):
 def test_float64_is_rounded_and_scalars_stay():
     table = Table((Rule("a", "a", Layout.LINEAR), Rule("s", "s")))
     third = np.float64([1, 2, 3]) / 3
-    found = convert({"a": np.stack([third, -third]), "s": np.float64(2)}, table, {"a": (3, 2), "s": ()})
-    np.testing.assert_array_equal(found["a"], np.stack([third, -third], 1).astype(np.float32))
-    assert found["a"].dtype == np.float32
-    assert found["s"].shape == ()
+    parameters = convert({"a": np.stack([third, -third]), "s": np.float64(2)}, table, {"a": (3, 2), "s": ()})
+    np.testing.assert_array_equal(parameters["a"], np.stack([third, -third], 1).astype(np.float32))
+    assert parameters["a"].dtype == np.float32
+    assert parameters["s"].shape == ()
 
 
 @pytest.mark.parametrize(
-    ("change", "prefix"),
-    [
-        (lambda key: key, None),
-        (lambda key: f"module.{key}", " module."),
-        (lambda key: f"state.model.{key}", " state.model."),
-        (lambda key: f"{key}.renamed", None),
-    ],
+    ("name", "prefix"),
+    [("{}", None), ("module.{}", " module."), ("state.model.{}", " state.model."), ("{}.renamed", None)],
 )
-def test_a_prefix_is_recognized(change, prefix):
-    message = resemblance([change(key) for key in d2net_shapes()], NETWORKS["d2_tf"])
+def test_a_prefix_is_recognized(name, prefix):
+    message = resemblance([name.format(key) for key in d2net_shapes()], NETWORKS["d2_tf"])
     assert message is None if prefix is None else prefix in message
 
 
 def test_other_networks_are_recognized():
-    told = "expected the keys of another network, got those of {}"
-    assert resemblance(list(mixvpr_shapes()), NETWORKS["d2_tf"]) == told.format("mixvpr")
-    assert resemblance(list(d2net_shapes()), NETWORKS["aliked-n16"]) == told.format("d2net")
+    text = "expected the keys of another network, got those of {}"
+    assert resemblance(list(mixvpr_shapes()), NETWORKS["d2_tf"]) == text.format("mixvpr")
+    assert resemblance(list(d2net_shapes()), NETWORKS["aliked-n16"]) == text.format("d2net")
     assert resemblance(list(mixvpr_shapes(64, 2)), NETWORKS["mixvpr_4096"]) is None  # its shapes tell
     assert resemblance(["posenc.Wr.weight", "layers.0.bias"], NETWORKS["aliked-n16"]) is None
 
 
-def test_blueprint_of_the_small_network(folder):
+def test_a_blueprint_can_be_filled_twice(folder, arrays):
     plan = blueprint(tiny_entry())
     assert dict(plan.shapes) == SHAPES
     assert plan.parameters == PARAMETERS
-
-
-def test_a_blueprint_can_be_filled_twice(folder, arrays):
-    plan = blueprint(tiny_entry())
     first = plan.filled(arrays)
     plan.filled({path: 2 * array for path, array in arrays.items()})
     np.testing.assert_array_equal(first.mix[1].kernel[...], arrays["mix.1.kernel"])
@@ -170,17 +137,18 @@ def test_a_blueprint_can_be_filled_twice(folder, arrays):
     "name", [pytest.param(name, marks=[pytest.mark.slow] if name.startswith("selavpr") else []) for name in PUBLIC]
 )
 def test_published_layouts_fit_the_networks(name):
-    """By names and shapes alone: each parameter of the network comes from one key of the checkpoint."""
+    """Each parameter of the network comes from one key of the checkpoint."""
     plan = blueprint(entry_of(name))
-    found = convert(vacant(PUBLIC[name]), NETWORKS[name].table, plan.shapes)
-    assert found.keys() == plan.shapes.keys()
+    parameters = convert(vacant(PUBLIC[name]), NETWORKS[name].table, plan.shapes)
+    assert parameters.keys() == plan.shapes.keys()
     assert plan.parameters == entry_of(name).parameters
 
 
-TORCHVISION = {name: f"features.{place}" for place, name in (
-    (0, "conv1_1"), (2, "conv1_2"), (5, "conv2_1"), (7, "conv2_2"), (10, "conv3_1"), (12, "conv3_2"), (14, "conv3_3"),
-    (17, "conv4_1"), (19, "conv4_2"), (21, "conv4_3"), (24, "conv5_1"), (26, "conv5_2"), (28, "conv5_3"),
-)} | {"fc6_1": "classifier.0", "fc7_1": "classifier.3", "fc8a_1": "classifier.6"}  # fmt: skip
+# Layers of Caffe -> of torchvision, where pooling and ReLU lie between the convolutions.
+CONVOLUTIONS = ("1_1", "1_2", "2_1", "2_2", "3_1", "3_2", "3_3", "4_1", "4_2", "4_3", "5_1", "5_2", "5_3")
+POSITIONS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
+TORCHVISION = {f"conv{name}": f"features.{place}" for name, place in zip(CONVOLUTIONS, POSITIONS, strict=True)}
+TORCHVISION |= {"fc6_1": "classifier.0", "fc7_1": "classifier.3", "fc8a_1": "classifier.6"}
 
 
 def with_names_of_torchvision(source):
@@ -204,10 +172,10 @@ def test_places365_in_files_of_torch(change, full):
     source = vacant(places365_shapes("weight", full=full))
     source["conv5_2.bias"] = np.arange(512, dtype=np.float32)
     source["conv1_1.weight"] = np.arange(64 * 27, dtype=np.float32).reshape(64, 3, 3, 3)
-    found = places365(change(source))
-    assert sum(value.size for value in found.values()) == 12_354_880
-    np.testing.assert_array_equal(found["vgg.conv5_2.bias"], np.arange(512))
-    assert found["vgg.conv1_1.kernel"][1, 2, 0, 5] == source["conv1_1.weight"][5, 0, 1, 2]
+    parameters = places365(change(source))
+    assert sum(value.size for value in parameters.values()) == 12_354_880
+    np.testing.assert_array_equal(parameters["vgg.conv5_2.bias"], np.arange(512))
+    assert parameters["vgg.conv1_1.kernel"][1, 2, 0, 5] == source["conv1_1.weight"][5, 0, 1, 2]
 
 
 def test_biases_of_places365_may_have_more_axes():
@@ -247,9 +215,9 @@ def test_real_weights_are_the_registrys_and_convert(name):
     assert len(content) == entry.size
     assert hashlib.sha256(content).hexdigest() == entry.sha256
     plan = blueprint(entry)
-    found = convert(read_checkpoint(file), NETWORKS[name].table, plan.shapes)
-    assert found.keys() == plan.shapes.keys()
-    assert all(np.isfinite(array).all() for array in found.values())
+    parameters = convert(read_checkpoint(file), NETWORKS[name].table, plan.shapes)
+    assert parameters.keys() == plan.shapes.keys()
+    assert all(np.isfinite(array).all() for array in parameters.values())
     assert plan.parameters == entry.parameters
 
 
@@ -270,12 +238,3 @@ def test_patchnetvlad_sizes_agree_with_its_parameters(name):
     entry = entry_of(name)
     projection = (512 * (16 if "mapillary" in name else 64) + 1) * int(name.rpartition("_")[2])
     assert 0 < entry.size - 4 * (entry.parameters + projection) < 30_000
-
-
-def test_random_checkpoints_depend_on_names_not_on_order():
-    forward = random_checkpoint(SOURCE_SHAPES)
-    backward = random_checkpoint(dict(reversed(SOURCE_SHAPES.items())))
-    assert all(np.array_equal(forward[key], backward[key]) for key in SOURCE_SHAPES)
-    assert not np.array_equal(forward["net.conv.bias"], forward["net.bn.bias"])
-    assert not np.array_equal(forward["net.conv.bias"], random_checkpoint(SOURCE_SHAPES, seed=1)["net.conv.bias"])
-    assert (forward["net.bn.running_var"] > 0).all()

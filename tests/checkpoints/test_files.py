@@ -34,29 +34,22 @@ def refused(words, name="tiny"):
     assert (str(copied), copied.entry) == (message, caught.value.entry)
 
 
-def test_round_trip(installed, folder, arrays):
+def test_saved_arrays_come_back(installed, folder, arrays, tmp_path):
     assert installed == folder / "tiny.safetensors"
-    found = load("tiny")
-    assert found.keys() == arrays.keys()
+    loaded = load("tiny")
+    assert loaded.keys() == arrays.keys()
     for path, array in arrays.items():
-        np.testing.assert_array_equal(found[path], array)
-        assert found[path].dtype == np.float32
+        np.testing.assert_array_equal(loaded[path], array)
+        assert loaded[path].dtype == np.float32
     assert sorted(path.name for path in folder.iterdir()) == ["tiny.json", "tiny.safetensors"]
-
-
-def test_manifest(installed, tmp_path):
     content = installed.read_bytes()
-    sha256 = hashlib.sha256(content).hexdigest()
     assert json.loads(installed.with_suffix(".json").read_text()) == {
-        "name": "tiny", "sha256": sha256, "size": len(content), "parameters": PARAMETERS, "source_file": "tiny.pth",
-        "source_sha256": hashlib.sha256(b"the source").hexdigest(), "format": 1, "rounded": 0,
+        "name": "tiny", "sha256": hashlib.sha256(content).hexdigest(), "size": len(content), "parameters": PARAMETERS,
+        "source_file": "tiny.pth", "source_sha256": hashlib.sha256(b"the source").hexdigest(),
+        "format": 1, "rounded": 0,
     }  # fmt: skip
-
-
-def test_saving_twice_makes_the_same_bytes(installed, arrays, tmp_path):
-    before = installed.read_bytes()
     save("tiny", dict(reversed(arrays.items())), tmp_path / "tiny.pth", parameters=PARAMETERS)
-    assert installed.read_bytes() == before
+    assert installed.read_bytes() == content
 
 
 def test_model(installed, arrays):
@@ -87,31 +80,28 @@ def test_a_flipped_bit_is_refused(installed, place):
     refused("sha256")
 
 
-def test_truncated(installed):
+def test_a_truncated_file_is_refused(installed):
     installed.write_bytes(installed.read_bytes()[:-1])
     refused(f"expected {installed.stat().st_size + 1} bytes, got {installed.stat().st_size}")
 
 
-def test_without_manifest(installed):
-    installed.with_suffix(".json").unlink()
-    refused("no manifest")
-
-
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"name": "tiny"}', '{"format": 1, "more": 2}', "\x00\x01"])
-def test_damaged_manifest(installed, text):
-    installed.with_suffix(".json").write_text(text)
-    refused("expected a manifest of format 1")
-
-
-def test_manifest_of_another(installed):
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        *((text, "") for text in ("", "{", "[]", '{"name": "tiny"}', '{"format": 1, "more": 2}', "\x00\x01")),
+        ({"parameters": "many"}, ""),
+        ({"name": "d2_tf"}, "expected the manifest of tiny, got that of d2_tf"),
+        ({"format": 2}, "expected a manifest of format 1, got 2"),
+    ],
+)
+def test_other_manifests_are_refused(installed, text, words):
     manifest = installed.with_suffix(".json")
-    values = json.loads(manifest.read_text())
-    manifest.write_text(json.dumps(values | {"parameters": "many"}))
-    refused("expected a manifest of format 1")
-    manifest.write_text(json.dumps(values | {"name": "d2_tf"}))
-    refused("expected the manifest of tiny, got that of d2_tf")
-    manifest.write_text(json.dumps(values | {"format": 2}))
-    refused("expected a manifest of format 1, got 2")
+    if isinstance(text, dict):
+        text = json.dumps(json.loads(manifest.read_text()) | text)
+    manifest.write_text(text)
+    refused(words or "expected a manifest of format 1;")
+    manifest.unlink()
+    refused("no manifest")
 
 
 @pytest.mark.parametrize(
@@ -199,33 +189,23 @@ class TestInstall:
         np.testing.assert_array_equal(load_model("tiny").mix[0].kernel[...], tensors["net.mix.0.weight"].T)
         assert path.read_bytes() == before
 
-    def test_keys_that_do_not_fit(self, checkpoint, folder):
-        path, tensors = checkpoint
-        tensors["net.conv.bis"] = tensors.pop("net.conv.bias")
-        write_zip(path, tensors)
-        with pytest.raises(
-            InputError,
-            match=r"tiny\.pth: .*1 unknown \(net\.conv\.bis\), 1 missing .*tiny\.pth",
-        ):
-            install(path, "tiny")
-        assert not folder.exists()
-
     @pytest.mark.parametrize(
         ("tensors", "words"),
         [
             (random_checkpoint(d2net_shapes()), "expected the keys of another network, got those of d2net"),
-            (
-                {f"module.{key}": np.zeros(2) for key in SOURCE_SHAPES},
-                "its keys begin with module.",
-            ),
+            ({f"module.{key}": np.zeros(2) for key in SOURCE_SHAPES}, "its keys begin with module."),
             ({f"layer{place}.weight": np.zeros(2) for place in range(500)}, "500 unknown (layer0.weight), 10 missing"),
-            (
-                {"net.conv.weight": np.zeros(2, np.float16)},
-                "got Half at net.conv.",
-            ),
+            ({"net.conv.weight": np.zeros(2, np.float16)}, "got Half at net.conv."),
             (random_checkpoint(SOURCE_SHAPES) | {"net.conv.bias": np.ones(4, np.int64)}, "got int64"),
+            (
+                {
+                    key.replace("conv.bias", "conv.bis"): array
+                    for key, array in random_checkpoint(SOURCE_SHAPES).items()
+                },
+                "1 unknown (net.conv.bis), 1 missing (conv.bias)",
+            ),
         ],
-        ids=["another network", "prefix", "unknown network", "half", "integer"],
+        ids=["another network", "prefix", "unknown network", "half", "integer", "another key"],
     )
     def test_foreign_files_are_one_short_line(self, checkpoint, folder, tensors, words):
         path, _ = checkpoint
@@ -248,9 +228,8 @@ class TestInstall:
         np.testing.assert_array_equal(load("tiny")["conv.bias"], third.astype(np.float32))
         assert read_manifest("tiny").rounded == 1
 
-    def test_manifests_without_that_note_are_read(self, checkpoint):
-        path, _ = checkpoint
-        manifest = install(path, "tiny").with_suffix(".json")
+    def test_manifests_without_the_number_of_rounded_tensors_are_read(self, checkpoint):
+        manifest = install(checkpoint[0], "tiny").with_suffix(".json")
         values = json.loads(manifest.read_text())
         del values["rounded"]
         manifest.write_text(json.dumps(values))

@@ -11,8 +11,8 @@ NAMES = ("a/image 1.jpg", "a/b/image2.jpg", "image10.png")
 
 def feature(seed, count=30, dimension=16):
     """Features in an image of `SIZE`, with detection scores in (0, 1)."""
-    made = make_features(np.random.default_rng(seed), count, dimension=dimension, size=480)
-    return type(made)(**(vars(made) | {"image_size": np.array(SIZE, np.float32)}))
+    features = make_features(np.random.default_rng(seed), count, dimension=dimension, size=480)
+    return type(features)(**(vars(features) | {"image_size": np.array(SIZE, np.float32)}))
 
 
 def features_of(num_images, **settings):
@@ -42,17 +42,17 @@ def append_hloc(path, name, parts, uncertainty=1.0):
 
 def write_hloc(path, names, features, half=True, change=None):
     """A file of hloc; `change` may alter the parts of an image."""
-    for name, one in zip(names, features, strict=True):
-        parts = hloc_parts(one, half)
+    for name, image_features in zip(names, features, strict=True):
+        parts = hloc_parts(image_features, half)
         append_hloc(path, name, parts if change is None else change(name, parts))
     return path
 
 
-def assert_equal(found, expected, *, rtol=0.0, atol=0.0):
-    assert found.keypoints.dtype == found.descriptors.dtype == found.scores.dtype == np.float32
-    assert found.image_size.dtype == np.float32
-    assert found.mask.dtype == bool
-    assert found.mask.shape == (len(found.keypoints),)
-    assert found.mask.all()
+def assert_equal(features, expected, *, rtol=0.0, atol=0.0):
+    assert features.keypoints.dtype == features.descriptors.dtype == features.scores.dtype == np.float32
+    assert features.image_size.dtype == np.float32
+    assert features.mask.dtype == bool
+    assert features.mask.shape == (len(features.keypoints),)
+    assert features.mask.all()
     for part in ("keypoints", "descriptors", "scores", "image_size"):
-        np.testing.assert_allclose(getattr(found, part), getattr(expected, part), rtol=rtol, atol=atol, err_msg=part)
+        np.testing.assert_allclose(getattr(features, part), getattr(expected, part), rtol=rtol, atol=atol, err_msg=part)

@@ -33,20 +33,20 @@ def test_npz_with_names(tmp_path, descriptors):
 
 def hloc(path, names, descriptors):
     """As hloc writes global features: float16, with the size of the image."""
-    for name, one in zip(names, descriptors, strict=True):
+    for name, vector in zip(names, descriptors, strict=True):
         with h5py.File(path, "a", libver="latest") as file:
             group = file.create_group(name)
-            group.create_dataset("global_descriptor", data=one.astype(np.float16))
+            group.create_dataset("global_descriptor", data=vector.astype(np.float16))
             group.create_dataset("image_size", data=np.array([640, 480]))
     return path
 
 
 def test_hloc(tmp_path, descriptors):
     path = hloc(tmp_path / "global-feats-netvlad.h5", [*NAMES[::-1], "z"], np.r_[descriptors[::-1], descriptors[:1]])
-    found = read_global_descriptors(path, NAMES)
-    assert found.dtype == np.float32
-    np.testing.assert_allclose(found, descriptors, atol=5e-4)
-    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1.2e-6)
+    vectors = read_global_descriptors(path, NAMES)
+    assert vectors.dtype == np.float32
+    np.testing.assert_allclose(vectors, descriptors, atol=5e-4)
+    np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1, atol=1.2e-6)
 
 
 @pytest.mark.parametrize("suffix", ["npy", "npz", "h5", "hdf5"])
@@ -54,9 +54,9 @@ def test_hloc(tmp_path, descriptors):
 def test_written_and_read(tmp_path, descriptors, suffix, half):
     path = tmp_path / "new" / f"g.{suffix}"
     write_global_descriptors(path, NAMES, descriptors, half=half)
-    found = read_global_descriptors(path, NAMES, lengths="keep")
+    vectors = read_global_descriptors(path, NAMES, lengths="keep")
     expected = descriptors.astype(np.float16).astype(np.float32) if half else descriptors
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(vectors, expected)
     assert [file.name for file in path.parent.iterdir()] == [path.name]
 
 

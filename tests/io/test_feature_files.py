@@ -17,14 +17,14 @@ PATHS = ["feats.h5", "feats.hdf5", "feats.npz", "feats"]
 @pytest.mark.parametrize("file", PATHS)
 @pytest.mark.parametrize("half", [False, True])
 def test_written_and_read(tmp_path, file, half):
-    made = [feature(seed, count=seed * 8) for seed in range(3)]
-    write_features(tmp_path / file, NAMES, enumerate(made), half=half)
+    written = [feature(seed, count=seed * 8) for seed in range(3)]
+    write_features(tmp_path / file, NAMES, enumerate(written), half=half)
     source = open_features(tmp_path / file, NAMES, lengths="keep" if half else "unit")
     assert source.counts.tolist() == [0, 8, 16]
-    for row, found in source.read():
+    for row, features in source.read():
         kind = np.float16 if half else np.float32
-        values = {name: getattr(made[row], name).astype(kind) for name in ("keypoints", "descriptors", "scores")}
-        assert_equal(found, type(found)(**(vars(made[row]) | values)))
+        values = {name: getattr(written[row], name).astype(kind) for name in ("keypoints", "descriptors", "scores")}
+        assert_equal(features, type(features)(**(vars(written[row]) | values)))
     if file != "feats":
         assert [path.name for path in tmp_path.iterdir()] == [file]
 
@@ -35,10 +35,10 @@ def test_padding_is_left_out_and_rows_may_be_few(tmp_path, file):
     write_features(tmp_path / file, NAMES, [(1, padded)])
     source = open_features(tmp_path / file, NAMES, partial=True)
     assert source.counts.tolist() == [-1, 9, -1]
-    [(row, found)] = source.read()
+    [(row, features)] = source.read()
     assert row == 1
-    np.testing.assert_array_equal(found.keypoints, padded.keypoints[:9])
-    np.testing.assert_array_equal(found.descriptors, padded.descriptors[:9])
+    np.testing.assert_array_equal(features.keypoints, padded.keypoints[:9])
+    np.testing.assert_array_equal(features.descriptors, padded.descriptors[:9])
 
 
 def test_what_is_read_is_written_again(tmp_path):
@@ -50,8 +50,8 @@ def test_what_is_read_is_written_again(tmp_path):
 
 
 def test_hloc_reads_what_is_written(tmp_path):
-    made = feature(0)
-    write_features(tmp_path / "f.h5", ["a/b.jpg"], [(0, made)], half=True)
+    written = feature(0)
+    write_features(tmp_path / "f.h5", ["a/b.jpg"], [(0, written)], half=True)
     with h5py.File(tmp_path / "f.h5", "r", libver="latest") as file:
         group = file["a/b.jpg"]
         assert {name: (data.dtype.name, data.shape) for name, data in group.items()} == {
@@ -60,7 +60,7 @@ def test_hloc_reads_what_is_written(tmp_path):
             "scores": ("float16", (30,)),
             "image_size": ("int64", (2,)),
         }
-        np.testing.assert_array_equal(group["descriptors"], made.descriptors.T.astype(np.float16))
+        np.testing.assert_array_equal(group["descriptors"], written.descriptors.T.astype(np.float16))
         assert group["image_size"][()].tolist() == [640, 480]
 
 
@@ -72,10 +72,10 @@ names = st.text(st.characters(exclude_categories=["Cc"], exclude_characters="/\\
 @settings(max_examples=20)
 @given(st.lists(names, min_size=1, max_size=3, unique=True))
 def test_any_name(tmp_path_factory, drawn):
-    folder, made = tmp_path_factory.mktemp("names"), feature(0, count=3)
+    folder, written = tmp_path_factory.mktemp("names"), feature(0, count=3)
     paths = [f"sub/{name}" for name in drawn]
     for file in ("f.h5", "f.npz"):
-        write_features(folder / file, paths, [(row, made) for row in range(len(paths))])
+        write_features(folder / file, paths, [(row, written) for row in range(len(paths))])
         assert open_features(folder / file, paths).counts.tolist() == [3] * len(paths)
 
 
@@ -95,11 +95,11 @@ def test_a_failure_leaves_what_was_there(tmp_path, file):
 
 
 def test_what_cannot_be_written(tmp_path):
-    made = feature(0)
-    loud = type(made)(**(vars(made) | {"scores": made.scores * 1e6}))
+    written = feature(0)
+    loud = type(written)(**(vars(written) | {"scores": written.scores * 1e6}))
     with pytest.raises(InputError, match=r"a\.jpg: scores: .*float16"):
         write_features(tmp_path / "f.h5", ["a.jpg"], [(0, loud)], half=True)
     for name in ("../a.jpg", "/a.jpg", ""):
         with pytest.raises(InputError, match="expected a path below the folder of images"):
-            write_features(tmp_path / "f", [name], [(0, made)])
+            write_features(tmp_path / "f", [name], [(0, written)])
     assert not list(tmp_path.iterdir())

@@ -28,26 +28,26 @@ def path(tmp_path):
 
 
 def test_float32_comes_back_exactly_in_the_order_of_the_names(path):
-    made = features_of(3, count=40)
-    write_hloc(path, NAMES, made, half=False)
+    written = features_of(3, count=40)
+    write_hloc(path, NAMES, written, half=False)
     source = open_features(path, NAMES[::-1])
     assert source.counts.tolist() == [40] * 3
     assert source.counts.dtype == np.int32
     assert (len(source), source.dimension, source.scored, source.paths) == (3, 16, True, (path,))
-    for (row, found), expected in zip(source.read(), made[::-1], strict=True):
-        assert_equal(found, expected)
+    for (row, features), expected in zip(source.read(), written[::-1], strict=True):
+        assert_equal(features, expected)
         assert 0 <= row < 3
     assert [row for row, _ in source.read([2, 0, 2])] == [2, 0, 2]
 
 
 def test_float16_becomes_float32_of_unit_length(path):
-    made = feature(0, count=200)
-    write_hloc(path, ["a.jpg"], [made])
-    [(_, found)] = open_features(path, ["a.jpg"]).read()
-    np.testing.assert_array_equal(found.keypoints, made.keypoints.astype(np.float16).astype(np.float32))
-    np.testing.assert_allclose(np.linalg.norm(found.descriptors, axis=1), 1, atol=1.2e-6)
-    assert_equal(found, made, atol=0.13)  # float16 at 480 px
-    np.testing.assert_allclose(found.descriptors, made.descriptors, atol=5e-4)
+    written = feature(0, count=200)
+    write_hloc(path, ["a.jpg"], [written])
+    [(_, features)] = open_features(path, ["a.jpg"]).read()
+    np.testing.assert_array_equal(features.keypoints, written.keypoints.astype(np.float16).astype(np.float32))
+    np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1, atol=1.2e-6)
+    assert_equal(features, written, atol=0.13)  # float16 at 480 px
+    np.testing.assert_allclose(features.descriptors, written.descriptors, atol=5e-4)
 
 
 def test_the_file_is_closed_between_readings_and_may_hold_other_images(path):
@@ -70,7 +70,7 @@ def test_descriptors_of_no_keypoints(path):
     for name, shape in (("b.jpg", (0,)), ("c.jpg", (0, 16)), ("d.jpg", (16, 3))):
         append_hloc(path, name, hloc_parts(feature(0, count=0)) | {"descriptors": np.ones(shape, np.float16)})
     source = open_features(path, ["a.jpg", "b.jpg", "c.jpg", "d.jpg"])
-    assert [found.descriptors.shape for _, found in source.read(range(3))] == [(30, 16), (0, 16), (0, 16)]
+    assert [features.descriptors.shape for _, features in source.read(range(3))] == [(30, 16), (0, 16), (0, 16)]
     with pytest.raises(InputError, match=r"d\.jpg: expected 0 keypoints"):
         list(source.read([3]))
 
@@ -79,25 +79,25 @@ def test_as_many_keypoints_as_dimensions(path):
     """The other images of the file tell the layout; alone, it is hloc's."""
     square = feature(0, count=16)
     write_hloc(path, ["a.jpg"], [square], half=False)
-    [(_, found)] = open_features(path, ["a.jpg"]).read()
-    np.testing.assert_array_equal(found.descriptors, square.descriptors)
-    for name, made in (("b.jpg", square), ("c.jpg", feature(1, count=9))):
-        append_hloc(path, name, hloc_parts(made, half=False) | {"descriptors": made.descriptors})
+    [(_, features)] = open_features(path, ["a.jpg"]).read()
+    np.testing.assert_array_equal(features.descriptors, square.descriptors)
+    for name, written in (("b.jpg", square), ("c.jpg", feature(1, count=9))):
+        append_hloc(path, name, hloc_parts(written, half=False) | {"descriptors": written.descriptors})
     source = open_features(path, ["b.jpg", "c.jpg"])
     np.testing.assert_array_equal(dict(source.read())[0].descriptors, square.descriptors)
 
 
 def test_scores_by_another_name_or_missing(path):
-    made = feature(0)
+    written = feature(0)
 
     def renamed(name, parts):
         scores = parts.pop("scores")
         return parts | ({"keypoint_scores": scores} if name == "a.jpg" else {})
 
-    write_hloc(path, ["a.jpg", "b.jpg"], [made, made], half=False, change=renamed)
+    write_hloc(path, ["a.jpg", "b.jpg"], [written, written], half=False, change=renamed)
     source = open_features(path, ["a.jpg"])
     assert source.scored
-    np.testing.assert_array_equal(next(source.read())[1].scores, made.scores)
+    np.testing.assert_array_equal(next(source.read())[1].scores, written.scores)
     source = open_features(path, ["b.jpg"])
     assert not source.scored
     np.testing.assert_array_equal(next(source.read())[1].scores, np.ones(30))
@@ -111,8 +111,8 @@ def test_image_size_that_the_file_lacks_is_given(path):
     with pytest.raises(InputError, match=r"x\.jpg: .*image_size .*got none; .*image_size="):
         open_features(path, ["x.jpg"])
     for size in ((640, 480), [[640, 480]]):
-        [(_, found)] = open_features(path, ["x.jpg"], image_size=size).read()
-        assert found.image_size.tolist() == [640, 480]
+        [(_, features)] = open_features(path, ["x.jpg"], image_size=size).read()
+        assert features.image_size.tolist() == [640, 480]
     with pytest.raises(InputError, match=r"a/image 1\.jpg: .*image_size .*\[320"):
         next(open_features(path, NAMES, image_size=(320, 240)).read())
     for size in ((0, 3), (np.nan, 1), (1, 2, 3), [[1, 2]]):
@@ -213,14 +213,14 @@ def test_keypoints_may_lie_a_hundredth_of_the_image_outside(path, point, is_insi
 
 
 def test_lengths_of_descriptors(path):
-    made = feature(0)
+    written = feature(0)
     lengths = np.linspace(0.5, 3, 30, dtype=np.float32)[:, None]
-    parts = hloc_parts(made, half=False) | {"descriptors": (made.descriptors * lengths).T}
+    parts = hloc_parts(written, half=False) | {"descriptors": (written.descriptors * lengths).T}
     append_hloc(path, "a.jpg", parts)
-    [(_, kept)] = open_features(path, ["a.jpg"], lengths="keep").read()
-    np.testing.assert_array_equal(kept.descriptors, parts["descriptors"].T)
+    [(_, unscaled)] = open_features(path, ["a.jpg"], lengths="keep").read()
+    np.testing.assert_array_equal(unscaled.descriptors, parts["descriptors"].T)
     [(_, unit)] = open_features(path, ["a.jpg"], lengths="normalize").read()
-    np.testing.assert_allclose(unit.descriptors, made.descriptors, atol=1e-6)
+    np.testing.assert_allclose(unit.descriptors, written.descriptors, atol=1e-6)
     append_hloc(path, "zero.jpg", spoiled("descriptors", 0, row=slice(None))(parts))
     with pytest.raises(InputError, match=r"zero\.jpg: descriptors: .*got zeros at 0"):
         list(open_features(path, ["zero.jpg"], lengths="normalize").read())

@@ -112,8 +112,8 @@ def test_values_that_were_not_all_written(path):
                 file.create_dataset(f"{name}/{part}", data=array, **chunked)
         del file["b.jpg/scores"]
         file["b.jpg"].create_dataset("scores", shape=(30,), dtype="f2", chunks=(10,))[:20] = 1
-    [_, (_, found)] = open_features(path, ["a.jpg", "c.jpg"]).read()
-    np.testing.assert_array_equal(found.scores, parts["scores"])
+    [_, (_, features)] = open_features(path, ["a.jpg", "c.jpg"]).read()
+    np.testing.assert_array_equal(features.scores, parts["scores"])
     refused(path, r"b\.jpg/scores: .*not written", ["b.jpg"])
 
 

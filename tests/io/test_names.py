@@ -103,8 +103,8 @@ def test_whatever_is_matched_is_called_so_alone(names, foreign):
         matched = match_names(FILE, names, foreign)
     except InputError:
         return
-    found = [name for name in matched if name is not None]
-    assert len(set(found)) == len(found)
+    matches = [name for name in matched if name is not None]
+    assert len(set(matches)) == len(matches)
     pairs = [(name.split("/"), other.split("/")) for name, other in zip(names, matched, strict=True) if other]
     shared = [(ours, theirs, min(len(ours), len(theirs))) for ours, theirs in pairs]
     assert len({(*ours[: len(ours) - n], "|", *theirs[: len(theirs) - n]) for ours, theirs, n in shared}) <= 1

@@ -30,76 +30,76 @@ def parts_of(features):
 
 
 def test_files_of_d2net_beside_their_images(tmp_path):
-    names, made = ["a/1.jpg", "a/2.jpg", "b/1.jpg"], [feature(seed) for seed in range(3)]
-    for name, one in zip(names, made, strict=True):
-        d2net(tmp_path / name, one)
+    names, written = ["a/1.jpg", "a/2.jpg", "b/1.jpg"], [feature(seed) for seed in range(3)]
+    for name, features in zip(names, written, strict=True):
+        d2net(tmp_path / name, features)
         (tmp_path / name).write_bytes(b"the image itself")
     source = open_features(tmp_path, names[::-1], image_size=SIZE)
     assert source.counts.tolist() == [30] * 3
     assert source.paths == tuple(tmp_path / f"{name}.d2-net" for name in names[::-1])
-    for (_, found), expected in zip(source.read(), made[::-1], strict=True):
-        assert_equal(found, expected)
+    for (_, features), expected in zip(source.read(), written[::-1], strict=True):
+        assert_equal(features, expected)
     with pytest.raises(InputError, match=r"b/1\.jpg: expected image_size"):
         open_features(tmp_path, names[::-1])
 
 
 def test_one_for_each_image_by_path_or_stem(tmp_path):
-    made = feature(0)
+    written = feature(0)
     (tmp_path / "a").mkdir()
-    np.savez(tmp_path / "a" / "1.jpg.npz", **parts_of(made))
-    np.savez(tmp_path / "a" / "2.npz", **parts_of(made))
+    np.savez(tmp_path / "a" / "1.jpg.npz", **parts_of(written))
+    np.savez(tmp_path / "a" / "2.npz", **parts_of(written))
     np.savez(tmp_path / ".hidden.npz", nothing=0)
     for names in (["a/1.jpg", "a/2.jpg"], ["1.jpg", "2.png"]):
-        for _, found in open_features(tmp_path, names).read():
-            assert_equal(found, made)
+        for _, features in open_features(tmp_path, names).read():
+            assert_equal(features, written)
 
 
 def test_one_for_all(tmp_path):
-    names, made = ["a/1.jpg", "keypoints", "b"], [feature(seed, count=seed + 5) for seed in range(3)]
-    arrays = {f"{n}/{part}": array for n, one in zip(names, made, strict=True) for part, array in parts_of(one).items()}
+    names, written = ["a/1.jpg", "keypoints", "b"], [feature(seed, count=seed + 5) for seed in range(3)]
+    arrays = {f"{n}/{part}": array for n, features in zip(names, written, strict=True) for part, array in parts_of(features).items()}
     np.savez_compressed(tmp_path / "all.npz", **arrays)
     source = open_features(tmp_path / "all.npz", names)
     assert source.counts.tolist() == [5, 6, 7]
     assert source.paths == (tmp_path / "all.npz",)
-    for row, found in source.read([2, 0, 1]):
-        assert_equal(found, made[row])
+    for row, features in source.read([2, 0, 1]):
+        assert_equal(features, written[row])
 
 
 def test_rows_of_descriptors_where_shapes_cannot_tell(tmp_path):
-    made = feature(0, count=16)
-    np.savez(tmp_path / "1.jpg.npz", **parts_of(made))
-    [(_, found)] = open_features(tmp_path, ["1.jpg"]).read()
-    np.testing.assert_array_equal(found.descriptors, made.descriptors)
+    written = feature(0, count=16)
+    np.savez(tmp_path / "1.jpg.npz", **parts_of(written))
+    [(_, features)] = open_features(tmp_path, ["1.jpg"]).read()
+    np.testing.assert_array_equal(features.descriptors, written.descriptors)
 
 
 def test_only_what_is_asked_for_is_read(tmp_path):
     """The other member's values are damaged: its header is not, so that nobody notices until it is read."""
-    made = {name: feature(seed, count=2000) for seed, name in enumerate(("a.jpg", "b.jpg"))}
+    written = {name: feature(seed, count=2000) for seed, name in enumerate(("a.jpg", "b.jpg"))}
     path = tmp_path / "all.npz"
-    np.savez(path, **{f"{name}/{part}": array for name, one in made.items() for part, array in parts_of(one).items()})
+    np.savez(path, **{f"{name}/{part}": array for name, features in written.items() for part, array in parts_of(features).items()})
     with zipfile.ZipFile(path) as archive:
         start = archive.getinfo("b.jpg/descriptors.npy").header_offset
     content = bytearray(path.read_bytes())
     content[start + 5000] ^= 1
     path.write_bytes(content)
     source = open_features(path, ["a.jpg", "b.jpg"])
-    [(_, found)] = source.read([0])
-    assert_equal(found, made["a.jpg"])
+    [(_, features)] = source.read([0])
+    assert_equal(features, written["a.jpg"])
     with pytest.raises(InputError, match=r"all\.npz: .*CRC-32 .*'b\.jpg/descriptors\.npy'"):
         list(source.read([1]))
 
 
 def test_pipes_are_not_waited_for(tmp_path):
-    made, names = feature(0), ["1.jpg", "2.jpg"]
-    np.savez(tmp_path / "1.jpg.npz", **parts_of(made))
+    written, names = feature(0), ["1.jpg", "2.jpg"]
+    np.savez(tmp_path / "1.jpg.npz", **parts_of(written))
     os.mkfifo(tmp_path / "2.jpg.npz")
     for path, wanted in ((tmp_path, names), (tmp_path / "2.jpg.npz", names)):
         with pytest.raises(InputError, match=r"2\.jpg\.npz: .*a pipe"):
             open_features(path, wanted)
-    [(_, found)] = open_features(tmp_path, names[:1]).read()
-    assert_equal(found, made)
+    [(_, features)] = open_features(tmp_path, names[:1]).read()
+    assert_equal(features, written)
     (tmp_path / "2.jpg.npz").unlink()
-    np.savez(tmp_path / "2.jpg.npz", **parts_of(made))
+    np.savez(tmp_path / "2.jpg.npz", **parts_of(written))
     source = open_features(tmp_path, names)
     (tmp_path / "2.jpg.npz").unlink()
     os.mkfifo(tmp_path / "2.jpg.npz")
@@ -115,7 +115,7 @@ def test_an_array_twice(tmp_path):
     """Of several arrays with one name, NumPy takes the last and others the first."""
     np.savez(tmp_path / "1.jpg.npz", **parts_of(feature(0)))
     np.savez(tmp_path / "all.npz", **{f"1.jpg/{part}": array for part, array in parts_of(feature(0)).items()})
-    source, whole = (open_features(path, ["1.jpg"]) for path in (tmp_path / "all.npz", tmp_path))
+    source, folder = (open_features(path, ["1.jpg"]) for path in (tmp_path / "all.npz", tmp_path))
     for path, member in ((tmp_path / "1.jpg.npz", "scores.npy"), (tmp_path / "all.npz", "1.jpg/scores.npy")):
         with zipfile.ZipFile(path, "a") as archive, warnings.catch_warnings(action="ignore"):
             archive.writestr(member, archive.read(member))
@@ -123,7 +123,7 @@ def test_an_array_twice(tmp_path):
         lambda: open_features(tmp_path / "all.npz", ["1.jpg"]),
         lambda: open_features(tmp_path, ["1.jpg"]),
         lambda: list(source.read()),
-        lambda: list(whole.read()),
+        lambda: list(folder.read()),
     ):
         with pytest.raises(InputError, match=r"npz: .*once, got .*scores\.npy"):
             use()

@@ -25,57 +25,57 @@ def read(tmp_path, text, queries=QUERIES, database=DATABASE, **settings):
 @pytest.mark.parametrize("text", ["\n".join(HLOC), "\r\n".join(HLOC) + "\r\n\r\n", "\ufeff" + "\n\n".join(HLOC)])
 def test_pairs_of_hloc(tmp_path, text):
     """Without scores, the places in the list tell: C, C - 1, ..."""
-    found = read(tmp_path, text)
-    assert found.indices.tolist() == EXPECTED
-    assert found.scores.tolist() == [[2, 1], [0, 0], [2, 0]]
-    assert found.mask.tolist() == [[True, True], [False, False], [True, False]]
-    assert (found.indices.dtype, found.scores.dtype, found.mask.dtype) == (np.int32, np.float32, bool)
+    shortlist = read(tmp_path, text)
+    assert shortlist.indices.tolist() == EXPECTED
+    assert shortlist.scores.tolist() == [[2, 1], [0, 0], [2, 0]]
+    assert shortlist.mask.tolist() == [[True, True], [False, False], [True, False]]
+    assert (shortlist.indices.dtype, shortlist.scores.dtype, shortlist.mask.dtype) == (np.int32, np.float32, bool)
 
 
 def test_pairs_of_kapture(tmp_path):
     lines = ["# kapture format: 1.0", "# query_image, map_image, score"]
     lines += ["q/1.jpg, d/2.jpg, 0.75", "q/my query.jpg, d/my place.jpg, -1e-3", "q/1.jpg,d/x, y.jpg,0.5"]
-    found = read(tmp_path, "\n".join(lines))
-    assert found.indices.tolist() == [[1, 3], [-1, -1], [2, -1]]
-    np.testing.assert_array_equal(found.scores, np.float32([[0.75, 0.5], [0, 0], [-1e-3, 0]]))
+    shortlist = read(tmp_path, "\n".join(lines))
+    assert shortlist.indices.tolist() == [[1, 3], [-1, -1], [2, -1]]
+    np.testing.assert_array_equal(shortlist.scores, np.float32([[0.75, 0.5], [0, 0], [-1e-3, 0]]))
 
 
 def test_predictions_of_patch_netvlad(tmp_path):
     """Full paths, no scores, two lines of comments."""
     lines = ["# kapture format: 1.0", "# query_image, map_image"]
     lines += ["/data/set/q/1.jpg, /data/set/d/2.jpg", "/data/set/q/1.jpg, /data/set/d/1.jpg"]
-    found = read(tmp_path, "\n".join(lines) + "\n")
-    assert found.indices.tolist() == [[1, 0], [-1, -1], [-1, -1]]
+    shortlist = read(tmp_path, "\n".join(lines) + "\n")
+    assert shortlist.indices.tolist() == [[1, 0], [-1, -1], [-1, -1]]
 
 
 def test_names_are_told_apart_by_those_that_there_are(tmp_path):
     queries, database = ["a", "a b", "#c"], ["c", "b c d", "d"]
-    found = read(tmp_path, "a b c d\n#c d\na b d", queries, database)
-    assert found.indices.tolist() == [[1], [2], [2]]
+    shortlist = read(tmp_path, "a b c d\n#c d\na b d", queries, database)
+    assert shortlist.indices.tolist() == [[1], [2], [2]]
     with pytest.raises(InputError, match=r"line 1: .*got several ways to read 'a b c d'"):
         read(tmp_path, "a b c d", queries, [*database, "c d"])
 
 
 def test_as_many_candidates_as_asked_for(tmp_path):
     pairs = "q/1.jpg d/2.jpg\nq/1.jpg d/1.jpg\nq/2.jpg d/1.jpg"
-    found = read(tmp_path, pairs, num_candidates=1)
-    assert found.indices.tolist() == [[1], [0], [-1]]
-    assert found.scores.tolist() == [[1], [1], [0]]
-    found = read(tmp_path, pairs, num_candidates=3)
-    assert found.indices.tolist() == [[1, 0, -1], [0, -1, -1], [-1, -1, -1]]
-    assert found.scores.tolist() == [[3, 2, 0], [3, 0, 0], [0, 0, 0]]
+    shortlist = read(tmp_path, pairs, num_candidates=1)
+    assert shortlist.indices.tolist() == [[1], [0], [-1]]
+    assert shortlist.scores.tolist() == [[1], [1], [0]]
+    shortlist = read(tmp_path, pairs, num_candidates=3)
+    assert shortlist.indices.tolist() == [[1, 0, -1], [0, -1, -1], [-1, -1, -1]]
+    assert shortlist.scores.tolist() == [[3, 2, 0], [3, 0, 0], [0, 0, 0]]
     with pytest.raises(InputError, match="num_candidates=0: expected at least 1"):
         read(tmp_path, pairs, num_candidates=0)
 
 
 def test_a_candidate_twice_counts_where_it_comes_first(tmp_path):
-    found = read(tmp_path, "q/1.jpg d/2.jpg\nq/1.jpg d/1.jpg\nq/1.jpg d/2.jpg")
-    assert found.indices.tolist() == [[1, 0], [-1, -1], [-1, -1]]
+    shortlist = read(tmp_path, "q/1.jpg d/2.jpg\nq/1.jpg d/1.jpg\nq/1.jpg d/2.jpg")
+    assert shortlist.indices.tolist() == [[1, 0], [-1, -1], [-1, -1]]
     scored = read(tmp_path, "q/1.jpg, d/2.jpg, 0.75\nq/1.jpg, d/1.jpg, 0.5\nq/1.jpg, d/2.jpg, 0.25")
     assert scored.scores.tolist() == [[0.75, 0.5], [0, 0], [0, 0]]
     np.savez(tmp_path / "p.npz", predictions=[[1, -1, 1, 0], [-1, -1, -1, -1], [0, 2, 2, 0]])
-    found = read_shortlist(tmp_path / "p.npz", QUERIES, DATABASE)
-    assert found.indices.tolist() == [[1, 0], [-1, -1], [0, 2]]
+    shortlist = read_shortlist(tmp_path / "p.npz", QUERIES, DATABASE)
+    assert shortlist.indices.tolist() == [[1, 0], [-1, -1], [0, 2]]
 
 
 @pytest.mark.parametrize(
@@ -164,14 +164,14 @@ def test_written_and_read(tmp_path_factory, file, layout, drawn):
     path = tmp_path_factory.mktemp("p") / file
     written = Shortlist(indices=indices, scores=np.where(mask, scores, np.nan), mask=mask)
     write_shortlist(path, written, QUERIES, DATABASE, layout=layout)
-    found = read_shortlist(path, QUERIES, DATABASE)
-    np.testing.assert_array_equal(found.indices, indices)
-    np.testing.assert_array_equal(found.mask, mask)
+    shortlist = read_shortlist(path, QUERIES, DATABASE)
+    np.testing.assert_array_equal(shortlist.indices, indices)
+    np.testing.assert_array_equal(shortlist.mask, mask)
     ranks = np.where(mask, depth - np.arange(depth), 0)
     np.testing.assert_array_equal(
-        found.scores, ranks if (file, layout) == ("p.txt", "hloc") else np.where(mask, scores, 0)
+        shortlist.scores, ranks if (file, layout) == ("p.txt", "hloc") else np.where(mask, scores, 0)
     )
-    assert [one.name for one in path.parent.iterdir()] == [file]
+    assert [child.name for child in path.parent.iterdir()] == [file]
 
 
 def test_hloc_reads_what_is_written(tmp_path):
@@ -189,13 +189,13 @@ def test_a_ranking_is_written_as_a_shortlist(tmp_path):
         indices=np.array([[3, 1, 0], [2, -1, -1]]), scores=np.zeros((2, 3)), mask=np.array([[1, 1, 1], [1, 0, 0]]) > 0
     )
     ranking = Ranking(order=np.array([[2, 0, 1], [0, 1, 2]]), scores=np.float32([[5, 3, 9], [1, 0, 0]]))
-    found = reranked_shortlist(shortlist, ranking)
-    assert found.indices.tolist() == [[0, 3, 1], [2, -1, -1]]
-    assert found.scores.tolist() == [[9, 5, 3], [1, 0, 0]]
-    write_shortlist(tmp_path / "p.npz", found, QUERIES[:2], DATABASE)
+    shortlist = reranked_shortlist(shortlist, ranking)
+    assert shortlist.indices.tolist() == [[0, 3, 1], [2, -1, -1]]
+    assert shortlist.scores.tolist() == [[9, 5, 3], [1, 0, 0]]
+    write_shortlist(tmp_path / "p.npz", shortlist, QUERIES[:2], DATABASE)
     read_again = read_shortlist(tmp_path / "p.npz", QUERIES[:2], DATABASE)
-    np.testing.assert_array_equal(read_again.indices, found.indices)
-    np.testing.assert_array_equal(read_again.scores, found.scores)
+    np.testing.assert_array_equal(read_again.indices, shortlist.indices)
+    np.testing.assert_array_equal(read_again.scores, shortlist.scores)
     with np.load(tmp_path / "p.npz") as arrays:
         assert {name: array.dtype.name for name, array in arrays.items()} == {
             "predictions": "int32",

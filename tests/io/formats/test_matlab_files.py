@@ -1,8 +1,7 @@
-"""MATLAB's files as arrays by their path, and what is no such file, or more than it says, as one line."""
+"""MATLAB's files as arrays by their path; other and damaged files give one line."""
 
 import struct
 import zlib
-from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -12,21 +11,16 @@ from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.checkpoints.conversion import convert
 from mfvpr.checkpoints.networks import network_of, plan_network
 from mfvpr.checkpoints.tables import NETVLAD_MATLAB
+from mfvpr.networks import VggNetVlad
 from mfvpr.utils import InputError
-from tests.random_checkpoints import matlab_netvlad, matlab_shapes, random_checkpoint, write_matlab
+from tests.checkpoints.test_checkpoint import assert_arrays_or_one_line, random_changes
+from tests.random_checkpoints import cell, matlab_netvlad, matlab_shapes, random_checkpoint, write_matlab
 
 pytestmark = pytest.mark.thorough
 
 
-def cell(*parts):
-    content = np.empty((1, len(parts)), object)
-    for place, part in enumerate(parts):
-        content[0, place] = part
-    return content
-
-
 CONTENT = {
-    "net": {"layers": cell({"w": cell(np.arange(6.0).reshape(2, 3), np.float32([[7]]))}, {"name": "relu"}),
+    "net": {"layers": cell([{"w": cell([np.arange(6.0).reshape(2, 3), np.float32([[7]])])}, {"name": "relu"}]),
             "note": "text", "empty": np.zeros((0, 0)), "flag": np.array([[True]])},
     "other": np.int16([[1, -2]]),
 }  # fmt: skip
@@ -34,64 +28,50 @@ CONTENT = {
 
 @pytest.mark.parametrize("packed", [True, False])
 def test_arrays_have_their_path(tmp_path, packed):
-    found = read_checkpoint(write_matlab(tmp_path / "a.mat", CONTENT, packed=packed))
-    assert {path: array.tolist() for path, array in found.items() if path != "net.flag"} == {
+    arrays = read_checkpoint(write_matlab(tmp_path / "a.mat", CONTENT, packed=packed))
+    assert {path: array.tolist() for path, array in arrays.items() if path != "net.flag"} == {
         "net.layers.0.w.0": [[0, 1, 2], [3, 4, 5]], "net.layers.0.w.1": [[7]], "other": [[1, -2]],
     }  # fmt: skip
-    assert {path: array.dtype for path, array in found.items()}["net.layers.0.w.1"] == np.float32
+    assert arrays["net.layers.0.w.1"].dtype == np.float32
 
 
 def test_an_array_of_structures_is_as_a_cell_of_them(tmp_path):
     several = np.zeros((1, 2), [("w", object)])
     several[0, 0]["w"], several[0, 1]["w"] = np.ones((1, 2)), np.zeros((2, 1))
-    found = read_checkpoint(write_matlab(tmp_path / "a.mat", {"net": {"layers": several}}))
-    assert {path: array.shape for path, array in found.items()} == {"net.layers.0.w": (1, 2), "net.layers.1.w": (2, 1)}
-
-
-def test_shapes_are_those_of_a_file(tmp_path):
-    read = read_checkpoint(write_matlab(tmp_path / "a.mat", matlab_netvlad(4, 3)))
-    assert {path: array.shape for path, array in read.items()} == matlab_shapes(4, 3)
+    arrays = read_checkpoint(write_matlab(tmp_path / "a.mat", {"net": {"layers": several}}))
+    assert {path: array.shape for path, array in arrays.items()} == {"net.layers.0.w": (1, 2), "net.layers.1.w": (2, 1)}
 
 
 def test_signs_and_axes(tmp_path):
     """The centers are stored with the other sign, all else as inputs, then outputs."""
     read = read_checkpoint(write_matlab(tmp_path / "a.mat", matlab_netvlad(4, 3)))
+    assert {path: array.shape for path, array in read.items()} == matlab_shapes(4, 3)
     with pytest.raises(InputError, match="of another shape"):
         convert(read, NETVLAD_MATLAB, plan_network(network_of(entry_of("netvlad_pitts30k")).builder()).shapes)
-    from mfvpr.networks import VggNetVlad
-
     plan = plan_network(lambda rngs: VggNetVlad(4, 3, original=True, rngs=rngs))
-    found = convert(read, NETVLAD_MATLAB, plan.shapes)
-    np.testing.assert_array_equal(found["pool.centers"], -read["net.layers.30.weights.1"].T)
-    np.testing.assert_array_equal(found["pool.assignment.kernel"][0, 0], read["net.layers.30.weights.0"])
-    np.testing.assert_array_equal(found["projection.kernel"], read["net.layers.33.weights.0"][0, 0])
-    np.testing.assert_array_equal(found["vgg.conv2_1.kernel"], read["net.layers.5.weights.0"])
-    np.testing.assert_allclose(found["average"], [123.68, 116.779, 103.939], rtol=1e-6)
+    parameters = convert(read, NETVLAD_MATLAB, plan.shapes)
+    np.testing.assert_array_equal(parameters["pool.centers"], -read["net.layers.30.weights.1"].T)
+    np.testing.assert_array_equal(parameters["pool.assignment.kernel"][0, 0], read["net.layers.30.weights.0"])
+    np.testing.assert_array_equal(parameters["projection.kernel"], read["net.layers.33.weights.0"][0, 0])
+    np.testing.assert_array_equal(parameters["vgg.conv2_1.kernel"], read["net.layers.5.weights.0"])
+    np.testing.assert_allclose(parameters["average"], [123.68, 116.779, 103.939], rtol=1e-6)
 
 
 def refused(path, words):
-    with pytest.raises(InputError, match=words) as told:
+    with pytest.raises(InputError, match=words) as error:
         read_checkpoint(path)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(error.value)
 
 
 def test_cut_and_changed_files_are_arrays_or_one_line(tmp_path):
-    whole = write_matlab(tmp_path / "a.mat", CONTENT, packed=False).read_bytes()
+    unpacked = write_matlab(tmp_path / "a.mat", CONTENT, packed=False).read_bytes()
     packed = write_matlab(tmp_path / "a.mat", CONTENT).read_bytes()
-    rng = np.random.default_rng(0)
     path = tmp_path / "b.mat"
-    for content in (whole, packed):
-        for end in range(6, len(content), 7):
-            path.write_bytes(content[:end])
-            with suppress(InputError):
-                read_checkpoint(path)
-        for _ in range(400):
-            changed = bytearray(content)
-            for place in rng.integers(116, len(content), rng.integers(1, 4)):
-                changed[place] = rng.integers(256)
-            path.write_bytes(changed)
-            with suppress(InputError):
-                read_checkpoint(path)
+    for content in (unpacked, packed):
+        cut = (content[:end] for end in range(6, len(content), 7))
+        for damaged in (*cut, *random_changes(content, 116)):
+            path.write_bytes(damaged)
+            assert_arrays_or_one_line(path)
 
 
 HEADER = b"MATLAB 5.0 MAT-file".ljust(124) + b"\0\1IM"
@@ -104,9 +84,8 @@ def element(kind, content):
 def nested(depth):
     """Cells within each other, around a number."""
     shape = element(5, struct.pack("<ii", 1, 1))
-    inner = element(
-        14, element(6, struct.pack("<II", 6, 0)) + shape + element(1, b"") + element(9, struct.pack("<d", 5))
-    )
+    value = element(9, struct.pack("<d", 5))
+    inner = element(14, element(6, struct.pack("<II", 6, 0)) + shape + element(1, b"") + value)
     for level in range(depth):
         name = element(1, b"x" * (level == depth - 1))
         inner = element(14, element(6, struct.pack("<II", 1, 0)) + shape + name + inner)
@@ -122,14 +101,10 @@ def test_depth_is_bounded_before_anything_is_read(tmp_path):
     refused(path, "expected layers of arrays, got deeper structures")
 
 
-def test_what_unpacks_to_much_more_than_the_file_is_refused(tmp_path):
+def test_large_content_and_other_versions_are_refused(tmp_path):
     path = tmp_path / "a.mat"
     path.write_bytes(HEADER + element(15, zlib.compress(bytes(200_000_000), 9)))
     refused(path, r"expected at most 20 times its \d+,\d+ bytes")
-
-
-def test_other_versions(tmp_path):
-    path = tmp_path / "a.mat"
     path.write_bytes(b"MATLAB 7.3 MAT-file, Platform".ljust(124) + b"\0\2IM" + bytes(1000))
     refused(path, "expected a MATLAB file of version 5, got 7.3; save it with -v7")
     path.write_bytes(b"MATLAB".ljust(200, b"\1"))
@@ -137,7 +112,7 @@ def test_other_versions(tmp_path):
 
 
 def test_another_networks_file_is_told(tmp_path):
-    other = {"net": {"layers": cell({"weights": cell(*random_checkpoint({"a": (3, 3, 3, 4)}).values())})}}
+    other = {"net": {"layers": cell([{"weights": cell([*random_checkpoint({"a": (3, 3, 3, 4)}).values()])}])}}
     read = read_checkpoint(write_matlab(tmp_path / "a.mat", other))
     plan = plan_network(network_of(entry_of("netvlad_tokyotm")).builder())
     with pytest.raises(InputError, match=r"keys do not fit the network: .*missing"):
