@@ -1,7 +1,5 @@
 """A small network with one of everything, registered beside the published ones; runtime files go to a test's folder."""
 
-from types import ModuleType
-
 import numpy as np
 import pytest
 from flax import nnx
@@ -58,7 +56,7 @@ def tiny_entry(name: str = "tiny", **changes: object) -> registry.Entry:
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """Where `tiny` is installed, once it is."""
+    """Folder of the weights; `tiny` is registered, not installed."""
     monkeypatch.setenv("MFVPR_WEIGHTS", str(tmp_path / "weights"))
     monkeypatch.setitem(registry.REGISTRY, "tiny", tiny_entry())
     monkeypatch.setitem(networks.NETWORKS, "tiny", networks.Network(lambda: Tiny, TABLE))
@@ -72,5 +70,5 @@ def arrays():
 
 
 @pytest.fixture
-def torch() -> ModuleType:
+def torch():
     return pytest.importorskip("torch", reason="torch, of the extra `benchmark`, is not installed")

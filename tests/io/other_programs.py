@@ -20,7 +20,7 @@ def features_of(num_images, **settings):
 
 
 def hloc_parts(features, half=True):
-    """What hloc's extractors give for an image: float32, or float16 with `as_half`; sizes in int64."""
+    """Results of hloc's extractors for an image: float32, or float16 with `as_half`; sizes in int64."""
     kind = np.float16 if half else np.float32
     return {
         "keypoints": features.keypoints.astype(kind),

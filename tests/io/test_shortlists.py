@@ -32,19 +32,15 @@ def test_pairs_of_hloc(tmp_path, text):
     assert (shortlist.indices.dtype, shortlist.scores.dtype, shortlist.mask.dtype) == (np.int32, np.float32, bool)
 
 
-def test_pairs_of_kapture(tmp_path):
+def test_pairs_of_kapture_and_of_patch_netvlad(tmp_path):
+    """Patch-NetVLAD writes full paths without scores."""
     lines = ["# kapture format: 1.0", "# query_image, map_image, score"]
-    lines += ["q/1.jpg, d/2.jpg, 0.75", "q/my query.jpg, d/my place.jpg, -1e-3", "q/1.jpg,d/x, y.jpg,0.5"]
-    shortlist = read(tmp_path, "\n".join(lines))
+    scored = ["q/1.jpg, d/2.jpg, 0.75", "q/my query.jpg, d/my place.jpg, -1e-3", "q/1.jpg,d/x, y.jpg,0.5"]
+    shortlist = read(tmp_path, "\n".join(lines + scored))
     assert shortlist.indices.tolist() == [[1, 3], [-1, -1], [2, -1]]
     np.testing.assert_array_equal(shortlist.scores, np.float32([[0.75, 0.5], [0, 0], [-1e-3, 0]]))
-
-
-def test_predictions_of_patch_netvlad(tmp_path):
-    """Full paths, no scores, two lines of comments."""
-    lines = ["# kapture format: 1.0", "# query_image, map_image"]
-    lines += ["/data/set/q/1.jpg, /data/set/d/2.jpg", "/data/set/q/1.jpg, /data/set/d/1.jpg"]
-    shortlist = read(tmp_path, "\n".join(lines) + "\n")
+    full_paths = ["/data/set/q/1.jpg, /data/set/d/2.jpg", "/data/set/q/1.jpg, /data/set/d/1.jpg\n"]
+    shortlist = read(tmp_path, "\n".join(lines + full_paths))
     assert shortlist.indices.tolist() == [[1, 0], [-1, -1], [-1, -1]]
 
 
@@ -82,10 +78,7 @@ def test_a_candidate_twice_counts_where_it_comes_first(tmp_path):
     "text, message",
     [
         ("q/1.jpg d/9.jpg", r"line 1: .*names .*'q/1"),
-        (
-            "q/1.jpg d/1.jpg\nd/1.jpg q/1.jpg",
-            r"query image, got 'd/1\.jpg'",
-        ),
+        ("q/1.jpg d/1.jpg\nd/1.jpg q/1.jpg", r"query image, got 'd/1\.jpg'"),
         ("q/1.jpg", "line 1: expected the names"),
         ("q/1.jpg d/1.jpg 0.5", "line 1: expected the names"),
         ("q/1.jpg, d/1.jpg, high", "line 1: expected the names"),
@@ -94,10 +87,7 @@ def test_a_candidate_twice_counts_where_it_comes_first(tmp_path):
         ("q/1.jpg, d/1.jpg, 0.5\nq/1.jpg, d/2.jpg, 0.6", r"q/1\.jpg: .*scores.* descend.*distances"),
         ("q/1.jpg, d/1.jpg, nan", r"q/1\.jpg: expected finite scores"),
         ("q/1.jpg, d/1.jpg, 1e99", r"q/1\.jpg: expected finite scores"),
-        (
-            "other/1.jpg d/1.jpg",
-            r"query image, got 'other/1\.jpg'.* 3",
-        ),
+        ("other/1.jpg d/1.jpg", r"query image, got 'other/1\.jpg'.* 3"),
         ("1.jpg d/1.jpg\nq/1.jpg d/2.jpg", r"got '1\.jpg'.* 3 .*full path"),
         ("# nothing but a comment", "3 queries, got none"),
         ("", "got none at all"),
@@ -141,8 +131,8 @@ def test_predictions_that_cannot_be_used(tmp_path, arrays, message):
 def test_not_a_file(tmp_path):
     os.mkfifo(tmp_path / "pipe.txt")
     os.mkfifo(tmp_path / "pipe.npz")
-    for name, got in (("p.txt", "nothing"), ("p.npz", "nothing"), (".", "a folder"), ("pipe.txt", "a pipe or device"),
-                      ("pipe.npz", "a pipe or device")):  # fmt: skip
+    pipes = {"pipe.txt": "a pipe or device", "pipe.npz": "a pipe or device"}
+    for name, got in ({"p.txt": "nothing", "p.npz": "nothing", ".": "a folder"} | pipes).items():
         with pytest.raises(InputError, match=f"expected a file, got {got}"):
             read_shortlist(tmp_path / name, QUERIES, DATABASE)
 
@@ -168,9 +158,8 @@ def test_written_and_read(tmp_path_factory, file, layout, drawn):
     np.testing.assert_array_equal(shortlist.indices, indices)
     np.testing.assert_array_equal(shortlist.mask, mask)
     ranks = np.where(mask, depth - np.arange(depth), 0)
-    np.testing.assert_array_equal(
-        shortlist.scores, ranks if (file, layout) == ("p.txt", "hloc") else np.where(mask, scores, 0)
-    )
+    expected = ranks if (file, layout) == ("p.txt", "hloc") else np.where(mask, scores, 0)
+    np.testing.assert_array_equal(shortlist.scores, expected)
     assert [child.name for child in path.parent.iterdir()] == [file]
 
 
@@ -189,18 +178,11 @@ def test_a_ranking_is_written_as_a_shortlist(tmp_path):
         indices=np.array([[3, 1, 0], [2, -1, -1]]), scores=np.zeros((2, 3)), mask=np.array([[1, 1, 1], [1, 0, 0]]) > 0
     )
     ranking = Ranking(order=np.array([[2, 0, 1], [0, 1, 2]]), scores=np.float32([[5, 3, 9], [1, 0, 0]]))
-    shortlist = reranked_shortlist(shortlist, ranking)
-    assert shortlist.indices.tolist() == [[0, 3, 1], [2, -1, -1]]
-    assert shortlist.scores.tolist() == [[9, 5, 3], [1, 0, 0]]
-    write_shortlist(tmp_path / "p.npz", shortlist, QUERIES[:2], DATABASE)
-    read_again = read_shortlist(tmp_path / "p.npz", QUERIES[:2], DATABASE)
-    np.testing.assert_array_equal(read_again.indices, shortlist.indices)
-    np.testing.assert_array_equal(read_again.scores, shortlist.scores)
+    write_shortlist(tmp_path / "p.npz", reranked_shortlist(shortlist, ranking), QUERIES[:2], DATABASE)
     with np.load(tmp_path / "p.npz") as arrays:
-        assert {name: array.dtype.name for name, array in arrays.items()} == {
-            "predictions": "int32",
-            "scores": "float32",
-        }
+        assert arrays["predictions"].tolist() == [[0, 3, 1], [2, -1, -1]]
+        assert arrays["scores"].tolist() == [[9, 5, 3], [1, 0, 0]]
+        assert (arrays["predictions"].dtype, arrays["scores"].dtype) == (np.int32, np.float32)
 
 
 def test_what_cannot_be_written(tmp_path):
