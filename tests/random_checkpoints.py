@@ -5,8 +5,9 @@ import pickle
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,17 +18,10 @@ from mfvpr.checkpoints.checkpoint import read_checkpoint
 SHARED = Path(__file__).parent.parent.parent / "shared" / "weights"
 ALIKED, LIGHTGLUE = SHARED / "aliked", SHARED / "lightglue" / "aliked_lightglue.pth"
 KINDS = {
-    "f4": "FloatStorage",
-    "f8": "DoubleStorage",
-    "f2": "HalfStorage",
-    "i8": "LongStorage",
-    "i4": "IntStorage",
-    "i2": "ShortStorage",
-    "i1": "CharStorage",
-    "u1": "ByteStorage",
-    "b1": "BoolStorage",
-    "c8": "ComplexFloatStorage",
-}
+    "f4": "FloatStorage", "f8": "DoubleStorage", "f2": "HalfStorage", "i8": "LongStorage", "i4": "IntStorage",
+    "i2": "ShortStorage", "i1": "CharStorage", "u1": "ByteStorage", "b1": "BoolStorage", "c8": "ComplexFloatStorage",
+}  # fmt: skip
+Shapes = dict[str, tuple[int, ...]]
 
 
 class Global(NamedTuple):
@@ -69,28 +63,29 @@ class Writer:
         return b"\x80\x02" + self._put(value) + b"."
 
     def _put(self, value: Any) -> bytes:
-        if isinstance(value, bytes):  # instructions
-            return value
-        if isinstance(value, Global):
-            return f"c{value.module}\n{value.name}\n".encode()
-        if isinstance(value, Call):
-            return self._put(value.function) + self._put(value.arguments) + b"R"
-        if isinstance(value, np.ndarray):
-            return self._put(View(value))
-        if isinstance(value, View):
-            return self._tensor(value)
-        if isinstance(value, dict):
-            return b"}(" + b"".join(self._put(item) for pair in value.items() for item in pair) + b"u"
-        if isinstance(value, (tuple, list)):
-            items = b"".join(map(self._put, value))
-            return b"(" + items + b"t" if isinstance(value, tuple) else b"](" + items + b"e"
-        if isinstance(value, str):
-            return b"X" + struct.pack("<I", len(value.encode())) + value.encode()
-        if isinstance(value, float):
-            return b"G" + struct.pack(">d", value)
-        if type(value) is int and -(2**31) <= value < 2**31:
-            return b"J" + struct.pack("<i", value)
-        return pickle.dumps(value, protocol=2)[2:-1]  # None, True, False, large numbers
+        match value:
+            case bytes():  # instructions
+                return value
+            case Global(module, name):
+                return f"c{module}\n{name}\n".encode()
+            case Call(function, arguments):
+                return self._put(function) + self._put(arguments) + b"R"
+            case np.ndarray():
+                return self._tensor(View(value))
+            case View():
+                return self._tensor(value)
+            case dict():
+                return b"}(" + self._put_all(chain.from_iterable(value.items())) + b"u"
+            case tuple():
+                return b"(" + self._put_all(value) + b"t"
+            case list():
+                return b"](" + self._put_all(value) + b"e"
+            case str():
+                return b"X" + struct.pack("<I", len(value.encode())) + value.encode()
+        return pickle.dumps(value, protocol=2)[2:-1]  # None, True, False, numbers
+
+    def _put_all(self, values: Iterable[Any]) -> bytes:
+        return b"".join(map(self._put, values))
 
     def _tensor(self, view: View) -> bytes:
         array = view.array
@@ -121,15 +116,10 @@ def write_zip(path: Path, content: Any, *, order: str = "little", compression: i
 def write_legacy(path: Path, content: Any) -> Path:
     """A checkpoint as torch wrote them before."""
     writer = Writer(legacy=True)
-    pickles = [
-        0x1950A86A20F9469CFC6C,
-        1001,
-        {"protocol_version": 1001, "little_endian": True, "type_sizes": {"int": 4}},
-    ]
-    parts = [writer.pickled(value) for value in (*pickles, content)]
+    system = {"protocol_version": 1001, "little_endian": True, "type_sizes": {"int": 4}}
+    parts = [writer.pickled(value) for value in (0x1950A86A20F9469CFC6C, 1001, system, content)]
     parts.append(writer.pickled(sorted(writer.storages)))
-    for key in sorted(writer.storages):
-        array = writer.storages[key]
+    for _, array in sorted(writer.storages.items()):
         parts.append(struct.pack("<q", array.size) + array.tobytes("A"))
     path.write_bytes(b"".join(parts))
     return path
@@ -139,7 +129,7 @@ HEADER = "{'descr': '|O', 'fortran_order': False, 'shape': (), }"
 
 
 def write_numpy(path: Path, content: Any, *, protocol: int = 4, header: str = HEADER) -> Path:
-    """A .npy file of one pickled object, in NumPy's way; of bytes, they are the pickle."""
+    """A .npy file of one pickled object, as NumPy writes it; `content` may be the bytes of the pickle."""
     start = header.ljust(117) + "\n"
     if not isinstance(content, bytes):
         content = pickle.dumps(np.array(content, dtype=object), protocol=protocol)
@@ -156,7 +146,7 @@ def layered(tensors: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.ndarray
     return layers
 
 
-def random_checkpoint(shapes: Mapping[str, tuple[int, ...]], seed: int = 0) -> dict[str, np.ndarray]:
+def random_checkpoint(shapes: Shapes, seed: int = 0) -> dict[str, np.ndarray]:
     """Plausible weights: each depends on its name, its shape and the seed alone."""
     return {name: _random(name, shape, seed) for name, shape in shapes.items()}
 
@@ -188,43 +178,44 @@ def at_hand() -> Iterator[tuple[str, dict[str, np.ndarray]]]:
         yield path.stem, read_checkpoint(path)
 
 
+def with_biases(weights: Shapes) -> Shapes:
+    """Shapes of layers' weights, each followed by that of the bias."""
+    return {
+        f"{name}.{part}": shape
+        for name, weight in weights.items()
+        for part, shape in (("weight", weight), ("bias", weight[:1]))
+    }
+
+
 _VGG16 = {0: (3, 64), 2: (64, 64), 5: (64, 128), 7: (128, 128), 10: (128, 256), 12: (256, 256), 14: (256, 256),
           17: (256, 512), 19: (512, 512), 21: (512, 512), 24: (512, 512), 26: (512, 512), 28: (512, 512)}  # fmt: skip
 
 
-def _vgg16(prefix: str, last: int = 28) -> dict[str, tuple[int, ...]]:
-    shapes = {}
-    for index, (inputs, outputs) in ((index, widths) for index, widths in _VGG16.items() if index <= last):
-        shapes |= {f"{prefix}.{index}.weight": (outputs, inputs, 3, 3), f"{prefix}.{index}.bias": (outputs,)}
-    return shapes
+def _vgg16(prefix: str, last: int = 28) -> Shapes:
+    weights = {f"{prefix}.{index}": (*widths[::-1], 3, 3) for index, widths in _VGG16.items() if index <= last}
+    return with_biases(weights)
 
 
-def d2net_shapes() -> dict[str, tuple[int, ...]]:
+def d2net_shapes() -> Shapes:
     """The tensors of d2_tf.pth, which holds them below the key `model`."""
     return _vgg16("dense_feature_extraction.model", last=21)
 
 
-def places365_shapes(weights: str = "weights", *, full: bool = True) -> dict[str, tuple[int, ...]]:
+def places365_shapes(weights: str = "weights", *, full: bool = True) -> Shapes:
     """The tensors of vgg16_places365.npy, and of other files with Caffe's names; those SSM-VPR needs unless `full`."""
-    widths = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
-    shapes, inputs = {}, 3
-    for block, outputs in enumerate(widths, start=1):
-        for place, width in enumerate(outputs, start=1):
-            shapes[f"conv{block}_{place}"] = (width, inputs, 3, 3)
-            inputs = width
+    names = (f"conv{block}_{place}" for block, count in enumerate((2, 2, 3, 3, 3), 1) for place in range(1, count + 1))
+    shapes = {name: (*widths[::-1], 3, 3) for name, widths in zip(names, _VGG16.values(), strict=True)}
     if full:
         shapes |= {"fc6_1": (4096, 25_088), "fc7_1": (4096, 4096), "fc8a_1": (365, 4096)}
     else:
         del shapes["conv5_3"]
-    kinds = {weights: lambda shape: shape, "bias": lambda shape: shape[:1]}
-    return {f"{layer}.{name}": kind(shape) for layer, shape in shapes.items() for name, kind in kinds.items()}
+    return {name.replace("weight", weights): shape for name, shape in with_biases(shapes).items()}
 
 
-def netvlad_shapes(clusters: int = 16, outputs: int | None = 4096) -> dict[str, tuple[int, ...]]:
+def netvlad_shapes(clusters: int = 16, outputs: int | None = 4096) -> Shapes:
     """The tensors of Patch-NetVLAD's checkpoints; without `outputs` those of pytorch-NetVlad's."""
     shapes = _vgg16("encoder") | {"pool.conv.weight": (clusters, 512, 1, 1), "pool.centroids": (clusters, 512)}
-    projection = {"WPCA.0.weight": (outputs, 512 * clusters, 1, 1), "WPCA.0.bias": (outputs,)}
-    return shapes | (projection if outputs else {})
+    return shapes | (with_biases({"WPCA.0": (outputs, 512 * clusters, 1, 1)}) if outputs else {})
 
 
 def netvlad_checkpoint(clusters: int = 16, outputs: int | None = 4096, seed: int = 0) -> dict[str, np.ndarray]:
@@ -238,21 +229,17 @@ def gem_checkpoint(backbone: str = "resnet50", outputs: int = 2048, seed: int = 
     return random_checkpoint(gem_shapes(backbone, outputs), seed) | {"aggregation.1.p": np.float32([2.875])}
 
 
-def gem_shapes(backbone: str = "resnet50", outputs: int = 2048) -> dict[str, tuple[int, ...]]:
+def gem_shapes(backbone: str = "resnet50", outputs: int = 2048) -> Shapes:
     """The tensors of CosPlace's checkpoints."""
     channels = {"vgg16": 512, "resnet50": 2048}[backbone]
     shapes = _vgg16("backbone") if backbone == "vgg16" else {
         "backbone.0.weight": (64, 3, 7, 7), **_norm("backbone.1", 64),
-        **_bottlenecks({f"backbone.{layer + 3}": (blocks, 64 * 2 ** (layer - 1))
-                        for layer, blocks in enumerate((3, 4, 6, 3), start=1)}),
+        **_bottlenecks([f"backbone.{place}" for place in (4, 5, 6, 7)]),
     }  # fmt: skip
-    return shapes | {"aggregation.1.p": (1,), "aggregation.3.weight": (outputs, channels),
-                     "aggregation.3.bias": (outputs,)}  # fmt: skip
+    return shapes | {"aggregation.1.p": (1,)} | with_biases({"aggregation.3": (outputs, channels)})
 
 
-def dinov2_shapes(
-    width: int, depth: int, registers: int = 0, prefix: str = "", *, adapted: bool = False
-) -> dict[str, tuple[int, ...]]:
+def dinov2_shapes(width: int, depth: int, registers: int = 0, prefix: str = "", *, adapted: bool = False) -> Shapes:
     """The tensors of DINOv2's checkpoints; `adapted` those of SelaVPR's backbone."""
     shapes = {"cls_token": (1, 1, width), "pos_embed": (1, 1370, width), "mask_token": (1, width),
               "patch_embed.proj.weight": (width, 3, 14, 14), "patch_embed.proj.bias": (width,),
@@ -264,18 +251,15 @@ def dinov2_shapes(
         adapters = (f"adapter{number}.D_fc{place}" for number in (1, 2) for place in (1, 2))
         linear |= {name: (0.5, 1) if name.endswith("1") else (1, 0.5) for name in adapters}
     for block in (f"blocks.{place}" for place in range(depth)):
-        for name, (outputs, inputs) in linear.items():
-            shapes[f"{block}.{name}.weight"] = (int(outputs * width), int(inputs * width))
-            shapes[f"{block}.{name}.bias"] = (int(outputs * width),)
+        shapes |= with_biases({f"{block}.{name}": (int(outputs * width), int(inputs * width))
+                               for name, (outputs, inputs) in linear.items()})  # fmt: skip
         for number in (1, 2):
             shapes[f"{block}.ls{number}.gamma"] = (width,)
             shapes |= {f"{block}.norm{number}.{part}": (width,) for part in ("weight", "bias")}
     return {f"{prefix}{name}": shape for name, shape in shapes.items()}
 
 
-def selavpr_shapes(
-    width: int = 1024, depth: int = 24, registers: int = 0, prefix: str = "module."
-) -> dict[str, tuple[int, ...]]:
+def selavpr_shapes(width: int = 1024, depth: int = 24, registers: int = 0, prefix: str = "module.") -> Shapes:
     """The tensors of SelaVPR's checkpoints, which hold them below `model_state_dict`."""
     head = {"aggregation.1.p": (1,), "LocalAdapt.upconv1.weight": (width, 256, 3, 3), "LocalAdapt.upconv1.bias": (256,),
             "LocalAdapt.upconv2.weight": (256, 128, 3, 3), "LocalAdapt.upconv2.bias": (128,)}  # fmt: skip
@@ -283,7 +267,7 @@ def selavpr_shapes(
     return backbone | {f"{prefix}{name}": shape for name, shape in head.items()}
 
 
-def transformer_checkpoint(shapes: Mapping[str, tuple[int, ...]], seed: int = 0) -> dict[str, np.ndarray]:
+def transformer_checkpoint(shapes: Shapes, seed: int = 0) -> dict[str, np.ndarray]:
     """Random weights of these tensors, in which positions and registers count as much as the patches do."""
     tensors = random_checkpoint(shapes, seed)
     for name, tensor in tensors.items():
@@ -294,7 +278,7 @@ def transformer_checkpoint(shapes: Mapping[str, tuple[int, ...]], seed: int = 0)
     return tensors
 
 
-def matlab_shapes(clusters: int = 64, outputs: int = 4096) -> dict[str, tuple[int, ...]]:
+def matlab_shapes(clusters: int = 64, outputs: int = 4096) -> Shapes:
     """The arrays of the original's files, as they are read."""
     weights = {}
     for position, (inputs, channels) in _VGG16.items():
@@ -306,7 +290,7 @@ def matlab_shapes(clusters: int = 64, outputs: int = 4096) -> dict[str, tuple[in
 
 
 def matlab_netvlad(clusters: int = 64, outputs: int = 4096, seed: int = 0) -> dict[str, Any]:
-    """What the original's files hold, as SciPy writes it: `net.layers{i}.weights{j}` and the average image."""
+    """Content of the original's files, as SciPy writes it: `net.layers{i}.weights{j}` and the average image."""
     tensors = netvlad_checkpoint(clusters, outputs, seed)
     weights = {position: [tensors[f"encoder.{position}.weight"].transpose(2, 3, 1, 0),
                           tensors[f"encoder.{position}.bias"][None]] for position in _VGG16}  # fmt: skip
@@ -338,24 +322,21 @@ def write_matlab(path: Path, content: dict[str, Any], *, packed: bool = True) ->
     return path
 
 
-def mixvpr_shapes(out_channels: int = 1024, out_rows: int = 4) -> dict[str, tuple[int, ...]]:
+def mixvpr_shapes(out_channels: int = 1024, out_rows: int = 4) -> Shapes:
     """The tensors of MixVPR's checkpoints: ResNet-50 to its third layer, the mixer, two projections."""
     shapes = {"backbone.model.conv1.weight": (64, 3, 7, 7), **_norm("backbone.model.bn1", 64)}
-    shapes |= _bottlenecks({f"backbone.model.layer{layer}": (blocks, 64 * 2 ** (layer - 1))
-                            for layer, blocks in enumerate((3, 4, 6), start=1)})  # fmt: skip
-    for mixer in range(4):
-        prefix = f"aggregator.mix.{mixer}.mix"
-        shapes |= {f"{prefix}.0.weight": (400,), f"{prefix}.0.bias": (400,)}
-        for layer in (1, 3):
-            shapes |= {f"{prefix}.{layer}.weight": (400, 400), f"{prefix}.{layer}.bias": (400,)}
-    shapes |= {"aggregator.channel_proj.weight": (out_channels, 1024), "aggregator.channel_proj.bias": (out_channels,)}
-    return shapes | {"aggregator.row_proj.weight": (out_rows, 400), "aggregator.row_proj.bias": (out_rows,)}
+    shapes |= _bottlenecks([f"backbone.model.layer{layer}" for layer in (1, 2, 3)])
+    weights = {}
+    for mixer in (f"aggregator.mix.{place}.mix" for place in range(4)):
+        weights |= {f"{mixer}.0": (400,), f"{mixer}.1": (400, 400), f"{mixer}.3": (400, 400)}
+    weights |= {"aggregator.channel_proj": (out_channels, 1024), "aggregator.row_proj": (out_rows, 400)}
+    return shapes | with_biases(weights)
 
 
-def _bottlenecks(layers: Mapping[str, tuple[int, int]]) -> dict[str, tuple[int, ...]]:
-    """Of ResNet-50's layers: blocks and width of each."""
+def _bottlenecks(layers: list[str]) -> Shapes:
+    """The tensors of ResNet-50's first layers, which have these names."""
     shapes, inputs = {}, 64
-    for layer, (blocks, width) in layers.items():
+    for layer, blocks, width in zip(layers, (3, 4, 6, 3), (64, 128, 256, 512), strict=False):
         for block in range(blocks):
             prefix = f"{layer}.{block}"
             sizes = ((width, inputs, 1, 1), (width, width, 3, 3), (4 * width, width, 1, 1))
@@ -369,9 +350,7 @@ def _bottlenecks(layers: Mapping[str, tuple[int, int]]) -> dict[str, tuple[int, 
     return shapes
 
 
-def lightglue_shapes(
-    inputs: int = 128, width: int = 256, layers: int = 9, heads: int = 4
-) -> dict[str, tuple[int, ...]]:
+def lightglue_shapes(inputs: int = 128, width: int = 256, layers: int = 9, heads: int = 4) -> Shapes:
     """The tensors of LightGlue's checkpoints for features without orientations, such as aliked_lightglue.pth."""
     linear = {"input_proj": (width, inputs)}
     shapes = {"posenc.Wr.weight": (width // heads // 2, 2)}
@@ -385,10 +364,9 @@ def lightglue_shapes(
         linear |= {f"log_assignment.{layer}.{name}": (size, width) for name, size in
                    (("final_proj", width), ("matchability", 1))}  # fmt: skip
     linear |= {f"token_confidence.{layer}.token.0": (1, width) for layer in range(layers - 1)}
-    weights = {f"{name}.weight": shape for name, shape in linear.items()}
-    return shapes | weights | {f"{name}.bias": shape[:1] for name, shape in linear.items()}
+    return shapes | with_biases(linear)
 
 
-def _norm(prefix: str, width: int) -> dict[str, tuple[int, ...]]:
+def _norm(prefix: str, width: int) -> Shapes:
     names = ("weight", "bias", "running_mean", "running_var")
     return {f"{prefix}.{name}": (width,) for name in names} | {f"{prefix}.num_batches_tracked": ()}

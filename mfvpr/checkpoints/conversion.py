@@ -5,6 +5,7 @@ shapes are checked. The error counts the problems by kind, with an example of ea
 """
 
 import re
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
@@ -74,41 +75,38 @@ def convert(
     """
     parameters: dict[str, np.ndarray] = {}
     origin: dict[str, str] = {}
-    problems: dict[str, list[str]] = {}
-
-    def add_problem(kind: str, example: str) -> None:
-        problems.setdefault(kind, []).append(example)
+    problems: dict[str, list[str]] = defaultdict(list)
 
     for key, value in source.items():
         if is_ignored(key, table):
             for pattern, shape in table.expected.items():
                 if re.fullmatch(pattern, key) and value.shape != shape:
-                    add_problem("of another shape", f"{key}: expected {shape}, got {value.shape}")
+                    problems["of another shape"].append(f"{key}: expected {shape}, got {value.shape}")
             continue
         targets = _targets(key, table)
         if len(targets) > 1:
-            add_problem("with several rules", excerpt(key))
+            problems["with several rules"].append(excerpt(key))
             continue
         if not targets or targets[0][0] not in shapes:
-            add_problem("unknown", excerpt(key))
+            problems["unknown"].append(excerpt(key))
             continue
         target, layout = targets[0]
         if target in origin:
-            add_problem("twice", f"{key} and {origin[target]}")
+            problems["twice"].append(f"{key} and {origin[target]}")
             continue
         origin[target] = key
         if layout.value.first_pixel and value.ndim:
             value = value[(0,) * (value.ndim - 1)]
         expected = _source_shape(shapes[target], layout)
         if _significant_shape(value.shape, layout) != expected:
-            add_problem("of another shape", f"{key}: expected {expected}, got {value.shape}")
+            problems["of another shape"].append(f"{key}: expected {expected}, got {value.shape}")
         elif value.dtype not in (np.float32, np.float64):
-            add_problem("of another type", f"{key}: expected float32 or float64, got {value.dtype}")
+            problems["of another type"].append(f"{key}: expected float32 or float64, got {value.dtype}")
         else:
             parameters[target] = _to_layout(value.reshape(expected), layout).reshape(shapes[target])
     for target in shapes:
         if target not in origin:
-            add_problem("missing", target)
+            problems["missing"].append(target)
     if problems:
         kinds = (f"{len(examples)} {kind} ({examples[0]})" for kind, examples in problems.items())
         raise InputError(f"keys do not fit the network: {', '.join(kinds)}")
@@ -117,9 +115,8 @@ def convert(
 
 def known_share(keys: Sequence[str], table: Table) -> float:
     """Share of the keys that the table names, from 0 to 1; 0 if the table ignores all of them."""
-    used = [bool(_targets(key, table)) for key in keys]
-    known = [key_used or is_ignored(key, table) for key, key_used in zip(keys, used, strict=True)]
-    return sum(known) / len(known) if any(used) else 0.0
+    used = {key for key in keys if _targets(key, table)}
+    return sum(key in used or is_ignored(key, table) for key in keys) / len(keys) if used else 0.0
 
 
 def is_ignored(key: str, table: Table) -> bool:

@@ -28,11 +28,9 @@ _DTYPES = {  # types of weights, then of counters
 }  # fmt: skip
 _MAGIC, _PROTOCOL = 0x1950A86A20F9469CFC6C, 1001  # the start of files from before torch 1.6, which are not zip files
 _NOTES = {  # the command line and the losses, in checkpoints of D2-Net's training
-    "argparse.Namespace",
-    "_codecs.encode",
-    "numpy.dtype",
-    *(f"numpy.{core}.multiarray.scalar" for core in ("core", "_core")),
-}
+    "argparse.Namespace", "_codecs.encode", "numpy.dtype",
+    "numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

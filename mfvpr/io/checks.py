@@ -33,11 +33,8 @@ def with_length(where: str, descriptors: np.ndarray, lengths: Lengths) -> np.nda
     Args:
         where: place of the descriptors, for messages.
         descriptors: finite.
-        lengths: `unit`: require unit length, and correct its rounding; `normalize`: scale to unit length; `keep`: do
-            not change the descriptors.
-
-    Raises:
-        InputError: a length differs from 1 by more than 1 % (`unit`), or is 0 (`normalize`).
+        lengths: `unit`: require unit length within 1 %, and correct its rounding; `normalize`: scale to unit length,
+            which raises an InputError for a length of 0; `keep`: do not change the descriptors.
     """
     if lengths == "keep" or not len(descriptors):
         return descriptors

@@ -78,8 +78,7 @@ def _images(path: Path, file: Any) -> Iterator[str]:
         addresses.add(address)
         for child in group:
             where = b"/".join((name, child)) if name else child
-            if not _is_hard(path, group, child):
-                raise _link_error(path, where)
+            _require_data(path, group, child, where)
             kind = h5py.h5o.get_info(group, child).type
             if kind == h5py.h5o.TYPE_GROUP:
                 names.append(where)
@@ -89,15 +88,14 @@ def _images(path: Path, file: Any) -> Iterator[str]:
 
 
 def _open_dataset(path: Path, image: str, group: Any, part: str) -> Any:
-    name, where = _encode(part), f"{image}/{part}"
-    if not _is_hard(path, group, name):
-        raise _link_error(path, _encode(where))
+    name, where = _encode(part), f"{path}: {shorten(image)}/{part}"
+    _require_data(path, group, name, _encode(f"{image}/{part}"))
     try:
         dataset = _h5py(path).h5d.open(group, name)
     except (KeyError, ValueError, OSError):
-        raise InputError(f"{path}: {shorten(where)}: expected a dataset, got a group or damaged bytes") from None
+        raise InputError(f"{where}: expected a dataset, got a group or damaged bytes") from None
     if dataset.shape is None:
-        raise InputError(f"{path}: {shorten(where)}: expected values, got a dataset without any")
+        raise InputError(f"{where}: expected values, got a dataset without any")
     return dataset
 
 
@@ -120,13 +118,10 @@ def _has_all_values(dataset: Any) -> bool:
     return dataset.id.get_num_chunks() == math.prod(chunks)
 
 
-def _is_hard(path: Path, group: Any, name: bytes) -> bool:
-    return group.links.get_info(name).type == _h5py(path).h5l.TYPE_HARD
-
-
-def _link_error(path: Path, where: bytes) -> InputError:
-    # Also for a link inside the file, which may lead to one that leaves it.
-    return InputError(f"{path}: {_decode(where)}: expected data, got a link, which is not followed; copy the data")
+def _require_data(path: Path, group: Any, name: bytes, where: bytes) -> None:
+    """Raise an InputError for any link: a link inside the file may lead to one that leaves it."""
+    if group.links.get_info(name).type != _h5py(path).h5l.TYPE_HARD:
+        raise InputError(f"{path}: {_decode(where)}: expected data, got a link, which is not followed; copy the data")
 
 
 def _encode(name: str) -> bytes:

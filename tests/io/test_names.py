@@ -54,7 +54,7 @@ def test_matches(names, foreign, expected):
         (["a/1.jpg", "b/1.jpg"], ["1.jpg"], r"a/1\.jpg: expected .* got 1\.jpg"),
         (["1.jpg", "1.png"], ["1"], r"1\.jpg: expected .* got 1,"),
         (["1.jpg"], ["1.png", "1"], r"1\.jpg: expected .* got 1 and 1\.png"),
-        (["0.jpg", "1.jpg"], ["db/0.jpg", "query/1.jpg"], r"one prefix .*db/0\.jpg .*query/1\.jpg"),
+        (["0.jpg", "1.jpg", "2.jpg"], ["db/0.jpg", "db/1.jpg", "query/2.jpg"], r"one prefix .*db/0.* .*query/2\.jpg"),
         (["1.jpg", "2.jpg"], ["1", "query/2.jpg"], r"one prefix .*query/2\.jpg for 2\.jpg .*1 for 1\.jpg"),
         (["a/1.jpg", "a/2.jpg"], ["1.jpg", "a/2.png"], r"one prefix .*1\.jpg for a/1\.jpg .*a/2\.png for a/2\.jpg"),
         (["a/1.jpg", "b/2.jpg"], ["1.jpg", "2.jpg"], r"one prefix .* got 1\.jpg .*a/1\.jpg .*b/2\.jpg"),
