@@ -130,7 +130,8 @@ def plan_network(build: Callable[..., "nnx.Module"]) -> Blueprint:
     with jax.numpy_dtype_promotion("standard"):  # Flax's initializers mix types
         module = nnx.eval_shape(lambda: build(rngs=nnx.Rngs(0)))
     graph, state = nnx.split(module)
-    shapes = {".".join(map(str, keys)): leaf.shape for keys, leaf in flatten_dict(nnx.to_pure_dict(state)).items()}
+    leaves: Any = flatten_dict(nnx.to_pure_dict(state))
+    shapes = {".".join(map(str, keys)): leaf.shape for keys, leaf in leaves.items()}
     parameters = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(nnx.state(module, nnx.Param)))
     return Blueprint(shapes, parameters, graph, state)
 
