@@ -3,6 +3,7 @@
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Float, Float32, Shaped
 
 from mfvpr.utils.errors import InputError
 
@@ -11,7 +12,7 @@ TOLERANCE = 0.01  # of unit length, relative; the error of float16 is 5e-4
 EXACT = 1e-6  # the error of float32
 
 
-def as_float32(where: str, array: np.ndarray, kinds: str = "f") -> np.ndarray:
+def as_float32(where: str, array: Shaped[np.ndarray, "..."], kinds: str = "f") -> Float32[np.ndarray, "..."]:
     """Convert an array of these kinds of numbers (`numpy.dtype.kind`) to float32.
 
     Raises:
@@ -27,8 +28,10 @@ def as_float32(where: str, array: np.ndarray, kinds: str = "f") -> np.ndarray:
     return values
 
 
-def with_length(where: str, descriptors: np.ndarray, lengths: Lengths) -> np.ndarray:
-    """Check or scale the lengths of descriptors `[N, D]`; the result is float32.
+def with_length(
+    where: str, descriptors: Float[np.ndarray, "rows dimensions"], lengths: Lengths
+) -> Float[np.ndarray, "rows dimensions"]:
+    """Check or scale the lengths of descriptors; the result is float32.
 
     Args:
         where: place of the descriptors, for messages.

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float, Float32
 
 from mfvpr.io.checks import Lengths, as_float32, with_length
 from mfvpr.io.containers import FileEntry, choose_reader, reading, shorten
@@ -11,13 +12,16 @@ from mfvpr.io.feature_files import as_float
 from mfvpr.io.h5 import H5File, write_h5
 from mfvpr.io.names import match_names, require_all, require_different
 from mfvpr.io.npz import parse_npy, read_npz, write_npz
+from mfvpr.types import Array
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.files import printable, replacing
 
 PART = "global_descriptor"  # hloc's name
 
 
-def read_global_descriptors(path: Path | str, names: Sequence[str], *, lengths: Lengths = "unit") -> np.ndarray:
+def read_global_descriptors(
+    path: Path | str, names: Sequence[str], *, lengths: Lengths = "unit"
+) -> Float32[np.ndarray, "images dimensions"]:
     """Global descriptors of the images `names`.
 
     Args:
@@ -39,7 +43,7 @@ def read_global_descriptors(path: Path | str, names: Sequence[str], *, lengths: 
 
 def read_with_entries(
     path: Path | str, names: Sequence[str], *, lengths: Lengths = "unit"
-) -> tuple[np.ndarray, list[FileEntry]]:
+) -> tuple[Float32[np.ndarray, "images dimensions"], list[FileEntry]]:
     """Descriptors as `read_global_descriptors` returns them, and `[M]` the entry of each image."""
     path = Path(path)
     require_word("lengths", lengths, Lengths)
@@ -51,7 +55,7 @@ def read_with_entries(
 
 
 def write_global_descriptors(
-    path: Path | str, names: Sequence[str], descriptors: np.ndarray, *, half: bool = False
+    path: Path | str, names: Sequence[str], descriptors: Float[Array, "images dimensions"], *, half: bool = False
 ) -> None:
     """Write global descriptors `[M, D]` as `read_global_descriptors` reads them, atomically.
 

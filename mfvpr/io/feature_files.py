@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+from jaxtyping import Float, Shaped
 
 from mfvpr.io.containers import shorten
 from mfvpr.io.h5 import write_h5
@@ -42,7 +43,7 @@ def write_features(
             write_npz(path / f"{_below(name)}.npz", arrays.items())
 
 
-def as_float(where: str, values: np.ndarray, half: bool) -> np.ndarray:
+def as_float(where: str, values: Shaped[np.ndarray, "*shape"], half: bool) -> Float[np.ndarray, "*shape"]:
     """Convert to float32, or to float16 if `half`.
 
     Raises:

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float32, Int32
 
 from mfvpr.io.checks import Lengths, as_float32, with_length
 from mfvpr.io.containers import Container, Contents, FileEntry, choose_reader, shorten
@@ -43,20 +44,20 @@ class ImportedFeatures:
     Attributes:
         path: file or folder.
         paths: files with the images.
-        counts: `[M]` int32, keypoints of each image, -1 = missing image.
+        counts: keypoints of each image, -1 = missing image.
         dimension: D; 0 if no image has a keypoint.
         scored: whether the files have scores; if not, all are 1.
     """
 
     path: Path
     paths: tuple[Path, ...]
-    counts: np.ndarray
+    counts: Int32[np.ndarray, " images"]
     dimension: int
     scored: bool
     _container: Container
     _images: tuple[str | None, ...]
     _transposed: bool
-    _sizes: np.ndarray | None
+    _sizes: Float32[np.ndarray, "images 2"] | None
     _lengths: Lengths
 
     def __len__(self) -> int:
@@ -222,8 +223,7 @@ def _has_scores(path: Path, contents: Mapping[str, Contents]) -> bool:
     return not without
 
 
-def _explicit_sizes(image_size: Any, count: int) -> np.ndarray:
-    """`[M, 2]`."""
+def _explicit_sizes(image_size: Any, count: int) -> Float32[np.ndarray, "images 2"]:
     sizes = np.asarray(image_size, np.float32)
     if sizes.shape not in ((2,), (count, 2)) or not (np.isfinite(sizes) & (sizes > 0)).all():
         got = f"shape {list(sizes.shape)} or sizes that are not positive"
@@ -231,8 +231,10 @@ def _explicit_sizes(image_size: Any, count: int) -> np.ndarray:
     return np.broadcast_to(sizes, (count, 2))
 
 
-def _image_size(where: str, stored_size: np.ndarray | None, explicit_size: np.ndarray | None) -> np.ndarray:
-    """`[2]` size in the file, or the one that the caller states."""
+def _image_size(
+    where: str, stored_size: np.ndarray | None, explicit_size: Float32[np.ndarray, "2"] | None
+) -> Float32[np.ndarray, "2"]:
+    """Size in the file, or the one that the caller states."""
     if stored_size is None:
         if explicit_size is None:
             raise InputError(f"{where}: expected image_size, got none; has the file changed since it was opened?")

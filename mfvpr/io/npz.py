@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import IO
 
 import numpy as np
+from jaxtyping import Shaped
 
 from mfvpr.io.containers import Container, Contents, FileEntry, reading, require_plain, shorten
 from mfvpr.utils.errors import InputError
@@ -136,7 +137,7 @@ def _array(archive: zipfile.ZipFile, member: str) -> np.ndarray:
     return parse_npy(f"{archive.filename}: {shorten(member)}", content)
 
 
-def parse_npy(where: str, content: bytes) -> np.ndarray:
+def parse_npy(where: str, content: bytes) -> Shaped[np.ndarray, "..."]:
     """The array in the bytes of a `.npy`; raise an InputError if bytes are missing or left over."""
     file = io.BytesIO(content)
     shape, dtype = _read_header(where, file)

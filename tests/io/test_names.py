@@ -71,7 +71,7 @@ def test_a_name_twice(tmp_path, names):
     """Bytes that are no UTF-8, and the text that stands for them in a file, are one name."""
     features = [(row, feature(row, count=3)) for row in range(len(names))]
     ones = np.ones((len(names), 1))
-    shortlist = Shortlist(indices=0 * ones, scores=ones, mask=ones > 0)
+    shortlist = Shortlist(indices=np.zeros((len(names), 1), int), scores=ones, mask=ones > 0)
     for use in (
         lambda: match_names(FILE, names, names),
         lambda: write_features(tmp_path / "a.h5", names, features),
