@@ -16,7 +16,14 @@ from mfvpr.features import Source
 from mfvpr.report import runs
 from mfvpr.report.confidences import CalibratedPredictions, confidence_figures, confidence_table, write_confidence
 from mfvpr.report.differences import write_gains
-from mfvpr.report.evaluations import EvaluationReport, Figure, figures, recall_table, write_rankings, write_skipped
+from mfvpr.report.evaluations import (
+    EvaluationReport,
+    Figure,
+    query_figures,
+    recall_table,
+    write_rankings,
+    write_skipped,
+)
 from mfvpr.report.shifts import write_shifts
 from mfvpr.reranking import Fusion
 from mfvpr.reranking.results import COHORT, FILTER, FRAMES
@@ -106,7 +113,7 @@ def evaluation_of(settings: dict[str, Any]) -> Outcome:
     histogram = scorers.get("histogram")
     histogram = histogram if isinstance(histogram, HistogramOfShifts) else None
     assured = CalibratedPredictions(judged, confidence and confidence.systems, settings["threshold"])
-    all_figures = figures(judged, tools.extractor, figure_queries, assured.refused_of_headline, histogram)
+    all_figures = query_figures(judged, tools.extractor, figure_queries, assured.refused_of_headline, histogram)
     all_figures += confidence_figures(assured) if figure_queries else []
     deciding = histogram if main == "histogram" else None
     return Outcome(settings, images, tools, judged, assured, parameters, deciding, all_figures)

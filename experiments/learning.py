@@ -51,24 +51,24 @@ def learn(settings: dict[str, Any]) -> None:
             comparison = compare(axes, data.judge, data.match_set, data.candidates, options,
                                  checkpoints=checkpoints, track=console.track)  # fmt: skip
         heading = _heading(settings, data, teach, report)
-        text = f"{heading}\n\n{comparisons.text(comparison)}"
+        text = f"{heading}\n\n{comparisons.comparison_text(comparison)}"
         left_out = ("dataset", "store", "out", "checkpoints", "multirun", "command")
         about = {"data_sets": [*map(_about, teach)], "reported_sets": [*map(_about, report)]}
         results = {
-            **(about if report else _about(teach[0])), **comparisons.results(comparison),
+            **(about if report else _about(teach[0])), **comparisons.comparison_json(comparison),
             "settings": {name: value for name, value in settings.items() if name not in left_out},
             "seconds": watch.seconds, "versions": versions(),
         }  # fmt: skip
 
         def write(new: Path) -> None:
-            runs.write_table(new, comparisons.table(comparison), heading)
+            runs.write_table(new, comparisons.comparison_table(comparison), heading)
             runs.write_json(new / "results.json", results)
             origin = {"command": settings.get("command"), "commit": runs.commit(Path()), **results}
             del origin["rows"], origin["queries"], origin["seconds"]
             comparisons.write_weights(new / "weights", comparison, origin)
             write_text(new / "summary.txt", f"{text}\n")
 
-        figures = comparisons.figures(comparison)
+        figures = comparisons.comparison_figures(comparison)
         by_name = {data_set.part.name: data_set.ground_truth for data_set in report}
         ground_truth = by_name if report else teach[0].ground_truth
         run_folder.leave(folder, settings, ground_truth, text=text, write=write, figures=figures)

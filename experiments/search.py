@@ -44,15 +44,15 @@ def sweep(settings: dict[str, Any]) -> None:
                 trials = {"trials": settings["trials"], "seed": settings["seed"]}
                 outcome = sweeping.search_optuna(axes, judge, matches, candidates, **trials, **options)
         heading = _heading(settings, images, outcome)
-        text = f"{heading}\n\n{sweeps.text(outcome)}"
+        text = f"{heading}\n\n{sweeps.sweep_summary(outcome)}"
 
         def write(new: Path) -> None:
-            runs.write_table(new, sweeps.table(outcome), heading)
+            runs.write_table(new, sweeps.settings_table(outcome), heading)
             runs.write_json(new / "results.json", _results(settings, images, outcome, watch.seconds))
             write_text(new / "summary.txt", f"{text}\n")
 
         ground_truth = truth.description(settings, images.dataset)
-        run_folder.leave(folder, settings, ground_truth, text=text, write=write, figures=sweeps.figures(outcome))
+        run_folder.leave(folder, settings, ground_truth, text=text, write=write, figures=sweeps.heat_maps(outcome))
     if blocks is not None:
         shutil.rmtree(blocks, ignore_errors=True)
 
@@ -90,5 +90,5 @@ def _results(
         "scorer": settings["scorer"], "features": settings["features"], "filter": settings["retrieval"],
         "matching": settings["matching"], "candidates": settings["candidates"], "fusion": settings["fusion"],
         "final": settings["final"], "ground_truth": truth.description(settings, images.dataset),
-        **sweeps.results(outcome), "seconds": seconds, "versions": versions(),
+        **sweeps.sweep_json(outcome), "seconds": seconds, "versions": versions(),
     }  # fmt: skip

@@ -1,22 +1,22 @@
 """The paper's figures, of the evaluations at hand."""
 
-import csv
+import itertools
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure as Canvas
 
 from experiments.paper.printed import average, printed_tables
-from experiments.paper.systems import Row
 from experiments.paper.tables import TOLERANCES, Evaluations
 from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
-from mfvpr.report import runs
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.figures import with_longest_side
 from mfvpr.report.plots import panels, save_figure
+from mfvpr.report.rankings import read_csv
+from mfvpr.report.runs import Figure
 from mfvpr.utils.files import clip_middle, printable, replacing
 
 _MIDDLE = 1  # of the tolerances: the paper's figure
@@ -27,30 +27,26 @@ _SIDE = 300  # px of an image's longer side among the failures
 _NAME_LENGTH = 32  # characters
 _FAILURES = 2  # of each data set
 
+_Image = tuple[np.ndarray, str]  # pixels and a title
 
-def paper_figures(
-    evaluations: Evaluations, best: Mapping[str, Path], growth: Mapping[str, Mapping[int, float]]
-) -> Iterator[runs.Figure]:
-    """The figures that there are numbers for.
 
-    Args:
-        evaluations: all of them.
-        best: the run folder by data set whose histograms and failures are shown.
-        growth: seconds of a query by title and by the size of the database.
-    """
-    histograms = (path for folder in best.values() for path in sorted((folder / "figures").rglob("right_*.png")))
+def paper_figures(evaluations: Evaluations) -> Iterator[Figure]:
+    """The figures that there are numbers for; of each data set, the best row shows its histogram and failures."""
+    folders = {name: evaluations.folders[name, row.run] for name in evaluations.datasets
+               for row in reversed(evaluations.best_rows) if (name, row.run) in evaluations.folders}  # fmt: skip
+    histograms = (path for folder in folders.values() for path in sorted((folder / "figures").rglob("right_*.png")))
     if histogram := next(histograms, None):
         yield "histogram.png", partial(_copy, source=histogram)
     if groups := mean_recalls(evaluations):
         titles = [row.title for row in evaluations.rows if any(row.title in group for group in groups.values())]
         yield "averages.png", partial(_draw_averages, titles=titles, groups=groups)
     if evaluations.seconds:
-        about = evaluations.timed_on
-        yield "speed.png", partial(_draw_speed, rows=evaluations.rows, seconds=evaluations.seconds, about=about)
-    if growth:
-        yield "growth.png", partial(_draw_growth, growth=growth)
-    if best:
-        yield "failures.png", partial(_draw_failures, datasets=evaluations.datasets, best=best)
+        yield "speed.png", partial(_draw_speed, evaluations=evaluations)
+    if evaluations.growth:
+        yield "growth.png", partial(_draw_growth, growth=evaluations.growth)
+    if folders:
+        cases = [case for name, folder in folders.items() for case in _failures(folder, evaluations.datasets[name])]
+        yield "failures.png", partial(_draw_failures, cases=cases)
 
 
 def mean_recalls(evaluations: Evaluations) -> dict[str, dict[str, float]]:
@@ -76,21 +72,22 @@ def _draw_averages(path: Path, titles: Sequence[str], groups: Mapping[str, Mappi
     _save_bars(figure, path, titles, "mean Recall@1 within 2 frames, %", 108)
 
 
-def _draw_speed(path: Path, rows: Sequence[Row], seconds: Mapping[str, Mapping[str, float]], about: str) -> None:
-    """Draw the seconds of a query, step by step; `about` names the data set and the device."""
-    shown = [row for row in rows if row.name in seconds]
-    figure, [axes] = panels(1, 9, 1.2 + 0.3 * len(shown))
-    left = np.zeros(len(shown))
+def _draw_speed(path: Path, evaluations: Evaluations) -> None:
+    """Draw the seconds of a query, step by step."""
+    rows = [row for row in evaluations.rows if row.name in evaluations.seconds]
+    figure, [axes] = panels(1, 9, 1.2 + 0.3 * len(rows))
+    left = np.zeros(len(rows))
     for step, color in _STEPS.items():
-        width = np.array([seconds[row.name][step] for row in shown])
-        axes.barh(np.arange(len(shown)), width, 0.7, left=left, label=step, color=color)
+        width = np.array([evaluations.seconds[row.name][step] for row in rows])
+        axes.barh(np.arange(len(rows)), width, 0.7, left=left, label=step, color=color)
         left += width
     for place, total in enumerate(left):
         axes.text(total, place, f" {total:.3f}", va="center", fontsize=7)
-    _save_bars(figure, path, [row.title for row in shown], f"seconds of a query of {about}", 1.12 * left.max())
+    label = f"seconds of a query of {evaluations.timed_on}"
+    _save_bars(figure, path, [row.title for row in rows], label, 1.12 * left.max())
 
 
-def _save_bars(figure: Figure, path: Path, titles: Sequence[str], label: str, limit: float) -> None:
+def _save_bars(figure: Canvas, path: Path, titles: Sequence[str], label: str, limit: float) -> None:
     [axes] = figure.axes
     axes.set_yticks(np.arange(len(titles)), titles, fontsize=8)
     axes.invert_yaxis()
@@ -112,39 +109,34 @@ def _draw_growth(path: Path, growth: Mapping[str, Mapping[int, float]]) -> None:
     save_figure(figure, path)
 
 
-def _draw_failures(path: Path, datasets: Mapping[str, Dataset], best: Mapping[str, Path]) -> None:
-    """Draw query, prediction, and the best ranked correct image of the clearest failures."""
-    cases = [(name, *case) for name, folder in best.items() for case in _failures(folder, datasets[name])]
-    shown = []
-    for name, sequence, *images in cases:
-        folders = (sequence.images, datasets[name].database, datasets[name].database)
-        shown.append([_small(folder, image) for folder, image in zip(folders, images, strict=True)])
-    heights = [0.35 + 3.1 * max(image.shape[0] / image.shape[1] for image in images) for images in shown] or [1.0]
+def _draw_failures(path: Path, cases: Sequence[Sequence[_Image]]) -> None:
+    """Draw query, prediction, and the best ranked correct image side by side."""
+    heights = [0.35 + 3.1 * max(image.shape[0] / image.shape[1] for image, _ in case) for case in cases] or [1.0]
     number = len(heights)
     figure, axes = panels(3 * number, 9.5 / 3, sum(heights) / number, columns=3, height_ratios=heights)
     for panel in axes:
         panel.set_axis_off()
-    for row, (images, (name, sequence, *names)) in enumerate(zip(shown, cases, strict=True)):
-        where = " ".join(dict.fromkeys((name, sequence.name)))
-        words = f"{where} query", "answer", "right"
-        for panel, image, file, word in zip(axes[3 * row : 3 * row + 3], images, names, words, strict=True):
-            panel.imshow(image)
-            title = f"{word}: {clip_middle(file, _NAME_LENGTH)}"
-            panel.set_title(printable(title.strip()), fontsize=7, parse_math=False)
+    for panel, (image, title) in zip(axes, itertools.chain.from_iterable(cases), strict=False):
+        panel.imshow(image)
+        panel.set_title(printable(title), fontsize=7, parse_math=False)
     save_figure(figure, path)
 
 
-def _failures(run: Path, dataset: Dataset) -> Iterator[tuple[QuerySequence, str, str, str]]:
-    """(sequence, query, prediction, correct image) of the clearest failures that retrieval did not cause."""
-    names, rows = [sequence.name for sequence in dataset.sequences], []
+def _failures(run: Path, dataset: Dataset) -> Iterator[list[_Image]]:
+    """Query, prediction and correct image of the clearest failures that retrieval did not cause."""
+    names, failures = [sequence.name for sequence in dataset.sequences], []
     for place, sequence in enumerate(dataset.sequences):
         file = sequence_folder(run, names, place) / "failures" / "histogram.csv"
-        with file.open(newline="", encoding="utf-8", errors="surrogateescape") as lines:
-            rows += [(sequence, row) for row in csv.DictReader(lines)
+        failures += [(sequence, row) for row in read_csv(file)
                      if row["right_answer"] and _is_far(sequence, dataset.database, row)]  # fmt: skip
-    rows.sort(key=lambda row: -float(row[1]["margin"]))
-    for sequence, row in rows[:_FAILURES]:
-        yield sequence, row["query"], row["answer"], row["right_answer"]
+    failures.sort(key=lambda failure: -float(failure[1]["margin"]))
+    for sequence, row in failures[:_FAILURES]:
+        where = " ".join(dict.fromkeys((dataset.name, sequence.name)))
+        yield [
+            _image(sequence.images, row["query"], f"{where} query"),
+            _image(dataset.database, row["answer"], "answer"),
+            _image(dataset.database, row["right_answer"], "right"),
+        ]
 
 
 def _is_far(sequence: QuerySequence, database: ImageFolder, row: Mapping[str, str]) -> bool:
@@ -160,5 +152,7 @@ def _copy(path: Path, source: Path) -> None:
         shutil.copyfile(source, temporary)
 
 
-def _small(folder: ImageFolder, name: str) -> np.ndarray:
-    return with_longest_side(folder.read(folder.names.index(name)), _SIDE)
+def _image(folder: ImageFolder, name: str, words: str) -> _Image:
+    """An image, small, and its title."""
+    image = with_longest_side(folder.read(folder.names.index(name)), _SIDE)
+    return image, f"{words}: {clip_middle(name, _NAME_LENGTH)}"

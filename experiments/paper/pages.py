@@ -21,26 +21,15 @@ _COSTS, _ABOUT = ("sizes", "seconds"), ("data_sets", "settings")  # names of tab
 
 
 def write_pages(
-    out: Path,
-    evaluations: Evaluations,
-    tables: Mapping[str, tuple[str, Table]],
-    growth: Mapping[str, Mapping[int, float]],
-    runs: Mapping[tuple[str, str], Path],
-    left_out: Sequence[str],
+    out: Path, evaluations: Evaluations, tables: Mapping[str, tuple[str, Table]], left_out: Sequence[str]
 ) -> None:
     """Write `report.html` of all evaluations, and in `comparisons/` a page of each data set's evaluations side by side.
 
-    Args:
-        out: folder of the pages.
-        evaluations: all of them.
-        tables: their headings and tables, by name.
-        growth: seconds of a query by title and by the size of the database.
-        runs: folders of the evaluations, by data set and name.
-        left_out: lines "<evaluation>: <reason>".
+    `tables` are (heading, table) by name; `left_out` are lines "<evaluation>: <reason>".
     """
     links: list[tuple[str, Path]] = []
-    for dataset in dict.fromkeys(name for name, _ in runs):
-        folders = {run: folder for (name, run), folder in runs.items() if name == dataset}
+    for dataset in dict.fromkeys(name for name, _ in evaluations.folders):
+        folders = {run: folder for (name, run), folder in evaluations.folders.items() if name == dataset}
         if len(folders) > 1:
             links.append((f"{dataset}: all side by side", out / "comparisons" / f"{dataset}.html"))
             write_comparison([*folders.values()], links[-1][1])
@@ -61,11 +50,12 @@ def write_pages(
         Section("pages", "Every evaluation", "Their own pages, and all of a data set side by side, with tests and "
                 "intervals.", links=addresses),
         Section("answers", "Answers", "Of each evaluation: query and first answer with their heaviest matches, and the "
-                "histogram of their shifts; below a wrong answer the right one.", gallery=_gallery(runs)),
-        Section("costs", "Seconds and sizes", "", [*_costs(evaluations, growth)], sheets(_COSTS)),
+                "histogram of their shifts; below a wrong answer the right one.", gallery=_gallery(evaluations)),
+        Section("costs", "Seconds and sizes", "", [*_costs(evaluations)], sheets(_COSTS)),
         Section("settings", "Data sets and settings", sheets=[*about, values_sheet("Versions", versions())]),
     ]  # fmt: skip
-    words = f"{len(evaluations.datasets)} data sets, {len(runs)} evaluations, after Pivonka and Preucil, IEEE T-IV 2024"
+    words = f"{len(evaluations.datasets)} data sets, {len(evaluations.folders)} evaluations, "
+    words += "after Pivonka and Preucil, IEEE T-IV 2024"
     write_page(out / PAGE, title="The paper's evaluation", words=words, facts={}, sections=sections)
 
 
@@ -94,26 +84,27 @@ def _by_sequence(evaluations: Evaluations) -> Iterator[Chart]:
             )
 
 
-def _costs(evaluations: Evaluations, growth: Mapping[str, Mapping[int, float]]) -> Iterator[Chart]:
+def _costs(evaluations: Evaluations) -> Iterator[Chart]:
     if evaluations.seconds:
         titles = {row.name: row.title for row in evaluations.rows}
         totals = {titles[name]: sum(steps[step] for step in STEPS) for name, steps in evaluations.seconds.items()}
         yield amounts("seconds", f"Seconds of a query of {evaluations.timed_on}", totals, axis="seconds")
-    if growth:
-        curves = {title: [(float(size), value) for size, value in by.items()] for title, by in growth.items()}
+    if evaluations.growth:
+        curves = {title: [(float(size), value) for size, value in seconds.items()]
+                  for title, seconds in evaluations.growth.items()}  # fmt: skip
         axes = "images of a database, whose descriptors are made up", "seconds of a query"
         yield lines("growth", "As a database grows", curves, axes=axes, scale="log", marked=True, unit="s")
 
 
-def _gallery(runs: Mapping[tuple[str, str], Path]) -> Gallery:
+def _gallery(evaluations: Evaluations) -> Gallery:
     """Pictures of every evaluation, as many as there is room for; sequences are named with their data set."""
-    each = max(1, MOST_PICTURES // max(1, len(runs)))
+    each = max(1, MOST_PICTURES // max(1, len(evaluations.folders)))
     shown = [
         replace(
             picture, system=f"{run}: {picture.system}",
             sequence=dataset if picture.sequence in ("", dataset) else f"{dataset} {picture.sequence}",
         )
-        for (dataset, run), folder in runs.items() for picture in pictures(folder, most=each)
+        for (dataset, run), folder in evaluations.folders.items() for picture in pictures(folder, most=each)
     ]  # fmt: skip
     systems, sequences = (dict.fromkeys(getattr(picture, name) for picture in shown) for name in ("system", "sequence"))
     return Gallery("", [*systems], [*sequences], shown)

@@ -1,6 +1,5 @@
 """The paper's evaluation as a program: every system on every data set at hand, then tables and figures."""
 
-import json
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -24,25 +23,28 @@ from mfvpr.report.pages.one_run import PAGE
 from mfvpr.reranking.results import FILTER
 from mfvpr.utils import InputError
 
-_BEST = ("mix_hist_50", "aliked_hist_50", "sift_hist_50")  # the first at hand shows its failures
-
-Folders = Mapping[tuple[str, str], Path]  # run folders by data set and evaluation
-
 
 def paper(settings: dict[str, Any]) -> None:
     """Evaluate what is not evaluated yet, then write tables and figures, and print the recalls."""
     rows = systems.chosen_rows(settings["systems"])
-    places, missing = systems.places(settings["data"], settings["datasets"])
-    rows, lacking = _with_weights(rows, places, settings)
-    out = Path(settings["out"]).expanduser()
+    places, left_out = systems.places(settings["data"], settings["datasets"])
+    lacking = _missing_weights(rows, places[0], settings) if places else {}
+    rows = [row for row in rows if row.run not in lacking]
+    left_out = [*left_out, *lacking.values()]
     if places and rows:
-        tell(_plan(rows, places, settings))
-    for line in (*missing, *lacking):
+        names = _names(rows)
+        tell(
+            f"plan: {len(names)} evaluations ({', '.join(names)}) on each of {len(places)} data sets "
+            f"({', '.join(place.name for place in places)}), {len(_finished_runs(rows, places, settings))} of "
+            f"{len(names) * len(places)} finished; then tables, seconds of a query, and figures in {settings['out']}"
+        )
+    for line in left_out:
         tell(f"left out: {line}")
     if not places or not rows:
         raise SettingsError("nothing to evaluate: the lines above say what is missing")
-    with runs.held(out):
-        _evaluate_and_report(rows, places, settings, out, [*missing, *lacking])
+    out = Path(settings["out"]).expanduser()
+    with runs.lock_output(out):
+        _evaluate_and_report(rows, places, settings, out, left_out)
 
 
 def _names(rows: Sequence[Row]) -> list[str]:
@@ -50,14 +52,14 @@ def _names(rows: Sequence[Row]) -> list[str]:
     return list(dict.fromkeys(row.run for row in rows))
 
 
-def _plan(rows: Sequence[Row], places: Sequence[Place], settings: Mapping[str, Any]) -> str:
-    """One line with the evaluations, the data sets, and the number of finished evaluations."""
-    names = _names(rows)
-    return (
-        f"plan: {len(names)} evaluations ({', '.join(names)}) on each of {len(places)} data sets "
-        f"({', '.join(place.name for place in places)}), {len(_finished_runs(rows, places, settings))} of "
-        f"{len(names) * len(places)} finished; then tables, seconds of a query, and figures in {settings['out']}"
-    )
+def _missing_weights(rows: Sequence[Row], place: Place, settings: Mapping[str, Any]) -> dict[str, str]:
+    """A line for each evaluation whose networks are not installed, by name."""
+    entries = {run: systems.missing_weights(runs.settings_of(run, place, settings)) for run in _names(rows)}
+    return {
+        run: f"{run}: needs " + "; ".join(f"{entry.name} ({entry.file}): {how_to_install(entry)}" for entry in missing)
+        for run, missing in entries.items()
+        if missing
+    }
 
 
 def _evaluate_and_report(
@@ -67,36 +69,26 @@ def _evaluate_and_report(
     readable = [place for place in places if place.name in datasets]
     if not readable:
         raise SettingsError(f"nothing was evaluated: {failures[0]}")
-    folders = _finished_runs(rows, readable, settings)
-    results = {
-        (row.name, place): result
-        for (place, run), folder in folders.items()
-        for row in rows
-        if row.run == run and (result := row_result(row, runs.results(folder), runs.asked(folder)))
-    }
+    evaluations = _read_evaluations(rows, datasets, _finished_runs(rows, readable, settings))
     timed_on = next((place for place in readable if place.name == "robotcar_seasons"), readable[0])
     about = f"{timed_on.name}, on {timing.device()['cores']} cores of {timing.device()['device']}"
-    evaluations = Evaluations(rows, datasets, results, {}, _sizes(rows, folders), about)
+    evaluations = replace(evaluations, timed_on=about)
     for name, (heading, table) in _write_tables(out, evaluations).items():  # before the seconds, which take a while
         if name in ("recall", "averages"):
             print(f"\n{heading}\n\n{table.text()}", end="", flush=True)
     times = measure_times(rows, timed_on, datasets[timed_on.name], settings, out)
     seconds = {row.name: times[row.run] for row in rows if row.run in times and row.leads}
-    _write(out, replace(evaluations, seconds=seconds), folders, [*left_out, *failures])
+    evaluations = replace(evaluations, seconds=seconds)
+    evaluations = replace(evaluations, growth=_measure_growth(evaluations, out))
+    for name in ("figures", "comparisons"):  # they may have those of other rows and data sets
+        shutil.rmtree(out / name, ignore_errors=True)
+    tables = _write_tables(out, evaluations)
+    for name, draw in paper_figures(evaluations):
+        draw(out / "figures" / name)
+    write_pages(out, evaluations, tables, [*left_out, *failures])
+    print(f"\ntables and figures: {out}\nreport: {out / PAGE}")
     if failures:
         raise SettingsError(f"{len(failures)} of the evaluations could not be made: {failures[0]}")
-
-
-def _with_weights(
-    rows: Sequence[Row], places: Sequence[Place], settings: Mapping[str, Any]
-) -> tuple[list[Row], list[str]]:
-    """Rows whose networks are installed, and a line for each evaluation that lacks one."""
-    lines: dict[str, str] = {}
-    for run in _names(rows) if places else ():
-        if entries := systems.missing_weights(runs.settings_of(run, places[0], settings)):
-            needs = "; ".join(f"{entry.name} ({entry.file}): {how_to_install(entry)}" for entry in entries)
-            lines[run] = f"{run}: needs {needs}"
-    return [row for row in rows if row.run not in lines], list(lines.values())
 
 
 def evaluate_all(
@@ -104,10 +96,9 @@ def evaluate_all(
 ) -> tuple[dict[str, Dataset], list[str]]:
     """Evaluate; return the data sets that could be read, and a line for each evaluation that failed."""
     names = _names(rows)
-    total = len(places) * len(names)
+    total, finished = len(places) * len(names), 0
     datasets: dict[str, Dataset] = {}
     failures: list[str] = []
-    finished = 0
 
     def fail(line: str) -> None:
         failures.append(line)
@@ -128,22 +119,45 @@ def evaluate_all(
         datasets[place.name] = dataset
         for difference in differences(dataset):
             tell(f"warning: {place.name}: {difference}; its numbers are not comparable")
-        for turn, run in enumerate(names, start=1):
-            chosen = runs.settings_of(run, place, settings)
-            folder, expected = runs.folder_of(run, place, settings), runs.made_of(chosen, images, right)
-            if runs.is_done(folder, expected):
-                runs.page(folder)
+        for turn, run in enumerate(names, start=number * len(names) + 1):
+            chosen, folder = runs.settings_of(run, place, settings), runs.folder_of(run, place, settings)
+            inputs = runs.input_fingerprints(chosen, images, right)
+            if runs.is_finished_with(inputs, folder):
                 finished += 1
-                continue
-            tell(f"{number * len(names) + turn} of {total}: {run} on {place.name}")
-            try:
-                runs.evaluate(chosen, expected)
-                runs.page(folder)
-            except InputError as error:
-                fail(f"{run} on {place.name}: {error}")
+            else:
+                tell(f"{turn} of {total}: {run} on {place.name}")
+                try:
+                    runs.evaluate(chosen, inputs)
+                except InputError as error:
+                    fail(f"{run} on {place.name}: {error}")
+                    continue
+            runs.write_missing_page(folder)
     if finished:
         tell(f"{finished} of {total} evaluations were finished before")
     return datasets, failures
+
+
+def _finished_runs(
+    rows: Sequence[Row], places: Sequence[Place], settings: Mapping[str, Any]
+) -> dict[tuple[str, str], Path]:
+    """Run folders by data set and evaluation."""
+    folders = {(place.name, run): runs.folder_of(run, place, settings) for place in places for run in _names(rows)}
+    return {key: folder for key, folder in folders.items() if runs.is_finished(folder)}
+
+
+def _read_evaluations(
+    rows: Sequence[Row], datasets: Mapping[str, Dataset], folders: Mapping[tuple[str, str], Path]
+) -> Evaluations:
+    results, sizes = {}, {}
+    for (name, run), folder in folders.items():
+        content, size = runs.read_json(folder / "results.json"), runs.read_json(folder / runs.SIZES)
+        candidates = runs.read_json(folder / "run.json")["settings"]["candidates"]
+        for row in (row for row in rows if row.run == run):
+            if result := row_result(row, content, candidates):
+                results[row.name, name] = result
+            if row.leads or row.ranking == FILTER:  # retrieval alone has no local features
+                sizes[row.name, name] = size["descriptor"] + (0 if row.ranking == FILTER else size["local"])
+    return Evaluations(rows, datasets, results, sizes=sizes, folders=folders)
 
 
 def measure_times(
@@ -153,86 +167,42 @@ def measure_times(
     times = {}
     for (_, run), folder in _finished_runs(rows, [place], settings).items():
         path = out / "seconds" / f"{run}.json"
-        about = {"data_set": place.name, "of": runs.origin(folder)} | timing.device()
-        known = _read(path)
-        if any(known.get(name) != value for name, value in about.items()):
+        about = {"data_set": place.name, "of": runs.read_json(folder / runs.INPUTS)} | timing.device()
+        times[run] = runs.read_object(path)
+        if any(times[run].get(name) != value for name, value in about.items()):
             tell(f"timing: {run} on {place.name}")
             try:
-                known = timing.measure_query(runs.settings_of(run, place, settings), dataset) | about
+                times[run] = timing.measure_query(runs.settings_of(run, place, settings), dataset) | about
+                write_json(path, times[run])
             except InputError as error:
                 tell(f"left out: seconds of {run}: {error}")
-                continue
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_json(path, known)
-        times[run] = known
+                del times[run]
     return times
 
 
-def _read(path: Path) -> dict[str, Any]:
-    """A JSON object; an empty one for a missing or damaged file."""
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return value if isinstance(value, dict) else {}
-
-
-def _sizes(rows: Sequence[Row], folders: Folders) -> dict[tuple[str, str], float]:
-    """Bytes of an image by row and data set; retrieval alone has no local features."""
-    sizes = {key: runs.sizes(folder) for key, folder in folders.items()}
-    return {
-        (row.name, place): size["descriptor"] + (0 if row.ranking == FILTER else size["local"])
-        for row in rows
-        for (place, run), size in sizes.items()
-        if run == row.run and (row.leads or row.ranking == FILTER)
-    }
-
-
-def _finished_runs(
-    rows: Sequence[Row], places: Sequence[Place], settings: Mapping[str, Any]
-) -> dict[tuple[str, str], Path]:
-    folders = {(place.name, run): runs.folder_of(run, place, settings) for place in places for run in _names(rows)}
-    return {key: folder for key, folder in folders.items() if runs.is_finished(folder)}
+def _measure_growth(evaluations: Evaluations, out: Path) -> dict[str, dict[int, float]]:
+    """Seconds of a query of some systems by the size of the database; the search is measured once."""
+    path, device = out / "seconds" / "growth.json", timing.device()
+    known = runs.read_object(path)
+    if known.get("device") != device:
+        known = {"device": device, "search": {}}
+    lengths = {run: int(runs.read_json(folder / runs.SIZES)["descriptor"])
+               for (_, run), folder in evaluations.folders.items()}  # fmt: skip
+    growth = {}
+    for row in (row for row in evaluations.best_rows if row.name in evaluations.seconds):
+        length = str(lengths[row.run])
+        if length not in known["search"]:
+            known["search"][length] = {str(size): value for size, value in timing.search(lengths[row.run]).items()}
+            write_json(path, known)
+        rest = sum(evaluations.seconds[row.name][step] for step in timing.STEPS)
+        growth[row.title] = {int(size): rest + value for size, value in known["search"][length].items()}
+    return growth
 
 
 def _write_tables(out: Path, evaluations: Evaluations) -> dict[str, tuple[str, Table]]:
+    """Write the tables; return headings and tables by name."""
     shutil.rmtree(out / "tables", ignore_errors=True)  # it may have tables of other rows and data sets
     tables = {name: (heading, table) for name, heading, table in paper_tables(evaluations)}
     for name, (heading, table) in tables.items():
         write_table(out / "tables", table, heading, name=name)
     return tables
-
-
-def _write(out: Path, evaluations: Evaluations, folders: Folders, left_out: Sequence[str]) -> None:
-    for name in ("figures", "comparisons"):  # likewise
-        shutil.rmtree(out / name, ignore_errors=True)
-    tables = _write_tables(out, evaluations)
-    best = [row for name in _BEST for row in evaluations.rows if row.name == name]
-    growth = _growth(best, evaluations, folders, out)
-    shown = {name: folders[name, row.run] for name in evaluations.datasets for row in reversed(best)
-             if (name, row.run) in folders}  # fmt: skip
-    for name, draw in paper_figures(evaluations, shown, growth):
-        draw(out / "figures" / name)
-    write_pages(out, evaluations, tables, growth, folders, left_out)
-    print(f"\ntables and figures: {out}\nreport: {out / PAGE}")
-
-
-def _growth(rows: Sequence[Row], evaluations: Evaluations, folders: Folders, out: Path) -> dict[str, dict[int, float]]:
-    """Seconds of a query of some systems by the size of the database; the search is measured once."""
-    path, device = out / "seconds" / "growth.json", timing.device()
-    known = _read(path)
-    if known.get("device") != device:
-        known = {"device": device, "search": {}}
-    lengths = {run: int(runs.sizes(folder)["descriptor"]) for (_, run), folder in folders.items()}
-    growth = {}
-    for row in rows:
-        if row.name not in evaluations.seconds or row.run not in lengths:
-            continue
-        length = str(lengths[row.run])
-        if length not in known["search"]:
-            known["search"][length] = {str(size): value for size, value in timing.search(lengths[row.run]).items()}
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_json(path, known)
-        rest = sum(evaluations.seconds[row.name][step] for step in timing.STEPS)
-        growth[row.title] = {int(size): rest + value for size, value in known["search"][length].items()}
-    return growth

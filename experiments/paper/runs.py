@@ -16,21 +16,21 @@ from experiments.paper.sizes import bytes_of_an_image
 from experiments.paper.systems import Place, overrides
 from experiments.settings import CONF, SettingsError, check
 from mfvpr.checkpoints import REGISTRY, files
-from mfvpr.report import runs
 from mfvpr.report.pages.one_run import PAGE
+from mfvpr.report.runs import write_json
 from mfvpr.utils.files import remove_leftovers
 from mfvpr.utils.fingerprints import fingerprint
 from mfvpr.utils.locks import lock_folder
 from mfvpr.utils.versions import versions
 
 FIGURES = 2  # queries that each run draws
-_MADE_OF, _SIZES = "made_of.json", "sizes.json"
+INPUTS, SIZES = "made_of.json", "sizes.json"  # see `input_fingerprints` and `bytes_of_an_image`
 _SHARED = ("store", "memory", "devices")  # settings of both programs
 _FREE = {"out", "store", "memory", "devices", "command"}  # settings that change no number
 
 
 @contextmanager
-def held(out: Path) -> Iterator[None]:
+def lock_output(out: Path) -> Iterator[None]:
     """Lock a folder for evaluations, and remove temporary files of a killed process.
 
     Raises:
@@ -64,7 +64,7 @@ def folder_of(run: str, place: Place, settings: Mapping[str, Any]) -> Path:
     return Path(settings["out"]).expanduser() / "runs" / place.name / run
 
 
-def made_of(settings: Mapping[str, Any], images: Mapping[str, str], truth: str | None) -> dict[str, str]:
+def input_fingerprints(settings: Mapping[str, Any], images: Mapping[str, str], truth: str | None) -> dict[str, str]:
     """Fingerprints of the inputs of an evaluation: settings, images, truth, weights; and the version of the code."""
     fixed = {name: value for name, value in settings.items() if name not in _FREE}
     fixed["dataset"] = {name: value for name, value in settings["dataset"].items() if name not in ("root", "cache")}
@@ -83,66 +83,57 @@ def is_finished(folder: Path) -> bool:
     return (folder / "results.json").is_file()
 
 
-def is_done(folder: Path, expected: Mapping[str, str]) -> bool:
-    """Whether the expected run is finished there.
+def is_finished_with(inputs: Mapping[str, str], folder: Path) -> bool:
+    """Whether a run of these inputs is finished there.
 
     Raises:
         SettingsError: the finished run has other settings, images, weights or another version, or is damaged.
     """
     if not is_finished(folder):
         return False
-    for name in ("results.json", "run.json", _SIZES):
+    for name in ("results.json", "run.json", SIZES):
         try:
-            json.loads((folder / name).read_text(encoding="utf-8"))
+            read_json(folder / name)
         except (OSError, ValueError):
             raise SettingsError(f"{folder}/{name}: is damaged, or missing; remove the folder, and run this again, or "
                                 "name another with out=DIR") from None  # fmt: skip
-    try:
-        inputs = json.loads((folder / _MADE_OF).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        inputs = {}
-    if other := [name for name, value in expected.items() if not isinstance(inputs, dict) or inputs.get(name) != value]:
+    before = read_object(folder / INPUTS)
+    if other := [name for name, value in inputs.items() if before.get(name) != value]:
         raise SettingsError(f"{folder}: a finished run of other {' and '.join(other)} is there; remove it, or name "
                             "another folder with out=DIR")  # fmt: skip
     return True
 
 
-def evaluate(settings: Mapping[str, Any], made_of: Mapping[str, str]) -> None:
+def evaluate(settings: Mapping[str, Any], inputs: Mapping[str, str]) -> None:
     """Evaluate into the run folder, without a table in the terminal."""
     with run_folder.claimed(settings, own=True) as folder:
         outcome = evaluation.evaluation_of(dict(settings))
 
         def write(new: Path) -> None:
             evaluation.write(new, outcome)
-            runs.write_json(new / _MADE_OF, dict(made_of))
-            runs.write_json(new / _SIZES, bytes_of_an_image(outcome.tools, outcome.images.dataset.database))
+            write_json(new / INPUTS, dict(inputs))
+            write_json(new / SIZES, bytes_of_an_image(outcome.tools, outcome.images.dataset.database))
             run_folder.draw(new, outcome.figures)  # before results.json, after which the run counts as finished
 
         run_folder.keep(folder, settings, evaluation.ground_truth(outcome), write)
     jax.clear_caches()  # other data sets need other programs, and each program takes memory maps
 
 
-def sizes(folder: Path) -> dict[str, float]:
-    """Sizes of a finished run, see `bytes_of_an_image`."""
-    return json.loads((folder / _SIZES).read_text(encoding="utf-8"))
-
-
-def page(folder: Path) -> None:
+def write_missing_page(folder: Path) -> None:
     """Write the page of a finished run, unless it is there."""
     if not (folder / PAGE).is_file():
         run_folder.report_page(folder)
 
 
-def results(folder: Path) -> list[dict[str, Any]]:
-    """Rows of results.json of a finished run."""
-    return json.loads((folder / "results.json").read_text(encoding="utf-8"))
+def read_json(path: Path) -> Any:
+    """The value of a JSON file."""
+    return json.loads(path.read_text(encoding="utf-8"))
 
 
-def asked(folder: Path) -> int | str:
-    """The setting `candidates` of a finished run."""
-    return json.loads((folder / "run.json").read_text(encoding="utf-8"))["settings"]["candidates"]
-
-
-def origin(folder: Path) -> Any:
-    """Fingerprints of the inputs of a finished run, see `made_of`."""
-    return json.loads((folder / _MADE_OF).read_text(encoding="utf-8"))
+def read_object(path: Path) -> dict[str, Any]:
+    """The object of a JSON file; an empty one for a missing or damaged file."""
+    try:
+        value = read_json(path)
+    except (OSError, ValueError):
+        return {}
+    return value if isinstance(value, dict) else {}

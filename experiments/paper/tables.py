@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ INCOMPLETE = " (incomplete)"
 OVERALL = ""  # in place of a sequence: the only one, or the plain mean of several
 TOLERANCES = (1, 2, 5)  # of the printed recalls
 _NONE = "-"
+_BEST = ("mix_hist_50", "aliked_hist_50", "sift_hist_50")
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,8 @@ class Evaluations:
         seconds: of a query, by row and step; see `timing`.
         sizes: by row and data set: bytes of an image's features in float32, as the paper counts them.
         timed_on: the data set and the device of the seconds, in words.
+        growth: seconds of a query by title and by the size of the database.
+        folders: run folders by data set and evaluation.
     """
 
     rows: Sequence[Row]
@@ -56,6 +60,13 @@ class Evaluations:
     seconds: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     sizes: Mapping[tuple[str, str], float] = field(default_factory=dict)
     timed_on: str = ""
+    growth: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
+    folders: Mapping[tuple[str, str], Path] = field(default_factory=dict)
+
+    @property
+    def best_rows(self) -> list[Row]:
+        """Rows whose histograms, failures and growth are shown, the most important first."""
+        return [row for name in _BEST for row in self.rows if row.name == name]
 
     def title(self, name: str) -> str:
         """A data set's name, marked if it lacks images."""
@@ -126,10 +137,12 @@ def paper_tables(evaluations: Evaluations) -> Iterator[tuple[str, str, Table]]:
     candidates = (
         ("data_sets", "Data sets (Table I)", _data_sets(evaluations)),
         ("settings", "Settings (Table II)", _settings(evaluations)),
-        ("recall", "Recall@1 in %, by data set and threshold (Tables III and VII)", _recalls(evaluations)),
+        ("recall", "Recall@1 in %, by data set and threshold (Tables III and VII)",
+         _recalls(evaluations, [(evaluations.title(name), name, OVERALL) for name in evaluations.datasets])),
         *(
             (f"sequences_{name}", f"Recall@1 in %, sequences of {evaluations.title(name)} (Table IV)",
-             _sequences(evaluations, name))
+             _recalls(evaluations, [*((part.name, name, part.name) for part in dataset.sequences),
+                                    ("mean", name, OVERALL)]))
             for name, dataset in evaluations.datasets.items() if len(dataset.sequences) > 1
         ),
         ("averages", f"Average Recall@1 in % (figure 8), here over {evaluations.averaged}", _averages(evaluations)),
@@ -169,42 +182,26 @@ def _settings(evaluations: Evaluations) -> Table:
     return Table(["system", "filter", "its images", "features", "their images", "candidates"], rows, text_columns=5)
 
 
-def _recalls(evaluations: Evaluations) -> Table:
-    """Recall by data set and threshold."""
-    names = list(evaluations.datasets)
-    columns = [(name, OVERALL, threshold) for name in names for threshold in evaluations.thresholds(name)]
-    header = [f"{evaluations.title(name)} ±{threshold:g}" for name, _, threshold in columns]
-    return _recall_table(evaluations, names, header, columns)
-
-
-def _sequences(evaluations: Evaluations, dataset: str) -> Table:
-    """Recall in each sequence of a data set, and their plain mean."""
-    parts = [*(sequence.name for sequence in evaluations.datasets[dataset].sequences), OVERALL]
-    columns = [(dataset, part, threshold) for part in parts for threshold in evaluations.thresholds(dataset)]
-    header = [f"{part or 'mean'} ±{threshold:g}" for _, part, threshold in columns]
-    return _recall_table(evaluations, [dataset], header, columns)
-
-
-def _recall_table(
-    evaluations: Evaluations, names: list[str], header: list[str], columns: list[tuple[str, str, float]]
-) -> Table:
-    rows = [[row.title, *(_recall_cell(evaluations, row, *column) for column in columns)]
-            for row in evaluations.rows_on(names) if columns]  # fmt: skip
-    return Table(["system", *header], rows)
-
-
-def _recall_cell(evaluations: Evaluations, row: Row, dataset: str, sequence: str, threshold: float) -> str:
-    result = evaluations.results.get((row.name, dataset))
-    ours = None if result is None else result.recall.get(sequence, {}).get(threshold, {}).get(1)
-    theirs = printed_recall(row.name, dataset, sequence or None)
-    return beside(ours, theirs[TOLERANCES.index(int(threshold))] if theirs and threshold in TOLERANCES else None)
+def _recalls(evaluations: Evaluations, parts: Sequence[tuple[str, str, str]]) -> Table:
+    """Recall by part and threshold; parts are (words, data set, sequence)."""
+    columns = [(*part, threshold) for part in parts for threshold in evaluations.thresholds(part[1])]
+    rows = []
+    for row in evaluations.rows_on([name for _, name, _ in parts]) if columns else ():
+        cells = []
+        for _, name, sequence, threshold in columns:
+            result = evaluations.results.get((row.name, name))
+            ours = None if result is None else result.recall.get(sequence, {}).get(threshold, {}).get(1)
+            theirs = printed_recall(row.name, name, sequence or None)
+            is_printed = theirs and threshold in TOLERANCES
+            cells.append(beside(ours, theirs[TOLERANCES.index(int(threshold))] if is_printed else None))
+        rows.append([row.title, *cells])
+    return Table(["system", *(f"{words} ±{threshold:g}" for words, *_, threshold in columns)], rows)
 
 
 def _averages(evaluations: Evaluations) -> Table:
     """Means over the data sets that are here, see `Evaluations.means`, and the printed ones beside those of all six."""
     names, means = evaluations.means
-    is_papers = {*names} == {*BERLIN, *OTHERS}
-    no_values = [None] * len(TOLERANCES)
+    is_papers, no_values = {*names} == {*BERLIN, *OTHERS}, [None] * len(TOLERANCES)
     rows = []
     for row in evaluations.rows:
         printed_mean = average(printed_tables()["recall"].get(row.name, {}))

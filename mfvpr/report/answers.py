@@ -9,7 +9,7 @@ from mfvpr.evaluation.stages import explain
 from mfvpr.features.extractor import Extractor
 from mfvpr.localization.answers import Asked
 from mfvpr.localization.map import Map
-from mfvpr.report.figures import Answer, histogram_figure, pixel_aspect_of
+from mfvpr.report.figures import Candidate, histogram_figure, pixel_aspect_of
 from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import below, clip_middle
@@ -23,27 +23,22 @@ def answer_figure(
 ) -> None:
     """Write the figure of one answer: the image beside the best candidate, their matches, the histogram of shifts.
 
-    Args:
-        path: PNG file to write.
-        known: the map.
-        name: of the image.
-        image: `[H, W, 3]` uint8 RGB.
-        localization: what the map answered.
-        root: folder of the map's images, by their names; an image that cannot be read is drawn gray. None = no images.
+    `image` is `[H, W, 3]` uint8 RGB. `root` is the folder of the map's images, by their names; an image that cannot be
+    read is drawn gray, as are all without a folder.
 
     Raises:
         InputError: the candidate's name leads out of the folder.
     """
     answer, extractor = localization.answer, known.extractor
     place = f"no place ({answer.reason})" if answer.place is None else clip_middle(str(answer.place), _NAME_LENGTH)
-    candidate = Answer(_gray(extractor), "no candidate")
+    candidate = Candidate(_gray(extractor), "no candidate")
     if localization.matches is not None:
         best = answer.alternatives[0].name
         shown, note = _candidate(extractor, best, root)
         histogram = known.scorer if isinstance(known.scorer, HistogramOfShifts) else HistogramOfShifts()
         p = "" if answer.p_right is None else f", p(right) {answer.p_right:.2f}"
         caption = f"{clip_middle(best, _NAME_LENGTH)}{note}, score {answer.score:.5g}{p}"
-        candidate = Answer(shown, caption, localization.matches, explain(histogram, localization.matches))
+        candidate = Candidate(shown, caption, localization.matches, explain(histogram, localization.matches))
     query = resize(image, extractor.image_size, extractor.interpolation)
     title = f"{clip_middle(name, _NAME_LENGTH)} -> {place}"
     about = {"image": name, "place": str(answer.place)}

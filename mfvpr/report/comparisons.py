@@ -1,7 +1,7 @@
 """Reports of a learning comparison: table, text, JSON values, learned weights, and figures."""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from mfvpr.utils.numerics import compiled
 SHOWN_QUERIES = 20  # whose matches the figure of the weights counts
 
 
-def table(comparison: Comparison) -> Table:
+def comparison_table(comparison: Comparison) -> Table:
     """Recall at 1 of every row, its interval at the threshold that decides, and how it differs from the first row.
 
     p is McNemar's, which takes queries for independent, and that of blocks of the path.
@@ -58,12 +58,18 @@ def _flips(judge: Judge, hits: np.ndarray, first: np.ndarray) -> SignFlips:
     return block_sign_flips(hits, first, sequences=[*judge.reported_sets.values()] or None)
 
 
-def text(comparison: Comparison) -> str:
-    """The table, and what was chosen or learned."""
-    return "\n".join([table(comparison).text(), *_remarks(comparison)])
+def comparison_text(comparison: Comparison) -> str:
+    """The table, and the values that were chosen or learned."""
+    lines = []
+    for name, _, halves in comparison.rows():
+        for row in (row for row in halves if row.values):
+            values = ", ".join(f"{key} = {format_value(value)}" for key, value in row.values.items())
+            steps = f"; best after {row.fitted.step} steps, {row.fitted.ended}" if row.fitted else ""
+            lines.append(f"{name}, {row.half}: {values}{steps}")
+    return "\n".join([comparison_table(comparison).text(), *lines])
 
 
-def results(comparison: Comparison) -> dict[str, Any]:
+def comparison_json(comparison: Comparison) -> dict[str, Any]:
     """The comparison as JSON values."""
     judge = comparison.judge
     first = next(comparison.rows())[1]
@@ -76,7 +82,10 @@ def results(comparison: Comparison) -> dict[str, Any]:
             "score": name,
             "recall_at_1": by_threshold(hits.mean(axis=1).tolist()),
             "interval": by_threshold(map(recall_interval, hits)),
-            "against_first": by_threshold(map(partial(_difference, judge), hits, first)),
+            "against_first": by_threshold(
+                {"mcnemar": mcnemar(*pair)._asdict(), "sign_flips": _flips(judge, *pair)._asdict()}
+                for pair in zip(hits, first, strict=True)
+            ),
             "by_set": {set_name: by_threshold(set_hits.mean(axis=0).tolist())
                        for set_name, set_hits in _by_set(judge, hits.T).items()},
             "halves": {row.half: _half(row) for row in halves},
@@ -97,7 +106,7 @@ def write_weights(folder: Path, comparison: Comparison, provenance: Mapping[str,
         write_weight(folder / f"{re.sub(r'[^a-z]+', '_', name)}.json", weight, {**provenance, "training": name})
 
 
-def figures(comparison: Comparison) -> list[Figure]:
+def comparison_figures(comparison: Comparison) -> list[Figure]:
     """Curves of the trainings, and the learned weights over their inputs."""
     histories = {name: fit.history for name, fit in _fits(comparison).items()}
     return [
@@ -113,19 +122,6 @@ def _fits(comparison: Comparison) -> dict[str, Fit]:
 def _weights(comparison: Comparison) -> dict[str, LearnedWeight]:
     fits = _fits(comparison)
     return {name: fit.parameters["weight"] for name, fit in fits.items() if "weight" in fit.parameters}
-
-
-def _remarks(comparison: Comparison) -> Iterator[str]:
-    for name, _, halves in comparison.rows():
-        for row in halves:
-            if row.values:
-                values = ", ".join(f"{key} = {format_value(value)}" for key, value in row.values.items())
-                steps = f"; best after {row.fitted.step} steps, {row.fitted.ended}" if row.fitted else ""
-                yield f"{name}, {row.half}: {values}{steps}"
-
-
-def _difference(judge: Judge, hits: np.ndarray, first: np.ndarray) -> dict[str, Any]:
-    return {"mcnemar": mcnemar(hits, first)._asdict(), "sign_flips": _flips(judge, hits, first)._asdict()}
 
 
 def _half(row: Row) -> dict[str, Any]:

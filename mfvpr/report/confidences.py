@@ -56,15 +56,13 @@ class CalibratedPredictions:
     @cached_property
     def fitted(self) -> dict[str, Confidence]:
         """Confidences by system for other images, fitted on all queries with ground truth; none without predictions."""
-        systems = self.judged.result.systems if self.judged.thresholds else ()
-        inputs = {name: self._inputs(name) for name in systems}
+        inputs = {name: self._inputs(name) for name in (self.judged.result.systems if self.judged.thresholds else ())}
         return {name: fit_confidence(values, self.right(name)) for name, values in inputs.items()
                 if np.isfinite(values).all(axis=1).any()}  # fmt: skip
 
     def right(self, system: str) -> np.ndarray:
         """`[Q]` bool, whether the first prediction is correct, with ground truth."""
-        places = range(len(self.judged.sequences))
-        return np.concatenate([np.asarray(self.judged.is_right(system, place), bool)[:, 0] for place in places])
+        return self.judged.hits(system)
 
     def scores(self, system: str) -> np.ndarray:
         """`[Q]` of the first predictions, NaN without one."""
@@ -85,11 +83,7 @@ class CalibratedPredictions:
     @property
     def refused_of_headline(self) -> list[np.ndarray]:
         """`[Q]` bool of each sequence, by the system that decides."""
-        return self.by_sequence(self.refusals(self.judged.headline))
-
-    def by_sequence(self, values: np.ndarray) -> list[np.ndarray]:
-        """Split values of all queries into those of each sequence."""
-        return np.split(values, np.cumsum([len(sequence.images) for sequence in self.judged.sequences])[:-1])
+        return self.judged.by_sequence(self.refusals(self.judged.headline))
 
     def curves(self, system: str) -> dict[str, PrecisionRecall]:
         """Precision and recall by the score, and by p where it is known."""
@@ -154,7 +148,7 @@ def _confidence_row(assured: CalibratedPredictions, system: str) -> list[str]:
 
 
 def share_table(assured: CalibratedPredictions) -> Table:
-    """Recall at 1 of all queries, by the share of them that is re-ranked, see `_recalls_by_share`."""
+    """Recall at 1 of all queries, by the share of them that is re-ranked, see `recall_by_share`."""
     recalls = _recalls_by_share(assured)
     names = [name for name in assured.judged.result.systems if name != FILTER]
     rows = [[f"{share:.2f}", *(f"{100 * recall[place]:.1f}" for recall in recalls.values())]
@@ -180,10 +174,7 @@ def recall_by_share(assured: CalibratedPredictions, system: str) -> np.ndarray:
 def write_confidence(folder: Path, assured: CalibratedPredictions, provenance: Mapping[str, Any]) -> None:
     """Write `answers.csv` of every sequence where p is known; with ground truth, the tables, curves, and fits.
 
-    Args:
-        folder: of the run.
-        assured: the evaluation.
-        provenance: JSON values that say how the confidences were fitted.
+    `provenance` has JSON values that say how the confidences were fitted.
     """
     judged = assured.judged
     if judged.headline in assured.probabilities:
@@ -207,7 +198,7 @@ def _write_answers(folder: Path, assured: CalibratedPredictions) -> None:
     """
     judged, name = assured.judged, assured.judged.headline
     database = judged.result.dataset.database.names
-    refused, probabilities = assured.refused_of_headline, assured.by_sequence(assured.probabilities[name])
+    refused, probabilities = assured.refused_of_headline, judged.by_sequence(assured.probabilities[name])
     for place, ranked in enumerate(judged.result.systems[name]):
         is_right, truth = judged.is_right(name, place), judged.right[place]
         lines = []

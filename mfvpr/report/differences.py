@@ -1,6 +1,7 @@
 """Differences between systems: hits of every query, and tests of every two systems."""
 
 import itertools
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,10 +29,7 @@ def differences(judged: EvaluationReport) -> list[Difference]:
     """Tests of every two systems, in their order; none without ground truth."""
     if not judged.thresholds:
         return []
-    sequences = range(len(judged.sequences))
-    hits = {name: np.concatenate([_right(judged, name, sequence)[:, 0] for sequence in sequences])
-            for name in judged.result.systems}  # fmt: skip
-    places = _places(judged)
+    hits, places = {name: judged.hits(name) for name in judged.result.systems}, _places(judged)
     return [
         Difference(first, second, mcnemar(hits[first], hits[second]),
                    block_sign_flips(hits[first], hits[second], places=places))
@@ -47,16 +45,15 @@ def _places(judged: EvaluationReport) -> np.ndarray | None:
     return places_along_path(stack_positives(right), truth.unit)
 
 
-def differences_table(judged: EvaluationReport) -> Table:
+def _table(names: Sequence[str], tests: Sequence[Difference]) -> Table:
     """Table system x system: queries that only the system of the row gets right, and p by blocks of the path.
 
     Blocks of several sequences are blocks of the database's places.
     """
     cells = {}
-    for first, second, counts, flips in differences(judged):
+    for first, second, counts, flips in tests:
         cells[first, second] = f"{counts.only_first} (p {flips.p_value:.2g})"
         cells[second, first] = f"{counts.only_second} (p {flips.p_value:.2g})"
-    names = [*judged.result.systems]
     rows = [[name, *(cells.get((name, other), "") for other in names)] for name in names]
     return Table(["only this is right, not", *names], rows)
 
@@ -70,31 +67,26 @@ def write_gains(folder: Path, judged: EvaluationReport) -> None:
     """
     if not judged.thresholds:
         return
-    columns = [column for name in judged.result.systems for column in (name, f"{name} rank")]
-    sizes = [len(sequence.images) for sequence in judged.sequences]
-    places = _places(judged)
-    along = range(sum(sizes)) if places is None else places.tolist()
-    start = 0
-    for place, sequence in enumerate(judged.sequences):
-        rights = [_right(judged, system, place) for system in judged.result.systems]
+    systems, places = [*judged.result.systems], _places(judged)
+    places = np.arange(sum(len(sequence.images) for sequence in judged.sequences)) if places is None else places
+    header = ["query", "place", *(column for name in systems for column in (name, f"{name} rank"))]
+    for part, (sequence, part_places) in enumerate(zip(judged.sequences, judged.by_sequence(places), strict=True)):
+        rights = [np.asarray(judged.is_right(system, part), bool) for system in systems]
         lines = []
         for query, name in enumerate(sequence.images.names):
-            line: list[str | int] = [name, along[start + query]]
-            for is_right in (right[query] for right in rights):
-                line += [int(is_right[0]), int(np.argmax(is_right)) + 1 if is_right.any() else ""]
-            lines.append(line)
-        write_csv(judged.folder(folder, place) / "gains.csv", ["query", "place", *columns], lines)
-        start += sizes[place]
+            cells = [cell for right in rights for cell in _hit_and_rank(right[query])]
+            lines.append([name, int(part_places[query]), *cells])
+        write_csv(judged.folder(folder, part) / "gains.csv", header, lines)
+    tests = differences(judged)
     write_csv(
         folder / "differences.csv",
         ["system", "other", "only_system", "only_other", "mcnemar_p", "block", "blocks", "blocks_p"],
         [[first, second, counts.only_first, counts.only_second, *(number(value) for value in (
             counts.p_value, flips.block, flips.blocks, flips.p_value))]
-         for first, second, counts, flips in differences(judged)],
+         for first, second, counts, flips in tests],
     )  # fmt: skip
-    write_text(folder / "differences.md", differences_table(judged).markdown())
+    write_text(folder / "differences.md", _table(systems, tests).markdown())
 
 
-def _right(judged: EvaluationReport, system: str, place: int) -> np.ndarray:
-    """`[Q, C]` bool in the order of a system's ranking, with ground truth."""
-    return np.asarray(judged.is_right(system, place), bool)
+def _hit_and_rank(right: np.ndarray) -> tuple[int, int | str]:
+    return int(right[0]), int(np.argmax(right)) + 1 if right.any() else ""

@@ -15,7 +15,7 @@ from mfvpr.datasets.truth import middle, threshold_words
 from mfvpr.evaluation.results import Recall, Result
 from mfvpr.evaluation.stages import explain
 from mfvpr.features.extractor import Extractor, Source
-from mfvpr.report.figures import Answer, histogram_figure, pixel_aspect_of
+from mfvpr.report.figures import Candidate, histogram_figure, pixel_aspect_of
 from mfvpr.report.file_names import file_names
 from mfvpr.report.rankings import Rankings, write_failures, write_predictions
 from mfvpr.report.runs import Figure
@@ -77,6 +77,15 @@ class EvaluationReport:
         right = self.right[place]
         return None if right is None else right.contains(self.result.systems[system][place].rows)
 
+    def hits(self, system: str) -> np.ndarray:
+        """`[Q]` bool of all sequences, whether the first prediction is correct, with ground truth."""
+        places = range(len(self.sequences))
+        return np.concatenate([np.asarray(self.is_right(system, place), bool)[:, 0] for place in places])
+
+    def by_sequence(self, values: np.ndarray) -> list[np.ndarray]:
+        """Split values of the queries of all sequences into those of each sequence."""
+        return np.split(values, np.cumsum([len(sequence.images) for sequence in self.sequences])[:-1])
+
     def folder(self, run: Path, place: int) -> Path:
         """The folder of the sequence at a place."""
         return sequence_folder(run, [sequence.name for sequence in self.sequences], place)
@@ -105,10 +114,7 @@ def recall_table(judged: EvaluationReport) -> Table:
 def write_rankings(folder: Path, judged: EvaluationReport, refused: Sequence[np.ndarray] | None = None) -> None:
     """Write `predictions/` and `failures/` of every system, those of the headline's into the folder itself.
 
-    Args:
-        folder: of the run.
-        judged: the evaluation.
-        refused: `[Q]` bool of each sequence, refused in the headline's predictions; None = no query is refused.
+    `refused` is `[Q]` bool of each sequence, refused in the headline's predictions; None = no query is refused.
     """
     database, files = judged.result.dataset.database.names, file_names([*judged.result.systems])
     for place, sequence in enumerate(judged.sequences):
@@ -119,26 +125,24 @@ def write_rankings(folder: Path, judged: EvaluationReport, refused: Sequence[np.
             write_predictions(target / "predictions" / f"{files[name]}.csv", rankings)
             write_failures(target / "failures" / f"{files[name]}.csv", rankings)
             if name == judged.headline:
-                answered = rankings if refused is None else replace(rankings, refused=refused[place])
-                write_predictions(target / "predictions.csv", answered)
                 write_failures(target / "failures.csv", rankings)
+                rankings = rankings if refused is None else replace(rankings, refused=refused[place])
+                write_predictions(target / "predictions.csv", rankings)
 
 
 def write_skipped(folder: Path, result: Result) -> None:
     """Write `skipped.csv` with images that could not be used and the reasons, if there are any."""
-    lines = sorted({
-        ("database", result.dataset.database.names[row], reason)
-        for matched in result.matched for row, reason in matched.bad_database.items()
-    })  # fmt: skip
-    lines += [
-        ("queries", matched.sequence.images.names[row], reason)
-        for matched in result.matched for row, reason in matched.bad_queries.items()
-    ]  # fmt: skip
+    names = result.dataset.database.names
+    bad_rows = {bad for matched in result.matched for bad in matched.bad_database.items()}
+    lines = sorted(("database", names[row], reason) for row, reason in bad_rows)
+    for matched in result.matched:
+        images = matched.sequence.images.names
+        lines += [("queries", images[row], reason) for row, reason in matched.bad_queries.items()]
     if lines:
         write_text(folder / "skipped.csv", Table(["folder", "image", "reason"], lines).csv())
 
 
-def figures(
+def query_figures(
     judged: EvaluationReport,
     extractor: Extractor | Source,
     shown: int | Sequence[int],
@@ -155,19 +159,20 @@ def figures(
         histogram: of shifts; None = the paper's.
     """
     several, folders = len(judged.sequences) > 1, file_names([sequence.name for sequence in judged.sequences])
-    drawings: list[Figure] = []
+    figures: list[Figure] = []
     for place, sequence in enumerate(judged.sequences):
-        page = Page(judged, place, extractor, histogram or HistogramOfShifts(), refused[place])
-        for query, verdict in page.shown(shown).items():
-            name = f"{verdict}_{query:04d}.png"
-            draw = partial(page.draw, query=query, verdict=verdict)
-            drawings.append((f"{folders[sequence.name]}/{name}" if several else name, draw))
-    return drawings
+        drawings = SequenceFigures(judged, place, extractor, histogram or HistogramOfShifts(), refused[place])
+        folder = f"{folders[sequence.name]}/" if several else ""
+        figures += [
+            (f"{folder}{verdict}_{query:04d}.png", partial(drawings.draw, query=query, verdict=verdict))
+            for query, verdict in drawings.verdicts(shown).items()
+        ]
+    return figures
 
 
 @dataclass(frozen=True)
-class Page:
-    """The figures of one sequence."""
+class SequenceFigures:
+    """The figures of one sequence; arguments as of `query_figures`."""
 
     judged: EvaluationReport
     place: int
@@ -176,30 +181,25 @@ class Page:
     refused: np.ndarray
 
     @property
-    def sequence(self) -> QuerySequence:
+    def _sequence(self) -> QuerySequence:
         return self.judged.sequences[self.place]
 
     @property
-    def matched(self) -> Matched:
+    def _matched(self) -> Matched:
         return self.judged.result.matched[self.place]
 
     @property
-    def ranked(self) -> Ranked:
+    def _ranked(self) -> Ranked:
         return self.judged.result.systems[self.judged.headline][self.place]
 
     @property
-    def database(self) -> ImageFolder:
+    def _database(self) -> ImageFolder:
         return self.judged.result.dataset.database
 
-    @property
-    def right(self) -> np.ndarray | None:
-        """`[Q, C]` bool in the order of the ranking."""
-        return self.judged.is_right(self.judged.headline, self.place)
-
-    def shown(self, selection: int | Sequence[int]) -> dict[int, str]:
+    def verdicts(self, selection: int | Sequence[int]) -> dict[int, str]:
         """Verdicts of queries that get a figure: the selected rows, or so many, half of them correct if known."""
-        right = self.right
-        has_prediction = self.ranked.rows[:, 0] >= 0
+        right = self.judged.is_right(self.judged.headline, self.place)
+        has_prediction = self._ranked.rows[:, 0] >= 0
         verdicts = np.full(len(has_prediction), "best") if right is None else np.where(right[:, 0], "right", "wrong")
         if not isinstance(selection, int):
             return {query: str(verdicts[query]) for query in selection if has_prediction[query]}
@@ -209,45 +209,47 @@ class Page:
 
     def title(self, query: int, verdict: str) -> str:
         """The score, whether the prediction is correct within the threshold, and both names."""
-        truth = self.sequence.truth
+        truth = self._sequence.truth
         within = "" if truth is None else " at" + threshold_words(truth.unit, self.judged.threshold)
-        names = f"{_short(self.sequence.images.names[query])} -> {_short(self._prediction(query))}"
+        names = f"{_short(self._sequence.images.names[query])} -> {_short(self._prediction(query))}"
         note = " (no place: confidence below the threshold)" if self.refused[query] else ""
         return f"{self.judged.headline}, {verdict}{within}: {names}{note}"
 
     def draw(self, path: Path, query: int, verdict: str) -> None:
         """Draw the prediction, and below an incorrect one a correct one."""
-        answers = [self._answer(query, 0, verdict), *(self.correct_predictions(query) if verdict == "wrong" else [])]
-        values = self.judged.headline, self.sequence.name, verdict, self.sequence.images.names[query]
+        candidates = [self._candidate(query, 0, verdict)]
+        candidates += self.correct_candidates(query) if verdict == "wrong" else []
+        values = self.judged.headline, self._sequence.name, verdict, self._sequence.images.names[query]
         about = dict(zip(ABOUT, (*values, self._prediction(query)), strict=True))
-        original = self.sequence.images.read(query)
+        original = self._sequence.images.read(query)
         image = self._resize(original)
         aspect = pixel_aspect_of(original, image)
-        histogram_figure(path, image, answers, title=self.title(query, verdict), pixel_aspect=aspect, about=about)
+        histogram_figure(path, image, candidates, title=self.title(query, verdict), pixel_aspect=aspect, about=about)
 
     def _prediction(self, query: int) -> str:
-        return self.database.names[self.ranked.rows[query, 0]]
+        return self._database.names[self._ranked.rows[query, 0]]
 
-    def _answer(self, query: int, rank: int, verdict: str) -> Answer:
+    def _candidate(self, query: int, rank: int, verdict: str) -> Candidate:
         """The candidate at a rank from 0."""
-        row, score = int(self.ranked.rows[query, rank]), self.ranked.scores[query, rank]
-        place = int(np.flatnonzero(self.matched.candidates.indices[query] == row)[0])
-        pair = jax.tree.map(lambda values: values[place], self.matched.matches[0][query])
-        caption = f"{verdict}: {_short(self.database.names[row])}, rank {rank + 1}, score {score:.5g}"
-        return Answer(self._resize(self.database.read(row)), caption, pair, explain(self.histogram, pair))
+        row, score = int(self._ranked.rows[query, rank]), self._ranked.scores[query, rank]
+        place = int(np.flatnonzero(self._matched.candidates.indices[query] == row)[0])
+        pair = jax.tree.map(lambda values: values[place], self._matched.matches[0][query])
+        caption = f"{verdict}: {_short(self._database.names[row])}, rank {rank + 1}, score {score:.5g}"
+        return Candidate(self._resize(self._database.read(row)), caption, pair, explain(self.histogram, pair))
 
-    def correct_predictions(self, query: int) -> list[Answer]:
+    def correct_candidates(self, query: int) -> list[Candidate]:
         """The first correct candidate, or the correct image that retrieval missed; empty if there is none."""
-        ranked, right, truth = self.right, self.judged.right[self.place], self.sequence.truth
+        ranked = self.judged.is_right(self.judged.headline, self.place)
+        right, truth = self.judged.right[self.place], self._sequence.truth
         if ranked is None or right is None or truth is None or not right.counts[query]:
             return []
         if ranked[query].any():
-            return [self._answer(query, int(np.argmax(ranked[query])), "right")]
+            return [self._candidate(query, int(np.argmax(ranked[query])), "right")]
         nearest, rows = truth.place(query), right.of(query)
         row = nearest if nearest is not None and nearest in rows else int(rows[0])
-        num_candidates = self.matched.candidates.indices.shape[1]
-        caption = f"right: {_short(self.database.names[row])}, not among the {num_candidates} candidates"
-        return [Answer(self._resize(self.database.read(row)), caption)]
+        num_candidates = self._matched.candidates.indices.shape[1]
+        caption = f"right: {_short(self._database.names[row])}, not among the {num_candidates} candidates"
+        return [Candidate(self._resize(self._database.read(row)), caption)]
 
     def _resize(self, image: np.ndarray) -> np.ndarray:
         size = self.extractor.image_size

@@ -23,14 +23,11 @@ _TITLE_LENGTH, _CAPTION_LENGTH = 140, 100  # characters that fit
 
 
 @dataclass(frozen=True)
-class Answer:
-    """A database image beside the query.
+class Candidate:
+    """A database image beside the query, `[H, W, 3]` uint8 at the size that the points refer to, and its caption.
 
-    Attributes:
-        image: `[H, W, 3]` uint8, at the size that the points refer to.
-        caption: above it.
-        matches: of this pair, `[K, ...]`, NumPy; None where it was not matched.
-        explanation: of these matches, see `mfvpr.evaluation.stages.explain`.
+    `matches` are of this pair, `[K, ...]`, NumPy; `explanation` is of the matches, see
+    `mfvpr.evaluation.stages.explain`. Both are None where the image was not matched.
     """
 
     image: np.ndarray
@@ -42,7 +39,7 @@ class Answer:
 def histogram_figure(
     path: Path,
     query_image: np.ndarray,
-    answers: Sequence[Answer],
+    candidates: Sequence[Candidate],
     *,
     title: str,
     pixel_aspect: float = 1.0,
@@ -53,24 +50,23 @@ def histogram_figure(
     Args:
         path: PNG file to write.
         query_image: `[H, W, 3]` uint8, at the size that the points refer to.
-        answers: one below the other, their histograms in the same colors.
+        candidates: one below the other, their histograms in the same colors.
         title: above everything.
         pixel_aspect: height of a pixel by its width, so that images are drawn in the shape that they were taken in.
         about: what it shows, for programs: text by keyword, in the file itself.
     """
-    count = len(answers)
+    count = len(candidates)
     figure, axes = panels(2 * count, 6, 4.8 + 0.2 / count, columns=2, width_ratios=(2, 1.15))
-    figure.suptitle(
-        clip_middle(printable(title), _TITLE_LENGTH), fontsize=11, parse_math=False
-    )  # a file's name may hold a $
-    top = max([1e-9, *(float(answer.explanation.score) for answer in answers if answer.explanation)])
-    for pair, heat, answer in zip(axes[::2], axes[1::2], answers, strict=True):
-        _draw_pair(pair, query_image, answer)
+    # A file's name may hold a $.
+    figure.suptitle(clip_middle(printable(title), _TITLE_LENGTH), fontsize=11, parse_math=False)
+    top = max([1e-9, *(float(candidate.explanation.score) for candidate in candidates if candidate.explanation)])
+    for pair, heat, candidate in zip(axes[::2], axes[1::2], candidates, strict=True):
+        _draw_pair(pair, query_image, candidate)
         pair.set_aspect(pixel_aspect)
-        if answer.explanation is None:
+        if candidate.explanation is None:
             heat.set_axis_off()
         else:
-            figure.colorbar(_draw_histogram(heat, answer.explanation, top), ax=heat, label="bin score", shrink=0.8)
+            figure.colorbar(_draw_histogram(heat, candidate.explanation, top), ax=heat, label="bin score", shrink=0.8)
     metadata = {keyword: printable(text) for keyword, text in (about or {}).items()}
     save_figure(figure, path, bbox_inches="tight", pad_inches=0.15, metadata=metadata)
 
@@ -87,18 +83,20 @@ def pixel_aspect_of(original: np.ndarray, smaller: np.ndarray) -> float:
     return (height / new_height) / (width / new_width)
 
 
-def _draw_pair(axes: Axes, query: np.ndarray, answer: Answer) -> None:
+def _draw_pair(axes: Axes, query: np.ndarray, candidate: Candidate) -> None:
     offset = query.shape[1] + _GAP
-    height = max(len(query), len(answer.image))
-    canvas = np.full((height, offset + answer.image.shape[1], 3), 255, np.uint8)
+    height = max(len(query), len(candidate.image))
+    canvas = np.full((height, offset + candidate.image.shape[1], 3), 255, np.uint8)
     canvas[: len(query), : query.shape[1]] = query
-    canvas[: len(answer.image), offset:] = answer.image
+    canvas[: len(candidate.image), offset:] = candidate.image
     axes.imshow(canvas)
     axes.set_axis_off()
     words = "query | candidate"
-    if answer.matches is not None and answer.explanation is not None:
-        words = _draw_matches(axes, offset, answer.matches, answer.explanation)
-    axes.set_title(f"{clip_middle(printable(answer.caption), _CAPTION_LENGTH)}\n{words}", fontsize=9, parse_math=False)
+    if candidate.matches is not None and candidate.explanation is not None:
+        words = _draw_matches(axes, offset, candidate.matches, candidate.explanation)
+    axes.set_title(
+        f"{clip_middle(printable(candidate.caption), _CAPTION_LENGTH)}\n{words}", fontsize=9, parse_math=False
+    )
 
 
 def _draw_matches(axes: Axes, offset: int, matches: Matches, explanation: Explanation) -> str:
@@ -112,19 +110,16 @@ def _draw_matches(axes: Axes, offset: int, matches: Matches, explanation: Explan
     axes.add_collection(LineCollection(list(lines), colors=colors, linewidths=0.8, alpha=0.9))
     for points in (start, end):
         axes.scatter(points[:, 0], points[:, 1], s=7, c=colors, linewidths=0)
-    return (
-        f"query | candidate: {len(heaviest)} heaviest of {count} matches; blue agree with the peak "
-        f"({explanation.agrees[heaviest].sum()}; of all {explanation.agrees.sum()})"
-    )
+    agree = f"blue agree with the peak ({explanation.agrees[heaviest].sum()}; of all {explanation.agrees.sum()})"
+    return f"query | candidate: {len(heaviest)} heaviest of {count} matches; {agree}"
 
 
 def _draw_histogram(axes: Axes, explanation: Explanation, top: float) -> AxesImage:
     scores, centers_x, centers_y = explanation.histogram
+    half = float(centers_x[1] - centers_x[0]) / 2
     inside = scores > -np.inf
     rows, columns = inside.any(axis=1), inside.any(axis=0)
     scores, centers_x, centers_y = scores[rows][:, columns], centers_x[columns], centers_y[rows]
-    width = float(explanation.histogram.centers_x[1] - explanation.histogram.centers_x[0])
-    half = width / 2
     extent = (centers_x[0] - half, centers_x[-1] + half, centers_y[-1] + half, centers_y[0] - half)
     image = axes.imshow(scores, extent=extent, cmap="magma", interpolation="nearest", vmin=0, vmax=top)
     direction = explanation.direction.replace("_", " ")
@@ -133,8 +128,8 @@ def _draw_histogram(axes: Axes, explanation: Explanation, top: float) -> AxesIma
     if explanation.score <= 0:
         axes.set_title("histogram of shifts: no votes", fontsize=9)
         return image
-    corner = explanation.shift - half
-    axes.add_patch(Rectangle((corner[0], corner[1]), width, width, fill=False, edgecolor="cyan", linewidth=1.4))
+    corner_x, corner_y = explanation.shift - half
+    axes.add_patch(Rectangle((corner_x, corner_y), 2 * half, 2 * half, fill=False, edgecolor="cyan", linewidth=1.4))
     axes.plot(*explanation.peak, marker="+", color="cyan", markersize=8)
     words = "histogram of shifts: score {:.4g}, peak at ({:.1f}, {:.1f}) px"
     words += f" of images zoomed by {explanation.scale:.3g}" if explanation.scale != 1 else ""

@@ -77,6 +77,12 @@ def _first_right(rankings: Rankings, right: np.ndarray, query: int) -> list[str 
     return [rank + 1, name, number(scores[rank]), number(margin)]
 
 
+def read_csv(path: Path) -> list[dict[str, str]]:
+    """Rows of a file of `write_csv` by column."""
+    with path.open(encoding="utf-8", errors="surrogateescape", newline="") as file:
+        return [*csv.DictReader(file)]
+
+
 def number(value: Any) -> str:
     """A number in a CSV file."""
     return f"{value:.7g}"

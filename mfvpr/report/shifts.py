@@ -20,12 +20,7 @@ def write_shifts(
 
     A line has the refined dominant shift of the query's middle in the images that the detector saw, its 95 % interval,
     and how much larger the candidate shows it; empty if no match votes. Features of several scales have no file.
-
-    Args:
-        folder: of the run.
-        judged: the evaluation.
-        scorer: the histogram of shifts.
-        refused: `[Q]` bool of each sequence, queries without a line; None = no query is refused.
+    `refused` is `[Q]` bool of each sequence, queries without a line; None = no query is refused.
     """
     names = judged.result.dataset.database.names
     sequences = zip(judged.result.matched, judged.result.systems[judged.headline], strict=True)

@@ -1,7 +1,7 @@
 """Reports of a sweep: table of all settings, summary, JSON values, and heat maps."""
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,12 +20,10 @@ TOP = 10
 MAX_HEAT_MAPS = 6
 
 
-def table(outcome: Outcome, numbers: Sequence[int] | None = None) -> Table:
-    """Recall at the first k by all thresholds, and at the other ks by the one that decides.
+def settings_table(outcome: Outcome, numbers: Iterable[int] | None = None) -> Table:
+    """Recall at the first k by all thresholds, and at the other ks by the one that decides; a line for each setting.
 
-    Args:
-        outcome: of a sweep.
-        numbers: of the settings; None = all.
+    `numbers` choose settings; None = all.
     """
     judge, (first, *deeper) = outcome.judge, outcome.ks
     numbers = range(len(outcome.settings)) if numbers is None else numbers
@@ -41,12 +39,7 @@ def table(outcome: Outcome, numbers: Sequence[int] | None = None) -> Table:
     return Table([*outcome.axes.values, *header], lines, text_columns=0)
 
 
-def text(outcome: Outcome) -> str:
-    """The summary: the best settings, the chosen ones, and what they are worth."""
-    return "\n".join(_summary(outcome))
-
-
-def results(outcome: Outcome) -> dict[str, Any]:
+def sweep_json(outcome: Outcome) -> dict[str, Any]:
     """The sweep as JSON values."""
     judge, ks = outcome.judge, outcome.ks
     recall = np.stack([judge.recall(outcome.rows[0], k) for k in ks], axis=-1)  # [S, thresholds, ks]
@@ -70,36 +63,32 @@ def results(outcome: Outcome) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def figures(outcome: Outcome) -> list[Figure]:
-    """Heat maps of every pair of axes with several values, the others at the best setting (of all queries).
-
-    A space that was not searched completely has none.
-    """
-    return list(_heat_maps(outcome)) if outcome.is_grid else []
-
-
-def _summary(outcome: Outcome) -> Iterator[str]:
+def sweep_summary(outcome: Outcome) -> str:
+    """The best settings, the chosen ones, and their recall on the queries to report on."""
     judge, defaults = outcome.judge, outcome.own
     best = np.argsort(-outcome.recall[:, judge.main], kind="stable")[:TOP].tolist()
     note = "" if defaults in best else "; last: the scorer's own values"
-    yield f"Best settings by {judge.label(1, judge.thresholds[judge.main])}, all queries{note}."
     shown = list(dict.fromkeys([*best, defaults]))
-    yield table(outcome, shown).text()
+    parts = [
+        f"Best settings by {judge.label(1, judge.thresholds[judge.main])}, all queries{note}.",
+        settings_table(outcome, shown).text(),
+    ]
     if outcome.is_grid and not judge.halves and len(shown) < len(outcome.settings):
         around = evaluation.neighbors(outcome.axes.values, outcome.chosen[0])
-        if around:
-            yield "The best, and its neighbors in the grid:"
-            yield table(outcome, [outcome.chosen[0], *around]).text()
-    yield from _verdicts(outcome)
+        table = settings_table(outcome, [outcome.chosen[0], *around])
+        parts += ["The best, and its neighbors in the grid:", table.text()] if around else []
+    return "\n".join([*parts, *_verdicts(outcome)])
 
 
 def _verdicts(outcome: Outcome) -> Iterator[str]:
     judge = outcome.judge
-    for name, half, number in zip(judge.names, judge.halves, outcome.chosen, strict=False):
+    words = [", ".join(f"{name} = {format_value(value)}" for name, value in outcome.settings[number].items())
+             for number in outcome.chosen]  # fmt: skip
+    for name, half, setting in zip(judge.names, judge.halves, words, strict=False):
         yield (f"chosen on {len(half.tune)} queries of {name}, reported on the {len(half.report)} of the other half: "
-               f"{_in_words(outcome, number)}")  # fmt: skip
+               f"{setting}")  # fmt: skip
     if not judge.halves:
-        yield f"chosen: {_in_words(outcome, outcome.chosen[0])}"
+        yield f"chosen: {words[0]}"
     yield "Recall at 1 in %, with 95 % intervals in brackets:"
     for verdict in outcome.report:
         yield (
@@ -121,22 +110,24 @@ def _with_interval(estimate: Estimate) -> str:
     return f"{100 * estimate.recall:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
 
 
-def _in_words(outcome: Outcome, number: int) -> str:
-    return ", ".join(f"{name} = {format_value(value)}" for name, value in outcome.settings[number].items())
+def heat_maps(outcome: Outcome) -> list[Figure]:
+    """Heat maps of every pair of axes with several values, the others at the best setting (of all queries).
 
-
-def _heat_maps(outcome: Outcome) -> Iterator[Figure]:
+    A space that was not searched completely has none.
+    """
     axes, judge = outcome.axes, outcome.judge
     values = {name: list(map(format_value, axis)) for name, axis in axes.values.items()}
-    recall = outcome.recall[: axes.size, judge.main].reshape(*map(len, values.values()))
-    names = [name for name, axis in values.items() if len(axis) > 1]
+    names = [name for name, axis in values.items() if len(axis) > 1] if outcome.is_grid else []
     pairs = list(itertools.combinations(names, 2)) or [(name, name) for name in names]
+    if not pairs:
+        return []
+    recall = outcome.recall[: axes.size, judge.main].reshape(*map(len, values.values()))
     flat_best = evaluation.best_setting(recall.reshape(-1), axes.values)
     best = dict(zip(values, map(int, np.unravel_index(flat_best, recall.shape)), strict=True))
-    defaults = {name: values[name].index(format_value(value)) if format_value(value) in values[name] else None
-                for name, value in axes.own.items()}  # fmt: skip
-    label = judge.label(1, judge.thresholds[judge.main])
+    own = {name: format_value(value) for name, value in axes.own.items()}
+    defaults = {name: values[name].index(value) if value in values[name] else None for name, value in own.items()}
     files = file_names([first if first == second else f"{first} + {second}" for first, second in pairs])
+    figures: list[Figure] = []
     for (first, second), file in zip(pairs[:MAX_HEAT_MAPS], files.values(), strict=False):
         single = first == second
         plane = recall[tuple(slice(None) if name in (first, second) else best[name] for name in values)]
@@ -149,9 +140,10 @@ def _heat_maps(outcome: Outcome) -> Iterator[Figure]:
             columns=(second, _short(values[second])),
             best=(0 if single else best[first], best[second]),
             defaults=None if row is None or column is None else (row, column),
-            title="; ".join([f"{label} in %", *fixed]),
+            title="; ".join([f"{judge.label(1, judge.thresholds[judge.main])} in %", *fixed]),
         )
-        yield f"{file}.png", draw
+        figures.append((f"{file}.png", draw))
+    return figures
 
 
 def _short(values: list[str]) -> list[str]:

@@ -135,7 +135,7 @@ def test_answers_of_sequences_are_as_sure_as_those_of_one_path(dataset, split, s
         expected = fitted.probability(inputs[half.report])
         assert np.isfinite(expected).all()
         np.testing.assert_allclose(assured.probabilities["count"][half.report], expected)
-    assert [len(part) for part in assured.by_sequence(assured.scores("count"))] == [3, 7]
+    assert [len(part) for part in assured.judged.by_sequence(assured.scores("count"))] == [3, 7]
 
 
 def test_the_database_is_described_once_for_all_sequences(split, small_street, tmp_path):

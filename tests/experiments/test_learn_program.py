@@ -36,7 +36,7 @@ def learn(root):
     def call(out, *overrides, pictures=False):
         with pytest.MonkeyPatch.context() as patch:
             if not pictures:
-                patch.setattr(learning.comparisons, "figures", lambda *_: [])
+                patch.setattr(learning.comparisons, "comparison_figures", lambda *_: [])
             learning.learn(composed(*small(root), f"out={out}", *overrides, config="learn"))
         return results(out)
 
@@ -226,7 +226,7 @@ def test_a_checkpoint_of_another_model_is_refused(root, learned, tmp_path, monke
 
 def test_whatever_changes_the_result_changes_the_checkpoint(root, untrained, tmp_path, monkeypatch):
     """Else one training would go on with what another one left."""
-    monkeypatch.setattr(learning.comparisons, "figures", lambda *_: [])
+    monkeypatch.setattr(learning.comparisons, "comparison_figures", lambda *_: [])
     shifted = tmp_path / "shifted.csv"
     shifted.write_text("query,database\n" + "".join(f"{row},{(row + 1) % QUERIES}\n" for row in range(QUERIES)))
     changes = [

@@ -25,7 +25,7 @@ from mfvpr.datasets.streets import streets_folder
 from mfvpr.evaluation import mcnemar
 from mfvpr.evaluation.statistics import block_sign_flips
 from mfvpr.report import runs
-from mfvpr.report.evaluations import Page
+from mfvpr.report.evaluations import SequenceFigures
 from mfvpr.scoring import HistogramOfShifts
 from mfvpr.utils import InputError
 from tests.programs import CANDIDATES, QUERIES, ROOT, composed, shared, small, typed
@@ -179,11 +179,11 @@ def test_a_wrong_figure_has_the_right_image_below(evaluated, outcome):
     names = outcome.images.dataset.database.names
     query = query_by_case[True]
     rank = int(np.argmax(right[query]))
-    [answer] = page.correct_predictions(query)
+    [answer] = page.correct_candidates(query)
     score = f"{ranked.scores[query, rank]:.5g}"
     assert answer.caption == f"right: {names[ranked.rows[query, rank]]}, rank {rank + 1}, score {score}"
     assert float(answer.explanation.score) == pytest.approx(float(score), rel=1e-3)
-    [answer] = page.correct_predictions(query_by_case[False])
+    [answer] = page.correct_candidates(query_by_case[False])
     place = outcome.images.dataset.truth.place(query_by_case[False])
     assert answer.caption == f"right: {names[place]}, not among the 3 candidates"
     assert answer.matches is None
@@ -194,7 +194,7 @@ def page_of(outcome, **changes):
     result = outcome.judged.result
     dataset = replace(result.dataset, sequences=(replace(result.dataset.only, **changes),))
     judged = replace(outcome.judged, result=replace(result, dataset=dataset))
-    return Page(judged, 0, outcome.tools.extractor, HistogramOfShifts(), np.zeros(24, bool))
+    return SequenceFigures(judged, 0, outcome.tools.extractor, HistogramOfShifts(), np.zeros(24, bool))
 
 
 def test_what_does_not_count_is_never_shown_as_right(outcome):
@@ -207,7 +207,7 @@ def test_what_does_not_count_is_never_shown_as_right(outcome):
 
     def answers(excluded):
         page = page_of(outcome, truth=AllowedTruth(truth, Positives.from_matrix(excluded)))
-        return [answer.caption for answer in page.correct_predictions(query)]
+        return [answer.caption for answer in page.correct_candidates(query)]
 
     other = int(np.argmax(outcome.judged.right[0].dense()[query] & ~excluded[query]))
     assert answers(excluded) == [f"right: {names[other]}, not among the 3 candidates"]
@@ -221,7 +221,7 @@ def test_figures_of_chosen_queries(outcome):
     for wrong in (24, -1, "nope.png"):
         with pytest.raises(SettingsError, match=r"rows .*0 to 23, .*0000"):
             query_rows([0, wrong], dataset)
-    assert list(page_of(outcome).shown([5, 2])) == [5, 2]
+    assert list(page_of(outcome).verdicts([5, 2])) == [5, 2]
 
 
 def test_the_figure_of_a_refused_answer_says_that_there_is_no_place(outcome):

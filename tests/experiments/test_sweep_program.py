@@ -35,7 +35,7 @@ def sweep(root):
     def call(out, *overrides, pictures=False):
         with pytest.MonkeyPatch.context() as patch:
             if not pictures:
-                patch.setattr(search.sweeps, "figures", lambda *_: [])
+                patch.setattr(search.sweeps, "heat_maps", lambda *_: [])
             search.sweep(composed(*small(root), f"out={out}", *overrides, config="sweep"))
         return results(out)
 

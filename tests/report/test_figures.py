@@ -22,7 +22,7 @@ def query():
 
 
 def drawn(path, query, name, **options):
-    answer = figures.Answer(query, f"wrong: {name}, rank 1")
+    answer = figures.Candidate(query, f"wrong: {name}, rank 1")
     figures.histogram_figure(path, query, [answer], title=f"histogram: {name} -> {name}", **options)
     return pixels(path)
 

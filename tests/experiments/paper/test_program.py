@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from experiments.paper import program, systems
-from experiments.paper.runs import held
+from experiments.paper.runs import lock_output
 from mfvpr.report import Table
 from tests.programs import ROOT, composed, typed
 from tests.programs import run as run_program
@@ -164,7 +164,7 @@ def test_two_do_not_evaluate_into_one_folder(finished, data, monkeypatch, capsys
     out, _ = finished
     (out / "tables" / ".recall-0123456z.csv").touch()  # of one that was killed
     (out / "tables" / ".mine").touch()
-    with held(out):
+    with lock_output(out):
         assert {path.name for path in (out / "tables").glob(".*")} == {".mine"}
         code, _, stderr = typed(monkeypatch, capsys, "paper", *arguments(data, out))
     (out / "tables" / ".mine").unlink()

@@ -7,7 +7,7 @@ import pytest
 from experiments.paper import systems
 from experiments.paper.figures import mean_recalls
 from experiments.paper.printed import printed_tables
-from experiments.paper.runs import made_of, settings_of
+from experiments.paper.runs import input_fingerprints, settings_of
 from experiments.paper.systems import DRAWN, ROWS, Place, chosen_rows, missing_weights, overrides, places
 from experiments.paper.tables import OVERALL, Evaluations, RowResult, beside, paper_tables, row_result
 from experiments.settings import SettingsError
@@ -104,10 +104,10 @@ def test_weights_that_are_missing_are_named(monkeypatch):
 
 def test_a_run_is_known_by_what_decides_its_numbers(tmp_path, monkeypatch):
     images = {"database": "a", "queries": "b"}
-    first = made_of(made("sift_50", "corridor", tmp_path / "a"), images, None)
-    assert first == made_of(made("sift_50", "corridor", tmp_path / "b") | {"out": "elsewhere"}, images, None)
-    assert first["settings"] != made_of(made("sift_10", "corridor", tmp_path), images, None)["settings"]
-    assert first["images"] != made_of(made("sift_50", "corridor", tmp_path), images | {"queries": "c"}, None)["images"]
+    first = input_fingerprints(made("sift_50", "corridor", tmp_path / "a"), images, None)
+    assert first == input_fingerprints(made("sift_50", "corridor", tmp_path / "b") | {"out": "elsewhere"}, images, None)
+    assert first["settings"] != input_fingerprints(made("sift_10", "corridor", tmp_path), images, None)["settings"]
+    assert first["images"] != input_fingerprints(made("sift_50", "corridor", tmp_path), images | {"queries": "c"}, None)["images"]
 
 
 def test_overrides_of_all_rows_are_few():
@@ -230,6 +230,6 @@ def test_another_ground_truth_of_the_same_images_is_another_run(tmp_path):
     known = []
     for rows in (((0,), (1,), (2,)), ((0,), (2,), (1,))):
         dataset = Dataset("corridor", folder, (QuerySequence("one", folder, FrameTruth(rows, 3)),))
-        known.append(made_of(settings, {}, fingerprint(dataset, [1])))
+        known.append(input_fingerprints(settings, {}, fingerprint(dataset, [1])))
     assert {name for name in known[0] if known[0][name] != known[1][name]} == {"ground truth"}
     assert fingerprint(Dataset("corridor", folder, (QuerySequence("one", folder, None),)), []) is None

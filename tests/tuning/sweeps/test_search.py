@@ -129,7 +129,7 @@ def test_optuna_proposes_as_many_as_asked_after_the_scorers_own(data):
     assert outcome.settings[0] == axes.own
     assert outcome.rows.shape == (1, 4, QUERIES, 1)
     assert outcome.chosen == [int(np.argmax(outcome.recall[:, 1]))]
-    assert sweeps.figures(outcome) == []
+    assert sweeps.heat_maps(outcome) == []
     rows = sweeping.sweep(SUM, [axes.setting(one) for one in outcome.settings], *data, depth=1)
     np.testing.assert_array_equal(outcome.rows, rows)
 
@@ -146,25 +146,25 @@ def test_optuna_learns_from_the_queries_that_choose(data, monkeypatch):
 
 
 def test_what_people_read_is_what_was_measured(outcome):
-    table = sweeps.table(outcome)
+    table = sweeps.settings_table(outcome)
     assert table.header == ["weight", "c", "R@1 ±0", "R@1 ±1", "R@1 ±2", "R@5 ±1"]
     for cells, setting, recall in zip(table.rows, outcome.settings, outcome.recall, strict=True):
         assert cells[:2] == [str(value) for value in setting.values()]
         assert cells[2:5] == [f"{100 * value:.1f}" for value in recall]
-    found = json.loads(json.dumps(sweeps.results(outcome)))
+    found = json.loads(json.dumps(sweeps.sweep_json(outcome)))
     assert (found["split"], found["search"], found["ks"]) == ("both", "grid", [1, 5])
     assert found["chosen"] == [outcome.settings[number] for number in outcome.chosen]
     assert [entry["parameters"] for entry in found["settings"]] == outcome.settings
-    text = sweeps.text(outcome)
+    text = sweeps.sweep_summary(outcome)
     for half in ("first_half", "second_half"):
         assert text.count(f"queries of {half}, reported on the 16 of the other half: weight = ") == 1
     assert text.count("95 % intervals") == 1
-    assert [name for name, _ in sweeps.figures(outcome)] == ["weight_c.png"]
+    assert [name for name, _ in sweeps.heat_maps(outcome)] == ["weight_c.png"]
 
 
 def test_neighbors_of_the_best_are_shown_where_not_all_settings_are(data, monkeypatch):
     axes = Axes(SUM, {"clamp": [False, True], "c": [0, 1, 2]}, {"clamp": False, "c": 0})
     outcome = sweeping.search_grid(axes, judge(TRUTH, TOLERANCES), *data, ks=[1])
-    assert "neighbors" not in sweeps.text(outcome)
+    assert "neighbors" not in sweeps.sweep_summary(outcome)
     monkeypatch.setattr(sweeps, "TOP", 2)
-    assert "The best, and its neighbors in the grid:" in sweeps.text(outcome)
+    assert "The best, and its neighbors in the grid:" in sweeps.sweep_summary(outcome)
