@@ -10,10 +10,10 @@ from experiments.paper.tables import Evaluations
 from experiments.paper.timing import STEPS
 from mfvpr.datasets.truth import middle, threshold_words
 from mfvpr.report import Table
-from mfvpr.report.pages.charts import Bar, Chart, amounts, bars, lines
-from mfvpr.report.pages.one_run import PAGE, values_sheet
+from mfvpr.report.pages.charts import Bar, Chart, amount_chart, bar_chart, line_chart
+from mfvpr.report.pages.one_run import PAGE, values_table
 from mfvpr.report.pages.pictures import MOST_PICTURES, pictures
-from mfvpr.report.pages.rendering import Gallery, Section, Sheet, write_page
+from mfvpr.report.pages.rendering import Gallery, Section, write_page
 from mfvpr.report.pages.several_runs import write_comparison
 from mfvpr.utils.versions import versions
 
@@ -36,23 +36,21 @@ def write_pages(
         links += [(f"{dataset}: {run}", folder / PAGE) for run, folder in folders.items()]
     addresses = [(words, quote(path.relative_to(out).as_posix())) for words, path in links if path.is_file()]
 
-    def sheets(names: Sequence[str]) -> list[Sheet]:
-        return [Sheet(*tables[name]) for name in names if name in tables]
-
-    about = sheets(_ABOUT)
+    recalls = dict(table for name, table in tables.items() if name not in (*_COSTS, *_ABOUT))
+    costs, about = (dict(tables[name] for name in names if name in tables) for names in (_COSTS, _ABOUT))
     if left_out:
         rows = [[*line.partition(": ")[::2]] for line in left_out]
-        about.append(Sheet("Left out", Table(["what", "why"], rows, text_columns=2)))
+        about["Left out"] = Table(["what", "why"], rows, text_columns=2)
+    about["Versions"] = values_table(versions())
     sections = [
         Section("recall", "Recall", "In %. Where the paper prints a number, that and the difference stand beside ours.",
-                [_averages(evaluations), *_by_sequence(evaluations)],
-                sheets([name for name in tables if name not in (*_COSTS, *_ABOUT)])),
+                [_averages(evaluations), *_by_sequence(evaluations)], recalls),
         Section("pages", "Every evaluation", "Their own pages, and all of a data set side by side, with tests and "
                 "intervals.", links=addresses),
         Section("answers", "Answers", "Of each evaluation: query and first answer with their heaviest matches, and the "
                 "histogram of their shifts; below a wrong answer the right one.", gallery=_gallery(evaluations)),
-        Section("costs", "Seconds and sizes", "", [*_costs(evaluations)], sheets(_COSTS)),
-        Section("settings", "Data sets and settings", sheets=[*about, values_sheet("Versions", versions())]),
+        Section("costs", "Seconds and sizes", "", [*_costs(evaluations)], costs),
+        Section("settings", "Data sets and settings", tables=about),
     ]  # fmt: skip
     words = f"{len(evaluations.datasets)} data sets, {len(evaluations.folders)} evaluations, "
     words += "after Pivonka and Preucil, IEEE T-IV 2024"
@@ -62,7 +60,7 @@ def write_pages(
 def _averages(evaluations: Evaluations) -> Chart:
     groups = {label: {title: Bar(value) for title, value in members.items()}
               for label, members in mean_recalls(evaluations).items()}  # fmt: skip
-    return bars("averages", "Mean recall at 1 within 2 frames", groups, axis="mean recall at 1, %")
+    return bar_chart("averages", "Mean recall at 1 within 2 frames", groups, axis="mean recall at 1, %")
 
 
 def _by_sequence(evaluations: Evaluations) -> Iterator[Chart]:
@@ -79,7 +77,7 @@ def _by_sequence(evaluations: Evaluations) -> Iterator[Chart]:
         }
         if groups:
             within = threshold_words(truth.unit, threshold) if truth else ""
-            yield bars(
+            yield bar_chart(
                 f"sequences-{name}", f"{evaluations.title(name)}, by sequence{within}", groups, axis="recall at 1, %"
             )
 
@@ -88,12 +86,12 @@ def _costs(evaluations: Evaluations) -> Iterator[Chart]:
     if evaluations.seconds:
         titles = {row.name: row.title for row in evaluations.rows}
         totals = {titles[name]: sum(steps[step] for step in STEPS) for name, steps in evaluations.seconds.items()}
-        yield amounts("seconds", f"Seconds of a query of {evaluations.timed_on}", totals, axis="seconds")
+        yield amount_chart("seconds", f"Seconds of a query of {evaluations.timed_on}", totals, axis="seconds")
     if evaluations.growth:
         curves = {title: [(float(size), value) for size, value in seconds.items()]
                   for title, seconds in evaluations.growth.items()}  # fmt: skip
         axes = "images of a database, whose descriptors are made up", "seconds of a query"
-        yield lines("growth", "As a database grows", curves, axes=axes, scale="log", marked=True, unit="s")
+        yield line_chart("growth", "As a database grows", curves, axes=axes, scale="log", marked=True, unit="s")
 
 
 def _gallery(evaluations: Evaluations) -> Gallery:

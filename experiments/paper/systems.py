@@ -27,13 +27,9 @@ COMBINED = f"histogram + {FILTER}"
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the tables.
+    """A row of the tables: its name (as in the printed numbers), its title, and the name of its evaluation.
 
-    Attributes:
-        name: of the row, in the printed numbers as well.
-        title: in tables.
-        run: name of its evaluation.
-        ranking: the evaluation's system; None = the headline.
+    `ranking` is the evaluation's system; None = the headline.
     """
 
     name: str
@@ -49,13 +45,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Place:
-    """A data set at hand.
-
-    Attributes:
-        name: of the data set.
-        settings: of `experiments.evaluate`.
-        root: its folder; None = it is synthetic.
-    """
+    """A data set at hand, its settings of `experiments.evaluate`, and its folder (None = it is synthetic)."""
 
     name: str
     settings: tuple[str, ...]

@@ -1,12 +1,12 @@
 """The figure of one localization: an image beside the place that the map found."""
 
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from mfvpr.datasets.images import read_image, resize
 from mfvpr.evaluation.stages import explain
-from mfvpr.features.extractor import Extractor
 from mfvpr.localization.answers import Asked
 from mfvpr.localization.map import Map
 from mfvpr.report.figures import Candidate, histogram_figure, pixel_aspect_of
@@ -30,32 +30,21 @@ def answer_figure(
         InputError: the candidate's name leads out of the folder.
     """
     answer, extractor = localization.answer, known.extractor
-    place = f"no place ({answer.reason})" if answer.place is None else clip_middle(str(answer.place), _NAME_LENGTH)
-    candidate = Candidate(_gray(extractor), "no candidate")
+    width, height = extractor.image_size
+    candidate = Candidate(np.full((height, width, 3), _GRAY, np.uint8), "no candidate")
     if localization.matches is not None:
         best = answer.alternatives[0].name
-        shown, note = _candidate(extractor, best, root)
+        shown, note = candidate.image, " (its image is not at hand)"
+        if root is not None:
+            file = below(root, best)
+            with suppress(InputError):  # the map keeps features, not images
+                shown, note = resize(read_image(file), extractor.image_size, extractor.interpolation), ""
         histogram = known.scorer if isinstance(known.scorer, HistogramOfShifts) else HistogramOfShifts()
         p = "" if answer.p_right is None else f", p(right) {answer.p_right:.2f}"
         caption = f"{clip_middle(best, _NAME_LENGTH)}{note}, score {answer.score:.5g}{p}"
         candidate = Candidate(shown, caption, localization.matches, explain(histogram, localization.matches))
     query = resize(image, extractor.image_size, extractor.interpolation)
+    place = f"no place ({answer.reason})" if answer.place is None else clip_middle(str(answer.place), _NAME_LENGTH)
     title = f"{clip_middle(name, _NAME_LENGTH)} -> {place}"
     about = {"image": name, "place": str(answer.place)}
     histogram_figure(path, query, [candidate], title=title, pixel_aspect=pixel_aspect_of(image, query), about=about)
-
-
-def _candidate(extractor: Extractor, name: str, root: Path | None) -> tuple[np.ndarray, str]:
-    """An image of the map as the detector saw it, or a gray one, and a note for its caption."""
-    if root is not None:
-        file = below(root, name)
-        try:
-            return resize(read_image(file), extractor.image_size, extractor.interpolation), ""
-        except InputError:  # the map keeps features, not images
-            pass
-    return _gray(extractor), " (its image is not at hand)"
-
-
-def _gray(extractor: Extractor) -> np.ndarray:
-    width, height = extractor.image_size
-    return np.full((height, width, 3), _GRAY, np.uint8)

@@ -151,12 +151,8 @@ def query_figures(
 ) -> list[Figure]:
     """The paper's figure for a few queries, correct and incorrect ones, spread over each sequence.
 
-    Args:
-        judged: the evaluation.
-        extractor: that resizes the images.
-        shown: number of queries, or their rows.
-        refused: `[Q]` bool of each sequence, queries whose confidence is below the threshold.
-        histogram: of shifts; None = the paper's.
+    The extractor resizes the images. `shown` is a number of queries, or their rows. `refused` is `[Q]` bool of each
+    sequence, queries whose confidence is below the threshold. `histogram` = None is the paper's.
     """
     several, folders = len(judged.sequences) > 1, file_names([sequence.name for sequence in judged.sequences])
     figures: list[Figure] = []

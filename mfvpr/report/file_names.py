@@ -26,19 +26,15 @@ def file_names(names: Sequence[str]) -> dict[str, str]:
         raise InputError(f"names: expected different ones, got {repeated[0]} twice. Rename one.")
     plain = {name: name.replace(" + ", "_") for name in names}
     counts = Counter(map(_fold_case, plain.values()))
-    return {
-        name: file if _is_plain(file) and counts[_fold_case(file)] == 1 else _hashed_name(name)
-        for name, file in plain.items()
-    }
+    files = {}
+    for name, file in plain.items():
+        is_safe = _PLAIN.fullmatch(file) and not _HASHED.fullmatch(file) and len(file.encode()) <= _MOST_BYTES
+        is_unique = counts[_fold_case(file)] == 1
+        files[name] = (
+            file if is_safe and is_unique else f"{re.sub('[^A-Za-z0-9]+', '_', name)[:60]}-{fingerprint(name)}"
+        )
+    return files
 
 
 def _fold_case(file: str) -> str:
     return unicodedata.normalize("NFC", file.casefold())
-
-
-def _is_plain(file: str) -> bool:
-    return bool(_PLAIN.fullmatch(file)) and not _HASHED.fullmatch(file) and len(file.encode()) <= _MOST_BYTES
-
-
-def _hashed_name(name: str) -> str:
-    return f"{re.sub('[^A-Za-z0-9]+', '_', name)[:60]}-{fingerprint(name)}"

@@ -107,16 +107,10 @@ def heat_map_figure(
     defaults: tuple[int, int] | None,
     title: str,
 ) -> None:
-    """Draw recall over two parameters of a sweep.
+    """Draw recall (`[R, C]` fractions) over two parameters of a sweep; `rows` and `columns` are name and values.
 
-    Args:
-        path: image file to write.
-        recall: `[R, C]` fractions.
-        rows: name and values of the first parameter.
-        columns: name and values of the second.
-        best: row and column of the best setting, framed.
-        defaults: row and column of the scorer's own values, marked with a circle; None = the grid lacks them.
-        title: above everything.
+    `best` is the row and column of the best setting, framed; `defaults` those of the scorer's own values, marked with a
+    circle (None = the grid lacks them).
     """
     figure, [axes] = panels(1, 1.8 + 0.75 * len(columns[1]), 1.9 + 0.5 * len(rows[1]))
     percent = 100 * recall
@@ -158,14 +152,10 @@ def curves_figure(path: Path, histories: Mapping[str, Sequence[tuple[int, float 
 def weights_figure(
     path: Path, names: Sequence[str], inputs: np.ndarray, weights: Mapping[str, np.ndarray], right: np.ndarray
 ) -> None:
-    """Draw the mean match weight over each input, and the share of matches that belong to a correct candidate.
+    """Draw the mean match weight over each of F inputs, and the share of matches that belong to a correct candidate.
 
-    Args:
-        path: image file to write.
-        names: of F inputs.
-        inputs: `[n, F]` of real matches, in their own units; each bin holds as many matches.
-        weights: `[n]` by training.
-        right: `[n]` bool, whether a match belongs to a correct candidate.
+    `inputs` are `[n, F]` of real matches, in their own units; each bin holds as many matches. `weights` are `[n]` by
+    training. `right` is `[n]` bool, whether a match belongs to a correct candidate.
     """
     figure, axes = panels(len(names), 3.2, 2.6)
     for panel, name, values in zip(axes, names, inputs.T, strict=True):

@@ -46,13 +46,15 @@ def claim_run_folder(
         InputError: the folder cannot be made or written to, is not empty, or another run uses it.
     """
     above = [parent for parent in folder.absolute().parents if not parent.exists()]
-    with _os_errors_as_input_errors(folder):
-        folder = _make(folder, numbered)
-    error = InputError(f"{folder}: another run is using this folder; wait until it ends, or name another")
     with ExitStack() as stack:
-        with suppress(OSError):  # a file system without locks of folders, such as NFS
-            stack.enter_context(lock_folder(folder, error))
-        _clear(folder, own, {*beside})  # a folder that is refused must stay
+        try:
+            folder = _make(folder, numbered)
+            in_use = InputError(f"{folder}: another run is using this folder; wait until it ends, or name another")
+            with suppress(OSError):  # a file system without locks of folders, such as NFS
+                stack.enter_context(lock_folder(folder, in_use))
+            _clear(folder, own, {*beside})  # a folder that is refused must stay
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be written to ({error.strerror}); name another run folder") from None
         try:
             yield folder
         finally:
@@ -76,28 +78,19 @@ def _make(folder: Path, numbered: bool) -> Path:
 
 def _clear(folder: Path, only_runs: bool, beside: set[str]) -> None:
     """Remove files of a killed run, and check that the folder is empty and writable."""
-    with _os_errors_as_input_errors(folder):
-        paths = [path for path in folder.iterdir() if path.name not in beside]
-        names = {path.name for path in paths}
-        if only_runs and LAST not in names:
-            for path in paths:
-                if path.is_dir() and not path.is_symlink():
-                    shutil.rmtree(path)
-                else:
-                    path.unlink()
-        elif names - {_UNFINISHED}:
-            raise InputError(f"{folder}: expected a new or empty run folder; remove it, or name another")
-        shutil.rmtree(folder / _UNFINISHED, ignore_errors=True)  # of a run that was killed
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-
-
-@contextmanager
-def _os_errors_as_input_errors(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written to ({error.strerror}); name another run folder") from None
+    paths = [path for path in folder.iterdir() if path.name not in beside]
+    names = {path.name for path in paths}
+    if only_runs and LAST not in names:
+        for path in paths:
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+    elif names - {_UNFINISHED}:
+        raise InputError(f"{folder}: expected a new or empty run folder; remove it, or name another")
+    shutil.rmtree(folder / _UNFINISHED, ignore_errors=True)  # of a run that was killed
+    with tempfile.TemporaryFile(dir=folder):
+        pass
 
 
 @contextmanager

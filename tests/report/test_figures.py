@@ -6,7 +6,7 @@ from PIL import Image
 
 from mfvpr.evaluation import precision_recall, reliability
 from mfvpr.report import figures, plots
-from mfvpr.report.pages.charts import lines
+from mfvpr.report.pages.charts import line_chart
 
 SYSTEMS = ["filter", *(f"histogram + anchor + cohort + filter {number}" for number in range(10))]
 P, RIGHT = np.linspace(0, 1, 20), np.arange(20) % 3 > 0
@@ -55,7 +55,7 @@ def test_systems_have_the_same_colors_in_figures_and_pages(tmp_path, monkeypatch
     monkeypatch.setattr(plots, "save_figure", lambda figure, path, **_: saved.append(figure))
     plots.precision_recall_figure(tmp_path / "a.png", {name: {"score": curve} for name in SYSTEMS})
     plots.shares_figure(tmp_path / "b.png", [0, 1], {name: np.zeros(2) for name in SYSTEMS[1:]})
-    chart = lines("name", "title", {name: [(0, 0), (1, 1)] for name in SYSTEMS}, axes=("x", "y"))
+    chart = line_chart("name", "title", {name: [(0, 0), (1, 1)] for name in SYSTEMS}, axes=("x", "y"))
     expected = [trace["line"]["color"] for trace in chart.figure["data"]]
     colors = [[line.get_color() for line in figure.axes[0].lines] for figure in saved]
     assert colors == [expected, expected[1:]]

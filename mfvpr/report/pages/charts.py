@@ -40,8 +40,13 @@ class Bar:
     percent: float
     interval: tuple[float, float] | None = None
 
+    @property
+    def interval_words(self) -> str:
+        """The interval in a cell; empty if it is not known."""
+        return "[{:.1f}, {:.1f}]".format(*self.interval) if self.interval else ""
 
-def lines(
+
+def line_chart(
     name: str,
     title: str,
     curves: Mapping[str, Sequence[tuple[float, float]]],
@@ -53,14 +58,8 @@ def lines(
 ) -> Chart:
     """A curve of points (x, y) for each name; the others are compared with the first.
 
-    Args:
-        name: of the chart's element.
-        title: of the chart.
-        curves: by name.
-        axes: words of x and y.
-        scale: of x.
-        marked: whether points are drawn, because the curve is known only there.
-        unit: of y; an axis in another unit than % has powers of ten.
+    `axes` are words of x and y, `scale` is that of x. Points are `marked` if the curve is known only there. The axis of
+    a `unit` other than % is logarithmic.
     """
     from plotly import graph_objects
 
@@ -79,7 +78,7 @@ def lines(
     return _chart(name, title, words, figure, axes, legend=len(curves) > 1)
 
 
-def bars(name: str, title: str, groups: Mapping[str, Mapping[str, Bar]], *, axis: str) -> Chart:
+def bar_chart(name: str, title: str, groups: Mapping[str, Mapping[str, Bar]], *, axis: str) -> Chart:
     """Horizontal bars by the name of a group, which has a color, and of its member; whiskers are intervals.
 
     Members of a single group have a color each if there are enough colors.
@@ -103,7 +102,7 @@ def bars(name: str, title: str, groups: Mapping[str, Mapping[str, Bar]], *, axis
     return _chart(name, title, f"{axis}. {'; '.join(parts)}.", figure, (axis, ""), legend=not single, height=height)
 
 
-def amounts(name: str, title: str, values: Mapping[str, float], *, axis: str) -> Chart:
+def amount_chart(name: str, title: str, values: Mapping[str, float], *, axis: str) -> Chart:
     """Horizontal bars, one for each name."""
     from plotly import graph_objects
 

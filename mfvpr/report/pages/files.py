@@ -19,6 +19,7 @@ from mfvpr.datasets.datasets import MEANS
 from mfvpr.datasets.truth import Unit, middle, threshold_words
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.file_names import file_names
+from mfvpr.report.rankings import read_csv
 from mfvpr.report.tables import Table
 from mfvpr.utils.errors import InputError, require_word
 
@@ -53,7 +54,7 @@ class Gains:
 
 
 @dataclass(frozen=True)
-class Answer:
+class Prediction:
     """The first prediction of a system for a query, as texts of the files.
 
     `outcome` is "right", "wrong", or "best" without ground truth. `answer` and `score` are empty without a prediction.
@@ -71,21 +72,11 @@ class Answer:
 
 @dataclass(frozen=True)
 class Run:
-    """A run folder.
-
-    Attributes:
-        folder: of the run.
-        results: of `results.json`, at least one row.
-        about: of `run.json`.
-        gains: by sequence; none without ground truth.
-        tables: of its CSV files, by name; numbers are finite.
-    """
+    """A run folder, the rows of its `results.json`, and its `run.json`."""
 
     folder: Path
     results: Sequence[Mapping[str, Any]]
     about: Mapping[str, Any]
-    gains: Mapping[str, Gains]
-    tables: Mapping[str, Table]
 
     @property
     def common(self) -> Mapping[str, Any]:
@@ -105,7 +96,9 @@ class Run:
     @cached_property
     def sequences(self) -> list[str]:
         """Names of the sequences; a single one without a name has the data set's."""
-        return _sequences(self.results)
+        if "sequence" not in self.common:
+            return [self.common["dataset"]]
+        return list(dict.fromkeys(row["sequence"] for row in self.results))[: -len(MEANS)]  # their means come last
 
     @property
     def unit(self) -> Unit:
@@ -128,6 +121,19 @@ class Run:
         return threshold_words(self.unit, middle(self.thresholds))
 
     @cached_property
+    def tables(self) -> Mapping[str, Table]:
+        """Tables of the CSV files, by name; numbers are finite."""
+        return {name: _table(self.folder / name, text) for name, text in _TABLES.items()
+                if (self.folder / name).exists()}  # fmt: skip
+
+    @cached_property
+    def gains(self) -> Mapping[str, Gains]:
+        """Gains by sequence; none without ground truth."""
+        paths = [sequence_folder(self.folder, self.sequences, place) for place in range(len(self.sequences))]
+        return {name: _gains(path / "gains.csv") for name, path in zip(self.sequences, paths, strict=True)
+                if (path / "gains.csv").exists()}  # fmt: skip
+
+    @cached_property
     def all_gains(self) -> Gains:
         """Gains of all sequences, with ground truth."""
         parts = [*self.gains.values()]
@@ -137,27 +143,20 @@ class Run:
             {name: np.concatenate([gains.ranks[name] for gains in parts]) for name in self.systems},
         )
 
-    def answers(self) -> Iterator[Answer]:
+    def predictions(self) -> Iterator[Prediction]:
         """The first predictions of all systems, those of the system that decides first."""
+        systems, files = sorted(self.systems, key=lambda name: name != self.headline), file_names(self.systems)
         with _errors_as_input_errors(self.folder):
-            for system in sorted(self.systems, key=lambda name: name != self.headline):
-                for place in range(len(self.sequences)):
-                    yield from self._answers(system, place)
-
-    def _answers(self, system: str, place: int) -> Iterator[Answer]:
-        sequence = self.sequences[place]
-        folder = sequence_folder(self.folder, self.sequences, place)
-        path = folder / "predictions" / f"{file_names(self.systems)[system]}.csv"
-        first = {line["query"]: line for line in _lines(path) if line["rank"] == "1"}
-        if sequence not in self.gains:
-            for query, line in first.items():
-                yield Answer(system, sequence, query, line["database"], line["score"], "best", "")
-            return
-        gains = self.gains[sequence]
-        for query, rank in zip(gains.queries, gains.ranks[system].tolist(), strict=True):
-            line, outcome = first.get(query, {}), "right" if rank == 1 else "wrong"
-            prediction = line.get("database", ""), line.get("score", "")
-            yield Answer(system, sequence, query, *prediction, outcome, str(rank or ""))
+            for system, (place, sequence) in itertools.product(systems, enumerate(self.sequences)):
+                folder = sequence_folder(self.folder, self.sequences, place) / "predictions"
+                first = {row["query"]: row for row in read_csv(folder / f"{files[system]}.csv") if row["rank"] == "1"}
+                ranks: Mapping[str, int | None] = dict.fromkeys(first)
+                if gains := self.gains.get(sequence):
+                    ranks = dict(zip(gains.queries, gains.ranks[system].tolist(), strict=True))
+                for query, rank in ranks.items():
+                    row, outcome = first.get(query), "best" if rank is None else "right" if rank == 1 else "wrong"
+                    texts = (row["database"], row["score"]) if row else ("", "")
+                    yield Prediction(system, sequence, query, *texts, outcome, str(rank or ""))
 
 
 def read_run(folder: Path) -> Run:
@@ -172,18 +171,14 @@ def read_run(folder: Path) -> Run:
     with _errors_as_input_errors(folder):
         results, about = (json.loads((folder / name).read_text("utf-8")) for name in ("results.json", "run.json"))
         _check(results, about)
-        sequences = _sequences(results)
-        if not sequences:
+        run = Run(folder, results, about)
+        if not run.sequences:
             raise ValueError("results.json has no sequence")
-        paths = {name: sequence_folder(folder, sequences, place) / "gains.csv" for place, name in enumerate(sequences)}
-        gains = {name: _gains(path) for name, path in paths.items() if path.exists()}
-        tables = {name: _table(folder / name, text) for name, text in _TABLES.items() if (folder / name).exists()}
-        run = Run(folder, results, about, gains, tables)
-        if len(gains) != (len(sequences) if run.thresholds else 0):
+        if len(run.gains) != (len(run.sequences) if run.thresholds else 0):
             raise ValueError("each sequence with ground truth has a gains.csv, and no other")
-        if any(not {*run.systems} <= {*part.ranks} for part in gains.values()):
+        if any(not {*run.systems} <= {*part.ranks} for part in run.gains.values()):
             raise ValueError("gains.csv lacks a system")
-        if "table.csv" in tables and not {row[0] for row in tables["table.csv"].rows} <= {*run.systems}:
+        if "table.csv" in run.tables and not {row[0] for row in run.tables["table.csv"].rows} <= {*run.systems}:
             raise ValueError("table.csv has another system")
         return run
 
@@ -233,14 +228,6 @@ def _errors_as_input_errors(folder: Path) -> Iterator[None]:
         ) from None
 
 
-def _sequences(results: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Names of the sequences, without those of their means, which come last."""
-    first = results[0]
-    if "sequence" not in first:
-        return [first["dataset"]]
-    return list(dict.fromkeys(row["sequence"] for row in results))[: -len(MEANS)]
-
-
 def _table(path: Path, num_texts: int | None) -> Table:
     with path.open(encoding="utf-8", errors="surrogateescape", newline="") as file:
         header, *rows = csv.reader(file)
@@ -255,13 +242,8 @@ def _table(path: Path, num_texts: int | None) -> Table:
 
 
 def _gains(path: Path) -> Gains:
-    lines = [*_lines(path)]
+    lines = read_csv(path)
     names = [name.removesuffix(" rank") for name in lines[0] if name.endswith(" rank")]
     ranks = {name: np.array([int(line[f"{name} rank"] or 0) for line in lines]) for name in names}
     places = [int(line["place"] or place) for place, line in enumerate(lines)]
     return Gains(tuple(line["query"] for line in lines), np.array(places), ranks)
-
-
-def _lines(path: Path) -> Iterator[dict[str, str]]:
-    with path.open(encoding="utf-8", errors="surrogateescape", newline="") as file:
-        yield from csv.DictReader(file)

@@ -11,10 +11,10 @@ import numpy as np
 from mfvpr.datasets.datasets import MEANS
 from mfvpr.evaluation.precision import PrecisionRecall
 from mfvpr.evaluation.statistics import recall_interval
-from mfvpr.report.pages.charts import Bar, Chart, amounts, bars, lines
+from mfvpr.report.pages.charts import Bar, Chart, amount_chart, bar_chart, line_chart
 from mfvpr.report.pages.files import Gains, Run, read_run
 from mfvpr.report.pages.pictures import pictures
-from mfvpr.report.pages.rendering import Gallery, Section, Sheet, write_page
+from mfvpr.report.pages.rendering import Gallery, Section, write_page
 from mfvpr.report.tables import Table
 from mfvpr.reranking.results import FILTER
 
@@ -28,10 +28,7 @@ Curves = Mapping[str, tuple[Run, str]]  # a run and one of its systems, by the n
 
 
 def write_report(folder: Path, path: Path | None = None) -> Path:
-    """Write the page of a run folder, by default into it.
-
-    Returns:
-        The path of the page.
+    """Write the page of a run folder, by default into it; returns its path.
 
     Raises:
         InputError: the folder is not the run folder of an evaluation.
@@ -68,7 +65,8 @@ def description(run: Run) -> str:
 def _facts(run: Run) -> dict[str, str]:
     facts = {"decides": run.headline}
     for name in dict.fromkeys((run.headline, FILTER)) if run.gains else ():
-        words = f"{recall_bar(run.all_gains, name).percent:.1f} %", interval_words(run.all_gains, name)
+        bar = recall_bar(run.all_gains, name)
+        words = f"{bar.percent:.1f} %", bar.interval_words
         facts[f"{name}, R@1{run.within}"] = " ".join(word.replace(" ", "\N{NO-BREAK SPACE}") for word in words)
     return facts | {"seconds in all": f"{sum(run.common['seconds'].values()):.1f}"}
 
@@ -79,32 +77,26 @@ def recall_bar(gains: Gains, system: str) -> Bar:
     return Bar(100 * float(gains.hits(system).mean()), (100 * low, 100 * high))
 
 
-def interval_words(gains: Gains, system: str) -> str:
-    """The 95 % interval of recall at 1 in a cell, in %."""
-    low, high = recall_interval(gains.hits(system))
-    return f"[{100 * low:.1f}, {100 * high:.1f}]"
-
-
 def _recall_section(run: Run) -> Section:
     several = len(run.gains) > 1
-    parts = {**run.gains, MEANS[-1]: run.all_gains} if several else {"recall": run.all_gains}
-    groups = {system: {name: recall_bar(gains, system) for name, gains in parts.items()} for system in run.systems}
-    groups = groups if several else {"recall": {system: group["recall"] for system, group in groups.items()}}
+    parts = {**run.gains, MEANS[-1]: run.all_gains} if several else {"": run.all_gains}
+    recalls = {system: {name: recall_bar(gains, system) for name, gains in parts.items()} for system in run.systems}
+    groups = recalls if several else {"recall": {system: bars[""] for system, bars in recalls.items()}}
     curves = {name: (run, name) for name in run.systems}
     charts = [
-        bars("intervals", f"Recall at 1{run.within}, with intervals", groups, axis="recall at 1, %"),
+        bar_chart("intervals", f"Recall at 1{run.within}, with intervals", groups, axis="recall at 1, %"),
         *tolerance_charts(curves), depths_chart(f"Recall over K{run.within}", curves),
     ]  # fmt: skip
     words = f"In %. Everything told of single queries is what is right at the middle tolerance{run.within}. Intervals "
     words += "are 95 % and know that neighbors along the path fail together."
-    sheets = []
+    tables = {}
     if table := run.tables.get("table.csv"):
         rows = []
         for row in table.rows:
-            gains = parts.get(row[1] if several else "recall")
-            rows.append([*row, "" if gains is None else interval_words(gains, row[0])])
-        sheets = [Sheet("Recall of every system", Table([*table.header, f"R@1{run.within}, 95 %"], rows, 1 + several))]
-    return Section("recall", "Recall", words, charts, sheets)
+            bar = recalls[row[0]].get(row[1] if several else "")
+            rows.append([*row, bar.interval_words if bar else ""])
+        tables["Recall of every system"] = Table([*table.header, f"R@1{run.within}, 95 %"], rows, 1 + several)
+    return Section("recall", "Recall", words, charts, tables)
 
 
 def depths_chart(title: str, curves: Curves) -> Chart:
@@ -114,7 +106,7 @@ def depths_chart(title: str, curves: Curves) -> Chart:
         largest = max(run.common["candidates"], 1)
         depths = np.unique(np.geomspace(1, largest, _CURVE_POINTS).round().astype(int)).tolist()
         points[name] = [(k, 100 * float(run.all_gains.hits(system, k).mean())) for k in depths]
-    return lines("depths", title, points, axes=("K, the first candidates", "recall at K, %"), scale="log")
+    return line_chart("depths", title, points, axes=("K, the first candidates", "recall at K, %"), scale="log")
 
 
 def tolerance_charts(curves: Curves) -> list[Chart]:
@@ -128,7 +120,7 @@ def tolerance_charts(curves: Curves) -> list[Chart]:
                 if row["system"] == system and row.get("sequence", MEANS[-1]) == MEANS[-1]
             ]
     return [
-        lines(f"tolerances-{number}" if number else "tolerances", "Recall over tolerance", points,
+        line_chart(f"tolerances-{number}" if number else "tolerances", "Recall over tolerance", points,
               axes=(f"tolerance, {unit}", f"recall at {k}, %"), marked=True)
         for number, ((unit, k), points) in enumerate(by_kind.items())
     ]  # fmt: skip
@@ -148,7 +140,7 @@ def precision_charts(curves: Curves, by: str = "score", words: str = "by the sco
             points[label] = [(round(100 * x, 3), round(100 * y, 3)) for x, y in pairs]
     axes = "recall of queries with an answer, %", "precision, %"
     title = f"Precision and recall {words}"
-    return [lines(f"precision-{by}", title, points, axes=axes, scale="percent")] if points else []
+    return [line_chart(f"precision-{by}", title, points, axes=axes, scale="percent")] if points else []
 
 
 def paired_tests_table(kind: str, rows: list[list[str]]) -> Table:
@@ -170,8 +162,8 @@ def _differences_section(run: Run) -> Iterator[Section]:
     if table and table.rows:
         rows = [[f"{float(cell):.2g}" if column in _P_VALUES else cell for column, cell in enumerate(row)]
                 for row in table.rows]  # fmt: skip
-        sheets = [Sheet("Every two systems", paired_tests_table("system", rows))]
-        yield Section("differences", "Differences", paired_tests_words("system"), sheets=sheets)
+        tables = {"Every two systems": paired_tests_table("system", rows)}
+        yield Section("differences", "Differences", paired_tests_words("system"), tables=tables)
 
 
 def _confidence_section(run: Run) -> Iterator[Section]:
@@ -182,20 +174,15 @@ def _confidence_section(run: Run) -> Iterator[Section]:
     curves = {name: (run, name) for name in run.systems}
     charts = precision_charts(curves) + precision_charts(curves, "p", "by p(right)")
     if shares and shares.rows and len(shares.header) > 1:
+        share, *recalls = [list(map(float, column)) for column in zip(*shares.rows, strict=True)]
+        points = {FILTER: [(0.0, recalls[0][0]), (100.0, recalls[0][0])]}  # alone, it re-ranks nothing
+        for name, recall in zip(shares.header[1:], recalls, strict=True):
+            points[name] = [(100 * x, y) for x, y in zip(share, recall, strict=True)]
         axes, title = ("queries re-ranked, %", "recall at 1, %"), "Re-ranking only what the filter is unsure of"
-        charts.append(lines("shares", title, _points_by_share(shares), axes=axes, scale="percent"))
-    sheets = [Sheet("Confidence of first answers, in %", table)] if table and table.rows else []
+        charts.append(line_chart("shares", title, points, axes=axes, scale="percent"))
+    tables = {"Confidence of first answers, in %": table} if table and table.rows else {}
     words = "AP is the average precision, R@100P the recall at 100 % precision, ECE the expected calibration error of "
-    yield Section("confidence", "Precision and recall", f"{words}p(right).", charts, sheets)
-
-
-def _points_by_share(shares: Table) -> dict[str, list[tuple[float, float]]]:
-    """(share of the queries re-ranked, recall) in % by system, and the recall of the filter alone."""
-    share, *recalls = [list(map(float, column)) for column in zip(*shares.rows, strict=True)]
-    points = {FILTER: [(0.0, recalls[0][0]), (100.0, recalls[0][0])]}
-    for name, recall in zip(shares.header[1:], recalls, strict=True):
-        points[name] = [(100 * x, y) for x, y in zip(share, recall, strict=True)]
-    return points
+    yield Section("confidence", "Precision and recall", f"{words}p(right).", charts, tables)
 
 
 def _costs_section(run: Run) -> Section:
@@ -205,17 +192,16 @@ def _costs_section(run: Run) -> Section:
              ["candidates of a query", f"{common['candidates']}"]]  # fmt: skip
     if common["bytes_per_image"] is not None:
         sizes.append(["bytes on disk of an image's features, about", f"{common['bytes_per_image']}"])
-    chart = amounts("seconds", "Seconds by stage", seconds, axis="seconds")
-    sheets = [Sheet("Seconds", Table(["stage", "seconds", "per query"], rows)),
-              Sheet("Sizes", Table(["what", "number"], sizes))]  # fmt: skip
+    chart = amount_chart("seconds", "Seconds by stage", seconds, axis="seconds")
+    tables = {"Seconds": Table(["stage", "seconds", "per query"], rows), "Sizes": Table(["what", "number"], sizes)}
     words = "What was in the stores already was not computed again."
-    return Section("costs", "Seconds and sizes", words, [chart], sheets)
+    return Section("costs", "Seconds and sizes", words, [chart], tables)
 
 
 def _answers_section(run: Run) -> Section:
     """First predictions, with pictures of some."""
     total = len(run.systems) * len(run.all_gains.queries) if run.gains else 0
-    answers = [*islice(run.answers(), MOST_ANSWERS)]
+    answers = [*islice(run.predictions(), MOST_ANSWERS)]
     left_out = max(0, total - len(answers))
     gallery = Gallery(run.headline, run.systems, run.sequences, pictures(run.folder), answers, left_out)
     words = "Query and first answer with their heaviest matches, and the histogram of their shifts; below a wrong "
@@ -227,20 +213,20 @@ def _settings_section(run: Run) -> Section:
     about = {name: run.about.get(name) for name in ("command", "commit")} | {
         "ground truth": run.common["ground_truth"], "data fingerprint": run.common["data_fingerprint"]
     }  # fmt: skip
-    sheets = [
-        values_sheet("Run", about),
-        values_sheet("Settings", run.about["settings"]),
-        values_sheet("Versions", run.common["versions"]),
-        values_sheet("Systems", {row["system"]: row["parameters"] for row in run.results}),
-    ]
+    tables = {
+        "Run": values_table(about),
+        "Settings": values_table(run.about["settings"]),
+        "Versions": values_table(run.common["versions"]),
+        "Systems": values_table({row["system"]: row["parameters"] for row in run.results}),
+    }
     if skipped := run.tables.get("skipped.csv"):
-        sheets.append(Sheet("Images that could not be used", Table(skipped.header, skipped.rows, 3)))
-    return Section("settings", "Settings and versions", sheets=sheets)
+        tables["Images that could not be used"] = Table(skipped.header, skipped.rows, 3)
+    return Section("settings", "Settings and versions", tables=tables)
 
 
-def values_sheet(caption: str, values: Mapping[str, Any]) -> Sheet:
+def values_table(values: Mapping[str, Any]) -> Table:
     """Nested values by their dotted names."""
-    return Sheet(caption, Table(["name", "value"], [*map(list, flat(values))], text_columns=2))
+    return Table(["name", "value"], [*map(list, flat(values))], text_columns=2)
 
 
 def flat(values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

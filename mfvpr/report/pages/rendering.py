@@ -2,26 +2,18 @@
 
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
 
 from mfvpr.report.pages.charts import Chart
-from mfvpr.report.pages.files import Answer
+from mfvpr.report.pages.files import Prediction
 from mfvpr.report.pages.pictures import Picture
 from mfvpr.report.tables import Table
 from mfvpr.utils.files import write_text
 
 # Jinja2 and plotly are imported where they are needed: the rest of the library does not depend on them.
 _TEMPLATES = Path(__file__).parent / "templates"
-
-
-@dataclass(frozen=True)
-class Sheet:
-    """A table of a page and its caption."""
-
-    caption: str
-    table: Table
 
 
 @dataclass(frozen=True)
@@ -32,7 +24,7 @@ class Gallery:
     systems: Sequence[str]
     sequences: Sequence[str]
     pictures: Sequence[Picture]
-    answers: Sequence[Answer] = ()
+    answers: Sequence[Prediction] = ()
     left_out: int = 0
 
     @property
@@ -45,14 +37,14 @@ class Gallery:
 class Section:
     """A part of a page; `name` is a word for its element, `words` stand above everything in it.
 
-    `links` are words and the addresses of other pages, relative to the page.
+    `tables` are by caption. `links` are words and the addresses of other pages, relative to the page.
     """
 
     name: str
     title: str
     words: str = ""
     charts: Sequence[Chart] = ()
-    sheets: Sequence[Sheet] = ()
+    tables: Mapping[str, Table] = field(default_factory=dict)
     gallery: Gallery | None = None
     links: Sequence[tuple[str, str]] = ()
 
@@ -60,12 +52,7 @@ class Section:
 def write_page(path: Path, *, title: str, words: str, facts: Mapping[str, str], sections: Sequence[Section]) -> None:
     """Write one HTML file that needs no other; the same bytes for the same values.
 
-    Args:
-        path: of the page.
-        title: of the page.
-        words: below its title.
-        facts: the most important values, by name.
-        sections: in their order.
+    `words` stand below the title; `facts` are the most important values, by name.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup

@@ -3,25 +3,23 @@
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from mfvpr.evaluation.statistics import block_sign_flips, mcnemar
-from mfvpr.report.pages.charts import bars
+from mfvpr.report.pages.charts import bar_chart
 from mfvpr.report.pages.files import Run, read_run
 from mfvpr.report.pages.one_run import (
     depths_chart,
     description,
     flat,
-    interval_words,
     paired_tests_table,
     paired_tests_words,
     precision_charts,
     recall_bar,
     tolerance_charts,
 )
-from mfvpr.report.pages.rendering import Section, Sheet, write_page
+from mfvpr.report.pages.rendering import Section, write_page
 from mfvpr.report.tables import Table
 from mfvpr.utils.errors import InputError
 
@@ -76,7 +74,7 @@ def _overview(runs: Mapping[str, Run]) -> Section:
         for label, run in runs.items()
     ]  # fmt: skip
     header = ["run", "data set", "decides", "what was evaluated", "seconds"]
-    return Section("runs", "Runs", sheets=[Sheet("Runs", Table(header, rows, 4))])
+    return Section("runs", "Runs", tables={"Runs": Table(header, rows, 4)})
 
 
 def _recall(runs: Mapping[str, Run]) -> Section:
@@ -84,23 +82,20 @@ def _recall(runs: Mapping[str, Run]) -> Section:
     curves = {label: (run, run.headline) for label, run in runs.items()}
     headlines = {label: recall_bar(run.all_gains, run.headline) for label, run in runs.items()}
     charts = [
-        bars("intervals", "Recall at 1, with intervals", {"recall": headlines}, axis="recall at 1, %"),
+        bar_chart("intervals", "Recall at 1, with intervals", {"recall": headlines}, axis="recall at 1, %"),
         depths_chart("Recall over K", curves), *tolerance_charts(curves), *precision_charts(curves),
     ]  # fmt: skip
     systems = dict.fromkeys(name for run in runs.values() for name in run.systems)
-    rows = [[system, *(_recall_cell(run, system) for run in runs.values())] for system in systems]
+    rows = []
+    for system in systems:
+        recalls = [recall_bar(run.all_gains, system) if system in run.systems else None for run in runs.values()]
+        rows.append([system, *(f"{bar.percent:.1f} {bar.interval_words}" if bar else "" for bar in recalls)])
     header = ["system", *(f"{label}{run.within}" for label, run in runs.items())]
     words = "In %, of all queries, right at the middle tolerance of each run; intervals are 95 % and know that "
     words += "neighbors along the path fail together."
     if any(why_not(*pair) for pair in itertools.combinations(runs.values(), 2)):
         words += " Not all of these runs have the same queries and the same ground truth: see below."
-    return Section("recall", "Recall", words, charts, [Sheet("Recall at 1 of every system", Table(header, rows))])
-
-
-def _recall_cell(run: Run, system: str) -> str:
-    if system not in run.systems:
-        return ""
-    return f"{recall_bar(run.all_gains, system).percent:.1f} {interval_words(run.all_gains, system)}"
+    return Section("recall", "Recall", words, charts, {"Recall at 1 of every system": Table(header, rows)})
 
 
 def _pairs(runs: Mapping[str, Run]) -> Section:
@@ -115,24 +110,25 @@ def _pairs(runs: Mapping[str, Run]) -> Section:
         rows.append([f"{label}: {run.headline}", f"{other}: {second.headline}", str(test.only_first),
                      str(test.only_second), f"{test.p_value:.2g}", str(flips.block), str(flips.blocks),
                      f"{flips.p_value:.2g}"])  # fmt: skip
-    sheets = [Sheet("Every two runs of the same queries", paired_tests_table("run", rows))] if rows else []
+    tables = {"Every two runs of the same queries": paired_tests_table("run", rows)} if rows else {}
     if incomparable:
-        sheets.append(Sheet("Not comparable query by query", Table(["run", "other", "why"], incomparable, 3)))
-    return Section("pairs", "Every two runs", paired_tests_words("run"), sheets=sheets)
+        tables["Not comparable query by query"] = Table(["run", "other", "why"], incomparable, 3)
+    return Section("pairs", "Every two runs", paired_tests_words("run"), tables=tables)
 
 
 def _settings(runs: Mapping[str, Run]) -> Section:
     """Settings that differ, and settings that are alike."""
-    settings = {label: dict(flat(_settings_of(run))) for label, run in runs.items()}
+    settings = {}
+    for label, run in runs.items():
+        about = {name: run.about.get(name) for name in ("command", "commit", "settings", "ground_truth")}
+        about |= {name: run.common[name] for name in ("data_fingerprint", "versions", "seconds")}
+        settings[label] = dict(flat(about))
     names = dict.fromkeys(name for values in settings.values() for name in values)
     rows = [[name, *(values.get(name, "") for values in settings.values())] for name in names]
     differ = [row for row in rows if len({*row[1:]}) > 1]
     alike = [row[:2] for row in rows if len({*row[1:]}) == 1]
-    sheets = [Sheet("What differs", Table(["name", *settings], differ, 1 + len(settings))),
-              Sheet("What is alike", Table(["name", "value"], alike, 2))]  # fmt: skip
-    return Section("settings", "Settings and versions", sheets=sheets)
-
-
-def _settings_of(run: Run) -> dict[str, Any]:
-    about = {name: run.about.get(name) for name in ("command", "commit", "settings", "ground_truth")}
-    return about | {name: run.common[name] for name in ("data_fingerprint", "versions", "seconds")}
+    tables = {
+        "What differs": Table(["name", *settings], differ, 1 + len(settings)),
+        "What is alike": Table(["name", "value"], alike, 2),
+    }
+    return Section("settings", "Settings and versions", tables=tables)
