@@ -61,20 +61,14 @@ def write_failures(path: Path, rankings: Rankings) -> None:
         return
     lines = []
     for query in map(int, np.flatnonzero(~rankings.right[:, 0])):
-        row = int(rankings.rows[query, 0])
-        answer = rankings.database[row] if row >= 0 else ""
-        lines.append([rankings.queries[query], answer, *_first_right(rankings, rankings.right[query], query)])
+        names = [rankings.database[row] if row >= 0 else "" for row in rankings.rows[query]]
+        right, scores = rankings.right[query], rankings.scores[query]
+        rank = int(np.argmax(right))
+        with np.errstate(invalid="ignore"):  # of two infinite scores
+            margin = scores[0] - scores[rank]
+        first_right = [rank + 1, names[rank], number(scores[rank]), number(margin)] if right.any() else [""] * 4
+        lines.append([rankings.queries[query], names[0], *first_right])
     write_csv(path, ("query", "answer", "rank", "right_answer", "score", "margin"), lines)
-
-
-def _first_right(rankings: Rankings, right: np.ndarray, query: int) -> list[str | int]:
-    if not right.any():
-        return [""] * 4
-    rank, scores = int(np.argmax(right)), rankings.scores[query]
-    name = rankings.database[int(rankings.rows[query, rank])]
-    with np.errstate(invalid="ignore"):  # of two infinite scores
-        margin = scores[0] - scores[rank]
-    return [rank + 1, name, number(scores[rank]), number(margin)]
 
 
 def read_csv(path: Path) -> list[dict[str, str]]:

@@ -21,14 +21,14 @@ def query():
     return np.zeros((90, 90, 3), np.uint8)
 
 
-def drawn(path, query, name, **options):
+def draw(path, query, name, **options):
     answer = figures.Candidate(query, f"wrong: {name}, rank 1")
     figures.histogram_figure(path, query, [answer], title=f"histogram: {name} -> {name}", **options)
     return pixels(path)
 
 
 def test_a_long_name_leaves_the_figure_as_large(tmp_path, query):
-    short, long = (drawn(tmp_path / f"{len(name)}.png", query, name) for name in ("x" * 30, "x" * 200))
+    short, long = (draw(tmp_path / f"{len(name)}.png", query, name) for name in ("x" * 30, "x" * 200))
     assert (short < 20).sum() == pytest.approx((long < 20).sum(), rel=0.1)  # of the images
     assert long.shape[1] == pytest.approx(short.shape[1], rel=0.1)
 
@@ -36,15 +36,14 @@ def test_a_long_name_leaves_the_figure_as_large(tmp_path, query):
 def test_images_are_drawn_in_the_shape_they_were_taken_in(tmp_path, query):
     aspect = figures.pixel_aspect_of(np.zeros((384, 1024, 3)), query)
     assert aspect == 384 / 1024
-    rows, columns = np.nonzero(drawn(tmp_path / "a.png", query, "name", pixel_aspect=aspect) == 0)
+    rows, columns = np.nonzero(draw(tmp_path / "a.png", query, "name", pixel_aspect=aspect) == 0)
     half = columns[columns < np.mean(columns)]  # the two images stand side by side
     rows_of_images = [row for row in np.unique(rows) if (rows == row).sum() > 100]
     assert len(rows_of_images) / (half.max() - half.min()) == pytest.approx(aspect, rel=0.1)
 
 
 def test_titles_of_panels_are_not_cut_off(tmp_path):
-    found = {name: reliability(P, RIGHT) for name in SYSTEMS[:4]}
-    plots.reliability_figure(tmp_path / "a.png", found)
+    plots.reliability_figure(tmp_path / "a.png", {name: reliability(P, RIGHT) for name in SYSTEMS[:4]})
     image = pixels(tmp_path / "a.png")
     assert {*np.concatenate([image[:, 0], image[:, -1], image[0], image[-1]]).tolist()} == {255}
 

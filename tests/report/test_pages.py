@@ -1,4 +1,4 @@
-"""Pages of run folders: what stands in them, that names cannot do anything, and what is refused."""
+"""Pages of run folders: their contents, hostile names, and files that are no run."""
 
 import base64
 import hashlib
@@ -65,8 +65,8 @@ class Parsed(HTMLParser):
         return json.loads(self.scripts[0], parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
 
 
-def shown(text):
-    """How a name stands in a page: a parser takes every end of a line for the same."""
+def text_on_page(text):
+    """A name as a parser reads it from a page: every end of a line is the same."""
     return text.encode("utf-8", "backslashreplace").decode().replace("\r", "\n")
 
 
@@ -89,9 +89,9 @@ def test_names_are_nothing_but_text(page, several):
     for parsed in (page, several):
         text = "".join(parsed.text).replace("\r", "\n")
         for name in (*HOSTILE, SYSTEMS[2], TWO[0]):
-            assert shown(name) in text
+            assert text_on_page(name) in text
         assert len(parsed.scripts) == 3
-        attributes = {name for _, found in parsed.elements for name in found}
+        attributes = {name for _, names in parsed.elements for name in names}
         assert not {name for name in attributes if name.startswith("on")}
         assert not {tag for tag, _ in parsed.elements} & {"b", "svg", "iframe", "object"}
         assert len(parsed.of("img")) == len(parsed.of("figcaption"))
@@ -106,7 +106,7 @@ def test_nothing_comes_from_elsewhere(page):
         assert attributes.get("src", "data:").startswith("data:")
         assert attributes.get("href", "#").startswith("#")
         assert tag not in ("link", "base", "iframe", "object", "embed")
-    [policy] = [one["content"] for one in page.of("meta") if "content" in one and "default-src" in one["content"]]
+    [policy] = [meta["content"] for meta in page.of("meta") if "default-src" in meta.get("content", "")]
     assert policy.startswith("default-src 'none'; script-src 'sha256-")
     assert "img-src data:" in policy
     for script in page.scripts[1:]:
@@ -151,14 +151,14 @@ def test_sequences_have_bars_and_rows_of_their_own(several):
 
 def test_answers_are_pictures_and_rows(page, several, run):
     images = page.of("img")
-    assert [one["alt"].split()[0] for one in images] == ["right", "wrong"]
-    assert shown(HOSTILE[6]) in images[1]["alt"]
+    assert [image["alt"].split()[0] for image in images] == ["right", "wrong"]
+    assert text_on_page(HOSTILE[6]) in images[1]["alt"]
     for image in images:
         assert (image["width"], image["height"]) == ("1000", "231")
         assert base64.b64decode(image["src"].removeprefix("data:image/jpeg;base64,"))[:3] == b"\xff\xd8\xff"
     rows = [row for row in page.rows if len(row) == 6 and row[0] in SYSTEMS]
     assert [row[0] for row in rows] == [HEADLINE] * 10 + ["filter"] * 10 + [SYSTEMS[2]] * 10
-    expected = [HEADLINE, shown(HOSTILE[3]), shown(HOSTILE[-4]), "13", "wrong", "2"]
+    expected = [HEADLINE, text_on_page(HOSTILE[3]), text_on_page(HOSTILE[-4]), "13", "wrong", "2"]
     assert [cell.replace("\r", "\n") for cell in rows[3]] == expected
     assert [choice["id"] for choice in page.of("select")] == ["filter-system", "filter-outcome"]
     assert [choice["id"] for choice in several.of("select")] == ["filter-system", "filter-sequence", "filter-outcome"]
@@ -194,7 +194,7 @@ def test_runs_are_compared_query_by_query(tmp_path):
     runs = [write_run(tmp_path / "a"), write_run(tmp_path / "b", ranks=other)]
     write_comparison(runs, tmp_path / "page.html")
     page = Parsed(tmp_path / "page.html")
-    hits = [np.array(one[HEADLINE]) == 1 for one in (RANKS, other)]
+    hits = [np.array(ranks[HEADLINE]) == 1 for ranks in (RANKS, other)]
     test, flips = mcnemar(*hits), block_sign_flips(*hits)
     [row] = [row for row in page.rows if row and row[0] == f"a: {HEADLINE}"]
     assert row == [f"a: {HEADLINE}", f"b: {HEADLINE}", "5", "2", f"{test.p_value:.2g}", str(flips.block),
@@ -204,18 +204,17 @@ def test_runs_are_compared_query_by_query(tmp_path):
     assert len(page.scripts) == 3
 
 
-def test_recall_over_tolerance_is_of_the_first_depth_that_is_told(run, tmp_path):
+def test_recall_over_tolerance_is_of_the_smallest_depth(run, tmp_path):
     results = json.loads((run / "results.json").read_text("utf-8"))
     for row in results:
         row["recall_at"] = {"2": row["recall_at"]["2"]}
-    folder = tmp_path / "run"
-    shutil.copytree(run, folder)
+    folder = shutil.copytree(run, tmp_path / "run")
     write_json(folder / "results.json", results)
     page = Parsed(write_report(folder))
     chart = page.charts["tolerances"]
     assert chart["layout"]["yaxis"]["title"]["text"] == "recall at 2, %"
-    own = [100 * row["recall_at"]["2"] for row in results if row["system"] == SYSTEMS[0]]
-    assert chart["data"][0]["y"] == own
+    recalls = [100 * row["recall_at"]["2"] for row in results if row["system"] == SYSTEMS[0]]
+    assert chart["data"][0]["y"] == recalls
 
 
 @pytest.mark.parametrize(
@@ -239,20 +238,16 @@ def test_runs_of_other_queries_are_not(tmp_path, changes, reason):
     assert not [row for row in page.rows if row[0] == f"a: {HEADLINE}"]
 
 
-def program(monkeypatch, capsys, *arguments):
-    return typed(monkeypatch, capsys, "report", *arguments)
-
-
 def test_the_program_says_where_the_page_is(run, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert program(monkeypatch, capsys, run) == (0, f"report: {run}/report.html\n", "")
     again = write_run(tmp_path / "again")
-    assert program(monkeypatch, capsys, run, again) == (0, "report: comparison.html\n", "")
-    assert program(monkeypatch, capsys, run, "--out", "a.html") == (0, "report: a.html\n", "")
+    for arguments, page in (([run], f"{run}/report.html"), ([run, again], "comparison.html"),
+                            ([run, "--out", "a.html"], "a.html")):  # fmt: skip
+        assert typed(monkeypatch, capsys, "report", *arguments) == (0, f"report: {page}\n", "")
     assert {path.name for path in tmp_path.iterdir()} == {"again", "comparison.html", "a.html"}
 
 
-def test_what_is_no_run_is_refused_in_one_line(run, tmp_path, monkeypatch, capsys):
+def test_folders_that_are_no_runs_are_errors_of_one_line(run, tmp_path, monkeypatch, capsys):
     places = {name: write_run(tmp_path / name) for name in ("sweep", "broken", "kind", "lacking", "old", "figure")}
     change_json(places["sweep"] / "results.json", lambda rows: {"settings": []})
     (places["broken"] / "run.json").write_text("{")
@@ -265,11 +260,11 @@ def test_what_is_no_run_is_refused_in_one_line(run, tmp_path, monkeypatch, capsy
         (places["kind"], "seconds is str"), (places["lacking"], "gains.csv"), (places["old"], "'place'"),
         (places["figure"], "expected a figure of the run"),
     ):  # fmt: skip
-        code, stdout, stderr = program(monkeypatch, capsys, place)
+        code, stdout, stderr = typed(monkeypatch, capsys, "report", place)
         assert (code, stdout, stderr.count("\n")) == (2, "", 1)
         assert stderr.startswith(f"error: {place}")
         assert words in stderr
-    code, _, stderr = program(monkeypatch, capsys, run, run)
+    code, _, stderr = typed(monkeypatch, capsys, "report", run, run)
     assert code == 2
     assert "one: expected different run folders" in stderr
     with pytest.raises(InputError, match="expected different"):
@@ -277,14 +272,13 @@ def test_what_is_no_run_is_refused_in_one_line(run, tmp_path, monkeypatch, capsy
 
 
 @pytest.fixture
-def edited(run, tmp_path, monkeypatch):
-    """A run folder whose page is made of an edited file, but not written."""
+def error_with(run, tmp_path, monkeypatch):
+    """The error of a run folder with another text in a file; None if it has a page, which is not written."""
     monkeypatch.setattr(one_run, "write_page", lambda *_, **parts: None)
     monkeypatch.setattr(one_run, "pictures", lambda *_: [])
     shutil.copytree(run, tmp_path / "run")
 
-    def refused(name, text):
-        """The reason; None where there is a page."""
+    def error_with(name, text):
         path = tmp_path / "run" / name
         before = path.read_bytes()
         path.write_text(text, "utf-8", "surrogateescape")
@@ -296,10 +290,10 @@ def edited(run, tmp_path, monkeypatch):
         finally:
             path.write_bytes(before)
 
-    return refused
+    return error_with
 
 
-def test_edited_results_are_refused_in_one_line(edited, run):
+def test_edited_results_are_errors_of_one_line(error_with, run):
     text = (run / "results.json").read_text("utf-8")
     for before, after in (
         ('"unit"', '"units"'), ('"frames"', '"miles"'), ('"scores": 2.0', '"scores": "2"'),
@@ -309,16 +303,16 @@ def test_edited_results_are_refused_in_one_line(edited, run):
         ('"thresholds": [', '"thresholds": ["0",'),
         ('"dataset"', '"sequence"'), ('"ground_truth"', '"truth"'),
     ):  # fmt: skip
-        reason = edited("results.json", text.replace(before, after, 1))
+        reason = error_with("results.json", text.replace(before, after, 1))
         assert reason is not None, after
         assert "\n" not in reason
         assert "run folder" in reason
 
 
-def test_edited_tables_are_refused_or_nothing_but_text(edited, run):
+def test_edited_tables_are_errors_or_nothing_but_text(error_with, run):
     for path in sorted(run.glob("*.csv")):
         text = path.read_text("utf-8", "surrogateescape")
-        reasons = [edited(path.name, new) for new in ("", text.replace("1", "one"), f"{text}x", "x,y\n1,2")]
+        reasons = [error_with(path.name, new) for new in ("", text.replace("1", "one"), f"{text}x", "x,y\n1,2")]
         assert path.name in ("confidence.csv", "skipped.csv") or any(reasons[1:]), path
 
 

@@ -1,4 +1,4 @@
-"""Pages as people meet them, in a headless Chromium: drawn, sorted, filtered, on a wide screen and on a phone."""
+"""Pages in a headless Chromium, on a wide screen and on a phone: charts, sorting, filters, keyboard, scripts."""
 
 import shutil
 from importlib.util import find_spec
@@ -32,7 +32,7 @@ def browser():
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory):
-    """Of a run with one sequence, of one with two, of one without ground truth, and of these compared."""
+    """Pages of runs with one sequence, with two, and without ground truth, and of several runs compared."""
     root = tmp_path_factory.mktemp("runs")
     runs = [
         write_run(root / "one"),
@@ -44,7 +44,7 @@ def pages(tmp_path_factory):
 
 
 @pytest.fixture
-def opened(browser, pages):
+def tab(browser, pages):
     """Opens a page, and fails where it says anything, asks anything, or wants anything from elsewhere."""
     said, contexts = [], []
 
@@ -73,8 +73,8 @@ def cells(page, column, table="First answers"):
 
 @pytest.mark.parametrize("width", [390, 1280])
 @pytest.mark.parametrize("name", ["one", "two", "none", "all"])
-def test_pages_fit_and_their_charts_are_drawn(opened, tmp_path, name, width):
-    page = opened.page(name, width, "dark" if width == 390 else "light")
+def test_pages_and_their_charts_fit(tab, tmp_path, name, width):
+    page = tab.page(name, width, "dark" if width == 390 else "light")
     assert page.evaluate("document.documentElement.scrollWidth") <= width
     charts = page.locator(".chart")
     assert charts.count() == {"one": 6, "two": 6, "none": 1, "all": 4}[name]
@@ -91,8 +91,8 @@ def test_pages_fit_and_their_charts_are_drawn(opened, tmp_path, name, width):
     assert pixels.std() > 10
 
 
-def test_tables_are_sorted_by_click_and_by_key(opened):
-    page = opened.page("one")
+def test_tables_are_sorted_by_click_and_by_key(tab):
+    page = tab.page("one")
     scores, header = cells(page, 4), page.locator("[aria-label='First answers'] th").nth(3)
     assert [float(score) for score in scores] == [*range(10, 20)]
     page.get_by_role("button", name="score", exact=True).click()
@@ -108,18 +108,19 @@ def test_tables_are_sorted_by_click_and_by_key(opened):
     assert cells(page, 5, "Every two systems") == ["1e-09", "0.06"]
 
 
-def test_answers_are_filtered_by_click_and_by_key(opened):
-    page = opened.page("two")
-    told = page.locator("#shown")
-    assert told.text_content() == "4 of 4 pictures, 20 of 60 answers"
+def test_answers_are_filtered_by_click_and_by_key(tab):
+    page = tab.page("two")
+    counts = page.locator("#shown")
+    assert counts.text_content() == "4 of 4 pictures, 20 of 60 answers"
     page.get_by_role("combobox", name="Outcome").select_option("wrong")
-    assert told.text_content() == "2 of 4 pictures, 4 of 60 answers"
+    assert counts.text_content() == "2 of 4 pictures, 4 of 60 answers"
     assert {*cells(page, 6)} == {"wrong"}
     page.get_by_role("combobox", name="Sequence").select_option("day")
-    assert told.text_content() == "1 of 4 pictures, 2 of 60 answers"
+    assert counts.text_content() == "1 of 4 pictures, 2 of 60 answers"
     page.get_by_role("combobox", name="System").focus()
     page.keyboard.press("Home")
-    assert told.text_content() == f"1 of 4 pictures, {sum(10 - one.count(1) for one in RANKS.values())} of 60 answers"
+    num_wrong = sum(10 - ranks.count(1) for ranks in RANKS.values())
+    assert counts.text_content() == f"1 of 4 pictures, {num_wrong} of 60 answers"
     page.get_by_role("combobox", name="System").select_option(SYSTEMS[0])
     assert page.locator(".picture:visible").count() == 0
     assert {*cells(page, 1)} == {SYSTEMS[0]}
@@ -127,8 +128,8 @@ def test_answers_are_filtered_by_click_and_by_key(opened):
     assert page.locator(".picture:visible").count() == 1
 
 
-def test_pictures_are_full_size_when_asked_for(opened):
-    page = opened.page("one", 390)
+def test_pictures_are_full_size_when_asked_for(tab):
+    page = tab.page("one", 390)
     picture = page.locator(".picture").first
     before = picture.locator("img").bounding_box()["width"]
     picture.get_by_role("button").press("Enter")
@@ -139,8 +140,8 @@ def test_pictures_are_full_size_when_asked_for(opened):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_the_theme_follows_the_system_until_it_is_chosen(opened, scheme):
-    page, other = opened.page("one", scheme=scheme), {"light": "Dark", "dark": "Light"}[scheme]
+def test_the_theme_follows_the_system_until_a_choice(tab, scheme):
+    page, other = tab.page("one", scheme=scheme), {"light": "Dark", "dark": "Light"}[scheme]
     look = "[document.body, document.querySelector('.xtick text')].map(one => getComputedStyle(one)).map(one => [one."
     look += "backgroundColor, one.fill])"
     [before, _], [_, text] = page.evaluate(look)
@@ -152,8 +153,8 @@ def test_the_theme_follows_the_system_until_it_is_chosen(opened, scheme):
     assert page.evaluate(look)[0][0] == after
 
 
-def test_the_keyboard_reaches_everything(opened):
-    page = opened.page("two", 390)
+def test_the_keyboard_reaches_everything(tab):
+    page = tab.page("two", 390)
     page.keyboard.press("Tab")
     assert page.evaluate("document.activeElement.textContent") == "Skip to the results"
     page.keyboard.press("Enter")
@@ -161,16 +162,16 @@ def test_the_keyboard_reaches_everything(opened):
     reached = set()
     for _ in range(80):
         page.keyboard.press("Tab")
-        found = page.evaluate("[document.activeElement.tagName, getComputedStyle(document.activeElement).outlineStyle]")
-        reached.add(tuple(found))
+        focus = page.evaluate("[document.activeElement.tagName, getComputedStyle(document.activeElement).outlineStyle]")
+        reached.add(tuple(focus))
     assert {tag for tag, _ in reached} >= {"SUMMARY", "DIV", "BUTTON", "SELECT"}
     assert "none" not in {style for tag, style in reached if tag != "BODY"}
 
 
-def test_scripts_in_what_is_added_do_not_run(opened):
-    page = opened.page("one")
+def test_scripts_in_what_is_added_do_not_run(tab):
+    page = tab.page("one")
     page.evaluate("document.body.insertAdjacentHTML('beforeend', '<img src=data:, onerror=\"window.ran = 1\">')")
     page.evaluate("fetch('https://example.invalid').catch(() => { window.refused = 1 })")
     assert page.evaluate("[window.ran, window.refused]") == [None, 1]
-    assert all("Content Security Policy" in line for line in opened.said)
-    opened.said.clear()
+    assert all("Content Security Policy" in line for line in tab.said)
+    tab.said.clear()

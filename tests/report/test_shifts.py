@@ -1,4 +1,4 @@
-"""shifts.csv of a run: which pairs it is of, and that it is what the library says of them."""
+"""shifts.csv of a run: its pairs, and that their shifts are those of the library."""
 
 import csv
 from dataclasses import replace
@@ -91,12 +91,12 @@ def test_the_refined_shift_stays_in_the_range_of_shifts():
 
 def test_refused_answers_have_no_shift(root, tmp_path):
     evaluation.evaluate(composed(*small(root), *STEERING, f"out={tmp_path}/first"))
-    given = (f"confidence={tmp_path}/first/confidence.json", "threshold=0.5", f"out={tmp_path}/out")
-    evaluation.evaluate(composed(*small(root), *STEERING, *given))
+    confidence = (f"confidence={tmp_path}/first/confidence.json", "threshold=0.5", f"out={tmp_path}/out")
+    evaluation.evaluate(composed(*small(root), *STEERING, *confidence))
     answers = {line["query"]: line["answer"] for line in lines_of(tmp_path / "out" / "answers.csv")}
-    kept = {query: answer for query, answer in answers.items() if answer != "no place"}
-    assert 0 < len(kept) < len(answers)
-    assert {line["query"]: line["answer"] for line in lines_of(tmp_path / "out" / "shifts.csv")} == kept
+    places = {query: answer for query, answer in answers.items() if answer != "no place"}
+    assert 0 < len(places) < len(answers)
+    assert {line["query"]: line["answer"] for line in lines_of(tmp_path / "out" / "shifts.csv")} == places
 
 
 def test_only_a_histogram_has_one(root, tmp_path):

@@ -1,4 +1,4 @@
-"""The paper's evaluation as a program: of what is there, once, however often it is killed."""
+"""The paper's evaluation as a program: it evaluates the data sets at hand once, however often it is killed."""
 
 import json
 import os
@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 
@@ -22,7 +21,7 @@ from tests.programs import run as run_program
 pytestmark = pytest.mark.slow
 
 SYSTEMS = "systems=[sift_hist_10,sift_hist_comb_10,mix_hist_10]"
-QUERIES = 8
+RUN = "runs/grief_season/sift_10"
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +30,7 @@ def data(tmp_path_factory):
     from mfvpr.datasets.streets import draw_streets
 
     folder = tmp_path_factory.mktemp("data") / "grief_season"
-    draw_streets(folder, num_frames=QUERIES, image_size=(160, 120))
+    draw_streets(folder, num_frames=8, image_size=(160, 120))
     (folder / "ground_truth.csv").unlink()
     return folder.parent
 
@@ -43,113 +42,113 @@ def arguments(data, out):
 @pytest.fixture(scope="module")
 def finished(data, tmp_path_factory):
     out = tmp_path_factory.mktemp("paper") / "out"
-    done = run_program(*arguments(data, out), program="paper")
-    assert done.returncode == 0, done.stderr
-    return out, done
+    process = run_program(*arguments(data, out), program="paper")
+    assert process.returncode == 0, process.stderr
+    return out, process
+
+
+@pytest.fixture
+def copy(finished, tmp_path):
+    """A copy of the finished output."""
+    return shutil.copytree(finished[0], tmp_path / "paper" / "out")
+
+
+@pytest.fixture
+def paper(data, monkeypatch, capsys):
+    """Runs the program in this process; settings replace those of `arguments` with their names."""
+
+    def run(out, *changes, data=data):
+        names = {change.partition("=")[0] for change in changes}
+        unchanged = [setting for setting in arguments(data, out) if setting.partition("=")[0] not in names]
+        return typed(monkeypatch, capsys, "paper", *unchanged, *changes)
+
+    return run
 
 
 def files(out):
-    """What does not depend on the time: every file but seconds and their figures, and results without them."""
-    found = {}
+    """Contents that do not depend on the time: every file but seconds and their figures, and results without them."""
+    contents = {}
     for path in sorted(path for path in out.rglob("*") if path.is_file()):
         if path.parent.name == "seconds" or path.stem in ("speed", "growth", "run", "seconds", "report"):
             continue
         content = path.read_bytes()
         if path.name == "results.json":
             content = [{name: value for name, value in row.items() if name != "seconds"} for row in json.loads(content)]
-        found[str(path.relative_to(out))] = content
-    return found
+        contents[str(path.relative_to(out))] = content
+    return contents
 
 
-def test_it_says_what_is_left_out_and_prints_what_it_found(finished, data):
-    out, done = finished
-    assert f"left out: gardens_point: needs {data}/gardens_point (http" in done.stderr
-    assert "left out: mix_hist_10: needs d2_tf (d2_tf.pth)" in done.stderr
-    assert "SIFT-hist 10" in done.stdout
-    assert "Mix-hist 10" not in done.stdout
-    assert done.stdout.endswith(f"tables and figures: {out}\nreport: {out}/report.html\n")
+def test_it_names_what_is_left_out_prints_recalls_and_links_every_page(finished, data):
+    out, process = finished
+    assert f"left out: gardens_point: needs {data}/gardens_point (http" in process.stderr
+    assert "left out: mix_hist_10: needs d2_tf (d2_tf.pth)" in process.stderr
+    assert "SIFT-hist 10" in process.stdout
+    assert "Mix-hist 10" not in process.stdout
+    assert process.stdout.endswith(f"tables and figures: {out}\nreport: {out}/report.html\n")
     assert sorted(path.stem for path in (out / "tables").glob("*.md")) == [
         "averages", "data_sets", "depths", "recall", "seconds", "settings", "sizes",
     ]  # fmt: skip
     assert {path.name for path in (out / "figures").iterdir()} >= {"averages.png", "speed.png"}
-
-
-def test_every_run_has_a_page_and_one_leads_to_them(finished):
-    out, _ = finished
     page = (out / "report.html").read_text()
-    addresses = re.findall(r'<li><a href="([^"#]+)">', page)
-    assert addresses == ["runs/grief_season/sift_10/report.html"]
-    assert all((out / address).is_file() for address in addresses)
+    assert re.findall(r'<li><a href="([^"#]+)">', page) == [f"{RUN}/report.html"]
+    assert (out / RUN / "report.html").is_file()
     assert "SIFT-hist 10" in page
     assert "sift_10: histogram" in page  # a picture
 
 
-def test_runs_of_a_data_set_stand_side_by_side(finished, data, tmp_path, monkeypatch, capsys):
-    out, whole = tmp_path / "paper" / "out", finished[0]
-    shutil.copytree(whole, out)
-    (out / "runs/grief_season/sift_10/report.html").unlink()
-    (out / "tables/sequences_other.md").touch()
-    chosen = [one for one in arguments(data, out) if not one.startswith("systems=")]
-    code, _, _ = typed(monkeypatch, capsys, "paper", *chosen, "systems=[sift_hist_10,sift_hist_50]")
-    assert code == 0
-    assert "sift_50" in (out / "comparisons/grief_season.html").read_text()
-    assert not (out / "tables/sequences_other.md").exists()
-    assert '<a href="comparisons/grief_season.html">' in (out / "report.html").read_text()
-    assert (out / "runs/grief_season/sift_10/report.html").is_file()
-    assert {path.name for path in (out / "figures").iterdir()} >= {"failures.png", "growth.png", "histogram.png"}
+def test_runs_of_a_data_set_stand_side_by_side(copy, paper):
+    (copy / RUN / "report.html").unlink()
+    (copy / "tables/sequences_other.md").touch()
+    assert paper(copy, "systems=[sift_hist_10,sift_hist_50]")[0] == 0
+    assert "sift_50" in (copy / "comparisons/grief_season.html").read_text()
+    assert not (copy / "tables/sequences_other.md").exists()
+    assert '<a href="comparisons/grief_season.html">' in (copy / "report.html").read_text()
+    assert (copy / RUN / "report.html").is_file()
+    assert {path.name for path in (copy / "figures").iterdir()} >= {"failures.png", "growth.png", "histogram.png"}
 
 
-def test_what_a_run_left_that_was_killed_while_its_files_moved_is_no_obstacle(finished, data, tmp_path):
-    whole, out = finished[0], tmp_path / "paper" / "out"
-    shutil.copytree(whole, out)
-    folder = out / "runs/grief_season/sift_10"
-    kept = files(folder)
+def test_leftovers_of_a_run_that_was_killed_while_its_files_moved_are_no_obstacle(copy, paper):
+    folder = copy / RUN
+    before = files(folder)
     (folder / ".unfinished").mkdir()
     (folder / "results.json").rename(folder / ".unfinished/results.json")
     (folder / "of another.csv").touch()
-    done = run_program(*arguments(data, out), program="paper")
-    assert done.returncode == 0, done.stderr
-    assert files(folder) == kept
+    assert paper(copy)[0] == 0
+    assert files(folder) == before
 
 
-def test_seconds_of_something_else_are_measured_again(finished, data, tmp_path, monkeypatch, capsys):
-    out = tmp_path / "paper" / "out"
-    shutil.copytree(finished[0], out)
-    path = out / "seconds/sift_10.json"
-    kept = json.loads(path.read_text())
-    for content in (json.dumps(kept | {"matching": 77.0, "of": kept["of"] | {"images": "others"}}), "{"):
+def test_seconds_of_something_else_are_measured_again(copy, paper):
+    path = copy / "seconds/sift_10.json"
+    seconds = json.loads(path.read_text())
+    for content in (json.dumps(seconds | {"matching": 77.0, "of": seconds["of"] | {"images": "others"}}), "{"):
         path.write_text(content)
-        code, _, stderr = typed(monkeypatch, capsys, "paper", *arguments(data, out))
+        code, _, stderr = paper(copy)
         assert code == 0
         assert "timing: sift_10 on grief_season" in stderr
         assert json.loads(path.read_text())["matching"] < 70
-    heading = (out / "tables/seconds.md").read_text().splitlines()[0]
+    heading = (copy / "tables/seconds.md").read_text().splitlines()[0]
     assert "here grief_season, on " in heading
 
 
 @pytest.mark.parametrize("name", ["results.json", "run.json", "sizes.json"])
-def test_damaged_runs_are_told(finished, data, tmp_path, monkeypatch, capsys, name):
-    out = tmp_path / "paper" / "out"
-    shutil.copytree(finished[0], out)
-    (out / "runs/grief_season/sift_10" / name).write_text("[")
-    code, _, stderr = typed(monkeypatch, capsys, "paper", *arguments(data, out))
+def test_damaged_runs_are_errors(copy, paper, name):
+    (copy / RUN / name).write_text("[")
+    code, _, stderr = paper(copy)
     assert code == 2
     assert f"sift_10/{name}: is damaged" in stderr
 
 
 def test_the_plan_comes_first_and_tables_before_the_seconds(tmp_path, monkeypatch, capsys):
     """An interrupted timing costs no table."""
-    place = systems.Place("streets_seasons", ("dataset=streets_seasons",))
-    monkeypatch.setattr(program.systems, "places", lambda *_: ([place], ["corridor: needs a folder"]))
-    monkeypatch.setattr(program, "evaluate_all", lambda *_: ({place.name: None}, []))
-    monkeypatch.setattr(
-        program, "paper_tables", lambda evaluations: [("recall", "heading", Table(["system"], [["SIFT"]]))]
-    )
+    place, table = systems.Place("streets_seasons", ("dataset=streets_seasons",)), Table(["system"], [["SIFT"]])
 
-    def interrupted(*_):
+    def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(program, "measure_times", interrupted)
+    monkeypatch.setattr(program.systems, "places", lambda *_: ([place], ["corridor: needs a folder"]))
+    monkeypatch.setattr(program, "evaluate_all", lambda *_: ({place.name: None}, []))
+    monkeypatch.setattr(program, "paper_tables", lambda _: [("recall", "heading", table)])
+    monkeypatch.setattr(program, "measure_times", interrupt)
     with pytest.raises(KeyboardInterrupt):
         program.paper(composed("systems=[sift_hist_10]", f"out={tmp_path}/out", config="paper"))
     assert (tmp_path / "out" / "tables" / "recall.csv").read_text() == "system\nSIFT\n"
@@ -160,27 +159,27 @@ def test_the_plan_comes_first_and_tables_before_the_seconds(tmp_path, monkeypatc
     assert second == "left out: corridor: needs a folder"
 
 
-def test_two_do_not_evaluate_into_one_folder(finished, data, monkeypatch, capsys):
+def test_two_do_not_evaluate_into_one_folder(finished, paper):
     out, _ = finished
     (out / "tables" / ".recall-0123456z.csv").touch()  # of one that was killed
     (out / "tables" / ".mine").touch()
     with lock_output(out):
         assert {path.name for path in (out / "tables").glob(".*")} == {".mine"}
-        code, _, stderr = typed(monkeypatch, capsys, "paper", *arguments(data, out))
+        code, _, stderr = paper(out)
     (out / "tables" / ".mine").unlink()
     assert code == 2
     assert "another process evaluates into it" in stderr
 
 
-def test_data_sets_whose_names_tell_positions_are_found(data, tmp_path, monkeypatch, capsys):
+def test_data_sets_with_positions_in_their_names_are_evaluated(data, tmp_path, paper):
     for side, east in (("database", 0), ("queries", 3)):
         folder = tmp_path / "data" / "my-town" / "images" / "test" / side
         folder.mkdir(parents=True)
         for row, image in enumerate(sorted((data / "grief_season" / side).iterdir())):
             shutil.copy(image, folder / f"@{500000 + 100 * row + east}@4600000@{row}@.png")
     shutil.copytree(tmp_path / "data/my-town", tmp_path / "data/my town")
-    arguments = [f"data={tmp_path}/data", f"out={tmp_path}/out", f"store={tmp_path}/store", "systems=[sift_hist_10]"]
-    code, stdout, stderr = typed(monkeypatch, capsys, "paper", *arguments, "datasets=[my-town,my town]")
+    chosen = "systems=[sift_hist_10]", "datasets=[my-town,my town]"
+    code, stdout, stderr = paper(tmp_path / "out", *chosen, data=tmp_path / "data")
     assert code == 0
     assert "left out: my town: " in stderr
     assert "my-town ±25" in stdout
@@ -188,70 +187,61 @@ def test_data_sets_whose_names_tell_positions_are_found(data, tmp_path, monkeypa
     assert '<a href="runs/my-town/sift_10/report.html">' in (tmp_path / "out/report.html").read_text()
 
 
-def test_what_is_finished_is_not_done_again(finished, data, monkeypatch, capsys):
+def test_finished_runs_are_not_repeated(finished, paper):
     out, _ = finished
-    before, folder = files(out), out / "runs/grief_season/sift_10"
-    made = (folder / "results.json").stat().st_mtime_ns
-    code, stdout, stderr = typed(monkeypatch, capsys, "paper", *arguments(data, out))
+    before, path = files(out), out / RUN / "results.json"
+    time_of_change = path.stat().st_mtime_ns
+    code, stdout, stderr = paper(out)
     assert code == 0
     assert "SIFT-hist 10" in stdout
     assert "sift_10 on grief_season" not in stderr
-    assert (folder / "results.json").stat().st_mtime_ns == made
+    assert path.stat().st_mtime_ns == time_of_change
     assert files(out) == before
 
 
-def test_other_images_in_the_same_folder_are_no_finished_run(finished, data, tmp_path, monkeypatch, capsys):
-    out, _ = finished
-    other = tmp_path / "data"
-    shutil.copytree(data, other)
-    image = other / "grief_season/queries/0003.png"
-    image.write_bytes((other / "grief_season/queries/0004.png").read_bytes())
-    code, _, stderr = typed(monkeypatch, capsys, "paper", *arguments(other, out))
+def test_runs_of_other_inputs_in_the_same_folder_are_errors(copy, data, tmp_path, paper):
+    other = shutil.copytree(data, tmp_path / "data")
+    queries = other / "grief_season/queries"
+    shutil.copyfile(queries / "0004.png", queries / "0003.png")
+    code, _, stderr = paper(copy, data=other)
     assert code == 2
     assert "sift_10: a finished run of other images" in stderr
-    made = out / "runs/grief_season/sift_10/made_of.json"
-    kept = made.read_text()
-    for content in (json.dumps(json.loads(kept) | {"weights": "x"}), "[]", "{"):
-        made.write_text(content)
-        code, _, stderr = typed(monkeypatch, capsys, "paper", *arguments(data, out))
+    path = copy / RUN / "made_of.json"
+    for content in (json.dumps(json.loads(path.read_text()) | {"weights": "x"}), "[]", "{"):
+        path.write_text(content)
+        code, _, stderr = paper(copy)
         assert code == 2
         assert "a finished run of other" in stderr
-    made.write_text(kept)
 
 
-@pytest.mark.parametrize(("changed", "words"), [
-    (["systems=[best]"], "systems=[best]: expected some of"),
-    (["datasets=[x]"], "datasets=[x]: expected some of streets_seasons"),
-    (["data=/no/such"], "data=/no/such: expected a folder"),
-    (["systems=[mix_hist_10]"], "nothing to evaluate"),
-    (["datasets=[gardens_point]"], "nothing to evaluate"),
-    (["systems=sift_hist_10"], "systems=sift_hist_10: expected"),
-    (["sytems=[x]"], "the nearest is systems"),
+@pytest.mark.parametrize(("change", "words"), [
+    ("systems=[best]", "systems=[best]: expected some of"),
+    ("datasets=[x]", "datasets=[x]: expected some of streets_seasons"),
+    ("data=/no/such", "data=/no/such: expected a folder"),
+    ("systems=[mix_hist_10]", "nothing to evaluate"),
+    ("datasets=[gardens_point]", "nothing to evaluate"),
+    ("systems=sift_hist_10", "systems=sift_hist_10: expected"),
+    ("sytems=[x]", "the nearest is systems"),
 ])  # fmt: skip
-def test_mistakes_are_one_line(data, tmp_path, monkeypatch, capsys, changed, words):
-    names = {one.partition("=")[0] for one in changed}
-    kept = [one for one in arguments(data, tmp_path / "out") if one.partition("=")[0] not in names]
-    code, _, stderr = typed(monkeypatch, capsys, "paper", *kept, *changed)
+def test_mistakes_are_one_line(tmp_path, paper, change, words):
+    code, _, stderr = paper(tmp_path / "out", change)
     assert code == 2
     [line] = [line for line in stderr.splitlines() if line.startswith("error: ")]
     assert words in line
     assert not (tmp_path / "out").exists()
 
 
-def test_a_data_set_of_another_layout_is_left_out(data, tmp_path, monkeypatch, capsys):
-    both = tmp_path / "data"
-    shutil.copytree(data, both)
+def test_a_data_set_of_another_layout_is_left_out(data, tmp_path, paper):
+    both = shutil.copytree(data, tmp_path / "data")
     (both / "gardens_point").mkdir()
-    code, stdout, stderr = typed(monkeypatch, capsys, "paper", *arguments(both, tmp_path / "out"))
+    code, stdout, stderr = paper(tmp_path / "out", data=both)
     assert code == 2
     assert "left out: gardens_point: " in stderr
     assert "could not be made: gardens_point" in stderr
     assert "SIFT-hist 10" in stdout
 
 
-@pytest.mark.slow
 def test_killed_five_times_it_ends_with_the_same_bytes(finished, data, tmp_path):
-    whole, _ = finished
     out, chance = tmp_path / "paper" / "out", random.Random(0)
     command = [sys.executable, "-m", "experiments.paper", *arguments(data, out)]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
@@ -264,5 +254,5 @@ def test_killed_five_times_it_ends_with_the_same_bytes(finished, data, tmp_path)
         os.killpg(running.pid, signal.SIGKILL)
         running.wait()
     assert run_program(*arguments(data, out), program="paper").returncode == 0
-    assert files(out) == files(whole)
-    assert not [path for path in Path(out).rglob("*") if path.name.startswith(".")]
+    assert files(out) == files(finished[0])
+    assert not [path for path in out.rglob("*") if path.name.startswith(".")]
