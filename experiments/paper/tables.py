@@ -192,8 +192,8 @@ def _recalls(evaluations: Evaluations, parts: Sequence[tuple[str, str, str]]) ->
             result = evaluations.results.get((row.name, name))
             ours = None if result is None else result.recall.get(sequence, {}).get(threshold, {}).get(1)
             theirs = printed_recall(row.name, name, sequence or None)
-            is_printed = theirs and threshold in TOLERANCES
-            cells.append(beside(ours, theirs[TOLERANCES.index(int(threshold))] if is_printed else None))
+            known = theirs[TOLERANCES.index(int(threshold))] if theirs and threshold in TOLERANCES else None
+            cells.append(beside(ours, known))
         rows.append([row.title, *cells])
     return Table(["system", *(f"{words} ±{threshold:g}" for words, *_, threshold in columns)], rows)
 

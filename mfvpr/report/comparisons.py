@@ -135,22 +135,13 @@ def _weights_figure(path: Path, comparison: Comparison, weights: Mapping[str, Le
     shown = queries[np.linspace(0, len(queries) - 1, min(SHOWN_QUERIES, len(queries))).astype(int)]
     positives = judge.positives[judge.main].take(shown).contains(comparison.candidates.indices[shown])
     first = next(iter(weights.values()))
-    inputs, right = [], []
-    values: dict[str, list[np.ndarray]] = {name: [] for name in weights}
-    for query, is_positive in zip(shown, positives, strict=True):
-        matches = comparison.match_set[query]
-        real = matches.mask
-        inputs.append(np.asarray(_raw(first, matches))[real])
-        right.append(np.broadcast_to(is_positive[:, None], real.shape)[real])
-        for name, weight in weights.items():
-            values[name].append(np.asarray(_weigh(weight, matches))[real])
-    by_training = {name: np.concatenate(parts) for name, parts in values.items()}
-    weights_figure(path, first.names, np.concatenate(inputs), by_training, np.concatenate(right))
+    pairs = [(comparison.match_set[query], right) for query, right in zip(shown, positives, strict=True)]
+    inputs = np.concatenate([np.asarray(_raw(first, matches))[matches.mask] for matches, _ in pairs])
+    right = np.concatenate([np.repeat(right, matches.mask.sum(axis=1)) for matches, right in pairs])
+    by_training = {name: np.concatenate([np.asarray(_weigh(weight, matches))[matches.mask] for matches, _ in pairs])
+                   for name, weight in weights.items()}  # fmt: skip
+    weights_figure(path, first.names, inputs, by_training, right)
 
 
 _weigh = compiled(jax.vmap(lambda weight, matches: weight(matches), in_axes=(None, 0)))
-_raw = compiled(
-    jax.vmap(
-        lambda weight, matches: weight.center[None] + weight.scale[None] * weight.inputs(matches), in_axes=(None, 0)
-    )
-)
+_raw = compiled(jax.vmap(lambda weight, matches: weight.center + weight.scale * weight.inputs(matches), (None, 0)))
