@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from jaxtyping import Float
 
 BERLIN = ("berlin_a100", "berlin_kudamm", "berlin_halenseestrasse")
 OTHERS = ("gardens_point", "nordland_1415", "robotcar_seasons")
@@ -18,10 +19,10 @@ def printed_tables() -> Mapping[str, Any]:
     return yaml.safe_load((Path(__file__).parent / "printed.yaml").read_text(encoding="utf-8"))
 
 
-def average(recalls: Mapping[str, Sequence[float]]) -> np.ndarray | None:
-    """The paper's average recall `[tolerances]`: Berlin's three count as one data set; None if one of six is missing.
+def average(recalls: Mapping[str, Sequence[float]]) -> Float[np.ndarray, " tolerances"] | None:
+    """The paper's average recall: Berlin's three count as one data set; None if one of six is missing.
 
-    `recalls` are `[tolerances]` by data set.
+    `recalls` are by data set and tolerance.
     """
     if not {*BERLIN, *OTHERS} <= recalls.keys():
         return None

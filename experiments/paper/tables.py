@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from experiments.paper.printed import BERLIN, OTHERS, average, printed_recall, printed_settings, printed_tables
 from experiments.paper.systems import Row
@@ -73,8 +74,8 @@ class Evaluations:
         return name + INCOMPLETE * (next(differences(self.datasets[name]), None) is not None)
 
     @cached_property
-    def means(self) -> tuple[list[str], dict[str, np.ndarray]]:
-        """Data sets, and by row the mean recall `[tolerances]` over them.
+    def means(self) -> tuple[list[str], dict[str, Float[np.ndarray, " tolerances"]]]:
+        """Data sets, and by row the mean recall over them.
 
         They are the paper's six, averaged as in the paper, if all six are here; else all with the paper's tolerances.
         Rows that lack one have no mean.

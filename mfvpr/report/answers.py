@@ -4,6 +4,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import UInt8
 
 from mfvpr.datasets.images import read_image, resize
 from mfvpr.evaluation.stages import explain
@@ -19,11 +20,17 @@ _NAME_LENGTH = 80  # characters of a name or a place
 
 
 def answer_figure(
-    path: Path, known: Map, name: str, image: np.ndarray, localization: Asked, *, root: Path | None = None
+    path: Path,
+    known: Map,
+    name: str,
+    image: UInt8[np.ndarray, "height width 3"],
+    localization: Asked,
+    *,
+    root: Path | None = None,
 ) -> None:
     """Write the figure of one answer: the image beside the best candidate, their matches, the histogram of shifts.
 
-    `image` is `[H, W, 3]` uint8 RGB. `root` is the folder of the map's images, by their names; an image that cannot be
+    `image` is RGB. `root` is the folder of the map's images, by their names; an image that cannot be
     read is drawn gray, as are all without a folder.
 
     Raises:

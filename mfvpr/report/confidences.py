@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from mfvpr.evaluation.calibration import Confidence, confidence_inputs, fit_confidence, write_confidences
 from mfvpr.evaluation.precision import (
@@ -45,8 +46,8 @@ class CalibratedPredictions:
     threshold: float | None = None
 
     @cached_property
-    def probabilities(self) -> dict[str, np.ndarray]:
-        """p(right) `[Q]` by system, NaN without a prediction, or without anything to fit on."""
+    def probabilities(self) -> dict[str, Float[np.ndarray, " queries"]]:
+        """p(right) by system, NaN without a prediction, or without anything to fit on."""
         systems = self.judged.result.systems
         if self.confidences is not None:
             return {name: confidence.probability(self._inputs(name, confidence))
@@ -60,29 +61,29 @@ class CalibratedPredictions:
         return {name: fit_confidence(values, self.right(name)) for name, values in inputs.items()
                 if np.isfinite(values).all(axis=1).any()}  # fmt: skip
 
-    def right(self, system: str) -> np.ndarray:
-        """`[Q]` bool, whether the first prediction is correct, with ground truth."""
+    def right(self, system: str) -> Bool[np.ndarray, " queries"]:
+        """Whether the first prediction is correct, with ground truth."""
         return self.judged.hits(system)
 
-    def scores(self, system: str) -> np.ndarray:
-        """`[Q]` of the first predictions, NaN without one."""
+    def scores(self, system: str) -> Float[np.ndarray, " queries"]:
+        """Scores of the first predictions, NaN without one."""
         parts = self.judged.result.systems[system]
         return np.concatenate([np.where(ranked.rows[:, 0] >= 0, ranked.scores[:, 0], np.nan) for ranked in parts])
 
     @cached_property
-    def has_answer(self) -> np.ndarray:
-        """`[Q]` bool, whether the database shows the query's place, with ground truth."""
+    def has_answer(self) -> Bool[np.ndarray, " queries"]:
+        """Whether the database shows the query's place, with ground truth."""
         return np.concatenate([right.counts > 0 for right in self.judged.right if right is not None])
 
-    def refusals(self, system: str) -> np.ndarray:
-        """`[Q]` bool, whether the prediction is `NO_PLACE`."""
+    def refusals(self, system: str) -> Bool[np.ndarray, " queries"]:
+        """Whether the prediction is `NO_PLACE`."""
         if self.threshold is None:
             return np.zeros(len(self.scores(system)), bool)
         return ~(self.probabilities[system] >= self.threshold)
 
     @property
-    def refused_of_headline(self) -> list[np.ndarray]:
-        """`[Q]` bool of each sequence, by the system that decides."""
+    def refused_of_headline(self) -> list[Bool[np.ndarray, " _"]]:
+        """Refusals of each sequence, by the system that decides."""
         return self.judged.by_sequence(self.refusals(self.judged.headline))
 
     def curves(self, system: str) -> dict[str, PrecisionRecall]:
@@ -162,8 +163,8 @@ def _recalls_by_share(assured: CalibratedPredictions) -> dict[str, np.ndarray]:
     return {name: recall_by_share(assured, name) for name in systems if name != FILTER}
 
 
-def recall_by_share(assured: CalibratedPredictions, system: str) -> np.ndarray:
-    """`[SHARES]` recall at 1 of a system that re-ranks the queries with the lowest p of the filter."""
+def recall_by_share(assured: CalibratedPredictions, system: str) -> Float[np.ndarray, " shares"]:
+    """By `SHARES`, recall at 1 of a system that re-ranks the queries with the lowest p of the filter."""
     filtered, right = assured.right(FILTER), assured.right(system)
     unsure = np.argsort(np.nan_to_num(assured.probabilities[FILTER], nan=-1.0), kind="stable")
     gains = np.concatenate([[0], np.cumsum(right[unsure].astype(int) - filtered[unsure])])

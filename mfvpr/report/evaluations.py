@@ -7,6 +7,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from jaxtyping import Bool, Float, Shaped
 
 from mfvpr.datasets.datasets import MEANS, ImageFolder, QuerySequence
 from mfvpr.datasets.images import resize
@@ -60,8 +61,8 @@ class EvaluationReport:
         """Recall by system."""
         return self.result.recall(self.thresholds, self.ks)
 
-    def parts(self, system: str) -> Iterator[tuple[str, np.ndarray]]:
-        """(sequence, recall `[thresholds, ks]`), and behind several sequences their means."""
+    def parts(self, system: str) -> Iterator[tuple[str, Float[np.ndarray, "tolerances ks"]]]:
+        """(sequence, recall), and behind several sequences their means."""
         recall = self.recall[system]
         yield from zip((sequence.name for sequence in self.sequences), recall.by_sequence, strict=True)
         if len(self.sequences) > 1:
@@ -72,17 +73,17 @@ class EvaluationReport:
         """Positives of each sequence, within `threshold`."""
         return self.result.positives(self.threshold) if self.thresholds else [None] * len(self.sequences)
 
-    def is_right(self, system: str, place: int) -> np.ndarray | None:
-        """`[Q, C]` bool in the order of a system's ranking of the sequence at a place."""
+    def is_right(self, system: str, place: int) -> Bool[np.ndarray, "queries candidates"] | None:
+        """Whether candidates are correct, in the order of a system's ranking of the sequence at a place."""
         right = self.right[place]
         return None if right is None else right.contains(self.result.systems[system][place].rows)
 
-    def hits(self, system: str) -> np.ndarray:
-        """`[Q]` bool of all sequences, whether the first prediction is correct, with ground truth."""
+    def hits(self, system: str) -> Bool[np.ndarray, " queries"]:
+        """Whether the first prediction is correct, for the queries of all sequences, with ground truth."""
         places = range(len(self.sequences))
         return np.concatenate([np.asarray(self.is_right(system, place), bool)[:, 0] for place in places])
 
-    def by_sequence(self, values: np.ndarray) -> list[np.ndarray]:
+    def by_sequence(self, values: Shaped[np.ndarray, " _"]) -> list[Shaped[np.ndarray, " _"]]:
         """Split values of the queries of all sequences into those of each sequence."""
         return np.split(values, np.cumsum([len(sequence.images) for sequence in self.sequences])[:-1])
 
@@ -111,10 +112,12 @@ def recall_table(judged: EvaluationReport) -> Table:
     return Table(["system", *(["sequence"] if several else []), *labels], lines, text_columns=1 + several)
 
 
-def write_rankings(folder: Path, judged: EvaluationReport, refused: Sequence[np.ndarray] | None = None) -> None:
+def write_rankings(
+    folder: Path, judged: EvaluationReport, refused: Sequence[Bool[np.ndarray, " _"]] | None = None
+) -> None:
     """Write `predictions/` and `failures/` of every system, those of the headline's into the folder itself.
 
-    `refused` is `[Q]` bool of each sequence, refused in the headline's predictions; None = no query is refused.
+    `refused` are queries of each sequence that the headline's predictions refuse; None = no query is refused.
     """
     database, files = judged.result.dataset.database.names, file_names([*judged.result.systems])
     for place, sequence in enumerate(judged.sequences):
@@ -146,13 +149,13 @@ def query_figures(
     judged: EvaluationReport,
     extractor: Extractor | Source,
     shown: int | Sequence[int],
-    refused: Sequence[np.ndarray],
+    refused: Sequence[Bool[np.ndarray, " _"]],
     histogram: HistogramOfShifts | None = None,
 ) -> list[Figure]:
     """The paper's figure for a few queries, correct and incorrect ones, spread over each sequence.
 
-    The extractor resizes the images. `shown` is a number of queries, or their rows. `refused` is `[Q]` bool of each
-    sequence, queries whose confidence is below the threshold. `histogram` = None is the paper's.
+    The extractor resizes the images. `shown` is a number of queries, or their rows. `refused` are queries of each
+    sequence whose confidence is below the threshold. `histogram` = None is the paper's.
     """
     several, folders = len(judged.sequences) > 1, file_names([sequence.name for sequence in judged.sequences])
     figures: list[Figure] = []
@@ -174,7 +177,7 @@ class SequenceFigures:
     place: int
     extractor: Extractor | Source
     histogram: HistogramOfShifts
-    refused: np.ndarray
+    refused: Bool[np.ndarray, " queries"]
 
     @property
     def _sequence(self) -> QuerySequence:

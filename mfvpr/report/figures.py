@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Shaped, UInt8
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.image import AxesImage
@@ -24,13 +25,13 @@ _TITLE_LENGTH, _CAPTION_LENGTH = 140, 100  # characters that fit
 
 @dataclass(frozen=True)
 class Candidate:
-    """A database image beside the query, `[H, W, 3]` uint8 at the size that the points refer to, and its caption.
+    """A database image beside the query, at the size that the points refer to, and its caption.
 
     `matches` are of this pair, `[K, ...]`, NumPy; `explanation` is of the matches, see
     `mfvpr.evaluation.stages.explain`. Both are None where the image was not matched.
     """
 
-    image: np.ndarray
+    image: UInt8[np.ndarray, "height width 3"]
     caption: str
     matches: Matches | None = None
     explanation: Explanation | None = None
@@ -38,7 +39,7 @@ class Candidate:
 
 def histogram_figure(
     path: Path,
-    query_image: np.ndarray,
+    query_image: UInt8[np.ndarray, "height width 3"],
     candidates: Sequence[Candidate],
     *,
     title: str,
@@ -49,7 +50,7 @@ def histogram_figure(
 
     Args:
         path: PNG file to write.
-        query_image: `[H, W, 3]` uint8, at the size that the points refer to.
+        query_image: at the size that the points refer to.
         candidates: one below the other, their histograms in the same colors.
         title: above everything.
         pixel_aspect: height of a pixel by its width, so that images are drawn in the shape that they were taken in.
@@ -71,13 +72,13 @@ def histogram_figure(
     save_figure(figure, path, bbox_inches="tight", pad_inches=0.15, metadata=metadata)
 
 
-def with_longest_side(image: np.ndarray, side: int) -> np.ndarray:
+def with_longest_side(image: UInt8[np.ndarray, "_ _ 3"], side: int) -> UInt8[np.ndarray, "_ _ 3"]:
     """Resize an image so that its longer side has so many pixels."""
     scale = side / max(image.shape[:2])
     return resize(image, (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))))
 
 
-def pixel_aspect_of(original: np.ndarray, smaller: np.ndarray) -> float:
+def pixel_aspect_of(original: Shaped[np.ndarray, "_ _ 3"], smaller: Shaped[np.ndarray, "_ _ 3"]) -> float:
     """Height of a pixel of a resized image by its width, where pixels of the original are squares."""
     (height, width), (new_height, new_width) = original.shape[:2], smaller.shape[:2]
     return (height / new_height) / (width / new_width)

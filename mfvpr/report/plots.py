@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -71,8 +72,8 @@ def reliability_figure(path: Path, reliabilities: Mapping[str, Reliability]) -> 
     save_figure(figure, path, bbox_inches="tight")
 
 
-def shares_figure(path: Path, shares: Sequence[float], recall: Mapping[str, np.ndarray]) -> None:
-    """Draw recall at 1 (`[shares]` by system, without the filter) over the share of queries that are re-ranked."""
+def shares_figure(path: Path, shares: Sequence[float], recall: Mapping[str, Float[np.ndarray, " shares"]]) -> None:
+    """Draw recall at 1 (by system, without the filter) over the share of queries that are re-ranked."""
     figure, [panel] = panels(1, 5.0, 5.0)
     for place, (name, values) in enumerate(recall.items(), start=1):
         panel.plot(shares, values, label=_short(name), **_line(place))
@@ -99,7 +100,7 @@ def _label(panel: Axes, x: str, y: str) -> None:
 
 def heat_map_figure(
     path: Path,
-    recall: np.ndarray,
+    recall: Float[np.ndarray, "rows columns"],
     rows: tuple[str, Sequence[str]],
     columns: tuple[str, Sequence[str]],
     *,
@@ -107,7 +108,7 @@ def heat_map_figure(
     defaults: tuple[int, int] | None,
     title: str,
 ) -> None:
-    """Draw recall (`[R, C]` fractions) over two parameters of a sweep; `rows` and `columns` are name and values.
+    """Draw recall (fractions) over two parameters of a sweep; `rows` and `columns` are name and values.
 
     `best` is the row and column of the best setting, framed; `defaults` those of the scorer's own values, marked with a
     circle (None = the grid lacks them).
@@ -150,12 +151,16 @@ def curves_figure(path: Path, histories: Mapping[str, Sequence[tuple[int, float 
 
 
 def weights_figure(
-    path: Path, names: Sequence[str], inputs: np.ndarray, weights: Mapping[str, np.ndarray], right: np.ndarray
+    path: Path,
+    names: Sequence[str],
+    inputs: Float[np.ndarray, "matches inputs"],
+    weights: Mapping[str, Float[np.ndarray, " matches"]],
+    right: Bool[np.ndarray, " matches"],
 ) -> None:
-    """Draw the mean match weight over each of F inputs, and the share of matches that belong to a correct candidate.
+    """Draw the mean match weight over each input, and the share of matches that belong to a correct candidate.
 
-    `inputs` are `[n, F]` of real matches, in their own units; each bin holds as many matches. `weights` are `[n]` by
-    training. `right` is `[n]` bool, whether a match belongs to a correct candidate.
+    `inputs` are of real matches, in their own units; each bin holds as many matches. `weights` are by training. `right`
+    says whether a match belongs to a correct candidate.
     """
     figure, axes = panels(len(names), 3.2, 2.6)
     for panel, name, values in zip(axes, names, inputs.T, strict=True):

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from mfvpr.utils.files import replacing
 
@@ -20,18 +21,18 @@ class Rankings:
     Attributes:
         queries: names of Q images.
         database: names of N images.
-        rows: `[Q, C]` database rows, best first, -1 = none.
-        scores: `[Q, C]` in that order.
-        right: `[Q, C]` bool in that order; None = unknown.
-        refused: `[Q]` bool, answered `NO_PLACE`; None = none.
+        rows: of the database, best first, -1 = none.
+        scores: in that order.
+        right: in that order; None = unknown.
+        refused: queries with the prediction `NO_PLACE`; None = none.
     """
 
     queries: Sequence[str]
     database: Sequence[str]
-    rows: np.ndarray
-    scores: np.ndarray
-    right: np.ndarray | None
-    refused: np.ndarray | None = None
+    rows: Int[np.ndarray, "queries candidates"]
+    scores: Float[np.ndarray, "queries candidates"]
+    right: Bool[np.ndarray, "queries candidates"] | None
+    refused: Bool[np.ndarray, " queries"] | None = None
 
 
 def write_predictions(path: Path, rankings: Rankings) -> None:

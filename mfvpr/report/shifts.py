@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool
 
 from mfvpr.evaluation.stages import Scales, dominant_shifts
 from mfvpr.report.evaluations import EvaluationReport
@@ -14,13 +15,16 @@ HEADER = ("query", "answer", "shift_x", "shift_y", "low_x", "high_x", "low_y", "
 
 
 def write_shifts(
-    folder: Path, judged: EvaluationReport, scorer: HistogramOfShifts, refused: Sequence[np.ndarray] | None = None
+    folder: Path,
+    judged: EvaluationReport,
+    scorer: HistogramOfShifts,
+    refused: Sequence[Bool[np.ndarray, " _"]] | None = None,
 ) -> None:
     """Write `shifts.csv` of every sequence: shifts of the headline's first predictions, candidate minus query, px.
 
     A line has the refined dominant shift of the query's middle in the images that the detector saw, its 95 % interval,
     and how much larger the candidate shows it; empty if no match votes. Features of several scales have no file.
-    `refused` is `[Q]` bool of each sequence, queries without a line; None = no query is refused.
+    `refused` are queries of each sequence, which have no line; None = no query is refused.
     """
     names = judged.result.dataset.database.names
     sequences = zip(judged.result.matched, judged.result.systems[judged.headline], strict=True)

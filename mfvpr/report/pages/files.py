@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Int
 
 from mfvpr.datasets.datasets import MEANS
 from mfvpr.datasets.truth import Unit, middle, threshold_words
@@ -39,16 +40,16 @@ class Gains:
 
     Attributes:
         queries: names.
-        places: `[Q]` whole numbers along the map.
-        ranks: `[Q]` by system, 0 = no candidate is correct.
+        places: along the map.
+        ranks: by system, 0 = no candidate is correct.
     """
 
     queries: tuple[str, ...]
-    places: np.ndarray
-    ranks: Mapping[str, np.ndarray]
+    places: Int[np.ndarray, " queries"]
+    ranks: Mapping[str, Int[np.ndarray, " queries"]]
 
-    def hits(self, system: str, k: int = 1) -> np.ndarray:
-        """`[Q]` bool in the order of the path: whether one of the first k candidates is correct."""
+    def hits(self, system: str, k: int = 1) -> Bool[np.ndarray, " queries"]:
+        """In the order of the path, whether one of the first k candidates is correct."""
         ranks = self.ranks[system]
         return ((ranks > 0) & (ranks <= k))[np.argsort(self.places, kind="stable")]
 
