@@ -73,7 +73,7 @@ class CalibratedPredictions:
     @cached_property
     def has_answer(self) -> Bool[np.ndarray, " queries"]:
         """Whether the database shows the query's place, with ground truth."""
-        return np.concatenate([right.counts > 0 for right in self.judged.right if right is not None])
+        return np.concatenate([positives.counts > 0 for positives in self.judged.positives if positives is not None])
 
     def refusals(self, system: str) -> Bool[np.ndarray, " queries"]:
         """Whether the prediction is `NO_PLACE`."""
@@ -164,7 +164,7 @@ def _recalls_by_share(assured: CalibratedPredictions) -> dict[str, np.ndarray]:
 
 
 def recall_by_share(assured: CalibratedPredictions, system: str) -> Float[np.ndarray, " shares"]:
-    """By `SHARES`, recall at 1 of a system that re-ranks the queries with the lowest p of the filter."""
+    """Recall at 1, by `SHARES`, of a system that re-ranks the queries with the lowest p of the filter."""
     filtered, right = assured.right(FILTER), assured.right(system)
     unsure = np.argsort(np.nan_to_num(assured.probabilities[FILTER], nan=-1.0), kind="stable")
     gains = np.concatenate([[0], np.cumsum(right[unsure].astype(int) - filtered[unsure])])
@@ -201,7 +201,7 @@ def _write_answers(folder: Path, assured: CalibratedPredictions) -> None:
     database = judged.result.dataset.database.names
     refused, probabilities = assured.refused_of_headline, judged.by_sequence(assured.probabilities[name])
     for place, ranked in enumerate(judged.result.systems[name]):
-        is_right, truth = judged.is_right(name, place), judged.right[place]
+        is_right, positives = judged.is_right(name, place), judged.positives[place]
         lines = []
         for query, image in enumerate(judged.sequences[place].images.names):
             row, unsure = ranked.rows[query, 0], refused[place][query]
@@ -209,7 +209,7 @@ def _write_answers(folder: Path, assured: CalibratedPredictions) -> None:
             values = (ranked.scores[query, 0], probabilities[place][query])
             numbers = ["" if np.isnan(value) else number(value) for value in values]
             right = "" if is_right is None else int(is_right[query, 0])
-            in_database = "" if truth is None else int(truth.counts[query] > 0)
+            in_database = "" if positives is None else int(positives.counts[query] > 0)
             lines.append([image, NO_PLACE if reason else database[row], *numbers, right, reason or "", in_database])
         header = ["query", "answer", "score", "p", "right", "reason", "in_database"]
         write_csv(judged.folder(folder, place) / "answers.csv", header, lines)

@@ -39,10 +39,10 @@ def differences(judged: EvaluationReport) -> list[Difference]:
 
 def _places(judged: EvaluationReport) -> np.ndarray | None:
     """`[Q]` places of all queries along the map; None for one sequence in the order of its path."""
-    truth, right = judged.sequences[0].truth, [positives for positives in judged.right if positives is not None]
+    truth, known = judged.sequences[0].truth, [positives for positives in judged.positives if positives is not None]
     if truth is None or (len(judged.sequences) == 1 and truth.unit != "m"):
         return None
-    return places_along_path(stack_positives(right), truth.unit)
+    return places_along_path(stack_positives(known), truth.unit)
 
 
 def _table(names: Sequence[str], tests: Sequence[Difference]) -> Table:

@@ -69,14 +69,14 @@ class EvaluationReport:
             yield from zip(MEANS, (recall.mean, recall.pooled), strict=True)
 
     @cached_property
-    def right(self) -> Sequence[Positives | None]:
+    def positives(self) -> Sequence[Positives | None]:
         """Positives of each sequence, within `threshold`."""
         return self.result.positives(self.threshold) if self.thresholds else [None] * len(self.sequences)
 
     def is_right(self, system: str, place: int) -> Bool[np.ndarray, "queries candidates"] | None:
         """Whether candidates are correct, in the order of a system's ranking of the sequence at a place."""
-        right = self.right[place]
-        return None if right is None else right.contains(self.result.systems[system][place].rows)
+        positives = self.positives[place]
+        return None if positives is None else positives.contains(self.result.systems[system][place].rows)
 
     def hits(self, system: str) -> Bool[np.ndarray, " queries"]:
         """Whether the first prediction is correct, for the queries of all sequences, with ground truth."""
@@ -238,13 +238,13 @@ class SequenceFigures:
 
     def correct_candidates(self, query: int) -> list[Candidate]:
         """The first correct candidate, or the correct image that retrieval missed; empty if there is none."""
-        ranked = self.judged.is_right(self.judged.headline, self.place)
-        right, truth = self.judged.right[self.place], self._sequence.truth
-        if ranked is None or right is None or truth is None or not right.counts[query]:
+        right = self.judged.is_right(self.judged.headline, self.place)
+        positives, truth = self.judged.positives[self.place], self._sequence.truth
+        if right is None or positives is None or truth is None or not positives.counts[query]:
             return []
-        if ranked[query].any():
-            return [self._candidate(query, int(np.argmax(ranked[query])), "right")]
-        nearest, rows = truth.place(query), right.of(query)
+        if right[query].any():
+            return [self._candidate(query, int(np.argmax(right[query])), "right")]
+        nearest, rows = truth.place(query), positives.of(query)
         row = nearest if nearest is not None and nearest in rows else int(rows[0])
         num_candidates = self._matched.candidates.indices.shape[1]
         caption = f"right: {_short(self._database.names[row])}, not among the {num_candidates} candidates"

@@ -124,8 +124,8 @@ def heat_maps(outcome: Outcome) -> list[Figure]:
     recall = outcome.recall[: axes.size, judge.main].reshape(*map(len, values.values()))
     flat_best = evaluation.best_setting(recall.reshape(-1), axes.values)
     best = dict(zip(values, map(int, np.unravel_index(flat_best, recall.shape)), strict=True))
-    own = {name: format_value(value) for name, value in axes.own.items()}
-    defaults = {name: values[name].index(value) if value in values[name] else None for name, value in own.items()}
+    defaults = {name: values[name].index(format_value(value)) if format_value(value) in values[name] else None
+                for name, value in axes.own.items()}  # fmt: skip
     files = file_names([first if first == second else f"{first} + {second}" for first, second in pairs])
     figures: list[Figure] = []
     for (first, second), file in zip(pairs[:MAX_HEAT_MAPS], files.values(), strict=False):

@@ -209,7 +209,7 @@ def test_what_does_not_count_is_never_shown_as_right(outcome):
         page = page_of(outcome, truth=AllowedTruth(truth, Positives.from_matrix(excluded)))
         return [answer.caption for answer in page.correct_candidates(query)]
 
-    other = int(np.argmax(outcome.judged.right[0].dense()[query] & ~excluded[query]))
+    other = int(np.argmax(outcome.judged.positives[0].dense()[query] & ~excluded[query]))
     assert answers(excluded) == [f"right: {names[other]}, not among the 3 candidates"]
     assert answers(np.ones_like(excluded)) == []
 
