@@ -28,17 +28,22 @@ class Parser(argparse.ArgumentParser):
         refuse(f"{message}; see {self.prog} --help")
 
 
-def run_command(prog: str, description: str, add_arguments: Callable[[Parser], None]) -> None:
-    """Parse the command line, and call the parser's default `run` with all arguments."""
-    from experiments.launch import version
+def version() -> str:
+    """Versions of mfvpr, JAX and Python in one line."""
+    from importlib.metadata import version
 
+    return f"mfvpr {version('mfvpr')} (jax {version('jax')}, Python {sys.version.split()[0]})"
+
+
+def run_command(prog: str, description: str, add_arguments: Callable[[Parser], None]) -> None:
+    """Parse the command line, import the parser's default `run`, and call it with all arguments."""
     unwind_on_sigterm()
     with one_line():
         parser = Parser(prog=prog, description=description)
         parser.add_argument("--version", action="version", version=version(), help="print it and exit")
         add_arguments(parser)
         arguments = vars(parser.parse_args())
-        arguments.pop("run")(**arguments)
+        arguments.pop("run")()(**arguments)
 
 
 @contextmanager

@@ -10,8 +10,9 @@ import signal
 import sys
 import threading
 import warnings
+from collections.abc import Callable
 
-from experiments.errors import leave, on_interrupt, one_line, unwind_on_sigterm
+from experiments.errors import leave, on_interrupt, one_line, unwind_on_sigterm, version
 from experiments.settings import Program
 
 
@@ -37,16 +38,9 @@ def launch(program: Program, config: str = "config") -> None:
             command_line.run(program, config)
 
 
-def program(module: str, job: str) -> Program:
+def program(module: str, job: str) -> Callable[[], Callable[..., None]]:
     """A function that imports a job, so that --help and a wrong setting need not wait for JAX."""
     return lambda: getattr(importlib.import_module(f"experiments.{module}"), job)
-
-
-def version() -> str:
-    """Versions of mfvpr, JAX and Python in one line."""
-    from importlib.metadata import version
-
-    return f"mfvpr {version('mfvpr')} (jax {version('jax')}, Python {sys.version.split()[0]})"
 
 
 def keep_interrupt(lost: "sys.UnraisableHookArgs") -> None:

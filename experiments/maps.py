@@ -11,7 +11,8 @@ from experiments.settings import SettingsError, check
 from experiments.stages import dataset_of
 from mfvpr.features import Aggregated
 from mfvpr.localization import Map
-from mfvpr.utils.files import written_once
+from mfvpr.storage.disk import used_bytes
+from mfvpr.utils.files import printable, written_once
 
 SETTINGS = "settings.json"
 _FORMAT = "mfvpr map 1"
@@ -23,6 +24,21 @@ def build_map(settings: Mapping[str, Any]) -> None:
     robot_map = map_of_settings(settings)
     added = robot_map.build(dataset_of(settings["dataset"]).database, track=track("images"))
     print(f"{robot_map.folder}: {len(robot_map)} images, {added} of them new")
+
+
+def print_map(folder: Path) -> None:
+    """Print the number of images, the size on disk and the settings of a map."""
+    settings, robot_map = read(folder), open_map(folder)
+    print(f"{folder}: {len(robot_map)} images, {used_bytes(folder) / 1e6:.1f} MB")
+    print(json.dumps(settings, indent=1, ensure_ascii=False))
+
+
+def add_images(folder: Path, images: list[Path], place: str | None) -> None:
+    """Add image files to a map, one by one."""
+    robot_map = open_map(folder)
+    for path in images:
+        robot_map.add(path, path.name if place is None else place)
+        print(printable(f"{path}: added, {len(robot_map)} images"), flush=True)
 
 
 def map_of_settings(settings: Mapping[str, Any]) -> Map:

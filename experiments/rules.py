@@ -4,17 +4,22 @@ import re
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+_NUMBERS = {
+    (1e-6, 1e12): "a number above 0 (1e-6 to 1e12)",
+    (1e-6, 2): "a number above 0 and at most 2",
+    (0, 1e12): "a number not below 0 (at most 1e12)",
+}
+_WHOLE_NUMBERS = {
+    (1, 10**6): "a whole number above 0 (at most 1000000)",
+    (0, 10**6): "a whole number not below 0 (at most 1000000)",
+}
+
 
 class Rule(NamedTuple):
     """A test of a setting's value, and what it expects in words."""
 
     holds: Callable[[Any], bool]
     expected: str
-
-
-def is_count(value: Any) -> bool:
-    """Whether a value is an integer, and no flag."""
-    return isinstance(value, int) and not isinstance(value, bool)
 
 
 def pattern(regex: str, expected: str) -> Rule:
@@ -32,11 +37,20 @@ def one_of(*choices: Any) -> Rule:
     )
 
 
-def either(rule: Rule, *choices: Any) -> Rule:
-    """A value that a rule allows, or one of some choices."""
-    other = one_of(*choices)
-    words = other.expected.removeprefix("one of ")
-    return Rule(lambda value: rule.holds(value) or other.holds(value), f"{rule.expected}, or {words}")
+def number(low: float, high: float) -> Rule:
+    """A number in a range, its ends included."""
+    return Rule(
+        lambda value: type(value) in (int, float) and low <= value <= high,
+        _NUMBERS.get((low, high), f"a number from {low:g} to {high:g}"),
+    )
+
+
+def whole(low: int, high: int) -> Rule:
+    """An integer in a range, its ends included."""
+    return Rule(
+        lambda value: type(value) is int and low <= value <= high,
+        _WHOLE_NUMBERS.get((low, high), f"a whole number from {low} to {high}"),
+    )
 
 
 def list_of(rule: Rule, length: int = 0) -> Rule:
@@ -49,40 +63,17 @@ def list_of(rule: Rule, length: int = 0) -> Rule:
     return Rule(holds, f"a list of {length or 'one or more'}, each {rule.expected}")
 
 
-def number(low: float, high: float) -> Rule:
-    """A number in a range, its ends included."""
-    words = {
-        (1e-6, 1e12): "a number above 0 (1e-6 to 1e12)",
-        (1e-6, 2): "a number above 0 and at most 2",
-        (0, 1e12): "a number not below 0 (at most 1e12)",
-    }.get((low, high), f"a number from {low:g} to {high:g}")
-    return Rule(
-        lambda value: isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high, words
-    )
+def any_of(expected: str, *rules: Rule) -> Rule:
+    """A value that one of several rules allows."""
+    return Rule(lambda value: any(rule.holds(value) for rule in rules), expected)
 
 
-def between(low: int, high: int) -> Rule:
-    """An integer in a range, its ends included."""
-    return Rule(lambda value: is_count(value) and low <= value <= high, f"a whole number from {low} to {high}")
+def either(rule: Rule, *choices: Any) -> Rule:
+    """A value that a rule allows, or one of some choices."""
+    other = one_of(*choices)
+    return any_of(f"{rule.expected}, or {other.expected.removeprefix('one of ')}", rule, other)
 
 
 def or_list(rule: Rule) -> Rule:
     """A value that a rule allows, or a list of such values."""
-    listed = list_of(rule)
-    return Rule(lambda value: rule.holds(value) or listed.holds(value), f"{rule.expected}, or a list of them")
-
-
-def or_file(rule: Rule, suffix: str) -> Rule:
-    """A value that a rule allows, or the path of a file with a suffix."""
-    return Rule(
-        lambda value: rule.holds(value) or (isinstance(value, str) and value.endswith(suffix)),
-        f"{rule.expected}, or a file that ends in {suffix}",
-    )
-
-
-def axis(rule: Rule) -> Rule:
-    """The values of one parameter in a grid, or null."""
-    listed = list_of(rule)
-    return Rule(
-        lambda value: value is None or listed.holds(value), f"{listed.expected}; null is the scorer's own value"
-    )
+    return any_of(f"{rule.expected}, or a list of them", rule, list_of(rule))

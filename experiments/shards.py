@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from experiments.errors import Parser, run_command
+from experiments.launch import program
 
 
 def main() -> None:
@@ -12,13 +13,13 @@ def main() -> None:
 
 def _add_commands(parser: Parser) -> None:
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    for name, run, words in (
-        ("status", status, "what each task of a run says of itself"),
-        ("missing", missing, "tasks that are to be started, as an array expression; nothing when all is done"),
+    for name, words in (
+        ("status", "what each task of a run says of itself"),
+        ("missing", "tasks that are to be started, as an array expression; nothing when all is done"),
     ):
         command = commands.add_parser(name, help=words)
         command.add_argument("folder", metavar="DIR", type=Path, help="out=DIR of the run")
-        command.set_defaults(run=run)
+        command.set_defaults(run=program("shards", name))
 
 
 def status(folder: Path) -> None:

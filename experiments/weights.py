@@ -1,19 +1,9 @@
 """Published weights: list them, download, convert, verify. `python -m experiments.weights --help`."""
 
-import shlex
-import sys
-from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from experiments.errors import WEIGHTS, Parser, how_to_install, refuse, run_command, with_command
-
-if TYPE_CHECKING:
-    from mfvpr.checkpoints.registry import Entry
-
-# Functions import what they need: --help and wrong usage need not wait for JAX.
-_CHUNK = 1 << 18  # bytes
-_LARGE = 200  # MiB, which take some seconds to convert
+from experiments.errors import WEIGHTS, Parser, run_command
+from experiments.launch import program
 
 
 def main() -> None:
@@ -25,156 +15,17 @@ def main() -> None:
 def _add_commands(parser: Parser) -> None:
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     command = commands.add_parser("list", help="all known weights, their licenses, and whether they are installed")
-    command.set_defaults(run=list_weights)
+    command.set_defaults(run=program("checkpoints", "list_weights"))
     command = commands.add_parser("convert", help="install an official checkpoint")
     command.add_argument("file", metavar="FILE", type=Path, help="a checkpoint under its official name")
     command.add_argument("--as", dest="name", metavar="NAME", help="what FILE is, where it has another name")
-    command.set_defaults(run=convert)
+    command.set_defaults(run=program("checkpoints", "convert"))
     command = commands.add_parser("verify", help="check what is installed, byte by byte")
     command.add_argument("names", metavar="NAME", nargs="*", help="by default all that are there")
-    command.set_defaults(run=verify)
+    command.set_defaults(run=program("checkpoints", "verify"))
     command = commands.add_parser("download", help="fetch an official checkpoint whose hash is published")
     command.add_argument("name", metavar="NAME")
-    command.set_defaults(run=download)
-
-
-def list_weights() -> None:
-    """Print all checkpoints with licenses and whether they are installed."""
-    from mfvpr.checkpoints import REGISTRY, is_installed
-    from mfvpr.report import Table
-
-    header = ["name", "network", "official file", "license of code", "of weights", "installed", "MB"]
-    rows = []
-    for entry in REGISTRY.values():
-        installed = "yes" if is_installed(entry) else "no"
-        size = f"{entry.size / 1e6:.1f}" if entry.size else "-"
-        licenses = (entry.code_license, entry.weights_license)
-        rows.append([entry.name, entry.network, entry.file, *licenses, installed, size])
-    print(Table(header, rows, text_columns=6).text(), end="")
-
-
-def convert(file: Path, name: str | None) -> None:
-    """Install an official checkpoint."""
-    from mfvpr.checkpoints import install
-    from mfvpr.checkpoints.files import read_manifest
-
-    entry = _entry_of(file, name)
-    if file.is_file() and (megabytes := file.stat().st_size >> 20) > _LARGE:
-        print(f"{file}: {megabytes:,} MiB to convert, some {max(1, megabytes // 50)} s", file=sys.stderr)
-    path = install(file, entry.name)
-    manifest = read_manifest(entry.name)
-    rounded = f", {manifest.rounded} of its tensors rounded from float64 to float32" if manifest.rounded else ""
-    print(f"{path}: {entry.name}, {manifest.parameters:,} parameters{rounded}")
-
-
-def verify(names: Iterable[str]) -> None:
-    """Check runtime files against their manifests, and downloaded checkpoints against the published hashes."""
-    from mfvpr.checkpoints import REGISTRY, entry_of, weights_folder
-    from mfvpr.utils import InputError
-
-    entries = [entry_of(name) for name in names]
-    entries = entries or [entry for entry in REGISTRY.values() if any(_present_files(entry))]
-    if not entries:
-        print(f"nothing is installed in {weights_folder()}")
-    bad = 0
-    for entry in entries:
-        try:
-            print(f"{entry.name}: {_verify(entry)}")
-        except InputError as error:
-            print(f"{entry.name}: BAD, {with_command(error).removeprefix(f'{entry.name}: ')}")
-            bad += 1
-    if bad:
-        refuse(f"{bad} of {len(entries)} could not be verified")
-
-
-def download(name: str) -> None:
-    """Download an official checkpoint into the weights folder, under its name only if its hash is the published one."""
-    from mfvpr.checkpoints import entry_of, weights_folder
-    from mfvpr.checkpoints.files import file_sha256
-
-    entry = entry_of(name)
-    if entry.sha256 is None:
-        refuse(f"{name}: no hash is published, so it cannot be fetched safely; get {entry.file} from {entry.source}, "
-               f"then: {how_to_install(entry)}")  # fmt: skip
-    target = weights_folder() / entry.file
-    size = f"{entry.size:,} bytes" if entry.size else "size not published"
-    print(f"{entry.file}: {entry.source}, {size}, {entry.license}", flush=True)
-    if target.is_file() and file_sha256(target) == entry.sha256:
-        print(f"{target}: is there already, with the published hash")
-    else:
-        _fetch(entry, target)
-        print(f"{target}: downloaded, with the published hash")
-    print(f"to install it: {WEIGHTS} convert {shlex.quote(str(target))}")
-
-
-def _fetch(entry: "Entry", target: Path) -> None:
-    from http.client import HTTPException
-    from urllib.request import urlopen
-
-    from tqdm import tqdm
-
-    from mfvpr.checkpoints.files import check_sha256, file_sha256
-    from mfvpr.utils.files import replacing
-
-    try:
-        with (
-            replacing(target) as temporary,
-            urlopen(entry.source, timeout=30) as response,
-            temporary.open("wb") as file,
-            tqdm(total=entry.size, unit="B", unit_scale=True, desc=entry.file) as bar,
-        ):
-            while chunk := response.read(_CHUNK):
-                bar.update(file.write(chunk))
-                if entry.size and bar.n > entry.size:
-                    break  # the hash will differ
-            file.flush()
-            check_sha256(file_sha256(temporary), entry, entry.source)
-    except (OSError, HTTPException) as error:
-        reason = getattr(error, "reason", None) or error
-        refuse(f"{entry.source}: could not be downloaded to {target.parent}: {reason}")
-
-
-def _entry_of(file: Path, name: str | None) -> "Entry":
-    from mfvpr.checkpoints import REGISTRY, entry_of
-
-    if name is not None:
-        return entry_of(name)
-    if known := [entry for entry in REGISTRY.values() if entry.file == file.name]:
-        return known[0]
-    if not file.exists():
-        refuse(f"{file}: no such file")
-    refuse(f"{file}: no official file name; say what it is with --as NAME, one of {', '.join(REGISTRY)}")
-
-
-def _present_files(entry: "Entry") -> tuple[bool, bool]:
-    """Whether the weights folder has the entry's checkpoint, if its hash is published, and its runtime file."""
-    from mfvpr.checkpoints import weights_folder
-
-    folder = weights_folder()
-    has_runtime_file = any((folder / f"{entry.name}{suffix}").exists() for suffix in (".safetensors", ".json"))
-    return entry.sha256 is not None and (folder / entry.file).exists(), has_runtime_file
-
-
-def _verify(entry: "Entry") -> str:
-    """Check the files of an entry and list the checks in words; raise an InputError if a check fails."""
-    from mfvpr.checkpoints import load_model, weights_folder
-    from mfvpr.checkpoints.files import check_published, read_manifest
-    from mfvpr.utils import InputError
-
-    has_checkpoint, has_runtime_file = _present_files(entry)
-    checks = []
-    if has_checkpoint:
-        check_published(weights_folder() / entry.file, entry)
-        checks.append(f"{entry.file} has the published hash")
-    if has_runtime_file or not has_checkpoint:
-        load_model(entry.name)
-        manifest = read_manifest(entry.name)
-        if manifest.parameters != entry.parameters:
-            raise InputError(f"expected {entry.parameters:,} parameters, got {manifest.parameters:,}")
-        checks.append(f"{manifest.parameters:,} parameters as converted")
-        if entry.sha256 is None:
-            checks.append(f"from a {entry.file} of sha256 {manifest.source_sha256[:12]}..., which nobody published")
-    return "good, " + ", ".join(checks)
+    command.set_defaults(run=program("checkpoints", "download"))
 
 
 if __name__ == "__main__":
