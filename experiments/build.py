@@ -8,6 +8,8 @@ from typing import Any
 
 from experiments import console
 from experiments.settings import SettingsError
+from mfvpr import features
+from mfvpr.checkpoints import REGISTRY, load_model
 from mfvpr.datasets import Dataset, folder_dataset, sequences_dataset
 from mfvpr.datasets.ground_truth import CHOICES
 from mfvpr.datasets.published import published_dataset
@@ -33,6 +35,19 @@ from mfvpr.scoring.weights import WEIGHTS
 from mfvpr.storage import FeatureCache, Shard
 from mfvpr.utils import recipe_of
 from mfvpr.utils.fingerprints import fingerprint
+
+# Classes of mfvpr.features, which imports each when it is used: Flax takes half a second.
+_NETWORK_EXTRACTORS = {
+    "features": {
+        "aliked": "AlikedFeatures",
+        "d2net": "D2NetFeatures",
+        "ssm": "SsmCells",
+        "patch_netvlad": "PatchNetVladFeatures",
+        "selavpr": "SelaVprFeatures",
+    },
+    "retrieval": {"mixvpr": "MixVprDescriptor", "ssm": "SsmWindows"}
+    | dict.fromkeys(["netvlad", "gem", "dinov2"], "GlobalDescriptor"),
+}
 
 
 def expand_user(path: str) -> Path:
@@ -81,27 +96,11 @@ def extractor(settings: dict[str, Any], data: Dataset | None) -> Extractor | Fea
     options["image_size"] = options["image_size"] and tuple(options["image_size"])
     if name == "import":
         return FeatureFiles(_files("features", options, data), options["lengths"], options["image_size"])
-    if name == "sift":
-        if (kind := options["interpolation"]).startswith("torch"):
-            raise SettingsError(f"features.interpolation={kind}: gives fractions, but SIFT takes whole numbers")
-        return Sift(**_only(options, Sift, "features=sift"))
-    # Here, since Flax takes half a second.
-    from mfvpr.features import AlikedFeatures, D2NetFeatures, PatchNetVladFeatures, SelaVprFeatures, SsmCells
-    from mfvpr.features.ssm import STAGE2_FITTING
-
-    classes = {
-        "aliked": AlikedFeatures,
-        "d2net": D2NetFeatures,
-        "ssm": SsmCells,
-        "patch_netvlad": PatchNetVladFeatures,
-        "selavpr": SelaVprFeatures,
-    }
-    weights = options.pop("weights", None)
-    if name == "ssm":
-        options["whitening"] = _pop_fitting(options, STAGE2_FITTING)
-    options = {option: tuple(value) if isinstance(value, list) else value for option, value in options.items()}
-    extractor_class = classes[name]
-    return extractor_class(_network("features", name, weights), **_only(options, extractor_class, f"features={name}"))
+    if name != "sift":
+        return _network_extractor("features", name, options)
+    if (kind := options["interpolation"]).startswith("torch"):
+        raise SettingsError(f"features.interpolation={kind}: gives fractions, but SIFT takes whole numbers")
+    return Sift(**_only(options, Sift, "features=sift"))
 
 
 def filter(settings: dict[str, Any], local: Extractor | FeatureFiles, data: Dataset | None) -> Filter:
@@ -110,65 +109,52 @@ def filter(settings: dict[str, Any], local: Extractor | FeatureFiles, data: Data
     if name == "pairs":
         return ShortlistFiles(_files("retrieval", {"database": None} | settings, data), settings["database_prefix"])
     if name == "ssm":
-        return _ssm_voting(options)
+        from mfvpr.retrieval import SsmVoting  # here, since Flax takes half a second
+
+        return SsmVoting(_network_extractor("retrieval", name, options))
     search = ExactSearch() if settings["whiten"] is None else WhitenedSearch(settings["whiten"])
-    if name == "same":
-        if isinstance(local, FeatureFiles) or not local.vector_size:
-            raise SettingsError("retrieval=same: expected features with a global descriptor, patch_netvlad or selavpr; "
-                                "choose another filter")  # fmt: skip
-        return Retrieval(local, search)
     if name == "import":
         return DescriptorFiles(_files("retrieval", options, data), options["lengths"], search)
     if name == "vlad":
-        return Retrieval(Aggregated(local, VladFitting(**options)), search)
-    if name in ("netvlad", "gem", "dinov2"):
-        return Retrieval(_global_descriptor(name, options), search)
-    from mfvpr.features import MixVprDescriptor
-    from mfvpr.features.mixvpr import IMAGE_SIZE
-
-    size = options.pop("image_size")
-    if tuple(size) != IMAGE_SIZE:
-        raise SettingsError(f"retrieval.image_size={size}: MixVPR takes {list(IMAGE_SIZE)} only, as its weights do")
-    return Retrieval(MixVprDescriptor(_network("retrieval", "mixvpr", options.pop("weights")), **options), search)
+        return Retrieval(Aggregated(local, VladFitting(**_only(options, VladFitting, "retrieval=vlad"))), search)
+    if name != "same":
+        return Retrieval(_network_extractor("retrieval", name, options), search)
+    if isinstance(local, FeatureFiles) or not local.vector_size:
+        raise SettingsError("retrieval=same: expected features with a global descriptor, patch_netvlad or selavpr; "
+                            "choose another filter")  # fmt: skip
+    return Retrieval(local, search)
 
 
-def _global_descriptor(name: str, options: dict[str, Any]) -> Extractor:
-    from mfvpr.features import GlobalDescriptor
-
+def _network_extractor(group: str, name: str, options: dict[str, Any]) -> Any:
+    """An extractor with a network; the options are fields of the extractor or of its fitting."""
+    extractor_class = getattr(features, _NETWORK_EXTRACTORS[group][name])
+    options = {option: tuple(value) if isinstance(value, list) else value for option, value in options.items()}
+    names = {field.name for field in fields(extractor_class)}
+    if "image_size" in options.keys() - names and (size := options.pop("image_size")) != extractor_class.image_size:
+        title = {"mixvpr": "MixVPR", "ssm": "SSM-VPR's filter"}[name]
+        expected = list(extractor_class.image_size)
+        raise SettingsError(f"{group}.image_size={list(size)}: {title} takes {expected} only, as its weights do")
     networks = ("netvlad", "patch_netvlad") if name == "netvlad" else (name,)
-    model, size = _network("retrieval", networks, options.pop("weights")), tuple(options.pop("image_size"))
+    model = _network(group, networks, options.pop("weights", None))
     if name == "dinov2":
         from mfvpr.networks.vit import TokenDescriptor
 
         model = TokenDescriptor(model, options.pop("pooling"), options.pop("power"))
-    return GlobalDescriptor(model, size, **_only(options, GlobalDescriptor, f"retrieval={name}"))
+    if "whitening" in names:
+        published = extractor_class.whitening
+        replaced = {field.name for field in fields(published)} & options.keys()
+        options["whitening"] = replace(published, **{option: options.pop(option) for option in replaced})
+    return extractor_class(model, **_only(options, extractor_class, f"{group}={name}"))
 
 
 def matching(settings: dict[str, Any]) -> Matcher:
     """The matcher of an image pair."""
     name, options = settings["name"], _without(settings, "name")
     weights = options.pop("weights", None)
-    options = _only(options, Matching if name == "neighbors" else LightGlueMatching, f"matching={name}")
     if name == "neighbors":
-        return Matching(**options)
-    return LightGlueMatching.of(_network("matching", "lightglue", weights), **options)
-
-
-def _ssm_voting(options: dict[str, Any]) -> Filter:
-    from mfvpr.features import SsmWindows
-    from mfvpr.features.ssm import STAGE1_FITTING, STAGE1_SIZE
-    from mfvpr.retrieval import SsmVoting
-
-    size, weights, whitening = options.pop("image_size"), options.pop("weights"), _pop_fitting(options, STAGE1_FITTING)
-    if tuple(size) != STAGE1_SIZE:
-        raise SettingsError(f"retrieval.image_size={size}: SSM-VPR's filter takes {list(STAGE1_SIZE)} only")
-    return SsmVoting(SsmWindows(_network("retrieval", "ssm", weights), whitening=whitening, **options))
-
-
-def _pop_fitting(options: dict[str, Any], published: Any) -> Any:
-    """The published fitting of the whitening with the options that replace its fields, which are removed."""
-    names = {field.name for field in fields(published)} & options.keys()
-    return replace(published, **{name: options.pop(name) for name in names})
+        return Matching(**_only(options, Matching, "matching=neighbors"))
+    options = _only(options, LightGlueMatching, "matching=lightglue")
+    return LightGlueMatching.of(_network("matching", ("lightglue",), weights), **options)
 
 
 def _files(group: str, settings: dict[str, Any], data: Dataset | None) -> dict[Path, File]:
@@ -226,11 +212,8 @@ def frames(settings: dict[str, Any]) -> FrameCorrelation | None:
     return FrameCorrelation(previous) if previous else None
 
 
-def _network(group: str, names: str | tuple[str, ...], weights: str | None) -> Any:
+def _network(group: str, names: tuple[str, ...], weights: str | None) -> Any:
     """A network of one of these names, with its converted weights."""
-    from mfvpr.checkpoints import REGISTRY, load_model
-
-    names = (names,) if isinstance(names, str) else names
     known = [entry.name for entry in REGISTRY.values() if entry.network in names]
     if weights not in known:
         raise SettingsError(f"{group}.weights={weights}: expected weights of {names[0]}: one of {', '.join(known)}")

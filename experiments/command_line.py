@@ -19,16 +19,23 @@ from omegaconf.errors import OmegaConfBaseException
 
 from experiments import distributed_launch
 from experiments.console import tell
-from experiments.data_sets import first_of
+from experiments.data_sets import compose, first_of
 from experiments.errors import on_interrupt, one_line
 from experiments.groups import PROGRAMS, check_choice, choices_with, groups
 from experiments.quoting import PATHS, as_typed
-from experiments.settings import CONF, Program, SettingsError, check
+from experiments.settings import CONF, Program, SettingsError, check, nodes
 from experiments.wording import in_settings
 
 _MULTIRUN = ("-m", "--multirun")
 _NAME = r"[A-Za-z_][\w/@]*(?:\.\w+)*"  # of a setting, or of a group
 _EXTRAS = {"joblib": "sweep", "submitit_local": "slurm", "submitit_slurm": "slurm"}  # install Hydra's launchers
+_EXPLANATIONS = {  # by their patterns in errors of Hydra and OmegaConf
+    r"Missing mandatory value: ([\w.]+)": r"\1: this setting has no default; give \1=VALUE",
+    r"^(.*) full_key: ([\w.]+)": r"\2: \1",
+    r"^Ambiguous value for argument '(.*?)' 1\.": r"\1: expected one value; write [...] for a list; to run once for "
+    "each, add --multirun",
+    r"^Error merging override (\S+)": r"\1: this is a group of settings; set one of its members (see --help)",
+}
 _MAX_DIGITS = 300  # beyond float64, and Python does not parse thousands of digits
 
 
@@ -40,7 +47,7 @@ def run(program: Program, config: str) -> None:
         is_multirun = job.mode == RunMode.MULTIRUN
         with _multirun_job() if is_multirun else one_line(), _hydra_errors(config):  # in here, or Hydra adds lines
             for name in sorted(OmegaConf.missing_keys(composed)):
-                raise SettingsError(_no_default(name))
+                raise SettingsError(f"{name}: this setting has no default; give {name}=VALUE")
             settings: Any = OmegaConf.to_container(composed, resolve=True)
             check(settings)
             arguments = typed
@@ -126,61 +133,39 @@ def _explain(error: Exception, config: str) -> str:
     """Explain a Hydra error in one line; for an unknown setting, name the nearest one."""
     text = " ".join((str(error) or str(error.__cause__)).split())
     text = text.partition(" Config search path")[0].partition(" See https")[0]
-    if missing := re.search(r"Missing mandatory value: ([\w.]+)", text):
-        return _no_default(missing[1])
     if launcher := re.search(r"Could not find 'hydra/launcher/(\w+)'.*: ([\w ]+)", text):
         mend = f"pip install 'mfvpr[{_EXTRAS[launcher[1]]}]'" if launcher[1] in _EXTRAS else f"there are {launcher[2]}"
         return f"{launcher[1]}: this launcher is not installed; {mend}"
-    if unresolved := re.match(r"(.*) full_key: ([\w.]+)", text):
-        return f"{unresolved[2]}: {unresolved[1]}"
-    if several := re.match(r"Ambiguous value for argument '(.*?)' 1\.", text):
-        return f"{several[1]}: expected one value; write [...] for a list; to run once for each, add --multirun"
-    if group := re.match(r"Error merging override (\S+)", text):
-        return f"{group[1]}: this is a group of settings; set one of its members (see --help)"
-    unknown = re.search(r"Could not override '([^']*)'", text) or re.search(r"Key '([^']*)' is not in struct", text)
-    if not unknown:
-        return text
-    return f"{unknown[1]}: unknown setting; {_suggestion(unknown[1], config)}"
+    if unknown := re.search(r"Could not override '([^']*)'|Key '([^']*)' is not in struct", text):
+        name = unknown[1] or unknown[2]
+        return f"{name}: unknown setting; {_suggestion(name, config)}"
+    for pattern, words in _EXPLANATIONS.items():
+        if known := re.search(pattern, text):
+            return known.expand(words)
+    return text
 
 
 def _suggestion(wrong: str, config: str) -> str:
     """Suggest a setting for an unknown one: in its group, in another choice of its group, or a similar name."""
-    names, (group, *_) = _setting_names(config), wrong.split(".")
-    outer, _, name = wrong.rpartition(".")
-    if outer in names and not any(known.startswith(f"{outer}.") for known in names):  # null, or one value
+    chosen = [argument for argument in sys.argv[1:] if argument.partition("=")[0] in groups(config)]
+    settings: Any = OmegaConf.to_container(compose(config, chosen))
+    values = dict(nodes(settings))
+    group, (outer, _, name) = wrong.partition(".")[0], wrong.rpartition(".")
+    if outer in values and not isinstance(values[outer], dict):
         return f"the nearest is {outer}, set as a whole"
-    same_name = [known for known in names if known.rpartition(".")[2] == name]
+    same_name = [known for known in values if known.rpartition(".")[2] == name]
     same_group = []
     if group in groups(config):
-        same_group = [known for known in names if known.startswith(f"{group}.")]
+        same_group = [known for known in values if known.startswith(f"{group}.")]
         same_name = [known for known in same_name if known in same_group] or same_name
         choices = [f"{group}={choice}" for choice in choices_with(group, name)]
         if choices and not {*same_name} & {*same_group}:
             return f"{' and '.join(choices)} {'have' if len(choices) > 1 else 'has'} {group}.{name}"
-    nearest = max(same_name or same_group or names, key=lambda known: _similarity(wrong, known))
+    nearest = max(same_name or same_group or values, key=lambda known: _similarity(wrong, known))
     return f"the nearest is {nearest}" if max(_similarity(wrong, nearest)) >= 0.6 else "see --help"
-
-
-def _no_default(name: str) -> str:
-    return f"{name}: this setting has no default; give {name}=VALUE"
 
 
 def _similarity(wrong: str, name: str) -> tuple[float, float]:
     """Similarity of the last parts of two dotted names, and of the names."""
     last_parts = wrong.rpartition(".")[2], name.rpartition(".")[2]
     return difflib.SequenceMatcher(None, *last_parts).ratio(), difflib.SequenceMatcher(None, wrong, name).ratio()
-
-
-def _setting_names(config: str) -> list[str]:
-    """All settings of the configuration with the groups that the command line chooses."""
-    chosen = [argument for argument in sys.argv[1:] if argument.partition("=")[0] in groups(config)]
-    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        names, pending = [], [("", hydra.compose(config, chosen))]
-    while pending:
-        prefix, node = pending.pop()
-        for name in node:
-            names.append(f"{prefix}{name}")
-            child = node._get_node(name)
-            if isinstance(child, DictConfig) and not child._is_missing():
-                pending.append((f"{prefix}{name}.", child))
-    return names

@@ -53,7 +53,9 @@ def check(
         tell(f"warning: confidence={file.path} was fitted on these very images, so that it flatters")
     if not any(file.systems[headline].weights):
         tell(f"warning: confidence={file.path} cannot tell right answers from wrong ones: p is the same for all")
-    other = {name: _differences(file.origin, name, settings, images) for name in file.systems}
+    recall = [] if _threshold(settings, images) in (None, file.origin.get("right_within")) else ["recall"]
+    candidates = num_candidates(settings, images)
+    other = {name: other_settings(file.origin, name, settings, candidates) + recall for name in file.systems}
     if other[headline]:
         tell(f"warning: confidence={file.path} was fitted with other settings of {', '.join(other[headline])}: p may "
              "mean nothing here")  # fmt: skip
@@ -63,26 +65,12 @@ def check(
     return file._replace(systems=usable)
 
 
-def _differences(origin: Mapping[str, Any], system: str, settings: Mapping[str, Any], images: Images) -> list[str]:
-    """The settings of a run that were others when a confidence was fitted."""
-    names = _differing_groups(origin, system, settings)
-    if origin.get("candidates") != num_candidates(settings, images):
-        names.append("candidates (as many as there were)")
-    if _threshold(settings, images) not in (None, origin.get("right_within")):
-        names.append("recall (what counts as right)")
-    return names
-
-
-def other_settings(origin: Mapping[str, Any], system: str, settings: Mapping[str, Any]) -> list[str]:
-    """The settings of a map that were others when a confidence was fitted."""
-    names = _differing_groups(origin, system, settings)
-    return names + (["candidates"] if origin.get("candidates") != settings["candidates"] else [])
-
-
-def _differing_groups(origin: Mapping[str, Any], system: str, settings: Mapping[str, Any]) -> list[str]:
+def other_settings(origin: Mapping[str, Any], system: str, settings: Mapping[str, Any], candidates: int) -> list[str]:
+    """The settings of a run or of a map that were others when a confidence was fitted."""
     before = _system_settings(origin.get("settings"), system)
     now = _system_settings({**settings, "scorer": build.describe_settings(settings["scorer"])}, system)
-    return [name for name in _NAMES if name in now and name != "candidates" and before.get(name) != now[name]]
+    names = [name for name in _NAMES if name in now and name != "candidates" and before.get(name) != now[name]]
+    return names + ["candidates"] * (origin.get("candidates") != candidates)
 
 
 def _threshold(settings: Mapping[str, Any], images: Images) -> list[Any] | None:

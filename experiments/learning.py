@@ -90,8 +90,7 @@ def _prepare(settings: dict[str, Any], watch: Stopwatch) -> Prepared:
     tools, images = stages.begun(settings, watch)
     judge = truth.judge(settings, images.dataset)
     matches, candidates = stages.match_data_set(settings, tools, images, watch)
-    if isinstance(matches, Scales):
-        raise ValueError("expected features of one scale, since learning knows one")
+    assert not isinstance(matches, Scales)
     recipe = stages.recipe(tools, images, candidates.mask.shape[1])
     part = Part(data_sets.label(settings["dataset"]), judge, matches, candidates)
     return Prepared(part, images, recipe, truth.description(settings, images.dataset))

@@ -37,7 +37,7 @@ def localize(settings: dict[str, Any]) -> None:
             if not len(robot_map):
                 raise
             failed += 1
-            line = {"error": str(error)} | drive.skip()
+            line = {"error": str(error)} | drive.route_entry(None, None)
         else:
             line |= drive.add(name, localized) | figures.draw(number, name, pixels, localized)
         print(printable(json.dumps({"image": name} | line, ensure_ascii=False, allow_nan=False)), flush=True)
@@ -58,12 +58,8 @@ class _Drive:
         start = time.perf_counter()
         row, recent = self._map.row(name) if self._settings["add"] else None, self._settings["recent"]
         localized = self._map.ask(pixels, recent=recent, before=row)
-        line = localized.answer.as_json(self._settings["alternatives"]) | self._route_entry(localized.answer, row)
+        line = localized.answer.as_json(self._settings["alternatives"]) | self.route_entry(localized.answer, row)
         return localized, line | {"seconds": round(time.perf_counter() - start, 4)}
-
-    def skip(self) -> dict[str, Any]:
-        """The route's entry in the line of an image that cannot be read."""
-        return self._route_entry(None, None)
 
     def add(self, name: str, localized: Asked) -> dict[str, Any]:
         """Add an image to the end of the map, unless it has one of this name, and return the entry in its line."""
@@ -75,7 +71,8 @@ class _Drive:
             self._map.add_described([Entry(name, name, vector)], [features])
         return {"added": is_new}
 
-    def _route_entry(self, answer: Answer | None, row: int | None) -> dict[str, Any]:
+    def route_entry(self, answer: Answer | None, row: int | None) -> dict[str, Any]:
+        """The route's entry in the line of an image, which may have no answer."""
         if self._route is None:
             return {}
         rows = self._map.there[:row]
@@ -94,7 +91,7 @@ def _confidence(settings: Mapping[str, Any]) -> Confidence | None:
     if name not in systems:
         raise SettingsError(f"confidence={settings['confidence']}: expected p of {name}, which the map scores by, got "
                             f"{', '.join(systems) or 'none'}; evaluate with the map's settings")  # fmt: skip
-    if other := confidences.other_settings(origin, name, map_settings):
+    if other := confidences.other_settings(origin, name, map_settings, map_settings["candidates"]):
         tell(f"warning: confidence={settings['confidence']} was fitted with other settings of {', '.join(other)}: p "
              "may mean nothing here")  # fmt: skip
     return systems[name]

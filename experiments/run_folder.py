@@ -40,13 +40,7 @@ def leave(
 ) -> None:
     """Write the files, then print the text, then draw the figures, so that no failure loses earlier results.
 
-    Args:
-        folder: the folder from `claim_run_folder`.
-        settings: settings of the run.
-        ground_truth: description of the ground truth.
-        text: text for the terminal, printed even if the files cannot be written.
-        write: function that writes the files into a folder.
-        figures: figures; if one cannot be drawn, there is a warning.
+    The text is printed even if the files cannot be written; `write` gets the folder for them.
     """
     try:
         keep(folder, settings, ground_truth, write)

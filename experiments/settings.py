@@ -152,7 +152,9 @@ def check(settings: Mapping[str, Any]) -> None:
 
 
 def _check_values(settings: Mapping[str, Any], methods: Mapping[str, str]) -> None:
-    for path, value in _leaves(settings, ""):
+    for path, value in nodes(settings):
+        if isinstance(value, Mapping):
+            continue
         rule = _rule(path, methods)
         if rule is None and methods["scorer"] and path.startswith("scorer."):
             name = path.removeprefix("scorer.")
@@ -239,9 +241,9 @@ def _check_patches(features: Mapping[str, Any], path: str, reach: list[float]) -
         raise SettingsError(f"{path}={reach}: expected {of_patches} {why}")
 
 
-def _leaves(settings: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+def nodes(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """All settings and groups of settings, by dotted name."""
     for name, value in settings.items():
+        yield f"{prefix}{name}", value
         if isinstance(value, Mapping):
-            yield from _leaves(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
+            yield from nodes(value, f"{prefix}{name}.")

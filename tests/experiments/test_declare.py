@@ -9,7 +9,7 @@ import hydra
 import jax.numpy as jnp
 import pytest
 
-from experiments import build, command_line, declare, groups, help_text, settings
+from experiments import build, command_line, data_sets, declare, groups, help_text, settings
 from experiments.settings import CONF
 from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, value
 from mfvpr.scoring import ALONE, SCORERS, match_shifts
@@ -66,7 +66,7 @@ def near(tmp_path, monkeypatch):
     conf = tmp_path / "conf"
     shutil.copytree(CONF, conf)
     declare.write(conf)
-    for module in (command_line, groups, help_text, settings):
+    for module in (command_line, data_sets, groups, help_text, settings):
         monkeypatch.setattr(module, "CONF", conf)
     return conf
 

@@ -83,7 +83,7 @@ def test_several_sets_as_they_are_typed(streets):
     assert data_sets.first_of(["dataset=streets", "dataset.root=/a:b,c"]) == ["dataset=streets", "dataset.root=/a:b,c"]
     assert data_sets.first_of(["dataset=streets:seed=3"]) == ["dataset=streets", "dataset.seed=3"]
     [named] = data_sets.parse("report", "corridor:root=/a,b:c")
-    assert named == ("corridor", [("root", "/a,b:c")])
+    assert named == ["corridor", "root=/a,b:c"]
     [corridor, drawn] = data_sets.composed("report", "corridor:root=/a,b:c,streets:seed=4")
     assert corridor["database"] == "/a,b:c/ref"
     assert (drawn["name"], data_sets.label(drawn)) == ("streets", "streets 4")
