@@ -18,11 +18,7 @@ class AnswerFigures:
     """Figures of the images that `figures=` names, each drawn as soon as the image is localized."""
 
     def __init__(self, robot_map: Map, settings: Mapping[str, Any]) -> None:
-        """Read `figures=`, `out=` and `root=`.
-
-        Raises:
-            SettingsError: `root=` is no folder.
-        """
+        """Read the settings `figures`, `out` and `root`."""
         figures, self._map, self._failed = settings["figures"], robot_map, 0
         self._wanted = set(range(figures) if isinstance(figures, int) else figures)
         self._missing = set() if isinstance(figures, int) else {*self._wanted}  # there may be fewer images
@@ -47,11 +43,7 @@ class AnswerFigures:
         return {"figure": str(path)}
 
     def finish(self) -> None:
-        """Check that all figures were drawn.
-
-        Raises:
-            SettingsError: a figure could not be drawn, or there was no such image.
-        """
+        """Raise a SettingsError if a figure could not be drawn, or if an image did not come."""
         if self._failed:
             raise SettingsError(f"{self._failed} of the figures could not be drawn; warnings say why")
         if self._missing:

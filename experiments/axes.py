@@ -52,7 +52,8 @@ def axes(settings: dict[str, Any]) -> Axes:
             f"matching.max_distance={limit} leaves no other matches; set matching.max_distance=null"
         )
     defaults = settings["scorer"] | {"max_distance": limit}
-    defaults |= {"c": _plain_c(settings) if settings["final"] == "combined" else 0} if "c" in values else {}
+    if "c" in values:
+        defaults |= {"c": _plain_c(settings) if settings["final"] == "combined" else 0}
     return Axes(scorer, values, {name: defaults.get(name) for name in values})
 
 

@@ -35,10 +35,7 @@ def check(
 ) -> ConfidenceFile | None:
     """Keep the systems of a file whose settings fit this run at least as well as those of the headline system.
 
-    Warns if the file was fitted on the same images, or with other settings.
-
-    Raises:
-        SettingsError: the file has no confidence of the headline system.
+    Warns if the file was fitted on the same images, or with other settings. The headline system must be in the file.
     """
     if file is None:
         return None

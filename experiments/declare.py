@@ -3,7 +3,7 @@
 They are files because --help and a wrong setting must not wait for JAX.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,6 @@ _VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "anchor_ratio": ("anchor", {"weight": "ratio"}),
     "histogram_ratio": ("histogram", {"weight": "ratio"}),
 }
-_HOMOGRAPHIES = ("homography_8", "homography_24", "magsac_8")
 
 
 def files() -> dict[str, str]:
@@ -32,19 +31,19 @@ def files() -> dict[str, str]:
     texts = {f"scorer/{name}.yaml": "\n".join(_scorer(*variant)) for name, variant in scorers.items()}
     every = [name for name in SCORERS if name not in ALONE]
     without_homography = [name for name in every if name != "homography"]
-    texts |= {
-        f"scorer/{name}.yaml": "\n".join([f"# {summary}", "defaults:", *_entries(members)])
-        for name, summary, members in (
-            ("paper", "The paper's scores, each with its parameters, and the number of matches.", PAPER),
-            ("all", "Every score of any features but OpenCV's, each with the parameters of its paper.", every),
-            ("compared", "Every score, and homographies as the paper has them beside MAGSAC.",
-             [*without_homography, *_HOMOGRAPHIES]),
-            ("demo", "The paper's, and the histogram weighted by the ratio of distances (not the paper's).",
-             [*PAPER, "histogram_ratio"]),
-            ("ratio", "Anchor points and histogram of shifts, matches weighted by the ratio of distances (not the "
-             "paper's).", {"anchor": "anchor_ratio", "histogram": "histogram_ratio"}),
-        )
+    groups = {
+        "paper": ("The paper's scores, each with its parameters, and the number of matches.", PAPER),
+        "all": ("Every score of any features but OpenCV's, each with the parameters of its paper.", every),
+        "compared": ("Every score, and homographies as the paper has them beside MAGSAC.",
+                     [*without_homography, "homography_8", "homography_24", "magsac_8"]),
+        "demo": ("The paper's, and the histogram weighted by the ratio of distances (not the paper's).",
+                 [*PAPER, "histogram_ratio"]),
+        "ratio": ("Anchor points and histogram of shifts, matches weighted by the ratio of distances (not the "
+                  "paper's).", ["anchor_ratio@anchor", "histogram_ratio@histogram"]),
     }  # fmt: skip
+    for name, (summary, members) in groups.items():
+        entries = (f"  - {member}" if "@" in member else f"  - {member}@{member}" for member in members)
+        texts[f"scorer/{name}.yaml"] = "\n".join([f"# {summary}", "defaults:", *entries])
     texts["axes.yaml"] = "\n".join(_axes())
     limits = {
         name: {field: parameter.limits for field, parameter in fields.parameters_of(scorer).items()}
@@ -69,12 +68,6 @@ def _scorer(method: str, values: Mapping[str, Any]) -> Iterator[str]:
     for field, parameter in fields.parameters_of(SCORERS[method]).items():
         comment = "; ".join(filter(None, (parameter.unit, parameter.note, parameter.words)))
         yield _line(field, values.get(field, parameter.default), comment)
-
-
-def _entries(members: Sequence[str] | Mapping[str, str]) -> Iterator[str]:
-    """Entries of a defaults list: files of scorers under their own names, or under those of a mapping."""
-    named = members if isinstance(members, Mapping) else {member: member for member in members}
-    yield from (f"  - {file}@{name}" for name, file in named.items())
 
 
 def _axes() -> Iterator[str]:

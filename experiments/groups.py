@@ -57,13 +57,7 @@ def choices_with(group: str, name: str) -> list[str]:
 
 
 def check_choice(name: str, value: str, config: str) -> None:
-    """Raise a SettingsError for a choice that a group does not have, or a group that a program does not have.
-
-    Args:
-        name: setting, possibly a group.
-        value: typed choice, or several choices between commas.
-        config: name of the program's file in conf/.
-    """
+    """Raise a SettingsError if a setting is a group that the program does not have, or a value is no choice of it."""
     known, program_groups = choices(name), groups(config)
     if known and name not in program_groups:
         if name in _read(CONF / f"{config}.yaml"):

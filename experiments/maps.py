@@ -42,11 +42,7 @@ def add_images(folder: Path, images: list[Path], place: str | None) -> None:
 
 
 def map_of_settings(settings: Mapping[str, Any]) -> Map:
-    """The map in the folder of the settings, which is created if it is not there.
-
-    Raises:
-        SettingsError: the folder holds a map with other settings, or the settings do not allow a map.
-    """
+    """The map in the folder of the settings, which is created if it is not there; its settings must be the same."""
     folder, map_settings = build.expand_user(settings["map"]), {name: settings[name] for name in _GROUPS}
     _check(map_settings)
     if (folder / SETTINGS).exists():
@@ -66,11 +62,7 @@ def open_map(folder: Path, **options: Any) -> Map:
 
 
 def read(folder: Path) -> dict[str, Any]:
-    """The settings that a map was made with.
-
-    Raises:
-        SettingsError: there is no map.
-    """
+    """The settings that a map was made with; a SettingsError if there is no map."""
     path = folder / SETTINGS
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

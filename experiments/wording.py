@@ -37,16 +37,12 @@ def in_settings(settings: Mapping[str, Any]) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        if (text := _translate(str(error), settings)) == str(error):
+        text, group = str(error), _group(str(error), settings)
+        for pattern, words in _WORDS.items():
+            text = re.sub(pattern, words.replace("GROUP", group), text)
+        if text == str(error):
             raise
         raise SettingsError(text) from error
-
-
-def _translate(text: str, settings: Mapping[str, Any]) -> str:
-    group = _group(text, settings)
-    for pattern, words in _WORDS.items():
-        text = re.sub(pattern, words.replace("GROUP", group), text)
-    return text
 
 
 def _group(text: str, settings: Mapping[str, Any]) -> str:
