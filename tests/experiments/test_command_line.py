@@ -12,7 +12,7 @@ from experiments.benchmark.__main__ import main as benchmark
 from experiments.launch import version
 from experiments.quoting import as_typed
 from experiments.settings import CONF
-from tests.programs import ROOT, composed, run, typed
+from tests.programs import ROOT, composed, run
 
 pytestmark = pytest.mark.thorough
 
@@ -21,9 +21,9 @@ PROGRAMS = {program: config for config, program in groups.PROGRAMS.items()}
 
 
 @pytest.mark.parametrize("program", PROGRAMS)
-def test_help_has_every_setting_and_the_comments_of_conf(monkeypatch, capsys, program):
-    code, stdout, stderr = typed(monkeypatch, capsys, program, "--help")
-    assert (code, stderr) == (0, "")
+def test_help_has_every_setting_and_the_comments_of_conf(succeed, program):
+    stdout, stderr = succeed(program, "--help")
+    assert stderr == ""
     pending = [composed(config=PROGRAMS[program])]
     while pending:
         for name, value in pending.pop().items():
@@ -48,31 +48,38 @@ def test_a_comma_is_part_of_a_path_unless_several_runs_are_asked_for(argument, a
     assert (as_typed(argument), as_typed(argument, several=True)) == (alone, in_multirun)
 
 
-def test_help_is_of_the_groups_that_were_chosen(monkeypatch, capsys):
-    _, anchor, _ = typed(monkeypatch, capsys, "sweep", "--help", "experiment=anchor", "dataset=corridor")
+def test_help_is_of_the_groups_that_were_chosen(succeed):
+    anchor, _ = succeed("sweep", "--help", "experiment=anchor", "dataset=corridor")
     assert "  window: 10.0  # cells" in anchor
     assert "sigma: 22.5" not in anchor
     assert "  num_bins: [10, 15, 20]" in anchor
     assert "  database: ${.root}/ref" in anchor
     assert "  index_file: null" in anchor
     assert "database: ???" not in anchor
-    _, system, _ = typed(monkeypatch, capsys, "evaluate", "system=mix_hist_10", "-h", "retrieval=vlad")
+    system, _ = succeed("evaluate", "system=mix_hist_10", "-h", "retrieval=vlad")
     assert "  weights: d2_tf  # d2_tf, d2_ots" in system
     assert "  num_words: 64" in system
 
 
-def test_help_needs_neither_hydra_nor_jax():
-    code = ("import sys; from experiments.launch import launch; from experiments.evaluate import evaluate; "
-            "sys.argv = ['evaluate', '--help']; launch(evaluate); "
-            "assert not {'hydra', 'omegaconf', 'numpy', 'jax'} & {*sys.modules}")  # fmt: skip
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
-    assert (done.returncode, done.stderr) == (0, "")
+@pytest.mark.parametrize(("argument", "code", "error", "modules"), [
+    ("--help", None, "", ["hydra", "omegaconf", "numpy", "jax"]),
+    ("scorer.histogram.sigma=0", 2, "error: scorer.histogram.sigma=0: expected a number above 0",
+     ["numpy", "jax", "mfvpr"]),
+])  # fmt: skip
+def test_help_and_wrong_settings_do_not_wait_for_slow_imports(argument, code, error, modules):
+    script = ("import sys; from experiments.launch import launch; from experiments.evaluate import evaluate\n"
+              f"sys.argv, code = ['evaluate', {argument!r}], None\n"
+              "try: launch(evaluate)\n"
+              "except SystemExit as left: code = left.code\n"
+              f"assert (code, {{*{modules}}} & {{*sys.modules}}) == ({code}, set())")  # fmt: skip
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr[: len(error) or None] == error
 
 
-@pytest.mark.parametrize("program", [*PROGRAMS])
-def test_version(monkeypatch, capsys, program):
-    code, stdout, _ = typed(monkeypatch, capsys, program, "candidates=3", "--version")
-    assert code == 0
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_version(succeed, program):
+    stdout, _ = succeed(program, "candidates=3", "--version")
     assert re.fullmatch(r"mfvpr \d+\.\d+\.\d+ \(jax .*, Python .*\)\n", stdout)
 
 
@@ -166,14 +173,10 @@ def test_version(monkeypatch, capsys, program):
         ("evaluate", ["out=/dev/null/x"], "/x: cannot be written to (Not a directory)"),
     ],
 )  # fmt: skip
-def test_mistakes_are_one_line_and_leave_nothing(tmp_path, monkeypatch, capsys, program, arguments, words):
-    monkeypatch.chdir(tmp_path)
-    code, stdout, stderr = typed(monkeypatch, capsys, program, *arguments)
-    assert (code, stdout) == (2, ""), stderr
-    assert words in stderr
-    assert stderr.count("\n") == 1
-    assert len(stderr) < 400
-    assert list(tmp_path.iterdir()) == []
+def test_mistakes_are_one_line_and_leave_nothing(refuse_at_once, program, arguments, words):
+    error = refuse_at_once(program, *arguments)
+    assert words in error
+    assert len(error) < 400
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from PIL import Image
 
 import mfvpr
 from mfvpr.evaluation import precision_recall, read_confidences, reliability
-from tests.programs import QUERIES, shared, small, typed
+from tests.programs import QUERIES, small
 
 pytestmark = pytest.mark.thorough
 
@@ -20,20 +20,34 @@ LINES = ("scorer=histogram", "figures=1")
 LEARNED = Path(mfvpr.__file__).parent / "scoring" / "learned" / "learned_aliked.json"
 
 
-@pytest.fixture(scope="module")
-def root(tmp_path_factory):
-    return shared(tmp_path_factory)
+@pytest.fixture
+def evaluate(root, tmp_path, succeed):
+    """Evaluates into a folder of this name: the folder, stderr, stdout."""
+
+    def run(name, *more):
+        stdout, stderr = succeed("evaluate", *small(root), *LINES, f"out={tmp_path}/{name}", *more)
+        return tmp_path / name, stderr, stdout
+
+    return run
 
 
 @pytest.fixture
-def evaluate(root, tmp_path, monkeypatch, capsys):
-    def run(name, *more):
-        code, stdout, stderr = typed(
-            monkeypatch, capsys, "evaluate", *small(root), *LINES, f"out={tmp_path}/{name}", *more
-        )
-        return tmp_path / name, code, stdout, stderr
+def refused(root, tmp_path, call):
+    """The error of an evaluation that is refused."""
+
+    def run(*more):
+        code, _, stderr = call("evaluate", *small(root), *LINES, f"out={tmp_path}/out", *more)
+        assert (code, (tmp_path / "out").exists()) == (2, False)
+        return stderr.splitlines()[-1]
 
     return run
+
+
+@pytest.fixture
+def content(evaluate):
+    """The content of the confidence file of a first run."""
+    first, *_ = evaluate("first", "figures=0")
+    return json.loads((first / "confidence.json").read_text())
 
 
 def rows(path):
@@ -42,8 +56,7 @@ def rows(path):
 
 
 def test_a_run_says_how_sure_its_answers_are(evaluate):
-    out, code, stdout, stderr = evaluate("first")
-    assert code == 0, stderr
+    out, _, stdout = evaluate("first")
     assert "ECE" not in stdout  # said in files, until it is asked for
     gains, answers = rows(out / "gains.csv"), rows(out / "answers.csv")
     hits = {system: np.array([line[system] == "1" for line in gains]) for system in SYSTEMS}
@@ -84,14 +97,10 @@ def test_below_the_threshold_the_answer_is_no_place(evaluate):
     first, *_ = evaluate("first")
     systems, origin = read_confidences(first / "confidence.json")
     assert tuple(systems) == SYSTEMS
-    assert (origin["queries"], origin["right_within"], origin["ground_truth"]["thresholds"]) == (
-        QUERIES,
-        [1, "frames"],
-        [0, 1],
-    )
+    assert (origin["queries"], origin["right_within"]) == (QUERIES, [1, "frames"])
+    assert origin["ground_truth"]["thresholds"] == [0, 1]
     confidence = (f"confidence={first}/confidence.json", "threshold=0.4")
-    out, code, stdout, stderr = evaluate("second", *confidence)
-    assert code == 0, stderr
+    out, stderr, stdout = evaluate("second", *confidence)
     assert "was fitted on these very images" in stderr
     assert "other settings" not in stderr
     header = stdout[stdout.index("AP by score") :].splitlines()[0]
@@ -121,10 +130,9 @@ def test_below_the_threshold_the_answer_is_no_place(evaluate):
     assert [line for line in predictions if line not in none] == [
         line for line in every if line["query"] not in refusing
     ]
-    unknown, code, _, stderr = evaluate(
+    unknown, stderr, _ = evaluate(
         "third", *confidence, "dataset.ground_truth=none", "dataset.index_file=null", "figures=0"
     )
-    assert code == 0, stderr
     assert [{**line, "right": "", "in_database": ""} for line in answers] == rows(unknown / "answers.csv")
     assert not (unknown / "confidence.csv").exists()
 
@@ -135,11 +143,8 @@ def test_no_place_is_right_where_the_database_does_not_show_it(evaluate, root, t
     index = next(setting for setting in small(root) if setting.startswith("dataset.index_file=")).partition("=")[2]
     header, line, *lines = Path(index).read_text().splitlines()
     (tmp_path / "index.csv").write_text("\n".join([header, f"{line.partition(',')[0]},", *lines]))
-    out, code, _, stderr = evaluate(
-        "second", f"confidence={first}/confidence.json", "threshold=1", "figures=0",
-        f"dataset.index_file={tmp_path}/index.csv",
-    )  # fmt: skip
-    assert code == 0, stderr
+    threshold = (f"confidence={first}/confidence.json", "threshold=1", "figures=0")
+    out, *_ = evaluate("second", *threshold, f"dataset.index_file={tmp_path}/index.csv")
     answers = rows(out / "answers.csv")
     assert {line["answer"] for line in answers} == {"no place"}
     assert [line["in_database"] for line in answers] == ["0"] + ["1"] * (QUERIES - 1)
@@ -160,93 +165,71 @@ def test_no_place_is_right_where_the_database_does_not_show_it(evaluate, root, t
         (["confidence=/none.json"], "/none.json: expected the confidence.json"),
     ],
 )
-def test_what_cannot_say_how_sure_answers_are_is_refused(evaluate, settings, words):
-    out, code, _, stderr = evaluate("out", *settings)
-    assert code == 2
-    assert words in stderr.splitlines()[-1]
-    assert not out.exists()
+def test_what_cannot_say_how_sure_answers_are_is_refused(refused, settings, words):
+    assert words in refused(*settings)
 
 
-def test_confidence_of_other_systems_is_refused(evaluate, tmp_path):
-    first, *_ = evaluate("first", "figures=0")
-    content = json.loads((first / "confidence.json").read_text())
+def test_confidence_of_other_systems_is_refused(content, refused, tmp_path):
     del content["systems"]["histogram"]
     (tmp_path / "other.json").write_text(json.dumps(content))
-    _, code, _, stderr = evaluate("out", f"confidence={tmp_path}/other.json")
-    assert code == 2
-    words = "got filter, histogram + filter; "
-    assert words in stderr.splitlines()[-1]
+    assert "got filter, histogram + filter; " in refused(f"confidence={tmp_path}/other.json")
 
 
 @pytest.mark.slow
 def test_confidence_of_other_settings_is_said(evaluate):
     first, *_ = evaluate("first", "figures=0")
     confidence = (f"confidence={first}/confidence.json", "figures=0")
-    _, code, _, stderr = evaluate("second", *confidence, "scorer.weight=ratio", "fusion.c=2")
-    assert code == 0, stderr
+    _, stderr, _ = evaluate("second", *confidence, "scorer.weight=ratio", "fusion.c=2")
     assert "other settings of scorer, fusion:" in stderr
     fused = ("scorer=ratio", "fusion.c=zscore", "fusion.weights={anchor: 1}", "final=combined", "figures=0")
     other, *_ = evaluate("fused", *fused)
     for changed, warns in (("scorer.anchor.window=6", True), ("scorer.anchor.window=10", False)):
-        _, code, _, stderr = evaluate(changed, f"confidence={other}/confidence.json", *fused, changed)
-        assert code == 0, stderr
+        _, stderr, _ = evaluate(changed, f"confidence={other}/confidence.json", *fused, changed)
         assert ("other settings of scorer:" in stderr) == warns
-    _, code, _, stderr = evaluate("third", *confidence, "scorer=paper")
-    assert code == 0, stderr
+    _, stderr, _ = evaluate("third", *confidence, "scorer=paper")
     assert "other settings" not in stderr  # the histogram is the same beside others
 
 
 def test_confidence_of_what_counted_otherwise_is_said(evaluate):
     first, *_ = evaluate("first", "figures=0", "scorer=paper")
     confidence = (f"confidence={first}/confidence.json", "figures=0", "scorer=paper")
-    for changed, words in (("recall.tolerances=[0]", "recall ("),
-                           ("candidates=5", "candidates (")):  # fmt: skip
-        _, code, _, stderr = evaluate(changed, *confidence, changed)
-        assert code == 0, stderr
+    for changed, words in (("recall.tolerances=[0]", "recall"), ("candidates=5", "candidates")):
+        _, stderr, _ = evaluate(changed, *confidence, changed)
         assert f"other settings of {words}" in stderr
-    out, code, _, stderr = evaluate("sum", *confidence, "scorer.sum.weight=fs")
-    assert code == 0, stderr
+    out, stderr, _ = evaluate("sum", *confidence, "scorer.sum.weight=fs")
     assert "nothing is said of sum" in stderr
     assert "other settings of" not in stderr
     assert "sum" not in {line["system"] for line in rows(out / "confidence.csv")}
 
 
-def test_what_it_was_fitted_on_is_known_under_any_name(evaluate, root, tmp_path):
+def test_what_it_was_fitted_on_is_known_under_any_name(evaluate, content, tmp_path):
     """The queries tell, whatever the folder is called; the database alone may be the same."""
-    first, *_ = evaluate("first", "figures=0")
-    content = json.loads((first / "confidence.json").read_text())
     for name, side, warns in (("renamed", "query fwd", True), ("map", "database", False)):
         seen = content["made"]["data_fingerprint"]
         [queries] = [folder for key, folder in seen.items() if key != "database"]
         sides = {"database": "other", side: queries} if warns else {"database": seen["database"], "query": "other"}
         changed = content | {"made": content["made"] | {"data_fingerprint": sides}}
         (tmp_path / f"{name}.json").write_text(json.dumps(changed))
-        _, code, _, stderr = evaluate(name, f"confidence={tmp_path}/{name}.json", "figures=0")
-        assert code == 0, stderr
+        _, stderr, _ = evaluate(name, f"confidence={tmp_path}/{name}.json", "figures=0")
         assert ("was fitted on these very images" in stderr) == warns
 
 
-def test_a_single_candidate_leaves_nothing_to_say(evaluate):
-    first, code, _, stderr = evaluate("first", "figures=0", "candidates=1")
-    assert code == 0, stderr
+def test_a_single_candidate_leaves_nothing_to_say(evaluate, refused):
+    first, *_ = evaluate("first", "figures=0", "candidates=1")
     line = rows(first / "confidence.csv")[0]
     assert line["AP by score"]
     assert {line[name] for name in line if " by p" in name or "ECE" in name or name == "by chance"} == {""}
-    _, code, _, stderr = evaluate("second", "figures=0", "candidates=1", f"confidence={first}/confidence.json")
-    assert code == 2
-    assert "expected p of systems, got none" in stderr.splitlines()[-1]
+    error = refused("figures=0", "candidates=1", f"confidence={first}/confidence.json")
+    assert "expected p of systems, got none" in error
 
 
 @pytest.mark.parametrize("origin", [
     {"settings": {"scorer": {"method": ["a"]}}, "data_fingerprint": ["x"]},
     {"settings": "x", "data_fingerprint": {"q": 5}}, {"settings": {"scorer": {"histogram": 5}}},
 ])  # fmt: skip
-def test_what_another_program_says_of_how_it_was_made_stops_nothing(evaluate, tmp_path, origin):
-    first, *_ = evaluate("first", "figures=0")
-    content = json.loads((first / "confidence.json").read_text())
+def test_what_another_program_says_of_how_it_was_made_stops_nothing(evaluate, content, tmp_path, origin):
     (tmp_path / "other.json").write_text(json.dumps(content | {"made": origin}))
-    _, code, _, stderr = evaluate("out", f"confidence={tmp_path}/other.json", "figures=0")
-    assert code == 0, stderr
+    _, stderr, _ = evaluate("out", f"confidence={tmp_path}/other.json", "figures=0")
     assert "other settings of features" in stderr
 
 
@@ -255,18 +238,14 @@ def test_a_weight_is_known_by_what_it_holds(evaluate, tmp_path):
         shutil.copy(LEARNED, tmp_path / f"{name}.json")
     first, *_ = evaluate("first", "figures=0", f"scorer.weight={tmp_path}/one.json")
     confidence = f"confidence={first}/confidence.json"
-    _, code, _, stderr = evaluate("second", "figures=0", confidence, f"scorer.weight={tmp_path}/other.json")
-    assert code == 0, stderr
+    _, stderr, _ = evaluate("second", "figures=0", confidence, f"scorer.weight={tmp_path}/other.json")
     assert "other settings" not in stderr
-    _, code, _, stderr = evaluate("third", "figures=0", confidence, "scorer.weight=ratio")
+    _, stderr, _ = evaluate("third", "figures=0", confidence, "scorer.weight=ratio")
     assert "other settings of scorer" in stderr
 
 
-def test_a_confidence_that_is_the_same_for_all_is_told(evaluate, tmp_path):
-    first, *_ = evaluate("first", "figures=0")
-    content = json.loads((first / "confidence.json").read_text())
+def test_a_confidence_that_is_the_same_for_all_is_told(evaluate, content, tmp_path):
     content["systems"]["histogram"]["weights"] = [0.0, 0.0]
     (tmp_path / "flat.json").write_text(json.dumps(content))
-    _, code, _, stderr = evaluate("out", f"confidence={tmp_path}/flat.json", "figures=0")
-    assert code == 0, stderr
+    _, stderr, _ = evaluate("out", f"confidence={tmp_path}/flat.json", "figures=0")
     assert "flat.json cannot tell right answers from wrong ones" in stderr

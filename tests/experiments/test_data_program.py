@@ -7,12 +7,11 @@ from PIL import Image
 
 from mfvpr.datasets.published import PUBLISHED
 from tests.datasets.test_published import put
-from tests.programs import typed
 
 
 @pytest.fixture
-def program(monkeypatch, capsys):
-    return partial(typed, monkeypatch, capsys, "data")
+def program(call):
+    return partial(call, "data")
 
 
 def test_all_are_listed_with_their_numbers(program):

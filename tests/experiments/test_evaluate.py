@@ -15,7 +15,7 @@ from experiments import settings
 from experiments.settings import CONF, SettingsError
 from mfvpr import AnchorPoints, HistogramOfShifts, RatioWeight
 from mfvpr.scoring import ALONE, PAPER, SCORERS, Homography, OpenCvHomography
-from tests.programs import QUICK, ROOT, composed, folder, run, typed
+from tests.programs import QUICK, ROOT, composed, folder, run
 
 pytestmark = pytest.mark.thorough
 
@@ -56,14 +56,8 @@ def test_features_of_a_named_system_may_be_replaced(features):
         (["system=ssm_vpr", "features.image_size=[336,320]"], "which are 40 x 38"),
         (["system=ssm_vpr", "features.image_size=null"], "features.image_size=null: expected width and height"),
         (["features=ssm", "features.image_size=null"], "features.image_size=null: expected width and height"),
-        (
-            ["system=ssm_vpr", "matching.cross_check=mutual"],
-            "cross_check=mutual: expected candidate, since",
-        ),
-        (
-            ["scorer=grid", "features=ssm", "matching=lightglue"],
-            "cross_check=lightglue: expected candidate, since",
-        ),
+        (["system=ssm_vpr", "matching.cross_check=mutual"], "cross_check=mutual: expected candidate, since"),
+        (["scorer=grid", "features=ssm", "matching=lightglue"], "cross_check=lightglue: expected candidate, since"),
         (["system=ssm_vpr_ras2020", "features.stride=1"], "scorer.side=25: .* 50 x 50"),
     ],
 )
@@ -96,7 +90,7 @@ def test_values_without_meaning_are_refused(name, value):
 
 
 @pytest.mark.slow
-def test_bad_images_by_policy(small_street, tmp_path, monkeypatch, capsys):
+def test_bad_images_by_policy(small_street, tmp_path, succeed, refuse):
     """Names with spaces, unicode and '@' in a parent folder; one image broken, one without keypoints."""
     root = tmp_path / "a@b, c's" / "ü"
     for name in ("database", "queries"):
@@ -115,8 +109,7 @@ def test_bad_images_by_policy(small_street, tmp_path, monkeypatch, capsys):
     assert "Traceback" not in failed.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a@b, c's"]
 
-    code, _, stderr = typed(monkeypatch, capsys, "evaluate", *arguments, "on_bad_image=skip")
-    assert code == 0, stderr
+    _, stderr = succeed("evaluate", *arguments, "on_bad_image=skip")
     assert "candidates=99, but the database has 10 images" in stderr
     heading = (tmp_path / "out" / "table.md").read_text().splitlines()[0]
     assert ": 10 queries, 10 database images (1 skipped), 10 candidates (" in heading
@@ -128,17 +121,14 @@ def test_bad_images_by_policy(small_street, tmp_path, monkeypatch, capsys):
     assert "é 0003.png" not in {row["database"] for row in rows}
     assert "é 0005.png: no candidates (1 such queries of 10)" in stderr
 
-    code, _, stderr = typed(monkeypatch, capsys, "evaluate", *arguments, "on_bad_image=skip")
-    assert code == 2
-    assert "expected a new or empty run folder" in stderr
+    assert "expected a new or empty run folder" in refuse("evaluate", *arguments, "on_bad_image=skip")
 
 
 @pytest.mark.slow
-def test_rankings_without_ground_truth(small_street, tmp_path, monkeypatch, capsys):
+def test_rankings_without_ground_truth(small_street, tmp_path, succeed):
     none = ("dataset.ground_truth=none", "dataset.index_file=null")
     arguments = folder(small_street, *none, "scorer=anchor", *QUICK, "figures=1", f"out={tmp_path}/out")
-    code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *arguments)
-    assert code == 0, stderr
+    stdout, _ = succeed("evaluate", *arguments)
     assert "no ground truth: rankings only" in stdout
     rows = json.loads((tmp_path / "out" / "results.json").read_text())
     assert [row["system"] for row in rows] == ["filter", "anchor", "anchor + filter"]
@@ -164,16 +154,13 @@ def test_ctrl_c_leaves_nothing(small_street, tmp_path, stage):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_bins_that_do_not_fit_are_refused(small_street, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    for setting, words in (
-        ("scorer.max_bins=3", "at least 45"),
-        ("scorer.bin_size=0.01", "at most 1024 bins per axis"),
-    ):
-        arguments = folder(small_street, "scorer=histogram", *QUICK, setting)
-        code, _, stderr = typed(monkeypatch, capsys, "evaluate", *arguments)
-        assert code == 2
-        assert words in stderr.splitlines()[-1]
+@pytest.mark.parametrize(("setting", "words"), [
+    ("scorer.max_bins=3", "at least 45"), ("scorer.bin_size=0.01", "at most 1024 bins per axis"),
+])  # fmt: skip
+def test_bins_that_do_not_fit_are_refused(small_street, tmp_path, refuse, setting, words):
+    assert words in refuse(
+        "evaluate", *folder(small_street, "scorer=histogram", *QUICK, setting, f"out={tmp_path}/out")
+    )
 
 
 @pytest.mark.slow

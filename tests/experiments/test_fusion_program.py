@@ -7,15 +7,10 @@ import numpy as np
 import pytest
 
 from experiments import axes, build, evaluation, settings
-from tests.programs import CANDIDATES, QUERIES, composed, shared, small
+from tests.programs import CANDIDATES, QUERIES, composed, small
 
 FUSED = ("scorer=ratio", "fusion.c=zscore", "fusion.weights={filter: 0.5, anchor: 1}")
 SYSTEM = "histogram + anchor + filter"
-
-
-@pytest.fixture(scope="module")
-def root(tmp_path_factory):
-    return shared(tmp_path_factory)
 
 
 def ranked(out, name):

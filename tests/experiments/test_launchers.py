@@ -10,7 +10,7 @@ from hydra.core.plugins import Plugins
 from experiments.groups import choices
 from experiments.settings import CONF
 from tests.experiments.test_shards_program import tables
-from tests.programs import composed, run, small, typed
+from tests.programs import composed, run, small
 
 PLUGINS = {"joblib": "joblib", "submitit_local": "submitit_local", "slurm": "submitit_slurm"}  # their launchers
 EXTRAS = {"joblib": "sweep", "submitit_local": "slurm", "slurm": "slurm"}
@@ -40,13 +40,11 @@ def test_a_launcher_composes_and_adds_no_setting(launcher):
 
 
 @pytest.mark.parametrize("launcher", PLUGINS)
-def test_what_is_not_installed_is_told_in_one_line(launcher, monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
+def test_what_is_not_installed_is_told_in_one_line(launcher, monkeypatch, refuse_at_once):
     monkeypatch.delitem(installed(), f"{PLUGINS[launcher]}.yaml", raising=False)
     message = f"error: {PLUGINS[launcher]}: this launcher is not installed; pip install 'mfvpr[{EXTRAS[launcher]}]'\n"
     for setting in (f"launcher={launcher}", f"hydra/launcher={PLUGINS[launcher]}"):
-        assert typed(monkeypatch, capsys, "evaluate", "-m", setting, "candidates=4,8") == (2, "", message)
-    assert not [*tmp_path.iterdir()]
+        assert refuse_at_once("evaluate", "-m", setting, "candidates=4,8") == message
 
 
 @pytest.mark.parametrize(
@@ -59,32 +57,30 @@ def test_what_is_not_installed_is_told_in_one_line(launcher, monkeypatch, capsys
         (["-m", "hydra/launcher=nope"], "nope: this launcher is not installed; there are basic joblib"),
     ],
 )
-def test_wrong_launchers(arguments, words, monkeypatch, capsys):
-    code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *arguments)
-    assert (code, stdout, stderr.count("\n")) == (2, "", 1)
-    assert words in stderr
+def test_wrong_launchers(arguments, words, refuse_at_once):
+    assert words in refuse_at_once("evaluate", *arguments)
 
 
-def test_help_shows_the_settings_of_a_launcher_where_they_are(monkeypatch, capsys):
-    _, without, _ = typed(monkeypatch, capsys, "evaluate", "--help")
+def test_help_shows_the_settings_of_a_launcher_where_they_are(succeed):
+    without, _ = succeed("evaluate", "--help")
     assert "  launcher=null           joblib, slurm, submitit_local\n" in without
-    _, stdout, _ = typed(monkeypatch, capsys, "sweep", "--help", "launcher=slurm")
+    stdout, _ = succeed("sweep", "--help", "launcher=slurm")
     assert "\nhydra:\n  # An array of Slurm" in stdout
     assert "\n  launcher:\n    name: mfvpr\n    array_parallelism: 64  # tasks" in stdout
     assert "@" not in stdout[stdout.index("hydra:") : stdout.index("scorer:")]
 
 
 @pytest.mark.slow
-def test_shards_are_one_command_line_until_nothing_is_missing(tmp_path, monkeypatch, capsys):
+def test_shards_are_one_command_line_until_nothing_is_missing(tmp_path, succeed):
     settings = [setting for setting in small(tmp_path) if not setting.startswith("store=")] + ["figures=0"]
     plain, out = tmp_path / "plain", tmp_path / "out"
-    assert typed(monkeypatch, capsys, "evaluate", *settings, f"store={tmp_path}/other", f"out={plain}")[0] == 0
+    succeed("evaluate", *settings, f"store={tmp_path}/other", f"out={plain}")
     shards = ("-m", "launcher=joblib", "hydra.launcher.n_jobs=2", "shard=0/2,1/2", f"hydra.sweep.dir={tmp_path}/jobs")
     missing, rounds = "0-1", 0
     while missing:
         done = run(*settings, *shards, f"store={tmp_path}/store", f"out={out}")
         assert done.returncode == 0, done.stderr
-        missing, rounds = typed(monkeypatch, capsys, "shards", "missing", out)[1], rounds + 1
+        missing, rounds = succeed("shards", "missing", out)[0], rounds + 1
         assert rounds <= 3
     assert tables(out) == tables(plain)
     assert "launcher" not in json.loads((out / "run.json").read_text())["command"]

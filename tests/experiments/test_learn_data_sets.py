@@ -8,7 +8,7 @@ import pytest
 
 from experiments import data_sets, evaluation, learning
 from mfvpr.datasets.streets import streets_folder
-from tests.programs import QUERIES, composed, results, shared, small, typed
+from tests.programs import QUERIES, composed, results, small
 
 pytestmark = pytest.mark.slow
 
@@ -19,11 +19,6 @@ def as_text(street, name):
     """A synthetic street's folder, in the words of a list of data sets."""
     index = f"ground_truth=index:index_file={street}/ground_truth.csv:widen_index=true"
     return f"folder:name={name}:database={street}/database:queries={street}/queries:{index}"
-
-
-@pytest.fixture(scope="module")
-def root(tmp_path_factory):
-    return shared(tmp_path_factory)
 
 
 @pytest.fixture(scope="module")
@@ -94,41 +89,25 @@ def test_several_sets_as_they_are_typed(streets):
     [
         (["also=streets"], "also=streets: expected report="),
         (["report=streets", "split=first_half"], "split=first_half: expected none with report="),
-        (
-            ["report=street"],
-            "report=street: expected data sets",
-        ),
+        (["report=street"], "report=street: expected data sets"),
         (["report=corridor"], "report=corridor: corridor has no default of root"),
         (["report=streets:sed=1"], "report=streets:sed=1: streets has no setting sed"),
         (["report=streets", "retrieval.name=pairs"], "retrieval=pairs: expected none with report="),
         (["report=streets:seed=-1"], "dataset.seed=-1: expected a whole number not below 0"),
     ],
 )
-def test_mistakes_are_one_line_and_exit_code_2(root, tmp_path, monkeypatch, capsys, arguments, words):
-    monkeypatch.chdir(tmp_path)
-    code, stdout, stderr = typed(monkeypatch, capsys, "learn", *small(root), *arguments)
-    assert (code, stdout) == (2, "")
-    assert words in stderr
-    assert stderr.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
+def test_mistakes_are_one_line_and_exit_code_2(root, refuse_at_once, arguments, words):
+    assert words in refuse_at_once("learn", *small(root), *arguments)
 
 
-def test_the_images_that_were_learned_on_are_not_reported_on(root, streets, tmp_path, monkeypatch, capsys):
-    same = f"report={streets[0]}"
-    code, stdout, stderr = typed(monkeypatch, capsys, "learn", *small(root), *SHORT, same, f"out={tmp_path}/out")
-    assert (code, stdout) == (2, "")
-    last = stderr.splitlines()[-1]
-    assert last.startswith("error: report=street0: expected")
-    assert f"; {2 * QUERIES} " in last.partition(" folder")[2]
-
-
-def test_the_same_queries_do_not_count_twice(root, streets, tmp_path, monkeypatch, capsys):
-    twice = f"report={streets[1]},{streets[1].replace('name=street1', 'name=again')}"
-    code, stdout, stderr = typed(monkeypatch, capsys, "learn", *small(root), *SHORT, twice, f"out={tmp_path}/out")
-    assert (code, stdout) == (2, "")
-    last = stderr.splitlines()[-1]
-    assert last.startswith("error: again: expected")
-    assert f"; {QUERIES} " in last.partition(" street1")[2]
+def test_images_that_were_learned_on_are_not_reported_on_and_queries_count_once(root, streets, tmp_path, refuse):
+    again = streets[1].replace("name=street1", "name=again")
+    for report, name, other, same in (
+        (streets[0], "report=street0", "folder", 2 * QUERIES), (f"{streets[1]},{again}", "again", "street1", QUERIES),
+    ):  # fmt: skip
+        error = refuse("learn", *small(root), *SHORT, f"report={report}", f"out={tmp_path}/out")
+        assert error.startswith(f"error: {name}: expected")
+        assert f"; {same} " in error.partition(f" {other}")[2]
 
 
 def test_sets_of_one_map_are_not_independent(root, streets, tmp_path, capsys):
@@ -146,7 +125,7 @@ def test_sets_of_one_map_are_not_independent(root, streets, tmp_path, capsys):
     assert "there and back" not in capsys.readouterr().err
 
 
-def test_a_learned_weight_knows_what_it_was_learned_on(root, streets, learned, tmp_path, monkeypatch, capsys):
+def test_a_learned_weight_knows_what_it_was_learned_on(root, streets, learned, tmp_path, capsys, succeed):
     weight = learned[0] / "out" / "weights" / "other_sets_match_labels.json"
     on_these = "was learned on images of folder"
     common = (*small(root), f"scorer.weight={weight}", "figures=0")
@@ -155,7 +134,7 @@ def test_a_learned_weight_knows_what_it_was_learned_on(root, streets, learned, t
         (["scorer=histogram", "scorer.weight=learned_aliked"], ["other features (aliked instead of sift, aliked-n16 "]),
         (["scorer=histogram", "scorer.weight=ratio"], []),
     ]):  # fmt: skip
-        _, _, stderr = typed(monkeypatch, capsys, "evaluate", *common, *more, f"out={tmp_path}/{number}")
+        _, stderr = succeed("evaluate", *common, *more, f"out={tmp_path}/{number}")
         assert [line for line in stderr.splitlines() if "was learned" in line and any(t in line for t in warns)] == [
             line for line in stderr.splitlines() if "was learned" in line
         ]

@@ -13,7 +13,7 @@ from mfvpr.scoring.weight_files import read_weight
 from mfvpr.tuning.learning import checkpoints, teaching
 from mfvpr.tuning.learning.splits import TrainingSplit
 from mfvpr.tuning.learning.training import Fit, Record
-from tests.programs import QUERIES, composed, results, shared, small, snapshot, typed
+from tests.programs import QUERIES, composed, results, small, snapshot
 
 pytestmark = pytest.mark.slow
 
@@ -22,11 +22,6 @@ SHORT = (*SUM, "split=first_half", "steps=4", "every=2", "batch=4", "learning_ra
 ROWS = [name + filtered for name in ("paper", "1 - ratio", "grid search", "gradient", "match weights", "match labels")
         for filtered in ("", " + filter")]  # fmt: skip
 WIDEST = 1  # frames
-
-
-@pytest.fixture(scope="session")
-def root(tmp_path_factory):
-    return shared(tmp_path_factory)
 
 
 @pytest.fixture(scope="session")
@@ -205,7 +200,7 @@ def test_what_is_trained_already_is_not_trained_again(learn, learned, tmp_path, 
     assert learn(tmp_path / "out", *SHORT) == learned[1]
 
 
-def test_a_checkpoint_of_another_model_is_refused(root, learned, tmp_path, monkeypatch, capsys):
+def test_a_checkpoint_of_another_model_is_refused(root, learned, tmp_path, refuse):
     [folder] = [path.parent for path in root.glob("store/folder_learning-*/first_half-gradient/4")]
     before = snapshot(root)
     for change, words in (
@@ -214,12 +209,10 @@ def test_a_checkpoint_of_another_model_is_refused(root, learned, tmp_path, monke
         ("loss=recall", 'loss="cross_entropy", expected "recall"'),
     ):
         arguments = (*small(root), *SHORT, change, f"checkpoints={folder.parent}", f"out={tmp_path}/out")
-        code, stdout, stderr = typed(monkeypatch, capsys, "learn", *arguments)
-        assert (code, stdout) == (2, "")
-        last = stderr.splitlines()[-1]
-        assert last.startswith(f"error: {folder}: ")
-        assert words in last
-        assert "delete" in last
+        error = refuse("learn", *arguments)
+        assert error.startswith(f"error: {folder}: ")
+        assert words in error
+        assert "delete" in error
         assert list(tmp_path.iterdir()) == []
     assert snapshot(root) == before
 
@@ -242,18 +235,15 @@ def test_whatever_changes_the_result_changes_the_checkpoint(root, untrained, tmp
 
 
 @pytest.mark.parametrize(("rate", "step", "step_kept"), [(20, 4, " {}/4;"), (1e12, 1, "no checkpoint")])
-def test_a_loss_that_turns_infinite_is_told(root, tmp_path, monkeypatch, capsys, rate, step, step_kept):
+def test_a_loss_that_turns_infinite_is_told(root, tmp_path, refuse, rate, step, step_kept):
     place = tmp_path / "kept"
     few = ("grid.sigma=[10]", "grid.bin_size=null", "grid.weight=null", "grid.c=[0,1]")
     absurd = (f"learning_rate={rate}", "every=1", f"checkpoints={place}", f"out={tmp_path}/out")
-    code, stdout, stderr = typed(monkeypatch, capsys, "learn", *small(root), *few, *absurd)
-    assert (code, stdout) == (2, "")
-    last = stderr.splitlines()[-1]
-    assert last.startswith(f"error: step {step}: ")
-    assert " is not finite at numbers.sigma=" in last
-    assert step_kept.format(place / "first_half-gradient") in last
-    assert "learning rate" in last
-    assert "Traceback" not in stderr
+    error = refuse("learn", *small(root), *few, *absurd)
+    assert error.startswith(f"error: step {step}: ")
+    assert " is not finite at numbers.sigma=" in error
+    assert step_kept.format(place / "first_half-gradient") in error
+    assert "learning rate" in error
     assert not (tmp_path / "out").exists()
     assert sorted(path.name for path in place.glob("*/*")) == (["3", "4"] if step == 4 else [])
 
@@ -265,10 +255,7 @@ def test_a_loss_that_turns_infinite_is_told(root, tmp_path, monkeypatch, capsys,
         (["scorer=count"], "scorer=count: expected one to learn"),
         (["scorer=lost"], "scorer=lost: expected one to learn"),
         (["scorer=all"], "scorer: expected one to learn"),
-        (
-            ["scorer=anchor", "grid.sigma=[10]"],
-            "it has num_bins, window, tolerance, ",
-        ),
+        (["scorer=anchor", "grid.sigma=[10]"], "it has num_bins, window, tolerance, "),
         (["loss=hinge"], "loss=hinge: expected one of cross_entropy"),
         (["steps=0"], "steps=0: expected a whole number above 0"),
         (["learning_rate=nan"], "learning_rate=nan: expected a number above 0"),
@@ -278,30 +265,19 @@ def test_a_loss_that_turns_infinite_is_told(root, tmp_path, monkeypatch, capsys,
         (["recall.tolerances=[30]"], "smaller tolerances or radius"),
     ],
 )
-def test_mistakes_are_one_line_and_exit_code_2(root, tmp_path, monkeypatch, capsys, arguments, words):
-    monkeypatch.chdir(tmp_path)
-    code, stdout, stderr = typed(monkeypatch, capsys, "learn", *small(root), *arguments)
-    assert (code, stdout) == (2, "")
-    assert words in stderr
-    assert stderr.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
+def test_mistakes_are_one_line_and_exit_code_2(root, refuse_at_once, arguments, words):
+    assert words in refuse_at_once("learn", *small(root), *arguments)
 
 
-def test_too_few_queries_are_refused(root, tmp_path, monkeypatch, capsys):
+def test_too_few_queries_are_refused(root, tmp_path, refuse):
     few = ("recall.tolerances=[0,3]", *SUM, f"out={tmp_path}/out")
-    code, stdout, stderr = typed(monkeypatch, capsys, "learn", *small(root), *few)
-    assert (code, stdout) == (2, "")
-    assert "split=first_half: expected queries" in stderr.splitlines()[-1]
+    assert "split=first_half: expected queries" in refuse("learn", *small(root), *few)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_what_is_not_the_papers_is_not_called_so(learn, untrained, tmp_path):
     content = learn(tmp_path / "out", *SUM, "scorer.weight=ratio", "split=first_half", "steps=1")
-    assert [row["score"] for row in content["rows"]][:4] == [
-        "as set",
-        "as set + filter",
-        "1 - ratio",
-        "1 - ratio + filter",
-    ]
+    names = ["as set", "as set + filter", "1 - ratio", "1 - ratio + filter"]
+    assert [row["score"] for row in content["rows"]][:4] == names
     assert content["rows"][0]["recall_at_1"] == content["rows"][2]["recall_at_1"]
     assert "against as set" in (tmp_path / "out" / "table.md").read_text()

@@ -10,23 +10,18 @@ import pytest
 
 from experiments import console
 from mfvpr.storage import matches as match_store
-from tests.programs import CANDIDATES, QUERIES, ROOT, composed, matches_path, results, shared, small, typed
+from tests.programs import CANDIDATES, QUERIES, ROOT, composed, matches_path, results, small
 
 pytestmark = pytest.mark.thorough
 
 SIGMA = "grid.sigma=[10]"
 
 
-@pytest.fixture(scope="session")
-def root(tmp_path_factory):
-    return shared(tmp_path_factory)
-
-
-def test_a_multirun_makes_one_run_folder_per_job(root, tmp_path, monkeypatch, capsys):
+def test_a_multirun_makes_one_run_folder_per_job(root, tmp_path, monkeypatch, call):
     """A job that fails stops no other, and comes up again at the end."""
     monkeypatch.chdir(tmp_path)
     jobs = ("experiment=weight", "scorer=sum,histogram", "candidates=8,0")
-    code, stdout, stderr = typed(monkeypatch, capsys, "sweep", *small(root), "-m", *jobs)
+    code, stdout, stderr = call("sweep", *small(root), "-m", *jobs)
     assert code == 2
     folders = sorted((tmp_path / "runs" / "folder").iterdir())
     assert [f"results: {path.relative_to(tmp_path)}" in stdout for path in folders] == [True, True]
@@ -39,30 +34,27 @@ def test_a_multirun_makes_one_run_folder_per_job(root, tmp_path, monkeypatch, ca
 
 
 @pytest.mark.slow
-def test_weights_of_every_score_are_one_command(root, tmp_path, monkeypatch, capsys):
+def test_weights_of_every_score_are_one_command(root, tmp_path, monkeypatch, succeed):
     monkeypatch.chdir(tmp_path)
-    arguments = ("-m", *small(root), "experiment=weight", "grid.weight=[fs,unit]")
-    code, stdout, _ = typed(monkeypatch, capsys, "sweep", *arguments)
-    assert code == 0
+    stdout, _ = succeed("sweep", "-m", *small(root), "experiment=weight", "grid.weight=[fs,unit]")
     assert [f"settings of the {name} score" in stdout for name in ("sum", "anchor", "histogram")] == [True] * 3
 
 
-def test_paths_stand_between_commas_in_a_multirun(root, tmp_path, monkeypatch, capsys):
+def test_paths_stand_between_commas_in_a_multirun(root, tmp_path, monkeypatch, succeed):
     outs = f"{tmp_path}/a b,{tmp_path}/it's"
     monkeypatch.chdir(tmp_path)
-    code, _, stderr = typed(monkeypatch, capsys, "sweep", "-m", *small(root), SIGMA, f"out={outs}")
-    assert code == 0, stderr
+    succeed("sweep", "-m", *small(root), SIGMA, f"out={outs}")
     assert results(tmp_path / "a b") == results(tmp_path / "it's")
 
 
-def test_a_job_waits_for_the_matches_of_another_and_a_single_run_does_not(root, tmp_path, monkeypatch, capsys):
+def test_a_job_waits_for_the_matches_of_another_and_a_single_run_does_not(root, tmp_path, monkeypatch, succeed, call):
     overrides = *small(root), SIGMA
     settings = composed(*overrides, config="sweep")
     path, recipe = matches_path(settings)
-    assert typed(monkeypatch, capsys, "sweep", *overrides, f"out={tmp_path}/first")[0] == 0
+    succeed("sweep", *overrides, f"out={tmp_path}/first")
     with match_store.open_match_store(path, recipe, num_queries=QUERIES, num_candidates=CANDIDATES) as complete:
         assert complete.done.all()  # so others read it at the same time
-        assert typed(monkeypatch, capsys, "sweep", *overrides, f"out={tmp_path}/second")[0] == 0
+        succeed("sweep", *overrides, f"out={tmp_path}/second")
     next(path.glob("3-*.npz")).unlink()
     taken, announced = threading.Event(), threading.Event()
 
@@ -75,14 +67,13 @@ def test_a_job_waits_for_the_matches_of_another_and_a_single_run_does_not(root, 
     monkeypatch.setattr(console, "tell", lambda text: (tell(text), "waiting until" in text and announced.set()))
     other.start()
     assert taken.wait(timeout=60)
-    code, _, stderr = typed(monkeypatch, capsys, "sweep", *overrides, f"out={tmp_path}/single")
+    code, _, stderr = call("sweep", *overrides, f"out={tmp_path}/single")
     assert (code, announced.is_set()) == (2, False)
     assert stderr.startswith(f"error: {path}: in use by process {os.getpid()}; ")
     assert stderr.count("\n") == 1
     monkeypatch.chdir(tmp_path)
-    code, _, stderr = typed(monkeypatch, capsys, "sweep", "-m", *overrides, f"out={tmp_path}/job")
+    _, stderr = succeed("sweep", "-m", *overrides, f"out={tmp_path}/job")
     other.join(timeout=60)
-    assert code == 0, stderr
     assert f"{path}: in use by process {os.getpid()}; waiting" in stderr
     assert {place.name for place in tmp_path.iterdir()} == {"runs", "first", "second", "job"}
 

@@ -28,17 +28,12 @@ from mfvpr.report import runs
 from mfvpr.report.evaluations import SequenceFigures
 from mfvpr.scoring import HistogramOfShifts
 from mfvpr.utils import InputError
-from tests.programs import CANDIDATES, QUERIES, ROOT, composed, shared, small, typed
+from tests.programs import CANDIDATES, QUERIES, ROOT, composed, small
 
 pytestmark = pytest.mark.thorough
 
 LINES = ("scorer=histogram", "figures=4")
 SYSTEMS = ("filter", "histogram", "histogram + filter")
-
-
-@pytest.fixture(scope="session")
-def root(tmp_path_factory):
-    return shared(tmp_path_factory)
 
 
 @pytest.fixture(scope="session")
@@ -145,13 +140,12 @@ def test_heading_and_tables_say_the_same(evaluated, capsys):
         assert f"{' & '.join(line.values())} \\\\\n" in latex
 
 
-def test_a_run_says_how_it_was_made(root, tmp_path, monkeypatch, capsys):
+def test_a_run_says_how_it_was_made(root, tmp_path, monkeypatch, succeed):
     subprocess.run(["git", "init", "--quiet", tmp_path], check=True)
     identity = ("-c", "user.name=a", "-c", "user.email=a@b.c")
     subprocess.run(["git", *identity, "commit", "--quiet", "--allow-empty", "-m", "x"], cwd=tmp_path, check=True)
     monkeypatch.chdir(tmp_path)
-    code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *small(root), "scorer=count", "figures=0", "out=a b")
-    assert code == 0, stderr
+    stdout, _ = succeed("evaluate", *small(root), "scorer=count", "figures=0", "out=a b")
     assert stdout.endswith("results: a b\nreport: a b/report.html\n")
     content = json.loads((tmp_path / "a b" / "run.json").read_text())
     assert content["command"].startswith("python -m experiments.evaluate dataset=folder dataset.database=")
@@ -233,13 +227,12 @@ def test_the_figure_of_a_refused_answer_says_that_there_is_no_place(outcome):
 # --- the claim ---------------------------------------------------------------------------------------------------
 
 
-def test_a_folder_in_use_is_refused_at_the_start(root, tmp_path, monkeypatch, capsys):
+def test_a_folder_in_use_is_refused_at_the_start(root, tmp_path, monkeypatch, call):
     monkeypatch.setattr(evaluation, "evaluation_of", lambda *_: pytest.fail("it was begun"))
     with runs.claim_run_folder(tmp_path / "out"):
-        code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *small(root), f"out={tmp_path}/out")
-    assert (code, stdout) == (2, "")
+        code, stdout, stderr = call("evaluate", *small(root), f"out={tmp_path}/out")
+    assert (code, stdout, stderr.count("\n")) == (2, "", 1)
     assert stderr.startswith(f"error: {tmp_path}/out: another run")
-    assert stderr.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 
 
@@ -327,9 +320,9 @@ def limited(monkeypatch):
     return limit
 
 
-def test_a_full_disk_costs_no_table(root, evaluated, tmp_path, monkeypatch, capsys, limited):
+def test_a_full_disk_costs_no_table(root, evaluated, tmp_path, call, limited):
     limited(2000)
-    code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *small(root), *LINES, f"out={tmp_path}/out")
+    code, stdout, stderr = call("evaluate", *small(root), *LINES, f"out={tmp_path}/out")
     assert code == 2
     assert "\nhistogram + filter " in stdout
     last = stderr.splitlines()[-1]
@@ -339,10 +332,9 @@ def test_a_full_disk_costs_no_table(root, evaluated, tmp_path, monkeypatch, caps
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_figure_that_cannot_be_drawn_costs_a_warning(root, evaluated, tmp_path, monkeypatch, capsys, limited):
+def test_a_figure_that_cannot_be_drawn_costs_a_warning(root, evaluated, tmp_path, succeed, limited):
     limited(30_000)
-    code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *small(root), *LINES, f"out={tmp_path}/out")
-    assert code == 0, stderr
+    stdout, stderr = succeed("evaluate", *small(root), *LINES, f"out={tmp_path}/out")
     assert stdout.endswith(f"results: {tmp_path}/out\nreport: {tmp_path}/out/report.html\n")
     warnings = [line for line in stderr.splitlines() if line.startswith(f"warning: {tmp_path}/out/figures/wrong_")]
     assert len(warnings) == 2
@@ -358,11 +350,11 @@ def test_a_page_that_cannot_be_made_costs_a_warning(tmp_path, capsys):
     assert stderr.startswith(f"warning: {tmp_path}: no page was made of it (")
 
 
-def test_ctrl_c_while_figures_are_drawn_keeps_the_tables(root, evaluated, tmp_path, monkeypatch, capsys):
+def test_ctrl_c_while_figures_are_drawn_keeps_the_tables(root, evaluated, tmp_path, monkeypatch, call):
     monkeypatch.setattr(
         "mfvpr.report.evaluations.histogram_figure", lambda *_, **__: os.kill(os.getpid(), signal.SIGINT)
     )
-    code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *small(root), *LINES, f"out={tmp_path}/out")
+    code, stdout, stderr = call("evaluate", *small(root), *LINES, f"out={tmp_path}/out")
     assert code == 130
     assert "\nhistogram + filter " in stdout
     assert stderr.splitlines()[-1].startswith("interrupted")
@@ -370,7 +362,7 @@ def test_ctrl_c_while_figures_are_drawn_keeps_the_tables(root, evaluated, tmp_pa
     assert {path.name for path in (tmp_path / "out").iterdir()} == names
 
 
-def test_names_that_are_no_utf8_cost_nothing(root, tmp_path, monkeypatch, capsys):
+def test_names_that_are_no_utf8_cost_nothing(root, tmp_path, succeed):
     """Names of images, of their folder, and of the run folder."""
     street = streets_folder(root, num_frames=QUERIES, image_size=(160, 120))
     place = tmp_path / os.fsdecode(b"data\xff")
@@ -381,8 +373,7 @@ def test_names_that_are_no_utf8_cost_nothing(root, tmp_path, monkeypatch, capsys
     out = tmp_path / os.fsdecode(b"out\xff")
     arguments = [f"dataset.database={place}/database", f"dataset.queries={place}/queries", f"out={out}", "figures=2",
                  "dataset.ground_truth=order", "dataset.index_file=null", "scorer=histogram"]  # fmt: skip
-    code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *small(root), *arguments)
-    assert code == 0, stderr
+    stdout, stderr = succeed("evaluate", *small(root), *arguments)
     assert stdout.endswith("out\\udcff/report.html\n")
     assert "warning" not in stderr
     assert len(list((out / "figures").glob("*_0*.png"))) == 2

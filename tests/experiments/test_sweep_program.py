@@ -16,16 +16,11 @@ from PIL import Image
 from experiments import axes, evaluation, launch, search
 from mfvpr.storage import FeatureCache
 from mfvpr.storage import matches as match_store
-from tests.programs import CANDIDATES, QUERIES, ROOT, composed, matches_path, results, shared, small, snapshot, typed
+from tests.programs import CANDIDATES, QUERIES, ROOT, composed, matches_path, results, small, snapshot
 
 pytestmark = pytest.mark.thorough
 
 SWEEP = sys.modules["mfvpr.tuning.sweeps.sweep"]
-
-
-@pytest.fixture(scope="session")
-def root(tmp_path_factory):
-    return shared(tmp_path_factory)
 
 
 @pytest.fixture(scope="session")
@@ -60,23 +55,18 @@ def recall_of(content, **parameters):
 # --- one sweep ---------------------------------------------------------------------------------------------------
 
 
-def results_of(out):
-    return json.loads((out / "results.json").read_text())
-
-
-def evaluated(root, out, **changes):
-    """Recall at ks by system and tolerance."""
-    overrides = [f"{name}={value}" for name, value in changes.items()]
+def evaluated(root, out, *overrides):
+    """The rows of an evaluation, and their recall at ks by system and tolerance."""
     evaluation.evaluate(composed(*small(root), "figures=0", f"out={out}", *overrides))
-    rows = results_of(out)
-    return {(row["system"], f"{row['tolerance']}"): row["recall_at"] for row in rows}
+    rows = json.loads((out / "results.json").read_text())
+    return rows, {(row["system"], f"{row['tolerance']}"): row["recall_at"] for row in rows}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("sigma", "weight"), [(10, "unit"), (22.5, "fs")])
 def test_a_sweep_is_one_evaluation_per_setting(root, swept, tmp_path, sigma, weight):
-    changes = {"scorer.sigma": sigma, "scorer.weight": weight, "fusion.c": 2}
-    expected = evaluated(root, tmp_path / "out", scorer="histogram", **changes)
+    changes = (f"scorer.sigma={sigma}", f"scorer.weight={weight}", "fusion.c=2")
+    _, expected = evaluated(root, tmp_path / "out", "scorer=histogram", *changes)
     for system, c in (("histogram", 0), ("histogram + filter", 2)):
         for tolerance, recall in recall_of(swept[1], sigma=sigma, weight=weight, c=c).items():
             assert recall == pytest.approx(expected[system, tolerance], abs=1e-6)
@@ -85,12 +75,10 @@ def test_a_sweep_is_one_evaluation_per_setting(root, swept, tmp_path, sigma, wei
 @pytest.mark.parametrize(("final", "c"), [("score", 0), ("combined", 2)])
 def test_the_own_values_score_as_without_a_sweep(root, sweep, swept, tmp_path, final, c):
     content = sweep(tmp_path / "swept", *GRID, f"final={final}")
-    evaluation.evaluate(
-        composed(*small(root), "figures=0", "scorer=histogram", GRID[-1], f"final={final}", f"out={tmp_path}/evaluated")
-    )
+    rows, _ = evaluated(root, tmp_path / "evaluated", "scorer=histogram", GRID[-1], f"final={final}")
     assert content["own"] == {"sigma": 22.5, "weight": "fs", "c": c}
-    deciding = [row for row in results_of(tmp_path / "evaluated") if row["decides"]]
-    assert recall_of(content, **content["own"]) == {f"{row['tolerance']}": row["recall_at"] for row in deciding}
+    deciding = {f"{row['tolerance']}": row["recall_at"] for row in rows if row["decides"]}
+    assert recall_of(content, **content["own"]) == deciding
 
 
 def test_every_file_tells_the_same(swept):
@@ -189,9 +177,9 @@ def test_chunks_change_nothing(sweep, swept, tmp_path, chunk):
 
 def test_without_a_store(root, sweep, tmp_path):
     """Nor with many ties, by another rule: most pairs have no matches."""
-    common = {"store": "null", "matching.max_distance": 0.3, "ties": "index"}
-    expected = evaluated(root, tmp_path / "evaluated", scorer="histogram", **common, **{"scorer.sigma": 10})
-    content = sweep(tmp_path / "swept", "grid.sigma=[10]", *(f"{name}={value}" for name, value in common.items()))
+    common = ("store=null", "matching.max_distance=0.3", "ties=index")
+    _, expected = evaluated(root, tmp_path / "evaluated", "scorer=histogram", "scorer.sigma=10", *common)
+    content = sweep(tmp_path / "swept", "grid.sigma=[10]", *common)
     for tolerance, recall in recall_of(content, sigma=10).items():
         assert recall == pytest.approx(expected["histogram", tolerance], abs=1e-6)
 
@@ -274,39 +262,29 @@ SIGMA = "grid.sigma=[10]"
         ([SIGMA, "features=sift,aliked"], "add --multirun"),
     ],
 )
-def test_mistakes_are_one_line_and_exit_code_2(root, tmp_path, monkeypatch, capsys, arguments, words):
-    monkeypatch.chdir(tmp_path)
-    code, stdout, stderr = typed(monkeypatch, capsys, "sweep", *small(root), *arguments)
-    assert (code, stdout) == (2, "")
-    assert words in stderr
-    assert stderr.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
+def test_mistakes_are_one_line_and_exit_code_2(root, refuse_at_once, arguments, words):
+    assert words in refuse_at_once("sweep", *small(root), *arguments)
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (
-            ["grid.bin_size=[15,0.01]"],
-            "bin_size=0.01: expected at most 1024 bins",
-        ),
+        (["grid.bin_size=[15,0.01]"], "bin_size=0.01: expected at most 1024 bins"),
         ([SIGMA, "scorer.max_bins=3"], "max_bins=3: expected at least 22"),
         (["search=optuna", "grid.bin_size=[0.1,5]"], "bin_size=0.1: expected at most 1024 bins"),
     ],
 )
-def test_bins_that_do_not_fit_are_refused(root, swept, tmp_path, monkeypatch, capsys, arguments, words):
-    code, stdout, stderr = typed(monkeypatch, capsys, "sweep", *small(root), *arguments, f"out={tmp_path}/out")
-    assert (code, stdout) == (2, "")
-    assert f"error: {words}" in stderr.splitlines()[-1]
+def test_bins_that_do_not_fit_are_refused(root, swept, tmp_path, refuse, arguments, words):
+    assert refuse("sweep", *small(root), *arguments, f"out={tmp_path}/out").startswith(f"error: {words}")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_does_not_fit_in_memory_is_refused_with_its_size(root, swept, tmp_path, monkeypatch, capsys):
+def test_what_does_not_fit_in_memory_is_refused_with_its_size(root, swept, tmp_path, monkeypatch, refuse):
     def refused(free, *arguments):
         monkeypatch.setattr(axes, "free_host_bytes", lambda: free)
-        code, _, stderr = typed(monkeypatch, capsys, "sweep", *small(root), *arguments, f"out={tmp_path}/out")
-        assert (code, list(tmp_path.iterdir())) == (2, [])
-        return stderr.splitlines()[-1]
+        error = refuse("sweep", *small(root), *arguments, f"out={tmp_path}/out")
+        assert list(tmp_path.iterdir()) == []
+        return error
 
     many = f"grid.sigma={list(range(1, 101))}", f"grid.bin_size={list(range(5, 105))}"
     assert "10,000 settings would take about 20 MB of memory, 10 MB are free" in refused(10**7, *many)
@@ -319,7 +297,7 @@ def test_what_does_not_fit_in_memory_is_refused_with_its_size(root, swept, tmp_p
 
 
 @pytest.mark.parametrize("change", ["candidates=7", "retrieval.num_words=9", "features.max_keypoints=61"])
-def test_matches_of_something_else_are_refused(root, swept, tmp_path, monkeypatch, capsys, change):
+def test_matches_of_something_else_are_refused(root, swept, tmp_path, call, change):
     """A store that was moved to where another one belongs."""
 
     def place(*changes):
@@ -330,20 +308,16 @@ def test_matches_of_something_else_are_refused(root, swept, tmp_path, monkeypatc
         pass
     matching_place.parent.joinpath(foreign.name).symlink_to(matching_place)
     before = snapshot(tmp_path)
-    code, stdout, stderr = typed(monkeypatch, capsys, "sweep", *small(root), change, SIGMA, f"store={tmp_path}/store",
-                                 f"out={tmp_path}/out")  # fmt: skip
-    assert (code, stdout) == (2, "")
+    folders = (f"store={tmp_path}/store", f"out={tmp_path}/out")
+    code, stdout, stderr = call("sweep", *small(root), change, SIGMA, *folders)
+    assert (code, stdout, stderr.count("\n")) == (2, "", 1)
     assert "these matches were made with" in stderr
-    assert stderr.count("\n") == 1
     assert snapshot(tmp_path) == before
 
 
-def test_results_are_not_overwritten(root, swept, monkeypatch, capsys):
+def test_results_are_not_overwritten(root, swept, refuse_at_once):
     before = snapshot(swept[0])
-    code, stdout, stderr = typed(monkeypatch, capsys, "sweep", *small(root), SIGMA, f"out={swept[0]}")
-    assert (code, stdout) == (2, "")
-    assert "expected a new or empty run folder" in stderr
-    assert stderr.count("\n") == 1
+    assert "expected a new or empty run folder" in refuse_at_once("sweep", *small(root), SIGMA, f"out={swept[0]}")
     assert snapshot(swept[0]) == before
 
 

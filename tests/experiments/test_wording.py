@@ -6,7 +6,6 @@ from PIL import Image
 
 from mfvpr.io import write_features, write_global_descriptors
 from tests.builders import make_features, unit
-from tests.programs import typed
 
 SIZE = 64
 
@@ -65,7 +64,7 @@ ORDER = "dataset.ground_truth=order"
         ([ORDER, *files("retrieval", "long.npz")], "retrieval.lengths=normalize"),
     ],
 )  # fmt: skip
-def test_what_is_refused_says_which_setting_mends_it(images, tmp_path, monkeypatch, capsys, arguments, words):
+def test_what_is_refused_says_which_setting_mends_it(images, tmp_path, monkeypatch, refuse, arguments, words):
     monkeypatch.chdir(tmp_path)
     sides = [f"dataset.{side}={images}/{side}" for side in ("database", "queries")]
     defaults = ("dataset=folder", *sides, "store=null", "candidates=2", "scorer=count")
@@ -74,15 +73,11 @@ def test_what_is_refused_says_which_setting_mends_it(images, tmp_path, monkeypat
     settings = [default for default in defaults if default.partition("=")[0] not in names]
     settings += [] if "features=import" in typed_here else ["features.image_size=[64,64]"]
     settings += [] if {"retrieval=import", "retrieval.num_words=99"} & {*typed_here} else ["retrieval.num_words=2"]
-    code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *settings, *typed_here)
-    assert (code, stdout) == (2, ""), stderr
-    assert words in stderr.splitlines()[-1]
+    assert words in refuse("evaluate", *settings, *typed_here)
 
 
-def test_a_sweep_says_how_one_sequence_is_chosen(images, tmp_path, monkeypatch, capsys):
+def test_a_sweep_says_how_one_sequence_is_chosen(images, tmp_path, monkeypatch, refuse):
     monkeypatch.chdir(tmp_path)
     several = ("dataset=sequences", f"dataset.database={images}/database", ORDER,
                f"dataset.queries=[{images}/queries,{images}/database]", "scorer=sum", "grid.clamp=[true]")  # fmt: skip
-    code, _, stderr = typed(monkeypatch, capsys, "sweep", *several, "store=null")
-    assert code == 2
-    assert "got 2; give one folder as dataset.queries=[DIR]" in stderr
+    assert "got 2; give one folder as dataset.queries=[DIR]" in refuse("sweep", *several, "store=null")

@@ -1,0 +1,60 @@
+"""Command lines of the programs in this process, and the data set that their tests share."""
+
+from functools import partial
+
+import pytest
+
+from tests.programs import shared, typed
+
+
+@pytest.fixture(scope="session")
+def root(tmp_path_factory):
+    """The folder of the small data set, of its features and of its matches."""
+    return shared(tmp_path_factory)
+
+
+@pytest.fixture
+def call(monkeypatch, capsys):
+    """Runs a command line: exit code, stdout, stderr."""
+    return partial(typed, monkeypatch, capsys)
+
+
+@pytest.fixture
+def succeed(call):
+    """Runs a command line that must succeed: stdout, stderr."""
+
+    def run(program, *arguments):
+        code, stdout, stderr = call(program, *arguments)
+        assert code == 0, stderr
+        return stdout, stderr
+
+    return run
+
+
+@pytest.fixture
+def refuse(call):
+    """Runs a command line that must end with exit code 2 and no result: the error, which is the last line."""
+
+    def run(program, *arguments):
+        code, stdout, stderr = call(program, *arguments)
+        assert (code, stdout) == (2, ""), stderr
+        assert "Traceback" not in stderr
+        error = stderr.splitlines()[-1]
+        assert error.startswith("error: ")
+        return error
+
+    return run
+
+
+@pytest.fixture
+def refuse_at_once(call, tmp_path, monkeypatch):
+    """Runs a command line that must be refused before any work: the only line, and no file is left."""
+
+    def run(program, *arguments):
+        monkeypatch.chdir(tmp_path)
+        code, stdout, stderr = call(program, *arguments)
+        assert (code, stdout, stderr.count("\n")) == (2, "", 1), stderr
+        assert list(tmp_path.iterdir()) == []
+        return stderr
+
+    return run
