@@ -133,7 +133,7 @@ def _network_extractor(group: str, name: str, options: dict[str, Any]) -> Any:
     if "image_size" in options.keys() - names and (size := options.pop("image_size")) != extractor_class.image_size:
         title = {"mixvpr": "MixVPR", "ssm": "SSM-VPR's filter"}[name]
         expected = list(extractor_class.image_size)
-        raise SettingsError(f"{group}.image_size={list(size)}: {title} takes {expected} only, as its weights do")
+        raise SettingsError(f"{group}.image_size={list(size)}: {title} takes {expected} only")
     networks = ("netvlad", "patch_netvlad") if name == "netvlad" else (name,)
     model = _network(group, networks, options.pop("weights", None))
     if name == "dinov2":

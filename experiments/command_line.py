@@ -19,7 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from experiments import distributed_launch
 from experiments.console import tell
-from experiments.data_sets import compose, first_of
+from experiments.data_sets import compose_program, first_of
 from experiments.errors import on_interrupt, one_line
 from experiments.groups import PROGRAMS, check_choice, choices_with, groups
 from experiments.quoting import PATHS, as_typed
@@ -148,7 +148,7 @@ def _explain(error: Exception, config: str) -> str:
 def _suggestion(wrong: str, config: str) -> str:
     """Suggest a setting for an unknown one: in its group, in another choice of its group, or a similar name."""
     chosen = [argument for argument in sys.argv[1:] if argument.partition("=")[0] in groups(config)]
-    settings: Any = OmegaConf.to_container(compose(config, chosen))
+    settings: Any = OmegaConf.to_container(compose_program(config, chosen))
     values = dict(nodes(settings))
     group, (outer, _, name) = wrong.partition(".")[0], wrong.rpartition(".")
     if outer in values and not isinstance(values[outer], dict):

@@ -48,7 +48,7 @@ def label(settings: dict[str, Any]) -> str:
     return f"{settings['name']} {settings['seed']}" if "seed" in settings else settings["name"]
 
 
-def compose(config: str, overrides: list[str]) -> DictConfig:
+def compose_program(config: str, overrides: list[str]) -> DictConfig:
     """The settings of a program with overrides in Hydra's grammar, also while Hydra runs."""
     running = GlobalHydra.instance().is_initialized()
     with nullcontext() if running else hydra.initialize_config_dir(str(CONF), version_base="1.3"):
@@ -56,12 +56,12 @@ def compose(config: str, overrides: list[str]) -> DictConfig:
 
 
 def _compose(typed: str, choice: str, *values: str) -> dict[str, Any]:
-    known = sorted(map(str, compose("learn", [f"dataset={choice}"]).dataset))
+    known = sorted(map(str, compose_program("learn", [f"dataset={choice}"]).dataset))
     for name in (value.partition("=")[0] for value in values):
         if name not in known:
             raise SettingsError(f"{typed}: {choice} has no setting {name}; it has {', '.join(known)}")
     overrides = [as_typed(f"dataset.{value}") for value in values]
-    config = compose("learn", [f"dataset={choice}", *overrides]).dataset
+    config = compose_program("learn", [f"dataset={choice}", *overrides]).dataset
     for name in known:
         if not OmegaConf.is_interpolation(config, name) and OmegaConf.is_missing(config, name):
             raise SettingsError(f"{typed}: {choice} has no default of {name}; write {choice}:{name}=VALUE")

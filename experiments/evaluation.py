@@ -56,24 +56,24 @@ def evaluate(settings: dict[str, Any]) -> None:
         with run_folder.claimed(settings) as folder:
             _leave(folder, evaluation_of(settings))
         return
-    with sharding.joined(settings):
+    with sharding.join_run(settings):
         try:
             outcome = evaluation_of(settings)
         except NotYet as needs:
-            sharding.wait(settings, needs)
+            sharding.mark_waiting(settings, needs)
             if needs.is_complete:
                 print(f"shard {settings['shard']} has done its part: {needs}; the last shard leaves the results")
             else:
                 print(f"shard {settings['shard']} has done what it can: {needs}; start it again when they are there")
             return
         distributed_launch.disconnect()
-        with sharding.last(settings) as is_last:
+        with sharding.claim_results(settings) as is_last:
             if is_last:
                 with run_folder.claimed(settings, own=True, beside=[sharding.SHARDS]) as folder:
                     _leave(folder, outcome)
             else:
                 print(f"shard {settings['shard']} is complete; results: {settings['out']}")
-        sharding.complete(settings)
+        sharding.mark_complete(settings)
 
 
 def _leave(folder: Path, outcome: Outcome) -> None:

@@ -13,7 +13,7 @@ from experiments.console import tell
 from experiments.query_images import images
 from experiments.settings import SettingsError
 from mfvpr.datasets import read_image
-from mfvpr.evaluation import Confidence, read_confidences
+from mfvpr.evaluation import Confidence
 from mfvpr.localization import Answer, Asked, Drive, Map, Route
 from mfvpr.storage.maps import Entry
 from mfvpr.utils import InputError
@@ -83,15 +83,15 @@ class _Drive:
 
 def _confidence(settings: Mapping[str, Any]) -> Confidence | None:
     """The confidence of the score that the map was made with."""
-    if settings["confidence"] is None:
+    file = confidences.read(settings)
+    if file is None:
         return None
-    systems, origin = read_confidences(build.expand_user(settings["confidence"]))
     map_settings = maps.read(build.expand_user(settings["map"]))
     name = map_settings["scorer"]["method"]
-    if name not in systems:
-        raise SettingsError(f"confidence={settings['confidence']}: expected p of {name}, which the map scores by, got "
-                            f"{', '.join(systems) or 'none'}; evaluate with the map's settings")  # fmt: skip
-    if other := confidences.other_settings(origin, name, map_settings, map_settings["candidates"]):
-        tell(f"warning: confidence={settings['confidence']} was fitted with other settings of {', '.join(other)}: p "
-             "may mean nothing here")  # fmt: skip
-    return systems[name]
+    if name not in file.systems:
+        raise SettingsError(f"confidence={file.path}: expected p of {name}, which the map scores by, got "
+                            f"{', '.join(file.systems) or 'none'}; evaluate with the map's settings")  # fmt: skip
+    if other := confidences.other_settings(file.origin, name, map_settings, map_settings["candidates"]):
+        tell(f"warning: confidence={file.path} was fitted with other settings of {', '.join(other)}: p may mean "
+             "nothing here")  # fmt: skip
+    return file.systems[name]

@@ -236,9 +236,10 @@ def _check_patches(features: Mapping[str, Any], path: str, reach: list[float]) -
     if min(map(min, expected)) < 0:
         return  # the images are too small for these patches, which is the extractor's error
     if expected != [list(reach)]:
-        of_patches = f"{expected[0]}, the largest place of these patches, or" if len(expected) == 1 else "null, since"
-        why = "null" if len(expected) == 1 else "each size of patches has its own"
-        raise SettingsError(f"{path}={reach}: expected {of_patches} {why}")
+        words = "null, since each size of patches has its own"
+        if len(expected) == 1:
+            words = f"{expected[0]}, the largest place of these patches, or null"
+        raise SettingsError(f"{path}={reach}: expected {words}")
 
 
 def nodes(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

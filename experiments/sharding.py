@@ -35,7 +35,7 @@ _LOCAL = ("shard", "wait", "coordinator", "out", "store", "memory", "devices", "
 
 
 @contextmanager
-def joined(settings: Mapping[str, Any]) -> Iterator[None]:
+def join_run(settings: Mapping[str, Any]) -> Iterator[None]:
     """Take part in a run as the task of `shard`, and lock the task.
 
     Raises:
@@ -76,7 +76,7 @@ def task_folder(settings: Mapping[str, Any]) -> Path:
     return _folder(build.expand_user(settings["out"])) / Shard.parse(settings["shard"]).folder
 
 
-def wait(settings: Mapping[str, Any], needs: NotYet) -> None:
+def mark_waiting(settings: Mapping[str, Any], needs: NotYet) -> None:
     """Write that this task waits; complete tasks that it waits for, because of damaged rows, are no longer complete."""
     folder = task_folder(settings)
     write_text(folder / _STATE, json.dumps({"state": COMPLETE if needs.is_complete else f"ended, waiting for {needs}"}))
@@ -87,7 +87,7 @@ def wait(settings: Mapping[str, Any], needs: NotYet) -> None:
             write_text(other / _STATE, json.dumps({"state": f"something is missing again, says {shard}"}))
 
 
-def complete(settings: Mapping[str, Any]) -> None:
+def mark_complete(settings: Mapping[str, Any]) -> None:
     """Write that this task has nothing left to do."""
     write_text(task_folder(settings) / _STATE, json.dumps({"state": COMPLETE}))
 
@@ -108,7 +108,7 @@ def check_data(settings: Mapping[str, Any], images: Images) -> None:
 
 
 @contextmanager
-def last(settings: Mapping[str, Any]) -> Iterator[bool]:
+def claim_results(settings: Mapping[str, Any]) -> Iterator[bool]:
     """Whether the results are still to be written, for one task at a time."""
     folder = build.expand_user(settings["out"])
     with lock_store(_folder(folder), "a run", lambda line: None):
