@@ -5,6 +5,7 @@ from pathlib import PurePath
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 
 from experiments import build
 from experiments.console import tell
@@ -26,7 +27,9 @@ class AnswerFigures:
         if self._root and not self._root.is_dir():
             raise SettingsError(f"root={self._root}: expected the folder of the map's images, got no folder")
 
-    def draw(self, number: int, name: str, pixels: np.ndarray, localized: Asked) -> dict[str, Any]:
+    def draw(
+        self, number: int, name: str, pixels: UInt8[np.ndarray, "height width channels"], localized: Asked
+    ) -> dict[str, Any]:
         """Draw the figure of an image, `number` from 0, and return its entry in the line; warn if that fails."""
         names = {number, name, PurePath(name).name}
         if not self._wanted & names:

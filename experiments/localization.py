@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 
 from experiments import build, confidences, maps
 from experiments.answer_figures import AnswerFigures
@@ -53,7 +54,7 @@ class _Drive:
         self._map, self._settings = robot_map, settings
         self._route = None if settings["route"] is None else Route(Drive(advance=settings["route"]))
 
-    def localize(self, name: str, pixels: np.ndarray) -> tuple[Asked, dict[str, Any]]:
+    def localize(self, name: str, pixels: UInt8[np.ndarray, "height width channels"]) -> tuple[Asked, dict[str, Any]]:
         """Localize an image and return its line; an image that is in the map sees only the images before it."""
         start = time.perf_counter()
         row, recent = self._map.row(name) if self._settings["add"] else None, self._settings["recent"]

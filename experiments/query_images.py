@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 
 from experiments import build
 from experiments.console import tell
@@ -18,7 +19,7 @@ from mfvpr.utils.files import IMAGE_SUFFIXES, canonical_name
 POLL = 0.2  # seconds between two looks at a folder
 
 
-def images(settings: Mapping[str, Any]) -> Iterator[tuple[str, Path | np.ndarray]]:
+def images(settings: Mapping[str, Any]) -> Iterator[tuple[str, Path | UInt8[np.ndarray, "height width channels"]]]:
     """(name, file or pixels) in order; names do not depend on the spelling of a path."""
     paths = settings["images"] if isinstance(settings["images"], list) else [settings["images"]]
     paths = [build.expand_user(path) for path in paths]
