@@ -4,8 +4,6 @@ import csv
 import json
 import os
 import shutil
-import signal
-import sys
 
 import numpy as np
 import pytest
@@ -13,7 +11,6 @@ from PIL import Image
 
 from experiments import stages
 from experiments.evaluation import evaluate
-from experiments.launch import launch
 from mfvpr import InputError
 from mfvpr.datasets import read_image
 from tests.programs import composed, folder, matches_path
@@ -164,7 +161,7 @@ def test_turned_and_16_bit_copies_give_the_same_and_it_is_said(small_street, tmp
     assert (off[2] / "predictions.csv").read_text() != (other[2] / "predictions.csv").read_text()
 
 
-def test_a_second_run_is_told_the_same_of_its_images(small_street, tmp_path, monkeypatch):
+def test_a_second_run_is_told_the_same_of_its_images(small_street, tmp_path):
     settings = composed(*folder(small_street, f"store={tmp_path}/store"))
     first, second = (stages.begun(settings, stages.Stopwatch())[1] for _ in range(2))
     assert first.fingerprints == second.fingerprints
@@ -173,20 +170,13 @@ def test_a_second_run_is_told_the_same_of_its_images(small_street, tmp_path, mon
 
 
 @pytest.mark.parametrize("value", ["", None, "elsewhere"])
-def test_an_empty_cache_variable_is_none(value, monkeypatch):
+def test_an_empty_cache_variable_is_none(value, monkeypatch, succeed):
     """Or features would be kept in the root of the file system."""
     monkeypatch.setenv("MFVPR_CACHE", value or "")
     if value is None:
         monkeypatch.delenv("MFVPR_CACHE")
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    monkeypatch.setattr(sys, "argv", ["evaluate"])
-    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
-    monkeypatch.setattr("logging.shutdown", lambda *_: None)
-    handler, seen = signal.getsignal(signal.SIGTERM), []
-    try:
-        launch(lambda: seen.append)
-    finally:
-        signal.signal(signal.SIGTERM, handler)
-    root = value or "~/.cache/mfvpr"
-    assert (seen[0]["store"], seen[0]["dataset"]["cache"]) == (f"{root}/features", root)
+    calls, root = [], value or "~/.cache/mfvpr"
+    monkeypatch.setattr("experiments.evaluate.evaluate", lambda: calls.append)
+    succeed("evaluate")
+    assert (calls[0]["store"], calls[0]["dataset"]["cache"]) == (f"{root}/features", root)
     assert os.environ.get("MFVPR_CACHE", "unset") == (value or "unset")
