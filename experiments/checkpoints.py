@@ -35,7 +35,7 @@ def list_weights() -> None:
 
 def convert(file: Path, name: str | None) -> None:
     """Install an official checkpoint."""
-    entry = _entry(file, name)
+    entry = _entry_of(file, name)
     if file.is_file() and (megabytes := file.stat().st_size >> 20) > _LARGE:
         print(f"{file}: {megabytes:,} MiB to convert, some {max(1, megabytes // 50)} s", file=sys.stderr)
     path = install(file, entry.name)
@@ -47,7 +47,7 @@ def convert(file: Path, name: str | None) -> None:
 def verify(names: Iterable[str]) -> None:
     """Check runtime files against their manifests, and downloaded checkpoints against the published hashes."""
     entries = [entry_of(name) for name in names]
-    entries = entries or [entry for entry in REGISTRY.values() if _has_runtime_file(entry) or _has_original(entry)]
+    entries = entries or [entry for entry in REGISTRY.values() if any(_present_files(entry))]
     if not entries:
         print(f"nothing is installed in {weights_folder()}")
     bad = 0
@@ -97,7 +97,7 @@ def _fetch(entry: Entry, target: Path) -> None:
         raise InputError(f"{entry.source}: could not be downloaded to {target.parent}: {reason}") from error
 
 
-def _entry(file: Path, name: str | None) -> Entry:
+def _entry_of(file: Path, name: str | None) -> Entry:
     if name is not None:
         return entry_of(name)
     if known := [entry for entry in REGISTRY.values() if entry.file == file.name]:
@@ -107,30 +107,26 @@ def _entry(file: Path, name: str | None) -> Entry:
     raise InputError(f"{file}: no official file name; say what it is with --as NAME, one of {', '.join(REGISTRY)}")
 
 
-def _has_runtime_file(entry: Entry) -> bool:
-    return any((weights_folder() / f"{entry.name}{suffix}").exists() for suffix in (".safetensors", ".json"))
-
-
-def _has_original(entry: Entry) -> bool:
-    return entry.sha256 is not None and (weights_folder() / entry.file).exists()
+def _present_files(entry: Entry) -> tuple[bool, bool]:
+    """Whether the weights folder has the entry's checkpoint, if its hash is published, and its runtime file."""
+    folder = weights_folder()
+    has_runtime_file = any((folder / f"{entry.name}{suffix}").exists() for suffix in (".safetensors", ".json"))
+    return entry.sha256 is not None and (folder / entry.file).exists(), has_runtime_file
 
 
 def _verify(entry: Entry) -> str:
-    """Check the files of an entry and list the checks in words.
-
-    Raises:
-        InputError: a check fails.
-    """
-    good = []
-    if _has_original(entry):
+    """Check the files of an entry and list the checks in words; raise an InputError if a check fails."""
+    has_checkpoint, has_runtime_file = _present_files(entry)
+    checks = []
+    if has_checkpoint:
         check_published(weights_folder() / entry.file, entry)
-        good.append(f"{entry.file} has the published hash")
-    if not good or _has_runtime_file(entry):
+        checks.append(f"{entry.file} has the published hash")
+    if has_runtime_file or not has_checkpoint:
         load_model(entry.name)
         manifest = read_manifest(entry.name)
         if manifest.parameters != entry.parameters:
             raise InputError(f"expected {entry.parameters:,} parameters, got {manifest.parameters:,}")
-        good.append(f"{manifest.parameters:,} parameters as converted")
+        checks.append(f"{manifest.parameters:,} parameters as converted")
         if entry.sha256 is None:
-            good.append(f"from a {entry.file} of sha256 {manifest.source_sha256[:12]}..., which nobody published")
-    return "good, " + ", ".join(good)
+            checks.append(f"from a {entry.file} of sha256 {manifest.source_sha256[:12]}..., which nobody published")
+    return "good, " + ", ".join(checks)
