@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mfvpr.datasets.streets import draw_seasons, seasons_folder
-from mfvpr.datasets.streets.drives import LANE, SPACING, plan_drives, plan_return
+from mfvpr.datasets.streets.camera import LANE, SPACING, plan_drives, plan_return
 from mfvpr.datasets.streets.exposure import fall_rain
 from mfvpr.datasets.streets.seasons import CONDITIONS, TRUTH
 from tests.datasets.test_streets import contents

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from mfvpr.datasets.streets import draw_streets, streets_folder
-from mfvpr.datasets.streets.camera import Camera
-from mfvpr.datasets.streets.drives import plan_drives
+from mfvpr.datasets.streets.camera import Camera, plan_drives
 from mfvpr.datasets.streets.exposure import expose
 from mfvpr.datasets.streets.ground_truth import Facade, image_shift, visible_points
 from mfvpr.datasets.streets.sheets import Sheet, texture

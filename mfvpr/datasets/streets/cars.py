@@ -4,11 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mfvpr.datasets.streets.camera import Camera
+from mfvpr.datasets.streets.camera import LANE, Camera
 from mfvpr.datasets.streets.colors import ACCENTS, CARS, pick, tone
-from mfvpr.datasets.streets.drives import LANE
-from mfvpr.datasets.streets.panels import Panel, Prop, move
-from mfvpr.datasets.streets.sheets import Sheet, Texture, draw_glyphs, texture
+from mfvpr.datasets.streets.sheets import Panel, Prop, Sheet, Texture, draw_glyphs, move, texture
 from mfvpr.datasets.streets.types import Color, Rng
 
 # Where cars may be: x, smallest and largest distance ahead of the camera (meters), whether oncoming.

@@ -1,4 +1,4 @@
-"""The folder of the synthetic street: images and ground truth, complete or absent."""
+"""The folders of the synthetic street: images and ground truth, complete or absent."""
 
 import os
 import tempfile
@@ -6,19 +6,18 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypedDict, Unpack
 
 import cv2
 import numpy as np
 
-from mfvpr.datasets.streets.camera import Camera
-from mfvpr.datasets.streets.cars import Car, traffic
-from mfvpr.datasets.streets.drives import SPACING, plan_drives
+from mfvpr.datasets.streets.camera import SPACING, Camera, plan_drives
+from mfvpr.datasets.streets.cars import traffic
 from mfvpr.datasets.streets.exposure import expose
 from mfvpr.datasets.streets.ground_truth import write_ground_truth
 from mfvpr.datasets.streets.painting import paint
-from mfvpr.datasets.streets.scene import Scene, build_scene
-from mfvpr.datasets.streets.sky import sky_prop
-from mfvpr.datasets.streets.weather import WEATHERS, Weather
+from mfvpr.datasets.streets.scene import Scene, build_scene, sky_prop
+from mfvpr.datasets.streets.weather import WEATHERS
 from mfvpr.utils.numerics import available_cpus
 
 VERSION = 1  # of the images: raise it when they change, so that old caches are not used for new ones
@@ -26,29 +25,32 @@ SIGHT = 100.0  # panels farther away are not drawn, meters
 Progress = Callable[[int, int], None]
 
 
+class DrawingOptions(TypedDict, total=False):
+    """Optional arguments of `draw_streets` and `draw_seasons`."""
+
+    seed: int
+    num_frames: int
+    image_size: tuple[int, int]
+    progress: Progress | None
+
+
 @dataclass(frozen=True)
-class Shot:
-    """One image to draw: its file, camera, weather, cars and seed."""
+class Drive:
+    """The images of one folder: a camera and the name of a weather per frame, and the seed of the images.
 
-    path: Path
-    camera: Camera
-    weather: Weather
-    cars: tuple[Car, ...]
+    `ground_truth` is the file with the shifts to the database's frames; None = this is the database.
+    """
+
+    folder: Path
+    cameras: list[Camera]
+    weathers: list[str]
     seed: tuple[int, ...]
+    ground_truth: Path | None = None
 
 
-def streets_folder(
-    cache: Path | str,
-    *,
-    seed: int = 0,
-    num_frames: int = 100,
-    image_size: tuple[int, int] = (448, 336),
-    progress: Progress | None = None,
-) -> Path:
-    """The folder of the synthetic street inside `cache`, drawn if it is missing; see `draw_streets`."""
-    return cached_folder(
-        cache, "streets", draw_streets, seed=seed, num_frames=num_frames, image_size=image_size, progress=progress
-    )
+def streets_folder(cache: Path | str, **options: Unpack[DrawingOptions]) -> Path:
+    """The folder of the synthetic street inside `cache`, drawn if it is missing; options as in `draw_streets`."""
+    return cached_folder(cache, "streets", draw_streets, **options)
 
 
 def cached_folder(
@@ -56,10 +58,10 @@ def cached_folder(
     kind: str,
     draw: Callable[..., None],
     *,
-    seed: int,
-    num_frames: int,
-    image_size: tuple[int, int],
-    progress: Progress | None,
+    seed: int = 0,
+    num_frames: int = 100,
+    image_size: tuple[int, int] = (448, 336),
+    progress: Progress | None = None,
 ) -> Path:
     """The folder inside `cache` that `draw` makes, drawn if it is missing.
 
@@ -111,25 +113,28 @@ def draw_streets(
         FileExistsError: the folder exists.
     """
     folder = Path(folder)
-    folder.mkdir(parents=True)
-    for name in ("database", "queries"):
-        (folder / name).mkdir()
-    scene = build_scene(seed, SPACING * num_frames + SIGHT)
     database, queries = plan_drives(seed, num_frames, image_size)
-    write_ground_truth(folder / "ground_truth.csv", scene.facades, queries, database)
-    shots = []
-    for row, (query, candidate) in enumerate(zip(queries, database, strict=True)):  # no car is in both drives
-        weather, name = WEATHERS["night" if row < num_frames // 2 else "snow"], f"{row:04d}.png"
-        shots.append(Shot(folder / "database" / name, candidate, WEATHERS["day"], scene.cars[1::2], (seed, 7, row)))
-        shots.append(Shot(folder / "queries" / name, query, weather, scene.cars[::2], (seed, 8, row)))
-    draw_shots(scene, shots, progress)
+    weathers = ["night"] * (num_frames // 2) + ["snow"] * (num_frames - num_frames // 2)
+    drives = [
+        Drive(folder / "database", database, ["day"] * num_frames, (seed, 7)),
+        Drive(folder / "queries", queries, weathers, (seed, 8), folder / "ground_truth.csv"),
+    ]
+    draw_drives(drives, seed, SPACING * num_frames, progress)
 
 
-def draw_shots(scene: Scene, shots: Sequence[Shot], progress: Progress | None) -> None:
-    """Draw the images on threads."""
+def draw_drives(drives: Sequence[Drive], seed: int, length: float, progress: Progress | None) -> None:
+    """Draw the images of several drives, the database first, down the first `length` meters of one street."""
+    drives[0].folder.parent.mkdir(parents=True)
+    scene = build_scene(seed, length + SIGHT)
+    for drive in drives:
+        drive.folder.mkdir()
+        if drive.ground_truth is not None:
+            write_ground_truth(drive.ground_truth, scene.facades, drive.cameras, drives[0].cameras)
+    # All drives in turn, so that threads rarely need the textures of one weather at the same time.
+    shots = [(drive, row) for row in range(len(drives[0].cameras)) for drive in drives]
     pool = ThreadPoolExecutor(available_cpus())  # more would only wait for each other
     try:
-        futures = [pool.submit(draw_shot, scene, shot) for shot in shots]
+        futures = [pool.submit(draw_frame, scene, drive, row) for drive, row in shots]
         for done, future in enumerate(as_completed(futures), start=1):
             future.result()
             if progress is not None:
@@ -138,12 +143,14 @@ def draw_shots(scene: Scene, shots: Sequence[Shot], progress: Progress | None) -
         pool.shutdown(cancel_futures=True)
 
 
-def draw_shot(scene: Scene, shot: Shot) -> None:
-    """Draw one image and write it."""
-    rng, camera = np.random.default_rng(shot.seed), shot.camera
+def draw_frame(scene: Scene, drive: Drive, row: int) -> None:
+    """Draw one image of a drive and write it."""
+    rng, camera, weather = np.random.default_rng((*drive.seed, row)), drive.cameras[row], WEATHERS[drive.weathers[row]]
+    cars = scene.cars[1::2] if drive.ground_truth is None else scene.cars[::2]  # no query meets a car of the database
     # Objects on the street are never behind a house, hence houses are painted first.
-    layers = (scene.ground, scene.houses, (*scene.street, *traffic(shot.cars, camera, rng)))
+    layers = (scene.ground, scene.houses, (*scene.street, *traffic(cars, camera, rng)))
     near = ([prop for prop in layer if prop.z < camera.z + SIGHT] for layer in layers)
-    image = expose(paint(([sky_prop(scene.sky, camera)], *near), camera, shot.weather), shot.weather, rng)
-    if not cv2.imwrite(str(shot.path), image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-        raise OSError(f"cannot write {shot.path}")
+    image = expose(paint(([sky_prop(scene.sky, camera)], *near), camera, weather), weather, rng)
+    path = drive.folder / f"{row:04d}.png"
+    if not cv2.imwrite(str(path), image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+        raise OSError(f"cannot write {path}")

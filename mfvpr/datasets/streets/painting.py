@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from mfvpr.datasets.streets.camera import NEAR, Camera
-from mfvpr.datasets.streets.panels import Panel, Prop
+from mfvpr.datasets.streets.sheets import Panel, Prop
 from mfvpr.datasets.streets.types import Floats, Image
 from mfvpr.datasets.streets.weather import Weather
 

@@ -1,18 +1,19 @@
-"""The street: houses on both sides, ground, trees, lamps, signs, cars."""
+"""The street: houses on both sides, ground, trees, lamps, signs, cars, and the sky."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
+from mfvpr.datasets.streets.camera import CAMERA_HEIGHT, Camera
 from mfvpr.datasets.streets.cars import Car, build_car
-from mfvpr.datasets.streets.colors import WALLS, pick
+from mfvpr.datasets.streets.colors import WALLS, as_array, pick, tone
 from mfvpr.datasets.streets.ground_truth import Facade
 from mfvpr.datasets.streets.houses import Design, draw_facade, draw_gable, draw_roof, make_design
 from mfvpr.datasets.streets.objects import draw_ground, draw_hedge, draw_lamp, draw_sign, draw_tree
-from mfvpr.datasets.streets.panels import Panel, Prop, upright
-from mfvpr.datasets.streets.sheets import Texture, texture
-from mfvpr.datasets.streets.sky import sky_texture
-from mfvpr.datasets.streets.types import Floats, Rng
+from mfvpr.datasets.streets.sheets import Panel, Prop, Texture, blotches, texture, upright
+from mfvpr.datasets.streets.types import Floats, Image, Rng
+from mfvpr.datasets.streets.weather import WEATHERS, Weather
 
 LAMP_SPACING = 22.0  # meters
 NUM_CARS = 24
@@ -127,3 +128,32 @@ def build_ground(seed: int, length: float) -> list[Prop]:
         light = lamp_light(np.linspace(z + 8, z, sheet.day.shape[0]))[:, None] * np.exp(-((across / 8) ** 2))
         props.append(Prop(z + 4, (Panel(texture(sheet, 0.8 * light), (-12, 0, z + 8), (24, 0, 0), (0, 0, -8)),)))
     return props
+
+
+def draw_sky(rng: Rng, weather: Weather) -> Image:
+    """Sky, clouds and a far skyline, directly in the colors of the weather; the horizon is the lower edge."""
+    rows, columns = shape = (256, 1024)
+    height = np.linspace(1, 0, rows, dtype=np.float32)[:, None, None]
+    zenith, horizon = as_array(weather.zenith), as_array(weather.horizon)
+    sky = np.broadcast_to(horizon + (zenith - horizon) * height**0.6, (rows, columns, 3)).copy()
+    cloud = sum(blotches(rng, shape, cell) * cell / 90 for cell in (90.0, 45.0, 20.0))
+    cover = np.clip(cloud * 0.7, 0, 1)[..., None] * np.clip(height * 4, 0, 1)
+    sky += cover * 0.7 * (as_array(tone(weather.horizon, 1.15)) - sky)
+    for layer, gain in ((0.16, 0.92), (0.10, 0.8)):
+        bumps = 0.35 * blotches(rng, (1, columns), 60) + 0.1 * blotches(rng, (1, columns), 8)
+        ridge = rows * (1 - layer * (1 + bumps))
+        hill = np.arange(rows)[:, None] > ridge
+        sky[hill] = as_array(tone(weather.horizon, gain)) * as_array((0.92, 1.0, 0.98))
+    return np.dstack([np.clip(sky, 0, 255).astype(np.uint8), np.full(shape, 255, np.uint8)])
+
+
+def sky_texture(seed: int) -> Texture:
+    """The sky of the street with this seed, whose clouds differ from weather to weather."""
+    places = {weather: place for place, weather in enumerate(WEATHERS.values())}
+    return cache(lambda weather: draw_sky(np.random.default_rng([seed, 5, places[weather]]), weather))
+
+
+def sky_prop(sky: Texture, camera: Camera) -> Prop:
+    """The sky, so far away that it moves along with the camera."""
+    z = camera.z + 4.0
+    return Prop(z, (Panel(sky, (camera.x - 8, -CAMERA_HEIGHT - 3.9, z), (16, 0, 0), (0, 4.0, 0)),))

@@ -1,29 +1,18 @@
 """The synthetic street by day and in seven other conditions, those of RobotCar Seasons."""
 
 from pathlib import Path
+from typing import Unpack
 
-from mfvpr.datasets.streets.drawing import SIGHT, Progress, Shot, cached_folder, draw_shots
-from mfvpr.datasets.streets.drives import SPACING, plan_drives, plan_return
-from mfvpr.datasets.streets.ground_truth import write_ground_truth
-from mfvpr.datasets.streets.scene import build_scene
-from mfvpr.datasets.streets.weather import WEATHERS
+from mfvpr.datasets.streets.camera import SPACING, plan_drives, plan_return
+from mfvpr.datasets.streets.drawing import DrawingOptions, Drive, Progress, cached_folder, draw_drives
 
 CONDITIONS = ("dawn", "dusk", "night", "night-rain", "winter", "rain", "snow")
 TRUTH = "ground_truth.csv"  # in the folder of each condition
 
 
-def seasons_folder(
-    cache: Path | str,
-    *,
-    seed: int = 0,
-    num_frames: int = 100,
-    image_size: tuple[int, int] = (448, 336),
-    progress: Progress | None = None,
-) -> Path:
+def seasons_folder(cache: Path | str, **options: Unpack[DrawingOptions]) -> Path:
     """The folder of the synthetic street's seasons inside `cache`, drawn if it is missing; see `draw_seasons`."""
-    return cached_folder(
-        cache, "seasons", draw_seasons, seed=seed, num_frames=num_frames, image_size=image_size, progress=progress
-    )
+    return cached_folder(cache, "seasons", draw_seasons, **options)
 
 
 def draw_seasons(
@@ -43,18 +32,10 @@ def draw_seasons(
     Arguments and errors are those of `draw_streets`; there are eight times as many images as frames.
     """
     folder = Path(folder)
-    folder.mkdir(parents=True)
-    scene = build_scene(seed, SPACING * (num_frames + 1) + SIGHT)
     database, _ = plan_drives(seed, num_frames, image_size)
-    drives = {"database": (database, WEATHERS["day"], scene.cars[1::2])}
+    drives = [Drive(folder / "database", database, ["day"] * num_frames, (seed, 10, 0))]
     for number, condition in enumerate(CONDITIONS):
-        cameras = plan_return(seed, number, num_frames, image_size)
-        drives[condition] = (cameras, WEATHERS[condition], scene.cars[::2])
-        (folder / condition).mkdir()
-        write_ground_truth(folder / condition / TRUTH, scene.facades, cameras, database)
-    (folder / "database").mkdir()
-    shots = []
-    for row in range(num_frames):  # all weathers in turn, so that threads rarely need the same textures
-        for number, (name, (cameras, weather, cars)) in enumerate(drives.items()):
-            shots.append(Shot(folder / name / f"{row:04d}.png", cameras[row], weather, cars, (seed, 10, number, row)))
-    draw_shots(scene, shots, progress)
+        cameras, weathers = plan_return(seed, number, num_frames, image_size), [condition] * num_frames
+        place = folder / condition
+        drives.append(Drive(place, cameras, weathers, (seed, 10, number + 1), place / TRUTH))
+    draw_drives(drives, seed, SPACING * (num_frames + 1), progress)

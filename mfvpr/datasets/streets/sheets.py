@@ -1,9 +1,10 @@
-"""Sheets: flat drawings in meters, and the textures they become in each weather.
+"""Sheets: flat drawings in meters, the textures they become in each weather, and panels that carry textures.
 
 A sheet has its colors on a summer day, its glow at night, and the amount of snow that settles, for use in any weather.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cache
 
 import cv2
@@ -106,3 +107,32 @@ def draw_glyphs(sheet: Sheet, rng: Rng, x: float, y: float, width: float, height
     for left in np.arange(x, x + width - 0.6 * step, step):
         nodes = rng.integers(0, (3, 4), (5, 2)) / (2, 3) * (0.6 * step, height)
         sheet.line(nodes + (left, y), height * 0.14, color)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A flat parallelogram, in meters: its upper left corner and its edges to the right and down on its front."""
+
+    texture: Texture
+    corner: tuple[float, float, float]
+    right: tuple[float, float, float]
+    down: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Prop:
+    """Panels that are painted together, in this order; z (meters) is that of the middle, for sorting."""
+
+    z: float
+    panels: tuple[Panel, ...]
+
+
+def upright(texture: Texture, x: float, z: float, width: float, height: float) -> Prop:
+    """A panel that stands on the ground across the street, with its middle at x; all in meters."""
+    return Prop(z, (Panel(texture, (x - width / 2, -height, z), (width, 0, 0), (0, height, 0)),))
+
+
+def move(prop: Prop, x: float, z: float) -> Prop:
+    """The prop, moved along the ground by x and z meters."""
+    panels = (replace(p, corner=(p.corner[0] + x, p.corner[1], p.corner[2] + z)) for p in prop.panels)
+    return Prop(prop.z + z, tuple(panels))
