@@ -30,8 +30,7 @@ class Content:
 
     Attributes:
         sha256: of all bytes; "" = the file cannot be read.
-        orientation: see `mfvpr.datasets.images.Header`.
-        largest: see `mfvpr.datasets.images.Header`.
+        orientation, largest: see `mfvpr.datasets.images.read_header`.
     """
 
     sha256: str = ""
@@ -125,8 +124,7 @@ def read_content(path: Path) -> Content:
         content = path.read_bytes()
     except OSError:
         return Content()  # reading the image raises
-    header = read_header(content)
-    return Content(hashlib.sha256(content).hexdigest(), header.orientation, header.largest)
+    return Content(hashlib.sha256(content).hexdigest(), *read_header(content))
 
 
 def _read_records(path: Path) -> dict[str, list[Any]]:

@@ -4,18 +4,18 @@ Decoding and the default resampling are Pillow's, as in the published networks' 
 their EXIF orientation, and 16 bits a channel are reduced to the upper 8.
 """
 
-import stat
 import warnings
-from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Literal
 
 import cv2
 import numpy as np
+from jaxtyping import Num, UInt8
 from PIL import Image, ImageFile
 
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import require_file
 
 MAX_PIXELS = 64_000_000
 
@@ -40,22 +40,8 @@ warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
 warnings.filterwarnings("ignore", message="Palette images with Transparency")
 
 
-@dataclass(frozen=True)
-class Header:
-    """Orientation and range of an image file.
-
-    Attributes:
-        orientation: EXIF's, 1 .. 8; 1 = as stored.
-        largest: largest value of an image of 16 bits a channel; 0 if the file states its range, cannot be decoded, or
-            has 32 bits; None = an image of 8 bits.
-    """
-
-    orientation: int
-    largest: int | None
-
-
-def read_image(path: Path | str, *, orient: bool = True, bits: int | None = 16) -> np.ndarray:
-    """Read an image file as `[H, W, 3]` uint8 RGB.
+def read_image(path: Path | str, *, orient: bool = True, bits: int | None = 16) -> UInt8[np.ndarray, "height width 3"]:
+    """Read an image file as RGB.
 
     Args:
         path: image file.
@@ -70,8 +56,10 @@ def read_image(path: Path | str, *, orient: bool = True, bits: int | None = 16) 
             or of 32 bits a channel, whose range is unknown (unless `bits` is None).
     """
     path = Path(path)
-    _check_file(path)
     try:
+        require_file(path, "an image file")
+        if path.stat().st_size == 0:
+            raise InputError(f"{path}: expected an image file, got 0 bytes; replace or remove it")
         with Image.open(path) as image:
             if image.width * image.height > MAX_PIXELS:
                 raise InputError(_too_large(path, f"{image.width} x {image.height} px"))
@@ -90,27 +78,35 @@ def read_image(path: Path | str, *, orient: bool = True, bits: int | None = 16) 
     except Image.DecompressionBombError:
         raise InputError(_too_large(path, "several times as many")) from None
     except Exception as error:  # decoders raise OSError, SyntaxError, struct.error and more on broken files
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: cannot be read as an image ({reason}); replace or remove it") from None
 
 
-def read_header(content: bytes) -> Header:
-    """Header of an image file's `content`; orientation 1 and no largest value if it cannot be read."""
+def read_header(content: bytes) -> tuple[int, int | None]:
+    """Orientation and range of an image file's `content`.
+
+    Returns:
+        orientation: EXIF's, 1 .. 8; 1 = as stored, or a file that cannot be read.
+        largest: largest value of an image of 16 bits a channel; 0 if the file states its range, cannot be decoded, or
+            has 32 bits; None = an image of 8 bits, or a file that cannot be read.
+    """
     try:
         with Image.open(BytesIO(content)) as image:
             used = _bits_in_use(image, 16) if image.width * image.height <= MAX_PIXELS else None
             may_be_turned = image.format != "PNG" or any(mark in content for mark in _MAY_BE_TURNED)
             orientation = _orientation(image) if may_be_turned else 1  # of a PNG file, `_orientation` decodes all
             if used is None:  # the range of 32 bits is unknown
-                return Header(orientation, 0 if image.mode in ("I", "F") and image.format != "PPM" else None)
+                return orientation, 0 if image.mode in ("I", "F") and image.format != "PPM" else None
             has_range = used != 16 or image.format == "PPM"
-            return Header(orientation, 0 if has_range else _largest(image, content))
+            return orientation, 0 if has_range else _largest(image, content)
     except Exception:  # reading the image raises
-        return Header(1, None)
+        return 1, None
 
 
-def resize(image: np.ndarray, size: tuple[int, int], interpolation: Interpolation = "pil_bilinear") -> np.ndarray:
-    """Resize an image `[H, W, 3]` uint8 to `size` (width, height) without crop; the aspect ratio changes.
+def resize(
+    image: UInt8[np.ndarray, "_ _ 3"], size: tuple[int, int], interpolation: Interpolation = "pil_bilinear"
+) -> Num[np.ndarray, "height width 3"]:
+    """Resize an image to `size` (width, height) without crop; the aspect ratio changes.
 
     Pixel centers are at half pixels.
 
@@ -180,24 +176,6 @@ def _color_values(content: np.ndarray) -> np.ndarray:
     if image is None or image.dtype != np.uint16 or image.ndim != 3:
         raise ValueError("its 16 bits of color cannot be decoded")
     return image[..., 2::-1]
-
-
-def _check_file(path: Path) -> None:
-    try:
-        status = path.stat()
-    except (OSError, ValueError) as error:  # a null character in the path is a ValueError
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise InputError(f"{path}: cannot be opened ({reason}); check the path and its permissions") from None
-    if not stat.S_ISREG(status.st_mode):
-        kind = "a directory" if stat.S_ISDIR(status.st_mode) else "a device or pipe"
-        raise InputError(f"{path}: expected an image file, got {kind}; rename or remove it")
-    if status.st_size == 0:
-        raise InputError(f"{path}: expected an image file, got 0 bytes; replace or remove it")
-    try:
-        with path.open("rb"):
-            return
-    except OSError as error:
-        raise InputError(f"{path}: cannot be opened ({error.strerror}); make it readable, or remove it") from None
 
 
 def _too_large(path: Path, size: str) -> str:

@@ -2,15 +2,16 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Int, Num
+from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
 from mfvpr.utils.errors import InputError
 
-_AT_A_TIME = 1 << 20  # ranked rows and positives that are looked up at once, in numbers of eight bytes
+_AT_A_TIME = 1 << 20  # ranked rows and positives that are looked up together, in numbers of eight bytes
 _QUERIES_AT_A_TIME = 128  # of a search by radius, which returns Python lists
 
 
@@ -18,11 +19,10 @@ _QUERIES_AT_A_TIME = 128  # of a search by radius, which returns Python lists
 class Positives:
     """Ragged lists of database rows, one per query; memory grows with the number of rows, not with Q x N.
 
-    Create it with `from_rows` or `from_matrix`. `first | second` and `first - second` are union and difference, query
-    by query.
+    Create it with `from_rows` or `from_matrix`. `first | second` and `first - second` are union and difference by query.
 
     Attributes:
-        rows: `[P]` int32, the rows of all queries one after the other; ascending and distinct for each query.
+        rows: of all queries one after the other; ascending and distinct for each query. int32.
         offsets: `[Q + 1]` int64; query q has `rows[offsets[q] : offsets[q + 1]]`.
         num_database: N.
 
@@ -30,8 +30,8 @@ class Positives:
         InputError: rows or offsets of another form.
     """
 
-    rows: np.ndarray
-    offsets: np.ndarray
+    rows: Int[np.ndarray, " _"]
+    offsets: Int[np.ndarray, " _"]
     num_database: int
 
     def __post_init__(self) -> None:
@@ -57,10 +57,7 @@ class Positives:
             raise InputError(f"positives: expected rows of a database of {num_database} images, got {flat.min()} to "
                              f"{flat.max()}; check the ground truth")  # fmt: skip
         flat, offsets = flat.astype(np.int32, copy=False), _offsets(list(map(len, per_query)))
-        if _ascending(flat, offsets):
-            return cls(flat, offsets, num_database)
-        empty = cls(flat[:0], np.zeros_like(offsets), num_database)
-        return empty._from_keys(_distinct(_keys(flat, offsets, num_database)))
+        return cls._from_csr(_csr(flat, offsets, num_database))
 
     @classmethod
     def from_matrix(cls, matrix: Any) -> "Positives":
@@ -68,39 +65,40 @@ class Positives:
         matrix = np.asarray(matrix, bool)
         if matrix.ndim != 2:
             raise InputError(f"positives: expected a matrix [queries, database], got shape {matrix.shape}")
-        return cls.from_rows((np.flatnonzero(row).astype(np.int32) for row in matrix), matrix.shape[1])
+        return cls._from_csr(csr_array(matrix))
+
+    @classmethod
+    def _from_csr(cls, matrix: csr_array) -> "Positives":
+        matrix.sum_duplicates()  # and sort each query's rows
+        return cls(matrix.indices.astype(np.int32), matrix.indptr.astype(np.int64), matrix.shape[1])
 
     def __len__(self) -> int:
         """Number Q of queries."""
         return len(self.offsets) - 1
 
     @property
-    def counts(self) -> np.ndarray:
-        """Number of rows of each query, `[Q]`."""
+    def counts(self) -> Int[np.ndarray, " queries"]:
+        """Number of rows of each query."""
         return np.diff(self.offsets)
 
     def any(self) -> bool:
         """Whether at least one query has rows."""
         return len(self.rows) > 0
 
-    def of(self, query: int) -> np.ndarray:
-        """Rows `[n]` of one query, ascending."""
+    def of(self, query: int) -> Int[np.ndarray, " _"]:
+        """Rows of one query, ascending."""
         query = range(len(self))[query]
         return self.rows[self.offsets[query] : self.offsets[query + 1]]
 
-    def union(self) -> np.ndarray:
-        """Mask `[N]` of the rows of all queries."""
+    def union(self) -> Bool[np.ndarray, " database"]:
+        """Mask of the rows of all queries."""
         union = np.zeros(self.num_database, bool)
         union[self.rows] = True
         return union
 
     def take(self, queries: Any) -> "Positives":
         """Select queries by numbers `[q]` in any order, a mask `[Q]`, or a slice."""
-        queries = np.arange(len(self))[queries]
-        counts = self.counts[queries]
-        offsets = _offsets(counts)
-        places = np.repeat(self.offsets[queries] - offsets[:-1], counts) + np.arange(offsets[-1])
-        return Positives(self.rows[places], offsets, self.num_database)
+        return self._from_csr(self._csr()[np.arange(len(self))[queries]])
 
     def among(self, allowed: np.ndarray) -> "Positives":
         """Select the rows that a mask `[N]` of the database allows."""
@@ -109,7 +107,7 @@ class Positives:
         is_allowed = np.asarray(allowed, bool)[self.rows]
         return Positives(self.rows[is_allowed], _offsets(is_allowed)[self.offsets], self.num_database)
 
-    def contains(self, rows: Any) -> np.ndarray:
+    def contains(self, rows: Any) -> Bool[np.ndarray, "*batch queries k"]:
         """Whether rankings are correct: for each row, whether it is among the query's rows; -1 never is.
 
         Args:
@@ -127,48 +125,35 @@ class Positives:
         if rows.dtype.kind not in "iu" or rows.max() >= self.num_database:
             raise InputError(f"rows: expected whole numbers below {self.num_database}, got {rows.dtype} up to "
                              f"{rows.max()}; rank images of this database")  # fmt: skip
-        for first, last in pairwise(self._cuts(rows.size // len(self))):
-            block_rows = rows[..., first:last, :]
-            keys = np.append(self.take(slice(first, last))._keys(), -1)  # -1: the key beyond the last
-            ranked = np.arange(last - first)[:, None] * self.num_database + block_rows.astype(np.int64)
-            is_known = keys[np.searchsorted(keys[:-1], ranked)] == ranked
-            is_correct[..., first:last, :] = is_known & (block_rows >= 0)
+        step = max(1, _AT_A_TIME * len(self) // (rows.size + len(self.rows)))
+        for first in range(0, len(self), step):
+            block, block_rows = self.take(slice(first, first + step)), rows[..., first : first + step, :]
+            starts = np.arange(len(block)) * self.num_database  # a pair of query and row is a number
+            pairs = np.append(np.repeat(starts, block.counts) + block.rows, -1)  # -1: the pair beyond the last
+            ranked = starts[:, None] + block_rows.astype(np.int64)
+            is_known = pairs[np.searchsorted(pairs[:-1], ranked)] == ranked
+            is_correct[..., first : first + step, :] = is_known & (block_rows >= 0)
         return is_correct
 
-    def dense(self, queries: Any = slice(None)) -> np.ndarray:
-        """Matrix `[q, N]` bool of queries that are selected as in `take`; large data sets do not fit into memory."""
-        part = self.take(queries)
-        dense = np.zeros((len(part), self.num_database), bool)
-        for query, row in enumerate(dense):
-            row[part.of(query)] = True
-        return dense
+    def dense(self, queries: Any = slice(None)) -> Bool[np.ndarray, "_ database"]:
+        """Matrix `[q, N]` of queries that are selected as in `take`; large data sets do not fit into memory."""
+        return self.take(queries)._csr().toarray()
 
     def __or__(self, other: "Positives") -> "Positives":
-        return self._from_keys(_distinct(np.concatenate(self._key_pair(other))))
+        self._require_same_size(other)
+        return self._from_csr(self._csr() + other._csr())
 
     def __sub__(self, other: "Positives") -> "Positives":
-        return self._from_keys(np.setdiff1d(*self._key_pair(other), assume_unique=True))
+        self._require_same_size(other)
+        return self._from_csr(self._csr() > other._csr())
 
-    def _key_pair(self, other: "Positives") -> tuple[np.ndarray, np.ndarray]:
+    def _require_same_size(self, other: "Positives") -> None:
         sizes = [(len(positives), positives.num_database) for positives in (self, other)]
         if sizes[0] != sizes[1]:
             raise InputError(f"positives: expected two of one size (queries, database), got {sizes[0]} and {sizes[1]}")
-        return self._keys(), other._keys()
 
-    def _keys(self) -> np.ndarray:
-        return _keys(self.rows, self.offsets, self.num_database)
-
-    def _from_keys(self, keys: np.ndarray) -> "Positives":
-        """Positives of the same queries and database, from ascending keys."""
-        offsets = np.searchsorted(keys, np.arange(len(self) + 1) * self.num_database)
-        rows = keys - np.repeat(np.arange(len(self)) * self.num_database, np.diff(offsets))
-        return Positives(rows.astype(np.int32), offsets, self.num_database)
-
-    def _cuts(self, num_ranked: int) -> np.ndarray:
-        """Bounds of blocks of queries, so that a block's positives and `num_ranked` rows per query are few enough."""
-        sizes = self.offsets + np.arange(len(self) + 1) * num_ranked
-        ends = np.arange(0, sizes[-1] + _AT_A_TIME, _AT_A_TIME)
-        return np.unique(np.minimum(np.searchsorted(sizes, ends), len(self)))
+    def _csr(self) -> csr_array:
+        return _csr(self.rows, self.offsets, self.num_database)
 
 
 def join_positives(parts: Sequence[Positives]) -> Positives:
@@ -185,7 +170,7 @@ def stack_positives(parts: Sequence[Positives]) -> Positives:
 
 
 def rows_within(query_xy: np.ndarray, database_xy: np.ndarray, radius: float) -> Iterator[np.ndarray]:
-    """Database rows `[n]` int32 at most `radius` meters away from each query; coordinates as in `radius_positives`."""
+    """Database rows int32 at most `radius` meters away from each query; coordinates as in `radius_positives`."""
     query_xy, database_xy = np.asarray(query_xy, np.float64), np.asarray(database_xy, np.float64)
     if not len(database_xy):
         yield from (np.zeros(0, np.int32) for _ in query_xy)
@@ -197,12 +182,14 @@ def rows_within(query_xy: np.ndarray, database_xy: np.ndarray, radius: float) ->
             yield np.array(rows, np.int32)
 
 
-def frame_positives(query_index: np.ndarray, database_index: np.ndarray, *, tolerance: int) -> np.ndarray:
-    """Matrix `[Q, N]` bool: |database_index - query_index| <= tolerance.
+def frame_positives(
+    query_index: Int[np.ndarray, " queries"], database_index: Int[np.ndarray, " database"], *, tolerance: int
+) -> Bool[np.ndarray, "queries database"]:
+    """Positives by frame: |database_index - query_index| <= tolerance.
 
     Args:
-        query_index: `[Q]` frame number of each query's place; negative = unknown, no positives.
-        database_index: `[N]` frame number of each database image.
+        query_index: frame number of each query's place; negative = unknown, no positives.
+        database_index: frame number of each database image.
         tolerance: in frames.
     """
     query_index, database_index = np.asarray(query_index, np.int64), np.asarray(database_index, np.int64)
@@ -212,8 +199,10 @@ def frame_positives(query_index: np.ndarray, database_index: np.ndarray, *, tole
     return positives
 
 
-def radius_positives(query_xy: np.ndarray, database_xy: np.ndarray, *, radius: float = 25.0) -> np.ndarray:
-    """Matrix `[Q, N]` bool: at most `radius` meters apart. Coordinates `[Q, 2]`, `[N, 2]` are UTM, float64."""
+def radius_positives(
+    query_xy: Num[np.ndarray, "queries 2"], database_xy: Num[np.ndarray, "database 2"], *, radius: float = 25.0
+) -> Bool[np.ndarray, "queries database"]:
+    """Positives by position: at most `radius` meters apart. Coordinates are UTM, float64."""
     positives = np.zeros((len(query_xy), len(database_xy)), bool)
     for row, near in zip(positives, rows_within(query_xy, database_xy, radius), strict=True):
         row[near] = True
@@ -228,15 +217,8 @@ def _ascending(rows: np.ndarray, offsets: np.ndarray) -> bool:
     return bool(ascending.all())
 
 
-def _keys(rows: np.ndarray, offsets: np.ndarray, num_database: int) -> np.ndarray:
-    """Keys `[P]` int64 of pairs, query x N + row; they ascend if the rows of each query do."""
-    return np.repeat(np.arange(len(offsets) - 1) * num_database, np.diff(offsets)) + rows
-
-
-def _distinct(keys: np.ndarray) -> np.ndarray:
-    """Sort and remove duplicates; `np.unique` hashes, which takes 100 times as long on keys that nearly ascend."""
-    keys = np.sort(keys, kind="stable")
-    return keys[np.diff(keys, prepend=-1) > 0]
+def _csr(rows: np.ndarray, offsets: np.ndarray, num_database: int) -> csr_array:
+    return csr_array((np.ones(len(rows), bool), rows, offsets), shape=(len(offsets) - 1, num_database))
 
 
 def _offsets(counts: Any) -> np.ndarray:
