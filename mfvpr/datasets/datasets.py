@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import UInt8
 
 from mfvpr.datasets.ground_truth import CHOICES, KINDS, truth_by_order, truth_from_names
 from mfvpr.datasets.images import read_image
@@ -16,6 +17,7 @@ from mfvpr.datasets.truth_files import truth_from_file, truth_from_labels
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import IMAGE_SUFFIXES
 
+FILES = {"index_file": "index", "database_labels": "label", "query_labels": "label"}  # and their ground truth
 MEANS = ("mean", "pooled")  # names in results of the means over sequences, and over all of their queries
 
 
@@ -23,11 +25,7 @@ MEANS = ("mean", "pooled")  # names in results of the means over sequences, and 
 class ImageFolder:
     """Images below `root`, by relative POSIX path in natural order (image2 before image10).
 
-    Attributes:
-        root: folder.
-        names: relative paths of the images.
-        orient: see `mfvpr.datasets.images.read_image`.
-        bits: see `mfvpr.datasets.images.read_image`.
+    `orient` and `bits` are those of `mfvpr.datasets.images.read_image`.
     """
 
     root: Path
@@ -46,18 +44,16 @@ class ImageFolder:
     def __len__(self) -> int:
         return len(self.names)
 
-    def read(self, row: int) -> np.ndarray:
-        """Read one image, `[H, W, 3]` uint8 RGB; errors are those of `read_image`."""
+    def read(self, row: int) -> UInt8[np.ndarray, "height width 3"]:
+        """Read one image; errors are those of `read_image`."""
         return read_image(self.root / self.names[row], orient=self.orient, bits=self.bits)
 
 
 @dataclass(frozen=True)
 class QuerySequence:
-    """Query images of one drive or walk, with their ground truth.
+    """Query images of one drive or walk, with their ground truth; `name` stands in results.
 
     Attributes:
-        name: in results.
-        images: the queries.
         truth: which database images are correct; None = no ground truth, rankings only.
         excluded: the database images that are no candidates of each query; None = all images are candidates.
     """
@@ -70,13 +66,7 @@ class QuerySequence:
 
 @dataclass(frozen=True)
 class Dataset:
-    """One database and at least one sequence of queries.
-
-    Attributes:
-        name: in results.
-        database: the database images.
-        sequences: the sequences of queries.
-    """
+    """One database and at least one sequence of queries; `name` stands in results."""
 
     name: str
     database: ImageFolder
@@ -84,11 +74,7 @@ class Dataset:
 
     @property
     def only(self) -> QuerySequence:
-        """The only sequence.
-
-        Raises:
-            InputError: there are several sequences.
-        """
+        """The only sequence; InputError if there are several."""
         if len(self.sequences) != 1:
             raise InputError(f"{self.name}: expected one query sequence, got {len(self.sequences)}; choose one of "
                              f"{', '.join(sequence.name for sequence in self.sequences)}")  # fmt: skip
@@ -115,8 +101,7 @@ def image_folder(root: Path | str, *, orient: bool = True, bits: int | None = 16
 
     Args:
         root: folder.
-        orient: see `mfvpr.datasets.images.read_image`.
-        bits: see `mfvpr.datasets.images.read_image`.
+        orient, bits: see `mfvpr.datasets.images.read_image`.
 
     Raises:
         InputError: no such folder, a folder that cannot be listed, a broken link, a link to a parent folder, or no
@@ -156,10 +141,8 @@ def folder_dataset(
         name: in results.
         index_file: for `index`, see `truth_files.truth_from_file`.
         widen_index: for `index`, whether database images within a tolerance in frames count as well.
-        database_labels: for `label`, see `truth_files.truth_from_labels`.
-        query_labels: for `label`, see `truth_files.truth_from_labels`.
-        orient: see `mfvpr.datasets.images.read_image`.
-        bits: see `mfvpr.datasets.images.read_image`.
+        database_labels, query_labels: for `label`, see `truth_files.truth_from_labels`.
+        orient, bits: see `mfvpr.datasets.images.read_image`.
     """
     images = image_folder(database, orient=orient, bits=bits)
     files = {"index_file": index_file, "database_labels": database_labels, "query_labels": query_labels}
@@ -185,9 +168,7 @@ def sequences_dataset(
         ground_truth: kind of ground truth of every sequence, one of `ground_truth.KINDS` except `label`.
         name: in results.
         index_file: for `index`, the file's name in the folder of each sequence.
-        widen_index: see `folder_dataset`.
-        orient: see `folder_dataset`.
-        bits: see `folder_dataset`.
+        widen_index, orient, bits: see `folder_dataset`.
 
     Raises:
         InputError: no sequence, two sequences of one name, or a sequence with the name of a mean.
@@ -196,18 +177,14 @@ def sequences_dataset(
     names = [(folder.resolve() if folder.name in ("", "..") else folder).name for folder in folders]
     if not names:
         raise InputError("queries: expected the folder of at least one sequence, got none")
-    for duplicate in {name for name in names if names.count(name) > 1}:
-        raise InputError(
-            f"queries: expected sequences of different names, got {duplicate} twice; rename one of the folders"
-        )
+    if len({*names}) < len(names):
+        duplicate = max(names, key=names.count)
+        raise InputError(f"queries: expected sequences of different names, got {duplicate} twice; rename a folder")
     for mean in {*names} & {*MEANS}:
-        raise InputError(
-            f"queries: expected no sequence called {mean}, as results call one of their means; rename the folder"
-        )
+        raise InputError(f"queries: expected no sequence called {mean}, the name of a mean in results; rename it")
     images, sequences = image_folder(database, orient=orient, bits=bits), []
     for folder_name, folder in zip(names, folders, strict=True):
-        index = folder / index_file if index_file else None
-        files = {"index_file": index, "database_labels": None, "query_labels": None}
+        files = {"index_file": folder / index_file if index_file else None}
         sequences.append(_sequence(folder_name, images, folder, ground_truth, files, widen_index))
     return Dataset(name, images, tuple(sequences))
 
@@ -231,7 +208,7 @@ def _sequence(
         truth = truth_from_names(*names)
     elif index_file := files["index_file"]:
         truth = truth_from_file(index_file, *names, widened=widen_index)
-    elif (query_labels := files["query_labels"]) and (database_labels := files["database_labels"]):
+    elif (query_labels := files.get("query_labels")) and (database_labels := files.get("database_labels")):
         truth = truth_from_labels(query_labels, database_labels, *names)
     return QuerySequence(name, images, truth)
 
@@ -239,8 +216,8 @@ def _sequence(
 def _check_files(ground_truth: str, files: Mapping[str, Path | str | None]) -> None:
     if ground_truth not in KINDS:
         raise InputError(f"ground_truth={ground_truth}: expected one of {CHOICES}")
-    for option, path in files.items():
-        kind = "index" if option == "index_file" else "label"
+    for option, kind in FILES.items():
+        path = files.get(option)
         if path is not None and kind != ground_truth:
             raise InputError(f"{path}: given as {option}, but ground_truth={ground_truth}; set it to {kind}")
         if path is None and kind == ground_truth:

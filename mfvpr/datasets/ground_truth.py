@@ -11,6 +11,7 @@ from pathlib import PurePosixPath
 from typing import ClassVar
 
 import numpy as np
+from jaxtyping import Float, Int, Num
 
 from mfvpr.datasets.positives import Positives, rows_within
 from mfvpr.datasets.truth import Truth, Unit
@@ -47,7 +48,7 @@ class FrameTruth(Truth):
 
     @property
     def unit(self) -> Unit:
-        """Frames if neighbors count, else exact."""
+        """Frames if neighbors count, otherwise exact."""
         return "frames" if self.widened else "exact"
 
     def positives(self, threshold: float) -> Positives:
@@ -61,8 +62,8 @@ class FrameTruth(Truth):
         rows = (np.concatenate([_NO_ROWS, *map(around, rows)]) for rows in self.rows)
         return Positives.from_rows(rows, self.num_database)
 
-    def distance(self, query: int) -> np.ndarray:
-        """Frames `[N]` to the nearest of the query's rows."""
+    def distance(self, query: int) -> Float[np.ndarray, " database"]:
+        """Frames to the nearest of the query's rows."""
         distance = np.full(self.num_database, np.inf)
         for row in self.rows[query]:
             drive = slice(*self._drive(row))
@@ -81,15 +82,15 @@ class RadiusTruth(Truth):
     """Positions in meters; database images within a radius of the query are correct."""
 
     unit: ClassVar[Unit] = "m"
-    query_xy: np.ndarray  # [Q, 2]
-    database_xy: np.ndarray  # [N, 2]
+    query_xy: Num[np.ndarray, "queries 2"]
+    database_xy: Num[np.ndarray, "database 2"]
 
     def positives(self, threshold: float) -> Positives:
         """Correct database images at a radius in meters, inclusive."""
         return Positives.from_rows(rows_within(self.query_xy, self.database_xy, threshold), len(self.database_xy))
 
-    def distance(self, query: int) -> np.ndarray:
-        """Meters `[N]` to the query."""
+    def distance(self, query: int) -> Float[np.ndarray, " database"]:
+        """Meters to the query."""
         return np.linalg.norm(self.database_xy - self.query_xy[query], axis=1)
 
 
@@ -98,8 +99,8 @@ class LabelTruth(Truth):
     """Labels of floors or rooms as numbers; database images with the query's label are correct. -1 = no label."""
 
     unit: ClassVar[Unit] = "exact"
-    query_labels: np.ndarray  # [Q]
-    database_labels: np.ndarray  # [N]
+    query_labels: Int[np.ndarray, " queries"]
+    database_labels: Int[np.ndarray, " database"]
 
     def positives(self, threshold: float = 0) -> Positives:
         """Database images with the query's label, at any threshold."""
@@ -109,20 +110,15 @@ class LabelTruth(Truth):
         rows = {label: group for label, group in zip(labels.tolist(), groups, strict=False) if label >= 0}
         return Positives.from_rows((rows.get(label, _NO_ROWS) for label in self.query_labels.tolist()), len(order))
 
-    def distance(self, query: int) -> np.ndarray:
-        """0 if correct, else infinite, `[N]`."""
+    def distance(self, query: int) -> Float[np.ndarray, " database"]:
+        """0 if correct, else infinite."""
         label = self.query_labels[query]
         return np.where((self.database_labels == label) & (label >= 0), 0.0, np.inf)
 
 
 @dataclass(frozen=True)
 class AllowedTruth(Truth):
-    """Ground truth without database images that are excluded from the candidates of a query.
-
-    Attributes:
-        truth: the ground truth of all images.
-        excluded: the excluded images, by query.
-    """
+    """Ground truth without the database images that are `excluded` from the candidates of each query."""
 
     truth: Truth
     excluded: Positives
@@ -140,8 +136,8 @@ class AllowedTruth(Truth):
         """Images of the query's place: correct images and excluded ones (the query itself and its neighbors)."""
         return self.truth.shows_place(threshold) | self.excluded
 
-    def distance(self, query: int) -> np.ndarray:
-        """Distance `[N]`, infinite for excluded images."""
+    def distance(self, query: int) -> Float[np.ndarray, " database"]:
+        """Distance, infinite for excluded images."""
         distance = np.array(self.truth.distance(query), np.float64)
         distance[self.excluded.of(query)] = np.inf
         return distance

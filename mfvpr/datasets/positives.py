@@ -19,7 +19,7 @@ _QUERIES_AT_A_TIME = 128  # of a search by radius, which returns Python lists
 class Positives:
     """Ragged lists of database rows, one per query; memory grows with the number of rows, not with Q x N.
 
-    Create it with `from_rows` or `from_matrix`. `first | second` and `first - second` are union and difference by query.
+    Create it with `from_rows` or `from_matrix`. `first | second` and `first - second` go query by query.
 
     Attributes:
         rows: of all queries one after the other; ascending and distinct for each query. int32.

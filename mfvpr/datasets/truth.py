@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Float
 
 from mfvpr.datasets.positives import Positives
 
@@ -28,8 +29,8 @@ class Truth(ABC):
         return self.positives(threshold)
 
     @abstractmethod
-    def distance(self, query: int) -> np.ndarray:
-        """Distance `[N]` of each database image to the query's place, in the unit; infinite = never correct."""
+    def distance(self, query: int) -> Float[np.ndarray, " database"]:
+        """Distance of each database image to the query's place, in the unit; infinite = never correct."""
 
     def place(self, query: int) -> int | None:
         """The database row nearest to the query's place; None if the place is unknown."""

@@ -3,7 +3,7 @@
 import csv
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -42,11 +42,7 @@ def truth_from_file(
     * `.npz`: arrays `query` and `database`, the same pairs; or Patch-NetVLAD's `utmQ` and `utmDb`.
     * `.json`: VPR-Bench's `[[query, [database, ...]], ...]`.
 
-    Args:
-        path: index file.
-        query_names: of the images.
-        database_names: of the images.
-        widened: whether database images within a tolerance in frames count as well, for databases that are sequences.
+    If `widened`, database images within a tolerance in frames count as well, for databases that are sequences.
     """
     path = Path(path)
     csv_pairs = partial(_csv_columns, choices=(("query", "database"), ("live", "reference")))
@@ -56,12 +52,10 @@ def truth_from_file(
     content = _parse(path, readers[path.suffix.lower()])
     if not isinstance(content, RadiusTruth):
         return _frame_truth(path, content, query_names, database_names, widened)
-    for name, got, expected in (
-        ("query positions (utmQ)", len(content.query_xy), len(query_names)),
-        ("database positions (utmDb)", len(content.database_xy), len(database_names)),
-    ):
-        if got != expected:
-            raise InputError(f"{path}: expected {expected} {name}, one per image, got {got}")
+    got, expected = (len(content.query_xy), len(content.database_xy)), (len(query_names), len(database_names))
+    if got != expected:
+        raise InputError(f"{path}: expected {expected[0]} query positions (utmQ) and {expected[1]} database positions "
+                         f"(utmDb), one per image, got {got[0]} and {got[1]}")  # fmt: skip
     return content
 
 
@@ -90,13 +84,17 @@ def _frame_truth(
         places = rows.setdefault(row, [])
         if str(place).strip():
             places.append(_row(path, line, "database", place, database_rows, len(database)))
-    missing = [name for row, name in enumerate(queries) if row not in rows]
+    _require_all(path, "queries", queries, rows)
+    return FrameTruth(tuple(tuple(rows[row]) for row in range(len(queries))), len(database), widened)
+
+
+def _require_all(path: Path, kind: str, names: Sequence[str], rows: Container[int]) -> None:
+    missing = [name for row, name in enumerate(names) if row not in rows]
     if missing:
         raise InputError(
-            f"{path}: expected ground truth for all {len(queries)} queries, got it for {len(rows)}; the first without "
-            f"is {missing[0]} (a line with an empty database cell says that it has no place)"
+            f"{path}: expected lines for all {len(names)} {kind}, got them for {len(names) - len(missing)}; the first "
+            f"without is {missing[0]} (a line with an empty cell says that it has no place or label)"
         )
-    return FrameTruth(tuple(tuple(rows[row]) for row in range(len(queries))), len(database), widened)
 
 
 def _labels(path: Path, names: Sequence[str]) -> list[str]:
@@ -112,12 +110,7 @@ def _labels(path: Path, names: Sequence[str]) -> list[str]:
         if row in labels:
             raise InputError(f"{path}: entry {number}: {_clip(name)!r} has a label already; keep one of them")
         labels[row] = label.strip()
-    missing = [name for row, name in enumerate(names) if row not in labels]
-    if missing:
-        raise InputError(
-            f"{path}: expected labels of all {len(names)} images, got {len(labels)}; the first without is {missing[0]} "
-            "(a line with an empty label says that it has none)"
-        )
+    _require_all(path, "images", names, labels)
     return [labels[row] for row in range(len(names))]
 
 
@@ -150,9 +143,8 @@ def _npz_pairs(path: Path) -> list[tuple[Any, Any]] | RadiusTruth:
         if {"query", "database"} <= set(arrays):
             query, database = arrays["query"], arrays["database"]
             if query.shape != database.shape or query.ndim != 1:
-                raise InputError(
-                    f"{path}: expected query and database of one length, got {query.shape} and {database.shape}"
-                )
+                shapes = f"{query.shape} and {database.shape}"
+                raise InputError(f"{path}: expected query and database of one length, got {shapes}")
             return list(zip(query.tolist(), database.tolist(), strict=True))
         raise InputError(f"{path}: expected arrays query and database, or utmQ and utmDb; got {', '.join(arrays)}")
 

@@ -118,7 +118,7 @@ def test_no_label_is_nobodys(folders, tmp_path):
 @pytest.mark.parametrize(
     ("database", "words"),
     [
-        ("0.png,x\n1.png,x\n", "all 3 images, got 2; "),
+        ("0.png,x\n1.png,x\n", "all 3 images, got them for 2; "),
         ("0.png,x\n1.png,x\n0.png,x\n2.png,x\n", "entry 3: '0.png' has a label already"),
         ("0.png,x\n1.png,x\n2.png,x\n9.png,x\n", "entry 4: got '9.png'"),
         ("0.png,x\n" + 5000 * "9" + ",x\n", "(5000 characters)'"),
@@ -279,7 +279,7 @@ def twice(path):
         ("gt.txt", "x", "named .csv, .npz or .json"),
         ("gt.csv", "", "no header"),
         ("gt.csv", "a,b\n0,0\n", "got a,b"),
-        ("gt.csv", "query,database\n0,0\n", "all 2 queries, got it for 1; "),
+        ("gt.csv", "query,database\n0,0\n", "all 2 queries, got them for 1; "),
         (
             "gt.csv",
             "query,database\n0,0\n1,3\n",

@@ -73,7 +73,7 @@ def test_ssm_vprs_lack_something(ssm, tmp_path):
     (ssm / "GroundTruth.csv").write_text("Reference,Live\n0,0\n12,1\n4,2\n")
     refused("gardens_point", ssm, "from 0 to 11, got '12'")
     (ssm / "GroundTruth.csv").write_text("Reference,Live\n0,0\n4,2\n")
-    refused("gardens_point", ssm, "expected ground truth for all 3 queries")
+    refused("gardens_point", ssm, "expected lines for all 3 queries")
     (ssm / "GroundTruth.csv").unlink()
     refused("gardens_point", ssm, "GroundTruth.csv: expected")
     refused("gardens_point", tmp_path / "no", "no: expected the folder of gardens_point")
