@@ -11,7 +11,7 @@ import pytest
 
 from mfvpr.datasets.published import PUBLISHED, differences, published_dataset
 from mfvpr.datasets.published.lists import read_lines, read_names, read_rows
-from mfvpr.datasets.published.robotcar import CONDITIONS, REFERENCE, nearest_places
+from mfvpr.datasets.published.robotcar import CONDITIONS, REFERENCE
 from mfvpr.utils import InputError
 from tests.random_checkpoints import write_matlab
 
@@ -103,7 +103,7 @@ def test_robotcar_takes_the_nearest_reference_within_five_meters(tmp_path, suffi
     for number, condition in enumerate(CONDITIONS):
         centers |= {place(condition, 200): (14.9, 0, 0), place(condition, 100): (3, 0, 4.1 if number == 2 else 4),
                     place(condition, 300): (0, 900, 0)}  # fmt: skip
-    centers |= {place("sun", 1): (0, 0, 0), "dawn/left/7": (0, 0, 0)}
+    centers |= {place("sun", 1): (0, 0, 0), "dawn/left/7": (0, 0, 0), place(CONDITIONS[1], 400): (5, 0, 0)}
     write_poses(tmp_path, centers, suffix)
     dataset = published_dataset("robotcar_seasons", tmp_path)
     assert dataset.database.names == tuple(f"{REFERENCE}/rear/{time}.jpg" for time in (10, 20, 30))
@@ -111,6 +111,7 @@ def test_robotcar_takes_the_nearest_reference_within_five_meters(tmp_path, suffi
     assert dataset.sequences[0].images.names == ("dawn/rear/100.jpg", "dawn/rear/200.jpg")
     assert rows(dataset, 0) == [[2], [1]]  # 5 m is near enough; of the order of timestamps
     assert rows(dataset, 1) == [[1, 2], [0, 1, 2]]
+    assert rows(dataset, 0, 1) == [[2], [1], [1]]  # of two that are equally near the first
     assert dataset.sequences[2].images.names == ("night/rear/200.jpg",)  # 5.08 m is not
     assert all(path.is_file() for sequence in dataset.sequences for path in sequence.images.paths)
 
@@ -133,12 +134,6 @@ def test_robotcar_keeps_as_many_queries_as_the_paper(tmp_path):
     assert list(differences(dataset)) == []
     assert [len(sequence.images) for sequence in dataset.sequences] == list(published)
     assert len(dataset.database) == 220
-
-
-def test_nearest_places_of_equal_ones_are_the_first():
-    found, distance = nearest_places(np.array([[1.0, 0, 0]]), np.array([[2.0, 0, 0], [0.0, 0, 0], [1.0, 3, 4]]))
-    assert found.tolist() == [0]
-    assert distance.tolist() == [1]
 
 
 def test_robotcar_knows_one_pose_of_each_image(tmp_path):

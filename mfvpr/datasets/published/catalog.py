@@ -15,13 +15,11 @@ class Published:
 
     Attributes:
         name: of the choice `dataset=`, and of its folder below a folder of data sets.
-        title: short description with its authors.
         layout: contents of its folder, in lines.
         database: published number of database images.
         queries: published numbers of queries, by sequence.
         read: `read(folder, name)`, with the keyword `seasons` if it has seasons.
         archive: name under which it is distributed, another possible name of its folder.
-        source: where to get it.
         seasons: default (database, queries) if seasons can be chosen.
     """
 
@@ -95,15 +93,10 @@ PUBLISHED = {
 
 
 def published_dataset(name: str, root: Path | str, *, seasons: tuple[str, str] | None = None) -> Dataset:
-    """A published data set, from the folder that holds it.
-
-    Args:
-        name: of `PUBLISHED`.
-        root: its folder.
-        seasons: (database, queries) of Nordland.
+    """The data set `name` of `PUBLISHED`, from its folder `root`; `seasons` of Nordland are (database, queries).
 
     Raises:
-        InputError: no such folder, or a folder of another layout.
+        InputError: no such folder, or files and images in it that are missing, damaged, or of another layout.
     """
     entry, root = PUBLISHED[name], Path(root)
     if not root.is_dir():

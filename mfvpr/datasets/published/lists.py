@@ -18,11 +18,7 @@ _OBJECTS = b"'|O'"
 
 
 def listed_images(root: Path, names: Iterable[str], origin: Path) -> ImageFolder:
-    """The images below `root` with the names of a list.
-
-    Raises:
-        InputError: an empty list, names outside the folder, duplicates, or missing images.
-    """
+    """The images below `root` with the names of a list."""
     names = tuple(names)
     if not names:
         raise InputError(f"{origin}: expected names of images, got none")
@@ -44,13 +40,7 @@ def dataset_of_lists(
 ) -> Dataset:
     """Data set from NumPy's lists of GSV-Cities and OpenVPRLab: image names, and correct database rows by query.
 
-    Args:
-        root: folder of the images.
-        name: of the data set.
-        database_list: names of database images.
-        query_list: names of query images.
-        truth_list: database rows by query.
-        selection_list: rows of `query_list` that are queries; None = all.
+    `selection_list` has the rows of `query_list` that are queries; None = all.
     """
     database = listed_images(root, read_names(database_list), database_list)
     names, rows = read_names(query_list), read_rows(truth_list, len(database))
@@ -84,11 +74,7 @@ def expected_file(root: Path, *names: str) -> Path | None:
 
 
 def read_lines(path: Path) -> list[str]:
-    """Read lines that are not empty, without the spaces around them.
-
-    Raises:
-        InputError: the file cannot be read.
-    """
+    """Read lines that are not empty, without the spaces around them."""
     with reading(path, "expected lines of text; get it again"):
         text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")
     return [stripped for line in text.splitlines() if (stripped := line.strip())]
@@ -103,11 +89,7 @@ def read_names(path: Path) -> list[str]:
 
 
 def read_rows(path: Path, num_database: int) -> list[tuple[int, ...]]:
-    """Read database rows by query from an `.npy` file of lists, or of an array `[Q]` or `[Q, P]`.
-
-    Raises:
-        InputError: a file of another content, a damaged file, or rows outside the database.
-    """
+    """Read database rows by query from an `.npy` file of lists, or of an array `[Q]` or `[Q, P]`."""
     with reading(path, "this file is damaged; get it again"), path.open("rb") as file:
         if _OBJECTS in file.read(128):
             file.seek(0)

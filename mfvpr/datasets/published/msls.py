@@ -22,11 +22,7 @@ msls_val_dbImages.npy, msls_val_qImages.npy, msls_val_qIdx.npy, msls_val_pIdx.np
 
 
 def msls_val(root: Path, name: str) -> Dataset:
-    """Copenhagen and San Francisco without panoramas; queries have a database image within 25 m, as in its own code.
-
-    Raises:
-        InputError: tables, lists or images are missing or damaged.
-    """
+    """Copenhagen and San Francisco without panoramas; queries have a database image within 25 m, as in its own code."""
     lists = database, queries, selection, truth = [
         root / f"{name}_{part}.npy" for part in ("dbImages", "qImages", "qIdx", "pIdx")
     ]

@@ -20,11 +20,7 @@ query/0000000.jpg, ...  the queries, in summer: query i shows database image 10 
 
 
 def nordland_27592(root: Path, name: str, *, seasons: tuple[str, str]) -> Dataset:
-    """Patch-NetVLAD's and gmberton's variant: every frame but tunnels and stations; correct within 10 frames.
-
-    Raises:
-        InputError: images are missing, or the seasons' frames differ.
-    """
+    """Patch-NetVLAD's and gmberton's variant: every frame but tunnels and stations; correct within 10 frames."""
     folders = []
     for season, side in zip(seasons, ("index", "query"), strict=True):
         origin = expected_file(root, f"nordland_imageNames_{side}.txt")
@@ -37,20 +33,12 @@ def nordland_27592(root: Path, name: str, *, seasons: tuple[str, str]) -> Datase
 
 
 def nordland_3450(root: Path, name: str, *, seasons: tuple[str, str]) -> Dataset:
-    """The test part of Olid, Facil and Civera (2018); correct within 2 frames of the same section.
-
-    Raises:
-        InputError: images are missing, or the seasons' frames differ.
-    """
+    """The test part of Olid, Facil and Civera (2018); correct within 2 frames of the same section."""
     return _frame_pairs(name, *(image_folder(root / f"{season}_images_test") for season in seasons))
 
 
 def nordland_vprbench(root: Path, name: str) -> Dataset:
-    """VPR-Bench's variant (Zaffar et al., IJCV 2021): every tenth frame is a query; correct within 1 frame.
-
-    Raises:
-        InputError: images are missing, or the database has too few images.
-    """
+    """VPR-Bench's variant (Zaffar et al., IJCV 2021): every tenth frame is a query; correct within 1 frame."""
     database, queries = image_folder(root / "ref"), image_folder(root / "query")
     last = EACH * (len(queries) - 1)
     if last >= len(database):

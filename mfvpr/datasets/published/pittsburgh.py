@@ -17,11 +17,7 @@ QUERIES = "queries_real"
 
 
 def pitts30k(root: Path, name: str) -> Dataset:
-    """The validation or test part; correct within a radius of the query, or within the lists' 25 m.
-
-    Raises:
-        InputError: lists or images are missing or damaged.
-    """
+    """The validation or test part; correct within a radius of the query, or within the lists' 25 m."""
     structure = f"{name}.mat"
     if path := expected_file(root, f"datasets/{structure}", structure):
         return _dataset_of_structure(root, name, path)

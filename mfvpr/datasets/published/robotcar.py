@@ -6,6 +6,7 @@ within five meters are left out.
 """
 
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -27,11 +28,7 @@ LAYOUT = f"""images/CONDITION/rear/TIMESTAMP.jpg  of {REFERENCE} (the database),
 
 
 def robotcar_seasons(root: Path, name: str) -> Dataset:
-    """The database, and a sequence per condition, in the order of their timestamps.
-
-    Raises:
-        InputError: a file is missing, damaged, or without one of the conditions.
-    """
+    """The database, and a sequence per condition, in the order of their timestamps."""
     path = root / POSES
     centers = camera_centers(path)
     database, places = _condition(centers, REFERENCE, path)
@@ -39,27 +36,22 @@ def robotcar_seasons(root: Path, name: str) -> Dataset:
     sequences = []
     for condition in CONDITIONS:
         names, positions = _condition(centers, condition, path)
-        nearest, distances = nearest_places(positions, places)
-        near = np.flatnonzero(distances <= REACH).tolist()
-        rows = tuple((int(nearest[query]),) for query in near)
+        distances = np.linalg.norm(positions[:, None] - places, axis=-1)
+        near = np.flatnonzero(distances.min(axis=1) <= REACH).tolist()
+        rows = tuple((int(distances[query].argmin()),) for query in near)
         queries = listed_images(root / "images", [names[query] for query in near], path)
         sequences.append(QuerySequence(condition, queries, FrameTruth(rows, len(database))))
     return Dataset(name, images, tuple(sequences))
 
 
 def camera_centers(path: Path) -> dict[str, np.ndarray]:
-    """Read camera centers `[3]` in meters by image name from a file of poses.
-
-    Raises:
-        InputError: a line is no pose.
-    """
+    """Read camera centers `[3]` in meters by image name from a file of poses."""
     centers = {}
     for number, line in enumerate(read_lines(path), start=1):
         name, *texts = line.split()
-        try:
+        numbers = []
+        with suppress(ValueError):
             numbers = [parse_number(text) for text in texts]
-        except ValueError:
-            numbers = []
         center = np.array(numbers[3:12:4])
         is_pose = len(numbers) == 16 and np.allclose(numbers[12:], (0, 0, 0, 1), rtol=0, atol=_LAST_ROW)
         if not is_pose or not np.all(np.abs(center) <= FARTHEST):
@@ -67,18 +59,11 @@ def camera_centers(path: Path) -> dict[str, np.ndarray]:
                 f"{path}: line {number}: expected a name and the 16 numbers of a pose by rows, the last 0 0 0 1, got "
                 f"{line[:60]!r}; get the file again"
             )
-        image = str(Path(name).with_suffix(".jpg").as_posix())
+        image = Path(name).with_suffix(".jpg").as_posix()
         if image in centers and not np.array_equal(centers[image], center):
             raise InputError(f"{path}: line {number}: expected one pose of {image}, got another; get the file again")
         centers[image] = center
     return centers
-
-
-def nearest_places(queries: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Row `[Q]` of the nearest of places `[N, 3]` for queries `[Q, 3]`, the first on a tie, and its distance `[Q]`."""
-    distances = np.linalg.norm(queries[:, None] - places[None], axis=-1)
-    nearest = np.argmin(distances, axis=1)
-    return nearest, distances[np.arange(len(queries)), nearest]
 
 
 def _condition(centers: Mapping[str, np.ndarray], condition: str, path: Path) -> tuple[list[str], np.ndarray]:

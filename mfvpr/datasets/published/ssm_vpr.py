@@ -13,11 +13,7 @@ GroundTruth.csv                         Reference,Live and then a line per query
 
 
 def ssm_vpr(root: Path, name: str) -> Dataset:
-    """Correct within a tolerance in frames of the database image in the table.
-
-    Raises:
-        InputError: a folder or the table is missing, or images are not numbered as the table counts them.
-    """
+    """Correct within a tolerance in frames of the database image in the table."""
     database, queries = (_numbered_images(root / side) for side in ("Reference", "Live"))
     truth = truth_from_file(root / "GroundTruth.csv", queries.names, database.names, widened=True)
     return Dataset(name, database, (QuerySequence(name, queries, truth),))
