@@ -104,11 +104,10 @@ class LabelTruth(Truth):
 
     def positives(self, threshold: float = 0) -> Positives:
         """Database images with the query's label, at any threshold."""
-        order = np.argsort(self.database_labels, kind="stable").astype(np.int32)
-        labels, starts = np.unique(self.database_labels[order], return_index=True)
-        groups = np.split(order, starts[1:])  # one, empty, if there are no images and so no labels
-        rows = {label: group for label, group in zip(labels.tolist(), groups, strict=False) if label >= 0}
-        return Positives.from_rows((rows.get(label, _NO_ROWS) for label in self.query_labels.tolist()), len(order))
+        labels, order = self.database_labels, np.argsort(self.database_labels, kind="stable").astype(np.int32)
+        first = np.searchsorted(labels, self.query_labels, "left", sorter=order)
+        last = np.where(self.query_labels < 0, first, np.searchsorted(labels, self.query_labels, "right", sorter=order))
+        return Positives.from_rows((order[run] for run in map(slice, first, last)), len(order))
 
     def distance(self, query: int) -> Float[np.ndarray, " database"]:
         """0 if correct, else infinite."""

@@ -68,7 +68,7 @@ class Positives:
         return cls._from_csr(csr_array(matrix))
 
     @classmethod
-    def _from_csr(cls, matrix: csr_array) -> "Positives":
+    def _from_csr(cls, matrix: Any) -> "Positives":
         matrix.sum_duplicates()  # and sort each query's rows
         return cls(matrix.indices.astype(np.int32), matrix.indptr.astype(np.int64), matrix.shape[1])
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from jaxtyping import Bool, Float
 
 from mfvpr.datasets.streets.types import Floats, Rng
 
@@ -29,36 +29,38 @@ class Camera:
         """Focal length in px."""
         return 0.7 * self.image_size[0]
 
-    def rotation(self) -> Floats:
+    def rotation(self) -> Float[np.ndarray, "3 3"]:
         """Rows: the camera's right, down and forward axes in the world."""
         sin_h, cos_h, sin_p, cos_p = (f(a) for a in (self.heading, self.pitch) for f in (np.sin, np.cos))
         forward = np.array([sin_h * cos_p, -sin_p, cos_h * cos_p])
         right = np.array([cos_h, 0.0, -sin_h])
         return np.stack([right, np.cross(forward, right), forward])
 
-    def center(self) -> Floats:
-        """The camera's position `[3]` in the world, in meters."""
+    def center(self) -> Float[np.ndarray, "3"]:
+        """The camera's position in the world, in meters."""
         return np.array([self.x, -CAMERA_HEIGHT, self.z])
 
-    def projection(self) -> Floats:
-        """The matrix `[3, 4]` from world points (x, y, z, 1) to homogeneous px; the last row gives the depth in m."""
+    def projection(self) -> Float[np.ndarray, "3 4"]:
+        """The matrix from world points (x, y, z, 1) to homogeneous px; the last row gives the depth in m."""
         width, height = self.image_size
         intrinsics = np.array([[self.focal, 0, width / 2], [0, self.focal, height / 2], [0, 0, 1]])
         rotation = self.rotation()
         return intrinsics @ np.column_stack([rotation, -rotation @ self.center()])
 
-    def project(self, points: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """World points `[n, 3]` to px `[n, 2]`, and which of them lie inside the image, `[n]`."""
+    def project(
+        self, points: Float[np.ndarray, "points 3"]
+    ) -> tuple[Float[np.ndarray, "points 2"], Bool[np.ndarray, " points"]]:
+        """World points to px, and which of them lie inside the image."""
         homogeneous = np.column_stack([points, np.ones(len(points))]) @ self.projection().T
         pixels = homogeneous[:, :2] / np.maximum(homogeneous[:, 2:], NEAR)
         inside = (homogeneous[:, 2] > NEAR) & np.all((pixels >= 0) & (pixels < self.image_size), axis=1)
         return pixels, inside
 
 
-def smooth_walk(rng: Rng, count: int, correlation: float = 8.0) -> Floats:
-    """Smooth random values `[count]` in [-1, 1], similar over `correlation` frames."""
+def smooth_walk(rng: Rng, count: int) -> Floats:
+    """Smooth random values `[count]` in [-1, 1], similar over 8 frames."""
     steps = np.arange(-30, 31)
-    kernel = np.exp(-0.5 * (steps / correlation) ** 2)
+    kernel = np.exp(-0.5 * (steps / 8.0) ** 2)
     walk = np.convolve(rng.standard_normal(count + len(steps) - 1), kernel, mode="valid")
     return np.clip(1.3 * walk / np.sqrt(np.sum(kernel**2)) / 2, -1, 1)
 

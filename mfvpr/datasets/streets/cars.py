@@ -16,6 +16,9 @@ TRAFFIC = (
 )  # fmt: skip
 
 
+End = tuple[float, float]  # where the glass and the roof start, meters from this end
+
+
 @dataclass(frozen=True)
 class Car:
     """A car with its middle at x = 0 and its near end at z = 0: seen from behind, and oncoming."""
@@ -26,14 +29,14 @@ class Car:
 
 @dataclass(frozen=True)
 class Body:
-    """Shape of a car, in meters: heights of hood and roof; where the glass starts and the roof starts, per end."""
+    """Shape of a car, in meters: heights of hood and roof, and its ends."""
 
     length: float
     width: float
     hood: float
     roof: float
-    rear: tuple[float, float]
-    front: tuple[float, float]
+    rear: End
+    front: End
 
 
 BODIES = (
@@ -48,30 +51,25 @@ def build_car(seed: int, index: int) -> Car:
     rng = np.random.default_rng([seed, 4, index])
     body, color = BODIES[int(rng.choice(3, p=(0.4, 0.35, 0.25)))], pick(rng, CARS)
     side = draw_side(rng, body, color)
-    right, left = texture(side), texture(side.mirror())
+    sides = texture(side.mirror()), texture(side)
     rear = texture(draw_end(body, color, (160, 30, 30), (255, 50, 40)))
     front = texture(draw_end(body, color, (236, 236, 228), (255, 250, 230)))
-    covers = (texture(draw_shadow()), texture(draw_top(color)), texture(draw_glass(body, color)))
+    covers = texture(draw_shadow()), texture(draw_top(color)), texture(draw_glass(body, color))
     return Car(
-        assemble(body, body.rear, body.front, rear, (left, right), covers),
-        assemble(body, body.front, body.rear, front, (right, left), covers),
+        assemble(body, (body.rear, body.front), rear, sides, covers),
+        assemble(body, (body.front, body.rear), front, sides[::-1], covers),
     )
 
 
 def assemble(
-    body: Body,
-    near: tuple[float, float],
-    far: tuple[float, float],
-    end: Texture,
-    sides: tuple[Texture, Texture],
-    covers: tuple[Texture, Texture, Texture],
+    body: Body, ends: tuple[End, End], end: Texture, sides: tuple[Texture, ...], covers: tuple[Texture, ...]
 ) -> Prop:
-    """Build a car from its textures; `near` and `far`: start of glass and roof, in meters from the respective end.
+    """Build a car from its textures, with its near and far ends, the near one's texture, and the left and right sides.
 
-    `sides` are the left and the right as seen from behind, `covers` shadow, top and glass. Panels that face away are
-    included, but never painted.
+    `covers` are shadow, top and glass. Panels that face away are included, but never painted.
     """
     shadow, top, glass = covers
+    near, far = ends
     width, length, left = body.width, body.length, -body.width / 2
     roof, across = length - far[1], (width, 0, 0)
     panels = (
@@ -130,7 +128,6 @@ def draw_end(body: Body, paint: Color, lights: Color, glow: Color) -> Sheet:
 
 
 def draw_top(paint: Color) -> Sheet:
-    """Roof, hood and trunk."""
     sheet = Sheet(1.0, 1.0, tone(paint, 1.1))
     sheet.settle_snow(235)
     return sheet
@@ -144,7 +141,6 @@ def draw_glass(body: Body, paint: Color) -> Sheet:
 
 
 def draw_shadow() -> Sheet:
-    """The shadow on the ground below a car."""
     sheet = Sheet(2.0, 2.0, None)
     sheet.ellipse(1.0, 1.0, 1.0, 1.0, (66, 66, 70), snow=60)
     return sheet

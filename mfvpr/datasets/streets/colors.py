@@ -1,7 +1,7 @@
 """Palettes of the street, and arithmetic with colors."""
 
 import numpy as np
-from numpy.typing import NDArray
+from jaxtyping import Float
 
 from mfvpr.datasets.streets.types import Color, Rng
 
@@ -14,13 +14,11 @@ CARS = ((186, 44, 40), (40, 72, 130), (228, 228, 226), (60, 64, 70), (150, 156, 
 GLASS, WARM, DARK = (62, 76, 92), (255, 196, 110), (0, 0, 0)
 
 
-def as_array(color: tuple[float, float, float]) -> NDArray[np.float32]:
-    """The color as floats `[3]`, ready for arithmetic."""
+def as_array(color: tuple[float, float, float]) -> Float[np.ndarray, "3"]:
     return np.array(color, np.float32)
 
 
 def pick(rng: Rng, colors: tuple[Color, ...]) -> Color:
-    """One of the colors."""
     return colors[int(rng.integers(len(colors)))]
 
 

@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from mfvpr.datasets.streets.camera import Camera
-from mfvpr.datasets.streets.types import Floats
+
+STEP = 8  # px
 
 
 @dataclass(frozen=True)
@@ -21,10 +23,10 @@ class Facade:
     height: float
 
 
-def visible_points(facades: Iterable[Facade], camera: Camera, step: int = 8) -> Floats:
-    """Points `[n, 3]` on the nearest facades, seen through a grid of every `step`-th px of the image."""
+def visible_points(facades: Iterable[Facade], camera: Camera) -> Float[np.ndarray, "points 3"]:
+    """Points on the nearest facades, seen through a grid of every `STEP`-th px of the image."""
     width, height = camera.image_size
-    u, v = np.meshgrid(np.arange(step / 2, width, step), np.arange(step / 2, height, step))
+    u, v = np.meshgrid(np.arange(STEP / 2, width, STEP), np.arange(STEP / 2, height, STEP))
     rays = np.stack([(u - width / 2) / camera.focal, (v - height / 2) / camera.focal, np.ones_like(u)], -1)
     rays = rays.reshape(-1, 3) @ camera.rotation()
     nearest = np.full(len(rays), np.inf)
@@ -39,11 +41,11 @@ def visible_points(facades: Iterable[Facade], camera: Camera, step: int = 8) -> 
     return camera.center() + nearest[hits, None] * rays[hits]
 
 
-def image_shift(points: Floats, query: Camera, database: Camera) -> tuple[float, float]:
+def image_shift(points: Float[np.ndarray, "points 3"], query: Camera, database: Camera) -> tuple[float, float]:
     """Shift (x, y) in px that moves the scene of the query image onto the database image.
 
     It is the median, per axis, of the position in the database image minus the position in the query image, over the
-    world points `[n, 3]` inside both images.
+    world points inside both images.
     """
     (before, inside_query), (after, inside_database) = query.project(points), database.project(points)
     x, y = np.median((after - before)[inside_query & inside_database], axis=0)

@@ -136,7 +136,6 @@ class Design:
 
 
 def make_design(rng: Rng) -> Design:
-    """A random design."""
     motif = MOTIFS[int(rng.integers(len(MOTIFS)))]
     return Design(rng.uniform(6.0, 11.0), int(rng.integers(1, 4)), motif, bool(rng.random() < 0.5))
 
@@ -176,7 +175,6 @@ def draw_gable(rng: Rng, color: Color, depth: float, height: float, rise: float)
 
 
 def draw_roof(rng: Rng, width: float, slope: float) -> Sheet:
-    """One tiled slope of a roof."""
     sheet = Sheet(width, slope, pick(rng, ROOFS), scale=16)
     sheet.settle_snow(np.clip(225 + 20 * blotches(rng, sheet.day.shape[:2], 12), 0, 250))
     tiles = 1 - 0.18 * (np.arange(sheet.day.shape[0]) % 5 == 0)[:, None]

@@ -58,7 +58,6 @@ def draw_tree(rng: Rng, width: float, height: float) -> Sheet:
 
 
 def draw_lamp() -> Sheet:
-    """A street lamp."""
     sheet = Sheet(1.0, 5.2, None)
     sheet.rect(0.44, 0.6, 0.12, 4.6, (52, 58, 56))
     sheet.rect(0.38, 4.3, 0.24, 0.9, (52, 58, 56))
@@ -68,7 +67,6 @@ def draw_lamp() -> Sheet:
 
 
 def draw_sign(rng: Rng) -> Sheet:
-    """A traffic sign on its post: round, triangular or square."""
     sheet = Sheet(0.9, 2.9, None)
     sheet.rect(0.41, 0.4, 0.08, 2.5, (120, 122, 124))
     kind = rng.integers(3)
@@ -85,7 +83,6 @@ def draw_sign(rng: Rng) -> Sheet:
 
 
 def draw_hedge(rng: Rng, width: float, height: float) -> Sheet:
-    """A garden hedge."""
     sheet = Sheet(width, height, None)
     for x, y in rng.uniform((0.1, 0.15), (width - 0.1, height), (500, 2)):
         light = 1.15 - 0.4 * y / height + rng.uniform(-0.2, 0.2)

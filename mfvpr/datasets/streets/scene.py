@@ -80,20 +80,12 @@ def build_house(rng: Rng, design: Design, side: int, x: float, z: float) -> tupl
     light = lamp_light(along) * np.exp(-(((above - 3.5) / 3.0) ** 2))
     near, far = (z, z + width) if side < 0 else (z + width, z)
     step = (0.0, 0.0, far - near)
-    inner, outer = side * x, side * (x + depth)
+    inner, middle, outer, top = side * x, side * (x + depth / 2), side * (x + depth), -height - rise
     facade = Panel(texture(sheet, light, 1.06 if side < 0 else 0.84), (inner, -height, near), step, (0, height, 0))
-    roof = Panel(
-        texture(draw_roof(rng, width, float(np.hypot(depth / 2, rise))), sun=1.05),
-        (side * (x + depth / 2), -height - rise, near),
-        step,
-        (-side * depth / 2, rise, 0),
-    )
-    gable = Panel(
-        texture(draw_gable(rng, wall, depth, height, rise)),
-        (min(inner, outer), -height - rise, z),
-        (depth, 0, 0),
-        (0, height + rise, 0),
-    )
+    slope = texture(draw_roof(rng, width, float(np.hypot(depth / 2, rise))), sun=1.05)
+    roof = Panel(slope, (middle, top, near), step, (-side * depth / 2, rise, 0))
+    end = texture(draw_gable(rng, wall, depth, height, rise))
+    gable = Panel(end, (min(inner, outer), top, z), (depth, 0, 0), (0, height + rise, 0))
     return Prop(z + width / 2, (gable, roof, facade)), Facade(inner, z, z + width, height)
 
 

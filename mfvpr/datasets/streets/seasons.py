@@ -35,7 +35,6 @@ def draw_seasons(
     database, _ = plan_drives(seed, num_frames, image_size)
     drives = [Drive(folder / "database", database, ["day"] * num_frames, (seed, 10, 0))]
     for number, condition in enumerate(CONDITIONS):
-        cameras, weathers = plan_return(seed, number, num_frames, image_size), [condition] * num_frames
-        place = folder / condition
-        drives.append(Drive(place, cameras, weathers, (seed, 10, number + 1), place / TRUTH))
+        cameras, place = plan_return(seed, number, num_frames, image_size), folder / condition
+        drives.append(Drive(place, cameras, [condition] * num_frames, (seed, 10, number + 1), place / TRUTH))
     draw_drives(drives, seed, SPACING * (num_frames + 1), progress)

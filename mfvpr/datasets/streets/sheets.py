@@ -9,7 +9,7 @@ from functools import cache
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mfvpr.datasets.streets.colors import DARK, as_array, tone
 from mfvpr.datasets.streets.types import Color, Floats, Image, Rng
@@ -59,7 +59,7 @@ class Sheet:
         corners = np.rint(np.asarray(points, float) * self.scale * 16).astype(np.int32)
         cv2.polylines(self.day, [corners], False, (*color, 255), max(1, round(width * self.scale)), shift=4)
 
-    def shade(self, gain: NDArray[np.floating]) -> None:
+    def shade(self, gain: Floats) -> None:
         """Multiply the colors by `gain`, broadcast over rows, columns and channels."""
         self.day[..., :3] = np.clip(self.day[..., :3] * gain, 0, 255)
 
@@ -74,7 +74,7 @@ class Sheet:
         return sheet
 
 
-def texture(sheet: Sheet, lamp_light: NDArray[np.floating] | float = 0.0, sun: float = 1.0) -> Texture:
+def texture(sheet: Sheet, lamp_light: Floats | float = 0.0, sun: float = 1.0) -> Texture:
     """The texture of a finished sheet, computed when a weather is first used.
 
     `lamp_light` (0..1, broadcast over rows and columns) is the light of street lamps on the sheet, `sun` the gain of

@@ -1,11 +1,9 @@
-"""Array types that pass between the modules; the annotations of cv2 lack element types."""
-
-from typing import Any
+"""Types of arrays and colors that pass between the modules."""
 
 import numpy as np
-from numpy.typing import NDArray
+from jaxtyping import Float, UInt8
 
-Image = NDArray[Any]  # uint8, rows x columns x channels
-Floats = NDArray[Any]  # floating point
+Image = UInt8[np.ndarray, "_ _ _"]  # rows, columns, channels
+Floats = Float[np.ndarray, "..."]
 Color = tuple[int, int, int]  # RGB, 0..255
 Rng = np.random.Generator
