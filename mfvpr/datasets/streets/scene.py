@@ -12,7 +12,7 @@ from mfvpr.datasets.streets.ground_truth import Facade
 from mfvpr.datasets.streets.houses import Design, draw_facade, draw_gable, draw_roof, make_design
 from mfvpr.datasets.streets.objects import draw_ground, draw_hedge, draw_lamp, draw_sign, draw_tree
 from mfvpr.datasets.streets.sheets import Panel, Prop, Texture, blotches, texture, upright
-from mfvpr.datasets.streets.types import Floats, Image, Rng
+from mfvpr.datasets.streets.types import Image, Rng
 from mfvpr.datasets.streets.weather import WEATHERS, Weather
 
 LAMP_SPACING = 22.0  # meters
@@ -44,7 +44,7 @@ def build_scene(seed: int, length: float) -> Scene:
     )
 
 
-def lamp_light(z: Floats) -> Floats:
+def lamp_light(z: np.ndarray) -> np.ndarray:
     """Light of the street lamps at z (meters), 0..1."""
     return np.exp(-((((z + LAMP_SPACING / 2) % LAMP_SPACING - LAMP_SPACING / 2) / 5.0) ** 2))
 
