@@ -1,4 +1,4 @@
-"""What is remembered of image files: content decides, and nothing is read twice without a reason."""
+"""Fingerprints of image files: content decides, and no file is read twice without a reason."""
 
 import hashlib
 import os
@@ -57,7 +57,7 @@ def record(cache):
 
 
 def bytes_read():
-    """By this process, files and pipes alike."""
+    """Bytes that this process has read from files and pipes."""
     return int(Path("/proc/self/io").read_text().split()[1])
 
 
@@ -81,24 +81,20 @@ def test_a_second_run_reads_no_image(tmp_path, cache):
     folder = image_folder(fill(tmp_path / "images", 30))
     settle()
     size = sum(path.stat().st_size for path in folder.paths)
-    counts, found = [], []
-    for _ in range(2):
-        before = bytes_read()
-        found.append(contents(folder, cache))
-        counts.append(bytes_read() - before)
-    assert found[0] == found[1]
-    assert counts[0] >= size
-    assert counts[1] < size / 10
+    before, first = bytes_read(), contents(folder, cache)
+    between, second = bytes_read(), contents(folder, cache)
+    assert first == second
+    assert between - before >= size
+    assert bytes_read() - between < size / 10
 
 
 def test_parts_of_a_folder_do_not_forget_each_other(folder, cache, monkeypatch):
-    """Files beside each other, of which one is asked for after the other."""
-    whole = image_folder(folder)
-    parts = [replace(whole, names=names) for names in (whole.names[:1], whole.names[1:], whole.names)]
+    images = image_folder(folder)
+    parts = [replace(images, names=names) for names in (images.names[:1], images.names[1:], images.names)]
     settle()
-    found = [contents(part, cache) for part in parts]
+    first = [contents(part, cache) for part in parts]
     monkeypatch.setattr(module, "read_content", lambda path: pytest.fail(f"{path} read again"))
-    assert [contents(part, cache) for part in parts] == found
+    assert [contents(part, cache) for part in parts] == first
 
 
 def test_content_decides_whatever_times_and_names_say(tmp_path, folder, cache):
@@ -170,7 +166,6 @@ def test_many_writers_of_one_record(folder, cache):
 
 def test_a_cache_that_cannot_be_written_costs_time_only(folder, tmp_path):
     (tmp_path / "file").write_text("")
-    settle()
     assert fingerprint(folder, tmp_path / "file") == fingerprint(folder)
 
 
@@ -203,9 +198,9 @@ def test_how_images_are_read_is_part_of_the_fingerprint_where_it_matters(folder,
     Image.new("RGB", (4, 6)).save(folder / "3.jpg", exif=exif)
     Image.fromarray(np.array([[7, 4095]], np.uint16)).save(folder / "4.png")
     settle()
-    found = [contents(image_folder(folder), cache) for _ in range(2)]
-    assert found[0].files == found[1].files
-    assert found[1].summary() == {"orient": True, "turned": 1, "bits": 16, "scaled_16bit": 1, "largest_16bit": 4095}
+    first, second = (contents(image_folder(folder), cache) for _ in range(2))
+    assert first.files == second.files
+    assert second.summary() == {"orient": True, "turned": 1, "bits": 16, "scaled_16bit": 1, "largest_16bit": 4095}
     ways = [contents(image_folder(folder, orient=orient, bits=bits), cache)
             for orient in (True, False) for bits in (16, 12, None)]  # fmt: skip
     assert len({way.fingerprint for way in ways}) == 6

@@ -1,4 +1,4 @@
-"""Ground truth of every kind, right and wrong."""
+"""Ground truth of every kind, and its faults."""
 
 import json
 import os
@@ -36,27 +36,22 @@ def test_order(folders):
     assert folder_dataset(database, queries, ground_truth="none").truth is None
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "query,database\na.png,2.png\nb.png,\na.png,0.png\n",
-        "Reference,Live\n2,0\n,1\n0,0\n",
-        "database,extra,query\n2.png,x,a.png\n,x,b.png\n0,x,a.png\n",
-        "\ufeffquery,database\r\n0,2\r\n1,\r\n0,0\r\n",
-    ],
-)
-def test_csv(folders, tmp_path, text):
-    write_text(tmp_path / "gt.csv", text)
-    truth = folder_dataset(*folders, ground_truth="index", index_file=tmp_path / "gt.csv").truth
+@pytest.mark.parametrize(("suffix", "content"), [
+    ("csv", "query,database\na.png,2.png\nb.png,\na.png,0.png\n"),
+    ("csv", "Reference,Live\n2,0\n,1\n0,0\n"),
+    ("csv", "database,extra,query\n2.png,x,a.png\n,x,b.png\n0,x,a.png\n"),
+    ("csv", "\ufeffquery,database\r\n0,2\r\n1,\r\n0,0\r\n"),
+    ("json", json.dumps([[0, [2, 0]], [1, []]])),
+    ("npz", {"query": np.array([0, 1, 0]), "database": np.array(["2", "", "0.png"])}),
+])  # fmt: skip
+def test_pairs_of_a_file(folders, tmp_path, suffix, content):
+    path = tmp_path / f"gt.{suffix}"
+    np.savez(path, **content) if suffix == "npz" else write_text(path, content)
+    truth = folder_dataset(*folders, ground_truth="index", index_file=path).truth
     np.testing.assert_array_equal(truth.positives(0).dense(), [[True, False, True], [False, False, False]])
 
 
-def test_json_and_npz(folders, tmp_path):
-    write_text(tmp_path / "gt.json", json.dumps([[0, [2, 0]], [1, []]]))
-    np.savez(tmp_path / "gt.npz", query=np.array([0, 1, 0]), database=np.array(["2", "", "0.png"]))
-    for name in ("gt.json", "gt.npz"):
-        truth = folder_dataset(*folders, ground_truth="index", index_file=tmp_path / name).truth
-        np.testing.assert_array_equal(truth.positives(0).dense(), [[True, False, True], [False, False, False]])
+def test_positions_of_a_file(folders, tmp_path):
     np.savez(tmp_path / "utm.npz", utmQ=np.array([[0, 0], [50, 0]]), utmDb=np.array([[0, 25], [0, 26], [50, 1]]))
     truth = folder_dataset(*folders, ground_truth="index", index_file=tmp_path / "utm.npz").truth
     np.testing.assert_array_equal(truth.positives(25).dense(), [[True, False, False], [False, False, True]])
@@ -71,15 +66,13 @@ def test_utm_reads_the_file_name_only(tmp_path):
     np.testing.assert_array_equal(truth.positives(25).dense(), [[True, True]])
 
 
-def test_nothing_is_assumed(folders):
-    """Not even where the counts agree."""
-    database, _ = folders
-    for kind in (None, "names"):
-        with pytest.raises(InputError) as caught:
-            folder_dataset(database, database, ground_truth=kind)
-        for choice in ("order (query i shows", "index (a file", "utm (positions", "label (two", "none (rankings"):
-            assert choice in str(caught.value)
-        assert "\n" not in str(caught.value)
+@pytest.mark.parametrize("kind", [None, "names"])
+def test_ground_truth_must_be_chosen_even_if_counts_agree(folders, kind):
+    with pytest.raises(InputError) as caught:
+        folder_dataset(folders[0], folders[0], ground_truth=kind)
+    for choice in ("order (query i shows", "index (a file", "utm (positions", "label (two", "none (rankings"):
+        assert choice in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_an_index_file_says_all_that_is_right_unless_neighbors_count(folders, tmp_path):
@@ -96,6 +89,16 @@ def test_an_index_file_says_all_that_is_right_unless_neighbors_count(folders, tm
     assert [threshold_words(truth.unit, 2) for truth in (exact, widened)] == ["", " ±2"]
 
 
+def check_error(folders, path, words, **options):
+    """An error of one line that names the file."""
+    with pytest.raises(InputError) as caught:
+        folder_dataset(*folders, **options)
+    assert words in str(caught.value)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400
+
+
 def labels(tmp_path, database, queries):
     write_text(tmp_path / "db.csv", "name,label\n" + database)
     write_text(tmp_path / "q.csv", "name,label\n" + queries)
@@ -108,29 +111,18 @@ def test_labels(folders, tmp_path):
     np.testing.assert_array_equal(truth.positives(5).dense(), [[False, True, True], [False, False, False]])
     assert (truth.place(0), truth.place(1)) == (1, None)
     assert truth.thresholds(tolerances=[1, 2], radius=25.0) == [0]
-
-
-def test_no_label_is_nobodys(folders, tmp_path):
     truth = folder_dataset(*folders, **labels(tmp_path, "0.png,\n1.png,\n2.png,x\n", "a.png,\nb.png,x\n")).truth
     np.testing.assert_array_equal(truth.positives(0).dense(), [[False, False, False], [False, False, True]])
 
 
-@pytest.mark.parametrize(
-    ("database", "words"),
-    [
-        ("0.png,x\n1.png,x\n", "all 3 images, got them for 2; "),
-        ("0.png,x\n1.png,x\n0.png,x\n2.png,x\n", "entry 3: '0.png' has a label already"),
-        ("0.png,x\n1.png,x\n2.png,x\n9.png,x\n", "entry 4: got '9.png'"),
-        ("0.png,x\n" + 5000 * "9" + ",x\n", "(5000 characters)'"),
-    ],
-)
-def test_wrong_labels_are_named_in_one_line(folders, tmp_path, database, words):
-    with pytest.raises(InputError) as caught:
-        folder_dataset(*folders, **labels(tmp_path, database, "a.png,x\nb.png,x\n"))
-    assert words in str(caught.value)
-    assert str(tmp_path / "db.csv") in str(caught.value)
-    assert "\n" not in str(caught.value)
-    assert len(str(caught.value)) < 400
+@pytest.mark.parametrize(("database", "words"), [
+    ("0.png,x\n1.png,x\n", "all 3 images, got them for 2; "),
+    ("0.png,x\n1.png,x\n0.png,x\n2.png,x\n", "entry 3: '0.png' has a label already"),
+    ("0.png,x\n1.png,x\n2.png,x\n9.png,x\n", "entry 4: got '9.png'"),
+    ("0.png,x\n" + 5000 * "9" + ",x\n", "(5000 characters)'"),
+])  # fmt: skip
+def test_wrong_labels_are_errors_of_one_line(folders, tmp_path, database, words):
+    check_error(folders, tmp_path / "db.csv", words, **labels(tmp_path, database, "a.png,x\nb.png,x\n"))
 
 
 def test_a_name_in_two_folders_needs_its_path(tmp_path):
@@ -142,9 +134,10 @@ def test_a_name_in_two_folders_needs_its_path(tmp_path):
     np.testing.assert_array_equal(truth.positives(0).dense(), np.eye(2, dtype=bool))
 
 
-def test_files_are_given_for_the_ground_truth_that_reads_them(folders, tmp_path):
+def test_files_belong_to_the_ground_truth_that_reads_them(folders, tmp_path):
     files = labels(tmp_path, "", "")
     for options, words in (
+        ({"ground_truth": "index"}, r"ground_truth=index: .*file; .*index_file"),
         ({"ground_truth": "order", "index_file": tmp_path / "db.csv"}, r"index_file, .*ground_truth=order"),
         (files | {"ground_truth": "none"}, r"database_labels, .*ground_truth=none; .*label"),
         (files | {"query_labels": None}, r"ground_truth=label: .*file; .*query_labels"),
@@ -154,14 +147,14 @@ def test_files_are_given_for_the_ground_truth_that_reads_them(folders, tmp_path)
             folder_dataset(*folders, **options)
 
 
-def test_as_many_labels_as_anyone_has():
+def test_many_labels_are_a_loop_over_all_pairs():
     rng = np.random.default_rng(0)
     truth = LabelTruth(rng.integers(-1, 60, 2000), rng.integers(-1, 60, 3000))
     positives = truth.positives(0)
     for query in (0, 7, 1999):
-        right = (truth.database_labels == truth.query_labels[query]) & (truth.query_labels[query] >= 0)
-        np.testing.assert_array_equal(positives.of(query), np.flatnonzero(right))
-        np.testing.assert_array_equal(np.isfinite(truth.distance(query)), right)
+        is_correct = (truth.database_labels == truth.query_labels[query]) & (truth.query_labels[query] >= 0)
+        np.testing.assert_array_equal(positives.of(query), np.flatnonzero(is_correct))
+        np.testing.assert_array_equal(np.isfinite(truth.distance(query)), is_correct)
 
 
 def test_a_long_file_of_labels_is_read_in_seconds(tmp_path):
@@ -172,7 +165,7 @@ def test_a_long_file_of_labels_is_read_in_seconds(tmp_path):
 
 
 def peak_of(work):
-    """The most memory that Python and NumPy held, in bytes, and what came of it."""
+    """Result of `work`, and the most memory that Python and NumPy took, in bytes."""
     tracemalloc.start()
     try:
         return work(), tracemalloc.get_traced_memory()[1]
@@ -181,24 +174,24 @@ def peak_of(work):
 
 
 def test_nordland_takes_a_few_megabytes():
-    """27,592 frames on each side, of which a matrix is 761 MB: what is right, both halves, and recall."""
+    """A matrix of 27,592 frames on each side takes 761 MB."""
     number, tolerance = 27_592, 10
     truth = FrameTruth(tuple((row,) for row in range(number)), number)
-    own = np.arange(number)[:, None]
-    rankings = np.stack([own, own - tolerance, own - tolerance - 1])
+    frames = np.arange(number)[:, None]
+    rankings = np.stack([frames, frames - tolerance, frames - tolerance - 1])
 
-    def protocol():
-        found = judge(truth, [tolerance], "both")
-        return found, found.recall(rankings), found.positives[0] - found.places
+    def judge_rankings():
+        protocol = judge(truth, [tolerance], "both")
+        return protocol, protocol.recall(rankings), protocol.positives[0] - protocol.places
 
-    (found, recall, nothing), peak = peak_of(protocol)
+    (protocol, recall, difference), peak = peak_of(judge_rankings)
     assert peak < 60e6
-    [positives] = found.positives
+    [positives] = protocol.positives
     assert positives.counts.sum() == number * (2 * tolerance + 1) - tolerance * (tolerance + 1)
     np.testing.assert_array_equal(positives.of(5000), np.arange(4990, 5011))
-    assert [len(half.tune) for half in found.halves] == [number // 2 - 2 * tolerance] * 2
+    assert [len(half.tune) for half in protocol.halves] == [number // 2 - 2 * tolerance] * 2
     np.testing.assert_array_equal(recall, [[1], [1 - tolerance / number], [0]])
-    assert not nothing.any()
+    assert not difference.any()
 
 
 def test_a_radius_takes_no_more_than_its_neighbors():
@@ -230,7 +223,7 @@ def test_a_radius_is_a_loop_over_all_pairs(seed, radius):
 def test_frames_are_a_loop_over_all_pairs(tolerance):
     truth = FrameTruth(((3, 7), (), (0,), (9,)), 10)
     for query, rows in enumerate(truth.rows):
-        expected = [any(abs(row - one) <= tolerance for one in rows) for row in range(10)]
+        expected = [any(abs(row - place) <= tolerance for place in rows) for row in range(10)]
         np.testing.assert_array_equal(truth.positives(tolerance).dense()[query], expected)
         np.testing.assert_array_equal(truth.distance(query) <= tolerance, expected)
 
@@ -240,7 +233,7 @@ def test_a_place_that_is_named_twice_counts_once():
     assert [truth.positives(tolerance).counts.tolist() for tolerance in (0, 1, 9)] == [[3, 1], [7, 2], [10, 10]]
 
 
-def test_what_is_excluded_is_not_right():
+def test_excluded_images_are_not_correct():
     excluded = np.array([[False, True, True, False], [True, False, False, False]])
     truth = AllowedTruth(FrameTruth(((1,), (0,)), 4), Positives.from_matrix(excluded))
     np.testing.assert_array_equal(truth.positives(1).dense(), [[True] + [False] * 3, [False, True, False, False]])
@@ -248,8 +241,7 @@ def test_what_is_excluded_is_not_right():
     assert not truth.positives(0).any()
     np.testing.assert_array_equal(truth.shows_place(0).dense(), excluded)  # more than the tolerance alone
     assert (truth.place(0), truth.place(1), truth.unit) == (0, 1, "frames")
-    everything = Positives.from_matrix(np.ones_like(excluded))
-    assert AllowedTruth(truth, everything).place(0) is None
+    assert AllowedTruth(truth, Positives.from_matrix(np.ones_like(excluded))).place(0) is None
 
 
 def bad_npz(path):
@@ -271,20 +263,12 @@ def twice(path):
         ("gt.json", f"[[0, [{5000 * '1'}]], [1, []]]", "cannot be read as .json"),
         ("gt.json", f"[[0, [{4000 * '1'}]], [1, []]]", "(4000 characters)'"),
         ("gt.json", 100_000 * "[", "cannot be read as .json"),
-        (
-            "gt.npz",
-            lambda p: np.savez(p, utmQ=np.full((2, 2), 1e308), utmDb=np.zeros((3, 2))),
-            "1e+09 m",
-        ),
+        ("gt.npz", lambda p: np.savez(p, utmQ=np.full((2, 2), 1e308), utmDb=np.zeros((3, 2))), "1e+09 m"),
         ("gt.txt", "x", "named .csv, .npz or .json"),
         ("gt.csv", "", "no header"),
         ("gt.csv", "a,b\n0,0\n", "got a,b"),
         ("gt.csv", "query,database\n0,0\n", "all 2 queries, got them for 1; "),
-        (
-            "gt.csv",
-            "query,database\n0,0\n1,3\n",
-            "a number from 0 to 2",
-        ),
+        ("gt.csv", "query,database\n0,0\n1,3\n", "a number from 0 to 2"),
         ("gt.csv", "query,database\n0,0\n1,-1\n", "got '-1'"),
         ("gt.csv", "query,database\n0,0\nzz.png,0\n", "got 'zz.png'"),
         ("gt.json", "[[0", "cannot be read as .json"),
@@ -306,33 +290,18 @@ def twice(path):
         ("gt.npz", lambda p: np.savez(p, utmQ=np.zeros((5, 2)), utmDb=np.zeros((3, 2))), "expected 2 query positions"),
     ],
 )
-def test_wrong_index_files_are_named_in_one_line(folders, tmp_path, name, content, words):
+def test_wrong_index_files_are_errors_of_one_line(folders, tmp_path, name, content, words):
     path = tmp_path / name
     if callable(content):
         content(path)
     elif content is not None:
         path.write_text(content)
-    with pytest.raises(InputError) as caught:
-        folder_dataset(*folders, ground_truth="index", index_file=path)
-    assert words in str(caught.value)
-    assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
+    check_error(folders, path, words, ground_truth="index", index_file=path)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "plain.png",
-        "@a@b@.png",
-        "@1.png",
-        "@nan@1@.png",
-        "@inf@1@.png",
-        "@1e308@1e308@.png",
-        "@5@-1e10@.png",
-        "@1_0@5@.png",
-    ],
-)
-def test_names_without_coordinates_are_named(tmp_path, name):
+@pytest.mark.parametrize("name", ["plain.png", "@a@b@.png", "@1.png", "@nan@1@.png", "@inf@1@.png",
+                                  "@1e308@1e308@.png", "@5@-1e10@.png", "@1_0@5@.png"])  # fmt: skip
+def test_names_without_coordinates_are_errors(tmp_path, name):
     folder = fill(tmp_path / "db", [name])
     with pytest.raises(InputError, match=r"easting"):
         folder_dataset(folder, folder, ground_truth="utm")

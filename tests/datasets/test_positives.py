@@ -1,4 +1,4 @@
-"""Rows per query answer as the matrix `[Q, N]` bool of the same does."""
+"""Positives as rows per query are equal to a matrix `[Q, N]` bool."""
 
 import numpy as np
 import pytest
@@ -16,90 +16,78 @@ pairs = sizes.flatmap(lambda shape: st.tuples(arrays(bool, shape), arrays(bool, 
 seeds = st.integers(0, 2**32 - 1)
 
 
-def same(found, matrix):
-    """Every attribute, as loops over the matrix have it: there is one form of the same positives, which is hashed."""
-    rows = [row for right in matrix.tolist() for row, is_right in enumerate(right) if is_right]
-    assert (found.rows.dtype, found.offsets.dtype) == (np.int32, np.int64)
-    assert (found.rows.tolist(), found.num_database, len(found)) == (rows, matrix.shape[1], len(matrix))
-    assert found.offsets.tolist() == [sum(map(sum, matrix.tolist()[:query])) for query in range(len(matrix) + 1)]
+def check_same(got, matrix):
+    """Every attribute is that of loops over the matrix: equal positives have one form, which is hashed."""
+    rows = [row for line in matrix.tolist() for row, is_correct in enumerate(line) if is_correct]
+    assert (got.rows.dtype, got.offsets.dtype) == (np.int32, np.int64)
+    assert (got.rows.tolist(), got.num_database, len(got)) == (rows, matrix.shape[1], len(matrix))
+    assert got.offsets.tolist() == [sum(map(sum, matrix.tolist()[:query])) for query in range(len(matrix) + 1)]
 
 
 @given(matrices)
 def test_they_are_the_matrix(matrix):
-    found = Positives.from_matrix(matrix)
-    same(found, matrix)
-    np.testing.assert_array_equal(found.dense(), matrix)
-    np.testing.assert_array_equal(found.counts, matrix.sum(axis=1))
-    np.testing.assert_array_equal(found.union(), matrix.any(axis=0))
-    assert found.any() is bool(matrix.any())
+    got = Positives.from_matrix(matrix)
+    check_same(got, matrix)
+    np.testing.assert_array_equal(got.dense(), matrix)
+    np.testing.assert_array_equal(got.counts, matrix.sum(axis=1))
+    np.testing.assert_array_equal(got.union(), matrix.any(axis=0))
+    assert got.any() is bool(matrix.any())
     for query in range(-len(matrix), len(matrix)):
-        np.testing.assert_array_equal(found.of(query), np.flatnonzero(matrix[query]))
+        np.testing.assert_array_equal(got.of(query), np.flatnonzero(matrix[query]))
     for beyond in (len(matrix), -len(matrix) - 1):
         with pytest.raises(IndexError):
-            found.of(beyond)
+            got.of(beyond)
 
 
 @given(matrices, seeds)
 def test_rows_come_in_any_order_and_any_number_of_times(matrix, seed):
     rng = np.random.default_rng(seed)
-    rows = [np.repeat(right.nonzero()[0], rng.integers(1, 3)) for right in matrix]
-    shuffled = [rng.permutation(some).tolist() for some in rows]
-    same(Positives.from_rows(shuffled, matrix.shape[1]), matrix)
-    same(Positives.from_rows(map(np.uint64, shuffled), matrix.shape[1]), matrix)
+    rows = [np.repeat(line.nonzero()[0], rng.integers(1, 3)) for line in matrix]
+    shuffled = [rng.permutation(query_rows).tolist() for query_rows in rows]
+    check_same(Positives.from_rows(shuffled, matrix.shape[1]), matrix)
+    check_same(Positives.from_rows(map(np.uint64, shuffled), matrix.shape[1]), matrix)
 
 
 @given(matrices, seeds)
 def test_of_some_queries(matrix, seed):
-    rng, found = np.random.default_rng(seed), Positives.from_matrix(matrix)
+    rng, got = np.random.default_rng(seed), Positives.from_matrix(matrix)
     mask = rng.random(len(matrix)) < 0.5
     numbers = rng.integers(0, max(len(matrix), 1), 9 * bool(len(matrix)))
     for queries in (mask, numbers, slice(1, 4), slice(None, None, -2), []):
         chosen = matrix[queries] if len(np.shape(queries)) == 0 or len(queries) else matrix[:0]
-        same(found.take(queries), chosen)
-        np.testing.assert_array_equal(found.dense(queries), chosen)
+        check_same(got.take(queries), chosen)
+        np.testing.assert_array_equal(got.dense(queries), chosen)
     allowed = rng.random(matrix.shape[1]) < 0.5
-    same(found.among(allowed), matrix & allowed)
+    check_same(got.among(allowed), matrix & allowed)
 
 
 @given(pairs)
 def test_union_and_difference(pair):
     first, second = map(Positives.from_matrix, pair)
-    same(first | second, pair[0] | pair[1])
-    same(first - second, pair[0] & ~pair[1])
+    check_same(first | second, pair[0] | pair[1])
+    check_same(first - second, pair[0] & ~pair[1])
 
 
 @given(matrices, seeds, st.sampled_from([(), (1,), (2, 3), (0,)]), st.sampled_from([1, 7, 1 << 20]))
 def test_rankings_are_looked_up(matrix, seed, several, at_a_time):
-    """Also cut into pieces, from which nothing of another query is to be seen."""
+    """Blocks of queries do not change the result."""
     rng = np.random.default_rng(seed)
     rows = rng.integers(-2, matrix.shape[1], (*several, len(matrix), 4)).astype(rng.choice(["i4", "i8"]))
     query = np.arange(len(matrix))[:, None]
-    expected = matrix[query, rows] & (rows >= 0) if matrix.size else np.zeros(rows.shape, bool)
+    expected = matrix[query, np.maximum(rows, 0)] & (rows >= 0) if matrix.size else np.zeros(rows.shape, bool)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(positives, "_AT_A_TIME", at_a_time)
-        found = Positives.from_matrix(matrix).contains(rows)
-    np.testing.assert_array_equal(found, expected)
+        got = Positives.from_matrix(matrix).contains(rows)
+    np.testing.assert_array_equal(got, expected)
 
 
-def test_more_rankings_than_are_looked_up_at_once():
-    rng = np.random.default_rng(0)
-    matrix = rng.random((1500, 1000)) < 0.05
-    rows = rng.integers(-1, 1000, (2, 1500, 400)).astype(np.int32)
-    found = Positives.from_matrix(matrix)
-    np.testing.assert_array_equal(found.contains(rows), matrix[np.arange(1500)[:, None], rows] & (rows >= 0))
-
-
-@pytest.mark.parametrize(
-    ("rows", "words"),
-    [
-        (np.zeros((3, 1), int), r"rows: .*\[..., 2 queries, k\], got \[3, 1\]"),
-        (np.zeros(2, int), r"got \[2\]"),
-        (np.array([[0], [4]]), r"rows: .*below 4, got int64 .*4"),
-        (np.zeros((2, 1)), "got float64"),
-    ],
-)
-def test_rankings_of_others_are_refused(rows, words):
-    """A row beyond the database would be one of the next query."""
+@pytest.mark.parametrize(("rows", "words"), [
+    (np.zeros((3, 1), int), r"rows: .*\[..., 2 queries, k\], got \[3, 1\]"),
+    (np.zeros(2, int), r"got \[2\]"),
+    (np.array([[0], [4]]), r"rows: .*below 4, got int64 .*4"),  # it would be a row of the next query
+    (np.zeros((2, 1)), "got float64"),
+])  # fmt: skip
+def test_rankings_of_other_data_are_errors(rows, words):
     with pytest.raises(InputError, match=words):
         Positives.from_rows([[0], [0, 1]], 4).contains(rows)
 
@@ -113,13 +101,13 @@ def test_rankings_of_others_are_refused(rows, words):
     ([0, 1], [1, 1, 2], "offsets that grow"),
     ([0, 1], [0, 3, 2], "offsets that grow"),
 ])  # fmt: skip
-def test_made_by_hand_they_are_as_described(rows, offsets, words):
+def test_rows_and_offsets_must_have_their_form(rows, offsets, words):
     with pytest.raises(InputError, match=words):
         Positives(np.array(rows, np.int32), np.array(offsets), 4)
 
 
-def test_what_does_not_fit_is_refused():
-    found = Positives.from_rows([[0], [0, 1]], 4)
+def test_values_that_do_not_fit_are_errors():
+    got = Positives.from_rows([[0], [0, 1]], 4)
     for rows in ([[4]], [[0], [-1]], [[2**32]]):
         with pytest.raises(InputError, match=r"positives: .*4 images, got"):
             Positives.from_rows(rows, 4)
@@ -127,18 +115,18 @@ def test_what_does_not_fit_is_refused():
         with pytest.raises(InputError, match=r"whole numbers, got .*from_matrix"):
             Positives.from_rows(rows, 4)
     with pytest.raises(InputError, match=r"size.* got \(2, 4\) and \(2, 5\)"):
-        found | Positives.from_rows([[0], [0]], 5)
+        got | Positives.from_rows([[0], [0]], 5)
     with pytest.raises(InputError, match="allowed: expected shape"):
-        found.among(np.ones(5, bool))
+        got.among(np.ones(5, bool))
     with pytest.raises(InputError, match="expected a matrix"):
         Positives.from_matrix(np.ones(3, bool))
 
 
-def test_neighbors_within_a_radius_across_the_pieces(monkeypatch):
+def test_neighbors_within_a_radius_by_blocks(monkeypatch):
     monkeypatch.setattr(positives, "_QUERIES_AT_A_TIME", 3)
     rng = np.random.default_rng(0)
     queries, database = rng.uniform(0, 100, (10, 2)), rng.uniform(0, 100, (30, 2))
-    same(
+    check_same(
         Positives.from_rows(positives.rows_within(queries, database, 25.0), 30), radius_positives(queries, database, 25)
     )
     assert [list(rows) for rows in positives.rows_within(queries[:2], database[:0], 25.0)] == [[], []]

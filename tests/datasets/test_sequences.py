@@ -1,4 +1,4 @@
-"""Database and queries of one sequence: nothing finds itself."""
+"""Database and queries of one sequence: no query is its own candidate."""
 
 import shutil
 
@@ -24,57 +24,54 @@ def sequence(tmp_path):
     return folder
 
 
-def owned(database, queries, ground_truth="none"):
+def dataset_and_own_rows(database, queries, ground_truth="none"):
     dataset = folder_dataset(database, queries, ground_truth=ground_truth)
     return dataset, own_rows(contents(dataset.queries), contents(dataset.database))
 
 
 def test_the_same_images_are_known_by_content(sequence, tmp_path):
-    assert owned(sequence, sequence)[1] == tuple((row,) for row in range(6))
+    assert dataset_and_own_rows(sequence, sequence)[1] == tuple((row,) for row in range(6))
     other = tmp_path / "other"
     other.mkdir()
     for name, source in (("b.png", "4.png"), ("a.png", "1.png")):
         shutil.copy(sequence / source, other / name)
     Image.new("RGB", (4, 4), (99, 0, 0)).save(other / "c.png")
     shutil.copy(sequence / "1.png", sequence / "5.png")  # the robot stood still
-    assert owned(sequence, other)[1] == ((1, 5), (4,), ())
-
-
-def test_files_that_cannot_be_read_are_not_the_same(sequence, tmp_path):
+    assert dataset_and_own_rows(sequence, other)[1] == ((1, 5), (4,), ())
     (sequence / "6.png").symlink_to("nowhere")
-    assert owned(sequence, sequence)[1][6] == ()
+    assert dataset_and_own_rows(sequence, sequence)[1][6] == ()  # files that cannot be read are not the same
 
 
-def test_neighbors_are_neither_found_nor_right(sequence):
-    dataset, own = owned(sequence, sequence, "order")
+def test_neighbors_are_neither_candidates_nor_correct(sequence):
+    dataset, rows = dataset_and_own_rows(sequence, sequence, "order")
     for neighbors in (0, 1):
         allowed = np.abs(np.arange(6)[:, None] - np.arange(6)) > neighbors
-        found = without_neighbors(dataset.only, 6, own, neighbors)
-        np.testing.assert_array_equal(found.excluded.dense(), ~allowed)
+        reduced = without_neighbors(dataset.only, 6, rows, neighbors)
+        np.testing.assert_array_equal(reduced.excluded.dense(), ~allowed)
         expected = dataset.truth.positives(2).dense() & allowed
-        np.testing.assert_array_equal(found.truth.positives(2).dense(), expected)
-    assert not found.truth.positives(1).any()  # a query whose right answers are all left out has none
-    assert without_neighbors(owned(sequence, sequence)[0].only, 6, own, 0).truth is None
+        np.testing.assert_array_equal(reduced.truth.positives(2).dense(), expected)
+    assert not reduced.truth.positives(1).any()  # all correct images are excluded
+    assert without_neighbors(dataset_and_own_rows(sequence, sequence)[0].only, 6, rows, 0).truth is None
 
 
 def test_two_sequences_have_no_neighbors(sequence, tmp_path):
     (tmp_path / "other").mkdir()
     Image.new("RGB", (4, 4), (99, 0, 0)).save(tmp_path / "other" / "0.png")
-    dataset, own = owned(sequence, tmp_path / "other")
+    dataset, rows = dataset_and_own_rows(sequence, tmp_path / "other")
     with pytest.raises(InputError, match=r"exclude_neighbors=2: expected .*database images"):
-        without_neighbors(dataset.only, 6, own, 2)
+        without_neighbors(dataset.only, 6, rows, 2)
 
 
 @pytest.mark.parametrize("memory, rows", [(None, 6), (1e-9, 6), (1e-9, 4), (None, 1)])
-def test_the_shortlist_leaves_out_what_is_not_allowed(memory, rows, monkeypatch):
-    """Whatever is searched at a time: all, two queries, some rows of the database, one."""
+def test_the_shortlist_leaves_out_excluded_images(memory, rows, monkeypatch):
+    """However much is searched at a time: all, two queries, several rows of the database, one."""
     monkeypatch.setattr(retrieval, "ROWS", rows)
     rng, search = np.random.default_rng(0), ExactSearch(memory)
     descriptors = unit(rng.normal(size=(6, 8)))
-    everything = search.shortlist(descriptors, descriptors, 6)
-    np.testing.assert_array_equal(everything.indices[:, 0], np.arange(6))
+    complete = search.shortlist(descriptors, descriptors, 6)
+    np.testing.assert_array_equal(complete.indices[:, 0], np.arange(6))
     excluded = np.abs(np.arange(6)[:, None] - np.arange(6)) <= 1
-    found = search.shortlist(descriptors, descriptors, 6, excluded=Positives.from_matrix(excluded))
+    reduced = search.shortlist(descriptors, descriptors, 6, excluded=Positives.from_matrix(excluded))
     for query in range(6):
-        expected = [row for row in everything.indices[query] if not excluded[query, row]]
-        np.testing.assert_array_equal(found.indices[query], expected + [-1] * (6 - len(expected)))
+        expected = [row for row in complete.indices[query] if not excluded[query, row]]
+        np.testing.assert_array_equal(reduced.indices[query], expected + [-1] * (6 - len(expected)))
