@@ -1,75 +1,97 @@
-"""The synthetic street: reproducible, complete or absent, and with a ground truth that follows the geometry."""
+"""The synthetic streets: reproducible, complete or absent, and with a ground truth that follows the geometry."""
 
 import csv
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from mfvpr.datasets.streets import draw_streets, streets_folder
-from mfvpr.datasets.streets.camera import Camera, plan_drives
-from mfvpr.datasets.streets.exposure import expose
+from mfvpr.datasets.streets import draw_seasons, draw_streets, seasons_folder, streets_folder
+from mfvpr.datasets.streets.camera import LANE, SPACING, Camera, plan_drives, plan_return
+from mfvpr.datasets.streets.exposure import expose, fall_rain
 from mfvpr.datasets.streets.ground_truth import Facade, image_shift, visible_points
+from mfvpr.datasets.streets.seasons import CONDITIONS, TRUTH
 from mfvpr.datasets.streets.sheets import Sheet, texture
 from mfvpr.datasets.streets.weather import WEATHERS, Exposure
 
 pytestmark = pytest.mark.thorough
 
-FRAMES = 4
+FRAMES, SEASONS_FRAMES = 4, 3
 SIZE = (96, 72)
 CAMERA = Camera(x=0.0, z=0.0, heading=0.0, pitch=0.0, image_size=(448, 336))
 WALLS = (Facade(-8.0, 0.0, 60.0, 9.0), Facade(8.0, 0.0, 60.0, 9.0))
 
 
-def contents(folder: Path) -> dict[str, bytes]:
+def contents(folder):
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 @pytest.fixture(scope="module")
-def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def streets(tmp_path_factory):
     folder = tmp_path_factory.mktemp("streets") / "drawn"
     draw_streets(folder, num_frames=FRAMES, image_size=SIZE)
     return folder
 
 
-@pytest.mark.slow
-def test_same_seed_gives_same_bytes(drawn: Path, tmp_path: Path) -> None:
-    draw_streets(tmp_path / "again", num_frames=FRAMES, image_size=SIZE)
-    assert contents(drawn) == contents(tmp_path / "again")
+@pytest.fixture(scope="module")
+def seasons(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("seasons") / "drawn"
+    draw_seasons(folder, num_frames=SEASONS_FRAMES, image_size=SIZE)
+    return folder
 
 
-def test_other_seed_gives_other_images(drawn: Path, tmp_path: Path) -> None:
-    draw_streets(tmp_path / "other", seed=1, num_frames=FRAMES, image_size=SIZE)
-    first, other = contents(drawn), contents(tmp_path / "other")
+def check_other_drawings(draw, folder, num_frames, tmp_path):
+    """The same seed gives the same bytes, and each file of another seed differs."""
+    draw(tmp_path / "again", num_frames=num_frames, image_size=SIZE)
+    draw(tmp_path / "other", seed=1, num_frames=num_frames, image_size=SIZE)
+    first, other = contents(folder), contents(tmp_path / "other")
+    assert first == contents(tmp_path / "again")
     assert first.keys() == other.keys()
     assert all(first[name] != other[name] for name in first)
 
 
-def test_files_and_rows(drawn: Path) -> None:
-    names = [f"{i:04d}.png" for i in range(FRAMES)]
-    for part in ("database", "queries"):
-        assert sorted(p.name for p in (drawn / part).iterdir()) == names
-    with (drawn / "ground_truth.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert list(rows[0]) == ["query", "database", "shift_x", "shift_y"]
-    assert [row["query"] for row in rows] == names
-    assert [row["database"] for row in rows] == names
-    assert all(np.isfinite([float(row["shift_x"]), float(row["shift_y"])]).all() for row in rows)
+def test_a_seed_decides_all_bytes_of_the_street(streets, tmp_path):
+    check_other_drawings(draw_streets, streets, FRAMES, tmp_path)
 
 
-def test_images_show_something(drawn: Path) -> None:
-    for path in drawn.rglob("*.png"):
+@pytest.mark.slow
+def test_a_seed_decides_all_bytes_of_the_seasons(seasons, tmp_path):
+    check_other_drawings(draw_seasons, seasons, SEASONS_FRAMES, tmp_path)
+
+
+def check_ground_truth(path, num_frames):
+    with path.open(newline="") as file:
+        lines = list(csv.DictReader(file))
+    names = [f"{row:04d}.png" for row in range(num_frames)]
+    assert list(lines[0]) == ["query", "database", "shift_x", "shift_y"]
+    assert [line["query"] for line in lines] == [line["database"] for line in lines] == names
+    assert all(np.isfinite([float(line["shift_x"]), float(line["shift_y"])]).all() for line in lines)
+
+
+def test_files_and_ground_truth(streets, seasons):
+    names = [f"{row:04d}.png" for row in range(FRAMES)]
+    assert sorted(contents(streets)) == [
+        *(f"database/{name}" for name in names), "ground_truth.csv", *(f"queries/{name}" for name in names)
+    ]  # fmt: skip
+    check_ground_truth(streets / "ground_truth.csv", FRAMES)
+    assert sorted(path.name for path in seasons.iterdir()) == sorted(["database", *CONDITIONS])
+    assert len(contents(seasons)) == SEASONS_FRAMES * (1 + len(CONDITIONS)) + len(CONDITIONS)
+    for condition in CONDITIONS:
+        check_ground_truth(seasons / condition / TRUTH, SEASONS_FRAMES)
+
+
+def test_images_show_something(streets):
+    for path in streets.rglob("*.png"):
         image = cv2.imread(str(path))
         assert image is not None
         assert image.shape == (SIZE[1], SIZE[0], 3)
         assert image.std() > 5
 
 
-def test_queries_are_dark_at_night_and_bright_in_snow(drawn: Path) -> None:
+def test_queries_are_dark_at_night_and_bright_in_snow(streets):
     day, night, snow = (
-        np.mean([cv2.imread(str(drawn / part / f"{i:04d}.png")) for i in frames])
+        np.mean([cv2.imread(str(streets / part / f"{i:04d}.png")) for i in frames])
         for part, frames in (("database", range(4)), ("queries", (0, 1)), ("queries", (2, 3)))
     )
     assert night < 0.7 * day
@@ -80,19 +102,19 @@ def test_queries_are_dark_at_night_and_bright_in_snow(drawn: Path) -> None:
     "effect, size",
     [("noise", 3), ("motion", 50), ("bloom", 1), ("defocus", 1), ("defocus_spread", 2), ("drops", 20), ("flakes", 50)],
 )
-def test_without_effects_the_image_stays_and_each_effect_changes_it(effect: str, size: float) -> None:
+def test_without_effects_the_image_stays_and_each_effect_changes_it(effect, size):
     image = np.zeros((72, 96, 3), np.uint8)
     image[20:50, 30:60] = 240
     quiet = Exposure(noise=0.0)
 
-    def exposed(exposure: Exposure) -> np.ndarray:
+    def exposed(exposure):
         return expose(image, replace(WEATHERS["day"], exposure=exposure), np.random.default_rng(0))
 
     np.testing.assert_array_equal(exposed(quiet), image)
     assert (exposed(replace(quiet, **{effect: size})) != image).any()
 
 
-def test_light_and_snow_of_a_weather_follow_its_row() -> None:
+def test_light_and_snow_of_a_weather_follow_its_row():
     sheet = Sheet(1.0, 1.0, (100, 80, 60))
     sheet.rect(0, 0, 1.0, 0.5, (100, 80, 60), glow=(200, 150, 90), snow=255)
     day = replace(WEATHERS["day"], horizon=(100, 100, 100))
@@ -105,46 +127,41 @@ def test_light_and_snow_of_a_weather_follow_its_row() -> None:
     np.testing.assert_array_equal(seen(replace(day, snow=1.0))[upper], (114, 114, 114))  # 1.15 times the horizon
 
 
-def test_existing_folder_is_refused(tmp_path: Path) -> None:
+def test_existing_folder_is_an_error(tmp_path):
     with pytest.raises(FileExistsError):
         draw_streets(tmp_path, num_frames=1, image_size=SIZE)
 
 
-def test_interrupted_drawing_leaves_nothing_and_the_cache_is_used_afterwards(tmp_path: Path) -> None:
-    def interrupt(done: int, total: int) -> None:
+@pytest.mark.parametrize("folder_of, folders", [(streets_folder, 2), (seasons_folder, 8)])
+def test_interrupted_drawing_leaves_nothing_and_the_cache_is_used_afterwards(folder_of, folders, tmp_path):
+    def interrupt(done, total):
         raise KeyboardInterrupt
 
+    options = {"num_frames": 2, "image_size": (32, 24)}
     with pytest.raises(KeyboardInterrupt):
-        streets_folder(tmp_path, num_frames=FRAMES, image_size=SIZE, progress=interrupt)
+        folder_of(tmp_path, **options, progress=interrupt)
     assert list(tmp_path.iterdir()) == []
 
-    calls: list[tuple[int, int]] = []
-    folder = streets_folder(
-        tmp_path, num_frames=FRAMES, image_size=SIZE, progress=lambda *done_total: calls.append(done_total)
-    )
-    assert calls == [(i + 1, 2 * FRAMES) for i in range(2 * FRAMES)]
+    calls = []
+    folder = folder_of(tmp_path, **options, progress=lambda *done_total: calls.append(done_total))
+    assert calls == [(done, 2 * folders) for done in range(1, 2 * folders + 1)]
     assert list(tmp_path.iterdir()) == [folder]
 
-    times = {p: p.stat().st_mtime_ns for p in folder.rglob("*")}
-    assert streets_folder(tmp_path, num_frames=FRAMES, image_size=SIZE) == folder
-    assert {p: p.stat().st_mtime_ns for p in folder.rglob("*")} == times
+    times = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    assert folder_of(tmp_path, **options) == folder
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == times
 
 
 @pytest.mark.parametrize("degrees", [-4.0, 0.0, 2.5])
-def test_heading_alone_shifts_by_the_tangent(degrees: float) -> None:
+def test_heading_or_pitch_alone_shifts_by_the_tangent(degrees):
     ahead = np.array([[x, -1.6 + y, 1000.0] for x in (-5.0, 0.0, 5.0) for y in (-5.0, 0.0, 5.0)])
-    query = replace(CAMERA, heading=np.radians(degrees))
-    shift = image_shift(ahead, query, CAMERA)
-    assert shift == pytest.approx((CAMERA.focal * np.tan(np.radians(degrees)), 0.0), abs=1.0)
+    angle = np.radians(degrees)
+    length = CAMERA.focal * np.tan(angle)
+    assert image_shift(ahead, replace(CAMERA, heading=angle), CAMERA) == pytest.approx((length, 0.0), abs=1.0)
+    assert image_shift(ahead, replace(CAMERA, pitch=angle), CAMERA) == pytest.approx((0.0, -length), abs=1.0)
 
 
-def test_pitch_alone_shifts_by_the_tangent() -> None:
-    ahead = np.array([[0.0, -1.6, 1000.0]])
-    shift = image_shift(ahead, replace(CAMERA, pitch=np.radians(2.0)), CAMERA)
-    assert shift == pytest.approx((0.0, -CAMERA.focal * np.tan(np.radians(2.0))), abs=1.0)
-
-
-def test_heading_on_facades_follows_each_points_angle() -> None:
+def test_heading_on_facades_follows_each_points_angle():
     turn = np.radians(3.0)
     query = replace(CAMERA, heading=turn)
     points = visible_points(WALLS, query)
@@ -154,13 +171,13 @@ def test_heading_on_facades_follows_each_points_angle() -> None:
     assert image_shift(points, query, CAMERA)[0] == pytest.approx(np.median(moved[inside]), abs=1.0)
 
 
-def test_lane_alone_shifts_by_the_parallax() -> None:
+def test_lane_alone_shifts_by_the_parallax():
     wall = np.array([[x, y, 20.0] for x in (-4.0, 0.0, 4.0) for y in (-4.0, -2.0)])
     shift = image_shift(wall, replace(CAMERA, x=1.0), CAMERA)
     assert shift == pytest.approx((CAMERA.focal * 1.0 / 20.0, 0.0), abs=1e-6)
 
 
-def test_visible_points_lie_on_the_nearest_facade_in_view() -> None:
+def test_visible_points_lie_on_the_nearest_facade_in_view():
     hidden = Facade(12.0, 0.0, 60.0, 9.0)
     points = visible_points((*WALLS, hidden), CAMERA)
     assert len(points) > 100
@@ -170,9 +187,39 @@ def test_visible_points_lie_on_the_nearest_facade_in_view() -> None:
     assert points[:, 1].max() <= 0.0
 
 
-def test_drives_differ_in_lane_and_heading_only() -> None:
+def test_drives_differ_in_lane_and_heading_only():
     database, queries = plan_drives(0, 100, CAMERA.image_size)
     lane = np.array([q.x - d.x for q, d in zip(queries, database, strict=True)])
     assert [q.z for q in queries] == [d.z for d in database]
     assert 0.3 <= np.abs(lane).min() <= np.abs(lane).max() <= 1.2 + 1e-9
     assert np.abs([q.heading for q in queries]).max() < np.radians(9.0)
+
+
+def test_nights_are_dark_and_all_days_differ(seasons):
+    light = {condition: np.mean([cv2.imread(str(path)).mean() for path in (seasons / condition).glob("*.png")])
+             for condition in ("database", *CONDITIONS)}  # fmt: skip
+    assert max(light["night"], light["night-rain"]) < min(light["dawn"], light["rain"]) < light["winter"]
+    assert max(light["dawn"], light["dusk"], light["rain"]) < light["database"]
+    assert len({round(value, 3) for value in light.values()}) == len(light)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_frames_of_a_return_are_nearest_to_their_own_frame(seed):
+    database, _ = plan_drives(seed, 50, SIZE)
+    drives = [plan_return(seed, number, 50, SIZE) for number in range(len(CONDITIONS))]
+    places = np.array([camera.z for camera in database])
+    for drive in drives:
+        z = np.array([camera.z for camera in drive])
+        assert (np.abs(z[:, None] - places).argmin(axis=1) == np.arange(50)).all()
+        assert np.abs(z - places).max() <= 0.4 * SPACING
+        assert all(0.3 <= abs(camera.x - LANE) <= 1.2 + 1e-9 for camera in drive)
+    assert len({drive[10].heading for drive in drives}) == len(CONDITIONS)
+
+
+def test_rain_falls_in_lines():
+    image = np.zeros((60, 80, 3), np.float32)
+    rain = fall_rain(image, 40, np.random.default_rng(0))
+    assert rain.max() > 5
+    down, across = (np.abs(np.diff(rain[..., 0], axis=axis)).sum() for axis in (0, 1))
+    assert across > 1.5 * down
+    assert (fall_rain(image, 0, np.random.default_rng(0)) == 0).all()
