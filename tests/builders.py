@@ -1,7 +1,6 @@
-"""Random and hand-made Features and Matches for the tests, NumPy but where said."""
+"""Random and hand-made Features and Matches for the tests, in NumPy."""
 
 from dataclasses import replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -22,50 +21,44 @@ def make_features(rng, count, *, capacity=None, dimension=16, size=SIZE, garbage
     """Features of one image with `count` real keypoints; the padding holds `garbage`."""
     capacity = capacity or count
 
-    def padded(real):
+    def pad(real):
         rows = np.full((capacity, *real.shape[1:]), garbage, np.float32)
         rows[:count] = real
         return rows
 
     return Features(
-        keypoints=padded(rng.uniform(0, size, (count, 2))),
-        descriptors=padded(unit(rng.normal(size=(count, dimension)))),
-        scores=padded(rng.uniform(0.1, 1, count)),
+        keypoints=pad(rng.uniform(0, size, (count, 2))),
+        descriptors=pad(unit(rng.normal(size=(count, dimension)))),
+        scores=pad(rng.uniform(0.1, 1, count)),
         mask=np.arange(capacity) < count,
         image_size=np.array([size, size], np.float32),
     )
 
 
-def make_matches(points0, points1, *, distance=None, scores0=None, scores1=None, ratio=None, confidence=None,
-                 index0=None, index1=None, count0=None, count1=None,
-                 capacity=None, garbage=np.nan, sizes=((SIZE, SIZE), (SIZE, SIZE))):  # fmt: skip
-    """Matches of one pair from real entries; the padding holds `garbage`."""
-    points0 = np.asarray(points0, np.float32).reshape(-1, 2)
-    points1 = np.asarray(points1, np.float32).reshape(-1, 2)
-    count = len(points0)
-    capacity = capacity or max(count, 1)
+def make_matches(points0, points1, *, count0=None, count1=None, capacity=None, garbage=np.nan,
+                 sizes=((SIZE, SIZE), (SIZE, SIZE)), **entries):  # fmt: skip
+    """Matches of one pair from real entries; the padding holds `garbage`.
 
-    def padded(real, default=0.5, fill=garbage, dtype=np.float32):
-        real = np.full(count, default) if real is None else np.asarray(real)
-        rows = np.full((capacity, *real.shape[1:]), fill, dtype)
-        rows[:count] = real
+    `entries` have a value per match: distance, scores0, scores1 (0.5 if missing), ratio, confidence, index0, index1.
+    """
+    real = {name: np.asarray(points, np.float32).reshape(-1, 2) for name, points in
+            (("points0", points0), ("points1", points1))}  # fmt: skip
+    count = len(real["points0"])
+    capacity = capacity or max(count, 1)
+    entries = {name: values for name, values in entries.items() if values is not None}
+    real |= dict.fromkeys(("distance", "scores0", "scores1"), np.full(count, 0.5)) | entries
+
+    def pad(name, values):
+        fill, dtype = (-7, np.int32) if name.startswith("index") else (garbage, np.float32)
+        rows = np.full((capacity, *np.shape(values)[1:]), fill, dtype)
+        rows[:count] = values
         return rows
 
-    whole = partial(padded, fill=-7, dtype=np.int32)
-
     return Matches(
-        points0=padded(points0),
-        points1=padded(points1),
-        distance=padded(distance),
-        scores0=padded(scores0),
-        scores1=padded(scores1),
+        **{name: pad(name, values) for name, values in real.items()},
         mask=np.arange(capacity) < count,
         image_size0=np.array(sizes[0], np.float32),
         image_size1=np.array(sizes[1], np.float32),
-        ratio=None if ratio is None else padded(ratio),
-        confidence=None if confidence is None else padded(confidence),
-        index0=None if index0 is None else whole(index0),
-        index1=None if index1 is None else whole(index1),
         count0=None if count0 is None else np.int32(count0),
         count1=None if count1 is None else np.int32(count1),
     )

@@ -153,15 +153,6 @@ def histogram_score(shifts, weights, size0, size1, **options):
     return max(_values(histogram))
 
 
-def dominant_shift(shifts, weights, size0, size1, **options):
-    """Center (x, y) of the largest bin, first in row-major order on ties; (0, 0) without matches."""
-    if len(shifts) == 0:
-        return 0.0, 0.0
-    histogram, centers_x, centers_y = histogram_of_shifts(shifts, weights, size0, size1, **options)
-    row, column = divmod(_first_argmax(_values(histogram)), len(centers_x))
-    return float(centers_x[column]), float(centers_y[row])
-
-
 def refined_shift(shifts, weights, sigma, start):
     """Local maximum of the continuous density behind eq. 1, by mean shift from `start` (not in the paper)."""
     x, y = float(start[0]), float(start[1])
@@ -218,8 +209,8 @@ def anchor_cells(points0, points1, weights, size0, size1, *, num_bins=15):
         candidates = sorted(targets)  # (row, column) in row-major order
         sums = [math.fsum(targets[target]) for target in candidates]
         winner = _first_argmax(sums)
-        everything = [weight for target in candidates for weight in targets[target]]
-        cells[cell] = candidates[winner], sums[winner], math.fsum(everything)
+        weights_of_cell = [weight for target in candidates for weight in targets[target]]
+        cells[cell] = candidates[winner], sums[winner], math.fsum(weights_of_cell)
     return cells
 
 
@@ -264,7 +255,7 @@ def anchor_points(
     return float(score)
 
 
-# --- aggregated score, match count --------------------------------------------------------------------------
+# --- aggregated score ---------------------------------------------------------------------------------------
 
 
 def _median(values):
@@ -325,23 +316,18 @@ def grid_anchors(index, side, *, patch=None, wrap=True, outside=-1000):
     return score
 
 
-def match_count(n):
-    """Number of mutual matches (re-ranking of SelaVPR)."""
-    return float(n)
-
-
 # --- fusion and ranking -------------------------------------------------------------------------------------
 
 
 def fuse_scales(scores, mask, weights, normalize):
-    """Of one query, `[C, S]` -> `[C]` (Patch-NetVLAD): z-scores over the candidates whose score is a number, summed."""
+    """Sum over scales of z-scores over the candidates with a finite score, `[C, S]` -> `[C]` (Patch-NetVLAD)."""
     fused = np.full(len(mask), np.nan)
     real = [place for place in range(len(mask)) if mask[place]]
     for place in real:
         fused[place] = 0.0
         for scale, weight in enumerate(weights):
             score = float(scores[place, scale])
-            finite = [float(scores[one, scale]) for one in real if np.isfinite(scores[one, scale])]
+            finite = [float(scores[row, scale]) for row in real if np.isfinite(scores[row, scale])]
             if normalize == "zscore" and np.isfinite(score):
                 deviation = np.std(finite) if min(finite) < max(finite) else 0.0
                 score = (score - np.mean(finite)) / deviation if deviation else 0.0

@@ -45,7 +45,7 @@ def visual_phrases(points0, points1, confidence, *, length, cell_size, align="ze
 
 
 def lost_distance(points0, points1, distance, confidence, *, form="weighted", mirrored=False, width=None):
-    """What LoST-X (Garg et al., RSS 2018) takes the smallest of; infinite where it would divide 0 by 0."""
+    """The distance that LoST-X (Garg et al., RSS 2018) minimizes; infinite instead of 0 / 0."""
     x0, x1 = [x for x, _ in _rows(points0)], [x for x, _ in _rows(points1)]
     if mirrored:
         x0 = [float(width) - 1 - x for x in x0]
@@ -61,23 +61,23 @@ def lost_distance(points0, points1, distance, confidence, *, form="weighted", mi
     length = math.sqrt(math.fsum(c[k] * weights[k] ** 2 for k in matches))
     if length == 0:
         return math.inf
-    found = _cosine_distance([w * x for w, x in zip(weights, x0, strict=True)],
+    cosine_distance = _cosine_distance([w * x for w, x in zip(weights, x0, strict=True)],
                              [w * x for w, x in zip(weights, x1, strict=True)], c)  # fmt: skip
-    return found / length / math.fsum(c)
+    return cosine_distance / length / math.fsum(c)
 
 
 def lost_score(points0, points1, distance, confidence, **options):
     """log(1 + 1 / L), with a smallest cosine distance, or `described` L, of 1e-12; 0 without matches."""
     if len(distance) == 0:
         return 0.0
-    found = lost_distance(points0, points1, distance, confidence, **options)
-    return math.log1p(1 / (max(found, 1e-12) if options.get("form") == "described" else found))
+    smallest = lost_distance(points0, points1, distance, confidence, **options)
+    return math.log1p(1 / (max(smallest, 1e-12) if options.get("form") == "described" else smallest))
 
 
 def _cosine_distance(first, second, confidence):
     """At least 1e-12; 1 where a vector is 0."""
     dot, square0, square1 = (
-        math.fsum(c * a * b for c, a, b in zip(confidence, one, other, strict=True))
-        for one, other in ((first, second), (first, first), (second, second))
+        math.fsum(c * a * b for c, a, b in zip(confidence, left, right, strict=True))
+        for left, right in ((first, second), (first, first), (second, second))
     )
     return max(1 - dot / math.sqrt(square0 * square1), 1e-12) if square0 and square1 else 1.0

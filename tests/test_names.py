@@ -7,20 +7,8 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 # Words that say nothing of the value. A few fields of public values still have them.
-EMPTY_NAMES = {
-    "found",
-    "one",
-    "kept",
-    "told",
-    "asked",
-    "given",
-    "made",
-    "some",
-    "others",
-    "nothing",
-    "who",
-    "everything",
-}
+EMPTY_NAMES = {"found", "one", "kept", "told", "asked", "given", "made", "some", "others", "nothing", "who",
+               "everything"}  # fmt: skip
 BEGINNINGS = {"What", "Of", "How", "Where", "By", "That", "Those", "Whose", "Who"}
 DEFINITIONS = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 

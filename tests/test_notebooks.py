@@ -30,7 +30,7 @@ def executed(tmp_path_factory):
     notebooks = [nbformat.read(path, as_version=4) for path in PATHS]
 
     async def execute():
-        clients = (NotebookClient(one, timeout=200, resources={"metadata": {"path": folder}}) for one in notebooks)
+        clients = (NotebookClient(book, timeout=200, resources={"metadata": {"path": folder}}) for book in notebooks)
         return await asyncio.gather(*(client.async_execute() for client in clients), return_exceptions=True)
 
     with pytest.MonkeyPatch.context() as patch:

@@ -40,14 +40,7 @@ def test_make_targets_exist(target):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "command",
-    [
-        pytest.param(line, marks=[pytest.mark.slow] if "system=" in line else [])
-        for line in COMMANDS
-        if "experiments.evaluate" in line
-    ],
-)
+@pytest.mark.parametrize("command", [line for line in COMMANDS if "experiments.evaluate" in line])
 def test_commands_run(command, small_street, weights, tmp_path, monkeypatch, capsys):
     if "aliked" in command and not random_checkpoints.ALIKED.is_dir():
         pytest.skip("no ../shared/weights: ALIKED's are not shipped")
@@ -85,9 +78,13 @@ def test_commands_of_sweeps_and_learning_are_settings(program):
     commands = [shlex.split(line) for line in COMMANDS if f"experiments.{program}" in line]
     assert len(commands) >= 2
     for _, _, _, *arguments in commands:
-        chosen = [one.replace("=DIR", "=root") for one in arguments if one != "-m" and not one.startswith("hydra/")]
+        chosen = [
+            argument.replace("=DIR", "=root")
+            for argument in arguments
+            if argument != "-m" and not argument.startswith("hydra/")
+        ]
         if "-m" in arguments:  # the first of several values
-            chosen = [re.sub(r"=(\[[^]]*\]|[^,\[]*),.*", r"=\1", one) for one in chosen]
+            chosen = [re.sub(r"=(\[[^]]*\]|[^,\[]*),.*", r"=\1", argument) for argument in chosen]
         settings = composed(*map(as_typed, data_sets.first_of(chosen)), config=program)
         check(settings)
         for name in ("also", "report"):
@@ -138,11 +135,11 @@ def test_the_whole_way_in_one_call(small_street, tmp_path, monkeypatch, capsys):
 
 def test_a_scorer_of_your_own_keeps_the_contract():
     """The example checks itself; what it scores is the number of matches that agree."""
-    code, made = EXAMPLES[2], {}
+    code, names = EXAMPLES[2], {}
     assert len(lines(code)) <= 15
-    exec(compile(code, "README.md", "exec"), made)
+    exec(compile(code, "README.md", "exec"), names)
     points = np.random.default_rng(0).uniform(50, 250, (12, 2))
-    assert made["Concentration"]()(make_matches(points, points + 30)) == pytest.approx(12)
+    assert names["Concentration"]()(make_matches(points, points + 30)) == pytest.approx(12)
     assert len(EXAMPLES) == 3
 
 

@@ -81,7 +81,7 @@ ENTRIES = {
 
 
 def check_classes(entry, count=40):
-    """Whoever is called while a program is traced is whom it computes."""
+    """The class that is called while a program is traced is the class of its scorer."""
     matches, log = jax.tree.map(lambda leaf: leaf[None], random_matches(np.random.default_rng(0), 3)), []
     for number in range(count):
         scorer = registered(number, log)()
@@ -176,9 +176,9 @@ def test_a_dataclass_may_be_registered_as_it_is():
     class Mutable:
         number: float = 1.0
 
-    made = Mutable()
-    made.number = 4.0
-    assert jax.tree.leaves(made) == [4.0]
+    scorer = Mutable()
+    scorer.number = 4.0
+    assert jax.tree.leaves(scorer) == [4.0]
 
 
 def test_every_field_of_matches_is_of_a_match_or_of_the_pair():
