@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from mfvpr.scoring.fields import check_choices, choice, flag, named, number
 from mfvpr.scoring.shifts import image_sizes, match_shifts
@@ -39,8 +40,8 @@ class AggregatedScore:
     def __post_init__(self) -> None:
         check_choices(self)
 
-    def __call__(self, matches: Matches) -> Array:
-        """Score of one pair, `[]` float32."""
+    def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
+        """Score of one pair, float32."""
         weights = match_weights(self.weight, matches)
         shifts = match_shifts(matches)
         confidence = match_confidence(matches)
@@ -52,8 +53,8 @@ class AggregatedScore:
         score = jnp.sum(weights * jnp.sum(masked(closeness, matches.mask) ** 2, axis=-1))
         return where_finite(score, weights, shifts)
 
-    def _closeness(self, offsets: Array, size: Array) -> Array:
-        """`[K, 2]` image size minus the distance of the shift from the center, px."""
+    def _closeness(self, offsets: Float[Array, "slots 2"], size: Float[Array, "1 2"]) -> Float[Array, "slots 2"]:
+        """Image size minus the distance of the shift from the center, px."""
         if self.temperature is None:
             closeness = size - jnp.abs(offsets)
             return jnp.maximum(closeness, 0.0) if self.clamp else closeness

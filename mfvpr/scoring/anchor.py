@@ -8,6 +8,7 @@ is the distance |d_ij - d_kl| of two displacements. Lengths are cells.
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float, Int
 
 from mfvpr.scoring.fields import check_choices, choice, flag, named, number, whole
 from mfvpr.scoring.shifts import image_sizes
@@ -72,8 +73,8 @@ class AnchorPoints:
         if not 0 < self.num_bins <= MAX_BINS:
             raise ValueError(f"AnchorPoints(num_bins={self.num_bins}): expected from 1 to {MAX_BINS} cells per side")
 
-    def __call__(self, matches: Matches) -> Array:
-        """Score of one pair, `[]` float32."""
+    def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
+        """Score of one pair, float32."""
         cells = self._cells if self.temperature is None else self._soft_cells
         index, rows, columns, occupancy, weights = cells(matches)
         # Two [cells, cells] planes, not one array with a trailing axis of 2, which costs nine times as much on a CPU.
@@ -144,27 +145,27 @@ class AnchorPoints:
         }[self.cell_weight]()
         return cells, rows, columns, occupancy, cell_weights
 
-    def _positions(self, matches: Matches) -> tuple[Array, Array]:
-        """`[K, 2]` (x, y) of the points in the first and second image, in cells; 0 on padding."""
+    def _positions(self, matches: Matches) -> tuple[Float[Array, "slots 2"], Float[Array, "slots 2"]]:
+        """(x, y) of the points in the first and second image, in cells; 0 on padding."""
         size0, size1 = image_sizes(matches)
         query = masked(at_least_single(matches.points0), matches.mask) * self.num_bins / size0[None]
         candidate = masked(at_least_single(matches.points1), matches.mask) * self.num_bins / size1[None]
         return (query, candidate) if self.first == "query" else (candidate, query)
 
-    def _cell(self, position: Array) -> Array:
-        """`[K]` int32 row-major cell of each position, clipped to the image."""
+    def _cell(self, position: Float[Array, "slots 2"]) -> Int[Array, " slots"]:
+        """Row-major cell of each position, clipped to the image."""
         column, row = jnp.clip(jnp.floor(position), 0, self.num_bins - 1).astype(jnp.int32).T
         return row * self.num_bins + column
 
-    def _membership(self, position: Array, temperature: Array) -> Array:
-        """`[K, cells]` membership of each position in each cell, row-major; a row sums to 1."""
+    def _membership(self, position: Float[Array, "slots 2"], temperature: Array) -> Float[Array, "slots cells"]:
+        """Membership of each position in each cell, row-major; a row sums to 1."""
         centers = jnp.arange(self.num_bins, dtype=position.dtype) + 0.5
         distance = jnp.clip(position, 0, self.num_bins)[:, :, None] - centers[None, None]
         along = jax.nn.softmax(-(distance**2) / temperature, axis=-1)  # [K, (x, y), bins]
         return (along[:, 1, :, None] * along[:, 0, None, :]).reshape(len(position), self.num_bins**2)
 
-    def _neighbors(self, cells: Array) -> Array:
-        """`[n, n]` bool, entry (a, b): cell b lies in the window around cell a."""
+    def _neighbors(self, cells: Int[Array, " cells"]) -> Bool[Array, "cells cells"]:
+        """Entry (a, b): cell b lies in the window around cell a."""
         low, high = self._reach()
         row, column = (index.astype(float) for index in jnp.divmod(cells, self.num_bins))
         offsets = row[None] - row[:, None], column[None] - column[:, None]
@@ -186,8 +187,10 @@ class AnchorPoints:
         return -window, window
 
 
-def _sums_by_key(values: Array, keys: Array, num_keys: int, *, pairwise: bool) -> Array:
-    """`[K]` sum of all `values` `[K]` with the same key."""
+def _sums_by_key(
+    values: Float[Array, " slots"], keys: Int[Array, " slots"], num_keys: int, *, pairwise: bool
+) -> Float[Array, " slots"]:
+    """Sum of all `values` with the same key."""
     if pairwise:  # few values and very many keys
         return jnp.sum(jnp.where(keys[:, None] == keys[None], values[:, None], 0.0), axis=0)
     return jnp.zeros(num_keys, values.dtype).at[keys].add(values)[keys]

@@ -1,10 +1,12 @@
 """The number of matches as a score, the re-ranking of SelaVPR (Lu et al., ICLR 2024)."""
 
+import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from mfvpr.scoring.fields import check_choices, choice
 from mfvpr.scoring.weights import match_confidence
-from mfvpr.types import Array, Matches, value
+from mfvpr.types import Matches, value
 
 
 @value
@@ -22,8 +24,8 @@ class MatchCount:
     def __post_init__(self) -> None:
         check_choices(self)
 
-    def __call__(self, matches: Matches) -> Array:
-        """Score of one pair, `[]` float32."""
+    def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
+        """Score of one pair, float32."""
         confidence = match_confidence(matches)
         score = jnp.sum(confidence)
         return score if self.single == "count" else jnp.where(jnp.sum(confidence != 0) == 1, 0.0 * score, score)

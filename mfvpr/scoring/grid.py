@@ -7,6 +7,7 @@ a patch of n x n cells around it. A cell of the patch agrees if index[anchor + o
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float, Int
 
 from mfvpr.scoring.fields import check_choices, choice, flag, whole
 from mfvpr.scoring.weights import match_confidence
@@ -57,8 +58,8 @@ class GridAnchors:
         size = 3 * self.side // 4
         return max(1, size - (size % 2 == 0))
 
-    def __call__(self, matches: Matches) -> Array:
-        """Score of one pair, `[]` float32.
+    def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
+        """Score of one pair, float32.
 
         The score is NaN if the number of keypoints is not side^2, or an index is out of range.
 
@@ -82,7 +83,9 @@ class GridAnchors:
             usable &= count == len(cells)
         return jnp.where(usable | ~jnp.any(real), score.astype(jnp.float32), jnp.nan)
 
-    def _agreements(self, index: Array, matched: Array, cells: Array) -> Array:
+    def _agreements(
+        self, index: Int[Array, " cells"], matched: Bool[Array, " cells"], cells: Int[Array, " cells"]
+    ) -> Int[Array, ""]:
         """Number of pairs that agree, of an anchor and a cell of its patch inside the grid.
 
         Agreement is symmetric, so that half of the offsets suffice: those to the right, and those in the rows below.
@@ -113,7 +116,9 @@ class GridAnchors:
         counts = jax.lax.fori_loop(1, half + 1, lambda row, counts: counts + count_offsets(row, full_row), right)
         return 2 * jnp.sum(counts) + jnp.sum(matched, dtype=jnp.int32)
 
-    def _agreements_outside(self, index: Array, matched: Array, cells: Array) -> Array:
+    def _agreements_outside(
+        self, index: Int[Array, " cells"], matched: Bool[Array, " cells"], cells: Int[Array, " cells"]
+    ) -> Int[Array, ""]:
         """Number of anchors that agree with the value of the padding around the grid."""
         side, half = self.side, self.size // 2
         row, column = jnp.divmod(cells, side)

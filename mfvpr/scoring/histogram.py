@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float, Num
 
 from mfvpr.scoring.fields import SCORE, check_choices, choice, flag, named, number, numbers, several, whole
 from mfvpr.scoring.intervals import mass_interval
@@ -29,15 +30,14 @@ MAX_BINS = 1024  # per axis unless `max_bins` is larger: the histograms of 50 pa
 
 
 class ShiftHistogram(NamedTuple):
-    """Bin scores and bin centers.
+    """Bin scores s_ij, and bin centers in px.
 
-    scores: `[By, Bx]` s_ij; -inf in bins beyond the range of shifts (present only if the capacity exceeds the bins).
-    centers_x: `[Bx]` px.  centers_y: `[By]` px.
+    Bins beyond the range of shifts score -inf; there are some only if the capacity exceeds the bins.
     """
 
-    scores: Array
-    centers_x: Array
-    centers_y: Array
+    scores: Float[Array, "bins_y bins_x"]
+    centers_x: Float[Array, " bins_x"]
+    centers_y: Float[Array, " bins_y"]
 
 
 @value
@@ -99,12 +99,14 @@ class HistogramOfShifts:
     def __post_init__(self) -> None:
         check_choices(self)
 
-    def __call__(self, matches: Matches) -> Array:
-        """Score of one pair, `[]` float32: the (smooth) maximum over bins, 0 without matches."""
+    def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
+        """Score of one pair, float32: the (smooth) maximum over bins, 0 without matches."""
         return self.scores_by_weights(matches, match_weights(self.weight, matches)[None])[0]
 
-    def scores_by_weights(self, matches: Matches, weights: Array) -> Array:
-        """Scores `[W]` of one pair with several weights `[W, K]` of its matches (0 on padding)."""
+    def scores_by_weights(
+        self, matches: Matches, weights: Float[Array, "weightings slots"]
+    ) -> Float[jax.Array, " weightings"]:
+        """Scores of one pair with several weights of its matches (0 on padding)."""
         shifts, lattice, capacity = self._shifts_by_scale(matches), self._lattice(matches), self._capacity(matches)
         pool = tallest
         if self.temperature is not None:
@@ -114,8 +116,10 @@ class HistogramOfShifts:
         scores = jax.vmap(lambda by_scale: pool(by_scale, jnp.ones_like(by_scale, bool)))(scores.T)
         return where_usable(scores, matches, shifts, weights, lattice.usable(capacity))
 
-    def batch_scores_by_weights(self, matches: Matches, weights: Array) -> Array:
-        """Scores `[C, W]` of pairs `[C, K, ...]` with weights `[C, W, K]`, see `scores_by_weights`.
+    def batch_scores_by_weights(
+        self, matches: Matches, weights: Float[Array, "candidates weightings slots"]
+    ) -> Float[jax.Array, "candidates weightings"]:
+        """`scores_by_weights` of pairs `[C, K, ...]`.
 
         On a CPU it scores pair by pair, which stays in the cache, and skips most bins by branch and bound where that
         pays. The scores are the same; the time depends on the data.
@@ -140,8 +144,8 @@ class HistogramOfShifts:
         x, y = (lattice.centers(axis, jnp.arange(len(scores), dtype=scores.dtype)) for axis in (0, 1))
         return ShiftHistogram(jnp.where(usable, scores, jnp.nan), x, y)
 
-    def dominant_shift(self, matches: Matches, *, refine: bool = False) -> Array:
-        """Shift of the tallest bin, `[2]` (x, y) px, candidate minus query; (0, 0) without votes.
+    def dominant_shift(self, matches: Matches, *, refine: bool = False) -> Float[jax.Array, "2"]:
+        """Shift of the tallest bin, (x, y) px, candidate minus query; (0, 0) without votes.
 
         It is the center of the tallest bin, the first in row-major order on a tie. With `refine` it is the peak
         between bin centers: the maximum of the same sum of Gaussians over all shifts that is uphill from that bin, to
@@ -151,12 +155,14 @@ class HistogramOfShifts:
         """
         return _dominant_shift(self._fit_to(matches), matches, refine=refine)
 
-    def dominant_scale(self, matches: Matches) -> Array:
-        """Scale `[]` that has the tallest bin: the first on a tie, 1 without votes."""
+    def dominant_scale(self, matches: Matches) -> Float[jax.Array, ""]:
+        """Scale that has the tallest bin: the first on a tie, 1 without votes."""
         return _dominant_scale(self._fit_to(matches), matches)
 
-    def shift_interval(self, matches: Matches, *, level: float = 0.95, sharpness: float = 24.0) -> Array:
-        """Interval of the dominant shift, `[2, 2]` (low, high) of (x, y) px.
+    def shift_interval(
+        self, matches: Matches, *, level: float = 0.95, sharpness: float = 24.0
+    ) -> Float[jax.Array, "2 2"]:
+        """Interval of the dominant shift, (low, high) of (x, y) px.
 
         The interval holds the central `level` of the mass s_ij^sharpness along each axis. It is wide if other bins are
         nearly as tall, and never narrower than `level` bins; without votes it is that part of all possible shifts. On
@@ -170,13 +176,15 @@ class HistogramOfShifts:
             raise InputError(f"level={level}: expected a number between 0 and 1")
         return _shift_interval(self._fit_to(matches), matches, level, sharpness)
 
-    def agrees(self, matches: Matches, shift: Array) -> Array:
-        """`[K]` bool, matches within two standard deviations of a `shift` `[2]` along both axes."""
+    def agrees(self, matches: Matches, shift: Float[Array, "2"]) -> Bool[jax.Array, " slots"]:
+        """Matches within two standard deviations of a `shift` (x, y) px along both axes."""
         shifts = self._shifts_by_scale(matches)[self._vote(matches)[-1] if len(self.scales) > 1 else 0].T
         near = jnp.all(jnp.abs(shifts - shift[None]) <= 2 * self._deviation(shifts.dtype), axis=-1)
         return near & matches.mask
 
-    def with_capacity(self, image_size0: Array, image_size1: Array, *, multiple: int = 1) -> "HistogramOfShifts":
+    def with_capacity(
+        self, image_size0: Num[Array, "*batch0 2"], image_size1: Num[Array, "*batch1 2"], *, multiple: int = 1
+    ) -> "HistogramOfShifts":
         """This scorer with `max_bins` set to the bins that its concrete values need.
 
         The number of bins is rounded up to a `multiple`. `bin_size` and the sizes may be batched: the capacity suffices
@@ -237,8 +245,8 @@ class HistogramOfShifts:
         usable = lattice.usable(capacity) & are_finite(shifts, weights[None])[0]
         return scores[scale], lattice, usable, scale
 
-    def _weigh_scales(self, scores: Array) -> Array:
-        """Scores `[S, ...]` times the prior of each scale."""
+    def _weigh_scales(self, scores: Float[Array, "scales ..."]) -> Float[Array, "scales ..."]:
+        """Scores times the prior of each scale."""
         octaves = jnp.log2(jnp.asarray(self.scales, scores.dtype)) / positive(self.scale_deviation, scores.dtype)
         return scores * jnp.exp(-0.5 * octaves**2).reshape(-1, *(1,) * (scores.ndim - 1))
 
@@ -280,8 +288,8 @@ class HistogramOfShifts:
         shifts = match_shifts(matches)
         return shifts if self.direction == "candidate_minus_query" else -shifts
 
-    def _shifts_by_scale(self, matches: Matches) -> Array:
-        """`[S, 2, K]` shifts along x and along y, at every scale."""
+    def _shifts_by_scale(self, matches: Matches) -> Float[Array, "scales 2 slots"]:
+        """Shifts along x and along y, at every scale."""
         shifts = [self._shifts(compensate_scale(matches, scale)).T for scale in self.scales]
         # The barrier keeps the copy: strided coordinates would keep the exponentials from being vectorized.
         return jax.lax.optimization_barrier(jnp.stack(shifts))

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float, Int
 
 from mfvpr.scoring import planes, quads
 from mfvpr.scoring.fields import check_choices, choice, flag, number, whole
@@ -25,16 +26,14 @@ _ROUNDS = 8  # the search ends after so many times the rounds that samples witho
 class Estimate(NamedTuple):
     """Result of RANSAC for one pair.
 
-    matrix: `[3, 3]` maps (x, y, 1) of the candidate to the query, px, last entry 1; NaN = no homography.
-    inliers: `[K]` bool.
-    score: `[]`.
-    samples: `[]` int32, number of samples before the search stopped.
+    matrix: maps (x, y, 1) of the candidate to the query, px, last entry 1; NaN = no homography.
+    samples: number of samples before the search stopped.
     """
 
-    matrix: Array
-    inliers: Array
-    score: Array
-    samples: Array
+    matrix: Float[Array, "3 3"]
+    inliers: Bool[Array, " slots"]
+    score: Float[Array, ""]
+    samples: Int[Array, ""]
 
 
 @value
@@ -71,8 +70,8 @@ class Homography:
     def __post_init__(self) -> None:
         check_choices(self)
 
-    def __call__(self, matches: Matches) -> Array:
-        """Score of one pair, `[]` float32."""
+    def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
+        """Score of one pair, float32."""
         return self.estimate(matches).score
 
     def estimate(self, matches: Matches) -> Estimate:
@@ -120,15 +119,15 @@ class _Search(NamedTuple):
 
     measure: str
     each_counts_one: bool
-    points: Array  # [K, 4]
-    counts: Array  # [K], confidence of the matches
-    number: Array  # [], real matches
-    threshold: Array
-    max_iterations: Array
-    probability: Array
+    points: Float[Array, "slots 4"]
+    counts: Float[Array, " slots"]  # confidence of the matches
+    number: Int[Array, ""]  # of real matches
+    threshold: Float[Array, ""]
+    max_iterations: Float[Array, ""]
+    probability: Float[Array, ""]
 
-    def __call__(self, key: Array) -> tuple[Array, Array]:
-        """The best model `[9]`, NaN if there is none, and the number of samples."""
+    def __call__(self, key: Array) -> tuple[Float[Array, "9"], Int[Array, ""]]:
+        """The best model, NaN if there is none, and the number of samples."""
         dtype = self.points.dtype
         rounds = _ROUNDS * jnp.ceil(self.max_iterations / quads.ROUND).astype(jnp.int32)
 
@@ -161,14 +160,14 @@ class _Search(NamedTuple):
         state = jax.lax.while_loop(is_searching, search_round, state)
         return state.model, state.samples
 
-    def inlier_quality(self, model: Array, points: Array) -> Array:
-        """`[K]` contribution of each match to the quality of a model, if it is an inlier."""
+    def inlier_quality(self, model: Float[Array, "9"], points: Float[Array, "slots 4"]) -> Float[Array, " slots"]:
+        """Contribution of each match to the quality of a model, if it is an inlier."""
         if self.measure == "inliers":
             return jnp.ones_like(points[:, 0])
         return _closeness(*planes.miss(model, points, self.threshold))
 
-    def _compare(self, models: Array) -> tuple[Array, Array, Array]:
-        """Quality, sum of the inliers' counts, and number of inliers, `[R]`, of models `[9, R]`.
+    def _compare(self, models: Float[Array, "9 samples"]) -> tuple[Array, Array, Array]:
+        """Quality, sum of the inliers' counts, and number of inliers, of each model.
 
         Matches are compared `_MATCHES_PER_STEP` at a time: all would leave the cache, one would make too short a step.
         """
@@ -207,14 +206,14 @@ def _closeness(error: Array, limit: Array) -> Array:
 
 
 class _State(NamedTuple):
-    round: Array
-    samples: Array
-    quality: Array
-    inliers: Array  # most inliers of any model that was the best at some time
-    model: Array  # [9]
-    has_samples: Array  # whether the last round had a sample
+    round: Int[Array, ""]
+    samples: Int[Array, ""]
+    quality: Float[Array, ""]
+    inliers: Float[Array, ""]  # most inliers of any model that was the best at some time
+    model: Float[Array, "9"]
+    has_samples: Bool[Array, ""]  # whether the last round had a sample
 
 
-def _maximum_before(values: Array, start: Array) -> Array:
-    """`[R]` maximum of `start` and all values before each one."""
+def _maximum_before(values: Float[Array, " samples"], start: Float[Array, ""]) -> Float[Array, " samples"]:
+    """Maximum of `start` and all values before each one."""
     return jnp.maximum(jnp.concatenate([jnp.zeros_like(values[:1]), jax.lax.cummax(values)[:-1]]), start)

@@ -4,6 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from mfvpr.scoring.fields import check_bounds, check_choices, choice, number
 from mfvpr.types import Array, Matches, value
@@ -37,8 +38,8 @@ class OpenCvHomography:
     def __post_init__(self) -> None:
         check_choices(self)
 
-    def __call__(self, matches: Matches) -> np.ndarray:
-        """Score of one pair, `[]` float32.
+    def __call__(self, matches: Matches) -> Float[np.ndarray, ""]:
+        """Score of one pair, float32.
 
         Raises:
             InputError: the scorer or the matches are traced, or a number is out of bounds.
@@ -57,15 +58,15 @@ class OpenCvHomography:
         keys = points.T[::-1] if matches.index0 is None else [np.asarray(matches.index0)[real]]
         return np.array(self._score(points[np.lexsort([*keys])]), np.float32)
 
-    def score_pairs(self, matches: Matches) -> np.ndarray:
-        """Scores `[P]` float32 of pairs `[P, K, ...]`."""
+    def score_pairs(self, matches: Matches) -> Float[np.ndarray, " pairs"]:
+        """Scores of pairs `[P, K, ...]`, float32."""
         host, count = jax.tree.map(np.asarray, matches), len(matches.mask)
         pairs = (jax.tree.map(lambda leaf, pair=pair: leaf[pair], host) for pair in range(count))
         with ThreadPoolExecutor(available_cpus()) as pool:  # OpenCV releases Python's lock
             return np.fromiter(pool.map(self, pairs), np.float32, count)
 
-    def _score(self, points: np.ndarray) -> float:
-        """Score of real matches `[n, 4]` (x1, y1, x0, y0)."""
+    def _score(self, points: Float[np.ndarray, "slots 4"]) -> float:
+        """Score of real matches (x1, y1, x0, y0)."""
         import cv2  # here, because it slows down the import of the library
 
         if not np.isfinite(points).all():

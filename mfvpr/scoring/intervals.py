@@ -1,18 +1,22 @@
 """Interval of the dominant shift from the scores of all bins. Lengths are pixels."""
 
+import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from mfvpr.scoring.lattice import Lattice
 from mfvpr.types import Array
 
 
-def mass_interval(scores: Array, lattice: Lattice, level: float | Array, sharpness: float | Array) -> Array:
-    """Interval `[2, 2]` (low, high) of (x, y) with the central mass along each axis.
+def mass_interval(
+    scores: Float[Array, "bins bins"], lattice: Lattice, level: float | Array, sharpness: float | Array
+) -> Float[jax.Array, "2 2"]:
+    """Interval (low, high) of (x, y) with the central mass along each axis.
 
     The mass of a bin is s_ij^sharpness. Mass is spread evenly within a bin. Without votes all bins have the same mass.
 
     Args:
-        scores: `[B, B]` (y, x) s_ij, -inf beyond the range of shifts; scores below 0 count as 0.
+        scores: (y, x) s_ij, -inf beyond the range of shifts; scores below 0 count as 0.
         lattice: positions of the bins.
         level: share of the mass, between 0 and 1; the rest is split between both sides.
         sharpness: exponent; the larger, the less mass the lower bins have.

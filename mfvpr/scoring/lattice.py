@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float
 
 from mfvpr.types import Array
 from mfvpr.utils.numerics import masked, safe_sqrt
@@ -16,15 +17,14 @@ _TOLERANCE = 1e-4  # standard deviations
 class Lattice(NamedTuple):
     """Positions of the bins, and the width of the votes.
 
-    first, num_bins: `[2]` (x, y) center of the first bin, and number of bins.  bin_size, deviation (sigma of equation
-    1): `[]` px.  truncate: `[]` sigmas.
+    Lengths are px. `first` is the (x, y) center of the first bin, `deviation` the sigma of equation 1.
     """
 
-    first: Array
-    num_bins: Array
-    bin_size: Array
-    deviation: Array
-    truncate: Array
+    first: Float[Array, "*batch 2"]
+    num_bins: Float[Array, "*batch 2"]
+    bin_size: Float[Array, "*batch"]
+    deviation: Float[Array, "*batch"]
+    truncate: Float[Array, "*batch"]  # sigmas
 
     def centers(self, axis: int, index: Array) -> Array:
         """Centers of bins along an axis, px, by bin number."""
@@ -34,13 +34,13 @@ class Lattice(NamedTuple):
         """Bin numbers, at most the last bin; a repeated bin changes no maximum."""
         return jnp.minimum(index, self.num_bins[axis] - 1)
 
-    def inside(self, capacity: int) -> Array:
-        """`[B, B]` (y, x) bool, True for bins within the range of shifts."""
+    def inside(self, capacity: int) -> Bool[Array, "bins bins"]:
+        """(y, x), True for bins within the range of shifts."""
         index = jnp.arange(capacity, dtype=self.num_bins.dtype)
         return (index < self.num_bins[1])[:, None] & (index < self.num_bins[0])[None]
 
-    def usable(self, capacity: int) -> Array:
-        """`[]` bool, whether the bins fit the capacity, and `deviation` and `truncate` are numbers."""
+    def usable(self, capacity: int) -> Bool[Array, ""]:
+        """Whether the bins fit the capacity, and `deviation` and `truncate` are numbers."""
         # Checked here, because XLA's maximum over thousands of values on a CPU skips NaN.
         fits = jnp.all((self.num_bins >= 1) & (self.num_bins <= capacity))
         return fits & ~jnp.isnan(self.deviation) & ~jnp.isnan(self.truncate)
@@ -52,31 +52,39 @@ def gaussian(distance: Array, deviation: Array, truncate: Array) -> Array:
     return jnp.where(jnp.abs(sigmas) > truncate, 0.0, jnp.exp(-0.5 * sigmas**2))
 
 
-def votes(shifts: Array, lattice: Lattice, capacity: int) -> tuple[Array, Array]:
-    """Unweighted votes `[B, K]` of shifts `[2, K]` along x and along y."""
+def votes(
+    shifts: Float[Array, "2 slots"], lattice: Lattice, capacity: int
+) -> tuple[Float[Array, "bins slots"], Float[Array, "bins slots"]]:
+    """Unweighted votes of shifts along x and along y."""
     index = jnp.arange(capacity, dtype=shifts.dtype)
     x, y = (votes_along(axis, index, shifts, lattice) for axis in (0, 1))
     return x, y
 
 
-def votes_along(axis: int, index: Array, shifts: Array, lattice: Lattice) -> Array:
-    """Votes `[..., K]` of shifts `[2, K]` along one axis, for bin numbers `[...]`."""
+def votes_along(
+    axis: int, index: Float[Array, "*bins"], shifts: Float[Array, "2 slots"], lattice: Lattice
+) -> Float[Array, "*bins slots"]:
+    """Votes of shifts along one axis, by bin number."""
     # Bins along rows: the exponentials then run along K, which is longer and contiguous (1.8x faster).
     distance = lattice.centers(axis, lattice.clip_index(axis, index))[..., None] - shifts[axis][(None,) * index.ndim]
     return gaussian(distance, lattice.deviation, lattice.truncate)
 
 
-def bin_scores(votes_x: Array, votes_y: Array, weights: Array) -> Array:
-    """`[B, B]` (y, x) s_ij of equation 1: sums of the votes `[B, K]`, weighted by `[K]`."""
+def bin_scores(
+    votes_x: Float[Array, "bins slots"], votes_y: Float[Array, "bins slots"], weights: Float[Array, " slots"]
+) -> Float[Array, "bins bins"]:
+    """(y, x) s_ij of equation 1: weighted sums of the votes."""
     return jnp.matmul(votes_y * weights[None], votes_x.T, precision=jax.lax.Precision.HIGHEST)
 
 
-def tallest(scores: Array, _: Array) -> Array:
+def tallest(scores: Float[Array, "*bins"], _: Bool[Array, "*bins"]) -> Float[Array, ""]:
     """Score of the tallest bin."""
     return jnp.max(scores)  # the mask would cost as much as the product; bins beyond the last only repeat it
 
 
-def smooth_tallest(values: Array, mask: Array, *, temperature: Array) -> Array:
+def smooth_tallest(
+    values: Float[Array, "*bins"], mask: Bool[Array, "*bins"], *, temperature: Array
+) -> Float[Array, ""]:
     """T log(mean of e^(v / T)) of the values where `mask`."""
     # Relative to the maximum nothing overflows or cancels. The maximum drops out, so that its gradient would be 0.
     largest = jax.lax.stop_gradient(jnp.max(values))
@@ -85,13 +93,13 @@ def smooth_tallest(values: Array, mask: Array, *, temperature: Array) -> Array:
 
 
 def pool_bins(
-    shifts: Array,
-    weights: Array,
+    shifts: Float[Array, "2 slots"],
+    weights: Float[Array, "weightings slots"],
     lattice: Lattice,
     capacity: int,
     pool: Callable[[Array, Array], Array] = tallest,
-) -> Array:
-    """Scores `[W]` of one pair by pooling its bins, with weights `[W, K]` of its matches.
+) -> Float[Array, " weightings"]:
+    """Scores of one pair by pooling its bins, for each weighting of its matches.
 
     `pool(scores, inside)` takes arrays `[B, B]`. The Gaussians do not depend on the weights and are evaluated once.
     """
@@ -106,8 +114,13 @@ def map_rows(function: Callable[[Array], Array], rows: Array) -> Array:
     return function(rows[0])[None] if len(rows) == 1 else jax.lax.map(function, rows)
 
 
-def climb(start: Array, shifts: Array, weights: Array, deviation: Array) -> Array:
-    """Position `[2]` of the maximum of the sum of votes uphill from `start`, to 1e-4 sigma.
+def climb(
+    start: Float[Array, "2"],
+    shifts: Float[Array, "slots 2"],
+    weights: Float[Array, " slots"],
+    deviation: Float[Array, ""],
+) -> Float[Array, "2"]:
+    """Position of the maximum of the sum of votes uphill from `start`, to 1e-4 sigma.
 
     The sum of votes for a shift s is sum_k w_k exp(-|s - s_k|^2 / (2 sigma^2)). Each step is Newton's or that of mean
     shift, whichever ends higher. First and second derivatives are exact.
@@ -137,14 +150,24 @@ def climb(start: Array, shifts: Array, weights: Array, deviation: Array) -> Arra
     return shift
 
 
-def _pull(shift: Array, shifts: Array, weights: Array, deviation: Array) -> tuple[Array, Array]:
-    """Offsets `[K, 2]` of the matches from a shift, and their weighted votes `[K]` for it."""
+def _pull(
+    shift: Float[Array, "2"],
+    shifts: Float[Array, "slots 2"],
+    weights: Float[Array, " slots"],
+    deviation: Float[Array, ""],
+) -> tuple[Float[Array, "slots 2"], Float[Array, " slots"]]:
+    """Offsets of the matches from a shift, and their weighted votes for it."""
     offsets = shifts - shift[None]
     return offsets, weights * jnp.exp(-0.5 * jnp.sum((offsets / deviation) ** 2, axis=-1))
 
 
-def _steps(shift: Array, shifts: Array, weights: Array, deviation: Array) -> Array:
-    """`[2, 2]` Newton's step and the step of mean shift, px; 0 without votes.
+def _steps(
+    shift: Float[Array, "2"],
+    shifts: Float[Array, "slots 2"],
+    weights: Float[Array, " slots"],
+    deviation: Float[Array, ""],
+) -> Float[Array, "2 2"]:
+    """Newton's step and the step of mean shift, px; 0 without votes.
 
     For mean shift see Comaniciu & Meer, PAMI 2002. If the sum of votes is not concave, a multiple of the identity is
     added to the Hessian, so that Newton's step leads uphill.

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 
 from mfvpr.scoring.weights import match_ratio
 from mfvpr.types import Array, Matches, value
@@ -28,22 +29,22 @@ class LearnedWeight:
     does not change them. Exclude them from weight decay with `optax.masked`.
 
     Attributes:
-        center: `[F]` mean of every input.
-        scale: `[F]` standard deviation of every input.
-        hidden: `[F, H]` M.
-        hidden_bias: `[H]` b.
-        output: `[H]` v.
-        output_bias: `[]` c.
-        names: names of the F inputs, out of `INPUTS`. RELATIVE inputs compare a match with the other matches of its
+        center: mean of every input.
+        scale: standard deviation of every input.
+        hidden: M.
+        hidden_bias: b.
+        output: v.
+        output_bias: c.
+        names: names of the inputs, out of `INPUTS`. RELATIVE inputs compare a match with the other matches of its
             pair, so that they carry over to other detectors, cameras and places; ABSOLUTE inputs have their units.
     """
 
-    center: Array  # [F]
-    scale: Array  # [F]
-    hidden: Array  # [F, H]
-    hidden_bias: Array  # [H]
-    output: Array  # [H]
-    output_bias: Array  # []
+    center: Float[Array, " inputs"]
+    scale: Float[Array, " inputs"]
+    hidden: Float[Array, "inputs hidden"]
+    hidden_bias: Float[Array, " hidden"]
+    output: Float[Array, " hidden"]
+    output_bias: Float[Array, ""]
     names: tuple[str, ...] = field(default=RELATIVE, metadata={"static": True})
 
     @classmethod
@@ -55,7 +56,7 @@ class LearnedWeight:
         Args:
             key: of `jax.random`, for the hidden layer.
             matches: `[..., K]`; padding may hold anything. Without a real match, inputs are not standardized.
-            hidden: H.
+            hidden: number of hidden units.
             names: names of the inputs.
 
         Raises:
@@ -81,8 +82,8 @@ class LearnedWeight:
             names=names,
         )
 
-    def __call__(self, matches: Matches) -> Array:
-        """`[K]` weights of one pair; finite on padding.
+    def __call__(self, matches: Matches) -> Float[jax.Array, " slots"]:
+        """Weights of one pair; finite on padding.
 
         Raises:
             InputError: the matches have no ratio.
@@ -90,8 +91,8 @@ class LearnedWeight:
         weights = jax.nn.softplus(self.logits(matches))
         return jnp.maximum(weights, jnp.finfo(weights.dtype).tiny)  # softplus may underflow
 
-    def logits(self, matches: Matches) -> Array:
-        """`[K]` z of one pair: log-odds that a match is correct, if the training taught this.
+    def logits(self, matches: Matches) -> Float[jax.Array, " slots"]:
+        """z of one pair: log-odds that a match is correct, if the training taught this.
 
         Raises:
             InputError: the matches have no ratio.
@@ -100,8 +101,8 @@ class LearnedWeight:
         hidden = jnp.tanh(jnp.matmul(self.inputs(matches), self.hidden, precision=exact) + self.hidden_bias[None])
         return jnp.matmul(hidden, self.output, precision=exact) + self.output_bias
 
-    def inputs(self, matches: Matches) -> Array:
-        """`[K, F]` standardized inputs of every match.
+    def inputs(self, matches: Matches) -> Float[jax.Array, "slots inputs"]:
+        """Standardized inputs of every match.
 
         `center + scale * inputs` undoes the standardization.
 
@@ -112,8 +113,8 @@ class LearnedWeight:
         return (_raw_inputs(matches, self.names) - center[None]) / scale[None]
 
 
-def _raw_inputs(matches: Matches, names: tuple[str, ...]) -> Array:
-    """`[..., K, F]` inputs that are not standardized; 0 on padding."""
+def _raw_inputs(matches: Matches, names: tuple[str, ...]) -> Float[Array, "*batch slots inputs"]:
+    """Inputs that are not standardized; 0 on padding."""
     columns = [masked(jnp.broadcast_to(INPUTS[name](matches), matches.mask.shape), matches.mask) for name in names]
     return jnp.stack(columns, axis=-1)
 
@@ -128,7 +129,7 @@ def _rank(name: str, matches: Matches) -> Array:
     return jax.lax.stop_gradient(jnp.vectorize(_mid_ranks, signature="(k),(k)->(k)")(values, matches.mask))
 
 
-def _mid_ranks(values: Array, mask: Array) -> Array:
+def _mid_ranks(values: Float[Array, " slots"], mask: Bool[Array, " slots"]) -> Float[Array, " slots"]:
     ordered = jnp.sort(masked(values, mask, jnp.inf))
     below, up_to = (jnp.searchsorted(ordered, values, side=side) for side in ("left", "right"))
     return (below + up_to).astype(values.dtype) / (2 * jnp.maximum(jnp.sum(mask), 1)).astype(values.dtype)

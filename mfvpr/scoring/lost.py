@@ -1,6 +1,8 @@
 """Score of LoST-X (Garg et al., RSS 2018): how well matches, those of near descriptors most, agree along x."""
 
+import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from mfvpr.scoring.fields import check_choices, choice, flag
 from mfvpr.scoring.shifts import image_sizes
@@ -8,6 +10,8 @@ from mfvpr.scoring.weights import match_confidence
 from mfvpr.types import Array, Matches, value
 from mfvpr.utils.numerics import at_least_single, masked, masked_mean, safe_sqrt, where_finite
 
+_Values = Float[Array, " slots"]
+_Terms = tuple[Float[Array, ""], Float[Array, ""]]
 _SMALLEST = 1e-12  # below what float32 resolves of a cosine distance, and below any distance of descriptors but 0
 
 
@@ -36,8 +40,8 @@ class LostScore:
     def __post_init__(self) -> None:
         check_choices(self)
 
-    def __call__(self, matches: Matches) -> Array:
-        """Score of one pair, `[]` float32."""
+    def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
+        """Score of one pair, float32."""
         confidence = match_confidence(matches)
         x0, x1 = (masked(at_least_single(points), matches.mask)[:, 0] for points in (matches.points0, matches.points1))
         if self.mirrored:
@@ -49,7 +53,7 @@ class LostScore:
         return where_finite(score, confidence, x0, x1, distance)
 
 
-def _weighted_terms(x0: Array, x1: Array, distance: Array, confidence: Array) -> tuple[Array, Array]:
+def _weighted_terms(x0: _Values, x1: _Values, distance: _Values, confidence: _Values) -> _Terms:
     """n |v|, and the cosine distance of v x0 and v x1."""
     real = confidence > 0
     largest = jnp.max(distance, initial=0.0, where=real)
@@ -61,19 +65,19 @@ def _weighted_terms(x0: Array, x1: Array, distance: Array, confidence: Array) ->
     return length / jnp.where(mean > 0, mean, 1.0), _cosine_distance(x0, x1, confidence * closeness**2)
 
 
-def _unweighted_terms(x0: Array, x1: Array, _: Array, confidence: Array) -> tuple[Array, Array]:
+def _unweighted_terms(x0: _Values, x1: _Values, _: _Values, confidence: _Values) -> _Terms:
     """n, and the cosine distance of x0 and x1."""
     return jnp.sum(confidence), _cosine_distance(x0, x1, confidence)
 
 
-def _described_terms(x0: Array, x1: Array, distance: Array, confidence: Array) -> tuple[Array, Array]:
+def _described_terms(x0: _Values, x1: _Values, distance: _Values, confidence: _Values) -> _Terms:
     """1 if there are matches, else 0; and the sum of |x1 - x0| distance^2 / 2."""
     has_matches = jnp.any(confidence > 0).astype(confidence.dtype)
     return has_matches, jnp.sum(confidence * jnp.abs(x1 - x0) * distance**2 / 2)
 
 
-def _cosine_distance(x0: Array, x1: Array, weights: Array) -> Array:
-    """1 - cos of two vectors `[K]` with weights `[K]`; 1 if one of the vectors is 0."""
+def _cosine_distance(x0: _Values, x1: _Values, weights: _Values) -> Float[Array, ""]:
+    """1 - cos of two vectors with weights; 1 if one of the vectors is 0."""
     length0, length1 = (safe_sqrt(jnp.sum(weights * x**2)) for x in (x0, x1))
     usable = (length0 > 0) & (length1 > 0)
     unit0, unit1 = (x / jnp.where(usable, length, 1.0) for x, length in ((x0, length0), (x1, length1)))

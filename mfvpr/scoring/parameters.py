@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import GetAttrKey
+from jaxtyping import Num
 
 from mfvpr.types import Array
 
@@ -49,7 +50,9 @@ def with_parameters(scorer: Any, values: Mapping[str, Any]) -> Any:
     return reduce(lambda varied, parameter: _replace(varied, *parameter), values.items(), scorer)
 
 
-def with_capacity(scorer: Any, image_size0: Array, image_size1: Array, *, multiple: int = 1) -> Any:
+def with_capacity(
+    scorer: Any, image_size0: Num[Array, "*batch0 2"], image_size1: Num[Array, "*batch1 2"], *, multiple: int = 1
+) -> Any:
     """The scorer with the capacities that pairs of these image sizes need.
 
     Call it before `vmap` or `jit` hide the sizes. Capacities are set by the method `fit_capacity(image_size0,
@@ -57,8 +60,8 @@ def with_capacity(scorer: Any, image_size0: Array, image_size1: Array, *, multip
 
     Args:
         scorer: any scorer, or a structure of scorers; parts are looked up at any depth.
-        image_size0: `[..., 2]` px, of queries.
-        image_size1: `[..., 2]` px, of candidates.
+        image_size0: px, of queries.
+        image_size1: px, of candidates.
         multiple: capacities are multiples of it, so that many values share few programs.
     """
     has_capacity = lambda part: callable(getattr(part, "fit_capacity", None))  # noqa: E731

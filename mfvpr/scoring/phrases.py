@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float
 
 from mfvpr.scoring.fields import check_choices, choice, number, whole
 from mfvpr.scoring.shifts import match_shifts
@@ -39,16 +40,16 @@ class VisualPhrases:
         if not 1 <= self.length <= MAX_LENGTH:
             raise ValueError(f"VisualPhrases(length={self.length}): expected from 1 to {MAX_LENGTH} matches")
 
-    def __call__(self, matches: Matches) -> Array:
-        """Score of one pair, `[]` float32."""
+    def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
+        """Score of one pair, float32."""
         confidence, cells = match_confidence(matches), self._cells(matches)
         rows, columns, votes = jax.lax.sort((cells[:, 1], cells[:, 0], confidence), num_keys=2)
         differs = (rows != jnp.roll(rows, 1)) | (columns != jnp.roll(columns, 1))
         is_first = differs.at[:1].set(True)  # of its cell
         return where_finite(jnp.sum(_count_phrases(votes, is_first, self.length)), confidence, cells)
 
-    def _cells(self, matches: Matches) -> Array:
-        """`[K, 2]` (column, row) of the cell of each match's shift, integers; 0 on padding."""
+    def _cells(self, matches: Matches) -> Float[Array, "slots 2"]:
+        """(column, row) of the cell of each match's shift, integers; 0 on padding."""
         shifts = match_shifts(matches)
         size = positive(self.cell_size, shifts.dtype)
         start = shifts + size / 2 if self.align == "zero_center" else shifts
@@ -58,8 +59,10 @@ class VisualPhrases:
         return masked(cells + above.astype(cells.dtype) - below.astype(cells.dtype), matches.mask)
 
 
-def _count_phrases(votes: Array, is_first: Array, length: int) -> Array:
-    """`[K]` phrases that end with each of the sorted matches; `is_first` begins a cell."""
+def _count_phrases(
+    votes: Float[Array, " slots"], is_first: Bool[Array, " slots"], length: int
+) -> Float[Array, " slots"]:
+    """Phrases that end with each of the sorted matches; `is_first` begins a cell."""
     empty = jnp.zeros(length, votes.dtype).at[0].set(1.0)
 
     def step(shorter: Array, match: tuple[Array, Array]) -> tuple[Array, Array]:

@@ -1,13 +1,14 @@
 """Homographies of matched points: frames, models through four matches, errors, least squares.
 
-A model `[9]` is a matrix, row by row, that maps points of the candidate (1) to points of the query (0). Matches are
-`[K, 4]` coordinates x1, y1, x0, y0.
+A model is a matrix, row by row, that maps points of the candidate (1) to points of the query (0). Matches are the
+coordinates x1, y1, x0, y0.
 """
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from mfvpr.scoring.quads import areas
 from mfvpr.types import Array
@@ -22,27 +23,25 @@ class Frame(NamedTuple):
 
     Single precision is enough in these coordinates. The frame follows from the image sizes, not from the points: one
     far point would cost the others their digits.
-
-    center: `[4]`, px; scale: `[2]`, px.
     """
 
-    center: Array
-    scale: Array
+    center: Float[Array, "4"]  # px
+    scale: Float[Array, "2"]  # px
 
     @classmethod
-    def of(cls, size1: Array, size0: Array) -> "Frame":
-        """Frame of images with sizes `[2]`, px; an invalid size leaves coordinates as they are."""
+    def of(cls, size1: Float[Array, "2"], size0: Float[Array, "2"]) -> "Frame":
+        """Frame of images with sizes in px; an invalid size leaves coordinates as they are."""
         sizes = jnp.stack([size1, size0])
         half = jnp.where(jnp.isfinite(sizes) & (sizes > 0), sizes, 0.0) / 2
         scale = jnp.max(half, axis=1)
         return cls(half.reshape(4), jnp.where(scale > 0, scale, 1.0))
 
-    def normalize(self, points: Array) -> Array:
-        """Points `[K, 4]` px in the coordinates of the frame."""
+    def normalize(self, points: Float[Array, "slots 4"]) -> Float[Array, "slots 4"]:
+        """Points in px, in the coordinates of the frame."""
         return (points - self.center[None]) / jnp.repeat(self.scale, 2)[None]
 
-    def to_pixels(self, model: Array) -> Array:
-        """Matrix `[3, 3]` in px, last entry 1, of a model `[9]` in the coordinates of the frame."""
+    def to_pixels(self, model: Float[Array, "9"]) -> Float[Array, "3 3"]:
+        """Matrix in px, last entry 1, of a model in the coordinates of the frame."""
         (x1, y1, x0, y0), (scale1, scale0) = self.center, self.scale
         zero, unit = jnp.zeros_like(x1), jnp.ones_like(x1)
         enter = jnp.stack([unit, zero, -x1, zero, unit, -y1, zero, zero, scale1]).reshape(3, 3)
@@ -51,8 +50,8 @@ class Frame(NamedTuple):
         return matrix / matrix[2, 2]
 
 
-def through(four: Array) -> Array:
-    """Homographies `[9, S]` through four matches `[4, 4, S]` (x1, y1, x0, y0).
+def through(four: Float[Array, "coordinates=4 matches=4 samples"]) -> Float[Array, "9 samples"]:
+    """Homographies through four matches (x1, y1, x0, y0).
 
     No three points may lie on a line. The fourth point of the candidate is p_3 = sum_i l_i p_i, where the l_i are
     ratios of triangles; in the query, q_3 = sum_i m_i q_i. A map from p_i to (m_i / l_i) q_i for i < 3 also maps p_3 to
@@ -109,14 +108,16 @@ def is_inlier(model: Array, points: Array, threshold: Array) -> Array:
     return error <= limit
 
 
-def least_squares(model: Array, points: Array, weights: Array) -> Array:
-    """Model `[9]` with the least squared error for matches `[K, 4]`, weighted `[K]`."""
+def least_squares(
+    model: Float[Array, "9"], points: Float[Array, "slots 4"], weights: Float[Array, " slots"]
+) -> Float[Array, "9"]:
+    """Model with the least weighted squared error for matches."""
     x1, y1, x0, y0 = points.T
     plane, roots = jnp.stack([x1, y1, jnp.ones_like(x1)]), jnp.sqrt(weights)
     target = jnp.stack([x0, y0])
 
-    def errors_of(free: Array) -> tuple[Array, Array]:
-        """Weighted errors `[2, K]`, and the common factor of their derivatives `[K]`."""
+    def errors_of(free: Float[Array, "8"]) -> tuple[Float[Array, "2 slots"], Float[Array, " slots"]]:
+        """Weighted errors, and the common factor of their derivatives."""
         u, v, w = jnp.matmul(jnp.append(free, 1.0).reshape(3, 3), plane, precision=_EXACT)
         inverse = roots / w
         return jnp.stack([u, v]) * inverse[None] - target * roots[None], inverse

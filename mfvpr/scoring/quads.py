@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from mfvpr.types import Array
 
@@ -14,14 +15,10 @@ _BLOCK = 64  # of `_running_count`
 _TRIANGLE = np.tri(_BLOCK, dtype=np.float32).T
 
 
-def canonical_order(points: Array, real: Array) -> Array:
-    """`[K]` slots of the real matches, sorted by a hash of their coordinates, then padding.
+def canonical_order(points: Float[Array, "slots 4"], real: Bool[Array, " slots"]) -> Int[Array, " slots"]:
+    """Slots of the real matches, sorted by a hash of their coordinates, then padding.
 
     The order of the matches in the input has no effect.
-
-    Args:
-        points: `[K, 4]` coordinates in both images.
-        real: `[K]` bool.
     """
     bits = jax.lax.bitcast_convert_type(points.astype(jnp.float32) + 0.0, jnp.uint32)  # 0 and -0 are equal
     code = jnp.zeros(real.shape, jnp.uint32)
@@ -31,8 +28,8 @@ def canonical_order(points: Array, real: Array) -> Array:
     return jax.lax.sort((*keys, jnp.arange(len(real), dtype=jnp.int32)), num_keys=len(keys))[-1]
 
 
-def draw(key: Array, round_number: Array, count: Array) -> Array:
-    """`[4, S]` int32: four distinct numbers below `count` (at least 4), all sets equally likely."""
+def draw(key: Array, round_number: Int[Array, ""] | int, count: Int[Array, ""] | int) -> Int[Array, "4 draws"]:
+    """Four distinct numbers below `count` (at least 4), all sets equally likely."""
     bits = jax.random.bits(jax.random.fold_in(key, round_number), (4, _DRAWS), jnp.uint32)
     share = (bits >> 8).astype(jnp.float32) * 2.0**-24
     remaining = count - jnp.arange(4, dtype=jnp.int32)  # numbers that are not taken yet
@@ -45,14 +42,16 @@ def draw(key: Array, round_number: Array, count: Array) -> Array:
     return jnp.stack(taken)
 
 
-def draw_samples(points: Array, key: Array, round_number: Array, count: Array) -> tuple[Array, Array]:
-    """Draw samples: (x1, y1, x0, y0) of four matches each, `[4, 4, R]`, and their number.
+def draw_samples(
+    points: Float[Array, "slots 4"], key: Array, round_number: Array, count: Array
+) -> tuple[Float[Array, "coordinates=4 matches=4 samples"], Int[Array, ""]]:
+    """Draw samples: (x1, y1, x0, y0) of four matches each, and their number.
 
-    Only so many of the R entries are samples. As in OpenCV's findHomography, a draw is rejected if no camera can see
+    Only so many of the entries are samples. As in OpenCV's findHomography, a draw is rejected if no camera can see
     it: three of the points lie on a line in one image, or some but not all triangles change their orientation.
 
     Args:
-        points: `[K, 4]` coordinates, the real matches first.
+        points: coordinates, the real matches first.
         key: of all rounds.
         round_number: from 0.
         count: number of real matches, at least 4.
@@ -64,20 +63,22 @@ def draw_samples(points: Array, key: Array, round_number: Array, count: Array) -
     return _gather(points, index), jnp.minimum(number[-1].astype(jnp.int32), ROUND)
 
 
-def areas(x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
-    """Twice the signed areas of the `_TRIANGLES` of four points `[4, ...]`."""
+def areas(x: Float[Array, "4 ..."], y: Float[Array, "4 ..."]) -> tuple[Array, Array, Array, Array]:
+    """Twice the signed areas of the `_TRIANGLES` of four points."""
     x, y = x - x[:1], y - y[:1]
     a012, a013, a023 = (x[i] * y[j] - x[j] * y[i] for i, j in ((1, 2), (1, 3), (2, 3)))
     return a012, a013, a023, a023 + a012 - a013
 
 
-def _gather(points: Array, index: Array) -> Array:
-    """Coordinates `[4, 4, S]` (x1, y1, x0, y0) of the matches `index` `[4, S]`."""
+def _gather(
+    points: Float[Array, "slots coordinates=4"], index: Int[Array, "matches=4 samples"]
+) -> Float[Array, "coordinates=4 matches=4 samples"]:
+    """Coordinates (x1, y1, x0, y0) of the matches `index`."""
     return jnp.moveaxis(points.at[index].get(mode="promise_in_bounds"), 2, 0)
 
 
-def _is_degenerate(samples: Array) -> Array:
-    """`[S]` bool: some but not all triangles change their orientation, or a triangle is flat."""
+def _is_degenerate(samples: Float[Array, "coordinates=4 matches=4 samples"]) -> Bool[Array, " samples"]:
+    """Some but not all triangles change their orientation, or a triangle is flat."""
     x1, y1, x0, y0 = samples
     same_orientation, flat = [], []
     for area1, area0, (corner, *ends) in zip(areas(x1, y1), areas(x0, y0), _TRIANGLES, strict=True):
@@ -89,8 +90,8 @@ def _is_degenerate(samples: Array) -> Array:
     return ((number != 0) & (number != len(same_orientation))) | jnp.any(jnp.stack(flat), axis=0)
 
 
-def _running_count(hits: Array) -> Array:
-    """`[S]` float32 cumulative sum of booleans; a matrix product is faster than a scan."""
+def _running_count(hits: Bool[Array, " samples"]) -> Float[Array, " samples"]:
+    """Cumulative sum of booleans; a matrix product is faster than a scan."""
     within = jnp.matmul(hits.astype(jnp.float32).reshape(-1, _BLOCK), _TRIANGLE)
     before = jnp.cumsum(within[:, -1]) - within[:, -1]
     return (within + before[:, None]).reshape(-1)

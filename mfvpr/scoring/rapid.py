@@ -1,6 +1,8 @@
 """Rapid spatial score of Patch-NetVLAD (CVPR 2021): matches count less, the further they are from the mean shift."""
 
+import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float
 
 from mfvpr.scoring.fields import check_choices, choice, flag, numbers
 from mfvpr.scoring.shifts import image_sizes, match_shifts, query_features
@@ -33,8 +35,8 @@ class RapidSpatialScore:
     def __post_init__(self) -> None:
         check_choices(self)
 
-    def __call__(self, matches: Matches) -> Array:
-        """Score of one pair, `[]` float32.
+    def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
+        """Score of one pair, float32.
 
         Raises:
             InputError: `per_feature` is set, and the matches have no `count0`.
@@ -47,8 +49,10 @@ class RapidSpatialScore:
             score = score / query_features(matches)
         return where_finite(score, confidence, shifts)
 
-    def _reach(self, matches: Matches, shifts: Array, real: Array) -> Array:
-        """`[2]` X and Y; 0 if they are a maximum over no matches."""
+    def _reach(
+        self, matches: Matches, shifts: Float[Array, "slots 2"], real: Bool[Array, " slots"]
+    ) -> Float[Array, "2"]:
+        """X and Y; 0 if they are a maximum over no matches."""
         if self.size is not None:
             return jnp.asarray(self.size, shifts.dtype)
         if self.reach == "image_size":

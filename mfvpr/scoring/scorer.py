@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from mfvpr.types import Array, Matches
 from mfvpr.utils.errors import InputError
@@ -38,8 +39,8 @@ def check_host(scorer: Any) -> None:
                          "with @mfvpr.value")  # fmt: skip
 
 
-def score_pairs(scorer: Any, matches: Matches) -> np.ndarray:
-    """Scores `[P]` float32 of pairs `[P, K, ...]` by the method `score_pairs` of a scorer.
+def score_pairs(scorer: Any, matches: Matches) -> Float[np.ndarray, " pairs"]:
+    """Scores of pairs `[P, K, ...]`, float32, by the method `score_pairs` of a scorer.
 
     Raises:
         InputError: the method does not return a real number for each pair.
@@ -52,7 +53,7 @@ def score_pairs(scorer: Any, matches: Matches) -> np.ndarray:
     return scores.astype(np.float32)
 
 
-def require_real(name: str, scores: Array | np.ndarray) -> None:
+def require_real(name: str, scores: Array) -> None:
     """Raise an InputError unless the scores are real numbers."""
     if scores.dtype.kind not in "fiub" and scores.dtype != jnp.bfloat16:
         raise InputError(f"{name}: expected real numbers as scores, got {scores.dtype}")

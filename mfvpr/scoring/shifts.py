@@ -3,15 +3,17 @@
 import math
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float, Num
 
 from mfvpr.types import Array, Matches
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import at_least_single, masked
 
 
-def match_shifts(matches: Matches) -> Array:
-    """`[K, 2]` points1 - points0 of one pair, px; 0 on padding."""
+def match_shifts(matches: Matches) -> Float[jax.Array, "slots 2"]:
+    """points1 - points0 of one pair, px; 0 on padding."""
     start, end = (masked(at_least_single(points), matches.mask) for points in (matches.points0, matches.points1))
     return end - start
 
@@ -34,13 +36,15 @@ def compensate_scale(matches: Matches, scale: float) -> Matches:
     return replace(matches, points0=points0, points1=points1)
 
 
-def _scale_about_center(points: Array, image_size: Array, factor: float) -> Array:
+def _scale_about_center(
+    points: Num[Array, "slots 2"], image_size: Num[Array, "2"], factor: float
+) -> Float[Array, "slots 2"]:
     center = at_least_single(image_size)[None] / 2
     return center + factor * (at_least_single(points) - center)
 
 
-def image_sizes(matches: Matches) -> tuple[Array, Array]:
-    """Sizes `[2]` (width, height) of query and candidate, px.
+def image_sizes(matches: Matches) -> tuple[Float[jax.Array, "2"], Float[jax.Array, "2"]]:
+    """Sizes (width, height) of query and candidate, px.
 
     An invalid size of a pair without matches is replaced by 1.
     """
@@ -50,8 +54,8 @@ def image_sizes(matches: Matches) -> tuple[Array, Array]:
     return masked(size0, usable(size0), 1.0), masked(size1, usable(size1), 1.0)
 
 
-def query_features(matches: Matches) -> Array:
-    """Number of the query's keypoints, at least 1, `[]` float32: divisor of scores per feature.
+def query_features(matches: Matches) -> Float[jax.Array, ""]:
+    """Number of the query's keypoints, at least 1, float32: divisor of scores per feature.
 
     Raises:
         InputError: the matches have no `count0`.
@@ -62,20 +66,26 @@ def query_features(matches: Matches) -> Array:
     return jnp.maximum(jnp.asarray(matches.count0, jnp.float32), 1.0)
 
 
-def where_usable(values: Array, matches: Matches, shifts: Array, weights: Array, usable: Array) -> Array:
+def where_usable(
+    values: Float[Array, "*weightings"],
+    matches: Matches,
+    shifts: Float[Array, "..."],
+    weights: Float[Array, "_ slots"],
+    usable: Bool[Array, ""],
+) -> Float[jax.Array, "*weightings"]:
     """Values of one pair where they mean something; 0 without matches, NaN if not usable.
 
     Args:
-        values: `[W]`, or `[...]` if W = 1.
-        matches: `[K, ...]`.
+        values: `[W]`, or of any shape with a single weighting.
+        matches: of the pair.
         shifts: of the matches; a shift that is not finite makes all values NaN.
-        weights: `[W, K]` of the matches; a weight that is not finite makes its value NaN.
-        usable: `[]` bool, False makes all values NaN.
+        weights: of the matches, by weighting; a weight that is not finite makes its value NaN.
+        usable: False makes all values NaN.
     """
     usable = usable & are_finite(shifts, weights)
     return jnp.where(jnp.any(matches.mask), jnp.where(usable, values, jnp.nan), 0.0)
 
 
-def are_finite(shifts: Array, weights: Array) -> Array:
-    """`[W]` whether all shifts and the weights `[W, K]` are finite."""
+def are_finite(shifts: Float[Array, "..."], weights: Float[Array, "weightings slots"]) -> Bool[Array, " weightings"]:
+    """Whether all shifts and the weights are finite."""
     return jnp.all(jnp.isfinite(shifts)) & jnp.all(jnp.isfinite(weights), axis=1)

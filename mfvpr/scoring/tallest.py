@@ -23,6 +23,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float, Int
 
 from mfvpr.scoring.lattice import Lattice, gaussian, pool_bins, votes_along
 from mfvpr.types import Array
@@ -36,14 +37,19 @@ _SLACK_PER_MATCH = 2**-22  # relative; covers the rounding of sums
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(3,))
-def tallest_bins(shifts: Array, weights: Array, lattice: Lattice, capacity: int) -> Array:
-    """Scores `[C, W]` of the tallest bins of C pairs, with W weights of each match.
+def tallest_bins(
+    shifts: Float[Array, "candidates 2 slots"],
+    weights: Float[Array, "candidates weightings slots"],
+    lattice: Lattice,
+    capacity: int,
+) -> Float[Array, "candidates weightings"]:
+    """Scores of the tallest bins of pairs, with several weights of each match.
 
     The derivative is the one of the maximum over all bins.
 
     Args:
-        shifts: `[C, 2, K]` along x and along y.
-        weights: `[C, W, K]`, 0 on padding; a weight that is not finite makes its score NaN.
+        shifts: along x and along y.
+        weights: 0 on padding; a weight that is not finite makes its score NaN.
         lattice: `[C, ...]`, of at most `capacity` bins along each axis.
         capacity: static.
     """
@@ -67,8 +73,10 @@ def _all_bins(pairs: Any, capacity: int, *, batch_size: int | None = None) -> Ar
     return jax.lax.map(lambda pair: pool_bins(*pair, capacity=capacity), pairs, batch_size=batch_size)
 
 
-def search_blocks(shifts: Array, weights: Array, lattice: Lattice, capacity: int) -> tuple[Array, Array]:
-    """Scores `[W]` of the tallest bins of one pair, and whether no bin can be taller."""
+def search_blocks(
+    shifts: Float[Array, "2 slots"], weights: Float[Array, "weightings slots"], lattice: Lattice, capacity: int
+) -> tuple[Float[Array, " weightings"], Bool[Array, ""]]:
+    """Scores of the tallest bins of one pair, and whether no bin can be taller."""
     side = block_side(capacity)
     count = -(-capacity // side)
     usable = jnp.all(jnp.isfinite(weights), axis=1)
@@ -100,8 +108,10 @@ def block_side(capacity: int) -> int:
     return 2 if capacity <= 48 else 3 if capacity <= 96 else 4 if capacity <= 256 else 8
 
 
-def block_bounds(shifts: Array, weights: Array, lattice: Lattice, side: int, count: int) -> Array:
-    """Upper bounds `[count (y), W, count (x)]` of the bins of every block, 0 out of range."""
+def block_bounds(
+    shifts: Float[Array, "2 slots"], weights: Float[Array, "weightings slots"], lattice: Lattice, side: int, count: int
+) -> Float[Array, "blocks_y weightings blocks_x"]:
+    """Upper bounds of the bins of every block, 0 out of range."""
     width = side * lattice.bin_size
     narrow = width <= lattice.deviation
     start = side * jnp.arange(count + 1, dtype=shifts.dtype)
@@ -118,8 +128,15 @@ def block_bounds(shifts: Array, weights: Array, lattice: Lattice, side: int, cou
     return jnp.where(y[:, None, None] & x[None, None], bounds, 0.0)
 
 
-def _block_votes(shifts: Array, axis: int, start: Array, lattice: Lattice, side: int, narrow: Array) -> Array:
-    """`[count + 1, K]` votes along one axis for the first bin of narrow blocks, else the nearest."""
+def _block_votes(
+    shifts: Float[Array, " slots"],
+    axis: int,
+    start: Float[Array, " blocks"],
+    lattice: Lattice,
+    side: int,
+    narrow: Array,
+) -> Float[Array, "blocks slots"]:
+    """Votes along one axis for the first bin of narrow blocks, else the nearest."""
     last = lattice.num_bins[axis] - 1
     lower = lattice.centers(axis, start)[:, None]
     upper = lattice.centers(axis, jnp.minimum(start + (side - 1), last))[:, None]
@@ -132,8 +149,15 @@ def _block_votes(shifts: Array, axis: int, start: Array, lattice: Lattice, side:
     return gaussian(distance, lattice.deviation, jnp.where(narrow, jnp.inf, truncate))
 
 
-def evaluate_blocks(blocks: Array, shifts: Array, weights: Array, lattice: Lattice, side: int, count: int) -> Array:
-    """Scores `[W]` of the tallest bin within range in blocks `[n]`."""
+def evaluate_blocks(
+    blocks: Int[Array, " blocks"],
+    shifts: Float[Array, "2 slots"],
+    weights: Float[Array, "weightings slots"],
+    lattice: Lattice,
+    side: int,
+    count: int,
+) -> Float[Array, " weightings"]:
+    """Scores of the tallest bin within range in some blocks."""
     inner = jnp.arange(side, dtype=shifts.dtype)[None]
 
     def along(axis: int, block: Array) -> Array:

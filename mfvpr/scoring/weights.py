@@ -6,7 +6,9 @@ Weights of padding are arbitrary; scorers use `match_weights`, where they are 0.
 from collections.abc import Callable
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
+from jaxtyping import Float, Num
 
 from mfvpr.types import INDICES, Array, Matches, per_match, value
 from mfvpr.utils.errors import InputError
@@ -19,7 +21,7 @@ Weight = Callable[[Matches], Array]
 class FeatureScoreWeight:
     """FS-weight: w = scores0 + scores1, in units of the detector's scores."""
 
-    def __call__(self, matches: Matches) -> Array:
+    def __call__(self, matches: Matches) -> Float[jax.Array, "*batch slots"]:
         return as_float(matches.scores0) + as_float(matches.scores1)
 
 
@@ -27,7 +29,7 @@ class FeatureScoreWeight:
 class DescriptorDistanceWeight:
     """DMF-weight: w = 2 - distance, in [0, 2]."""
 
-    def __call__(self, matches: Matches) -> Array:
+    def __call__(self, matches: Matches) -> Float[Array, "*batch slots"]:
         return 2.0 - matches.distance
 
 
@@ -45,8 +47,8 @@ class RatioWeight:
 
     exponent: float | Array = 1.0
 
-    def __call__(self, matches: Matches) -> Array:
-        """Weights `[K]`.
+    def __call__(self, matches: Matches) -> Float[jax.Array, "*batch slots"]:
+        """Weights of the matches.
 
         Raises:
             InputError: the matches have no ratio.
@@ -60,7 +62,7 @@ class RatioWeight:
 class UnitWeight:
     """w = 1: every match counts the same."""
 
-    def __call__(self, matches: Matches) -> Array:
+    def __call__(self, matches: Matches) -> Num[jax.Array, "*batch slots"]:
         return jnp.ones_like(matches.distance)
 
 
@@ -71,7 +73,7 @@ class ChosenWeight:
     options: tuple[Weight, ...]
     index: int | Array
 
-    def __call__(self, matches: Matches) -> Array:
+    def __call__(self, matches: Matches) -> Float[jax.Array, "*batch slots"]:
         return jnp.stack([as_float(weight(matches)) for weight in self.options])[self.index]
 
 
@@ -83,8 +85,8 @@ WEIGHTS: dict[str, Weight] = {
 }
 
 
-def match_weights(weight: Weight, matches: Matches) -> Array:
-    """`[K]` weights times the matches' confidence, 0 on padding."""
+def match_weights(weight: Weight, matches: Matches) -> Float[jax.Array, " slots"]:
+    """Weights times the matches' confidence, 0 on padding."""
     # Padding is set to 1 before the weight's arithmetic: its NaN would reappear in the gradients.
     clean = {
         name: masked(values if name in INDICES else at_least_single(values), matches.mask, 1)
@@ -94,8 +96,8 @@ def match_weights(weight: Weight, matches: Matches) -> Array:
     return weights if matches.confidence is None else weights * match_confidence(matches)
 
 
-def match_ratio(matches: Matches) -> Array:
-    """`[..., K]` the matches' ratio.
+def match_ratio(matches: Matches) -> Float[jax.Array, "*batch slots"]:
+    """The matches' ratio.
 
     Raises:
         InputError: the matches have no ratio.
@@ -105,7 +107,7 @@ def match_ratio(matches: Matches) -> Array:
     return as_float(matches.ratio)
 
 
-def match_confidence(matches: Matches) -> Array:
-    """`[K]` the matches' confidence, by default 1, and 0 on padding. Confidence 0 means no match."""
+def match_confidence(matches: Matches) -> Float[jax.Array, "*batch slots"]:
+    """The matches' confidence, by default 1, and 0 on padding. Confidence 0 means no match."""
     confidence = jnp.ones_like(matches.distance) if matches.confidence is None else matches.confidence
     return masked(at_least_single(confidence), matches.mask)
