@@ -6,11 +6,12 @@ images can be used for other images.
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Bool, Float
 from scipy import optimize, special
 
 from mfvpr.reranking.results import Ranked
@@ -28,8 +29,8 @@ _FORMAT = "mfvpr confidence 2"
 
 def confidence_inputs(
     ranked: Ranked, filtered: Ranked, *, inputs: Sequence[Input] = INPUTS, apart: int = APART
-) -> np.ndarray:
-    """Inputs `[Q, F]` of the confidence in the top predictions; NaN without a prediction.
+) -> Float[np.ndarray, "queries inputs"]:
+    """Inputs of the confidence in the top predictions; NaN without a prediction.
 
     margin: log(1 + x), where x is the difference of the first score and that of the best candidate of another place,
         divided by the standard deviation of the scores of candidates of other places. If there are few of them, that is
@@ -41,9 +42,9 @@ def confidence_inputs(
     A larger input means a more confident prediction.
 
     Args:
-        ranked: of a system, `[Q, C]`.
+        ranked: of a system.
         filtered: the ranking of the same candidates by retrieval.
-        inputs: names of F inputs.
+        inputs: their names.
         apart: database images within this many rows of the prediction count as its place.
     """
     there = (ranked.rows >= 0) & np.isfinite(ranked.scores)
@@ -89,28 +90,29 @@ class Confidence:
     weights: tuple[float, ...]
     bias: float
 
-    def __call__(self, ranked: Ranked, filtered: Ranked) -> np.ndarray:
-        """Probabilities `[Q]`, NaN without a prediction; for the arguments see `confidence_inputs`."""
+    def __call__(self, ranked: Ranked, filtered: Ranked) -> Float[np.ndarray, " queries"]:
+        """Probabilities, NaN without a prediction; for the arguments see `confidence_inputs`."""
         return self.probability(confidence_inputs(ranked, filtered, inputs=self.inputs, apart=self.apart))
 
-    def probability(self, inputs: np.ndarray) -> np.ndarray:
-        """Probabilities `[Q]` from inputs `[Q, F]`; an infinite input counts as its center."""
+    def probability(self, inputs: Float[np.ndarray, "queries inputs"]) -> Float[np.ndarray, " queries"]:
+        """Probabilities from inputs; an infinite input counts as its center."""
         centered = (np.where(np.isinf(inputs), self.center, inputs) - self.center) / np.array(self.scale)
         return special.expit(centered @ np.array(self.weights) + self.bias)
 
 
 def fit_confidence(
-    values: np.ndarray, right: np.ndarray, *, inputs: Sequence[Input] = INPUTS, apart: int = APART, ridge: float = 1.0
-) -> Confidence:
+    values: Float[np.ndarray, "queries inputs"], right: Bool[np.ndarray, " queries"], *,
+    inputs: Sequence[Input] = INPUTS, apart: int = APART, ridge: float = 1.0,
+) -> Confidence:  # fmt: skip
     """Fit a logistic model with weights of at least 0 by maximum likelihood.
 
     If larger inputs go with incorrect predictions, the probability does not depend on them. If all predictions are
     correct, it stays below 1: half a correct and half an incorrect prediction are added at the center.
 
     Args:
-        values: `[Q, F]` of `confidence_inputs`; rows that are not finite, without a prediction or without candidates of
-            other places, are left out.
-        right: `[Q]` bool, whether the top prediction is correct; False for queries without a place in the database.
+        values: of `confidence_inputs`; rows that are not finite, without a prediction or without candidates of other
+            places, are left out.
+        right: whether the top prediction is correct; False for queries without a place in the database.
         inputs: names of the values.
         apart: with which the values were computed.
         ridge: penalty on weights: half of it times the sum of their squares is added to the negative log likelihood.
@@ -144,10 +146,7 @@ def fit_confidence(
 
 def write_confidences(path: Path | str, systems: Mapping[str, Confidence], recipe: Mapping[str, Any]) -> None:
     """Write the confidences of systems by name as JSON, with the recipe of their rankings (JSON values)."""
-    values = {
-        name: {field.name: getattr(confidence, field.name) for field in fields(confidence)}
-        for name, confidence in systems.items()
-    }
+    values = {name: vars(confidence) for name, confidence in systems.items()}
     content = {"format": _FORMAT, "made": recipe, "systems": values}
     write_text(Path(path), json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
@@ -159,7 +158,8 @@ def read_confidences(path: Path | str) -> tuple[dict[str, Confidence], dict[str,
         InputError: no such file, or a file of another format.
     """
     path = Path(path)
-    require_file(path, "the confidence.json that an evaluation wrote")
+    expected = "the confidence.json that an evaluation wrote"
+    require_file(path, expected)
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["format"] != _FORMAT:
@@ -167,8 +167,8 @@ def read_confidences(path: Path | str) -> tuple[dict[str, Confidence], dict[str,
         return {name: _confidence(**values) for name, values in content["systems"].items()}, dict(content["made"])
     except (OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         reason = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
-        raise InputError(f"{path}: expected the confidence.json that an evaluation wrote ({reason}); evaluate images "
-                         "with ground truth to make one") from error  # fmt: skip
+        fix = "evaluate images with ground truth to make one"
+        raise InputError(f"{path}: expected {expected} ({reason}); {fix}") from error
 
 
 def _confidence(*, inputs: list[Input], apart: int, bias: float, **vectors: list[float]) -> Confidence:

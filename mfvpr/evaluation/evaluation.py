@@ -9,7 +9,7 @@ Features, shortlist and matches are kept in the folder of a cache, if it has one
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
 
@@ -37,27 +37,16 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import Device
 from mfvpr.utils.progress import Stopwatch
 
-Tools = tuple[Extractor | Source, Filter, int | Literal["all"]]
 Scored = tuple[Matched, dict[str, np.ndarray]]  # a sequence, and its scores [Q, C] by name of the scorer
 
 
 def evaluate(
-    dataset: Dataset,
-    extractor: Extractor | Source,
-    filter: Filter,
-    scorers: Mapping[str, Scorer],
-    *,
-    candidates: int | Literal["all"] = 50,
-    matching: Matcher = NEIGHBORS,
-    fused: Mapping[str, Fusion] | None = None,
-    correlated: Mapping[str, FrameCorrelation] | None = None,
-    cohort: int | None = None,
-    ties: Ties = "filter",
-    cache: FeatureCache | None = None,
-    memory: float | None = None,
-    devices: Sequence[Device] | None = None,
-    watch: Stopwatch | None = None,
-) -> Result:
+    dataset: Dataset, extractor: Extractor | Source, filter: Filter, scorers: Mapping[str, Scorer], *,
+    candidates: int | Literal["all"] = 50, matching: Matcher = NEIGHBORS,
+    fused: Mapping[str, Fusion] | None = None, correlated: Mapping[str, FrameCorrelation] | None = None,
+    cohort: int | None = None, ties: Ties = "filter", cache: FeatureCache | None = None, memory: float | None = None,
+    devices: Sequence[Device] | None = None, watch: Stopwatch | None = None,
+) -> Result:  # fmt: skip
     """Rank every query's candidates by every scorer.
 
     Args:
@@ -68,95 +57,124 @@ def evaluate(
         candidates: number of candidates of each query.
         matching: matches a pair, see `mfvpr.Matcher`.
         fused: by name of a scorer, how its score is combined with the retrieval's (system `name + filter`), or with
-            other scorers' and the retrieval's (`name + other + filter`); see `mfvpr.reranking.fusion.Fusion`.
+            other scorers' and the retrieval's (`name + other + filter`).
         correlated: by name of a scorer or a fused system, how its scores are correlated with those of the queries
             before (`name + frames`).
-        cohort: rank by every scorer with a cohort as well: database images that score high with other places lose as
-            much (`mfvpr.reranking.cohort_normalization`). The number says how many frames on both sides of an image
-            show its place, and are left out; None = no cohort.
+        cohort: rank with a cohort as well, see `mfvpr.reranking.cohort_normalization`: the number of frames on both
+            sides of a database image that show its place, and are left out; None = no cohort.
         ties: equal scores keep the order of the retrieval, or go by the row of the database: "filter", "index".
         cache: where features and matches are kept; None = in memory.
         memory: GB that features of the database may take on the devices, and matches that are kept in memory; None = a
             third of what is free.
         devices: that share the queries; None = the one that JAX takes.
-        watch: gets the seconds of the stages. A cohort is a stage of its own. The extraction of local features always
-            counts as the stage `features`.
+        watch: gets the seconds of the stages. Extraction always counts as `features`; a cohort is a stage of its own.
 
     Raises:
         InputError: arguments, images, stores or features that cannot be used, or an invalid result of an extractor, the
             retrieval or a scorer; one line says which, and how to fix it.
         NotYet: this shard has done its part, but other shards have not; see `mfvpr.storage.shards`.
     """
-    fused, correlated = fused or {}, correlated or {}
+    fused, correlated, watch = fused or {}, correlated or {}, watch or Stopwatch()
     check_request(scorers, fused, correlated, ties, memory, cohort=cohort is not None)
-    watch = watch or Stopwatch()
     cache = replace(cache or FeatureCache(), watch=watch)
-    tools = (extractor, filter, candidates)
-    options = {"matching": matching, "cache": cache, "memory": memory, "devices": devices}
-    calls = [partial(_score, dataset, sequence, tools, scorers, watch, **options) for sequence in dataset.sequences]
-    if cohort is not None:
-        sequence = cohort_sequence(cache.contents(dataset.database), cohort)
-        calls.insert(0, partial(_score_cohort, dataset, sequence, tools, scorers, watch, **options))
-    scored: list[Scored] = together(*calls)
-    strengths = {} if cohort is None else _hubness(*scored.pop(0), len(dataset.database))
+    where = {"memory": memory, "devices": devices}
+    scoring = _Scoring(dataset, (extractor, filter, candidates), scorers, matching, cache, where)
+    calls = [partial(scoring.score, sequence, watch) for sequence in dataset.sequences]
+    of_cohort = [] if cohort is None else [partial(scoring.score_cohort, cohort, watch)]
+    scored: list[Scored] = together(*of_cohort, *calls)
+    strengths = scoring.hubness(*scored.pop(0)) if of_cohort else {}
+    ranked = [rank_sequence(*result, fused, correlated, ties, hubness=strengths) for result in scored]
     matched = [sequence for sequence, _ in scored]
-    ranked = [
-        rank_sequence(sequence, scores, fused, correlated, ties, hubness=strengths) for sequence, scores in scored
-    ]
     for line in score_warnings(matched, ranked, scorers):
         cache.warn(line)
     systems = {name: [by_system[name] for by_system in ranked] for name in ranked[0]}
     return Result(dataset, matched, systems, watch.seconds)
 
 
-def _score(
-    dataset: Dataset,
-    sequence: QuerySequence,
-    tools: Tools,
-    scorers: Mapping[str, Scorer],
-    watch: Stopwatch,
-    *,
-    cache: FeatureCache,
-    label: str = "",
-    **options: Any,
-) -> Scored:
-    """Match and score a sequence; a shard computes scores of its own queries and reads those of other shards."""
+@dataclass(frozen=True)
+class _Scoring:
+    """Arguments of `evaluate` that determine matches and scores."""
 
-    def match(rows: Sequence[int] | None = None) -> Matched:
-        tracked: dict[str, Any] = options | ({"track": cache.track(f"{label}matching")} if label else {})
-        return match_sequence(dataset, sequence, *tools, cache=cache, watch=watch, rows=rows, **tracked)
+    dataset: Dataset
+    tools: tuple[Extractor | Source, Filter, int | Literal["all"]]  # the number of candidates last
+    scorers: Mapping[str, Scorer]
+    matching: Matcher
+    cache: FeatureCache
+    where: Mapping[str, Any]  # `memory` and `devices`
 
-    def score(matched: Matched) -> dict[str, np.ndarray]:
-        with watch("scores"):
-            track = cache.track(f"{label}scores")
-            return stages.score(scorers, matched.by_scale, matched.candidates, devices=options["devices"], track=track)
+    def score(self, sequence: QuerySequence, watch: Stopwatch, label: str = "") -> Scored:
+        """Match and score a sequence; a shard computes scores of its own queries and reads those of other shards."""
 
-    if cache.shard is None or cache.root is None:
+        def match(rows: Sequence[int] | None = None) -> Matched:
+            track = {"track": self.cache.track(f"{label}matching")} if label else {}
+            options = {"matching": self.matching, "cache": self.cache, "watch": watch, **self.where, **track}
+            return match_sequence(self.dataset, sequence, *self.tools, rows=rows, **options)
+
+        def score(matched: Matched) -> dict[str, np.ndarray]:
+            options = {"devices": self.where["devices"], "track": self.cache.track(f"{label}scores")}
+            with watch("scores"):
+                return stages.score(self.scorers, matched.by_scale, matched.candidates, **options)
+
+        if self.cache.shard is not None and self.cache.root is not None:
+            return self._share_scores(sequence, self.cache.shard, match, score)
         matched = match()
         return matched, score(matched)
-    scorer_names = sorted(scorers)
-    with _score_store(dataset, sequence, tools, scorers, options["matching"], cache) as store:
-        _write_scores(store, cache.shard, sequence.images.names, scorer_names, match, score)
 
-        def missing_rows() -> Sequence[int]:
-            store.look()
-            return np.flatnonzero(~store.done).tolist()
+    def score_cohort(self, cohort: int, watch: Stopwatch) -> Scored:
+        """Match and score the database with itself, as a stage of its own."""
+        sequence = cohort_sequence(self.cache.contents(self.dataset.database), cohort)
+        with watch(COHORT):
+            return self.score(sequence, Stopwatch(), "cohort ")
 
-        cache.shard.wait(
-            missing_rows, sequence.images.names, f"{sequence.name} scores", patience=cache.patience, is_complete=True
-        )
-        stored = [query for _, query in store.read()]
-    matched = match()
-    if (np.stack([query.indices for query in stored]) != matched.candidates.indices).any():
-        raise InputError(f"{store.folder}: expected scores of these candidates, got those of another shortlist; delete "
-                         "this folder, and run again")  # fmt: skip
-    by_scorer = np.stack([query.scores for query in stored], axis=1)
-    return matched, {name: by_scorer[scorer_names.index(name)] for name in scorers}
+    def hubness(self, matched: Matched, scores: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Hubness `[N]` of the database images by name of the scorer, from the matches and scores of the cohort."""
+        size = len(self.dataset.database)
+        return {name: hubness(matched.candidates, values, size, name=name) for name, values in scores.items()}
+
+    def _share_scores(
+        self, sequence: QuerySequence, shard: Shard,
+        match: Callable[..., Matched], score: Callable[[Matched], dict[str, np.ndarray]],
+    ) -> Scored:  # fmt: skip
+        names, scorer_names = sequence.images.names, sorted(self.scorers)
+        with self._open_store(sequence) as store:
+            _write_scores(store, shard, names, scorer_names, match, score)
+
+            def missing_rows() -> Sequence[int]:
+                store.look()
+                return np.flatnonzero(~store.done).tolist()
+
+            label, patience = f"{sequence.name} scores", self.cache.patience
+            shard.wait(missing_rows, names, label, patience=patience, is_complete=True)
+            stored = [query for _, query in store.read()]
+        matched = match()
+        if (np.stack([query.indices for query in stored]) != matched.candidates.indices).any():
+            raise InputError(f"{store.folder}: expected scores of these candidates, got those of another shortlist; "
+                             "delete this folder, and run again")  # fmt: skip
+        by_scorer = np.stack([query.scores for query in stored], axis=1)
+        return matched, {name: by_scorer[scorer_names.index(name)] for name in self.scorers}
+
+    def _open_store(self, sequence: QuerySequence) -> ScoreStore:
+        """Open a shard's store of scores. Its recipe has the code of the scorers, but not of functions they call."""
+        if self.cache.root is None or not self.scorers:
+            raise InputError("scorers: expected at least one, got none; a shard keeps their scores")
+        recipes = {}
+        for name, scorer in self.scorers.items():
+            try:
+                recipes[name] = self.cache.recipe_of(scorer)
+            except TypeError as error:
+                raise InputError(f"{name}: a shard keeps scores, and must know what makes them: {error}") from None
+        recipe = {
+            "matches": matches_recipe(self.dataset, sequence, *self.tools, self.matching, self.cache),
+            "scorers": recipes,
+            "scale weights": [scale.weight for scale in self.tools[0].scales],
+        }
+        path = store_path(self.cache.root, "scores", recipe, SCORES)
+        return open_score_store(path, recipe, num_queries=len(sequence.images), **self.cache.store_options)
 
 
 def _write_scores(
     store: ScoreStore, shard: Shard, names: Sequence[str], scorer_names: Sequence[str],
-    match: Callable[[Sequence[int]], Matched], score: Callable[[Matched], dict[str, np.ndarray]],
+    match: Callable[..., Matched], score: Callable[[Matched], dict[str, np.ndarray]],
 ) -> None:  # fmt: skip
     """Match and score the queries of a shard, and write the missing scores."""
     rows = shard.rows(names)
@@ -169,38 +187,3 @@ def _write_scores(
             by_query = np.stack([scores[name] for name in scorer_names], axis=1)
             queries = dict(zip(rows, map(QueryScores, by_query, np.asarray(matched.candidates.indices)), strict=True))
             store.write({row: queries[row] for row in missing})
-
-
-def _score_store(
-    dataset: Dataset, sequence: QuerySequence, tools: Tools, scorers: Mapping[str, Scorer], matching: Matcher,
-    cache: FeatureCache,
-) -> ScoreStore:  # fmt: skip
-    """Open a shard's store of scores. Its recipe covers the code of the scorers, but not of functions they call."""
-    if cache.root is None or not scorers:
-        raise InputError("scorers: expected at least one, got none; a shard keeps their scores")
-    recipes, extractor = {}, tools[0]
-    for name, scorer in scorers.items():
-        try:
-            recipes[name] = cache.recipe_of(scorer)
-        except TypeError as error:
-            raise InputError(f"{name}: a shard keeps scores, and must know what makes them: {error}") from None
-    recipe = {
-        "matches": matches_recipe(dataset, sequence, *tools, matching, cache),
-        "scorers": recipes,
-        "scale weights": [scale.weight for scale in extractor.scales],
-    }
-    path = store_path(cache.root, "scores", recipe, SCORES)
-    return open_score_store(path, recipe, num_queries=len(sequence.images), **cache.store_options)
-
-
-def _hubness(matched: Matched, scores: Mapping[str, np.ndarray], num_database: int) -> dict[str, np.ndarray]:
-    """Hubness `[N]` of the database images by name of the scorer, from the matches and scores of the cohort."""
-    return {name: hubness(matched.candidates, values, num_database, name=name) for name, values in scores.items()}
-
-
-def _score_cohort(
-    dataset: Dataset, sequence: QuerySequence, tools: Tools, scorers: Any, watch: Stopwatch, **options: Any
-) -> Scored:
-    """Match and score the database with itself, as a stage of its own."""
-    with watch(COHORT):
-        return _score(dataset, sequence, tools, scorers, Stopwatch(), label="cohort ", **options)

@@ -1,6 +1,7 @@
 """The order of places along a path. Neighbors fail together, which confidence intervals and tests must consider."""
 
 import numpy as np
+from jaxtyping import Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
@@ -8,8 +9,8 @@ from mfvpr.datasets.positives import Positives
 from mfvpr.datasets.truth import Unit
 
 
-def places_along_path(shown: Positives, unit: Unit) -> np.ndarray:
-    """Places `[Q]` of the queries of one or several drives: whole numbers from 0 in the order of the map.
+def places_along_path(shown: Positives, unit: Unit) -> Int[np.ndarray, " queries"]:
+    """Places of the queries of one or several drives: whole numbers from 0 in the order of the map.
 
     Frames of the map are in the order of their rows. Images with positions may have any order: two images are neighbors
     if they show the place of the same query, and each connected part of the map is traversed from one of its ends. With

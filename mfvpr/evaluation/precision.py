@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from mfvpr.utils.errors import InputError
 
@@ -13,14 +14,14 @@ _DRAWS = 400
 class PrecisionRecall(NamedTuple):
     """Precision and recall if only queries with a confidence of at least a threshold have a prediction.
 
-    thresholds: `[n]` the distinct confidences of the predictions, descending.
-    precision: `[n]` fraction of the predictions that are correct.
-    recall: `[n]` correct predictions, as a fraction of the queries with positives.
+    thresholds: the distinct confidences of the predictions, descending.
+    precision: fraction of the predictions that are correct.
+    recall: correct predictions, as a fraction of the queries with positives.
     """
 
-    thresholds: np.ndarray
-    precision: np.ndarray
-    recall: np.ndarray
+    thresholds: Float[np.ndarray, " thresholds"]
+    precision: Float[np.ndarray, " thresholds"]
+    recall: Float[np.ndarray, " thresholds"]
 
     @property
     def average_precision(self) -> float:
@@ -35,14 +36,14 @@ class PrecisionRecall(NamedTuple):
 class Reliability(NamedTuple):
     """Predictions in bins of equal width of their probabilities, from 0 to 1.
 
-    probability: `[bins]` mean, NaN in an empty bin.
-    right: `[bins]` fraction of correct predictions, NaN in an empty bin.
-    count: `[bins]` of predictions.
+    probability: mean, NaN in an empty bin.
+    right: fraction of correct predictions, NaN in an empty bin.
+    count: of predictions.
     """
 
-    probability: np.ndarray
-    right: np.ndarray
-    count: np.ndarray
+    probability: Float[np.ndarray, " bins"]
+    right: Float[np.ndarray, " bins"]
+    count: Int[np.ndarray, " bins"]
 
     @property
     def calibration_error(self) -> float:
@@ -53,15 +54,16 @@ class Reliability(NamedTuple):
 
 
 def precision_recall(
-    confidence: np.ndarray, right: np.ndarray, has_answer: np.ndarray | None = None
-) -> PrecisionRecall:
+    confidence: Float[np.ndarray, " queries"], right: Bool[np.ndarray, " queries"],
+    has_answer: Bool[np.ndarray, " queries"] | None = None,
+) -> PrecisionRecall:  # fmt: skip
     """Precision and recall of top predictions at every threshold.
 
     Args:
-        confidence: `[Q]` any number that is larger for more confident predictions; NaN without a prediction.
-        right: `[Q]` bool, whether the top prediction is correct.
-        has_answer: `[Q]` bool, queries with positives in the database; None = all. A prediction for another query is
-            incorrect and lowers the precision.
+        confidence: any number that is larger for more confident predictions; NaN without a prediction.
+        right: whether the top prediction is correct.
+        has_answer: queries with positives in the database; None = all. A prediction for another query is incorrect and
+            lowers the precision.
 
     Raises:
         InputError: a correct prediction for a query without positives.
@@ -73,17 +75,17 @@ def precision_recall(
                          "ground truth.")  # fmt: skip
     order = np.argsort(-confidence, kind="stable")[: np.sum(~np.isnan(confidence))]
     thresholds, hits = confidence[order], np.cumsum(right[order])
-    ends = np.append(thresholds[1:] != thresholds[:-1], [True] * min(len(thresholds), 1))
-    last = np.flatnonzero(ends)  # equal confidences, also infinite ones, share a threshold
-    hits = hits[last]
-    return PrecisionRecall(thresholds[last], hits / (last + 1), hits / max(has_answer.sum(), 1))
+    # Equal confidences, also infinite ones, share a threshold.
+    last = np.flatnonzero(np.append(thresholds[1:] != thresholds[:-1], [True] * min(len(thresholds), 1)))
+    return PrecisionRecall(thresholds[last], hits[last] / (last + 1), hits[last] / max(has_answer.sum(), 1))
 
 
-def reliability(probability: np.ndarray, right: np.ndarray, *, bins: int = BINS) -> Reliability:
-    """Compare probabilities `[Q]` with the fractions of correct predictions; NaN probabilities are left out."""
-    probability, right = np.asarray(probability, np.float64), np.asarray(right, bool)
+def reliability(
+    probability: Float[np.ndarray, " queries"], right: Bool[np.ndarray, " queries"], *, bins: int = BINS
+) -> Reliability:
+    """Compare probabilities with the fractions of correct predictions; NaN probabilities are left out."""
     there = ~np.isnan(probability)
-    probability, right = probability[there], right[there]
+    probability, right = probability[there], np.asarray(right, bool)[there]
     place = np.clip((probability * bins).astype(int), 0, bins - 1)
     count = np.bincount(place, minlength=bins)
     divisor = np.where(count > 0, count, np.nan)
@@ -91,9 +93,8 @@ def reliability(probability: np.ndarray, right: np.ndarray, *, bins: int = BINS)
     return Reliability(mean, share, count)
 
 
-def chance_calibration_error(probability: np.ndarray, *, bins: int = BINS, seed: int = 0) -> float:
-    """Mean `calibration_error` of perfectly calibrated probabilities `[Q]`, which is above 0 for few queries."""
-    probability = np.asarray(probability, np.float64)
+def chance_calibration_error(probability: Float[np.ndarray, " queries"], *, bins: int = BINS, seed: int = 0) -> float:
+    """Mean `calibration_error` of perfectly calibrated probabilities, which is above 0 for few queries."""
     rng = np.random.default_rng(seed)
     draws = (rng.random(len(probability)) < probability for _ in range(_DRAWS))
     return float(np.mean([reliability(probability, right, bins=bins).calibration_error for right in draws]))

@@ -6,6 +6,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from mfvpr.datasets.positives import Positives
 from mfvpr.datasets.truth import Truth, Unit, threshold_words
@@ -30,7 +31,7 @@ class Judge:
         positives: at each threshold.
         places: images of a query's place at the widest threshold, also those that are no positives.
         halves: where to choose and where to report; none = both on all queries.
-        views: candidates `[Q, C]` bool that are ranked: all, and for each half those that choosing may see.
+        views: candidates that are ranked: all, and for each half those that choosing may see.
         split: which half to choose on, or both in turn; "other sets" if the halves are complete data sets, see
             `mfvpr.tuning.learning.data_sets`; None = no halves.
         reported_sets: number of queries of each data set that is reported on, by name, if there are several sets.
@@ -41,7 +42,7 @@ class Judge:
     positives: Sequence[Positives]
     places: Positives
     halves: Sequence[Half]
-    views: Sequence[np.ndarray] = ()
+    views: Sequence[Bool[np.ndarray, "queries candidates"]] = ()
     split: Split | Literal["other sets"] | None = None
     reported_sets: Mapping[str, int] = field(default_factory=dict)
 
@@ -69,12 +70,16 @@ class Judge:
         """R@K with its threshold, for tables."""
         return f"R@{k}{threshold_words(self.unit, threshold)}"
 
-    def recall(self, rows: np.ndarray, k: int = 1) -> np.ndarray:
-        """Recall@k `[S, thresholds]` over all queries, of rankings `[S, Q, depth]`."""
+    def recall(
+        self, rows: Int[np.ndarray, "settings queries depth"], k: int = 1
+    ) -> Float[np.ndarray, "settings tolerances"]:
+        """Recall@k over all queries."""
         return np.stack([hits(rows, positives, k).mean(axis=-1) for positives in self.positives], axis=-1)
 
-    def tuning(self, rows: np.ndarray) -> np.ndarray:
-        """Recall@1 `[halves, S, thresholds]` over the queries to choose on, of rankings `[V, S, Q, depth]`."""
+    def tuning(
+        self, rows: Int[np.ndarray, "views settings queries depth"]
+    ) -> Float[np.ndarray, "halves settings tolerances"]:
+        """Recall@1 over the queries to choose on."""
         if not self.halves:
             return self.recall(rows[0])[None]
         seen = [
@@ -83,8 +88,10 @@ class Judge:
         ]
         return np.moveaxis(np.array(seen), 1, -1)
 
-    def reported_hits(self, rows: np.ndarray, chosen: Sequence[int]) -> np.ndarray:
-        """Hits `[thresholds, R]` of the queries to report on, each with the setting that was chosen without it."""
+    def reported_hits(
+        self, rows: Int[np.ndarray, "views settings queries depth"], chosen: Sequence[int]
+    ) -> Bool[np.ndarray, "tolerances reported"]:
+        """Hits of the queries to report on, each with the setting that was chosen without it."""
         if not self.halves:
             return np.stack([hits(rows[0][chosen[0]], positives) for positives in self.positives])[:, self.order]
         parts = [
@@ -93,8 +100,8 @@ class Judge:
         ]
         return self.join_halves([np.array(part) for part in parts])
 
-    def join_halves(self, parts: Sequence[np.ndarray]) -> np.ndarray:
-        """Join hits `[thresholds, r]` of each half to `[thresholds, R]` in the order of the path.
+    def join_halves(self, parts: Sequence[Bool[np.ndarray, "tolerances _"]]) -> Bool[np.ndarray, "tolerances reported"]:
+        """Join the hits of each half in the order of the path.
 
         Neighbors fail together, so confidence intervals depend on this order.
         """
@@ -102,8 +109,8 @@ class Judge:
         return np.concatenate(parts, axis=1)[:, np.argsort(place)]
 
     @cached_property
-    def order(self) -> np.ndarray:
-        """Queries `[Q]` in the order of their path, data set by data set.
+    def order(self) -> Int[np.ndarray, " queries"]:
+        """Queries in the order of their path, data set by data set.
 
         This is the order of their rows, except for positions in meters, whose images may have any order.
         """

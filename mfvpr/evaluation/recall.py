@@ -5,8 +5,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from mfvpr.datasets.positives import Positives
+from mfvpr.types import Array
 
 
 @dataclass(frozen=True)
@@ -14,15 +16,15 @@ class Tally:
     """Recall@K as counts, which can be added over shards, sequences and the parts of an interrupted run.
 
     Attributes:
-        right: `[len(ks)]` number of queries with a positive among their first k.
+        right: number of queries with a positive among their first k.
         queries: number of all queries.
     """
 
-    right: np.ndarray
+    right: Int[np.ndarray, " ks"]
     queries: int
 
     @classmethod
-    def of(cls, order: Any, positives: Positives | np.ndarray, ks: Sequence[int]) -> "Tally":
+    def of(cls, order: Any, positives: Positives | Bool[Array, "queries database"], ks: Sequence[int]) -> "Tally":
         """Count the queries of a ranking; for the arguments see `recall_at_k`."""
         order = np.asarray(order)
         if order.size == 0:
@@ -37,22 +39,26 @@ class Tally:
         return Tally(self.right + other.right, self.queries + other.queries)
 
     @property
-    def recall(self) -> np.ndarray:
-        """Fractions `[len(ks)]` of all queries; 0 without queries."""
+    def recall(self) -> Float[np.ndarray, " ks"]:
+        """Fractions of all queries; 0 without queries."""
         return self.right / max(self.queries, 1)
 
 
-def hits(rows: np.ndarray, positives: Positives, k: int = 1) -> np.ndarray:
-    """Whether one of the first k `rows` `[..., Q, depth]` is a positive, `[..., Q]` bool; -1 never is."""
+def hits(
+    rows: Int[np.ndarray, "*batch queries depth"], positives: Positives, k: int = 1
+) -> Bool[np.ndarray, "*batch queries"]:
+    """Whether one of the first k database rows of a ranking is a positive; -1 never is."""
     return np.any(positives.contains(rows[..., :k]), axis=-1)
 
 
-def recall_at_k(order: Any, positives: Positives | np.ndarray, ks: Sequence[int]) -> np.ndarray:
-    """Fraction `[len(ks)]` of ALL queries with a positive among their first k.
+def recall_at_k(
+    order: Any, positives: Positives | Bool[Array, "queries database"], ks: Sequence[int]
+) -> Float[np.ndarray, " ks"]:
+    """Fraction of ALL queries with a positive among their first k.
 
     Args:
         order: `[Q, C]` database rows, best first; -1 = none.
-        positives: `Positives`, or `[Q, N]` bool. A query without positives counts as a failure.
+        positives: a query without positives counts as a failure.
         ks: depths; beyond C all C candidates count.
     """
     return Tally.of(order, positives, ks).recall

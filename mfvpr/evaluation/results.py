@@ -6,6 +6,7 @@ from functools import reduce
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from mfvpr.datasets.datasets import Dataset
 from mfvpr.datasets.positives import Positives
@@ -23,23 +24,22 @@ class Recall:
     tallies: Sequence[Sequence[Tally]]
 
     @property
-    def by_sequence(self) -> np.ndarray:
-        """`[sequences, thresholds, ks]`."""
+    def by_sequence(self) -> Float[np.ndarray, "sequences tolerances ks"]:
         return np.array([[tally.recall for tally in of_sequence] for of_sequence in self.tallies])
 
     @property
-    def queries(self) -> np.ndarray:
-        """`[sequences]` how many each has."""
+    def queries(self) -> Int[np.ndarray, " sequences"]:
+        """Number of queries of each sequence."""
         return np.array([of_sequence[0].queries for of_sequence in self.tallies])
 
     @property
-    def mean(self) -> np.ndarray:
-        """`[thresholds, ks]` plain mean over the sequences."""
+    def mean(self) -> Float[np.ndarray, "tolerances ks"]:
+        """Plain mean over the sequences."""
         return self.by_sequence.mean(axis=0)
 
     @property
-    def pooled(self) -> np.ndarray:
-        """`[thresholds, ks]` over all queries of all sequences."""
+    def pooled(self) -> Float[np.ndarray, "tolerances ks"]:
+        """Recall over all queries of all sequences."""
         return np.array([reduce(Tally.merged, of_threshold).recall for of_threshold in zip(*self.tallies, strict=True)])
 
 

@@ -1,9 +1,11 @@
 """Selection of settings: queries to choose on, queries to report on, and the best setting."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from mfvpr.datasets.positives import Positives, stack_positives
 from mfvpr.datasets.truth import Unit
@@ -13,15 +15,15 @@ from mfvpr.evaluation.paths import places_along_path
 class Half(NamedTuple):
     """Two disjoint parts of a path: settings are chosen or learned on one, and reported on the other.
 
-    tune: `[t]` query rows to choose on.
-    report: `[r]` query rows to report on.
-    allowed: `[N]` bool, database rows that may be used while choosing.
+    tune: query rows to choose on.
+    report: query rows to report on.
+    allowed: database rows that may be used while choosing.
     paths: number of queries to choose on of each path, if there are several paths one after the other.
     """
 
-    tune: np.ndarray
-    report: np.ndarray
-    allowed: np.ndarray
+    tune: Int[np.ndarray, " tune"]
+    report: Int[np.ndarray, " report"]
+    allowed: Bool[np.ndarray, " database"]
     paths: tuple[int, ...] = ()
 
 
@@ -62,7 +64,7 @@ def halves_of_map(parts: Sequence[Positives], unit: Unit) -> tuple[Half, Half]:
     return separate(together, first, second), separate(together, second, first)
 
 
-def separate(positives: Positives, tune: np.ndarray, report: np.ndarray) -> Half:
+def separate(positives: Positives, tune: Int[np.ndarray, " tune"], report: Int[np.ndarray, " report"]) -> Half:
     """Leave out query rows to choose on that share a place with a row to report on; see `halves`."""
     reported = positives.take(report).union()
     return Half(tune[positives.take(tune).among(reported).counts == 0], report, ~reported)
@@ -71,19 +73,17 @@ def separate(positives: Positives, tune: np.ndarray, report: np.ndarray) -> Half
 def neighbors(axes: Mapping[str, Sequence[Any]], setting: int) -> list[int]:
     """Numbers of the settings of a grid that differ from a setting by one step along one axis."""
     shape = tuple(map(len, axes.values()))
-    place = np.array(np.unravel_index(setting, shape))
-    numbers = []
-    for axis, length in enumerate(shape):
-        for step in (-1, 1):
-            if 0 <= place[axis] + step < length:
-                neighbor = place.copy()
-                neighbor[axis] += step
-                numbers.append(int(np.ravel_multi_index(tuple(neighbor), shape)))
-    return numbers
+    numbers = np.arange(math.prod(shape)).reshape(shape)
+    place = np.unravel_index(setting, shape)
+    around = []
+    for axis, index in enumerate(place):
+        line = numbers[(*place[:axis], slice(None), *place[axis + 1 :])]
+        around += [*line[max(index - 1, 0) : index], *line[index + 1 : index + 2]]
+    return list(map(int, around))
 
 
-def best_setting(recall: np.ndarray, axes: Mapping[str, Sequence[Any]] | None = None) -> int:
-    """The number of the setting with the highest `recall` `[S]`.
+def best_setting(recall: Float[np.ndarray, " settings"], axes: Mapping[str, Sequence[Any]] | None = None) -> int:
+    """The number of the setting with the highest recall.
 
     Among equal settings, the neighbors in the grid decide by their mean recall, which makes the choice depend less on
     luck. Then the first setting wins.
@@ -92,4 +92,4 @@ def best_setting(recall: np.ndarray, axes: Mapping[str, Sequence[Any]] | None = 
     if axes is None:
         return int(equal[0])
     around = [np.mean(recall[neighbors(axes, int(setting)) or [setting]]) for setting in equal]
-    return int(equal[int(np.argmax(around))])
+    return int(equal[np.argmax(around)])

@@ -35,18 +35,10 @@ _SHORTLIST = "shortlist.npz"  # beside the matches of shards
 
 
 def match_sequence(
-    dataset: Dataset,
-    sequence: QuerySequence,
-    extractor: Extractor | Source,
-    filter: Filter,
-    candidates: int | Literal["all"] = 50,
-    *,
-    matching: Matcher = NEIGHBORS,
-    cache: FeatureCache | None = None,
-    watch: Stopwatch | None = None,
-    rows: Sequence[int] | None = None,
-    **where: Any,
-) -> Matched:
+    dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, filter: Filter,
+    candidates: int | Literal["all"] = 50, *, matching: Matcher = NEIGHBORS, cache: FeatureCache | None = None,
+    watch: Stopwatch | None = None, rows: Sequence[int] | None = None, **where: Any,
+) -> Matched:  # fmt: skip
     """Find and match the candidates of one sequence's queries; features of other database images are not extracted.
 
     If the cache has a root, matches are kept below it. If they are all there, nothing else is read.
@@ -92,8 +84,7 @@ def match_sequence(
 
 def _find_candidates(
     sequence: QuerySequence, database: ImageFolder, filter: Filter, candidates: int | Literal["all"],
-    cache: FeatureCache,
-    stores: Sequence[MatchStore],
+    cache: FeatureCache, stores: Sequence[MatchStore],
 ) -> Filtered:  # fmt: skip
     """The shortlist; all shards use that of the first, since near ties may come out differently on other machines."""
 
@@ -123,7 +114,10 @@ def _match(
     """Extract features and match all scales."""
     with watch("features"):
         sides, remarks = _extract(dataset, sequence, extractor, filtered, cache)
-    _write_remarks(stores, cache, remarks)
+    for store in stores[:1]:  # for later runs, which read the matches and nothing else
+        write_text(store.folder / _REMARKS, json.dumps(remarks))
+    for line in remarks["warnings"]:
+        cache.warn(line)
     shortlist = filtered.candidates
     with watch("matching"):
         matches = tuple(
@@ -136,15 +130,9 @@ def _match(
 
 
 def match_cohort(
-    dataset: Dataset,
-    neighbors: int,
-    extractor: Extractor | Source,
-    filter: Filter,
-    candidates: int | Literal["all"] = 50,
-    *,
-    cache: FeatureCache | None = None,
-    **how: Any,
-) -> Matched:
+    dataset: Dataset, neighbors: int, extractor: Extractor | Source, filter: Filter,
+    candidates: int | Literal["all"] = 50, *, cache: FeatureCache | None = None, **how: Any,
+) -> Matched:  # fmt: skip
     """Match the database images among each other, once for all sequences.
 
     See `mfvpr.reranking.cohort_normalization`. Arguments not listed here are those of `match_sequence`.
@@ -216,14 +204,6 @@ def _read_matches(
     for line in warnings:
         cache.warn(line)
     return Matched(sequence, shortlists[0], match_sets, queries, database)
-
-
-def _write_remarks(stores: Sequence[MatchStore], cache: FeatureCache, remarks: Mapping[str, Any]) -> None:
-    """Warn of bad images, and keep the warnings for later runs, which read the matches and nothing else."""
-    for store in stores[:1]:
-        write_text(store.folder / _REMARKS, json.dumps(remarks))
-    for line in remarks["warnings"]:
-        cache.warn(line)
 
 
 def matches_recipe(

@@ -36,17 +36,10 @@ STORE_BATCH = 8  # queries whose matches may be lost when a run is killed
 
 
 def match(
-    queries: FeatureSet,
-    database: FeatureSet,
-    candidates: Shortlist,
-    matcher: Matcher = NEIGHBORS,
-    *,
-    memory: float | None = None,
-    devices: Sequence[Device] | None = None,
-    store: MatchStore | None = None,
-    rows: Sequence[int] | None = None,
-    track: Track = no_progress,
-) -> MatchSet:
+    queries: FeatureSet, database: FeatureSet, candidates: Shortlist, matcher: Matcher = NEIGHBORS, *,
+    memory: float | None = None, devices: Sequence[Device] | None = None, store: MatchStore | None = None,
+    rows: Sequence[int] | None = None, track: Track = no_progress,
+) -> MatchSet:  # fmt: skip
     """Match every query with its candidates; matches include their ratio, which some weights use.
 
     Args:
@@ -119,18 +112,15 @@ def stored_matches(
             f"{store.folder}: expected the matches of all {len(done)} queries, got {done.sum()}; finish the matching "
             "first"
         )
-    left, matches, lists = memory_budget(memory, jax.local_devices(backend="cpu")[:1]), [], []
-    for _, row in store.read(rows):
+    left, matches = memory_budget(memory, jax.local_devices(backend="cpu")[:1]), []
+    shape = len(rows), store.sizes["num_candidates"]
+    counts, indices, scores = (np.zeros(shape, dtype) for dtype in (np.int32, np.int32, np.float32))
+    for place, (_, row) in enumerate(store.read(rows)):
         left -= sum(leaf.nbytes for leaf in jax.tree.leaves(row.matches))
         matches.append(row.matches)
         if left < 0:
             matches.clear()
-        lists.append((row.counts, row.indices, row.filter_scores))
-    counts, indices, scores = (
-        (np.array(values).reshape(len(rows), store.sizes["num_candidates"]) for values in zip(*lists, strict=True))
-        if lists
-        else [np.zeros((0, store.sizes["num_candidates"]), np.int32)] * 3
-    )
+        counts[place], indices[place], scores[place] = row.counts, row.indices, row.filter_scores
     shortlist = Shortlist(indices=indices, scores=scores, mask=indices >= 0)
     return MatchSet.of(matches or StoredMatches(store, rows), counts), shortlist
 
