@@ -31,40 +31,35 @@ def compete(
 
     Each step has an implementation called "mfvpr"; the table shows how many times as long the others take.
     """
-    names = [(step, implementation) for step, implementation, _ in entries]
-    times, outputs = take_turns([call for _, _, call in entries], rounds)
-    seconds, results = dict(zip(names, times, strict=True)), dict(zip(names, outputs, strict=True))
-    rows = []
-    for (step, implementation), taken in seconds.items():
-        low, median, high = (1e3 * float(quantile) for quantile in np.quantile(taken, (0.25, 0.5, 0.75)))
-        rows.append({"step": step, "name": implementation, "median_ms": median, "quartiles_ms": [low, high]})
-    ours = {row["step"]: row["median_ms"] for row in rows if row["name"] == "mfvpr"}
-    rows.sort(key=lambda row: (list(ours).index(row["step"]), row["median_ms"]))
-    lines = [
-        [row["step"], row["name"], f"{row['median_ms']:.2f}", "{:.2f} .. {:.2f}".format(*row["quartiles_ms"]),
-         f"{row['median_ms'] / ours[row['step']]:.2f}"]
-        for row in rows
-    ]  # fmt: skip
+    seconds, results = take_turns(entries, rounds)
+    steps, medians = [step for step, _ in seconds], {name: float(np.median(times)) for name, times in seconds.items()}
+    rows, lines = [], []
+    for step, name in sorted(seconds, key=lambda entry: (steps.index(entry[0]), medians[entry])):
+        median, ratio = 1e3 * medians[step, name], medians[step, name] / medians[step, "mfvpr"]
+        low, high = (1e3 * float(np.quantile(seconds[step, name], share)) for share in (0.25, 0.75))
+        rows.append({"step": step, "name": name, "median_ms": median, "quartiles_ms": [low, high]})
+        lines.append([step, name, f"{median:.2f}", f"{low:.2f} .. {high:.2f}", f"{ratio:.2f}"])
     table = Table(["step", "who", "median, ms", "quartiles, ms", "/ mfvpr"], lines, text_columns=2)
     parts = [table, *remarks(seconds, results)]
     write_report(out, title, parts, {**setting, "rounds": rounds, "results": rows})
     return results
 
 
-def take_turns(calls: list[Callable[[], Any]], rounds: int) -> tuple[list[list[float]], list[Any]]:
+def take_turns(entries: list[Entry], rounds: int) -> tuple[Seconds, Results]:
     """Seconds of every call after an untimed first one, and the results of the first ones.
 
     Calls of a few milliseconds are repeated untimed before each timed one: other implementations have just emptied the
     caches, and their idle threads may still be spinning.
     """
-    results = [call() for call in bar("warm-up", len(calls), calls)]
-    seconds: list[list[float]] = [[] for _ in calls]
+    results = {(step, name): call() for step, name, call in bar("warm-up", len(entries), entries)}
+    seconds: dict[tuple[str, str], list[float]] = {name: [] for name in results}
     for _ in bar("rounds", rounds, range(rounds)):
-        for call, taken in zip(calls, seconds, strict=True):
-            quick = bool(taken) and taken[-1] < QUICK
-            for _ in range(10 if quick else 0):
+        for step, name, call in entries:
+            times = seconds[step, name]
+            is_quick = bool(times) and times[-1] < QUICK
+            for _ in range(10 if is_quick else 0):
                 call()
-            taken.append(duration(call))
+            times.append(duration(call))
     return seconds, results
 
 

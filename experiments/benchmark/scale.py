@@ -70,79 +70,65 @@ def run(rounds: int | None, out: Path, stores: Path | None = None) -> None:
         pools = []
         for data in bar("first queries", len(SETS), SETS):
             pools.append(stack.enter_context(ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))))
-            pools[-1].submit(_start, data, root, time.monotonic()).result()
+            pools[-1].submit(_next_turn, data, root, rounds or ROUNDS, time.monotonic()).result()
         turns = [pool for _ in range(rounds or ROUNDS) for pool in pools]
         for pool in bar("rounds", len(turns), turns):
-            pool.submit(_call, "take_turn").result()
-        results = {
-            data.title: pool.submit(_call, "measurements").result() for data, pool in zip(SETS, pools, strict=True)
-        }
+            pool.submit(_next_turn).result()
+        results = {data.title: pool.submit(_next_turn).result() for data, pool in zip(SETS, pools, strict=True)}
     setting = {"queries": SETS[0].queries, "candidates": CANDIDATES, "keypoints": SETS[0].keypoints, "memory": MEMORY}
     title = f"{setting['queries']} queries with {CANDIDATES} candidates, {MEMORY:g} GB of memory"
     parts = [_table(results), *_remarks(results)]
     write_report(out, title, parts, setting | {"results": [*results.values()]})
 
 
-_sessions: list["Session"] = []  # the only one of a process that `run` started
+_measurements: list[Iterator[Any]] = []  # the only one of a process that `run` started
 
 
-def _start(data: MadeUp, root: Path, start: float) -> None:
-    _sessions.append(Session(data, root, start))
+def _next_turn(*arguments: Any) -> Any:
+    """Go on to the next `yield` of the measurement of this process; the first turn has its arguments."""
+    if arguments:
+        _measurements.append(_measure(*arguments))
+    return next(_measurements[0])
 
 
-def _call(method: str) -> Any:
-    return getattr(_sessions[0], method)()
+def _measure(data: MadeUp, root: Path, rounds: int, start: float) -> Iterator[dict[str, Any] | None]:
+    """Rank a first query, rank all queries in each round, and yield the numbers of the process that began at `start`.
 
-
-class Session:
-    """One database in the process that calls, which started at `start` (`time.monotonic`)."""
-
-    def __init__(self, data: MadeUp, root: Path, start: float) -> None:
-        """Rank a first query."""
-        self.data, self.vectors = data, data.global_descriptors()
-        query_store, self.store = data.stores(root)
-        self.source, self.queries = Counted(self.store), FeatureSet(query_store, {})
-        self.database = FeatureSet(self.source, {})
-        rank_queries(FeatureSet.of([self.queries[0]]), self.database, (self.vectors[0][:1], self.vectors[1]))
-        self.first = time.monotonic() - start
-        self.source.rows, self.source.seconds = 0, 0.0
-        self.answers: list[Answer] = []
-        self.cpu = 0.0
-
-    def take_turn(self) -> None:
-        """Rank all queries."""
-        cpu = time.process_time()
-        self.answers.append(rank_queries(self.queries, self.database, self.vectors))
-        self.cpu += time.process_time() - cpu
-
-    def measurements(self) -> dict[str, Any]:
-        """The data set's numbers, and what all turns took; only now are all features of a database in memory.
-
-        Seconds are per query: `total` of each round, medians of the `steps`, `cpu` of all threads, `reading` of the
-        thread that reads `rows` while others are matched. `peak` is in GB. `first` is seconds from the start of the
-        process to the first ranking. `same` says whether the ranking equals the one with all features in memory, bit
-        for bit; None = not compared.
-        """
-        peak = peak_bytes() / 1e9
-        data, first, count = self.data, self.answers[0], len(self.answers) * self.data.queries
-        correct = [best in rows for best, rows in zip(first.rows[:, 0], data.similar(), strict=True)]
-        medians = median_seconds(self.answers)
-        return vars(data) | {
-            "total": [sum(answer.seconds.values()) / data.queries for answer in self.answers],
-            "steps": {name: medians[name] / data.queries for name in STEPS},
-            "cpu": self.cpu / count,
-            "reading": self.source.seconds / count,
-            "rows": self.source.rows / count,
-            "peak": peak,
-            "first": self.first,
-            "recall": float(np.mean(correct)),
-            "same": self._equals_ranking_in_memory() if data.images * data.dimension <= IN_MEMORY * 128 else None,
-        }
-
-    def _equals_ranking_in_memory(self) -> bool:
-        database = FeatureSet(InMemory(dict(self.store.read()), self.data.images), {})
-        expected = rank_queries(self.queries, database, self.vectors, memory=None)
-        return all(np.array_equal(*arrays) for arrays in zip(self.answers[0][:2], expected[:2], strict=True))
+    Seconds are per query: `total` of each round, medians of the `steps`, `cpu` of all threads, `reading` of the thread
+    that reads `rows` while others are matched. `peak` is in GB. `first` is seconds from the start of the process to the
+    first ranking. `same` says whether the ranking equals the one with all features in memory, bit for bit; None = not
+    compared. Only then are all features in memory.
+    """
+    vectors, (query_store, store) = data.global_descriptors(), data.stores(root)
+    source, queries = Counted(store), FeatureSet(query_store, {})
+    database = FeatureSet(source, {})
+    rank_queries(FeatureSet.of([queries[0]]), database, (vectors[0][:1], vectors[1]))
+    first, source.rows, source.seconds = time.monotonic() - start, 0, 0.0
+    answers, cpu = list[Answer](), 0.0
+    yield None
+    for _ in range(rounds):
+        before = time.process_time()
+        answers.append(rank_queries(queries, database, vectors))
+        cpu += time.process_time() - before
+        yield None
+    peak, same = peak_bytes() / 1e9, None
+    if data.images * data.dimension <= IN_MEMORY * 128:
+        in_memory = FeatureSet(InMemory(dict(store.read()), data.images), {})
+        expected = rank_queries(queries, in_memory, vectors, memory=None)
+        same = all(np.array_equal(*arrays) for arrays in zip(answers[0][:2], expected[:2], strict=True))
+    correct = [best in rows for best, rows in zip(answers[0].rows[:, 0], data.similar(), strict=True)]
+    count = len(answers) * data.queries
+    yield vars(data) | {
+        "total": [sum(answer.seconds.values()) / data.queries for answer in answers],
+        "steps": {name: seconds / data.queries for name, seconds in median_seconds(answers).items()},
+        "cpu": cpu / count,
+        "reading": source.seconds / count,
+        "rows": source.rows / count,
+        "peak": peak,
+        "first": first,
+        "recall": float(np.mean(correct)),
+        "same": same,
+    }
 
 
 def peak_bytes() -> int:

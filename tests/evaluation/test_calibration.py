@@ -20,7 +20,7 @@ from mfvpr.utils import InputError
 NAMES = ("margin", "height", "filter", "score")
 
 
-def ranked(scores, rows):
+def rank_by_scores(scores, rows):
     """Sorted, those without a candidate (-1) last."""
     scores = np.where(rows < 0, -np.inf, scores)
     order = np.argsort(-scores, axis=1, kind="stable")
@@ -29,46 +29,46 @@ def ranked(scores, rows):
 
 @pytest.fixture(scope="module")
 def rankings():
-    """Of a system and of the filter: 30 queries, 20 of 60 images, some lists shorter, one empty, one of one place."""
+    """Rankings of a system and of the filter: 30 queries, 20 of 60 images; lists are short, empty, or of one place."""
     rng = np.random.default_rng(0)
     rows = np.argsort(rng.random((30, 60)), axis=1)[:, :20]
     rows[rng.random(rows.shape) < 0.1] = -1
     rows[3] = -1
     rows[4] = np.arange(20) // 5
     scores = rng.gamma(2.0, 5.0, (2, 30, 20))
-    return ranked(scores[0], rows), ranked(scores[1], rows)
+    return rank_by_scores(scores[0], rows), rank_by_scores(scores[1], rows)
 
 
 @pytest.mark.parametrize("apart", [0, 5])
 def test_inputs_are_those_of_loops_over_candidates(rankings, apart):
     system, filtered = rankings
-    found = confidence_inputs(system, filtered, inputs=NAMES, apart=apart)
+    inputs = confidence_inputs(system, filtered, inputs=NAMES, apart=apart)
     for query, (rows, scores) in enumerate(zip(system.rows.tolist(), system.scores.tolist(), strict=True)):
         if rows[0] < 0:
-            assert np.isnan(found[query]).all()
+            assert np.isnan(inputs[query]).all()
             continue
-        others = [score for row, score in zip(rows, scores, strict=True) if row >= 0 and abs(row - rows[0]) > apart]
+        elsewhere = [score for row, score in zip(rows, scores, strict=True) if row >= 0 and abs(row - rows[0]) > apart]
         every = [score for row, score in zip(rows, scores, strict=True) if row >= 0]
-        squares = sum((score - statistics.fmean(others)) ** 2 for score in others) if others else 0
-        spread = math.sqrt((squares + 2 * statistics.pvariance(every)) / (len(others) + 2))
-        margin = math.log(1 + (scores[0] - max(others)) / spread) if others else math.inf
-        height = math.log(1 + (scores[0] - statistics.fmean(others)) / spread) if others else math.inf
+        squares = sum((score - statistics.fmean(elsewhere)) ** 2 for score in elsewhere) if elsewhere else 0
+        spread = math.sqrt((squares + 2 * statistics.pvariance(every)) / (len(elsewhere) + 2))
+        margin = math.log(1 + (scores[0] - max(elsewhere)) / spread) if elsewhere else math.inf
+        height = math.log(1 + (scores[0] - statistics.fmean(elsewhere)) / spread) if elsewhere else math.inf
         place = [row >= 0 and abs(row - rows[0]) <= apart for row in filtered.rows[query].tolist()]
         expected = [margin, height, -math.log(1 + place.index(True)), math.asinh(scores[0])]
-        np.testing.assert_allclose(found[query], expected, rtol=1e-9)
-    assert np.isinf(found[4, :2]).all() == (apart == 5)
+        np.testing.assert_allclose(inputs[query], expected, rtol=1e-9)
+    assert np.isinf(inputs[4, :2]).all() == (apart == 5)
 
 
 def test_margins_and_heights_have_no_unit(rankings):
     system, filtered = rankings
     other = replace(system, scores=250 * system.scores + 30)
-    np.testing.assert_allclose(*(confidence_inputs(one, filtered) for one in (system, other)), rtol=1e-6)
+    np.testing.assert_allclose(*(confidence_inputs(ranking, filtered) for ranking in (system, other)), rtol=1e-6)
 
 
 def test_what_stands_behind_the_candidates_does_not_matter(rankings):
     system, filtered = rankings
-    padded = [Ranked(np.pad(one.rows, ((0, 0), (0, 3)), constant_values=-1),
-                     np.pad(one.scores, ((0, 0), (0, 3)), constant_values=np.nan)) for one in rankings]  # fmt: skip
+    padded = [Ranked(np.pad(side.rows, ((0, 0), (0, 3)), constant_values=-1),
+                     np.pad(side.scores, ((0, 0), (0, 3)), constant_values=np.nan)) for side in rankings]  # fmt: skip
     expected = confidence_inputs(system, filtered, inputs=NAMES)
     np.testing.assert_allclose(confidence_inputs(*padded, inputs=NAMES), expected, rtol=1e-12)
 
@@ -82,8 +82,8 @@ def test_scores_that_are_all_equal_are_sure_of_nothing():
     np.testing.assert_allclose(confidence_inputs(alone, alone), np.log1p(4 / spread))
 
 
-@pytest.mark.parametrize("others", [1, 2])
-def test_few_candidates_of_other_places_make_no_answer_certain(others):
+@pytest.mark.parametrize("num_others", [1, 2])
+def test_few_candidates_of_other_places_make_no_answer_certain(num_others):
     """Fitted on many candidates; a little above one other image, whose score has no spread, is not far above it."""
     rng = np.random.default_rng(0)
     scores = -np.sort(-rng.normal(2.0, 0.2, (200, 50)), axis=1)
@@ -92,32 +92,32 @@ def test_few_candidates_of_other_places_make_no_answer_certain(others):
     rows = np.concatenate([np.zeros((200, 1)), 10 * np.arange(1, 50) + np.zeros((200, 1))], axis=1).astype(int)
     many = Ranked(rows, scores)
     model = fit_confidence(confidence_inputs(many, many), right)
-    few = Ranked(np.array([[0, 100, 200][: 1 + others]]), np.array([[2.2, 2.0, 1.8][: 1 + others]]))
+    few = Ranked(np.array([[0, 100, 200][: 1 + num_others]]), np.array([[2.2, 2.0, 1.8][: 1 + num_others]]))
     assert 0.02 < model(few, few)[0] < 0.7
     place = Ranked(np.arange(4)[None], np.array([[2.2, 2.1, 2.0, 1.9]]))  # no other place: what is known of all answers
     assert model(place, place)[0] == pytest.approx(special.expit(model.bias))
 
 
-def drawn(weights, bias, queries=4000, seed=1):
+def draw_answers(weights, bias, queries=4000, seed=1):
     rng = np.random.default_rng(seed)
     values = rng.gamma(2.0, 0.5, (queries, len(weights)))
     return values, rng.random(queries) < special.expit(values @ np.array(weights) + bias)
 
 
 def test_the_model_that_answers_were_drawn_from_is_found():
-    values, right = drawn([2.0, 0.7], -1.5)
-    found = fit_confidence(values, right)
-    weights = np.array(found.weights) / np.array(found.scale)
+    values, right = draw_answers([2.0, 0.7], -1.5)
+    model = fit_confidence(values, right)
+    weights = np.array(model.weights) / np.array(model.scale)
     np.testing.assert_allclose(weights, [2.0, 0.7], atol=0.25)
-    assert found.bias - weights @ np.array(found.center) == pytest.approx(-1.5, abs=0.25)
-    other, hits = drawn([2.0, 0.7], -1.5, seed=2)
-    sure = found.probability(other) > 0.9
-    assert np.mean(hits[sure]) == pytest.approx(np.mean(found.probability(other)[sure]), abs=0.03)
+    assert model.bias - weights @ np.array(model.center) == pytest.approx(-1.5, abs=0.25)
+    other, hits = draw_answers([2.0, 0.7], -1.5, seed=2)
+    sure = model.probability(other) > 0.9
+    assert np.mean(hits[sure]) == pytest.approx(np.mean(model.probability(other)[sure]), abs=0.03)
 
 
 def test_no_weights_around_the_fitted_ones_are_more_probable():
-    values, right = drawn([1.0, 0.5], -1.0, queries=60)
-    found = fit_confidence(values, right)
+    values, right = draw_answers([1.0, 0.5], -1.0, queries=60)
+    model = fit_confidence(values, right)
     columns = (values - values.mean(axis=0)) / values.std(axis=0)
 
     def loss(bias, *weights):
@@ -126,26 +126,26 @@ def test_no_weights_around_the_fitted_ones_are_more_probable():
         half = (math.log1p(math.exp(bias)) + math.log1p(math.exp(-bias))) / 2
         return total + half + sum(w**2 for w in weights) / 2
 
-    best = loss(found.bias, *found.weights)
+    best = loss(model.bias, *model.weights)
     for step in ([0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01], [0.01, 0.01, -0.01]):
         for sign in (-1, 1):
-            assert loss(*(np.array([found.bias, *found.weights]) + sign * np.array(step))) > best
+            assert loss(*(np.array([model.bias, *model.weights]) + sign * np.array(step))) > best
 
 
 def test_a_surer_input_never_makes_an_answer_less_probable():
-    values, right = drawn([-2.0, 1.0], 0.0)
+    values, right = draw_answers([-2.0, 1.0], 0.0)
     weights = fit_confidence(values, right).weights
     assert weights[0] == 0 < weights[1]
 
 
 @pytest.mark.parametrize("right", [True, False])
 def test_where_all_answers_are_right_or_wrong_p_is_not_certain(right):
-    values, _ = drawn([1.0, 1.0], 0.0, queries=50)
+    values, _ = draw_answers([1.0, 1.0], 0.0, queries=50)
     probability = fit_confidence(np.vstack([values, [[np.nan, np.nan]]]), np.full(51, right)).probability(values)
     probability = probability if right else 1 - probability
     np.testing.assert_allclose(probability, 50.5 / 51, rtol=1e-3)
     with pytest.raises(InputError, match="expected predictions to fit it on"):
-        fit_confidence(np.full((2, 2), np.nan), np.zeros(2))
+        fit_confidence(np.full((2, 2), np.nan), np.zeros(2, bool))
 
 
 def test_what_is_written_is_read(rankings, tmp_path):
@@ -153,14 +153,14 @@ def test_what_is_written_is_read(rankings, tmp_path):
     model = fit_confidence(values, values[:, 0] > 0.3, inputs=NAMES, apart=3)
     assert np.isnan(model(*rankings)).sum() == 1
     write_confidences(tmp_path / "confidence.json", {"histogram + filter": model}, {"dataset": "ä"})
-    systems, made = read_confidences(tmp_path / "confidence.json")
-    assert (systems, made) == ({"histogram + filter": model}, {"dataset": "ä"})
+    systems, recipe = read_confidences(tmp_path / "confidence.json")
+    assert (systems, recipe) == ({"histogram + filter": model}, {"dataset": "ä"})
     np.testing.assert_array_equal(systems["histogram + filter"](*rankings), model(*rankings))
 
 
 def broken(**changes):
-    one = {"inputs": ["margin"], "apart": 5, "center": [0.0], "scale": [1.0], "weights": [1.0], "bias": 0.0}
-    return {"format": "mfvpr confidence 2", "made": {}, "systems": {"histogram": one | changes}}
+    confidence = {"inputs": ["margin"], "apart": 5, "center": [0.0], "scale": [1.0], "weights": [1.0], "bias": 0.0}
+    return {"format": "mfvpr confidence 2", "made": {}, "systems": {"histogram": confidence | changes}}
 
 
 @pytest.mark.parametrize(
@@ -169,15 +169,15 @@ def broken(**changes):
         {"inputs": ["else"]}, {"center": [0, 1]}, {"scale": [0]}, {"bias": float("nan")}, {"weights": ["a"]},
         {"weights": ["1_0"]}, {"scale": "1"}, {"center": [True]}, {"bias": "0"}, {"center": [10**400]},
         {"more": [1]}, {"apart": -1}, {"bias": None}, {"apart": 2.5}, {"apart": True}, {"weights": [-1.0]},
-        {name: one * 2 for name, one in broken()["systems"]["histogram"].items() if isinstance(one, list)})),
+        {name: values * 2 for name, values in broken()["systems"]["histogram"].items() if isinstance(values, list)})),
      '{"format": "mfvpr confidence 2", "made": ' + "[" * 100_000 + "]" * 100_000 + "}"],
 )  # fmt: skip
 def test_other_files_are_refused_in_one_line(content, tmp_path):
     path = tmp_path / "confidence.json"
     path.write_text(content)
-    with pytest.raises(InputError, match=r"confidence.json: expected .*\(.*\); ") as told:
+    with pytest.raises(InputError, match=r"confidence.json: expected .*\(.*\); ") as refusal:
         read_confidences(path)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(refusal.value)
     with pytest.raises(InputError, match="got nothing"):
         read_confidences(tmp_path / "none.json")
 
@@ -192,11 +192,11 @@ def test_queries_without_an_answer_are_reranked_first():
 
 
 def test_halves_of_drives_there_and_back_share_no_place():
-    """Of 20 places, two drives of all of them, the second backward; a query shows the places beside it as well."""
+    """Two drives of 20 places, the second backward; a query shows the places beside it as well."""
     rows = [range(max(0, place - 1), min(20, place + 2)) for place in (*range(20), *reversed(range(20)))]
-    shown = [Positives.from_rows([list(one) for one in some], 20) for some in (rows[:20], rows[20:])]
-    sequences = [SimpleNamespace(truth=SimpleNamespace(shows_place=lambda _, one=one: one, unit="frames"))
-                 for one in shown]  # fmt: skip
+    places = [Positives.from_rows(list(map(list, drive)), 20) for drive in (rows[:20], rows[20:])]
+    sequences = [SimpleNamespace(truth=SimpleNamespace(shows_place=lambda _, drive=drive: drive, unit="frames"))
+                 for drive in places]  # fmt: skip
     judged: Any = SimpleNamespace(thresholds=[1], sequences=sequences)
     reported = []
     for half in CalibratedPredictions(judged).path_halves():

@@ -36,30 +36,30 @@ def retrieval():
     return queries, database, excluded
 
 
-def matched():
+def eight_queries():
     """Matches [8, 4, ...] of eight queries and four candidates."""
     rng = np.random.default_rng(1)
     points = rng.uniform(0, 48, (32, 2, 20, 2))
-    pairs = [make_matches(*one, scores0=rng.uniform(size=20), scores1=rng.uniform(size=20)) for one in points]
+    pairs = [make_matches(*pair, scores0=rng.uniform(size=20), scores1=rng.uniform(size=20)) for pair in points]
     return jax.tree.map(lambda *fields: np.reshape(np.stack(fields), (8, 4, *np.shape(fields[0]))), *pairs)
 
 
-def taken(tree, rows):
+def take(tree, rows):
     return jax.tree.map(lambda field: field[rows], tree)
 
 
 def work(mesh, queries):
-    """By name, what a process gets."""
-    found = {}
+    """Results of a process by name."""
+    results = {}
     for name, left_out in (("all", None), ("some", retrieval()[2])):
         shortlist = retrieve_on_mesh(*retrieval()[:2], num_candidates=CANDIDATES, mesh=mesh, excluded=left_out)
-        found |= {
+        results |= {
             f"{name} indices": shortlist.indices,
             f"{name} scores": shortlist.scores,
             f"{name} mask": shortlist.mask,
         }
-    own = taken(matched(), queries)
-    return found | {"scores": score_on_mesh(mfvpr.HistogramOfShifts(), own, mesh=mesh)}
+    matches = take(eight_queries(), queries)
+    return results | {"scores": score_on_mesh(mfvpr.HistogramOfShifts(), matches, mesh=mesh)}
 
 
 def process(address, index, out):
@@ -69,9 +69,9 @@ def process(address, index, out):
 
 
 def free_address():
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return f"127.0.0.1:{one.getsockname()[1]}"
+    with socket.socket() as connection:
+        connection.bind(("127.0.0.1", 0))
+        return f"127.0.0.1:{connection.getsockname()[1]}"
 
 
 @pytest.mark.slow
@@ -82,49 +82,49 @@ def test_two_processes_of_four_devices_find_what_one_finds(tmp_path):
         subprocess.Popen([sys.executable, "-c", code, address, str(index), f"{tmp_path}/{index}.npz"], cwd=ROOT,
                          env=os.environ | FLAGS) for index in (0, 1)
     ]  # fmt: skip
-    assert [one.wait(120) for one in started] == [0, 0]
+    assert [task.wait(120) for task in started] == [0, 0]
     first, second = (np.load(tmp_path / f"{index}.npz") for index in (0, 1))
     queries, database, excluded = retrieval()
     for name, mask in (("all", None), ("some", ~excluded.dense())):
         alone = mfvpr.retrieve(queries, database, num_candidates=CANDIDATES, mask=mask)
-        for found in (first, second):
-            np.testing.assert_array_equal(found[f"{name} indices"], alone.indices)
-            np.testing.assert_array_equal(found[f"{name} mask"], alone.mask)
-            np.testing.assert_allclose(found[f"{name} scores"], alone.scores, atol=1e-6)
+        for results in (first, second):
+            np.testing.assert_array_equal(results[f"{name} indices"], alone.indices)
+            np.testing.assert_array_equal(results[f"{name} mask"], alone.mask)
+            np.testing.assert_allclose(results[f"{name} scores"], alone.scores, atol=1e-6)
     assert first["all indices"][0, :3].tolist() == [5, 60, 190]  # of equal ones, on three devices, the first row
-    everything = matched()
+    matches = eight_queries()
     for query in range(8):
-        alone = mfvpr.score_candidates(mfvpr.HistogramOfShifts(), taken(everything, query))
-        for found in (first, second):
-            np.testing.assert_array_equal(found["scores"][query], alone)
+        alone = mfvpr.score_candidates(mfvpr.HistogramOfShifts(), take(matches, query))
+        for results in (first, second):
+            np.testing.assert_array_equal(results["scores"][query], alone)
 
 
 def test_one_device_is_a_mesh(tmp_path):
-    found = work(all_devices(jax.devices()[:1]), slice(None))
+    results = work(all_devices(jax.devices()[:1]), slice(None))
     alone = mfvpr.retrieve(*retrieval()[:2], num_candidates=CANDIDATES)
-    np.testing.assert_array_equal(found["all indices"], alone.indices)
-    np.testing.assert_array_equal(found["all scores"], alone.scores)
-    assert found["scores"].shape == (8, 4)
+    np.testing.assert_array_equal(results["all indices"], alone.indices)
+    np.testing.assert_array_equal(results["all scores"], alone.scores)
+    assert results["scores"].shape == (8, 4)
 
 
 def test_what_cannot_be_spread():
     with pytest.raises(InputError, match="expected a scorer that runs on devices"):
-        score_on_mesh(mfvpr.OpenCvHomography(), matched(), mesh=all_devices())
+        score_on_mesh(mfvpr.OpenCvHomography(), eight_queries(), mesh=all_devices())
     with pytest.raises(ValueError, match="expected matches"):
-        score_on_mesh(mfvpr.MatchCount(), taken(matched(), 0), mesh=all_devices())
+        score_on_mesh(mfvpr.MatchCount(), take(eight_queries(), 0), mesh=all_devices())
 
 
 @pytest.mark.slow
 def test_a_task_that_dies_ends_the_others_and_all_go_on(tmp_path):
-    settings = (*(one for one in small(tmp_path / "data") if not one.startswith("store=")), "figures=0")
+    settings = (*(setting for setting in small(tmp_path / "data") if not setting.startswith("store=")), "figures=0")
     expected = tmp_path / "plain"
     assert run(*settings, f"store={tmp_path}/plain-store", f"out={expected}").returncode == 0
 
     def tasks():
-        own = (f"store={tmp_path}/store", f"out={tmp_path}/out", f"coordinator={free_address()}")
+        folders = (f"store={tmp_path}/store", f"out={tmp_path}/out", f"coordinator={free_address()}")
         return [
             subprocess.Popen(
-                [sys.executable, "-m", "experiments.evaluate", *settings, *own, f"shard={index}/2"], cwd=ROOT,
+                [sys.executable, "-m", "experiments.evaluate", *settings, *folders, f"shard={index}/2"], cwd=ROOT,
                 env=os.environ | FLAGS, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
                 start_new_session=True,
             )
@@ -146,14 +146,14 @@ def test_a_task_that_dies_ends_the_others_and_all_go_on(tmp_path):
     assert "Terminating process" in Path(line.partition("(see ")[2].partition(")")[0]).read_text()
     second.communicate()
     again = tasks()
-    outputs = [one.communicate() for one in again]
-    assert [one.returncode for one in again] == [0, 0], outputs
+    outputs = [task.communicate() for task in again]
+    assert [task.returncode for task in again] == [0, 0], outputs
     assert tables(tmp_path / "out") == tables(expected)
     # One has nothing left to do but what all do together.
     (tmp_path / "out" / "results.json").unlink()
     for path in (tmp_path / "store").glob("scores-*/shards/1-of-2/*.npz"):
         path.unlink()
     again = tasks()
-    outputs = [one.communicate(timeout=200) for one in again]
-    assert [one.returncode for one in again] == [0, 0], outputs
+    outputs = [task.communicate(timeout=200) for task in again]
+    assert [task.returncode for task in again] == [0, 0], outputs
     assert tables(tmp_path / "out") == tables(expected)

@@ -15,7 +15,7 @@ import mfvpr
 from mfvpr.datasets import Positives, folder_dataset, sequences_dataset
 from mfvpr.evaluation import confidence_inputs, fit_confidence, halves, match_sequence, stages
 from mfvpr.evaluation.statistics import block_sign_flips
-from mfvpr.features import Aggregated, Sift, VladFitting
+from mfvpr.features import Aggregated, Description, Sift, VladFitting
 from mfvpr.features.extraction import describe_folder
 from mfvpr.io import write_features, write_global_descriptors, write_shortlist
 from mfvpr.report.confidences import CalibratedPredictions
@@ -44,6 +44,13 @@ def dataset(small_street):
 
 
 @pytest.fixture(scope="module")
+def several(split, small_street):
+    return sequences_dataset(
+        small_street / "database", split, ground_truth="index", index_file="truth.csv", widen_index=True
+    )
+
+
+@pytest.fixture(scope="module")
 def result(dataset):
     return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=5, fused={"histogram": Fusion(c=10.0)})
 
@@ -65,7 +72,7 @@ def test_systems_and_their_recall(dataset, result):
 
 
 def test_frame_correlation_is_a_ranking_more(result):
-    """Of a scorer, or of one that is fused; all others are what they are without it."""
+    """It ranks by a scorer, or by a fused one, and changes no other system."""
     [matched] = result.matched
     correlated = {"histogram": FrameCorrelation(1), "histogram + filter": FrameCorrelation()}
     scores = stages.score(SCORERS, matched.by_scale, matched.candidates)
@@ -75,10 +82,9 @@ def test_frame_correlation_is_a_ranking_more(result):
         np.testing.assert_array_equal(systems[name].rows, ranked.rows)
         np.testing.assert_array_equal(systems[name].scores, ranked.scores)
     for name, how in correlated.items():
-        alone = systems[name]
+        alone, got = systems[name], systems[f"{name} + frames"]
         expected = how(alone.shortlist, alone.scores)
         order = np.argsort(-expected, axis=1, kind="stable")
-        got = systems[f"{name} + frames"]
         np.testing.assert_array_equal(got.scores, np.take_along_axis(expected, order, axis=1))
         np.testing.assert_array_equal(got.rows, np.take_along_axis(alone.rows, order, axis=1))
         assert (got.scores != alone.scores).any()
@@ -90,19 +96,16 @@ def test_gains_say_where_on_the_path_each_query_is(result, tmp_path):
         assert [line["place"] for line in csv.DictReader(file)] == [*map(str, range(10))]
 
 
-def test_sequences_are_evaluated_by_themselves_with_their_means(dataset, split, small_street, result, tmp_path):
-    several = sequences_dataset(
-        small_street / "database", split, ground_truth="index", index_file="truth.csv", widen_index=True
-    )
-    found = mfvpr.evaluate(several, SIFT, VLAD, SCORERS, candidates=5)
-    [whole] = result.systems["count"]
-    rows = np.concatenate([ranked.rows for ranked in found.systems["count"]])
-    np.testing.assert_array_equal(rows, whole.rows)
-    recall = found.recall([0, 1], [1])["count"]
+def test_sequences_are_evaluated_by_themselves_with_their_means(several, split, small_street, result, tmp_path):
+    parts = mfvpr.evaluate(several, SIFT, VLAD, SCORERS, candidates=5)
+    [joint] = result.systems["count"]
+    rows = np.concatenate([ranked.rows for ranked in parts.systems["count"]])
+    np.testing.assert_array_equal(rows, joint.rows)
+    recall = parts.recall([0, 1], [1])["count"]
     np.testing.assert_allclose(recall.pooled, result.recall([0, 1], [1])["count"].pooled)
     np.testing.assert_allclose(recall.mean, recall.by_sequence.mean(axis=0))
     assert recall.queries.tolist() == [3, 7]
-    judged = EvaluationReport(found, [0, 1], [1], "count")
+    judged = EvaluationReport(parts, [0, 1], [1], "count")
     table = recall_table(judged)
     assert [line[:2] for line in table.rows[:4]] == [["filter", name] for name in ("first", "second", "mean", "pooled")]
     write_gains(tmp_path, judged)
@@ -110,7 +113,7 @@ def test_sequences_are_evaluated_by_themselves_with_their_means(dataset, split, 
     assert list(map(len, gains)) == [4, 8]
     places = [line.split(",")[1] for lines in gains for line in lines[1:]]
     assert places == list(map(str, range(10)))  # the two ends of one path, so that tests know what is next to what
-    hits = {name: np.concatenate([judged.is_right(name, place)[:, 0] for place in (0, 1)]) for name in found.systems}
+    hits = {name: np.concatenate([judged.is_right(name, place)[:, 0] for place in (0, 1)]) for name in parts.systems}
     for first, second, counts, flips in differences(judged):
         assert counts.only_first == (hits[first] > hits[second]).sum()
         assert flips == block_sign_flips(hits[first], hits[second], places=np.arange(10))
@@ -120,14 +123,11 @@ def test_sequences_are_evaluated_by_themselves_with_their_means(dataset, split, 
         sequences_dataset(small_street / "database", [split[0], split[0]], ground_truth="order")
 
 
-def test_answers_of_sequences_are_as_sure_as_those_of_one_path(dataset, split, small_street):
+def test_answers_of_sequences_are_as_sure_as_those_of_one_path(dataset, several):
     """The sequences are the two ends of a path: what p is fitted on is the other half of its places, not of each."""
-    several = sequences_dataset(
-        small_street / "database", split, ground_truth="index", index_file="truth.csv", widen_index=True
-    )
-    found = mfvpr.evaluate(several, SIFT, VLAD, SCORERS, candidates=10)
-    assured = CalibratedPredictions(EvaluationReport(found, [0, 1], [1], "count"))
-    answers, filtered = found.systems["count"], found.systems["filter"]
+    result = mfvpr.evaluate(several, SIFT, VLAD, SCORERS, candidates=10)
+    assured = CalibratedPredictions(EvaluationReport(result, [0, 1], [1], "count"))
+    answers, filtered = result.systems["count"], result.systems["filter"]
     inputs = np.concatenate([confidence_inputs(*pair) for pair in zip(answers, filtered, strict=True)])
     right, halved = assured.right("count"), halves(dataset.truth.positives(1))
     for half in halved:
@@ -138,8 +138,7 @@ def test_answers_of_sequences_are_as_sure_as_those_of_one_path(dataset, split, s
     assert [len(part) for part in assured.judged.by_sequence(assured.scores("count"))] == [3, 7]
 
 
-def test_the_database_is_described_once_for_all_sequences(split, small_street, tmp_path):
-    several = sequences_dataset(small_street / "database", split, ground_truth="none")
+def test_the_database_is_described_once_for_all_sequences(several, tmp_path):
     lines = []
     mfvpr.evaluate(several, SIFT, VLAD, SCORERS, candidates=5, cache=FeatureCache(tmp_path, tell=lines.append))
     assert [line for line in lines if "10 of 10 images to do" in line and "database" in line] == lines[1:2]
@@ -153,17 +152,15 @@ class Vectors:
     recipe = "thumbnails"
 
     def __call__(self, images):
-        from mfvpr.features import Description
-
         flat = images.reshape(len(images), -1).astype(np.float32)
-        return [Description(one / np.linalg.norm(one)) for one in flat]
+        return [Description(vector / np.linalg.norm(vector)) for vector in flat]
 
 
 def test_only_candidates_are_extracted(dataset, tmp_path):
     few = replace(dataset.only, images=replace(dataset.queries, names=dataset.queries.names[:2]), truth=None)
-    feature_cache, lines = FeatureCache(tmp_path), []
-    feature_cache.tell = lines.append
-    matched = match_sequence(dataset, few, SIFT, Retrieval(Vectors()), 3, cache=feature_cache)
+    lines = []
+    cache = FeatureCache(tmp_path, tell=lines.append)
+    matched = match_sequence(dataset, few, SIFT, Retrieval(Vectors()), 3, cache=cache)
     wanted = np.unique(matched.candidates.indices)
     assert len(wanted) < 7
     [features] = FeatureCache(tmp_path).local(dataset.database, SIFT, [])
@@ -172,7 +169,7 @@ def test_only_candidates_are_extracted(dataset, tmp_path):
 
 
 def test_matches_are_kept_and_read_without_features(dataset, result, tmp_path):
-    found = mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=5, cache=FeatureCache(tmp_path))
+    first = mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=5, cache=FeatureCache(tmp_path))
 
     def only_scores(label):
         assert label == "scores"
@@ -182,10 +179,10 @@ def test_matches_are_kept_and_read_without_features(dataset, result, tmp_path):
         replace(dataset, name="again"), SIFT, VLAD, SCORERS, candidates=5,
         cache=FeatureCache(tmp_path, track=only_scores), memory=1e-5,
     )  # fmt: skip
-    for name, system in itertools.product(again.systems, (found, again)):
+    for name, system in itertools.product(again.systems, (first, again)):
         [ranked], [expected] = system.systems[name], result.systems[name]
         np.testing.assert_array_equal(ranked.rows, expected.rows)
-    np.testing.assert_array_equal(found.matched[0].candidates.indices, again.matched[0].candidates.indices)
+    np.testing.assert_array_equal(first.matched[0].candidates.indices, again.matched[0].candidates.indices)
 
 
 def test_whitening_is_fitted_on_the_database():
@@ -198,16 +195,16 @@ def test_whitening_is_fitted_on_the_database():
     components = axes[:, ::-1][:, :4] / np.sqrt(values[::-1][:4])
     unit = [(side - usable.mean(axis=0)) @ components for side in (queries, usable)]
     unit = [side / np.linalg.norm(side, axis=1, keepdims=True) for side in unit]
-    found = fitted.shortlist(queries, database, 6)
+    shortlist = fitted.shortlist(queries, database, 6)
     rows = np.delete(np.arange(200), 3)[np.argsort(-(unit[0] @ unit[1].T), axis=1)[:, :6]]
-    np.testing.assert_array_equal(found.indices, rows)
+    np.testing.assert_array_equal(shortlist.indices, rows)
     with pytest.raises(InputError, match="expected more than 12 descriptors"):
         WhitenedSearch(12).fit(usable[:12])
 
 
 @pytest.fixture(scope="module")
 def files(dataset, tmp_path_factory):
-    """What another program would have left of the data set, exactly."""
+    """Files of another program with the same features, descriptors and candidates."""
     root, feature_cache = tmp_path_factory.mktemp("files"), FeatureCache()
     for side, folder in (("database", dataset.database), ("queries", dataset.queries)):
         names = [f"{side}/{name}" for name in folder.names]
@@ -233,9 +230,9 @@ def test_files_of_other_programs_stand_in_for_every_stage(dataset, files, result
         "pairs": ShortlistFiles({dataset.queries.root: File(files / "pairs.npz")}),
     }
     for name, chosen in filters.items():
-        found = mfvpr.evaluate(dataset, local, chosen, SCORERS, candidates=5)
+        imported_result = mfvpr.evaluate(dataset, local, chosen, SCORERS, candidates=5)
         for system in ("filter", "histogram", "count"):
-            [got], [expected] = found.systems[system], result.systems[system]
+            [got], [expected] = imported_result.systems[system], result.systems[system]
             np.testing.assert_array_equal(got.rows, expected.rows, err_msg=name)
             np.testing.assert_allclose(got.scores, expected.scores, rtol=1e-5)
 
@@ -245,10 +242,10 @@ def test_imported_shortlists_leave_out_what_is_excluded(dataset, files):
     sequence = replace(dataset.only, excluded=excluded)
     listed = ShortlistFiles({dataset.queries.root: File(files / "pairs.npz")})
     for width in (2, 7):
-        found = listed.shortlist(sequence, dataset.database, width, FeatureCache()).candidates
-        assert found.indices.shape == (10, width)
-        assert not excluded.contains(found.indices).any()
-        for row, mask in zip(found.indices, found.mask, strict=True):
+        candidates = listed.shortlist(sequence, dataset.database, width, FeatureCache()).candidates
+        assert candidates.indices.shape == (10, width)
+        assert not excluded.contains(candidates.indices).any()
+        for row, mask in zip(candidates.indices, candidates.mask, strict=True):
             assert (row[mask] >= 0).all()
             assert (row[~mask] == -1).all()
             assert (np.diff(mask.astype(int)) <= 0).all()
@@ -269,38 +266,35 @@ def test_queries_without_candidates_are_told(dataset, tmp_path):
 
 
 def test_files_are_known_by_content(dataset, files, tmp_path):
-    feature_cache, before = FeatureCache(tmp_path / "s"), FeatureFiles(at(dataset, files, ".npz"))
-    recipe = feature_cache.recipe(dataset.database, before)
-    moved = tmp_path / "elsewhere"
-    shutil.copytree(files, moved)
-    assert feature_cache.recipe(dataset.database, FeatureFiles(at(dataset, moved, ".npz"))) == recipe
+    def recipe(root):
+        return FeatureCache(tmp_path / "s").recipe(dataset.database, FeatureFiles(at(dataset, root, ".npz")))
+
+    moved = Path(shutil.copytree(files, tmp_path / "elsewhere"))
+    assert recipe(moved) == recipe(files)
     shutil.copy(files / "queries.npz", moved / "database.npz")
-    assert FeatureCache(tmp_path / "s").recipe(dataset.database, FeatureFiles(at(dataset, moved, ".npz"))) != recipe
+    assert recipe(moved) != recipe(files)
 
 
 def test_what_is_read_of_files_is_part_of_the_recipe(dataset, files, tmp_path):
     """Which file belongs to which folder, and the prefixes; also within an aggregation."""
     feature_cache, sides = FeatureCache(tmp_path), at(dataset, files, ".npz")
-    (one, first), (other, second) = sides.items()
-    changed = [sides, {one: second, other: first}, sides | {one: replace(first, prefix="other/")}]
-    for wrap in (
-        FeatureFiles,
-        DescriptorFiles,
-        lambda found: Retrieval(Aggregated(FeatureFiles(found), VladFitting())),
-    ):
-        assert len({fingerprint(feature_cache.recipe_of(wrap(found))) for found in changed}) == len(changed)
-    pairs = [ShortlistFiles({one: first}, prefix) for prefix in ("", "database/")]
-    assert len({fingerprint(feature_cache.recipe_of(found)) for found in pairs}) == 2
+    (folder, first), (other_folder, second) = sides.items()
+    changed = [sides, {folder: second, other_folder: first}, sides | {folder: replace(first, prefix="other/")}]
+    readers = FeatureFiles, DescriptorFiles, lambda at: Retrieval(Aggregated(FeatureFiles(at), VladFitting()))
+    for read in readers:
+        assert len({fingerprint(feature_cache.recipe_of(read(at))) for at in changed}) == len(changed)
+    pairs = [ShortlistFiles({folder: first}, prefix) for prefix in ("", "database/")]
+    assert len({fingerprint(feature_cache.recipe_of(shortlists)) for shortlists in pairs}) == 2
 
 
-def test_what_is_fitted_on_the_database_is_fitted_once_for_all_sequences(split, small_street, monkeypatch):
-    several, learned = sequences_dataset(small_street / "database", split, ground_truth="none"), []
+def test_what_is_fitted_on_the_database_is_fitted_once_for_all_sequences(several, monkeypatch):
+    fitted = []
     for kind in (VladFitting, WhitenedSearch):
         plain = kind.fit
-        monkeypatch.setattr(kind, "fit", lambda self, found, plain=plain: learned.append(self) or plain(self, found))
+        monkeypatch.setattr(kind, "fit", lambda self, sample, plain=plain: fitted.append(self) or plain(self, sample))
     whitened = replace(VLAD, search=WhitenedSearch(4))
     mfvpr.evaluate(several, SIFT, whitened, SCORERS, candidates=5)
-    assert learned == [VLAD.describer.fitting, whitened.search]
+    assert fitted == [VLAD.describer.fitting, whitened.search]
 
 
 def test_bad_images_of_the_database_are_told_once(split, small_street, tmp_path):
@@ -311,22 +305,28 @@ def test_bad_images_of_the_database_are_told_once(split, small_street, tmp_path)
     for root in (None, tmp_path / "s", tmp_path / "s"):  # the last reads matches alone
         lines.clear()
         feature_cache = FeatureCache(root, skip_bad=True, tell=lines.append)
-        found = mfvpr.evaluate(several, SIFT, VLAD, SCORERS, candidates="all", cache=feature_cache)
-        assert all(list(one.bad_database) == [4] for one in found.matched)
+        result = mfvpr.evaluate(several, SIFT, VLAD, SCORERS, candidates="all", cache=feature_cache)
+        assert all(list(matched.bad_database) == [4] for matched in result.matched)
         warned = [line for line in lines if line.startswith("warning: ")]
         assert len(warned) == 2
         assert "0004.png" in warned[0]
         assert "0005.png: no keypoints, so no matches (1 such images of 10)" in warned[1]
 
 
+@pytest.fixture
+def imported(small_street, files):
+    """Settings of programs that read the features of other programs."""
+    return (f"dataset.database={small_street}/database", "candidates=5", "store=null", "features=import",
+            f"features.database={files}/database.npz", f"features.queries={files}/queries.npz",
+            "features.database_prefix=database/", "features.query_prefix=queries/")  # fmt: skip
+
+
 @pytest.mark.slow
-def test_programs_take_sequences_and_files(split, small_street, files, tmp_path, monkeypatch, capsys):
-    common = ("dataset=sequences", f"dataset.database={small_street}/database", "dataset.ground_truth=index",
-              f"dataset.queries=[{split[0]},{split[1]}]", "dataset.index_file=truth.csv", "dataset.widen_index=true",
-              "candidates=5", "recall.tolerances=[0,1]", "recall.ks=[1,5]", "store=null",
-              "features=import", f"features.database={files}/database.npz", f"features.queries={files}/queries.npz",
-              "features.database_prefix=database/", "features.query_prefix=queries/", "retrieval=vlad",
-              "retrieval.num_words=8", "scorer=count", "devices=all", "memory=0.5")  # fmt: skip
+def test_programs_take_sequences_and_files(split, imported, tmp_path, monkeypatch, capsys):
+    common = (*imported, "dataset=sequences", "dataset.ground_truth=index", "dataset.index_file=truth.csv",
+              f"dataset.queries=[{split[0]},{split[1]}]", "dataset.widen_index=true", "recall.tolerances=[0,1]",
+              "recall.ks=[1,5]", "retrieval=vlad", "retrieval.num_words=8", "scorer=count", "devices=all",
+              "memory=0.5")  # fmt: skip
     code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *common, "figures=2", f"out={tmp_path}/out")
     assert code == 0, stderr
     assert "sequences: 10 queries in 2 sequences, 10 database images, 5 candidates (vlad), import features" in stdout
@@ -340,13 +340,12 @@ def test_programs_take_sequences_and_files(split, small_street, files, tmp_path,
     assert "expected one query sequence, got 2" in stderr
 
 
-def test_a_sweep_takes_features_whose_files_tell_the_image_size(small_street, files, tmp_path, monkeypatch, capsys):
-    common = ("dataset=folder", f"dataset.database={small_street}/database", f"dataset.queries={small_street}/queries",
-              "dataset.ground_truth=order", "candidates=5", "store=null", "scorer=sum", "grid.clamp=[true]",
-              "features=import", f"features.database={files}/database.npz", f"features.queries={files}/queries.npz",
-              "features.database_prefix=database/", "features.query_prefix=queries/", "retrieval=pairs",
-              f"retrieval.queries={files}/pairs.npz")  # fmt: skip
-    code, stdout, stderr = typed(monkeypatch, capsys, "sweep", *common, f"out={tmp_path}/out")
+def test_a_sweep_takes_features_whose_files_tell_the_image_size(
+    small_street, files, imported, tmp_path, monkeypatch, capsys
+):
+    settings = ("dataset=folder", f"dataset.queries={small_street}/queries", "dataset.ground_truth=order", "scorer=sum",
+                "grid.clamp=[true]", "retrieval=pairs", f"retrieval.queries={files}/pairs.npz")  # fmt: skip
+    code, stdout, stderr = typed(monkeypatch, capsys, "sweep", *imported, *settings, f"out={tmp_path}/out")
     assert code == 0, stderr
     assert "score, import features; recall in %" in stdout
 
@@ -392,9 +391,9 @@ def test_sequences_of_any_name_leave_all_of_their_files(split, small_street, tmp
     folders = [*(tmp_path / name for name in names), tmp_path / "real" / "deeper" / "..", Path()]
     several = sequences_dataset(small_street / "database", folders, ground_truth="none")
     assert [sequence.name for sequence in several.sequences] == [*names, "real", "second"]
-    found = mfvpr.evaluate(several, SIFT, VLAD, {"count": mfvpr.MatchCount()}, candidates=2)
-    write_rankings(tmp_path / "out", EvaluationReport(found, [], [1], "count"))
+    result = mfvpr.evaluate(several, SIFT, VLAD, {"count": mfvpr.MatchCount()}, candidates=2)
+    write_rankings(tmp_path / "out", EvaluationReport(result, [], [1], "count"))
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["sequences"]
     for name in (*names, "real", "second"):
-        own = tmp_path / "out" / "sequences" / name
-        assert {path.name for path in own.rglob("*.csv")} >= {"predictions.csv", "filter.csv", "count.csv"}
+        folder = tmp_path / "out" / "sequences" / name
+        assert {path.name for path in folder.rglob("*.csv")} >= {"predictions.csv", "filter.csv", "count.csv"}

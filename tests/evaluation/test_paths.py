@@ -26,10 +26,10 @@ def rising(places):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_neighbors_follow_whatever_the_rows_of_the_map_are(seed):
-    found = rising(places_along_path(shown(seed), "m"))
-    assert np.abs(found - DRIVES).max() <= 2  # at the ends images are shown by few queries
-    assert (np.diff(found[2 : PLACES - 2]) == 1).all()
-    np.testing.assert_array_equal(found[PLACES:][::-1], found[:PLACES:2])
+    places = rising(places_along_path(shown(seed), "m"))
+    assert np.abs(places - DRIVES).max() <= 2  # at the ends images are shown by few queries
+    assert (np.diff(places[2 : PLACES - 2]) == 1).all()
+    np.testing.assert_array_equal(places[PLACES:][::-1], places[:PLACES:2])
 
 
 def test_frames_are_in_order_and_exact_images_in_that_of_the_first_queries():
@@ -40,10 +40,10 @@ def test_frames_are_in_order_and_exact_images_in_that_of_the_first_queries():
 
 @pytest.mark.parametrize("unit", ["frames", "m", "exact"])
 def test_places_that_the_map_does_not_show_are_none(unit):
-    found = places_along_path(Positives.from_rows([[], [3], [3], [], [1], [0], []], 5), unit)
-    assert (found == -1).tolist() == [True, False, False, True, False, False, True]
-    assert found[1] == found[2]
-    assert len({*found[[1, 4, 5]].tolist()}) == 3
+    places = places_along_path(Positives.from_rows([[], [3], [3], [], [1], [0], []], 5), unit)
+    assert (places == -1).tolist() == [True, False, False, True, False, False, True]
+    assert places[1] == places[2]
+    assert len({*places[[1, 4, 5]].tolist()}) == 3
     for queries in (0, 2):
         assert places_along_path(Positives.from_rows([[]] * queries, 4), unit).tolist() == [-1] * queries
 

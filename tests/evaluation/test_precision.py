@@ -62,21 +62,21 @@ def test_answers_to_queries_without_a_place_cost_precision_and_no_recall():
 @pytest.mark.parametrize("bins", [1, 4, 10])
 def test_reliability_is_that_of_loops_over_bins(bins):
     confidence, right, _ = made_up(5)
-    found = reliability(confidence, right, bins=bins)
+    curve = reliability(confidence, right, bins=bins)
     error, total = 0.0, 0
     for number in range(bins):
         last = number == bins - 1
         inside = [query for query in range(40) if number / bins <= confidence[query] < (number + 1) / bins
                   or (last and confidence[query] == 1)]  # fmt: skip
-        assert found.count[number] == len(inside)
+        assert curve.count[number] == len(inside)
         if inside:
             mean, share = (sum(values[query] for query in inside) / len(inside) for values in (confidence, right))
-            assert found.probability[number] == pytest.approx(mean)
-            assert found.right[number] == pytest.approx(share)
+            assert curve.probability[number] == pytest.approx(mean)
+            assert curve.right[number] == pytest.approx(share)
             error, total = error + len(inside) * abs(mean - share), total + len(inside)
         else:
-            assert np.isnan([found.probability[number], found.right[number]]).all()
-    assert found.calibration_error == pytest.approx(error / total)
+            assert np.isnan([curve.probability[number], curve.right[number]]).all()
+    assert curve.calibration_error == pytest.approx(error / total)
 
 
 def test_calibration_error_by_chance_is_that_of_probabilities_that_are_true():

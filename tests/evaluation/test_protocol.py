@@ -21,30 +21,30 @@ def rows():
 
 
 def recall_of(rows, queries, tolerance, k=1):
-    """Of one ranking `[Q, depth]`, by a loop."""
+    """Recall of one ranking `[Q, depth]`, by a loop."""
     right = [any(row >= 0 and abs(row - query) <= tolerance for row in rows[query][:k]) for query in queries]
     return sum(right) / len(right)
 
 
 def test_recall_is_of_all_queries(rows):
-    found = judge(TRUTH, TOLERANCES)
+    protocol = judge(TRUTH, TOLERANCES)
     for k in (1, 2):
-        expected = [[recall_of(one, range(QUERIES), tolerance, k) for tolerance in TOLERANCES] for one in rows[0]]
-        np.testing.assert_allclose(found.recall(rows[0], k), expected)
-    np.testing.assert_array_equal(found.tuning(rows), [found.recall(rows[0])])
-    np.testing.assert_allclose(found.reported_hits(rows, [2]).mean(axis=1), found.recall(rows[0])[2])
+        expected = [[recall_of(ranking, range(QUERIES), width, k) for width in TOLERANCES] for ranking in rows[0]]
+        np.testing.assert_allclose(protocol.recall(rows[0], k), expected)
+    np.testing.assert_array_equal(protocol.tuning(rows), [protocol.recall(rows[0])])
+    np.testing.assert_allclose(protocol.reported_hits(rows, [2]).mean(axis=1), protocol.recall(rows[0])[2])
 
 
 @pytest.mark.parametrize(("split", "numbers"), [("both", [0, 1]), ("first_half", [0]), ("second_half", [1])])
 def test_each_half_chooses_by_its_own_view_and_is_reported_on_by_the_other(rows, split, numbers):
-    found, half = judge(TRUTH, TOLERANCES, split), QUERIES // 2
+    protocol, half = judge(TRUTH, TOLERANCES, split), QUERIES // 2
     blocks = [range(half), range(half, QUERIES)]
     inner = [range(half - 2 * TOLERANCES[-1]), range(half + 2 * TOLERANCES[-1], QUERIES)]
     expected = [
-        [[recall_of(one, inner[number], tolerance) for tolerance in TOLERANCES] for one in rows[view]]
+        [[recall_of(ranking, inner[number], tolerance) for tolerance in TOLERANCES] for ranking in rows[view]]
         for view, number in enumerate(numbers, start=1)
     ]
-    np.testing.assert_allclose(found.tuning(rows), expected)
+    np.testing.assert_allclose(protocol.tuning(rows), expected)
     chosen = [3, 1][: len(numbers)]
     parts = [
         [[bool(recall_of(rows[0][setting], [query], tolerance)) for query in blocks[1 - number]]
@@ -52,22 +52,22 @@ def test_each_half_chooses_by_its_own_view_and_is_reported_on_by_the_other(rows,
         for setting, number in zip(chosen, numbers, strict=True)
     ]  # fmt: skip
     along_the_path = np.concatenate(parts[::-1], axis=1)  # the first half is reported on by who chose on the second
-    np.testing.assert_array_equal(found.reported_hits(rows, chosen), along_the_path)
+    np.testing.assert_array_equal(protocol.reported_hits(rows, chosen), along_the_path)
 
 
 def test_choosing_sees_no_candidate_of_a_reported_place():
     indices = np.tile(np.arange(-1, QUERIES, dtype=np.int32), (QUERIES, 1))
     shortlist = Shortlist(indices=indices, scores=np.zeros(indices.shape, np.float32), mask=indices >= 0)
-    everything, first, second = judge(TRUTH, TOLERANCES, "both").of(shortlist).views
-    np.testing.assert_array_equal(everything, indices >= 0)
+    all_candidates, first, second = judge(TRUTH, TOLERANCES, "both").of(shortlist).views
+    np.testing.assert_array_equal(all_candidates, indices >= 0)
     np.testing.assert_array_equal(first, (indices >= 0) & (indices < QUERIES // 2 - TOLERANCES[-1]))
     np.testing.assert_array_equal(second, indices >= QUERIES // 2 + TOLERANCES[-1])
 
 
 def test_thresholds_ascend_and_the_middle_one_decides():
-    found = judge(TRUTH, [3, 0, 1, 3])
-    assert (found.thresholds, found.main, found.label(5, 1)) == ([0, 1, 3], 1, "R@5 ±1")
-    np.testing.assert_array_equal(found.places.dense(), TRUTH.positives(3).dense())
+    protocol = judge(TRUTH, [3, 0, 1, 3])
+    assert (protocol.thresholds, protocol.main, protocol.label(5, 1)) == ([0, 1, 3], 1, "R@5 ±1")
+    np.testing.assert_array_equal(protocol.places.dense(), TRUTH.positives(3).dense())
     for thresholds, main in (([1], 0), ([0, 1], 1), ([0, 1, 2, 3], 2)):  # of two in the middle the larger
         assert (judge(TRUTH, thresholds).main, middle(thresholds)) == (main, thresholds[main])
     meters = judge(RadiusTruth(np.zeros((2, 2)), np.zeros((2, 2))), [25.0])
@@ -96,9 +96,9 @@ def test_halves_have_the_names_of_the_split():
 
 def test_fingerprints_tell_what_is_right_apart():
     shifted = FrameTruth(tuple(((row + 1) % QUERIES,) for row in range(QUERIES)), QUERIES)
-    made = [judge(TRUTH, TOLERANCES), judge(TRUTH, (0, 1, 2)), judge(shifted, TOLERANCES), judge(TRUTH, (1, 3))]
-    assert len({one.fingerprint for one in made}) == 4
-    assert judge(TRUTH, TOLERANCES, "both").fingerprint == made[0].fingerprint
+    protocols = [judge(TRUTH, TOLERANCES), judge(TRUTH, (0, 1, 2)), judge(shifted, TOLERANCES), judge(TRUTH, (1, 3))]
+    assert len({protocol.fingerprint for protocol in protocols}) == 4
+    assert judge(TRUTH, TOLERANCES, "both").fingerprint == protocols[0].fingerprint
 
 
 @pytest.mark.parametrize("split", [None, "both"])
@@ -107,9 +107,9 @@ def test_positions_are_reported_along_their_path_however_names_sort_them(split):
     rng = np.random.default_rng(0)
     north = rng.permutation(40).astype(float)
     positions = np.stack([rng.normal(0, 0.1, 40), 10 * north], axis=1)
-    found = judge(RadiusTruth(positions, positions), [12.0], split)
+    protocol = judge(RadiusTruth(positions, positions), [12.0], split)
     rows = np.where(north < 25, np.arange(40), -1).astype(np.int32)[None, None, :, None].repeat(3, axis=0)
-    hits = found.reported_hits(rows, [0, 0] if split else [0])[0]
+    hits = protocol.reported_hits(rows, [0, 0] if split else [0])[0]
     changes = np.flatnonzero(np.diff(hits.astype(int)))
     assert hits.sum() == 25
     assert len(changes) == 1  # neighbors of the street are neighbors

@@ -33,9 +33,9 @@ def test_queries_without_a_place_are_in_both_halves_of_a_map(share):
     parts = [Positives.from_matrix(frame_positives(places, drive, tolerance=2))
              for places in (there, there[::-1], np.full(50, -1))]  # fmt: skip
     nowhere = np.concatenate([there, there[::-1], np.full(50, -1)]) < 0
-    found = halves_of_map(parts, "frames")
-    assert sorted(np.concatenate([half.report for half in found])) == list(range(250))
-    for half in found:
+    both = halves_of_map(parts, "frames")
+    assert sorted(np.concatenate([half.report for half in both])) == list(range(250))
+    for half in both:
         for side in (half.tune, half.report):
             assert abs(nowhere[side].sum() - nowhere.sum() / 2) <= 2
             assert abs((~nowhere[side]).sum() - (~nowhere).sum() / 2) <= 0.1 * (~nowhere).sum() + 8
@@ -50,8 +50,8 @@ def test_halves_of_a_map_where_most_queries_wait_at_its_end():
     for end in (places, 59 - places):  # or at its start
         parts = [Positives.from_matrix(frame_positives(end, np.arange(60), tolerance=1))] * 2
         assert sorted(len(half.report) for half in halves_of_map(parts, "frames")) == [2 * 20, 2 * 40]
-    nothing = halves_of_map([Positives.from_rows([[]] * 4, 3)] * 2, "m")
-    assert [len(half.report) for half in nothing] == [4, 4]
+    without_places = halves_of_map([Positives.from_rows([[]] * 4, 3)] * 2, "m")
+    assert [len(half.report) for half in without_places] == [4, 4]
 
 
 def test_queries_without_a_place_may_be_tuned_on():

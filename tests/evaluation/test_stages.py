@@ -1,7 +1,6 @@
 """The way over a data set, stage by stage, on a synthetic street and on broken images."""
 
 import itertools
-from contextlib import contextmanager
 from dataclasses import replace
 
 import jax
@@ -44,10 +43,8 @@ def features(street):
 
 @pytest.fixture(scope="module")
 def candidates(street):
-    filtered = Retrieval(Aggregated(SIFT, VladFitting(num_words=8))).shortlist(
-        street.only, street.database, 6, FeatureCache()
-    )
-    return filtered.candidates
+    vlad = Retrieval(Aggregated(SIFT, VladFitting(num_words=8)))
+    return vlad.shortlist(street.only, street.database, 6, FeatureCache()).candidates
 
 
 @pytest.fixture(scope="module")
@@ -90,15 +87,13 @@ def test_the_street_is_recognized(street, candidates, matches):
 
 def test_fusion_with_a_constant_and_balanced(candidates, matches):
     scores = stages.score({"count": mfvpr.MatchCount()}, matches, candidates)["count"]
-    np.testing.assert_allclose(
-        ranking.fuse_shortlist(candidates, scores, 10.0), 10 * candidates.scores + scores, rtol=1e-5
-    )
+    fused = ranking.fuse_shortlist(candidates, scores, 10.0)
+    np.testing.assert_allclose(fused, 10 * candidates.scores + scores, rtol=1e-5)
     distance = np.sqrt(2 - 2 * candidates.scores)
     euclidean = ranking.fuse_shortlist(candidates, scores, 10.0, filter_score="negative_euclidean")
     np.testing.assert_allclose(euclidean, scores - 10 * distance, rtol=1e-5)
-    by_index = np.take_along_axis(
-        candidates.indices, ranking.rank_shortlist(candidates, 0 * scores, ties="index"), axis=1
-    )
+    order = ranking.rank_shortlist(candidates, 0 * scores, ties="index")
+    by_index = np.take_along_axis(candidates.indices, order, axis=1)
     np.testing.assert_array_equal(by_index, np.sort(candidates.indices, axis=1))
     added = ranking.fuse_shortlist(candidates, scores, None) - scores
     np.testing.assert_allclose(added.std(axis=1), scores.std(axis=1), rtol=1e-3)
@@ -112,18 +107,13 @@ def test_capacity_of_matches_is_the_largest_pair(features, candidates, matches):
     assert few.capacity == 64
 
 
-PER_MATCH = ("points0", "points1", "distance", "scores0", "scores1", "ratio")
-
-
 @pytest.fixture
-def opened(tmp_path):
-    @contextmanager
-    def opened(num_queries=10, num_candidates=6, name="store"):
+def open_store(tmp_path):
+    def open_store(num_queries=10, num_candidates=6, name="store"):
         sizes = {"num_queries": num_queries, "num_candidates": num_candidates}
-        with open_match_store(tmp_path / name, {"name": "street"}, **sizes) as store:
-            yield store
+        return open_match_store(tmp_path / name, {"name": "street"}, **sizes)
 
-    return opened
+    return open_store
 
 
 def killed_after(number):
@@ -141,18 +131,17 @@ def nothing_done(items, total):
     raise AssertionError(f"{total} queries are matched again")
 
 
-def assert_same_matches(got, expected, names=PER_MATCH):
+def assert_same_matches(got, expected):
     np.testing.assert_array_equal(got.counts, expected.counts)
     assert got.capacity == expected.capacity
     for query in range(len(expected.counts)):
-        for name in (*names, "mask", "image_size0", "image_size1", "index0", "index1", "count0", "count1"):
-            np.testing.assert_array_equal(getattr(got[query], name), getattr(expected[query], name))
+        jax.tree.map(np.testing.assert_array_equal, got[query], expected[query])
 
 
-def test_a_store_gives_what_was_matched_and_is_read_ever_after(features, candidates, matches, opened, monkeypatch):
-    with opened() as store:
+def test_a_store_gives_what_was_matched_and_is_read_ever_after(features, candidates, matches, open_store, monkeypatch):
+    with open_store() as store:
         first = stages.match(features[1], features[0], candidates, store=store)
-    with opened() as store:
+    with open_store() as store:
         again = stages.match(features[1], features[0], candidates, store=store, track=nothing_done)
         alone, stored = stages.stored_matches(store)
         read_again, _ = stages.stored_matches(store, memory=1e-5)
@@ -163,34 +152,32 @@ def test_a_store_gives_what_was_matched_and_is_read_ever_after(features, candida
     for later in (again, alone, read_again, read_again.take(range(10))):
         assert_same_matches(later, first)
         np.testing.assert_array_equal(later.image_sizes, first.image_sizes)
-    for name in ("indices", "scores", "mask"):
-        np.testing.assert_array_equal(getattr(stored, name), getattr(candidates, name))
+    jax.tree.map(np.testing.assert_array_equal, stored, candidates)
     scorers = {"h": mfvpr.HistogramOfShifts(), "a": mfvpr.AnchorPoints(), "s": mfvpr.AggregatedScore()}
-    fresh, *others = (stages.score(scorers, one, candidates) for one in (matches, alone, read_again))
-    for name, other in itertools.product(scorers, others):
-        np.testing.assert_array_equal(fresh[name], other[name])
+    fresh = stages.score(scorers, matches, candidates)
+    for stored_matches in (alone, read_again):
+        jax.tree.map(np.testing.assert_array_equal, stages.score(scorers, stored_matches, candidates), fresh)
     monkeypatch.setattr(match_sets, "BLOCK_BYTES", 1)  # a query at a time
     one_by_one = stages.score(scorers, read_again, candidates)
-    for name in scorers:
-        np.testing.assert_array_equal(fresh[name], one_by_one[name])
-    rows = [sweep(scorers["h"], [{"sigma": 9.0}], one, candidates) for one in (matches, read_again)]
+    jax.tree.map(np.testing.assert_array_equal, one_by_one, fresh)
+    rows = [sweep(scorers["h"], [{"sigma": 9.0}], match_set, candidates) for match_set in (matches, read_again)]
     np.testing.assert_array_equal(*rows)
 
 
-def test_an_interrupted_matching_goes_on_where_it_was(features, candidates, opened):
-    with opened() as store, pytest.raises(KeyboardInterrupt):
+def test_an_interrupted_matching_goes_on_where_it_was(features, candidates, open_store):
+    with open_store() as store, pytest.raises(KeyboardInterrupt):
         stages.match(features[1], features[0], candidates, store=store, track=killed_after(9))
-    with opened() as store:
+    with open_store() as store:
         assert store.done.tolist() == [True] * stages.STORE_BATCH + [False] * 2
         with pytest.raises(InputError, match=r"store: .*10 queries, got 8"):
             stages.stored_matches(store)
         resumed = stages.match(features[1], features[0], candidates, store=store)
-    with opened(name="uninterrupted") as store:
+    with open_store(name="uninterrupted") as store:
         assert_same_matches(resumed, stages.match(features[1], features[0], candidates, store=store))
 
 
-def test_matches_of_another_shortlist_are_told(features, candidates, opened):
-    with opened() as store:
+def test_matches_of_another_shortlist_are_told(features, candidates, open_store):
+    with open_store() as store:
         stages.match(features[1], features[0], candidates, store=store)
         other = replace(candidates, indices=candidates.indices[:, ::-1])
         with pytest.raises(InputError, match=r"store: .*candidates.*delete"):
@@ -210,18 +197,18 @@ def mixed(tmp_path, small_street):
     return image_folder(tmp_path)
 
 
-def test_skipped_images_are_listed_and_never_shortlisted(mixed, opened):
+def test_skipped_images_are_listed_and_never_shortlisted(mixed, open_store):
     cache, vlad = FeatureCache(skip_bad=True), Aggregated(SIFT, VladFitting(num_words=4))
-    [found] = cache.local(mixed, SIFT)
-    assert sorted(found.bad) == [1, 2]
-    assert not found.counts[[1, 2, 3]].any()
+    [features] = cache.local(mixed, SIFT)
+    assert sorted(features.bad) == [1, 2]
+    assert not features.counts[[1, 2, 3]].any()
     descriptors = cache.vectors(mixed, vlad, mixed).values
     candidates = EXACT.shortlist(descriptors, descriptors, 5)
     np.testing.assert_array_equal(candidates.indices[0], [0, 4, 3, -1, -1])
     np.testing.assert_array_equal(candidates.indices[1], [-1] * 5)
-    matches = stages.match(found, found, candidates)
-    with opened(5, 5) as store:
-        assert_same_matches(stages.match(found, found, candidates, store=store), matches)
+    matches = stages.match(features, features, candidates)
+    with open_store(5, 5) as store:
+        assert_same_matches(stages.match(features, features, candidates, store=store), matches)
         np.testing.assert_array_equal(stages.stored_matches(store)[1].mask, candidates.mask)
     scores = stages.score({"h": mfvpr.HistogramOfShifts(), "a": mfvpr.AnchorPoints()}, matches, candidates)
     for values in scores.values():
@@ -246,9 +233,9 @@ def test_features_that_are_not_finite_are_named_and_rank_last(street, value):
             return described
 
     cache, extractor = FeatureCache(), Broken()
-    [found] = cache.local(street.database, extractor)
-    assert list(found.bad) == [1]
-    assert "0001.png" in found.bad[1]
+    [features] = cache.local(street.database, extractor)
+    assert list(features.bad) == [1]
+    assert "0001.png" in features.bad[1]
     descriptors = cache.vectors(street.database, Aggregated(extractor, VladFitting(num_words=4)), street.database)
     candidates = EXACT.shortlist(descriptors.values, descriptors.values, 10)
     assert (candidates.indices != 1).all()

@@ -28,8 +28,8 @@ def latent_paths(recall, correlation, queries, count=200, systems=1, shared=0.0,
     rng = np.random.default_rng(seed)
     noise = rng.standard_normal((systems + 1, count, queries))
     noise[..., 1:] *= math.sqrt(1 - correlation**2)
-    common, *own = signal.lfilter([1], [1, -correlation], noise)
-    return math.sqrt(shared) * common + math.sqrt(1 - shared) * np.array(own) < stats.norm.ppf(recall)
+    common, *separate = signal.lfilter([1], [1, -correlation], noise)
+    return math.sqrt(shared) * common + math.sqrt(1 - shared) * np.array(separate) < stats.norm.ppf(recall)
 
 
 def effect_oracle(values, events, sequences=None):
@@ -126,11 +126,8 @@ def test_the_recall_is_inside_and_misses_mirror_hits():
             np.testing.assert_allclose(recall_interval(~hits), (1 - high, 1 - low), atol=1e-9)
 
 
-def test_no_queries_tell_nothing():
+def test_an_interval_needs_one_system_and_no_query():
     assert recall_interval(np.zeros(0)) == (0.0, 1.0)
-
-
-def test_hits_of_several_systems_are_told():
     with pytest.raises(InputError, match=r"hits: expected \[Q\].* got \[2, 5\]"):
         recall_interval(np.ones((2, 5), bool))
 
@@ -242,8 +239,8 @@ def test_drives_of_the_same_places_are_no_independent_ones():
     drives, count = 4, 300
     low = {"places": 0, "drives": 0}
     common = np.random.default_rng(1).standard_normal((2, count, 101 + 200))
-    own = np.random.default_rng(2).standard_normal((2, count, drives, 101 + 200))
-    latent = (common[:, :, None] + own) / math.sqrt(2)
+    separate = np.random.default_rng(2).standard_normal((2, count, drives, 101 + 200))
+    latent = (common[:, :, None] + separate) / math.sqrt(2)
     for step in range(1, latent.shape[-1]):  # an autoregression, whose start is forgotten
         latent[..., step] = 0.5 * latent[..., step - 1] + math.sqrt(0.75) * latent[..., step]
     hits = latent[..., -101:].reshape(2, count, -1) < 0.52

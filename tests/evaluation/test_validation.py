@@ -1,4 +1,4 @@
-"""What is asked of an evaluation, and what other people's parts give: one line, before anything is done with it."""
+"""Errors of an evaluation's arguments and of user-defined parts: one line, before anything is done."""
 
 import shutil
 from dataclasses import dataclass, replace
@@ -19,6 +19,7 @@ from mfvpr.retrieval.search import EXACT
 from mfvpr.storage import FeatureCache
 from mfvpr.types import Shortlist
 from mfvpr.utils import InputError
+from tests.shapes import unchecked_shapes
 
 pytestmark = pytest.mark.thorough
 
@@ -53,30 +54,28 @@ class Own:
     vector_size, scales = 0, SIFT.scales
 
     def __call__(self, images):
-        features = [one.features for one in SIFT(images)]
-        if self.change == "fewer":
-            return [Description(None, (one,)) for one in features[1:]]
-        if self.change == "features":
-            return features
-        if self.change == "dimension":
-            features = [replace(one, descriptors=one.descriptors[:, :5]) for one in features]
-        if self.change == "shape":
-            features = [replace(one, descriptors=one.descriptors.T) for one in features]
-        if self.change == "padded":
-            features = [padded(one) for one in features]
-        return [Description(np.ones(2, np.float32) if self.change == "vector" else None, (one,)) for one in features]
+        vector = np.ones(2, np.float32) if self.change == "vector" else None
+        features = [CHANGES.get(self.change, lambda image: image)(description.features) for description in SIFT(images)]
+        descriptions = [Description(vector, (image,)) for image in features]
+        return {"features": features, "fewer": descriptions[1:]}.get(self.change, descriptions)
 
 
-def padded(features):
-    """With four slots of nonsense."""
+def pad(features):
+    """Add four slots of nonsense."""
     more = {name: np.concatenate([values, np.full((4, *values.shape[1:]), 9, values.dtype)])
             for name, values in (("keypoints", features.keypoints), ("descriptors", features.descriptors),
                                  ("scores", features.scores))}  # fmt: skip
     return replace(features, **more, mask=np.arange(len(features.mask) + 4) < len(features.mask))
 
 
-def evaluated(dataset, extractor=SIFT, chosen=None, scorers=HISTOGRAM, **options):
-    chosen = chosen or Fixed((0, 1, 2))
+CHANGES = {
+    "dimension": lambda image: replace(image, descriptors=image.descriptors[:, :5]),
+    "shape": lambda image: replace(image, descriptors=image.descriptors.T),
+    "padded": pad,
+}
+
+
+def evaluate(dataset, extractor=SIFT, chosen=Fixed((0, 1, 2)), scorers=HISTOGRAM, **options):
     return mfvpr.evaluate(dataset, extractor, chosen, scorers, **{"candidates": 3} | options)
 
 
@@ -131,22 +130,22 @@ def evaluated(dataset, extractor=SIFT, chosen=None, scorers=HISTOGRAM, **options
     ],
 )  # fmt: skip
 def test_what_cannot_be_used_is_told(dataset, options, words):
-    with pytest.raises(InputError, match=words):
-        evaluated(dataset, **options)
+    with unchecked_shapes(), pytest.raises(InputError, match=words):
+        evaluate(dataset, **options)
 
 
 def test_padding_of_ones_own_extractor_is_dropped(dataset, tmp_path):
     counts = [
         match.counts
         for extractor, cache in ((SIFT, None), (Own("padded"), None), (Own("padded"), FeatureCache(tmp_path)))
-        for match in evaluated(dataset, extractor, cache=cache).matched[0].matches
+        for match in evaluate(dataset, extractor, cache=cache).matched[0].matches
     ]
     np.testing.assert_array_equal(counts[1], counts[0])
     np.testing.assert_array_equal(counts[2], counts[0])
 
 
 def test_no_scorer_is_the_filter_alone(dataset):
-    result = evaluated(dataset, scorers={}, candidates=np.int64(3))
+    result = evaluate(dataset, scorers={}, candidates=np.int64(3))
     assert list(result.systems) == ["filter"]
     assert repr(result) == "Result(folder: folder (10 queries); filter)"
     [ranked] = result.systems["filter"]
@@ -163,7 +162,7 @@ class Negative(mfvpr.HistogramOfShifts):
 
 def test_a_scorer_on_top_of_ours_scores_as_it_says(dataset):
     scorers = HISTOGRAM | {"negative": Negative(), "flat": mfvpr.HistogramOfShifts(shift_range=(100.0, 0.0))}
-    [matched] = evaluated(dataset, scorers=scorers).matched
+    [matched] = evaluate(dataset, scorers=scorers).matched
     scores = stages.score(scorers, matched.by_scale, matched.candidates)
     np.testing.assert_allclose(scores["negative"], -scores["histogram"], rtol=1e-6)
     assert (scores["histogram"] > 0).any()
@@ -171,7 +170,7 @@ def test_a_scorer_on_top_of_ours_scores_as_it_says(dataset):
 
 def test_scores_that_are_nan_are_told(dataset):
     lines = []
-    counts = [matched.matches[0].counts for matched in evaluated(dataset).matched]
+    counts = [matched.matches[0].counts for matched in evaluate(dataset).matched]
     few = float(np.median(counts[0][counts[0] > 0]))
 
     def scorer(matches):
@@ -179,11 +178,11 @@ def test_scores_that_are_nan_are_told(dataset):
         return jnp.where(count > few, jnp.nan, count)
 
     scorers = {"n": scorer}
-    evaluated(dataset, scorers=scorers, cache=FeatureCache(tell=lines.append))
+    evaluate(dataset, scorers=scorers, cache=FeatureCache(tell=lines.append))
     assert any("of n are NaN" in line for line in lines)
     lines.clear()  # of a single candidate every z-score is 0
     options = {"chosen": Fixed((4,)), "candidates": 1, "fused": {"n": Fusion("zscore")}}
-    evaluated(dataset, scorers=scorers, cache=FeatureCache(tell=lines.append), **options)
+    evaluate(dataset, scorers=scorers, cache=FeatureCache(tell=lines.append), **options)
     assert any("of n + filter are NaN" in line for line in lines)
 
 
@@ -197,12 +196,12 @@ def test_scores_that_are_nan_are_told(dataset):
 )
 def test_a_scorer_of_nothing_but_nan_is_refused(dataset, scorer):
     with pytest.raises(InputError, match=r"^n: .*NaN"):
-        evaluated(dataset, scorers={"n": scorer})
+        evaluate(dataset, scorers={"n": scorer})
 
 
 def test_a_ground_truth_of_other_images_is_told(dataset):
     other = replace(dataset.only, truth=FrameTruth(tuple((row,) for row in range(9)), 10))
-    result = evaluated(replace(dataset, sequences=(other,)))
+    result = evaluate(replace(dataset, sequences=(other,)))
     with pytest.raises(InputError, match=r"10 queries.*10 .*got .*9"):
         result.recall([0])
     with pytest.raises(InputError, match=r"ks=\[0\]: expected depths from 1"):
@@ -226,5 +225,5 @@ def test_images_of_nothing_have_no_shortlist(dataset, tmp_path):
     shutil.copy(dataset.queries.paths[3], tmp_path / "1.png")
     sequence = replace(dataset.only, images=image_folder(tmp_path))
     described = Retrieval(Aggregated(SIFT, VladFitting(num_words=4)))
-    found = described.shortlist(sequence, dataset.database, 3, FeatureCache()).candidates
-    assert found.mask.tolist() == [[False] * 3, [True] * 3]
+    candidates = described.shortlist(sequence, dataset.database, 3, FeatureCache()).candidates
+    assert candidates.mask.tolist() == [[False] * 3, [True] * 3]

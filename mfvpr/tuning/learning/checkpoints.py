@@ -39,10 +39,7 @@ def lock_checkpoints(folder: Path) -> Iterator[None]:
             folder.mkdir(parents=True, exist_ok=True)
             stack.enter_context(lock_folder(folder, in_use))
         except OSError as error:
-            raise InputError(
-                f"{folder}: no checkpoint can be kept here ({_reason(error)}); "
-                "check the path, its permissions and its disk"
-            ) from None
+            raise _disk_error(folder, "no checkpoint can be kept here", error) from None
         yield
 
 
@@ -54,7 +51,7 @@ def save(folder: Path, step: int, recipe: Mapping[str, Any], state: Any, progres
         step: above the steps of earlier checkpoints.
         recipe: of the training, JSON values.
         state: pytree of arrays.
-        progress: JSON values that `restore` returns with the state.
+        progress: JSON values.
 
     Raises:
         InputError: the disk is full, or cannot be written. Earlier checkpoints stay.
@@ -67,10 +64,7 @@ def save(folder: Path, step: int, recipe: Mapping[str, Any], state: Any, progres
         with _manager(folder) as manager:
             manager.save(step, args=items)
     except (OSError, ValueError, RuntimeError) as error:
-        raise InputError(
-            f"{folder}: the checkpoint of step {step} cannot be written ({_reason(error)}); "
-            "check the path, its permissions and its disk"
-        ) from None
+        raise _disk_error(folder, f"the checkpoint of step {step} cannot be written", error) from None
 
 
 def restore(folder: Path, recipe: Mapping[str, Any], state: Any) -> tuple[Any, Any] | None:
@@ -144,6 +138,10 @@ def _read(manager: ocp.CheckpointManager, where: Path, **item: Any) -> Any:
         raise _damage_error(where, _reason(error)) from None
 
 
+def _disk_error(folder: Path, problem: str, error: Exception) -> InputError:
+    return InputError(f"{folder}: {problem} ({_reason(error)}); check the path, its permissions and its disk")
+
+
 def _damage_error(where: Path, why: str) -> InputError:
     return InputError(f"{where}: damaged ({why}); delete it to go on from the checkpoint before")
 
@@ -163,9 +161,8 @@ def _holds_checkpoints(folder: Path) -> bool:
         raise InputError(f"{folder}: expected a folder of checkpoints, got a file; choose another folder")
     names = sorted(path.name for path in folder.iterdir())
     if foreign := [name for name in names if not name.partition(".orbax-checkpoint-tmp")[0].isdecimal()]:
-        raise InputError(
-            f"{folder}: expected a folder of checkpoints, got one that holds {foreign[0]}; choose another folder"
-        )
+        raise InputError(f"{folder}: expected a folder of checkpoints, got one that holds {foreign[0]}; choose another "
+                         "folder")  # fmt: skip
     return bool(names)
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool
 
 from mfvpr.evaluation.protocol import Judge
 from mfvpr.evaluation.recall import hits
@@ -47,14 +48,14 @@ class Row:
     Attributes:
         half: name of the half to choose or learn on.
         name: of the score.
-        hits: `[thresholds, R]` bool, of the queries of the other half.
+        hits: of the queries of the other half.
         values: chosen or learned parameters, as plain values.
         fitted: the training; None if nothing was trained.
     """
 
     half: str
     name: str
-    hits: np.ndarray
+    hits: Bool[np.ndarray, "tolerances reported"]
     values: Mapping[str, Any]
     fitted: Fit | None
 
@@ -76,7 +77,7 @@ class Comparison:
     halves: Sequence[Sequence[Row]]
 
     def rows(self) -> Iterator[tuple[str, np.ndarray, Sequence[Row]]]:
-        """Name, hits `[thresholds, R]` of all reported queries along the path, and the row of each half."""
+        """Name, hits `[tolerances, reported]` of all reported queries along the path, and the row of each half."""
         for rows in zip(*self.halves, strict=True):
             yield rows[0].name, self.judge.join_halves([row.hits for row in rows]), rows
 

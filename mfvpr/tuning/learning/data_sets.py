@@ -2,8 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, overload
+from typing import Any
 
+import jax
 import numpy as np
 
 from mfvpr.datasets.positives import join_positives
@@ -73,11 +74,7 @@ def join_data_sets(teach: Sequence[Part], report: Sequence[Part]) -> Part:
         max(part.match_set.capacity for part in parts),
     )
     shortlists = [_shift(part.candidates, int(start), width) for part, start in zip(parts, starts, strict=True)]
-    columns = {
-        name: np.concatenate([getattr(shortlist, name) for shortlist in shortlists])
-        for name in ("indices", "scores", "mask")
-    }
-    return Part(" ".join(names), judge, match_set, Shortlist(**columns))
+    return Part(" ".join(names), judge, match_set, jax.tree.map(lambda *rows: np.concatenate(rows), *shortlists))
 
 
 def _shift(candidates: Shortlist, start: int, width: int) -> Shortlist:
@@ -91,7 +88,6 @@ def _shift(candidates: Shortlist, start: int, width: int) -> Shortlist:
 
 
 def _pad(values: np.ndarray, width: int, fill: Any) -> np.ndarray:
-    """Pad `[Q, C]` to `[Q, width]`."""
     return np.pad(values, [(0, 0), (0, width - values.shape[1])], constant_values=fill)
 
 
@@ -105,13 +101,8 @@ class _Chain(Sequence[Matches]):
     def __len__(self) -> int:
         return int(self._ends[-1])
 
-    @overload
-    def __getitem__(self, query: int) -> Matches: ...
-    @overload
-    def __getitem__(self, query: slice) -> Sequence[Matches]: ...
-    def __getitem__(self, query: int | slice) -> Matches | Sequence[Matches]:
-        if isinstance(query, slice):
-            return [self[row] for row in range(*query.indices(len(self)))]
+    def __getitem__(self, query: Any) -> Matches:
+        """Matches of one query; slices are not supported."""
         query = range(len(self))[query]
         number = int(np.searchsorted(self._ends, query, side="right"))
         part = self._parts[number]

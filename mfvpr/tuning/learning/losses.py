@@ -1,7 +1,7 @@
 """Losses of one query's ranking: scores, positives and mask of the candidates -> a number, smaller = better.
 
-A query without a positive has the loss 0 and the gradient 0. For `mean_loss`, set a temperature with
-`functools.partial`.
+Positives are the correct candidates. Scores of padding may be anything. A query without a positive has the loss 0 and
+the gradient 0. For `mean_loss`, set a temperature with `functools.partial`.
 """
 
 from collections.abc import Callable
@@ -9,6 +9,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float, Num
 
 from mfvpr.types import Array
 from mfvpr.utils.numerics import as_float, masked, masked_mean, positive
@@ -16,14 +17,10 @@ from mfvpr.utils.numerics import as_float, masked, masked_mean, positive
 Loss = Callable[[Array, Array, Array], Array]
 
 
-def cross_entropy(scores: Array, positives: Array, mask: Array) -> Array:
-    """-log of the probability that softmax(scores) gives to all positives together, `[]`, in nats.
-
-    Args:
-        scores: `[C]`; padding may hold anything.
-        positives: `[C]` bool, the correct candidates.
-        mask: `[C]` bool.
-    """
+def cross_entropy(
+    scores: Num[Array, " candidates"], positives: Bool[Array, " candidates"], mask: Bool[Array, " candidates"]
+) -> Float[Array, ""]:
+    """-log of the probability that softmax(scores) gives to all positives together, in nats."""
     scores, positives, real, teaches = _usable(scores, positives, mask)
     # The highest score is subtracted first: else scores in the thousands round a small loss away.
     scores = scores - jax.lax.stop_gradient(jnp.max(scores, where=real, initial=-jnp.inf))
@@ -31,10 +28,13 @@ def cross_entropy(scores: Array, positives: Array, mask: Array) -> Array:
     return jnp.where(teaches, loss, 0.0)
 
 
-def smooth_recall_at_1(scores: Array, positives: Array, mask: Array, temperature: float | Array) -> Array:
-    """1 - the probability that softmax(scores / temperature) gives to the positives, `[]` in [0, 1].
+def smooth_recall_at_1(
+    scores: Num[Array, " candidates"], positives: Bool[Array, " candidates"], mask: Bool[Array, " candidates"],
+    temperature: float | Float[Array, ""],
+) -> Float[Array, ""]:  # fmt: skip
+    """1 - the probability that softmax(scores / temperature) gives to the positives, in [0, 1].
 
-    It tends to 1 - R@1 as the temperature tends to 0. For the other arguments see `cross_entropy`.
+    It tends to 1 - R@1 as the temperature tends to 0.
 
     Args:
         temperature: above 0, in units of the scores; else the loss is NaN.
@@ -44,12 +44,15 @@ def smooth_recall_at_1(scores: Array, positives: Array, mask: Array, temperature
     return jnp.where(teaches, jnp.sum(masked(probability, ~positives)), 0.0)
 
 
-def smooth_average_precision(scores: Array, positives: Array, mask: Array, temperature: float | Array) -> Array:
-    """1 - Smooth-AP (Brown et al., ECCV 2020, equation 4), `[]` in [0, 1].
+def smooth_average_precision(
+    scores: Num[Array, " candidates"], positives: Bool[Array, " candidates"], mask: Bool[Array, " candidates"],
+    temperature: float | Float[Array, ""],
+) -> Float[Array, ""]:  # fmt: skip
+    """1 - Smooth-AP (Brown et al., ECCV 2020, equation 4), in [0, 1].
 
     The rank of a candidate is 1 + the sum of sigmoid(lead / temperature) over all other candidates, where lead is how
     far their score is above its own. The loss tends to 1 - average precision as the temperature tends to 0; a tie
-    counts half. For the other arguments see `cross_entropy`.
+    counts half.
 
     Args:
         temperature: above 0, in units of the scores; else the loss is NaN.
@@ -70,15 +73,11 @@ LOSSES: dict[str, Loss] = {
 """Losses of the programs, by name."""
 
 
-def mean_loss(loss: Loss, scores: Array, positives: Array, mask: Array) -> Array:
-    """Mean of `loss` over the queries with a positive, `[]`; 0 if there are none.
-
-    Args:
-        loss: of one query.
-        scores: `[B, C]`; padding may hold anything.
-        positives: `[B, C]` bool.
-        mask: `[B, C]` bool.
-    """
+def mean_loss(
+    loss: Loss, scores: Num[Array, "queries candidates"], positives: Bool[Array, "queries candidates"],
+    mask: Bool[Array, "queries candidates"],
+) -> Float[Array, ""]:  # fmt: skip
+    """Mean of the loss of one query over the queries with a positive; 0 if there are none."""
     return masked_mean(jax.vmap(loss)(scores, positives, mask), jnp.any(positives & mask, axis=-1))
 
 

@@ -44,7 +44,7 @@ class Model:
 
     @classmethod
     def of(cls, scorer: Any, unit: float, *, c: float | None = None, weight: LearnedWeight | None = None) -> "Model":
-        """A model that starts from a hard scorer's values.
+        """A model that starts from the values of a hard scorer.
 
         Args:
             scorer: the hand-set one.
@@ -52,8 +52,10 @@ class Model:
             c: the retrieval's weight to start with; None = not fused.
             weight: the match weight to start with; None = that of the scorer, which is not learned.
         """
-        numbers = to_logarithms(starts(scorer, unit))
-        start: Parameters = {"numbers": numbers, "sharpness": jnp.log(jnp.asarray(SHARPNESS))}
+        start: Parameters = {
+            "numbers": to_logarithms(starts(scorer, unit)),
+            "sharpness": jnp.log(jnp.asarray(SHARPNESS)),
+        }
         if c is not None:
             start["c"] = jnp.log(jnp.asarray(max(c, LEAST_C * unit) / unit))
         if weight is not None:
@@ -62,13 +64,7 @@ class Model:
 
     @classmethod
     def of_matches(cls, scorer: Any, weight: LearnedWeight, teacher: HistogramOfShifts) -> "Model":
-        """A model whose match weight alone is learned, match by match.
-
-        Args:
-            scorer: the hand-set one.
-            weight: to start with.
-            teacher: has a capacity.
-        """
+        """A model that learns only its match weight, starting with `weight`, from the labels of a teacher."""
         return cls(scorer, {"numbers": {}, "weight": weight}, 1.0, teacher)
 
     def scorer_of(self, parameters: Parameters) -> Any:

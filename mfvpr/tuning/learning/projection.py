@@ -5,6 +5,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Num
 
 from mfvpr.types import Array, Features, value
 from mfvpr.utils.numerics import masked, safe_sqrt
@@ -12,34 +13,26 @@ from mfvpr.utils.numerics import masked, safe_sqrt
 
 @value
 class Projection:
-    """x -> x M / |x M|; padding, and a descriptor with x M = 0, become 0.
+    """x -> x M / |x M| of unit length; padding, and a descriptor with x M = 0, become 0."""
 
-    Attributes:
-        matrix: `[D, d]`.
-    """
-
-    matrix: Array  # [D, d]
+    matrix: Float[Array, "dimensions projected"]
 
     def __call__(self, features: Features) -> Features:
-        """Project the descriptors `[..., N, D]` of features to `[..., N, d]` of unit length."""
+        """Project the descriptors of features."""
         descriptors = masked(jnp.asarray(features.descriptors, dtype=self.matrix.dtype), features.mask)
         projected = jnp.matmul(descriptors, self.matrix, precision=jax.lax.Precision.HIGHEST)
         length = safe_sqrt(jnp.sum(projected**2, axis=-1, keepdims=True))
         return replace(features, descriptors=projected / jnp.where(length > 0, length, 1.0))
 
     @classmethod
-    def principal(cls, descriptors: np.ndarray, dimension: int) -> "Projection":
+    def principal(cls, descriptors: Num[np.ndarray, "descriptors dimensions"], dimension: int) -> "Projection":
         """The projection that preserves most of the descriptors' squared length: PCA without centering.
 
         The mean is not subtracted, since matching compares dot products. The columns are orthonormal, the strongest
         first.
 
-        Args:
-            descriptors: `[n, D]`, all real.
-            dimension: d, at most D.
-
         Raises:
-            ValueError: `dimension` is not in 1 ... D.
+            ValueError: `dimension` is below 1, or above the number of dimensions of the descriptors.
         """
         available = np.shape(descriptors)[1]
         if not 1 <= dimension <= available:

@@ -5,6 +5,7 @@ from functools import cached_property, partial
 
 import jax
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from mfvpr.datasets.positives import Positives
 from mfvpr.evaluation.protocol import Judge
@@ -13,7 +14,7 @@ from mfvpr.matching.match_set import MatchSet
 from mfvpr.reranking.batched_scoring import score
 from mfvpr.reranking.ranking import FilterScore, filter_scores
 from mfvpr.scoring.scorer import Scorer
-from mfvpr.types import Matches, Shortlist, value
+from mfvpr.types import Array, Matches, Shortlist, value
 from mfvpr.utils import ragged
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import round_up
@@ -23,15 +24,12 @@ VALIDATION = 0.25  # of the queries to learn on, the end of each path
 
 @value
 class Batch:
-    """Queries to learn from, padded.
-
-    matches: `[B, C, K, ...]`.  filter_scores: `[B, C]`.  positives, mask: `[B, C]` bool.
-    """
+    """Queries to learn from, padded; matches `[queries, candidates, slots, ...]`."""
 
     matches: Matches
-    filter_scores: np.ndarray
-    positives: np.ndarray
-    mask: np.ndarray
+    filter_scores: Float[Array, "queries candidates"]
+    positives: Bool[Array, "queries candidates"]
+    mask: Bool[Array, "queries candidates"]
 
 
 @dataclass(frozen=True)
@@ -39,13 +37,13 @@ class TrainingSplit:
     """One half of the path to learn on.
 
     Attributes:
-        match_set: matches of all Q queries.
+        match_set: matches of all queries.
         candidates: of all queries; their scores are the retrieval's part of a combined score.
         judge: the ground truth.
         half: queries to choose on and to report on.
-        train: `[t]` queries of the losses.
-        validation: `[v]` queries that decide when learning stops.
-        seen: `[Q, C]` bool, candidates that learning may use.
+        train: queries of the losses.
+        validation: queries that decide when learning stops.
+        seen: candidates that learning may use.
         name: of the half.
     """
 
@@ -53,19 +51,19 @@ class TrainingSplit:
     candidates: Shortlist
     judge: Judge
     half: Half
-    train: np.ndarray
-    validation: np.ndarray
-    seen: np.ndarray
+    train: Int[np.ndarray, " train"]
+    validation: Int[np.ndarray, " validation"]
+    seen: Bool[np.ndarray, "queries candidates"]
     name: str
 
     @cached_property
-    def correct(self) -> np.ndarray:
-        """Correct candidates `[Q, C]` bool at the main threshold."""
+    def correct(self) -> Bool[np.ndarray, "queries candidates"]:
+        """Correct candidates at the main threshold."""
         return self._positive(self.judge.positives[self.judge.main])
 
     @cached_property
-    def usable(self) -> np.ndarray:
-        """Candidates `[Q, C]` bool of the losses: seen, and not correct at the widest threshold only."""
+    def usable(self) -> Bool[np.ndarray, "queries candidates"]:
+        """Candidates of the losses: seen, and not correct at the widest threshold only."""
         return self.seen & ~(self._positive(self.judge.positives[-1]) & ~self.correct)
 
     def _positive(self, positives: Positives) -> np.ndarray:
@@ -77,11 +75,11 @@ class TrainingSplit:
         most = int(self.usable[self.half.tune].sum(axis=1).max())
         return min(round_up(most, 8), self.usable.shape[1])
 
-    def part(self, queries: np.ndarray) -> tuple[MatchSet, Shortlist]:
+    def part(self, queries: Int[np.ndarray, " part"]) -> tuple[MatchSet, Shortlist]:
         """Matches and candidates of some queries."""
         return self.match_set.take(queries), jax.tree.map(lambda values: values[queries], self.candidates)
 
-    def batch(self, queries: np.ndarray, size: int) -> Batch:
+    def batch(self, queries: Int[np.ndarray, " batch"], size: int) -> Batch:
         """A batch of queries, padded to `size` with queries without candidates."""
         padded = ragged.repeat_last(queries, size)
         places = np.argsort(~self.usable[padded], axis=1, kind="stable")[:, : self.width]
@@ -109,7 +107,7 @@ def training_splits(
     """Split each half of a judge into queries to train on and queries to validate on.
 
     Args:
-        match_set: matches of Q queries with C candidates.
+        match_set: of all queries.
         candidates: their shortlist.
         judge: the ground truth, with halves.
         filter_score: the retrieval's part of a combined score, see `mfvpr.reranking.ranking.filter_scores`.

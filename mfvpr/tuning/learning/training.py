@@ -59,19 +59,11 @@ class _State(NamedTuple):
 
 
 def fit(
-    parameters: Any,
-    objective: Callable[[Any, Any], Array],
-    batches: Callable[[int], Any],
-    *,
-    optimizer: optax.GradientTransformation,
-    steps: int,
-    validate: Callable[[Any], float] | None = None,
-    every: int = 10,
-    patience: int | None = None,
-    folder: Path | None = None,
-    recipe: Mapping[str, Any] | None = None,
-    track: Track = no_progress,
-) -> Fit:
+    parameters: Any, objective: Callable[[Any, Any], Array], batches: Callable[[int], Any], *,
+    optimizer: optax.GradientTransformation, steps: int, validate: Callable[[Any], float] | None = None,
+    every: int = 10, patience: int | None = None, folder: Path | None = None,
+    recipe: Mapping[str, Any] | None = None, track: Track = no_progress,
+) -> Fit:  # fmt: skip
     """Minimize the objective.
 
     Args:
@@ -101,7 +93,7 @@ def fit(
     start = _State(parameters, parameters, _strong(optimizer.init(parameters)))
     with checkpoints.lock_checkpoints(folder) if folder else nullcontext():
         state, history = training.descend(*training.begin(start))
-    is_early = _is_exhausted(history, patience)
+    is_early = _out_of_patience(history, patience)
     ended = f"no gain in {patience} validations" if is_early else f"all {steps} steps are done"
     return Fit(state.best, _best(history).step, tuple(history), ended)
 
@@ -143,16 +135,14 @@ class _Training:
         state, (rows, losses) = _strong(stored[0]), stored[1]
         history = [Record(*row) for row in rows]
         if (done := history[-1].step + len(losses)) > self.steps:
-            raise InputError(
-                f"{self.folder}: this checkpoint is of step {done}, expected at most {self.steps}; ask for more steps, "
-                "or choose another folder"
-            )
+            raise InputError(f"{self.folder}: this checkpoint is of step {done}, expected at most {self.steps}; ask "
+                             "for more steps, or choose another folder")  # fmt: skip
         return state, history, losses
 
     def descend(self, state: _State, history: list[Record], losses: list[float]) -> tuple[_State, list[Record]]:
         """Do the remaining steps, until patience ends."""
         done = history[-1].step + len(losses)
-        remaining = 0 if _is_exhausted(history, self.patience) else self.steps - done
+        remaining = 0 if _out_of_patience(history, self.patience) else self.steps - done
         for step in self.track(range(done, done + remaining), remaining):
             state, loss = self.advance(state, step)
             losses = [*losses, loss]
@@ -160,7 +150,7 @@ class _Training:
                 state, history, losses = self.add_record(state, history, losses)
             if self.folder and (is_due or step + 1 == self.steps):
                 checkpoints.save(self.folder, step + 1, self.recipe, state, (history, losses))
-            if _is_exhausted(history, self.patience):
+            if _out_of_patience(history, self.patience):
                 break
         if losses:  # after the checkpoint: a training of more steps would not validate here
             state, history, _ = self.add_record(state, history, losses)
@@ -209,7 +199,7 @@ def _best(history: Sequence[Record]) -> Record:
     return min(validations)[-1] if validations else history[-1]
 
 
-def _is_exhausted(history: Sequence[Record], patience: int | None) -> bool:
+def _out_of_patience(history: Sequence[Record], patience: int | None) -> bool:
     return patience is not None and len(history) - 1 - history.index(_best(history)) >= patience
 
 

@@ -6,6 +6,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from mfvpr import evaluation
 from mfvpr.evaluation.protocol import Judge
@@ -38,8 +39,8 @@ class Outcome:
     Attributes:
         axes: of the sweep.
         judge: the ground truth, with the views of the shortlist.
-        settings: S settings in plain values; those of a complete grid come first, in its order.
-        rows: `[V, S, Q, depth]` database rows, best first.
+        settings: in plain values; those of a complete grid come first, in its order.
+        rows: of the database, best first.
         ks: depths of the recall, ascending, up to the depth of `rows`.
         is_grid: whether `settings` has all settings of the grid.
     """
@@ -47,13 +48,13 @@ class Outcome:
     axes: Axes
     judge: Judge
     settings: Sequence[Mapping[str, Any]]
-    rows: np.ndarray
+    rows: Int[np.ndarray, "views settings queries depth"]
     ks: Sequence[int]
     is_grid: bool
 
     @cached_property
-    def recall(self) -> np.ndarray:
-        """Recall@1 `[S, thresholds]` over all queries."""
+    def recall(self) -> Float[np.ndarray, "settings tolerances"]:
+        """Recall@1 over all queries."""
         return self.judge.recall(self.rows[0])
 
     @property

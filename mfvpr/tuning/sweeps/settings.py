@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Int, Shaped
 
 from mfvpr.reranking import grids
 from mfvpr.reranking.grids import WEIGHTINGS
@@ -25,16 +26,16 @@ class Group:
 
     Attributes:
         scorer: with the choices and the capacity for these settings.
-        settings: `[G]` values by parameter.
-        weightings: `[W]` values of `weight` (an option's number) and `max_distance`.
-        rows: `[G, W]` numbers of the settings.
+        settings: values by parameter.
+        weightings: values of `weight` (an option's number) and `max_distance`.
+        rows: numbers of the settings.
         program: the scorer's program as text, if blocks are stored.
     """
 
     scorer: Any
-    settings: Mapping[str, np.ndarray]
-    weightings: Mapping[str, np.ndarray]
-    rows: np.ndarray
+    settings: Mapping[str, Shaped[np.ndarray, " settings"]]
+    weightings: Mapping[str, Shaped[np.ndarray, " weightings"]]
+    rows: Int[np.ndarray, "settings weightings"]
     program: str = ""
 
     def blocks(self, size: int) -> Iterator["Group"]:
@@ -74,18 +75,16 @@ def groups(scorer: Any, settings: Sequence[Setting], image_sizes: tuple[np.ndarr
     """
     static, integers = parameters.choices(scorer), parameters.whole_numbers(scorer)
     weights = list({id(s["weight"]): s["weight"] for s in settings if "weight" in s}.values())
-    for choices, members in _group_by(
-        settings, range(len(settings)), lambda name, value: name in static or value is None
-    ):
+    by_choices = _group_by(settings, range(len(settings)), lambda name, value: name in static or value is None)
+    for choices, members in by_choices:
         chosen = with_parameters(scorer, choices)
         if weights:
             chosen = replace(chosen, weight=ChosenWeight(tuple(weights), 0))
         chosen = with_static_functions(chosen)
         for rows in _products(settings, members):
             values = _arrays([settings[row] for row in rows[:, 0]], weights, integers, without={*choices, *WEIGHTINGS})
-            weightings = _arrays(
-                [settings[row] for row in rows[0]], weights, integers, without=set(settings[0]) - set(WEIGHTINGS)
-            )
+            parameter_names = set(settings[0]) - set(WEIGHTINGS)
+            weightings = _arrays([settings[row] for row in rows[0]], weights, integers, without=parameter_names)
             for fitted, part in grids.by_capacity(chosen, values, len(rows), *image_sizes):
                 yield Group(fitted, {name: axis[part] for name, axis in values.items()}, weightings, rows[part])
 

@@ -16,6 +16,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from mfvpr.matching.match_set import MatchSet, Scales, queries_that_fit, scales, shapes
 from mfvpr.reranking import grids, ranking
@@ -43,7 +44,7 @@ class Work:
         queries: the part.
         settings: mean number of settings of a program, for the size of the batches.
         candidates: of the part, `[q, C]`.
-        views: V times the candidates `[q, C]` bool that are ranked.
+        views: candidates `[q, C]` bool that are ranked.
         depth: rows kept of each ranking.
         ties: as in `reranking.rank_shortlist`.
         filter_score: as in `reranking.fuse_shortlist`.
@@ -78,22 +79,22 @@ class Work:
 
 def sweep(
     scorer: Any, settings: Sequence[Setting], match_set: MatchSet | Scales, candidates: Shortlist, *,
-    views: Sequence[np.ndarray] | None = None, depth: int = 10, ties: Ties = "filter",
+    views: Sequence[Bool[np.ndarray, "queries candidates"]] | None = None, depth: int = 10, ties: Ties = "filter",
     filter_score: FilterScore = "cosine",
     settings_per_block: int | None = None, queries_per_block: int | None = None,
     folder: Path | None = None, devices: Sequence[Device] | None = None, track: Track = no_progress,
-) -> np.ndarray:  # fmt: skip
-    """The first rows of every query's ranking by every setting.
+) -> Int[np.ndarray, "views settings queries depth"]:  # fmt: skip
+    """Database rows of the first candidates of every query's ranking by every setting, best first, -1 = none.
 
     Args:
         scorer: its other parameters stay.
-        settings: S times values by name, the same names in each: fields of the scorer (numbers are batch axes; each
+        settings: values by name, the same names in each: fields of the scorer (numbers are batch axes; each
             value of a static field has its own program), `weight` (a Weight), `max_distance` of matches, and `c` of the
             fusion with retrieval (None = balanced). Without `c` the score alone ranks.
-        match_set: matches of Q queries with C candidates; several scales are scored one by one and fused over the
+        match_set: matches of queries with their candidates; several scales are scored one by one and fused over the
             candidates that are ranked.
         candidates: their shortlist.
-        views: V times the candidates `[Q, C]` bool that are ranked; by default one, all of the shortlist.
+        views: candidates that are ranked; by default one view, all of the shortlist.
         depth: number of rows of a ranking to return.
         ties: as in `reranking.rank_shortlist`.
         filter_score: as in `reranking.fuse_shortlist`.
@@ -104,9 +105,6 @@ def sweep(
             a scorer that calls back to Python or runs on the host are never stored, since its code is not known.
         devices: that share the batches of pairs, without any change of the scores; None = the one that JAX takes.
         track: progress over blocks.
-
-    Returns:
-        `[V, S, Q, depth]` int32 database rows, best first, -1 where there is none.
     """
     check_host(scorer)
     names = {name for setting in settings for name in setting}
@@ -162,8 +160,8 @@ def _rows(
 
 def block_scores(
     block: Group, batches: Sequence[PaddedBatch], shape: tuple[int, int, int], devices: Sequence[Device] | None
-) -> np.ndarray:
-    """Scores `[S, G, W, q, C]` of every scale; a pair without matches scores 0."""
+) -> Float[np.ndarray, "scales settings weightings queries candidates"]:
+    """Scores of every scale; a pair without matches scores 0."""
     scores = np.zeros((*block.rows.shape, math.prod(shape)), np.float32)
     inputs = block.scorer, block.settings, block.weightings
     for places, values in run_batches(_score_settings, inputs, batches, devices=devices):
@@ -224,14 +222,8 @@ def _read_or_compute(
 
 def _fingerprint(part: Work, block: Group, cs: Sequence[Any]) -> str:
     """Hash of everything that determines a block's rows: matches and shortlist, the scorer's program and numbers."""
-    options = (
-        part.depth,
-        part.ties,
-        part.filter_score,
-        [repr(c) for c in cs],
-        block.rows.tolist(),
-        [*block.settings, *block.weightings],
-    )
+    names = [*block.settings, *block.weightings]
+    options = part.depth, part.ties, part.filter_score, list(map(repr, cs)), block.rows.tolist(), names
     numbers = block.scorer, dict(block.settings), dict(block.weightings)
     return content_hash(repr(options), block.program, part.digest, numbers)
 
@@ -251,7 +243,8 @@ def group_program(work: Work, group: Group) -> str:
         score_settings = partial(grids.score_settings)  # equal to no other: nor is another class's program
         return jax.jit(score_settings).lower(group.scorer, batch, settings, group.weightings).as_text()
 
-    sets = scales(work.match_set)
     return "".join(
-        text(scale.matches[0], *shape) for scale in sets for shape in shapes(scale, settings=work.settings).items()
+        text(scale.matches[0], *shape)
+        for scale in scales(work.match_set)
+        for shape in shapes(scale, settings=work.settings).items()
     )

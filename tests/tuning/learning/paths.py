@@ -28,8 +28,8 @@ def path(*, sizes=SIZES, only_right=(), seed=0):
     mask = ~np.isin(np.arange(QUERIES), only_right)[:, None] | (indices == np.arange(QUERIES)[:, None])
     scores = -np.sort(-rng.random(indices.shape).astype(np.float32), axis=1)
     candidates = Shortlist(indices=indices, scores=scores, mask=mask)
-    found = [matches_of(query, indices[query], rng, sizes) for query in range(QUERIES)]
-    matches = MatchSet([one for one, _ in found], np.array([counts for _, counts in found]), 16)
+    of_queries = [matches_of(query, indices[query], rng, sizes) for query in range(QUERIES)]
+    matches = MatchSet([flat for flat, _ in of_queries], np.array([counts for _, counts in of_queries]), 16)
     apart = np.abs(np.arange(QUERIES)[:, None] - np.arange(QUERIES))
     positives = [Positives.from_matrix(apart <= tolerance) for tolerance in TOLERANCES]
     judge = Judge(TOLERANCES, "frames", positives, positives[-1], halves(positives[-1]), split="both")

@@ -21,7 +21,7 @@ STATE = {"a": np.float32([1.5, -2.0]), "b": {"c": np.int32(3), "d": np.arange(60
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory):
+def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("trained")
     train(folder, steps=10)
     return folder
@@ -61,24 +61,24 @@ def test_what_comes_back_is_what_was_saved(tmp_path):
         ({"optimizer": optax.sgd(0.1)}, 'optimizer.0.count="int32[]", expected nothing'),
     ],
 )  # fmt: skip
-def test_another_training_is_refused_and_nothing_changes(trained, changes, difference):
-    before = contents(trained)
-    with pytest.raises(InputError) as told:
-        train(trained, **changes)
-    assert str(told.value).startswith(f"{trained}: ")
-    assert f"{difference}; " in str(told.value)
-    assert contents(trained) == before
+def test_another_training_is_refused_and_nothing_changes(finished, changes, difference):
+    before = contents(finished)
+    with pytest.raises(InputError) as refusal:
+        train(finished, **changes)
+    assert str(refusal.value).startswith(f"{finished}: ")
+    assert f"{difference}; " in str(refusal.value)
+    assert contents(finished) == before
 
 
-def test_fewer_steps_than_were_made_are_refused(trained):
-    before = contents(trained)
+def test_fewer_steps_than_were_made_are_refused(finished):
+    before = contents(finished)
     with pytest.raises(InputError, match=r"step 10, .*5; "):
-        train(trained, steps=5)
-    assert contents(trained) == before
+        train(finished, steps=5)
+    assert contents(finished) == before
 
 
-def test_the_remains_of_a_kill_are_not_touched_by_a_refusal(trained, tmp_path):
-    folder = Path(shutil.copytree(trained, tmp_path / "copy"))
+def test_the_remains_of_a_kill_are_not_touched_by_a_refusal(finished, tmp_path):
+    folder = Path(shutil.copytree(finished, tmp_path / "copy"))
     (folder / "15.orbax-checkpoint-tmp" / "arrays").mkdir(parents=True)
     before = contents(folder)
     with pytest.raises(InputError, match="this checkpoint is of"):
@@ -123,9 +123,9 @@ def test_damage_is_told_and_the_one_before_still_serves(tmp_path, item, damage):
     files = [path for path in (tmp_path / "2" / item).rglob("*") if path.is_file() and path.suffix != ".txt"]
     largest = max(files, key=lambda path: path.stat().st_size)
     largest.write_bytes(damage(largest.read_bytes()))
-    with pytest.raises(InputError, match=r"/2: damaged \(.+\); delete") as told:
+    with pytest.raises(InputError, match=r"/2: damaged \(.+\); delete") as refusal:
         checkpoints.restore(tmp_path, {}, state)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(refusal.value)
     shutil.rmtree(tmp_path / "2")
     restored = checkpoints.restore(tmp_path, {}, state)
     assert restored is not None

@@ -1,4 +1,4 @@
-"""What a half of the path may learn from: which candidates, which matches, and images of several sizes."""
+"""A half of the path to learn from: its candidates and matches, and images of several sizes."""
 
 from dataclasses import replace
 
@@ -74,7 +74,7 @@ scores_of_one = jax.jit(score_candidates)
 
 
 def scores_of(scorer, at, query):
-    """By the public function: every query with the sizes of its own images, and room for all bins."""
+    """Scores by the public function: every query with the sizes of its own images, and room for all bins."""
     return np.asarray(scores_of_one(replace(scorer, max_bins=2 * max(SIZES) // 20), at.match_set[query]))
 
 
@@ -93,11 +93,11 @@ def test_images_of_two_sizes_are_learned_from_as_one_by_one():
     at = split()
     model = start(at, HISTOGRAM, OPTIONS)
     batch = at.batch(at.train, len(at.train))
-    found = jax.jit(model.objective(LOSSES["cross_entropy"]))(model.start, batch)
+    loss = jax.jit(model.objective(LOSSES["cross_entropy"]))(model.start, batch)
     scores = np.stack([scores_of(model.scorer_of(model.start), at, query) for query in at.train])
     assert np.all(np.isfinite(scores))
     expected = mean_loss(cross_entropy, 2 * scores / model.unit, at.correct[at.train], at.usable[at.train])
-    assert float(found) == pytest.approx(float(expected), rel=1e-4)
+    assert float(loss) == pytest.approx(float(expected), rel=1e-4)
 
 
 def test_anchors_start_near_the_hard_score():
@@ -123,8 +123,8 @@ def test_what_cannot_be_compared_is_refused():
     data = at.match_set, at.candidates
     with pytest.raises(InputError, match=r"MatchCount: .*numbers to learn"):
         comparison.compare(Axes(MatchCount(), {}, {}), at.judge, *data)
-    whole = replace(at.judge, halves=(), split=None)
+    without_halves = replace(at.judge, halves=(), split=None)
     with pytest.raises(InputError, match=r"split=None: .*first_half, second_half .*both"):
-        comparison.compare(Axes(AggregatedScore(), {}, {}), whole, *data)
+        comparison.compare(Axes(AggregatedScore(), {}, {}), without_halves, *data)
     with pytest.raises(InputError, match=r"split=first_half: .*queries .*got 0"):
         split(only_right=range(QUERIES))

@@ -25,10 +25,10 @@ def part(name, seed, width=QUERIES):
     judge = replace(judge, halves=(), split=None)
     keep = [int(ends[width - 1]) for ends in np.cumsum(matches.counts, axis=1)]
     flat = [
-        replace(one, image_size1=one.image_size1[:width], count1=one.count1[:width],
-                **{n: values[:end] for n, values in per_match(one).items()},
-                mask=one.mask[:end])
-        for one, end in zip(matches.matches, keep, strict=True)
+        replace(flat_matches, image_size1=flat_matches.image_size1[:width], count1=flat_matches.count1[:width],
+                **{n: values[:end] for n, values in per_match(flat_matches).items()},
+                mask=flat_matches.mask[:end])
+        for flat_matches, end in zip(matches.matches, keep, strict=True)
     ]  # fmt: skip
     matches = replace(matches, matches=flat, counts=matches.counts[:, :width])
     return Part(name, judge, matches, jax.tree.map(lambda values: values[:, :width], candidates))
@@ -40,50 +40,50 @@ def parts():
 
 
 @pytest.fixture(scope="module")
-def whole(parts):
+def joined(parts):
     return join_data_sets(parts[:2], parts[2:])
 
 
-def test_every_query_keeps_its_own(parts, whole):
-    assert len(whole.match_set) == 3 * QUERIES
-    assert whole.candidates.indices.shape == (3 * QUERIES, QUERIES)
-    for number, one in enumerate(parts):
-        width = one.candidates.indices.shape[1]
+def test_every_query_keeps_its_own(parts, joined):
+    assert len(joined.match_set) == 3 * QUERIES
+    assert joined.candidates.indices.shape == (3 * QUERIES, QUERIES)
+    for number, data_set in enumerate(parts):
+        width = data_set.candidates.indices.shape[1]
         for query in (0, 7, QUERIES - 1):
             row = number * QUERIES + query
             np.testing.assert_array_equal(
-                whole.candidates.indices[row, :width], one.candidates.indices[query] + number * QUERIES
+                joined.candidates.indices[row, :width], data_set.candidates.indices[query] + number * QUERIES
             )
-            assert np.all(whole.candidates.indices[row, width:] == -1)
-            assert not whole.candidates.mask[row, width:].any()
-            np.testing.assert_array_equal(whole.candidates.scores[row, :width], one.candidates.scores[query])
-            ours, own = whole.match_set[row], one.match_set[query]
-            for name, values in per_match(own).items():
-                np.testing.assert_array_equal(getattr(ours, name)[:width], values)
-            assert not ours.mask[width:].any()
-            for level, positives in enumerate(whole.judge.positives):
-                right = one.judge.positives[level].of(query) + number * QUERIES
+            assert np.all(joined.candidates.indices[row, width:] == -1)
+            assert not joined.candidates.mask[row, width:].any()
+            np.testing.assert_array_equal(joined.candidates.scores[row, :width], data_set.candidates.scores[query])
+            joined_matches, matches = joined.match_set[row], data_set.match_set[query]
+            for name, values in per_match(matches).items():
+                np.testing.assert_array_equal(getattr(joined_matches, name)[:width], values)
+            assert not joined_matches.mask[width:].any()
+            for level, positives in enumerate(joined.judge.positives):
+                right = data_set.judge.positives[level].of(query) + number * QUERIES
                 np.testing.assert_array_equal(positives.of(row), right)
-    assert whole.judge.reported_sets == {"c": QUERIES}
+    assert joined.judge.reported_sets == {"c": QUERIES}
 
 
-def test_the_last_quarter_of_each_set_validates_and_nothing_reported_is_seen(whole):
-    [split] = training_splits(whole.match_set, whole.candidates, whole.judge)
+def test_the_last_quarter_of_each_set_validates_and_nothing_reported_is_seen(joined):
+    [split] = training_splits(joined.match_set, joined.candidates, joined.judge)
     assert split.name == "other sets"
     assert {*split.half.report} == {*range(2 * QUERIES, 3 * QUERIES)}
     for number in range(2):
         end = QUERIES * (number + 1)
         first = end - round(VALIDATION * QUERIES)
-        own = range(number * QUERIES, end)
-        assert {query for query in split.validation if query in own} <= {*range(first, end)}
-        assert {query for query in split.train if query in own} <= {*range(end - QUERIES, first - TOLERANCES[-1])}
-        assert min(sum(query in own for query in queries) for queries in (split.train, split.validation)) >= 5
+        of_set = range(number * QUERIES, end)
+        assert {query for query in split.validation if query in of_set} <= {*range(first, end)}
+        assert {query for query in split.train if query in of_set} <= {*range(end - QUERIES, first - TOLERANCES[-1])}
+        assert min(sum(query in of_set for query in queries) for queries in (split.train, split.validation)) >= 5
     assert not split.seen[2 * QUERIES :].any()
-    assert whole.candidates.indices[split.usable].max() < 2 * QUERIES
+    assert joined.candidates.indices[split.usable].max() < 2 * QUERIES
 
 
-def test_what_is_reported_is_what_the_set_has_alone(parts, whole):
-    [split] = training_splits(whole.match_set, whole.candidates, whole.judge)
+def test_what_is_reported_is_what_the_set_has_alone(parts, joined):
+    [split] = training_splits(joined.match_set, joined.candidates, joined.judge)
     scorer = HistogramOfShifts(bin_size=20.0, sigma=20.0)
     compared = comparison._HalfComparison(split, Axes(scorer, {}, {}), Options(), None, untracked_stages)
     last = parts[2]
@@ -94,9 +94,9 @@ def test_what_is_reported_is_what_the_set_has_alone(parts, whole):
         np.testing.assert_array_equal(got, expected.evaluate("it", scorer, setting).hits)
 
 
-def _halved(one):
+def _halved(data_set):
     judge, _, _ = path(seed=2)
-    return one.match_set, one.candidates, judge
+    return data_set.match_set, data_set.candidates, judge
 
 
 def test_databases_stand_side_by_side():

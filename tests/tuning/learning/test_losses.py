@@ -47,19 +47,19 @@ def oracle(name, scores, positives, mask, temperature=0.7):
         if not right[i]:
             continue
         ahead = [1 / (1 + math.exp((scores[i] - scores[j]) / temperature)) for j in range(len(scores))]
-        others = [j for j in range(len(scores)) if j != i]
-        among = 1 + sum(ahead[j] for j in others if right[j])
-        precisions.append(among / (1 + sum(ahead[j] for j in others)))
+        rivals = [j for j in range(len(scores)) if j != i]
+        among = 1 + sum(ahead[j] for j in rivals if right[j])
+        precisions.append(among / (1 + sum(ahead[j] for j in rivals)))
     return 1 - sum(precisions) / len(precisions)
 
 
 def average_precision(scores, positives):
     """The exact one: mean over positives of the share of positives down to their place."""
-    found, precisions = 0, []
+    num_positives, precisions = 0, []
     for place, i in enumerate(sorted(range(len(scores)), key=lambda i: -scores[i]), start=1):
         if positives[i]:
-            found += 1
-            precisions.append(found / place)
+            num_positives += 1
+            precisions.append(num_positives / place)
     return sum(precisions) / len(precisions)
 
 
@@ -72,12 +72,6 @@ def random_queries(seed, queries=200, candidates=CANDIDATES):
     positives[5:10] = False
     scores = rng.permuted(np.tile(np.arange(candidates, dtype=np.float32), (queries, 1)), axis=1)
     return np.where(mask, scores, np.nan).astype(np.float32), positives, mask
-
-
-def distances(loss, exact, *queries):
-    """Of the mean loss from the exact one, for falling temperatures."""
-    smooth = jax.jit(lambda temperature: mean_loss(partial(loss, temperature=temperature), *queries))
-    return [abs(float(smooth(temperature)) - exact) for temperature in (1.0, 0.3, 0.1, 0.03)]
 
 
 @losses
@@ -118,24 +112,26 @@ def test_temperature_has_a_gradient_and_must_be_above_0(loss):
         assert jnp.all(jnp.isnan(jax.vmap(compiled)(jnp.array([0.0, -1.0]))))
 
 
-def test_recall_loss_tends_to_one_minus_recall():
-    scores, positives, mask = random_queries(1)
-    some = np.any(positives & mask, axis=1)
+def exact_recall(scores, positives, mask):
     order = np.asarray(rank(jnp.asarray(scores), jnp.asarray(mask)))
-    order = np.where(np.take_along_axis(mask, order, axis=1), order, -1)
-    exact = 1 - recall_at_k(order[some], positives[some], [1])[0]
-    assert 0.2 < exact < 0.8
-    errors = distances(smooth_recall_at_1, exact, scores, positives, mask)
-    assert errors == sorted(errors, reverse=True)
-    assert errors[-1] < 1e-6
+    return recall_at_k(np.where(np.take_along_axis(mask, order, axis=1), order, -1), positives, [1])[0]
 
 
-def test_precision_loss_tends_to_one_minus_average_precision():
-    scores, positives, mask = random_queries(2)
-    some = np.any(positives & mask, axis=1)
-    rows = zip(scores[some], positives[some], mask[some], strict=True)
-    exact = 1 - np.mean([average_precision(s[m].tolist(), p[m].tolist()) for s, p, m in rows])
-    errors = distances(smooth_average_precision, exact, scores, positives, mask)
+def mean_average_precision(scores, positives, mask):
+    rows = zip(scores, positives, mask, strict=True)
+    return np.mean([average_precision(s[m].tolist(), p[m].tolist()) for s, p, m in rows])
+
+
+@pytest.mark.parametrize(
+    ("loss", "exact"), [(smooth_recall_at_1, exact_recall), (smooth_average_precision, mean_average_precision)]
+)
+def test_smooth_losses_tend_to_the_exact_ones_as_the_temperature_falls(loss, exact):
+    queries = random_queries(1)
+    has_positive = np.any(queries[1] & queries[2], axis=1)
+    limit = 1 - exact(*(values[has_positive] for values in queries))
+    assert 0.2 < limit < 0.8
+    smooth = jax.jit(lambda temperature: mean_loss(partial(loss, temperature=temperature), *queries))
+    errors = [abs(float(smooth(temperature)) - limit) for temperature in (1.0, 0.3, 0.1, 0.03)]
     assert errors == sorted(errors, reverse=True)
     assert errors[-1] < 1e-6
 
@@ -174,5 +170,5 @@ def test_what_teaches_nothing_may_have_any_score(name):
 
 @losses
 def test_no_candidate_slots_at_all(name):
-    nothing = np.zeros(0, np.float32), np.zeros(0, bool), np.zeros(0, bool)
-    assert LOSSES[name](*nothing) == 0
+    no_slots = np.zeros(0, np.float32), np.zeros(0, bool), np.zeros(0, bool)
+    assert LOSSES[name](*no_slots) == 0

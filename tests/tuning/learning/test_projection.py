@@ -61,12 +61,12 @@ def test_principal_directions_are_the_right_singular_vectors(dimension):
     _, strengths, vectors = np.linalg.svd(descriptors.astype(np.float64), full_matrices=False)
     np.testing.assert_allclose(matrix.T @ matrix, np.eye(dimension), atol=1e-6)
     np.testing.assert_allclose(np.abs(np.sum(matrix * vectors[:dimension].T, axis=0)), 1, atol=1e-6)
-    kept = np.sum((descriptors @ matrix) ** 2)
-    np.testing.assert_allclose(kept, np.sum(strengths[:dimension] ** 2), rtol=1e-6)
+    energy = np.sum((descriptors @ matrix) ** 2)
+    np.testing.assert_allclose(energy, np.sum(strengths[:dimension] ** 2), rtol=1e-6)
     rng = np.random.default_rng(4)
     for _ in range(20):  # no other subspace keeps more
         other, _ = np.linalg.qr(rng.normal(size=(12, dimension)))
-        assert np.sum((descriptors @ other) ** 2) <= kept * (1 + 1e-6)
+        assert np.sum((descriptors @ other) ** 2) <= energy * (1 + 1e-6)
 
 
 def test_fewer_descriptors_than_dimensions_still_give_orthonormal_columns():
@@ -87,9 +87,9 @@ def test_gradients_are_finite_for_zeros_and_padding():
         assert np.all(np.isfinite(leaf))
         assert np.any(leaf != 0)
     with jax.enable_x64(True):
-        whole = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), (start, features.descriptors[1:4]))
+        inputs = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), (start, features.descriptors[1:4]))
         features = make_features(np.random.default_rng(6), 3)
-        check_grads(total, whole, order=1, modes=["rev"])
+        check_grads(total, inputs, order=1, modes=["rev"])
 
 
 @pytest.mark.parametrize("dimension", [0, 13])
@@ -114,10 +114,10 @@ def test_a_projection_is_learned_through_soft_matching():
     start = Projection.principal(database.descriptors.reshape(-1, 6), 3)
 
     def scores(projection):
-        def one(query, candidate):
+        def of_pair(query, candidate):
             return MatchCount()(soft_match(projection(query), projection(candidate), temperature=0.1))
 
-        return jax.vmap(lambda query: jax.vmap(lambda candidate: one(query, candidate))(database))(queries)
+        return jax.vmap(lambda query: jax.vmap(lambda candidate: of_pair(query, candidate))(database))(queries)
 
     right = np.eye(5, dtype=bool)
 
@@ -125,8 +125,8 @@ def test_a_projection_is_learned_through_soft_matching():
         return mean_loss(cross_entropy, scores(projection), right, np.ones_like(right))
 
     fitted = fit(start, objective, lambda step: 0, optimizer=optax.adam(0.1), steps=80, every=80)
-    found = [jax.jit(scores)(projection) for projection in (start, fitted.parameters)]
-    losses = [mean_loss(cross_entropy, one, right, np.ones_like(right)) for one in found]
-    recall = [np.mean(np.argmax(one, axis=1) == np.arange(5)) for one in found]
+    scores_of_both = [jax.jit(scores)(projection) for projection in (start, fitted.parameters)]
+    losses = [mean_loss(cross_entropy, of_pair, right, np.ones_like(right)) for of_pair in scores_of_both]
+    recall = [np.mean(np.argmax(of_pair, axis=1) == np.arange(5)) for of_pair in scores_of_both]
     assert losses[1] < 0.5 * losses[0]
     assert recall[1] == 1.0 > recall[0]

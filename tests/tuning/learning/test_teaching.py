@@ -36,8 +36,8 @@ def pair(rng, right, size=24, capacity=30):
 def batch(seed=0, queries=4, candidates=3):
     """The first candidate of every query is right; the last of the last query is none."""
     rng = np.random.default_rng(seed)
-    made = [pair(rng, candidate == 0) for _ in range(queries) for candidate in range(candidates)]
-    matches = jax.tree.map(lambda *leaves: np.stack(leaves).reshape(queries, candidates, *leaves[0].shape), *made)
+    pairs = [pair(rng, candidate == 0) for _ in range(queries) for candidate in range(candidates)]
+    matches = jax.tree.map(lambda *leaves: np.stack(leaves).reshape(queries, candidates, *leaves[0].shape), *pairs)
     mask = np.ones((queries, candidates), bool)
     mask[-1, -1] = False
     positives = np.tile(np.arange(candidates) == 0, (queries, 1))
@@ -50,32 +50,34 @@ def model(taught):
 
 def test_the_loss_is_that_of_a_loop():
     taught = batch()
-    made = model(taught)
+    start_model = model(taught)
     rng = np.random.default_rng(3)
     output = np.float32(rng.normal(size=4))
-    start = made.start | {"weight": replace(made.start["weight"], output=output, output_bias=np.float32(0.3))}
+    start = start_model.start | {
+        "weight": replace(start_model.start["weight"], output=output, output_bias=np.float32(0.3))
+    }
     right, wrong = [], []
     for query, candidate in np.argwhere(taught.mask):
-        one = jax.tree.map(lambda leaf: leaf[query, candidate], taught.matches)  # noqa: B023
-        logits = np.asarray(start["weight"].logits(one), np.float64)
-        for k in np.flatnonzero(one.mask):
-            off = np.abs(one.points1[k] - one.points0[k] - np.float32(SHIFT)).max()
+        matches = jax.tree.map(lambda leaf: leaf[query, candidate], taught.matches)  # noqa: B023
+        logits = np.asarray(start["weight"].logits(matches), np.float64)
+        for k in np.flatnonzero(matches.mask):
+            off = np.abs(matches.points1[k] - matches.points0[k] - np.float32(SHIFT)).max()
             if taught.positives[query, candidate] and off < 2:
                 right.append(math.log1p(math.exp(-logits[k])))
             else:
                 wrong.append(math.log1p(math.exp(logits[k])))
     assert len(right) == 4 * 12
     expected = (np.mean(right) + np.mean(wrong)) / 2
-    assert float(jax.jit(made.objective(None))(start, taught)) == pytest.approx(expected, rel=1e-5)
+    assert float(jax.jit(start_model.objective(None))(start, taught)) == pytest.approx(expected, rel=1e-5)
 
 
 def test_it_finds_what_tells_right_matches_from_wrong_ones():
     taught, other = batch(), batch(seed=9)
-    made = model(taught)
-    found = fit(made.start, made.objective(None), lambda _: taught, optimizer=optax.adam(0.05), steps=40)
-    loss = jax.jit(made.objective(None))
-    assert loss(found.parameters, other) < 0.85 * loss(made.start, other)
-    learned = made.scorer_of(found.parameters)
+    teachable = model(taught)
+    result = fit(teachable.start, teachable.objective(None), lambda _: taught, optimizer=optax.adam(0.05), steps=40)
+    loss = jax.jit(teachable.objective(None))
+    assert loss(result.parameters, other) < 0.85 * loss(teachable.start, other)
+    learned = teachable.scorer_of(result.parameters)
     assert isinstance(learned, AggregatedScore)
     clear, doubtful = (
         jax.tree.map(lambda leaf: leaf[0, 0], replace(other.matches, ratio=np.full_like(other.matches.ratio, ratio)))
@@ -83,12 +85,12 @@ def test_it_finds_what_tells_right_matches_from_wrong_ones():
     )
     weigh = jax.jit(LearnedWeight.__call__)
     assert np.all((weigh(learned.weight, clear) > 2 * weigh(learned.weight, doubtful))[:24])
-    assert made.values(found.parameters) == {}
+    assert teachable.values(result.parameters) == {}
 
 
 def test_the_teacher_goes_with_the_size_of_the_images():
-    made = of_matches(split(), HistogramOfShifts(bin_size=20.0, sigma=20.0), Options(batch=4))
-    assert made.teacher.sigma == pytest.approx(TEACHER_SIGMA * max(SIZES))
-    assert made.teacher.bin_size == pytest.approx(made.teacher.sigma / 2)
-    assert made.teacher.max_bins >= 2 * max(SIZES) / made.teacher.bin_size
-    assert made.start["weight"].names == RELATIVE
+    taught_model = of_matches(split(), HistogramOfShifts(bin_size=20.0, sigma=20.0), Options(batch=4))
+    assert taught_model.teacher.sigma == pytest.approx(TEACHER_SIGMA * max(SIZES))
+    assert taught_model.teacher.bin_size == pytest.approx(taught_model.teacher.sigma / 2)
+    assert taught_model.teacher.max_bins >= 2 * max(SIZES) / taught_model.teacher.bin_size
+    assert taught_model.start["weight"].names == RELATIVE

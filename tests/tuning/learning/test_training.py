@@ -20,7 +20,7 @@ pytestmark = pytest.mark.thorough
 
 
 @pytest.fixture(scope="module")
-def whole():
+def uninterrupted():
     """The training that nothing interrupts."""
     return train()
 
@@ -29,9 +29,9 @@ def test_finds_the_least_squares_line():
     x, y = (np.concatenate(parts) for parts in zip(*(batches(step) for step in range(20)), strict=True))
     design = np.concatenate([np.repeat(x, 3)[:, None], np.tile(np.eye(3), (len(x), 1))], axis=1)
     slope, *offset = np.linalg.lstsq(design, y.reshape(-1), rcond=None)[0]
-    found = train(steps=400, batches=lambda step: (x, y), optimizer=optax.adam(0.1), validate=None, every=400)
-    np.testing.assert_allclose(found.parameters["slope"], slope, atol=1e-4)
-    np.testing.assert_allclose(found.parameters["offset"], offset, atol=1e-4)
+    result = train(steps=400, batches=lambda step: (x, y), optimizer=optax.adam(0.1), validate=None, every=400)
+    np.testing.assert_allclose(result.parameters["slope"], slope, atol=1e-4)
+    np.testing.assert_allclose(result.parameters["offset"], offset, atol=1e-4)
 
 
 def test_recovers_a_planted_temperature():
@@ -44,10 +44,10 @@ def test_recovers_a_planted_temperature():
     def likelihood(parameters, _):
         return mean_loss(cross_entropy, scores / from_logarithms(parameters)["temperature"], positives, mask)
 
-    found = fit(
+    result = fit(
         to_logarithms({"temperature": 3.0}), likelihood, lambda step: None, optimizer=optax.adam(0.1), steps=120
     )
-    assert float(from_logarithms(found.parameters)["temperature"]) == pytest.approx(0.4, rel=0.05)
+    assert float(from_logarithms(result.parameters)["temperature"]) == pytest.approx(0.4, rel=0.05)
 
 
 def test_a_learned_weight_finds_which_matches_count():
@@ -68,7 +68,7 @@ def test_a_learned_weight_finds_which_matches_count():
 
     def scores(weight):
         scorer = HistogramOfShifts(bin_size=40.0, sigma=40.0, weight=weight, max_bins=17)
-        return jax.vmap(lambda one: score_candidates(scorer, one))(matches)
+        return jax.vmap(lambda of_query: score_candidates(scorer, of_query))(matches)
 
     start = LearnedWeight.create(jax.random.key(0), matches, names=ABSOLUTE)
 
@@ -76,24 +76,24 @@ def test_a_learned_weight_finds_which_matches_count():
     def loss(weight, _):
         return mean_loss(cross_entropy, scores(weight), positives, mask)
 
-    found = fit(start, loss, lambda step: None, optimizer=optax.adam(0.05), steps=40)
+    result = fit(start, loss, lambda step: None, optimizer=optax.adam(0.05), steps=40)
     assert loss(start, None) > 1
-    assert loss(found.parameters, None) < 0.1
+    assert loss(result.parameters, None) < 0.1
     close, distant = (replace(pairs[0], distance=np.full(24, distance, np.float32)) for distance in (0.3, 1.1))
     weigh = jax.jit(LearnedWeight.__call__)
-    assert np.all((weigh(found.parameters, close) > 2 * weigh(found.parameters, distant))[:20])
+    assert np.all((weigh(result.parameters, close) > 2 * weigh(result.parameters, distant))[:20])
     for name in ("center", "scale"):
-        np.testing.assert_array_equal(getattr(found.parameters, name), getattr(start, name))
+        np.testing.assert_array_equal(getattr(result.parameters, name), getattr(start, name))
 
 
-def test_history_and_best(whole):
-    assert [record.step for record in whole.history] == [0, 5, 10, 15, 20]
-    assert whole.history[0].loss is None
-    assert whole.history[0].validation == validate(START)
-    assert whole.ended == "all 20 steps are done"
+def test_history_and_best(uninterrupted):
+    assert [record.step for record in uninterrupted.history] == [0, 5, 10, 15, 20]
+    assert uninterrupted.history[0].loss is None
+    assert uninterrupted.history[0].validation == validate(START)
+    assert uninterrupted.ended == "all 20 steps are done"
     first = train(steps=5, every=1)
-    assert whole.history[1].loss == np.mean([record.loss for record in first.history[1:]])
-    assert validate(whole.parameters) == min(record.validation for record in whole.history)
+    assert uninterrupted.history[1].loss == np.mean([record.loss for record in first.history[1:]])
+    assert validate(uninterrupted.parameters) == min(record.validation for record in uninterrupted.history)
 
 
 def test_stops_in_time_and_returns_the_best():
@@ -104,16 +104,15 @@ def test_stops_in_time_and_returns_the_best():
         seen.append(parameters)
         return next(scripted)
 
-    found = train(steps=100, every=2, patience=2, validate=scripted_validation)
-    assert [record.validation for record in found.history] == [5.0, 4.0, 6.0, 3.0, 3.0, 9.0]
-    assert (found.step, found.ended) == (6, "no gain in 2 validations")
-    jax.tree.map(np.testing.assert_array_equal, found.parameters, seen[3])
+    result = train(steps=100, every=2, patience=2, validate=scripted_validation)
+    assert [record.validation for record in result.history] == [5.0, 4.0, 6.0, 3.0, 3.0, 9.0]
+    assert (result.step, result.ended) == (6, "no gain in 2 validations")
+    jax.tree.map(np.testing.assert_array_equal, result.parameters, seen[3])
 
 
 def test_the_start_may_be_the_best():
-    found = train(steps=3, every=1, validate=lambda parameters: float(parameters["slope"]))
-    assert found.step == 0
-    assert found.parameters["slope"] == 1
+    result = train(steps=3, every=1, validate=lambda parameters: float(parameters["slope"]))
+    assert (result.step, result.parameters["slope"]) == (0, 1)
 
 
 def test_one_compilation_for_all_steps(compilations):
@@ -132,28 +131,28 @@ def test_one_compilation_for_all_steps(compilations):
     assert compiled[1] == compiled[-1]
 
 
-def test_goes_on_to_the_bit(tmp_path, whole):
+def test_goes_on_to_the_bit(tmp_path, uninterrupted):
     half = train(tmp_path, steps=10)
-    assert half.history == whole.history[:3]
-    assert same(train(tmp_path), whole)
+    assert half.history == uninterrupted.history[:3]
+    assert same(train(tmp_path), uninterrupted)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["15", "20"]
     before = contents(tmp_path)
-    assert same(train(tmp_path, batches=None), whole)  # nothing is left to do
+    assert same(train(tmp_path, batches=None), uninterrupted)  # nothing is left to do
     assert contents(tmp_path) == before
 
 
 @pytest.mark.parametrize("validated", [True, False])
 def test_more_steps_than_were_asked_for_first_change_nothing(tmp_path, validated):
     """Seven steps end between two validations, where one of 20 steps would neither look nor choose."""
-    given = {} if validated else {"validate": None}
-    short = train(tmp_path, steps=7, **given)
+    options = {} if validated else {"validate": None}
+    short = train(tmp_path, steps=7, **options)
     assert [record.step for record in short.history] == [0, 5, 7]
     before = contents(tmp_path)
-    assert same(train(tmp_path, steps=7, batches=None, **given), short)
+    assert same(train(tmp_path, steps=7, batches=None, **options), short)
     assert contents(tmp_path) == before
-    assert same(short, train(steps=7, **given))
-    assert same(train(tmp_path, steps=9, **given), train(steps=9, **given))
-    assert same(train(tmp_path, **given), train(**given))
+    assert same(short, train(steps=7, **options))
+    assert same(train(tmp_path, steps=9, **options), train(steps=9, **options))
+    assert same(train(tmp_path, **options), train(**options))
 
 
 def test_the_best_between_two_validations_is_of_the_shorter_training_alone(tmp_path):
@@ -187,7 +186,7 @@ def test_an_ended_training_stays_ended(tmp_path):
 
 
 @pytest.mark.parametrize("stop", [2, 13])
-def test_an_interruption_changes_nothing(tmp_path, whole, stop):
+def test_an_interruption_changes_nothing(tmp_path, uninterrupted, stop):
     def interrupted(step):
         if step == stop:
             raise KeyboardInterrupt
@@ -195,16 +194,16 @@ def test_an_interruption_changes_nothing(tmp_path, whole, stop):
 
     with pytest.raises(KeyboardInterrupt):
         train(tmp_path, batches=interrupted)
-    assert same(train(tmp_path), whole)
+    assert same(train(tmp_path), uninterrupted)
 
 
-def test_killed_in_the_middle_it_ends_the_same(tmp_path, whole):
+def test_killed_in_the_middle_it_ends_the_same(tmp_path, uninterrupted):
     done = program(f"folder = Path({str(tmp_path)!r}); print(killed(lambda: train(folder), folder, 80))")
     assert done.stdout == "True\n", done.stderr
     left = {path.name for path in tmp_path.iterdir()}
     assert "10" in left
     assert "20" not in left
-    assert same(train(tmp_path), whole)
+    assert same(train(tmp_path), uninterrupted)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["15", "20"]
 
 
@@ -216,22 +215,22 @@ def test_killed_in_the_middle_it_ends_the_same(tmp_path, whole):
     ],
     ids=["loss", "gradient"],
 )
-def test_what_is_not_finite_is_told_and_leaves_the_checkpoint(tmp_path, whole, broken, culprit):
+def test_what_is_not_finite_is_told_and_leaves_the_checkpoint(tmp_path, uninterrupted, broken, culprit):
     def spiked(step):
         x, y = batches(step)
         spike = np.float32(np.inf if culprit != "loss" else 1e6)
         return (np.where(np.arange(8) == 0, spike, x), y) if step == 13 else (x, y)
 
-    with pytest.raises(TrainingError) as told:
+    with pytest.raises(TrainingError) as messages:
         train(tmp_path, batches=spiked, objective=broken)
-    message = str(told.value)
-    assert isinstance(told.value, InputError)
+    message = str(messages.value)
+    assert isinstance(messages.value, InputError)
     assert "\n" not in message
     assert message.startswith("step 13: ")
     assert "of batch 13 is not finite at slope=" in message
     assert f"the last good checkpoint is {tmp_path}/10;" in message
     assert "offset=" not in message
-    assert same(train(tmp_path), whole)
+    assert same(train(tmp_path), uninterrupted)
 
 
 def test_a_step_to_infinity_and_a_validation_of_nan_are_told():
@@ -248,12 +247,12 @@ def test_impossible_settings_are_refused(wrong):
 
 
 def test_progress_is_told():
-    told = []
+    tracked = []
 
-    def track(items, total):
-        for item in items:
-            told.append((item, total))
-            yield item
+    def track(steps, total):
+        for step in steps:
+            tracked.append((step, total))
+            yield step
 
     train(steps=7, track=track)
-    assert told == [(step, 7) for step in range(7)]
+    assert tracked == [(step, 7) for step in range(7)]

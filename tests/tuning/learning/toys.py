@@ -39,27 +39,20 @@ def validate(parameters):
 
 
 def train(folder: Path | None = None, steps: int = 20, **changes) -> Fit:
-    settings = {
-        "objective": objective,
-        "batches": batches,
-        "optimizer": optax.adam(0.1),
-        "validate": validate,
-        "every": 5,
-        "recipe": RECIPE,
-    }
-    settings |= changes
-    return fit(settings.pop("parameters", START), steps=steps, folder=folder, **settings)
+    settings = {"parameters": START, "objective": objective, "batches": batches, "optimizer": optax.adam(0.1),
+                "validate": validate, "every": 5, "recipe": RECIPE}  # fmt: skip
+    return fit(steps=steps, folder=folder, **settings | changes)
 
 
-def same(one: Fit, other: Fit) -> bool:
+def same(first: Fit, second: Fit) -> bool:
     """To the bit."""
-    leaves = zip(jax.tree.leaves(one.parameters), jax.tree.leaves(other.parameters), strict=True)
+    leaves = zip(jax.tree.leaves(first.parameters), jax.tree.leaves(second.parameters), strict=True)
     equal = all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in leaves)
-    return equal and (one.step, one.history, one.ended) == (other.step, other.history, other.ended)
+    return equal and (first.step, first.history, first.ended) == (second.step, second.history, second.ended)
 
 
 def program(lines: str) -> subprocess.CompletedProcess[str]:
-    """What a process of its own says that runs some lines with all of this module."""
+    """Run lines in a process of its own, with all names of this module."""
     call = [sys.executable, "-W", "default", "-c", f"from tests.tuning.learning.toys import *\n{lines}"]
     return subprocess.run(call, cwd=ROOT, capture_output=True, text=True, check=False)
 

@@ -73,7 +73,7 @@ def test_every_setting_of_the_grid_is_ranked_and_then_the_scorers_own(data, outc
     assert outcome.ks == [1, 5]
     weights = {"fs": mfvpr.FeatureScoreWeight(), "unit": mfvpr.UnitWeight(), "dmf": mfvpr.DescriptorDistanceWeight()}
     settings = [
-        {"weight": weights[one["weight"]], "c": None if one["c"] == "auto" else one["c"]} for one in outcome.settings
+        {"weight": weights[row["weight"]], "c": None if row["c"] == "auto" else row["c"]} for row in outcome.settings
     ]
     rows = sweeping.sweep(SUM, settings, *data, views=outcome.judge.views, depth=5)
     np.testing.assert_array_equal(outcome.rows, rows)
@@ -92,20 +92,20 @@ def test_own_values_that_the_grid_has_are_ranked_once(data):
 def test_each_half_is_reported_by_what_was_chosen_on_the_other(outcome):
     """The scorer's own values are beside the grid, and never chosen."""
     right = outcome.judge.positives[1]
-    first, own = [], []
+    first, of_scorer = [], []
     for view, half, chosen in zip((1, 2), outcome.judge.halves, outcome.chosen, strict=True):
         tuned = hits(outcome.rows[view][:4, half.tune], right.take(half.tune)).mean(axis=1)
         assert chosen == best_setting(tuned, WEIGHTS)
         first += hits(outcome.rows[0][chosen], right)[half.report].tolist()
-        own += hits(outcome.rows[0][4], right)[half.report].tolist()
+        of_scorer += hits(outcome.rows[0][4], right)[half.report].tolist()
     path = np.argsort(np.concatenate([half.report for half in outcome.judge.halves]))
-    first, own = np.array(first)[path], np.array(own)[path]
+    first, of_scorer = np.array(first)[path], np.array(of_scorer)[path]
     verdict = outcome.report[1]
     assert (verdict.threshold, verdict.queries) == (TOLERANCES[1], QUERIES)
     assert verdict.chosen == statistics.estimate(first) == (np.mean(first), verdict.chosen.interval)
     assert verdict.chosen.interval == statistics.recall_interval(first)
-    assert verdict.mcnemar == statistics.mcnemar(first, own)
-    assert verdict.sign_flips == statistics.block_sign_flips(first, own)
+    assert verdict.mcnemar == statistics.mcnemar(first, of_scorer)
+    assert verdict.sign_flips == statistics.block_sign_flips(first, of_scorer)
 
 
 def test_optuna_draws_within_the_axes():
@@ -130,7 +130,7 @@ def test_optuna_proposes_as_many_as_asked_after_the_scorers_own(data):
     assert outcome.rows.shape == (1, 4, QUERIES, 1)
     assert outcome.chosen == [int(np.argmax(outcome.recall[:, 1]))]
     assert sweeps.heat_maps(outcome) == []
-    rows = sweeping.sweep(SUM, [axes.setting(one) for one in outcome.settings], *data, depth=1)
+    rows = sweeping.sweep(SUM, [axes.setting(plain) for plain in outcome.settings], *data, depth=1)
     np.testing.assert_array_equal(outcome.rows, rows)
 
 
@@ -151,10 +151,10 @@ def test_what_people_read_is_what_was_measured(outcome):
     for cells, setting, recall in zip(table.rows, outcome.settings, outcome.recall, strict=True):
         assert cells[:2] == [str(value) for value in setting.values()]
         assert cells[2:5] == [f"{100 * value:.1f}" for value in recall]
-    found = json.loads(json.dumps(sweeps.sweep_json(outcome)))
-    assert (found["split"], found["search"], found["ks"]) == ("both", "grid", [1, 5])
-    assert found["chosen"] == [outcome.settings[number] for number in outcome.chosen]
-    assert [entry["parameters"] for entry in found["settings"]] == outcome.settings
+    written = json.loads(json.dumps(sweeps.sweep_json(outcome)))
+    assert (written["split"], written["search"], written["ks"]) == ("both", "grid", [1, 5])
+    assert written["chosen"] == [outcome.settings[number] for number in outcome.chosen]
+    assert [entry["parameters"] for entry in written["settings"]] == outcome.settings
     text = sweeps.sweep_summary(outcome)
     for half in ("first_half", "second_half"):
         assert text.count(f"queries of {half}, reported on the 16 of the other half: weight = ") == 1

@@ -81,12 +81,19 @@ CASES = [
     (mfvpr.LostScore(), {"form": ["weighted", "described"], "mirrored": [False, True], "max_distance": [0.8, 2.0]}),
     (Wrapped(), {"inner.sigma": [9.0, 22.5], "inner.bin_size": [14.0, 16.0], "inner.align": ["min_edge", "zero_edge"]}),
     *((scorer, {"max_distance": [0.8, 3.0], "c": [None, 0.0]}) for scorer in FOREIGN),
-]
+    (mfvpr.HistogramOfShifts(), [
+        {"sigma": 9.0, "max_distance": 2.0, "weight": FS},
+        {"sigma": 30.0, "max_distance": 0.9, "weight": DMF},
+        {"sigma": 14.0, "max_distance": 2.0, "weight": DMF},
+    ]),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(("scorer", "axes"), CASES, ids=lambda value: "" if isinstance(value, dict) else title(value))
+@pytest.mark.parametrize(
+    ("scorer", "axes"), CASES, ids=lambda value: "" if isinstance(value, dict | list) else title(value)
+)
 def test_sweep_is_one_evaluation_per_setting(data, scorer, axes):
-    settings = sweeps.grid(axes)
+    settings = axes if isinstance(axes, list) else sweeps.grid(axes)
     got = sweeps.sweep(scorer, settings, *data, depth=CANDIDATES)
     assert got.shape == (1, len(settings), QUERIES, CANDIDATES)
     for rows, setting in zip(got[0], settings, strict=True):
@@ -98,23 +105,11 @@ def test_one_setting_beside_a_grid_leaves_it_whole(data):
     scorer = mfvpr.HistogramOfShifts()
     settings = sweeps.grid({"sigma": [9.0, 20.0, 30.0], "weight": [FS, DMF], "max_distance": [0.8, 2.0]})
     settings.insert(3, {"sigma": 9.0, "weight": FS, "max_distance": 1.1})
-    found = list(groups(scorer, settings, data[0].image_sizes))
-    assert sorted(group.rows.shape for group in found) == [(1, 5), (2, 4)]
-    assert sorted(row for group in found for row in group.rows.reshape(-1)) == list(range(13))
+    programs = list(groups(scorer, settings, data[0].image_sizes))
+    assert sorted(group.rows.shape for group in programs) == [(1, 5), (2, 4)]
+    assert sorted(row for group in programs for row in group.rows.reshape(-1)) == list(range(13))
     for rows, setting in zip(sweeps.sweep(scorer, settings, *data)[0], settings, strict=True):
         np.testing.assert_array_equal(rows[:, :CANDIDATES], one_by_one(scorer, setting, *data))
-
-
-def test_settings_need_not_be_a_grid(data):
-    scorer = mfvpr.HistogramOfShifts()
-    settings = [
-        {"sigma": 9.0, "max_distance": 2.0, "weight": FS},
-        {"sigma": 30.0, "max_distance": 0.9, "weight": DMF},
-        {"sigma": 14.0, "max_distance": 2.0, "weight": DMF},
-    ]
-    got = sweeps.sweep(scorer, settings, *data, depth=2)
-    for rows, setting in zip(got[0], settings, strict=True):
-        np.testing.assert_array_equal(rows, one_by_one(scorer, setting, *data)[:, :2])
 
 
 @pytest.mark.parametrize("settings_per_block", [1, 5, 100])
@@ -133,11 +128,11 @@ def test_views_hide_candidates_and_ties_may_go_by_index(data):
     view = np.random.default_rng(1).random(candidates.mask.shape) < 0.6
     settings = [{"max_distance": limit, "c": c} for limit in (0.05, 2.0) for c in (None, 0.0)]  # 0.05: mostly ties
     got = sweeps.sweep(mfvpr.MatchCount(), settings, *data, views=[candidates.mask, view], ties="index")
-    for seen, rows in zip((candidates.mask, view), got, strict=True):
-        for found, setting in zip(rows, settings, strict=True):
+    for seen, rankings in zip((candidates.mask, view), got, strict=True):
+        for first_rows, setting in zip(rankings, settings, strict=True):
             expected = one_by_one(mfvpr.MatchCount(), setting, *data, view=seen, ties="index")
-            np.testing.assert_array_equal(found[:, :CANDIDATES], expected)
-            assert (found[:, CANDIDATES:] == -1).all()
+            np.testing.assert_array_equal(first_rows[:, :CANDIDATES], expected)
+            assert (first_rows[:, CANDIDATES:] == -1).all()
 
 
 def test_finished_blocks_are_read_and_damaged_ones_computed_again(data, tmp_path, monkeypatch):
@@ -156,13 +151,13 @@ def test_finished_blocks_are_read_and_damaged_ones_computed_again(data, tmp_path
     chunks = {"settings_per_block": 1, "queries_per_block": 3, "folder": tmp_path}
     with pytest.raises(Stopped):
         sweeps.sweep(scorer, settings, *data, track=stops, **chunks)
-    kept = sorted(tmp_path.iterdir())
-    assert len(kept) == 4
-    kept[0].write_bytes(kept[0].read_bytes()[:-5])
-    kept[1].write_bytes(b"")
-    turned = bytearray(kept[2].read_bytes())
+    files = sorted(tmp_path.iterdir())
+    assert len(files) == 4
+    files[0].write_bytes(files[0].read_bytes()[:-5])
+    files[1].write_bytes(b"")
+    turned = bytearray(files[2].read_bytes())
     turned[len(turned) // 2] ^= 1  # a row of the right shape, but another
-    kept[2].write_bytes(turned)
+    files[2].write_bytes(turned)
     computed = []
     module = vars(sys.modules["mfvpr.tuning.sweeps.sweep"])
     scores = module["block_scores"]
@@ -201,26 +196,23 @@ def test_slots_hold_every_match_in_few_sizes_with_little_padding(high):
 def test_a_shape_is_compiled_where_that_costs_less_than_padding(pairs):
     """The fewer settings there are to score, and the fewer pairs, the fewer shapes."""
     counts = np.random.default_rng(0).integers(0, 321, (pairs // 50, 50))
-    found = MatchSet([], counts, 320)
-    of_settings = [slots(found, settings=settings) for settings in (1, 8, 64, 10_000)]
+    match_set = MatchSet([], counts, 320)
+    of_settings = [slots(match_set, settings=settings) for settings in (1, 8, 64, 10_000)]
     for few, many in itertools.pairwise(of_settings):
         assert (counts <= many).all()
         assert (many <= few).all()
     fewest, *_, most = (len(np.unique(sizes)) for sizes in of_settings)
     assert fewest == (1 if pairs < 500_000 else 4)
-    assert most == len(np.unique(slots(found))) >= 4
-    least = slots(found, settings=10_000_000)
+    assert most == len(np.unique(slots(match_set))) >= 4
+    least = slots(match_set, settings=10_000_000)
     for settings, sizes in zip((1, 8, 64), of_settings, strict=False):
         padding = sizes.sum() - least.sum()
         assert settings * padding <= 4 * PROGRAM_SLOTS
 
 
 def test_the_largest_size_is_that_of_the_set_whatever_part_is_scored():
-    whole = MatchSet([], np.array([[300, 9], [9, 0]]), 320)
-    assert max(shapes(whole)) == max(shapes(replace(whole, counts=whole.counts[1:]))) == 320
-
-
-def test_slots_of_no_matches():
+    match_set = MatchSet([], np.array([[300, 9], [9, 0]]), 320)
+    assert max(shapes(match_set)) == max(shapes(replace(match_set, counts=match_set.counts[1:]))) == 320
     assert (slots(MatchSet([], np.zeros((3, 2), int), 0)) == 32).all()
 
 
@@ -233,30 +225,30 @@ def test_memory_is_told_beforehand(data):
     assert block_bytes(uneven, many, 1) == block_bytes(largest, many, 1)
 
 
-def other_matches(match_set, candidates):
-    moved = [replace(one, points1=one.points1[::-1].copy()) for one in match_set.matches]
-    return replace(match_set, matches=moved), candidates
+def with_matches(change):
+    """Change the matches of every query."""
+
+    def changed(match_set, candidates):
+        return replace(match_set, matches=list(map(change, match_set.matches))), candidates
+
+    return changed
 
 
-def other_sizes(match_set, candidates):
-    return replace(
-        match_set, matches=[replace(m, image_size1=m.image_size1 / 2) for m in match_set.matches]
-    ), candidates
+OTHER_DATA = {
+    "matches": with_matches(lambda matches: replace(matches, points1=matches.points1[::-1].copy())),
+    "sizes": with_matches(lambda matches: replace(matches, image_size1=matches.image_size1 / 2)),
+    "shortlist": lambda matches, listed: (
+        matches, replace(listed, indices=np.where(listed.mask, listed.indices[:, ::-1], -1))
+    ),
+    "filter": lambda matches, listed: (matches, replace(listed, scores=listed.scores[:, ::-1])),
+}  # fmt: skip
 
 
-def other_shortlist(match_set, candidates):
-    return match_set, replace(candidates, indices=np.where(candidates.mask, candidates.indices[:, ::-1], -1))
-
-
-def other_filter(match_set, candidates):
-    return match_set, replace(candidates, scores=candidates.scores[:, ::-1])
-
-
-@pytest.mark.parametrize("change", [other_matches, other_sizes, other_shortlist, other_filter])
+@pytest.mark.parametrize("change", OTHER_DATA)
 def test_blocks_of_other_data_in_the_same_folder_are_not_taken(data, tmp_path, change):
     scorer, settings = mfvpr.HistogramOfShifts(bin_size=20.0), [{"sigma": 9.0, "c": 0.5}, {"sigma": 20.0, "c": 0.5}]
     sweeps.sweep(scorer, settings, *data, folder=tmp_path)
-    other = change(*data)
+    other = OTHER_DATA[change](*data)
     expected = sweeps.sweep(scorer, settings, *other)
     np.testing.assert_array_equal(sweeps.sweep(scorer, settings, *other, folder=tmp_path), expected)
     np.testing.assert_array_equal(
@@ -289,15 +281,15 @@ def test_nor_are_those_of_other_views_options_or_scorers_of_one_name(data, tmp_p
         (lambda matches: -mfvpr.MatchCount()(matches), {}),
     ]
     fused = [{"c": c} for c in (10.0, 20.0)]
-    for made, options in cases:
-        expected = sweeps.sweep(made, settings, *data, **options)
+    for changed_scorer, options in cases:
+        expected = sweeps.sweep(changed_scorer, settings, *data, **options)
         np.testing.assert_array_equal(
-            sweeps.sweep(made, settings, *data, **options, folder=tmp_path), expected, err_msg=str(options)
+            sweeps.sweep(changed_scorer, settings, *data, **options, folder=tmp_path), expected, err_msg=str(options)
         )
     for kind in ("cosine", "negative_euclidean"):
         expected = sweeps.sweep(mfvpr.MatchCount(), fused, *data, filter_score=kind)
-        kept = sweeps.sweep(mfvpr.MatchCount(), fused, *data, filter_score=kind, folder=tmp_path)
-        np.testing.assert_array_equal(kept, expected)
+        stored = sweeps.sweep(mfvpr.MatchCount(), fused, *data, filter_score=kind, folder=tmp_path)
+        np.testing.assert_array_equal(stored, expected)
 
 
 def test_scores_by_the_number_of_keypoints_are_kept(data, tmp_path):
@@ -309,8 +301,8 @@ def test_scores_by_the_number_of_keypoints_are_kept(data, tmp_path):
     for matches in (match_set.matches, fewer):
         expected.append(sweeps.sweep(scorer, settings, replace(match_set, matches=matches), candidates))
         for _ in range(2):
-            kept = sweeps.sweep(scorer, settings, replace(match_set, matches=matches), candidates, folder=tmp_path)
-            np.testing.assert_array_equal(kept, expected[-1])
+            stored = sweeps.sweep(scorer, settings, replace(match_set, matches=matches), candidates, folder=tmp_path)
+            np.testing.assert_array_equal(stored, expected[-1])
     assert (expected[0] != expected[1]).any()
 
 
@@ -325,10 +317,24 @@ def test_whole_numbers_and_keys_are_swept_and_kept(data, tmp_path):
         np.testing.assert_array_equal(got[0, 0, :, :CANDIDATES], one_by_one(sampled, settings[0], *data))
 
 
-def test_code_that_depends_on_the_shape_is_told_apart(data, tmp_path):
-    def scorer(sign):
-        return lambda matches: mfvpr.MatchCount()(matches) * (1.0 if len(matches.mask) <= 8 else sign)
+def signed_by_slots(sign):
+    return lambda matches: mfvpr.MatchCount()(matches) * (1.0 if len(matches.mask) <= 8 else sign)
 
+
+def signed_by_pairs(sign):
+    @jax.custom_batching.custom_vmap
+    def signed(count):
+        return count
+
+    @signed.def_vmap
+    def _(pairs, _, count):
+        return count * (1.0 if pairs == 1 else sign), True
+
+    return lambda matches: signed(mfvpr.MatchCount()(matches))
+
+
+@pytest.mark.parametrize("scorer", [signed_by_slots, signed_by_pairs])
+def test_code_that_depends_on_a_shape_is_told_apart(data, tmp_path, scorer):
     for sign in (1.0, -1.0):
         expected = sweeps.sweep(scorer(sign), [{"max_distance": 2.0}], *data)
         got = sweeps.sweep(scorer(sign), [{"max_distance": 2.0}], *data, folder=tmp_path)
@@ -347,24 +353,6 @@ def test_a_number_named_as_the_filters_share_is_refused(data):
         sweeps.sweep(Score(), [{"c": 0.5}], *data)
 
 
-def test_code_that_depends_on_the_number_of_pairs_is_told_apart(data, tmp_path):
-    def scorer(sign):
-        @jax.custom_batching.custom_vmap
-        def signed(count):
-            return count
-
-        @signed.def_vmap
-        def _(pairs, _, count):
-            return count * (1.0 if pairs == 1 else sign), True
-
-        return lambda matches: signed(mfvpr.MatchCount()(matches))
-
-    for sign in (1.0, -1.0):
-        expected = sweeps.sweep(scorer(sign), [{"max_distance": 2.0}], *data)
-        got = sweeps.sweep(scorer(sign), [{"max_distance": 2.0}], *data, folder=tmp_path)
-        np.testing.assert_array_equal(got, expected)
-
-
 @pytest.mark.parametrize(
     "scorer", [mfvpr.AnchorPoints(), mfvpr.AggregatedScore(), Sampled(jax.random.key(3))], ids=title
 )
@@ -373,17 +361,17 @@ def test_pairs_score_the_same_in_a_smaller_set(data, scorer, monkeypatch):
     match_set, candidates = data
     few = replace(match_set, matches=match_set.matches[:2], counts=match_set.counts[:2])
     assert shapes(few) == shapes(match_set)
-    found, module = [], vars(sys.modules["mfvpr.tuning.sweeps.sweep"])
+    computed, module = [], vars(sys.modules["mfvpr.tuning.sweeps.sweep"])
     scores = module["block_scores"]
-    monkeypatch.setitem(module, "block_scores", lambda *inputs: found.append(scores(*inputs)) or found[-1])
-    for one in (match_set, few):
-        listed = jax.tree.map(lambda rows: rows[: len(one.matches)], candidates)  # noqa: B023
-        sweeps.sweep(scorer, [{"max_distance": 2.0}], one, listed)
-    np.testing.assert_array_equal(found[0][..., :2, :], found[1])
+    monkeypatch.setitem(module, "block_scores", lambda *inputs: computed.append(scores(*inputs)) or computed[-1])
+    for pairs in (match_set, few):
+        listed = jax.tree.map(lambda rows: rows[: len(pairs.matches)], candidates)  # noqa: B023
+        sweeps.sweep(scorer, [{"max_distance": 2.0}], pairs, listed)
+    np.testing.assert_array_equal(computed[0][..., :2, :], computed[1])
 
 
 def test_a_folder_that_goes_meanwhile_costs_nothing_but_a_full_disk_is_told(data, tmp_path, monkeypatch):
-    """Of blocks: whoever ends the same sweep first removes it."""
+    """Whoever ends the same sweep first removes the folder of blocks."""
     settings, expected = [{"c": 0.5}], sweeps.sweep(mfvpr.MatchCount(), [{"c": 0.5}], *data)
     error = FileNotFoundError
 
