@@ -8,8 +8,7 @@ import os
 from importlib import import_module
 from pathlib import Path
 
-from experiments.errors import Parser, one_line
-from experiments.launch import version
+from experiments.errors import Parser, run_command
 
 # Module -> what it measures. A module's `run(rounds, out, **options)` prints tables and writes them as JSON to `out`.
 BENCHMARKS = {
@@ -26,13 +25,14 @@ OPTIONS = {"stores": "scale", "data": "real"}  # option -> the only benchmark th
 
 
 def main() -> None:
-    """Run the chosen benchmark. Its module is imported here, so that --help does not wait for JAX."""
-    parser = Parser(
-        prog="python -m experiments.benchmark",
-        description=__doc__,
-        epilog="\n".join(["benchmarks:", *(f"  {name:<12} {about}" for name, about in BENCHMARKS.items())]),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    """Run the chosen benchmark."""
+    run_command("python -m experiments.benchmark", str(__doc__), add_arguments)
+
+
+def add_arguments(parser: Parser) -> None:
+    """Declare the command line. The benchmark's module is imported later, so that --help does not wait for JAX."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = "\n".join(["benchmarks:", *(f"  {name:<12} {about}" for name, about in BENCHMARKS.items())])
     parser.add_argument("benchmark", nargs="?", choices=BENCHMARKS, default="scores", help="default: scores")
     parser.add_argument("--rounds", type=positive_int, help="timed calls of each implementation (default: see below)")
     parser.add_argument("--out", type=Path, help="JSON file to write (default: runs/benchmark_BENCHMARK.json)")
@@ -40,17 +40,17 @@ def main() -> None:
         "--stores", type=Path, help="for scale: folder that keeps its features (default: 6 GB, deleted)"
     )
     parser.add_argument("--data", type=Path, help="for real: folder with grief_season and corridor")
-    parser.add_argument("--version", action="version", version=version(), help="print it and exit")
-    arguments = parser.parse_args()
-    with one_line():
-        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # leaves torch its part of a GPU
-        name = arguments.benchmark
-        options = {option: value for option in OPTIONS if (value := getattr(arguments, option))}
-        for option in options:
-            if OPTIONS[option] != name:
+
+    def run(benchmark: str, rounds: int | None, out: Path | None, **options: Path | None) -> None:
+        paths = {option: path for option, path in options.items() if path}
+        for option in paths:
+            if OPTIONS[option] != benchmark:
                 parser.error(f"--{option} is for {OPTIONS[option]} alone")
-        module = import_module(f"experiments.benchmark.{name}")
-        module.run(arguments.rounds, arguments.out or Path(f"runs/benchmark_{name}.json"), **options)
+        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # leaves torch its part of a GPU
+        module = import_module(f"experiments.benchmark.{benchmark}")
+        module.run(rounds, out or Path(f"runs/benchmark_{benchmark}.json"), **paths)
+
+    parser.set_defaults(run=run)
 
 
 def positive_int(text: str) -> int:

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -42,8 +42,6 @@ ASSUMED = (
     "re-ranking a query takes as long as here, where hardly any candidate is shared, whatever the size of the database",
     "network, waiting for the slowest machine and failures cost nothing",
 )
-
-Result = TypeVar("Result")
 
 
 class Step(NamedTuple):
@@ -101,29 +99,23 @@ def measure(data: MadeUp, root: Path, rounds: int) -> dict[str, Any]:
     _, reranking = repeat("re-ranking", rounds, lambda: answers.append(rerank(queries, database, candidates)))
     num_images, written, rows_read = int(store.done.sum()), store.size_bytes, source.rows / len(answers)
     positives = Positives.from_rows(data.similar(), data.images)
-    recall = [
-        *recall_at_k(candidates.indices, positives, [1, CANDIDATES]),
-        *recall_at_k(answers[0].rows, positives, [1]),
-    ]
+    of_filter, of_shortlist = recall_at_k(candidates.indices, positives, [1, CANDIDATES]).tolist()
+    [of_reranking] = recall_at_k(answers[0].rows, positives, [1]).tolist()
     return {
-        "steps": steps | making | {"re-ranking": reranking},
-        "reranking": median_seconds(answers[1:]),
-        "made": num_images,
-        "written": written,
-        "rows_read": rows_read,
-        "read": rows_read * written / num_images,
-        "recall": dict(zip(("filter", "shortlist", "re-ranking"), map(float, recall), strict=True)),
-    }
+        "steps": steps | making | {"re-ranking": reranking}, "reranking": median_seconds(answers[1:]),
+        "made": num_images, "written": written, "rows_read": rows_read, "read": rows_read * written / num_images,
+        "recall": {"filter": of_filter, "shortlist": of_shortlist, "re-ranking": of_reranking},
+    }  # fmt: skip
 
 
-def measure_step(call: Callable[[], Result]) -> tuple[Result, Step]:
+def measure_step(call: Callable[[], Any]) -> tuple[Any, Step]:
     """Result of a call and its cost."""
     start, cpu = time.perf_counter(), time.process_time()
     result = call()
     return result, Step(time.perf_counter() - start, time.process_time() - cpu, peak_bytes() / 1e9)
 
 
-def repeat(label: str, rounds: int, call: Callable[[], Result]) -> tuple[Result, Step]:
+def repeat(label: str, rounds: int, call: Callable[[], Any]) -> tuple[Any, Step]:
     """Result of a first call, which compiles, and the median cost of `rounds` more."""
     result = call()
     steps = [measure_step(call)[1] for _ in bar(label, rounds, range(rounds))]
@@ -218,13 +210,14 @@ def _remarks(data: MadeUp, measured: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _plans_table(plans: list[dict]) -> Table:
-    header = ["features", "machines", "database once, h", "queries, s", "filter, s", "(merging)", "extraction, s",
-              "re-ranking, s", "in all, s", "memory, GB", "disk, GB"]  # fmt: skip
+    columns = {  # header -> name, unit, digits
+        "database once, h": ("describing", 3600, 2), "queries, s": ("asking", 1, 2), "filter, s": ("filtering", 1, 2),
+        "(merging)": ("merging", 1, 2), "extraction, s": ("extracting", 1, 1), "re-ranking, s": ("reranking", 1, 1),
+        "in all, s": ("answering", 1, 1), "memory, GB": ("memory", 1e9, 2), "disk, GB": ("disk", 1e9, 2),
+    }  # fmt: skip
     lines = [
-        [plan["features"], str(plan["machines"]), f"{plan['describing'] / 3600:.2f}"]
-        + [f"{plan[name]:.2f}" for name in ("asking", "filtering", "merging")]
-        + [f"{plan[name]:.1f}" for name in ("extracting", "reranking", "answering")]
-        + [f"{plan[name] / 1e9:.2f}" for name in ("memory", "disk")]
+        [plan["features"], str(plan["machines"])]
+        + [f"{plan[name] / unit:.{digits}f}" for name, unit, digits in columns.values()]
         for plan in plans
     ]
-    return Table(header, lines)
+    return Table(["features", "machines", *columns], lines)

@@ -37,42 +37,35 @@ def run(rounds: int | None, out: Path) -> None:
         root, rng = Path(temporary), random.Random(0)
         street = streets_folder(root, num_frames=FRAMES, image_size=IMAGE_SIZE)
         os.environ["JAX_COMPILATION_CACHE_DIR"] = f"{root}/programs"
-        _run_to_end(root / "first", street)  # fills the compilation cache
-        expected = _run_to_end(root / "undisturbed", street)
+        _evaluate(root / "first", street)  # fills the compilation cache
+        _evaluate(root / "undisturbed", street)
+        expected = file_hashes(root / "undisturbed")
         seconds = duration(lambda: _start_task(root / "undisturbed", street, 0).wait())  # a task with nothing to do
-        progress = bar("kills", total)
-        while kills.total() < total:
-            folder = root / f"{evaluations}"
-            new_kills = _run_with_kills(folder, street, seconds, rng, total - kills.total())
-            hashes = file_hashes(folder)
-            differing = sorted(name for name in {*hashes, *expected} if hashes.get(name) != expected.get(name))
-            if differing:
-                raise SettingsError(f"kills: {len(differing)} files differ from an undisturbed run: {differing[0]} ...")
-            kills += new_kills
-            evaluations += 1
-            progress.update(new_kills.total())
-        progress.close()
+        with bar("kills", total) as progress:
+            while kills.total() < total:
+                folder = root / f"{evaluations}"
+                new_kills = _evaluate(folder, street, rng, seconds, total - kills.total())
+                hashes = file_hashes(folder)
+                differing = sorted(name for name in {*hashes, *expected} if hashes.get(name) != expected.get(name))
+                if differing:
+                    raise SettingsError(f"kills: {len(differing)} files differ from an undisturbed run: {differing[0]}")
+                kills += new_kills
+                evaluations += 1
+                progress.update(new_kills.total())
     lines = [[stage, str(count)] for stage, count in [*kills.items(), ("in all", kills.total())]]
     title = f"{evaluations} evaluations in {SHARDS} shards: rows and tables equal undisturbed ones, rows written once"
     content = {"evaluations": evaluations, "kills": dict(kills)}
     write_report(out, title, [Table(["killed during", "times"], lines)], content)
 
 
-def _run_to_end(folder: Path, street: Path) -> dict[str, str]:
-    while missing := _missing_tasks(folder):
-        for index in missing:
-            if _start_task(folder, street, index).wait():
-                raise SettingsError(f"kills: the task {index}/{SHARDS} of an undisturbed run failed")
-    return file_hashes(folder)
-
-
-def _run_with_kills(folder: Path, street: Path, seconds: float, rng: random.Random, max_kills: int) -> Counter[str]:
-    """Run an evaluation whose tasks are killed, and count the kills by stage."""
+def _evaluate(
+    folder: Path, street: Path, rng: random.Random | None = None, seconds: float = 0.0, max_kills: int = 0
+) -> Counter[str]:
+    """Run an evaluation, kill its tasks after about `seconds`, and count the kills by stage."""
     kills, states = Counter[str](), {}
     while missing := _missing_tasks(folder):
-        tasks = {
-            index: (_start_task(folder, street, index), time.monotonic() + _delay(rng, seconds)) for index in missing
-        }
+        ends = [time.monotonic() + (_delay(rng, seconds) if rng else math.inf) for _ in missing]
+        tasks = {index: (_start_task(folder, street, index), end) for index, end in zip(missing, ends, strict=True)}
         while tasks:
             time.sleep(POLL)
             _check_rows(states, folder)

@@ -39,12 +39,9 @@ def run(rounds: int | None, out: Path) -> None:
                 _fill(street_map, images, size)
                 rows.append({"detector": name, "images": size} | _percentiles(street_map, queries, rounds or ROUNDS))
     header = ["features", "images", "p50, ms", "p95, ms", "p50, candidates read", "p95", "features alone"]
-    lines = [
-        [name, f"{images:,}", *(f"{value:.1f}" for value in values)]
-        for name, images, *values in (row.values() for row in rows)
-    ]
-    title = f"{FRAMES} queries with {CANDIDATES} candidates"
-    write_report(out, title, [Table(header, lines)], {"rows": rows})
+    lines = [[name, f"{images:,}", *(f"{value:.1f}" for value in values)]
+             for name, images, *values in (row.values() for row in rows)]  # fmt: skip
+    write_report(out, f"{FRAMES} queries with {CANDIDATES} candidates", [Table(header, lines)], {"rows": rows})
 
 
 def _extractors() -> Iterator[tuple[str, Any]]:

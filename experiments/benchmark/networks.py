@@ -165,12 +165,12 @@ def torch_entries(contest: Contest, arrays: Mapping[str, np.ndarray], images: np
     module, _, function = str(contest.peer).partition(".")
     network = partial(getattr(import_module(f"experiments.benchmark.{module}"), function), **(contest.options or {}))
     device, table = "cuda" if torch.cuda.is_available() else "cpu", network_of(entry_of(contest.checkpoint)).table
-    default, channels_last = (
-        partial(
-            run_network, network, weights=torch_weights(arrays, table, device, layout), device=device, layout=layout
-        )
-        for layout in (torch.contiguous_format, torch.channels_last)
-    )
+
+    def run_with(layout: torch.memory_format) -> Callable[[list[np.ndarray]], list[Any]]:
+        weights = torch_weights(arrays, table, device, layout)
+        return partial(run_network, network, weights=weights, device=device, layout=layout)
+
+    default, channels_last = run_with(torch.contiguous_format), run_with(torch.channels_last)
     entries: list[Entry] = []
     for count in BATCHES:
         batch, step = images[:count], f"{contest.step}, batch {count}"

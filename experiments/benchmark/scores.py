@@ -45,14 +45,10 @@ def run(rounds: int | None, out: Path) -> None:
     matches = float(np.asarray(data.matches.mask).sum(1).mean())
     sizes = f"1 query x {CANDIDATES} candidates, {KEYPOINTS} features of {DIMENSION} dimensions"
     libraries = (mfvpr_entries, opencv_entries, faiss_entries, torch_entries, numpy_entries)
-    compete(
-        [entry for entries in libraries for entry in entries(data)], rounds or 15, out,
-        title=f"{sizes}, {matches:.0f} matches a pair",
-        setting={
-            "candidates": CANDIDATES, "keypoints": KEYPOINTS, "dimension": DIMENSION, "matches_per_pair": matches,
-        },
-        remarks=_remarks,
-    )  # fmt: skip
+    entries = [entry for entries in libraries for entry in entries(data)]
+    setting = {"candidates": CANDIDATES, "keypoints": KEYPOINTS, "dimension": DIMENSION, "matches_per_pair": matches}
+    title = f"{sizes}, {matches:.0f} matches a pair"
+    compete(entries, rounds or 15, out, title=title, setting=setting, remarks=_remarks)
 
 
 def _remarks(seconds: Seconds, _: Results) -> list[str]:

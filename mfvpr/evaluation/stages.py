@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from mfvpr.features.feature_set import FeatureSet, memory_budget
 from mfvpr.matching import batched
@@ -130,23 +131,23 @@ class Explanation:
     """The histogram of one pair and its parts, NumPy.
 
     Attributes:
-        histogram: all bins `[B, B]` (-inf beyond the range of shifts) with their centers, px.
+        histogram: all bins (-inf beyond the range of shifts) with their centers, px.
         score: the tallest bin.
-        shift: `[2]` its center (x, y), px.
-        peak: `[2]` the refined peak between bin centers, px.
-        weights: `[K]` of the matches.
-        agrees: `[K]` whether a match's shift lies within two standard deviations of the peak along both axes.
+        shift: its center (x, y), px.
+        peak: the refined peak between bin centers, px.
+        weights: of the matches.
+        agrees: whether a match's shift lies within two standard deviations of the peak along both axes.
         scale: the dominant one of the scorer's scales, to which all of this belongs.
         direction: of the shifts, as the scorer defines it.
     """
 
     histogram: ShiftHistogram
-    score: Array
-    shift: Array
-    peak: Array
-    weights: Array
-    agrees: Array
-    scale: Array
+    score: Float[Array, ""]
+    shift: Float[Array, "2"]
+    peak: Float[Array, "2"]
+    weights: Float[Array, " slots"]
+    agrees: Bool[Array, " slots"]
+    scale: Float[Array, ""]
     direction: str
 
 
@@ -165,19 +166,20 @@ def _explain(scorer: HistogramOfShifts, matches: Matches) -> tuple[Any, ...]:
 
 
 def dominant_shifts(
-    scorer: HistogramOfShifts, match_set: MatchSet, queries: np.ndarray, places: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    scorer: HistogramOfShifts, match_set: MatchSet,
+    queries: Int[np.ndarray, " pairs"], places: Int[np.ndarray, " pairs"],
+) -> tuple[Float[np.ndarray, "pairs 2"], Float[np.ndarray, "pairs 2 2"], Float[np.ndarray, " pairs"]]:  # fmt: skip
     """Shifts from the center of a query to the same point in a candidate, px, with their intervals; one program.
 
     Args:
         scorer: computes the histogram.
         match_set: of all queries.
-        queries: `[n]` rows.
-        places: `[n]` of the candidates in their shortlists.
+        queries: rows of the queries.
+        places: of the candidates in their shortlists.
 
     Returns:
-        Refined dominant shifts `[n, 2]` (candidate minus query), their 95 % intervals `[n, 2, 2]` (low, high), and the
-        scales `[n]`; NaN if no match votes.
+        Refined dominant shifts (candidate minus query), their 95 % intervals (low, high), and the scales; NaN if no
+        match votes.
     """
     fitted = with_capacity(scorer, *match_set.image_sizes, multiple=BIN_STEP)
     parts = [(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))]
@@ -187,11 +189,13 @@ def dominant_shifts(
         number = len(queries[part])
         shifts, intervals, scales = pair_shifts(fitted, pairs)
         parts.append((shifts[:number], intervals[:number], scales[:number]))
-    shifts, intervals, scales = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    shifts, intervals, scales = map(np.concatenate, zip(*parts, strict=True))
     return shifts, intervals, scales
 
 
-def pair_shifts(scorer: HistogramOfShifts, matches: Matches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def pair_shifts(
+    scorer: HistogramOfShifts, matches: Matches
+) -> tuple[Float[np.ndarray, "pairs 2"], Float[np.ndarray, "pairs 2 2"], Float[np.ndarray, " pairs"]]:
     """`dominant_shifts` of matches `[P, K, ...]`, by a scorer with the capacity for their images."""
     votes, shifts, intervals, scales = jax.tree.map(np.asarray, _pair_shifts(scorer, matches))
     no_votes = ~votes  # the host makes the NaN: `jax_debug_nans` stops at those of programs

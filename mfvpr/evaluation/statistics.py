@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Bool
 from scipy import special, stats
 
 from mfvpr.utils.errors import InputError
@@ -48,8 +49,8 @@ class Estimate(NamedTuple):
     interval: tuple[float, float]
 
 
-def estimate(hits: np.ndarray) -> Estimate:
-    """Recall of hits `[Q]` bool along a path with at least one query, with its confidence interval."""
+def estimate(hits: Bool[np.ndarray, " queries"]) -> Estimate:
+    """Recall of hits along a path with at least one query, with its confidence interval."""
     return Estimate(float(np.mean(hits)), recall_interval(hits))
 
 

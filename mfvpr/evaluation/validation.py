@@ -27,15 +27,7 @@ def check_request(
     scorers: Mapping[str, Any], fused: Mapping[str, Fusion], correlated: Iterable[str], ties: Ties,
     memory: float | None, *, cohort: bool = False,
 ) -> None:  # fmt: skip
-    """Check the arguments of `mfvpr.evaluate` that concern scores.
-
-    Args:
-        scorers: by name.
-        fused: combinations with the retrieval's score, by name of the scorer.
-        correlated: names of scorers and fused systems.
-        ties: see `mfvpr.evaluate`.
-        memory: see `mfvpr.evaluate`.
-        cohort: whether scorers are ranked with a cohort as well.
+    """Check the arguments of `mfvpr.evaluate` that concern scores; `cohort` = whether there is one.
 
     Raises:
         InputError: an argument cannot be used.
@@ -94,16 +86,9 @@ def check_matching(candidates: Any, extractor: Extractor | Source, matching: Mat
 def validate_candidates(filtered: Any, name: str, num_queries: int, num_database: int, num_candidates: int) -> Filtered:
     """Check the candidates of a retrieval, which may be user-defined; return them padded with -1 and 0.
 
-    Args:
-        filtered: result of the retrieval.
-        name: of the retrieval.
-        num_queries: Q.
-        num_database: N.
-        num_candidates: C.
-
     Raises:
-        InputError: no Filtered, or no Shortlist `[Q, C]` in it, rows that the database lacks, or a row twice for one
-            query.
+        InputError: no Filtered, or no Shortlist of the expected shape in it, rows that the database lacks, or a row
+            twice for one query. The error has the `name` of the retrieval.
     """
     if not isinstance(filtered, Filtered):
         raise InputError(f"{name}: expected a Filtered, got {type(filtered).__name__}; return "
@@ -143,12 +128,7 @@ def image_warnings(folder: ImageFolder, features: FeatureSet, bad: Mapping[int, 
 def score_warnings(
     matched: Sequence[Matched], ranked: Sequence[Mapping[str, Ranked]], scorers: Iterable[str]
 ) -> Iterator[str]:
-    """Warnings of scores that are NaN or infinite, for example if a user-defined scorer divides by 0.
-
-    Args:
-        matched: by sequence.
-        ranked: by sequence and system.
-        scorers: names of the systems that rank by the scores of one scorer.
+    """Warnings of NaN and infinite scores of every sequence, for example if a user-defined scorer divides by 0.
 
     Raises:
         InputError: every score of a scorer is NaN, infinite, or 0, the score of pairs without matches.

@@ -141,6 +141,9 @@ def assert_same_matches(got, expected):
 def test_a_store_gives_what_was_matched_and_is_read_ever_after(features, candidates, matches, open_store, monkeypatch):
     with open_store() as store:
         first = stages.match(features[1], features[0], candidates, store=store)
+        other = replace(candidates, indices=candidates.indices[:, ::-1])
+        with pytest.raises(InputError, match=r"store: .*candidates.*delete"):
+            stages.match(features[1], features[0], other, store=store)
     with open_store() as store:
         again = stages.match(features[1], features[0], candidates, store=store, track=nothing_done)
         alone, stored = stages.stored_matches(store)
@@ -174,14 +177,6 @@ def test_an_interrupted_matching_goes_on_where_it_was(features, candidates, open
         resumed = stages.match(features[1], features[0], candidates, store=store)
     with open_store(name="uninterrupted") as store:
         assert_same_matches(resumed, stages.match(features[1], features[0], candidates, store=store))
-
-
-def test_matches_of_another_shortlist_are_told(features, candidates, open_store):
-    with open_store() as store:
-        stages.match(features[1], features[0], candidates, store=store)
-        other = replace(candidates, indices=candidates.indices[:, ::-1])
-        with pytest.raises(InputError, match=r"store: .*candidates.*delete"):
-            stages.match(features[1], features[0], other, store=store)
 
 
 @pytest.fixture

@@ -135,16 +135,6 @@ def test_a_small_database_is_ranked_in_its_own_process(tmp_path, monkeypatch, ca
     assert stores == {path: path.stat().st_mtime_ns for path in (tmp_path / "stores").rglob("*.npz")}
 
 
-def test_stores_are_for_scale_alone(monkeypatch, capsys):
-    from experiments.benchmark.__main__ import main
-
-    monkeypatch.setattr(sys, "argv", ["benchmark", "scores", "--stores", "somewhere"])
-    with pytest.raises(SystemExit) as left:
-        main()
-    assert left.value.code == 2
-    assert "--stores is for scale alone" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("name", BENCHMARKS)
 def test_every_benchmark_is_a_module(name):
     assert callable(import_module(f"experiments.benchmark.{name}").run)

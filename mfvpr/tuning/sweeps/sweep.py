@@ -41,13 +41,8 @@ class Work:
 
     Attributes:
         match_set: of all queries.
-        queries: the part.
+        queries: the part; candidates and views are of these queries.
         settings: mean number of settings of a program, for the size of the batches.
-        candidates: of the part, `[q, C]`.
-        views: candidates `[q, C]` bool that are ranked.
-        depth: rows kept of each ranking.
-        ties: as in `reranking.rank_shortlist`.
-        filter_score: as in `reranking.fuse_shortlist`.
     """
 
     match_set: MatchSet | Scales
@@ -68,6 +63,11 @@ class Work:
             fusion, [(scale.counts, scale.matches) for scale in parts], self.candidates, list(self.views)
         )
 
+    @cached_property
+    def batches(self) -> list[PaddedBatch]:
+        """Padded pairs of these queries; made only if a block needs them."""
+        return list(all_batches(self.match_set, self.queries, settings=self.settings))
+
     def parts(self, size: int) -> Iterator["Work"]:
         """Split into at most `size` queries at a time."""
         for start in range(0, len(self.queries), size):
@@ -80,17 +80,16 @@ class Work:
 def sweep(
     scorer: Any, settings: Sequence[Setting], match_set: MatchSet | Scales, candidates: Shortlist, *,
     views: Sequence[Bool[np.ndarray, "queries candidates"]] | None = None, depth: int = 10, ties: Ties = "filter",
-    filter_score: FilterScore = "cosine",
-    settings_per_block: int | None = None, queries_per_block: int | None = None,
+    filter_score: FilterScore = "cosine", settings_per_block: int | None = None, queries_per_block: int | None = None,
     folder: Path | None = None, devices: Sequence[Device] | None = None, track: Track = no_progress,
 ) -> Int[np.ndarray, "views settings queries depth"]:  # fmt: skip
     """Database rows of the first candidates of every query's ranking by every setting, best first, -1 = none.
 
     Args:
         scorer: its other parameters stay.
-        settings: values by name, the same names in each: fields of the scorer (numbers are batch axes; each
-            value of a static field has its own program), `weight` (a Weight), `max_distance` of matches, and `c` of the
-            fusion with retrieval (None = balanced). Without `c` the score alone ranks.
+        settings: values by name, the same names in each: fields of the scorer (numbers are batch axes; each value of a
+            static field has its own program), `weight` (a Weight), `max_distance` of matches, and `c` of the fusion
+            with retrieval (None = balanced). Without `c` the score alone ranks.
         match_set: matches of queries with their candidates; several scales are scored one by one and fused over the
             candidates that are ranked.
         candidates: their shortlist.
@@ -107,29 +106,25 @@ def sweep(
         track: progress over blocks.
     """
     check_host(scorer)
-    names = {name for setting in settings for name in setting}
-    grids.refuse_own_names(scorer, names, reserved=(*grids.WEIGHTINGS, FUSION))
+    grids.refuse_own_names(scorer, {*itertools.chain(*settings)}, reserved=(*grids.WEIGHTINGS, FUSION))
     num_queries = len(candidates.mask)
     views = [candidates.mask] if views is None else views
     unique, places = distinct(settings)
     per_block = min(settings_per_block or SETTINGS_PER_BLOCK, len(unique))
     queries = queries_per_block or queries_that_fit(match_set, per_block)
     programs = list(groups(scorer, unique, match_set.image_sizes))
-    per_program = len(unique) / len(programs)
-    work = Work(match_set, range(num_queries), per_program, candidates, views, depth, ties, filter_score)
+    mean_size = len(unique) / len(programs)
+    work = Work(match_set, range(num_queries), mean_size, candidates, views, depth, ties, filter_score)
     if folder is not None:
         programs = [replace(group, program=group_program(work, group)) for group in programs]
     blocks = [block for group in programs for block in group.blocks(per_block)]
     all_rows = np.full((len(views), len(settings), num_queries, depth), -1, np.int32)
     steps = ((part, block) for part in work.parts(queries) for block in blocks)
-    batches: dict[range, list[PaddedBatch]] = {}
     for part, block in track(steps, len(blocks) * -(-num_queries // queries)):
-        if part.queries not in batches:  # the batches of one part at a time, and only if a block needs them
-            batches = {part.queries: []}
         places_of_block = [places[row] for row in dict.fromkeys(block.rows.reshape(-1).tolist())]
-        members, repeats = list(itertools.chain.from_iterable(places_of_block)), list(map(len, places_of_block))
+        members, repeats = list(itertools.chain(*places_of_block)), list(map(len, places_of_block))
         cs = [settings[place].get(FUSION, _ALONE) for place in members]
-        compute = partial(_rows, part, block, batches[part.queries], cs, repeats, devices)
+        compute = partial(_rows, part, block, cs, repeats, devices)
         rows = _read_or_compute(folder, part, block, cs, compute)
         all_rows[:, members, part.queries.start : part.queries.stop] = rows
     return all_rows
@@ -141,14 +136,11 @@ def result_bytes(num_views: int, num_settings: int, num_queries: int, depth: int
 
 
 def _rows(
-    part: Work, block: Group, batches: list[PaddedBatch], cs: Sequence[Any], repeats: Sequence[int],
-    devices: Sequence[Device] | None,
-) -> np.ndarray:  # fmt: skip
+    part: Work, block: Group, cs: Sequence[Any], repeats: Sequence[int], devices: Sequence[Device] | None
+) -> np.ndarray:
     """Rows `[V, W, q, depth]` of the block's distinct settings, each repeated for all its values of c."""
-    if not batches:
-        batches.extend(all_batches(part.match_set, part.queries, settings=part.settings))
     shape = len(scales(part.match_set)), *part.candidates.mask.shape
-    scores = block_scores(block, batches, shape, devices)
+    scores = block_scores(block, part.batches, shape, devices)
     _, first = np.unique(block.rows, return_index=True)
     scores = scores.reshape(shape[0], -1, *shape[1:])[:, np.sort(first)]
 
