@@ -66,7 +66,8 @@ class MadeUp:
     def global_descriptors(self) -> tuple[np.ndarray, np.ndarray]:
         """Unit vectors `[Q, GLOBAL]` of the queries and `[M, GLOBAL]` of the database."""
         rng = np.random.default_rng(2)
-        queries, database = (_unit(_normal(rng, count, GLOBAL)) for count in (self.queries, self.images))
+        sizes = self.queries, self.images
+        queries, database = (_unit(rng.standard_normal((size, GLOBAL), np.float32)) for size in sizes)
         rows = self.similar()
         database[rows] = _unit(self.likeness * queries[:, None] + np.sqrt(1 - self.likeness**2) * database[rows])
         return queries, database
@@ -92,11 +93,7 @@ class MadeUp:
         return store
 
     def _descriptors(self, rng: np.random.Generator, count: int) -> np.ndarray:
-        return _unit(_normal(rng, count, self.dimension))
-
-
-def _normal(rng: np.random.Generator, *shape: int) -> np.ndarray:
-    return rng.standard_normal(shape, np.float32)
+        return _unit(rng.standard_normal((count, self.dimension), np.float32))
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

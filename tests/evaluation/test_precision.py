@@ -83,7 +83,7 @@ def test_calibration_error_by_chance_is_that_of_probabilities_that_are_true():
     """One bin of p = 1/2: the mean distance of a fair coin's share of heads, sqrt(2 / (pi n)) / 2 of n throws."""
     assert chance_calibration_error(np.full(100, 0.5)) == pytest.approx(math.sqrt(2 / (math.pi * 100)) / 2, rel=0.1)
     assert chance_calibration_error(np.array([0.0, 1.0, np.nan])) == 0
-    assert np.isnan(reliability(np.full(3, np.nan), np.zeros(3)).calibration_error)
+    assert np.isnan(reliability(np.full(3, np.nan), np.zeros(3, bool)).calibration_error)
 
 
 @pytest.mark.parametrize("value", [5.0, np.inf, -np.inf])

@@ -107,20 +107,19 @@ def sweep(
     """
     check_host(scorer)
     grids.refuse_own_names(scorer, {*itertools.chain(*settings)}, reserved=(*grids.WEIGHTINGS, FUSION))
-    num_queries = len(candidates.mask)
+    all_queries = range(len(candidates.mask))
     views = [candidates.mask] if views is None else views
     unique, places = distinct(settings)
     per_block = min(settings_per_block or SETTINGS_PER_BLOCK, len(unique))
     queries = queries_per_block or queries_that_fit(match_set, per_block)
     programs = list(groups(scorer, unique, match_set.image_sizes))
-    mean_size = len(unique) / len(programs)
-    work = Work(match_set, range(num_queries), mean_size, candidates, views, depth, ties, filter_score)
+    work = Work(match_set, all_queries, len(unique) / len(programs), candidates, views, depth, ties, filter_score)
     if folder is not None:
         programs = [replace(group, program=group_program(work, group)) for group in programs]
     blocks = [block for group in programs for block in group.blocks(per_block)]
-    all_rows = np.full((len(views), len(settings), num_queries, depth), -1, np.int32)
+    all_rows = np.full((len(views), len(settings), len(all_queries), depth), -1, np.int32)
     steps = ((part, block) for part in work.parts(queries) for block in blocks)
-    for part, block in track(steps, len(blocks) * -(-num_queries // queries)):
+    for part, block in track(steps, len(blocks) * -(-len(all_queries) // queries)):
         places_of_block = [places[row] for row in dict.fromkeys(block.rows.reshape(-1).tolist())]
         members, repeats = list(itertools.chain(*places_of_block)), list(map(len, places_of_block))
         cs = [settings[place].get(FUSION, _ALONE) for place in members]
