@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import optax
 import orbax.checkpoint as ocp
@@ -37,13 +38,9 @@ def test_what_comes_back_is_what_was_saved(tmp_path):
     assert restored is not None
     state, progress = restored
     assert progress == [[100, None, 0.1 + 0.2]]
-    for got, expected in (
-        (state["a"], STATE["a"]),
-        (state["b"]["c"], STATE["b"]["c"]),
-        (state["b"]["d"], STATE["b"]["d"]),
-    ):
-        assert got.dtype == expected.dtype
-        np.testing.assert_array_equal(got, expected)
+    dtypes = jax.tree.map(lambda leaf: leaf.dtype, (state, STATE))
+    assert dtypes[0] == dtypes[1]
+    jax.tree.map(np.testing.assert_array_equal, state, STATE)
 
 
 @pytest.mark.parametrize(
