@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Int, Num
 
 from mfvpr.features.feature_set import FeatureSet, Slots, Staged, memory_budget
 from mfvpr.matching.match_set import QueryMatches, split_pairs
@@ -21,30 +22,28 @@ from mfvpr.utils.threads import ordered_map
 QUERIES = 8  # per batch; the queries of a batch share the features of their candidates
 PAIRS = 128  # per call
 
-Calls = list[
-    tuple[np.ndarray, Matches]
-]  # (positions in the pairs of a part [n], Matches [P, ...] that the device computes)
+Calls = list[tuple[Int[np.ndarray, " pairs"], Matches]]  # (positions in the pairs of a part, their matches)
 
 
 class Part(NamedTuple):
     """Pairs of a batch of queries with candidates that fit on the device at the same time.
 
-    pairs: `[n, 3]` row of the query, position of the candidate in its shortlist, row of the database.
+    pairs: row of the query, position of the candidate in its shortlist, row of the database.
     device: matches these pairs.
-    ends: `[B]` rows of the queries without further pairs.
+    ends: rows of the queries without further pairs.
     """
 
-    pairs: np.ndarray
+    pairs: Int[np.ndarray, "pairs 3"]
     device: Device
-    ends: np.ndarray
+    ends: Int[np.ndarray, " queries"]
 
 
 class Pair(NamedTuple):
-    """Real matches of one pair, and the sizes `[2]` of its images."""
+    """Real matches of one pair, and the sizes of its images."""
 
     matches: Row
-    image_size0: np.ndarray
-    image_size1: np.ndarray
+    image_size0: Num[np.ndarray, "2"]
+    image_size1: Num[np.ndarray, "2"]
 
 
 @dataclass(frozen=True)
@@ -131,7 +130,11 @@ def match_queries(
 
 
 def _parts(
-    counts0: np.ndarray, counts1: np.ndarray, indices: np.ndarray, todo: np.ndarray, sides: dict[Device, Sides]
+    counts0: Int[np.ndarray, " queries"],
+    counts1: Int[np.ndarray, " database"],
+    indices: Int[np.ndarray, "queries candidates"],
+    todo: Int[np.ndarray, " rows"],
+    sides: dict[Device, Sides],
 ) -> Iterator[Part]:
     """Parts of all batches, each batch on the next device; without pairs that lack keypoints."""
     for start, device in zip(range(0, len(todo), QUERIES), itertools.cycle(sides), strict=False):

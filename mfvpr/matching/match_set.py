@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int, Num
 
 from mfvpr.types import Matches, per_match, per_pair
 from mfvpr.utils import ragged
@@ -33,15 +34,15 @@ class QueryMatches:
     Attributes:
         matches: Matches `[n, ...]` of all candidates, best candidate first, without padding; `image_size0` `[2]` and
             `count0` `[]` are the query's, `image_size1` `[C, 2]` and `count1` `[C]` the candidates'.
-        counts: `[C]` int32 matches of each candidate; their sum is n.
-        indices: `[C]` int32 database rows, best first, -1 = none.
-        filter_scores: `[C]` float32.
+        counts: matches of each candidate, int32; their sum is n.
+        indices: database rows, int32, best first, -1 = none.
+        filter_scores: float32.
     """
 
     matches: Matches
-    counts: np.ndarray
-    indices: np.ndarray
-    filter_scores: np.ndarray
+    counts: Int[np.ndarray, " candidates"]
+    indices: Int[np.ndarray, " candidates"]
+    filter_scores: Float[np.ndarray, " candidates"]
 
 
 @dataclass(frozen=True)
@@ -50,16 +51,16 @@ class MatchSet:
 
     Attributes:
         matches: per query, as in QueryMatches; a store may read them on access.
-        counts: `[Q, C]` matches of each candidate.
+        counts: matches of each candidate.
         capacity: slots that suffice for every pair.
     """
 
     matches: Sequence[Matches]
-    counts: np.ndarray
+    counts: Int[np.ndarray, "queries candidates"]
     capacity: int
 
     @classmethod
-    def of(cls, matches: Sequence[Matches], counts: np.ndarray) -> "MatchSet":
+    def of(cls, matches: Sequence[Matches], counts: Int[np.ndarray, "queries candidates"]) -> "MatchSet":
         """Match set with a rounded capacity, so that sets of similar size share programs."""
         return cls(matches, counts, round_up(int(counts.max(initial=0)), 64))
 
@@ -75,12 +76,19 @@ class MatchSet:
         matches = ordered_map(self.matches.__getitem__, list(queries), workers=available_cpus())
         return MatchSet(list(matches), self.counts[queries], self.capacity)
 
-    def pairs(self, queries: np.ndarray, places: np.ndarray, capacity: int, *, total: int | None = None) -> Matches:
+    def pairs(
+        self,
+        queries: Int[np.ndarray, " pairs"],
+        places: Int[np.ndarray, " pairs"],
+        capacity: int,
+        *,
+        total: int | None = None,
+    ) -> Matches:
         """Matches `[P, K, ...]` of pairs, padded with zeros.
 
         Args:
-            queries: `[P]` rows of the queries.
-            places: `[P]` positions of the candidates in their shortlists.
+            queries: rows of the queries.
+            places: positions of the candidates in their shortlists.
             capacity: K, at least the matches of any of the pairs.
             total: number of pairs with padding; padding has no matches, and the images of the last pair.
         """
@@ -97,8 +105,8 @@ class MatchSet:
         return Matches(**entries, mask=mask, **pair_fields)
 
     @cached_property
-    def _ends(self) -> np.ndarray:
-        """`[Q, C]` end of each candidate's matches among the matches of its query."""
+    def _ends(self) -> Int[np.ndarray, "queries candidates"]:
+        """End of each candidate's matches among the matches of its query."""
         return np.cumsum(self.counts, axis=1)
 
     def _row(self, matches: Matches, query: int, place: int) -> ragged.Row:
@@ -107,8 +115,8 @@ class MatchSet:
         return {name: values[end - self.counts[query, place] : end] for name, values in per_match(matches).items()}
 
     @cached_property
-    def image_sizes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Sizes of query and database images, `[n, 2]` each, in all combinations."""
+    def image_sizes(self) -> tuple[Num[np.ndarray, "pairs 2"], Num[np.ndarray, "pairs 2"]]:
+        """Sizes of query and database images, in all combinations."""
         sizes = [
             [np.reshape(query.image_size0, (-1, 2)), np.reshape(query.image_size1, (-1, 2))] for query in self.matches
         ]
@@ -143,7 +151,7 @@ class Scales:
             )
 
     @property
-    def image_sizes(self) -> tuple[np.ndarray, np.ndarray]:
+    def image_sizes(self) -> tuple[Num[np.ndarray, "pairs 2"], Num[np.ndarray, "pairs 2"]]:
         """Image sizes of all scales, see `MatchSet.image_sizes`."""
         sizes0, sizes1 = zip(*(match_set.image_sizes for match_set in self.match_sets), strict=True)
         return np.concatenate(sizes0), np.concatenate(sizes1)
@@ -162,18 +170,18 @@ def scales(match_set: MatchSet | Scales) -> Sequence[MatchSet]:
 class Batch(NamedTuple):
     """Pairs with similar numbers of matches, which are scored in one call.
 
-    places: `[n]` positions of the pairs in the flattened `[queries, C]`.
+    places: positions of the pairs in the flattened `[queries, candidates]`.
     slots: per pair, at least its matches.
     pairs: number of pairs with padding, at least n; padding has no matches.
     """
 
-    places: np.ndarray
+    places: Int[np.ndarray, " pairs"]
     slots: int
     pairs: int
 
 
-def slots(match_set: MatchSet, *, settings: float = math.inf) -> np.ndarray:
-    """`[Q, C]` slots of the batch of each pair: few sizes to compile, with little padding.
+def slots(match_set: MatchSet, *, settings: float = math.inf) -> Int[np.ndarray, "queries candidates"]:
+    """Slots of the batch of each pair: few sizes to compile, with little padding.
 
     Args:
         match_set: the largest size is its capacity, so that subsets have the same sizes.
@@ -208,7 +216,9 @@ def partition(match_set: MatchSet, queries: range, *, settings: float = math.inf
     return [batch for batch in interleaved if batch is not None]
 
 
-def batches(match_set: MatchSet, queries: range, *, settings: float = math.inf) -> Iterator[tuple[np.ndarray, Matches]]:
+def batches(
+    match_set: MatchSet, queries: range, *, settings: float = math.inf
+) -> Iterator[tuple[Int[np.ndarray, " pairs"], Matches]]:
     """Padded matches of all batches of `partition`.
 
     Returns:

@@ -6,6 +6,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Int
 
 from mfvpr.matching.nearest_neighbors import CrossCheck, filter_matches, match, pairs_at_once
 from mfvpr.types import Array, Features, Matches, value
@@ -47,7 +48,11 @@ NEIGHBORS = Matching()
 
 
 def match_pairs(
-    queries: Features, candidates: Features, pairs: Array, count: int | Array, matcher: Matcher = NEIGHBORS
+    queries: Features,
+    candidates: Features,
+    pairs: Int[Array, "pairs 2"],
+    count: int | Int[Array, ""],
+    matcher: Matcher = NEIGHBORS,
 ) -> Matches:
     """Match the first `count` pairs of images.
 
@@ -56,7 +61,7 @@ def match_pairs(
     Args:
         queries: keypoints `[B, N0, 2]`.
         candidates: keypoints `[S, N1, 2]`.
-        pairs: `[P, 2]` int32 rows of queries and candidates.
+        pairs: int32 rows of queries and candidates.
         count: number of pairs to match.
         matcher: of one pair.
 

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from mfvpr.matching.similarity import even_size, nearest, nearest_two
 from mfvpr.types import Array, Features, Matches, per_keypoint, per_match
@@ -105,7 +106,7 @@ def pairs_at_once(chunk_size: int | None, query: Features, candidates: Features)
 
 
 def filter_matches(
-    matches: Matches, *, max_distance: float | Array | None = None, max_matches: int | None = None
+    matches: Matches, *, max_distance: float | Float[Array, ""] | None = None, max_matches: int | None = None
 ) -> Matches:
     """Keep matches of one pair up to `max_distance`, and of these the `max_matches` closest.
 
@@ -140,15 +141,19 @@ def ready(features: Features) -> Features:
 
 
 def make_matches(
-    features0: Features, features1: Features, index1: Array, real: Array, **optional: Array | None
+    features0: Features,
+    features1: Features,
+    index1: Int[Array, " keypoints0"],
+    real: Bool[Array, " keypoints0"],
+    **optional: Float[Array, " keypoints0"] | None,
 ) -> Matches:
     """Matches with N0 slots, one for every keypoint of the query.
 
     Args:
         features0: query, `ready`.
         features1: candidate, `ready`, with one slot or more.
-        index1: `[N0]` int32, the candidate's keypoint of each match.
-        real: `[N0]` bool, the mask.
+        index1: the candidate's keypoint of each match, int32.
+        real: the mask.
         **optional: further fields of the matches.
     """
     return Matches(
@@ -176,11 +181,11 @@ def _swap_images(matches: Matches) -> Matches:
     return replace(matches, **query, **candidate)
 
 
-def slot_numbers(features: Features) -> Array:
+def slot_numbers(features: Features) -> Int[Array, " keypoints"]:
     return jnp.arange(features.mask.shape[-1], dtype=jnp.int32)
 
 
-def keypoint_count(features: Features) -> Array:
+def keypoint_count(features: Features) -> Int[Array, ""]:
     return jnp.sum(features.mask, dtype=jnp.int32)
 
 
@@ -204,35 +209,39 @@ def _pad_to_blocks(features: Features) -> Features:
     return replace(features, **padded)
 
 
-def _similarity(features0: Features, features1: Features) -> Array:
-    """`[N0, N1]` dot products, -inf for padding and for descriptors that are not finite."""
+def _similarity(features0: Features, features1: Features) -> Float[Array, "keypoints0 keypoints1"]:
+    """Dot products, -inf for padding and for descriptors that are not finite."""
     similarity = products(features0.descriptors, features1.descriptors)
     real = features0.mask[:, None] & features1.mask[None] & jnp.isfinite(similarity)
     return jnp.where(real, similarity, -jnp.inf)
 
 
-def products(rows0: Array, rows1: Array) -> Array:
-    """Dot products of all rows `[N0, D]` and `[N1, D]`, in full precision on every device."""
+def products(rows0: Float[Array, "rows0 _"], rows1: Float[Array, "rows1 _"]) -> Float[Array, "rows0 rows1"]:
+    """Dot products of all rows, in full precision on every device."""
     if rows0.shape[-1] != rows1.shape[-1]:
         raise InputError(f"descriptors: expected as many dimensions on both sides, got {rows0.shape[-1]} and "
                          f"{rows1.shape[-1]}; extract all images alike")  # fmt: skip
     return jnp.matmul(rows0, rows1.T, precision=jax.lax.Precision.HIGHEST)
 
 
-def _distance(features0: Features, features1: Features, index1: Array, real: Array) -> Array:
-    """`[N0]` distances to the candidate's descriptors `index1`; 0 where not `real`."""
+def _distance(
+    features0: Features, features1: Features, index1: Int[Array, " keypoints0"], real: Bool[Array, " keypoints0"]
+) -> Float[Array, " keypoints0"]:
+    """Distances to the candidate's descriptors `index1`; 0 where not `real`."""
     # sqrt(2 - 2 cos) would turn a distance of 0 into up to 3.5e-4 in float32.
     difference = masked(features0.descriptors - features1.descriptors[index1], real)
     return safe_sqrt(jnp.sum(difference * difference, axis=-1))
 
 
-def distance_ratio(features0: Features, features1: Features) -> Array:
-    """`[N0]` ratio as in `match`, for features that are `ready`."""
+def distance_ratio(features0: Features, features1: Features) -> Float[Array, " keypoints0"]:
+    """Ratio as in `match`, for features that are `ready`."""
     return _ratio(features0, features1, _similarity(features0, features1))
 
 
-def _ratio(features0: Features, features1: Features, similarity: Array) -> Array:
-    """`[N0]` distance to the nearest over the second nearest descriptor; 1 without a second."""
+def _ratio(
+    features0: Features, features1: Features, similarity: Float[Array, "keypoints0 keypoints1"]
+) -> Float[Array, " keypoints0"]:
+    """Distance to the nearest over the second nearest descriptor; 1 without a second."""
     nearest1, second1 = nearest_two(similarity)
     has_second = second1.similarity > -jnp.inf
     closest, second = (_distance(features0, features1, side.index, has_second) for side in (nearest1, second1))
@@ -240,8 +249,10 @@ def _ratio(features0: Features, features1: Features, similarity: Array) -> Array
     return jnp.where(differ, closest / jnp.where(differ, second, 1.0), 1.0)
 
 
-def _neighbors(similarity: Array, cross_check: CrossCheck) -> tuple[Array, Array]:
-    """Column of each row's match, `[N0]` int32, and whether the row has a match, `[N0]` bool."""
+def _neighbors(
+    similarity: Float[Array, "rows columns"], cross_check: CrossCheck
+) -> tuple[Int[Array, " rows"], Bool[Array, " rows"]]:
+    """Column of each row's match, and whether the row has a match."""
     rows = jnp.arange(similarity.shape[0], dtype=jnp.int32)
     nearest1 = nearest(similarity, axis=1)
     has_neighbor = nearest1.similarity > -jnp.inf

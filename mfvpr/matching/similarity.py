@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float, Int
 
 from mfvpr.types import Array
 
@@ -15,20 +16,20 @@ BLOCK = 32
 
 
 class Nearest(NamedTuple):
-    """Largest `similarity` `[n]` of rows or columns, and its `index` `[n]` int32; 0 if all are -inf."""
+    """Largest `similarity` of rows or columns, and its `index`, int32; 0 if all are -inf."""
 
-    index: Array
-    similarity: Array
+    index: Int[Array, " lines"]
+    similarity: Float[Array, " lines"]
 
 
-def nearest(similarity: Array, axis: int) -> Nearest:
-    """Nearest neighbors of the rows (axis 1) or columns (axis 0) of `similarity` `[N0, N1]`."""
+def nearest(similarity: Float[Array, "rows columns"], axis: int) -> Nearest:
+    """Nearest neighbors of the rows (axis 1) or columns (axis 0)."""
     blocks = _blocks(similarity, axis)
     return _find_largest(blocks, jnp.max(blocks, axis=axis + 1), axis)
 
 
-def nearest_two(similarity: Array) -> tuple[Nearest, Nearest]:
-    """The nearest and the second nearest neighbor of every row of `similarity` `[N0, N1]`."""
+def nearest_two(similarity: Float[Array, "rows columns"]) -> tuple[Nearest, Nearest]:
+    """The nearest and the second nearest neighbor of every row."""
     blocks = _blocks(similarity, 1)
     maxima = jnp.max(blocks, axis=2)
     best = _find_largest(blocks, maxima, 1)
@@ -84,7 +85,7 @@ def _take_block(blocks: Array, index: Array, axis: int) -> Array:
     return jnp.squeeze(jnp.take_along_axis(blocks, jnp.expand_dims(index, (axis, axis + 1)), axis=axis), axis)
 
 
-def _without(values: Array, place: Array) -> Array:
-    """`values` `[N0, n]` with -inf at one `place` of every row."""
+def _without(values: Float[Array, "rows columns"], place: Int[Array, " rows"]) -> Float[Array, "rows columns"]:
+    """`values` with -inf at one `place` of every row."""
     columns = jnp.arange(values.shape[1], dtype=jnp.int32)
     return jnp.where(columns[None] == place[:, None], -jnp.inf, values)

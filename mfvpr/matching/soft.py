@@ -2,13 +2,14 @@
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float
 
 from mfvpr.matching.nearest_neighbors import at_least_one, keypoint_count, products, ready, slot_numbers
 from mfvpr.types import Array, Features, Matches
 from mfvpr.utils.numerics import as_float, masked, positive, safe_sqrt
 
 
-def soft_match(features0: Features, features1: Features, *, temperature: float | Array) -> Matches:
+def soft_match(features0: Features, features1: Features, *, temperature: float | Float[Array, ""]) -> Matches:
     """Smooth version of `match`: a dual softmax over the similarities s_ij.
 
     See Rocco et al., NeurIPS 2018. Let R be the softmax of s / T over the candidate's keypoints j, and C the softmax
@@ -46,7 +47,9 @@ def soft_match(features0: Features, features1: Features, *, temperature: float |
     )
 
 
-def _softmax(logits: Array, real: Array, axis: int) -> Array:
+def _softmax(
+    logits: Float[Array, "rows columns"], real: Bool[Array, "rows columns"], axis: int
+) -> Float[Array, "rows columns"]:
     """Softmax over the real entries along `axis`; all other entries are 0, even if none is real."""
     lowest = jnp.finfo(logits.dtype).min  # with -inf, the softmax and its gradient would be NaN if no entry is real
     return masked(jax.nn.softmax(jnp.where(real, logits, lowest), axis=axis), real)

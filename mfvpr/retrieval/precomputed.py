@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence
 from mfvpr.datasets.images import Interpolation
@@ -102,7 +103,7 @@ class DescriptorFiles:
         shortlist = search.shortlist(query_vectors, database_vectors, num_candidates, excluded=sequence.excluded)
         return Filtered(shortlist, {}, {})
 
-    def _read(self, folder: ImageFolder) -> np.ndarray:
+    def _read(self, folder: ImageFolder) -> Float[np.ndarray, "images dimensions"]:
         file = _file_of(self.files, folder)
         vectors, entries = read_descriptors(file.path, file.names(folder), lengths=self.lengths)
         require_one_image(file.path, folder.paths, entries, self._images)
@@ -145,8 +146,8 @@ def _file_of(files: Mapping[Path, File], folder: ImageFolder) -> File:
     return files[folder.root]
 
 
-def _without(shortlist: Shortlist, excluded: np.ndarray) -> Shortlist:
-    """Shortlist `[Q, C]` without the `excluded` candidates; the next candidates move up."""
+def _without(shortlist: Shortlist, excluded: Bool[np.ndarray, "queries candidates"]) -> Shortlist:
+    """Shortlist without the `excluded` candidates; the next candidates move up."""
     mask = shortlist.mask & ~excluded
     order = np.argsort(~mask, axis=1, kind="stable")
     mask, indices, scores = (
@@ -156,7 +157,7 @@ def _without(shortlist: Shortlist, excluded: np.ndarray) -> Shortlist:
 
 
 def _cut(shortlist: Shortlist, num_candidates: int) -> Shortlist:
-    """Shortlist `[Q, num_candidates]`, cut or padded."""
+    """Shortlist of `num_candidates`, cut or padded."""
     missing = max(0, num_candidates - shortlist.mask.shape[1])
 
     def cut(values: np.ndarray, fill: float) -> np.ndarray:

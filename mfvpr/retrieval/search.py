@@ -8,6 +8,7 @@ from typing import Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 
 from mfvpr.datasets.positives import Positives
 from mfvpr.types import Array, Shortlist
@@ -20,17 +21,21 @@ SHARE = 1 / 16  # of the free memory, for the similarities that exist at the sam
 ROWS = 2**16  # database rows at a time; fixed, because the last bits of the similarities depend on it
 
 
+Queries = Float[np.ndarray, "queries dimensions"]
+Database = Float[np.ndarray, "database dimensions"]
+
+
 class Search(Protocol):
     """Interface of a search by global descriptors."""
 
-    def fit(self, database: np.ndarray) -> "Search":
-        """Search that has learned from the database's descriptors `[N, D]`."""
+    def fit(self, database: Database) -> "Search":
+        """Search that has learned from the database's descriptors."""
         ...
 
     def shortlist(
-        self, queries: np.ndarray, database: np.ndarray, num_candidates: int, *, excluded: Positives | None = None
+        self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
     ) -> Shortlist:
-        """Candidates `[Q, C]` of queries `[Q, D]` in the database `[N, D]`, NumPy.
+        """Candidates of queries in the database, NumPy.
 
         Images in `excluded` are no candidates of their queries.
         """
@@ -51,12 +56,12 @@ class ExactSearch:
     memory: float | None = None
     spread: Callable[..., Shortlist] | None = field(default=None, metadata={"recipe": False})
 
-    def fit(self, database: np.ndarray) -> "ExactSearch":
+    def fit(self, database: Database) -> "ExactSearch":
         """Return itself: there is nothing to learn."""
         return self
 
     def shortlist(
-        self, queries: np.ndarray, database: np.ndarray, num_candidates: int, *, excluded: Positives | None = None
+        self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
     ) -> Shortlist:
         """See `Search`; dot products are cosine similarities if descriptors have unit length.
 
@@ -113,8 +118,8 @@ class WhitenedSearch:
         if self.dimension < 1:
             raise InputError(f"whitening: dimension={self.dimension}: expected at least 1")
 
-    def fit(self, database: np.ndarray) -> Search:
-        """Search with the principal components of a database `[N, D]`.
+    def fit(self, database: Database) -> Search:
+        """Search with the principal components of a database.
 
         Raises:
             InputError: there are fewer finite descriptors, or fewer dimensions, than components.
@@ -127,7 +132,7 @@ class WhitenedSearch:
         return Whitened(single, self.search)
 
     def shortlist(
-        self, queries: np.ndarray, database: np.ndarray, num_candidates: int, *, excluded: Positives | None = None
+        self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
     ) -> Shortlist:
         """See `Search`; learns from the database first."""
         return self.fit(database).shortlist(queries, database, num_candidates, excluded=excluded)
@@ -140,32 +145,36 @@ class Whitened:
     whitening: Whitening
     search: Search
 
-    def fit(self, database: np.ndarray) -> "Whitened":
+    def fit(self, database: Database) -> "Whitened":
         """Return itself: the components are known."""
         return self
 
     def shortlist(
-        self, queries: np.ndarray, database: np.ndarray, num_candidates: int, *, excluded: Positives | None = None
+        self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
     ) -> Shortlist:
         """See `Search`."""
         queries, database = self._whiten(queries), self._whiten(database)
         return self.search.shortlist(queries, database, num_candidates, excluded=excluded)
 
-    def _whiten(self, descriptors: np.ndarray) -> np.ndarray:
+    def _whiten(self, descriptors: Float[np.ndarray, "images _"]) -> Float[np.ndarray, "images dimensions"]:
         mean, components = self.whitening.mean, self.whitening.components
         return np.concatenate([_whiten(descriptors[part], mean, components) for part in _parts(len(descriptors), ROWS)])
 
 
 @compiled
-def _whiten(descriptors: Array, mean: Array, components: Array) -> Array:
-    """Principal components `[n, D']` of unit length; a row does not depend on the other rows."""
+def _whiten(
+    descriptors: Float[Array, "images _"], mean: Float[Array, " _"], components: Float[Array, "dimensions _"]
+) -> Float[Array, "images dimensions"]:
+    """Principal components of unit length; a row does not depend on the other rows."""
     rows = _at_least_two(at_least_single(descriptors))
     whitened = jnp.matmul(rows - mean[None], components.T, precision=jax.lax.Precision.HIGHEST)[: len(descriptors)]
     lengths = jnp.linalg.norm(whitened, axis=1, keepdims=True)
     return whitened / jnp.where(lengths > 0, lengths, 1)
 
 
-def _shortlist(queries: np.ndarray, database: np.ndarray, num_candidates: int, allowed: np.ndarray | None) -> Shortlist:
+def _shortlist(
+    queries: Queries, database: Database, num_candidates: int, allowed: Bool[np.ndarray, "queries database"] | None
+) -> Shortlist:
     """Shortlist of a chunk of queries, `ROWS` of the database at a time; the first row wins a tie."""
     best: Shortlist | None = None
     for part in _parts(len(database), ROWS):
@@ -177,7 +186,7 @@ def _shortlist(queries: np.ndarray, database: np.ndarray, num_candidates: int, a
 
 @compiled
 def _best(first: Shortlist, second: Shortlist, start: int) -> Shortlist:
-    """Merge shortlists `[Q, C]`; rows of the second count from `start`; the first wins ties."""
+    """Merge shortlists; rows of the second count from `start`; the first wins ties."""
     second = replace(second, indices=jnp.where(second.mask, second.indices + start, -1))
     both = jax.tree.map(lambda *fields: jnp.concatenate(fields, axis=1), first, second)
     _, place = jax.lax.top_k(masked(both.scores, both.mask, -jnp.inf), first.mask.shape[1])
@@ -190,18 +199,22 @@ def _parts(total: int, size: int) -> Iterator[slice]:
 
 @partial(compiled, static_argnames="num_candidates")
 def retrieve(
-    query_descriptors: Array, database_descriptors: Array, *, num_candidates: int, mask: Array | None = None
+    query_descriptors: Float[Array, "queries dimensions"],
+    database_descriptors: Float[Array, "database dimensions"],
+    *,
+    num_candidates: int,
+    mask: Bool[Array, " database"] | Bool[Array, "queries database"] | None = None,
 ) -> Shortlist:
     """Find the database images that are most similar to each query.
 
     Args:
-        query_descriptors: `[Q, D]`, unit length.
-        database_descriptors: `[N, D]`, unit length.
-        num_candidates: C; if larger than N, the shortlist ends in -1.
-        mask: `[N]` or `[Q, N]` bool, False for database images that must not appear (for that query).
+        query_descriptors: unit length.
+        database_descriptors: unit length.
+        num_candidates: if there are fewer database images, the shortlist ends in -1.
+        mask: False for database images that must not appear (for that query).
 
     Returns:
-        Shortlist `[Q, C]` by descending cosine similarity; the first row wins a tie. A database image with a descriptor
+        Shortlist by descending cosine similarity; the first row wins a tie. A database image with a descriptor
         that is not finite never appears; a query with a descriptor that is not finite has an empty shortlist. On a CPU
         the scores of a query do not depend on the other queries, in any bit.
     """
@@ -221,6 +234,6 @@ def retrieve(
     )
 
 
-def _at_least_two(rows: Array) -> Array:
-    """Rows `[n, D]`, a single row padded with zeros: its products would be summed in another order."""
+def _at_least_two(rows: Float[Array, "_ dimensions"]) -> Float[Array, "_ dimensions"]:
+    """Rows, a single row padded with zeros: its products would be summed in another order."""
     return jnp.pad(rows, ((0, max(0, 2 - len(rows))), (0, 0)))

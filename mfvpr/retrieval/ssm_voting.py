@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence
 from mfvpr.datasets.positives import Positives
@@ -45,19 +46,19 @@ class SsmVoting:
 
 
 def vote(
-    queries: np.ndarray,
-    database: np.ndarray,
+    queries: Float[np.ndarray, "queries windows dimensions"],
+    database: Float[np.ndarray, "database windows dimensions"],
     num_candidates: int,
     *,
     excluded: Positives | None = None,
     search: ExactSearch = EXACT,
 ) -> Shortlist:
-    """Candidates `[Q, C]` by votes, NumPy: most votes first, then the lowest row.
+    """Candidates by votes, NumPy: most votes first, then the lowest row.
 
     Args:
-        queries: `[Q, V, D]` windows; a query with a window that is not finite has no candidates.
-        database: `[N, V, D]` windows; an image with a window that is not finite is no candidate.
-        num_candidates: C, also the number of nearest windows that each query window votes for.
+        queries: their windows; a query with a window that is not finite has no candidates.
+        database: its windows; an image with a window that is not finite is no candidate.
+        num_candidates: also the number of nearest windows that each query window votes for.
         excluded: images that must not appear for each query; their windows get no votes.
         search: search for the nearest windows.
     """
@@ -84,12 +85,16 @@ def vote(
 
 
 def _count_votes(
-    queries: np.ndarray, windows: np.ndarray, num_neighbors: int, excluded: Positives | None, search: ExactSearch
-) -> np.ndarray:
-    """Votes `[q, N]` of queries `[q, V, D]` for images.
+    queries: Float[np.ndarray, "queries windows dimensions"],
+    windows: Float[np.ndarray, "_ dimensions+1"],
+    num_neighbors: int,
+    excluded: Positives | None,
+    search: ExactSearch,
+) -> Int[np.ndarray, "queries database"]:
+    """Votes of queries for images.
 
-    The window b that is nearest to a maximizes a . b - |b|^2 / 2, so that the database windows `[N * V, D + 1]` end in
-    -|b|^2 / 2, and the query windows in 1.
+    The window b that is nearest to a maximizes a . b - |b|^2 / 2, so that the database windows end in -|b|^2 / 2, and
+    the query windows in 1.
     """
     number, per_image, _ = queries.shape
     num_images = len(windows) // per_image

@@ -25,6 +25,7 @@ from mfvpr.types import Shortlist, per_match, per_pair
 from mfvpr.utils import ragged
 from tests.builders import make_features
 from tests.features.test_feature_set import Counting
+from tests.shapes import unchecked_shapes
 
 pytestmark = pytest.mark.thorough
 
@@ -185,7 +186,8 @@ def test_any_number_of_queries(number):
         found = stages.match(some, database, few)
         assert_same(found, stages.match(queries, database, candidates).take(range(number)))
     else:
-        assert list(stages.match(some, database, few).matches) == []
+        with unchecked_shapes():  # counts without a row have no columns
+            assert list(stages.match(some, database, few).matches) == []
 
 
 def test_nothing_to_match():
