@@ -9,6 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import Float, Num
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale
@@ -62,8 +63,8 @@ class AlikedFeatures:
         """
         return (Scale(self.model.dimension, min(self._limit, math.prod(self.image_size) // 125)),)
 
-    def __call__(self, images: np.ndarray) -> list[Description]:
-        """Local features of each image `[B, H, W, 3]` RGB, 0 .. 255.
+    def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
+        """Local features of each image, RGB, 0 .. 255.
 
         Raises:
             InputError: the images do not have `image_size`.
@@ -97,6 +98,6 @@ class AlikedFeatures:
 
         return cache(program)
 
-    def _features(self, detections: Detections, descriptors: np.ndarray) -> Features:
+    def _features(self, detections: Detections, descriptors: Float[np.ndarray, "slots dimensions"]) -> Features:
         keypoints, scores, mask = map(np.asarray, (detections.keypoints, detections.scores, detections.mask))
         return local_features(keypoints[mask], descriptors[mask], self.image_size, scores[mask])

@@ -6,6 +6,7 @@ from functools import cache, cached_property, partial
 from typing import Any
 
 import numpy as np
+from jaxtyping import Num
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale
@@ -67,8 +68,8 @@ class D2NetFeatures:
         usual = round(740 * share * (1.4 if self.multiscale else 1))
         return (Scale(512, usual if self.max_keypoints is None else min(usual, self.max_keypoints)),)
 
-    def __call__(self, images: np.ndarray) -> list[Description]:
-        """Local features of each image `[B, H, W, 3]` RGB, 0 .. 255.
+    def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
+        """Local features of each image, RGB, 0 .. 255.
 
         Raises:
             InputError: the images do not have `image_size`.

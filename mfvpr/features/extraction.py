@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import fields
 
 import numpy as np
+from jaxtyping import Num
 
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.datasets.images import resize
@@ -51,8 +52,8 @@ def describe_folder(
         yield descriptions
 
 
-def describe_images(images: np.ndarray, extractor: Extractor) -> list[Description | None]:
-    """Extract descriptions of images `[B, H, W, 3]` of the extractor's size; None if a description is not finite.
+def describe_images(images: Num[np.ndarray, "images height width 3"], extractor: Extractor) -> list[Description | None]:
+    """Extract descriptions of images of the extractor's size; None if a description is not finite.
 
     Raises:
         InputError: the extractor returns something else than its `scales` and `vector_size` promise.
@@ -87,8 +88,8 @@ def _readable_images(
     skip_bad: bool,
     bad: dict[int, str],
     track: Track,
-) -> Iterator[tuple[int, np.ndarray]]:
-    """(row, image `[H, W, 3]`) of readable images; the reasons of the others are added to `bad`."""
+) -> Iterator[tuple[int, Num[np.ndarray, "height width 3"]]]:
+    """(row, image) of readable images; the reasons of the others are added to `bad`."""
 
     def load(row: int) -> np.ndarray | InputError:
         try:

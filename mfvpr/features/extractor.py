@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Float, Num
 
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.datasets.images import Interpolation
@@ -28,11 +29,11 @@ class Scale(NamedTuple):
 class Description(NamedTuple):
     """Global descriptor and local features of one image, as NumPy arrays.
 
-    vector: `[D]` global descriptor of unit length, or several `[V, D]`; None = no global descriptor.
+    vector: global descriptor of unit length, or several; None = no global descriptor.
     local: Features by scale, without padding (mask all True); () = no local features.
     """
 
-    vector: np.ndarray | None = None
+    vector: Float[np.ndarray, " dimensions"] | Float[np.ndarray, "vectors dimensions"] | None = None
     local: tuple[Features, ...] = ()
 
     @property
@@ -49,7 +50,7 @@ class Description(NamedTuple):
 
 @runtime_checkable
 class Extractor(Protocol):
-    """Images `[B, H, W, 3]` uint8 RGB -> a Description of each.
+    """Images, uint8 RGB -> a Description of each.
 
     A cache needs the extractor's recipe, see `mfvpr.utils.fingerprints.recipe_of`; every frozen dataclass has one.
     """
@@ -79,18 +80,18 @@ class Extractor(Protocol):
         """Scales of the local features; () = no local features."""
         ...
 
-    def __call__(self, images: np.ndarray) -> list[Description]: ...
+    def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]: ...
 
 
 class Aggregation(Protocol):
-    """Local features -> a global descriptor of each image `[B, D]` of unit length."""
+    """Local features -> a global descriptor of each image, of unit length."""
 
     @property
     def vector_size(self) -> int:
-        """Length D of a global descriptor."""
+        """Length of a global descriptor."""
         ...
 
-    def __call__(self, images: Sequence[Features]) -> np.ndarray: ...
+    def __call__(self, images: Sequence[Features]) -> Float[np.ndarray, "images dimensions"]: ...
 
 
 class Fitting(Protocol):

@@ -14,8 +14,9 @@ from typing import NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int
 
-from mfvpr.types import Features, per_keypoint
+from mfvpr.types import Array, Features, per_keypoint
 from mfvpr.utils import ragged
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import Device, compiled, free_bytes, round_up
@@ -27,11 +28,11 @@ KEPT, STAGED = 3 / 5, 1 / 24  # of the budget: for rows that stay, and for each 
 
 
 class FeatureSource(Protocol):
-    """Local features of M images, by row."""
+    """Local features of images, by row."""
 
     @property
-    def counts(self) -> np.ndarray:
-        """Number of keypoints of each image, `[M]` int; below 0 = the image has no features to read."""
+    def counts(self) -> Int[np.ndarray, " images"]:
+        """Number of keypoints of each image; below 0 = the image has no features to read."""
         ...
 
     def read(self, rows: Iterable[int] | None = None) -> Iterator[tuple[int, Features]]:
@@ -87,8 +88,8 @@ class FeatureSet:
         return cls(InMemory(dict(enumerate(map(without_padding, images))), len(images)), {})
 
     @property
-    def counts(self) -> np.ndarray:
-        """Number of keypoints of each image, `[M]` int; 0 if the image has no features to read."""
+    def counts(self) -> Int[np.ndarray, " images"]:
+        """Number of keypoints of each image; 0 if the image has no features to read."""
         return np.maximum(self.source.counts, 0)
 
     def __len__(self) -> int:
@@ -130,8 +131,8 @@ def memory_budget(memory: float | None, devices: Sequence[Device]) -> int:
     return int((SHARE * free if memory is None else 1e9 * memory) / sharing)
 
 
-def _capacities(counts: np.ndarray) -> np.ndarray:
-    """The capacity that fits all counts `[n]`, and a smaller one for half of the images if it saves a quarter."""
+def _capacities(counts: Int[np.ndarray, " images"]) -> Int[np.ndarray, " capacities"]:
+    """The capacity that fits all counts, and a smaller one for half of the images if it saves a quarter."""
     half, most = ragged.sizes(counts, (0.5, 1.0), STEP)[[0, -1]]
     return np.array([half, most] if half <= 0.75 * most else [most])
 
@@ -145,14 +146,14 @@ def few_sizes(number: int) -> int:
 class Staged(NamedTuple):
     """Slots of rows on the device, and the rows that have to be written to them first.
 
-    capacity: `[n]` capacity of each row's slot.
-    slot: `[n]` number of each row's slot, among those of its capacity.
-    new: rows to write: (capacity, slots `[WRITTEN]`, Features `[WRITTEN, N, ...]`); padding has a slot beyond the last.
+    capacity: of each row's slot.
+    slot: number of each row's slot, among those of its capacity.
+    new: rows to write: (capacity, slots, Features `[WRITTEN, N, ...]`); padding has a slot beyond the last.
     """
 
-    capacity: np.ndarray
-    slot: np.ndarray
-    new: Sequence[tuple[int, np.ndarray, Features]]
+    capacity: Int[np.ndarray, " rows"]
+    slot: Int[np.ndarray, " rows"]
+    new: Sequence[tuple[int, Int[np.ndarray, " WRITTEN"], Features]]
 
 
 class Recent:
@@ -187,12 +188,12 @@ class Slots:
     matched with. `stage` reads rows, and may run ahead on another thread by two calls; `put` writes them to the device.
     """
 
-    def __init__(self, features: FeatureSet, wanted: np.ndarray, budget: int, device: Device) -> None:
+    def __init__(self, features: FeatureSet, wanted: Int[np.ndarray, " rows"], budget: int, device: Device) -> None:
         """Plan the slots; all are empty.
 
         Args:
             features: source of the rows.
-            wanted: `[n]` distinct rows that will be staged.
+            wanted: distinct rows that will be staged.
             budget: bytes for the slots and the rows on their way to them; a few slots are used in any case.
             device: of the slots.
         """
@@ -211,12 +212,12 @@ class Slots:
         }
         self._arrays: dict[int, Features] = {}
 
-    def parts(self, rows: np.ndarray) -> Iterator[np.ndarray]:
+    def parts(self, rows: Int[np.ndarray, " rows"]) -> Iterator[Int[np.ndarray, " part"]]:
         """Split distinct rows into parts that fit on the device together, in their order."""
         return (rows[start : start + self._part_size] for start in range(0, len(rows), self._part_size))
 
-    def stage(self, rows: np.ndarray) -> Staged:
-        """Assign slots to rows `[n]` of one of the `parts`, with repetitions, and read the rows that are in no slot."""
+    def stage(self, rows: Int[np.ndarray, " rows"]) -> Staged:
+        """Assign slots to rows of one of the `parts`, with repetitions, and read the rows that are in no slot."""
         distinct, inverse = np.unique(rows, return_inverse=True)
         capacity, slot = self._capacity[distinct], np.zeros(len(distinct), np.int32)
         missing: list[tuple[int, list[int]]] = []
@@ -248,8 +249,8 @@ def empty_slots(rows: Features, number: int) -> Features:
     return jax.tree.map(lambda leaf: jnp.zeros((number, *leaf.shape[1:]), leaf.dtype, device=leaf.device), rows)
 
 
-def write_slots(arrays: Features, slots: np.ndarray, rows: Features) -> Features:
-    """Write rows `[R, N, ...]` to slots `[R]` in place; rows with a slot beyond the last are dropped."""
+def write_slots(arrays: Features, slots: Int[Array, " rows"], rows: Features) -> Features:
+    """Write rows `[R, N, ...]` to slots in place; rows with a slot beyond the last are dropped."""
     return jax.tree.map(lambda array, row: array.at[slots].set(row, mode="drop"), arrays, rows)
 
 

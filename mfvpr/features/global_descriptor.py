@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 import jax
 import numpy as np
+from jaxtyping import Float, Num
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description
@@ -16,11 +17,11 @@ from mfvpr.utils.errors import InputError
 
 
 class DescriptorNetwork(Protocol):
-    """A network that maps preprocessed images `[B, H, W, 3]` to descriptors `[B, D]` of unit length."""
+    """A network that maps preprocessed images to descriptors of unit length."""
 
     @property
     def dimension(self) -> int:
-        """Length D of a descriptor."""
+        """Length of a descriptor."""
         ...
 
     @property
@@ -32,9 +33,11 @@ class DescriptorNetwork(Protocol):
         """Raise an InputError if the network cannot take images of this (width, height) px."""
         ...
 
-    def preprocess(self, images: jax.Array) -> jax.Array: ...
+    def preprocess(
+        self, images: Num[jax.Array, "images height width 3"]
+    ) -> Float[jax.Array, "images height width 3"]: ...
 
-    def __call__(self, images: jax.Array) -> jax.Array: ...
+    def __call__(self, images: Float[jax.Array, "images height width 3"]) -> Float[jax.Array, "images dimensions"]: ...
 
 
 @dataclass(frozen=True)
@@ -71,8 +74,8 @@ class GlobalDescriptor:
         """Length of a descriptor."""
         return self.components or self.model.dimension
 
-    def __call__(self, images: np.ndarray) -> list[Description]:
-        """`[D]` float32 descriptors of unit length, of images `[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32.
+    def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
+        """Descriptors of unit length, float32, of images, RGB, 0 .. 255, uint8 or float32.
 
         Raises:
             InputError: the images do not have `image_size`.

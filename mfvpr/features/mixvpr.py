@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Num
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description
@@ -36,8 +37,8 @@ class MixVprDescriptor:
         """Length of a descriptor: 4096, 512 or 128 with published weights."""
         return self.model.dimension
 
-    def __call__(self, images: np.ndarray) -> list[Description]:
-        """`[D]` float32 descriptors of unit length, of images `[B, 320, 320, 3]` RGB, 0 .. 255, uint8 or float32.
+    def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
+        """Descriptors of unit length, float32, of images, RGB, 0 .. 255, uint8 or float32.
 
         Raises:
             InputError: the images have another size.

@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 from flax import nnx
+from jaxtyping import Float, Num
 
 from mfvpr.types import Features
 from mfvpr.utils import ragged
@@ -28,17 +29,20 @@ def require_network(name: str, model: Any, expected: type[nnx.Module]) -> None:
                          "`mfvpr.checkpoints.files.load_model` gives a network by its name")  # fmt: skip
 
 
-def require_size(name: str, images: np.ndarray, size: tuple[int, int]) -> None:
-    """Raise an InputError unless images `[B, H, W, 3]` have this (width, height)."""
+def require_size(name: str, images: Num[np.ndarray, "images height width 3"], size: tuple[int, int]) -> None:
+    """Raise an InputError unless images have this (width, height)."""
     rows, columns = images.shape[1:3]
     if (columns, rows) != tuple(size):
         raise InputError(f"{name}: expected images of {size[0]} x {size[1]} px, got {columns} x {rows}")
 
 
 def local_features(
-    keypoints: np.ndarray, descriptors: np.ndarray, image_size: tuple[int, int], scores: np.ndarray | None = None
+    keypoints: Num[np.ndarray, "keypoints 2"],
+    descriptors: Float[np.ndarray, "keypoints dimensions"],
+    image_size: tuple[int, int],
+    scores: Float[np.ndarray, " keypoints"] | None = None,
 ) -> Features:
-    """Features of one image without padding, from keypoints `[N, 2]` (x, y) px; scores are 1 by default."""
+    """Features of one image without padding, from keypoints (x, y) px; scores are 1 by default."""
     return Features(
         keypoints=keypoints.astype(np.float32),
         descriptors=descriptors,
@@ -48,8 +52,10 @@ def local_features(
     )
 
 
-def in_batches(program: Callable[[Any], Any], images: np.ndarray, batch_size: int) -> list[Any]:
-    """Results of `program` for each image of `[B, H, W, 3]`, NumPy.
+def in_batches(
+    program: Callable[[Any], Any], images: Num[np.ndarray, "images height width 3"], batch_size: int
+) -> list[Any]:
+    """Results of `program` for each image, NumPy.
 
     A device without memory of its own takes images one by one, which keeps activations in the processor's caches (a
     batch of 8 is no faster there); elsewhere the last batch is filled up, so that there is one program.

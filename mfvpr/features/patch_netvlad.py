@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float, Num
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale
@@ -77,8 +78,8 @@ class PatchNetVladFeatures:
         width, height = self.image_size
         return width // STRIDE, height // STRIDE
 
-    def __call__(self, images: np.ndarray) -> list[Description]:
-        """Descriptors of images `[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32.
+    def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
+        """Descriptors of images, RGB, 0 .. 255, uint8 or float32.
 
         Raises:
             InputError: the images do not have `image_size`.
@@ -94,7 +95,7 @@ class PatchNetVladFeatures:
 
         return compile_network(self.model, describe)
 
-    def _features(self, size: int, descriptors: np.ndarray) -> Features:
+    def _features(self, size: int, descriptors: Float[np.ndarray, "keypoints dimensions"]) -> Features:
         columns, rows = (side - size + 1 for side in self._map_size)
         row, column = np.indices((rows, columns)).reshape(2, -1)
         middle = STRIDE * np.stack([column, row], axis=1) + STRIDE * (size - 1) // 2 + _MIDDLE

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float, Num
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale
@@ -61,8 +62,8 @@ class SelaVprFeatures:
         width, height = (4 * (side // PATCH) - 3 for side in self.image_size)
         return width, height
 
-    def __call__(self, images: np.ndarray) -> list[Description]:
-        """Descriptors of images `[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32.
+    def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
+        """Descriptors of images, RGB, 0 .. 255, uint8 or float32.
 
         Raises:
             InputError: the images do not have `image_size`.
@@ -78,7 +79,7 @@ class SelaVprFeatures:
 
         return compile_network(self.model, describe)
 
-    def _features(self, local: np.ndarray) -> Features:
+    def _features(self, local: Float[np.ndarray, "rows columns dimensions"]) -> Features:
         row, column = np.indices(local.shape[:2]).reshape(2, -1)
         keypoints = _MIDDLE + _STEP * np.stack([column, row], axis=1)
         return local_features(keypoints, local.reshape(-1, LOCAL), self.image_size)

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale
@@ -35,11 +36,11 @@ class Sift:
         """One scale of 128 dimensions; textured images reach `max_keypoints`, or one keypoint in 100 px."""
         return (Scale(128, self.max_keypoints or self.image_size[0] * self.image_size[1] // 100),)
 
-    def __call__(self, images: np.ndarray) -> list[Description]:
-        """Local features of each image `[B, H, W, 3]` uint8 RGB."""
+    def __call__(self, images: UInt8[np.ndarray, "images height width 3"]) -> list[Description]:
+        """Local features of each RGB image."""
         return [Description(local=(self._extract(image),)) for image in images]
 
-    def _extract(self, image: np.ndarray) -> Features:
+    def _extract(self, image: UInt8[np.ndarray, "height width 3"]) -> Features:
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         if self.clahe_clip > 0:
             gray = cv2.createCLAHE(self.clahe_clip, (8, 8)).apply(gray)
@@ -58,6 +59,6 @@ class Sift:
         )
 
 
-def _root(descriptors: np.ndarray) -> np.ndarray:
+def _root(descriptors: Float[np.ndarray, "keypoints 128"]) -> Float[np.ndarray, "keypoints 128"]:
     """RootSIFT: the square root of L1-normalized SIFT has unit Euclidean length."""
     return np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12))

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import jax
 import numpy as np
+from jaxtyping import Float, Num
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale
@@ -56,12 +57,14 @@ class SsmMaps:
         """Length of a map as a vector."""
         return int(np.prod(self.shape))
 
-    def __call__(self, images: np.ndarray) -> list[Description]:
-        """Maps of images `[B, H, W, 3]` RGB, 0 .. 255."""
+    def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
+        """Maps of images, RGB, 0 .. 255."""
         return [Description(maps.reshape(-1)) for maps in in_batches(self._program, images, self.batch_size)]
 
-    def compute(self, model: SsmVgg, images: jax.Array) -> jax.Array:
-        """Maps `[B, rows, columns, 512]`; call it from a compiled function."""
+    def compute(
+        self, model: SsmVgg, images: Num[jax.Array, "images height width 3"]
+    ) -> Float[jax.Array, "images rows columns 512"]:
+        """Maps; call it from a compiled function."""
         stage = {1: model.stage1, 2: model.stage2}[self.stage]
         return normalize_maps(stage(model.preprocess(images, self.preprocessing)))
 
@@ -107,8 +110,8 @@ class SsmWindows:
         """Length of all windows' descriptors, one after the other."""
         return self.windows.count * self.whitening.dimension
 
-    def __call__(self, images: np.ndarray) -> list[Description]:
-        """Whitened windows of images `[B, 224, 224, 3]` RGB, 0 .. 255, `[36 * D']` float32 each.
+    def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
+        """Whitened windows of images, RGB, 0 .. 255, `[36 * D']` float32 each.
 
         Raises:
             InputError: the whitening was not learned yet.
@@ -169,8 +172,8 @@ class SsmCells:
         """One scale with all cells."""
         return (Scale(self.whitening.dimension, self.windows.count),)
 
-    def __call__(self, images: np.ndarray) -> list[Description]:
-        """Cells of images `[B, H, W, 3]` RGB, 0 .. 255, in row order; scores are 1.
+    def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
+        """Cells of images, RGB, 0 .. 255, in row order; scores are 1.
 
         Raises:
             InputError: the whitening was not learned yet.

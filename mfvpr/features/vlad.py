@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 from scipy.special import softmax
 
 from mfvpr.features.feature_set import FeatureSet
@@ -29,7 +30,7 @@ class VladFitting:
     last bit, or one keypoint more, moves a descriptor to another word, and every step multiplies the difference.
 
     Attributes:
-        num_words: M.
+        num_words: of the vocabulary.
         power: exponent of the power law.
         max_samples: largest number of descriptors to learn from.
         seed: of the random images, and of the start: a normal sample with the descriptors' mean and covariance.
@@ -70,18 +71,18 @@ class VladFitting:
 
 @dataclass(frozen=True)
 class Vlad:
-    """A vocabulary of M visual words `centers` `[M, D]`, and the power law's exponent."""
+    """A vocabulary of visual words `centers`, and the power law's exponent."""
 
-    centers: np.ndarray  # [M, D]
+    centers: Float[np.ndarray, "words dimensions"]
     power: float = 0.5
 
     @property
     def vector_size(self) -> int:
-        """Length M * D of a global descriptor."""
+        """Length of a global descriptor: words times dimensions."""
         return self.centers.size
 
-    def __call__(self, images: Sequence[Features]) -> np.ndarray:
-        """Global descriptors `[B, M * D]` of unit length, float32; zero if an image has no features."""
+    def __call__(self, images: Sequence[Features]) -> Float[np.ndarray, "images _"]:
+        """Global descriptors of unit length, float32; zero if an image has no features."""
         # All images at once: few large operations instead of many small ones.
         per_image = [features.descriptors[features.mask] for features in images]
         descriptors = np.concatenate(per_image)
@@ -103,8 +104,10 @@ class Vlad:
         return _unit_length(vlad.reshape(len(images), self.vector_size))
 
 
-def _mixture_centers(sample: np.ndarray, num_words: int, rng: np.random.Generator) -> np.ndarray:
-    """Centers `[M, D]` of the Gaussians, float64; a center without members stays."""
+def _mixture_centers(
+    sample: Float[np.ndarray, "samples dimensions"], num_words: int, rng: np.random.Generator
+) -> Float[np.ndarray, "words dimensions"]:
+    """Centers of the Gaussians, float64; a center without members stays."""
     mean, dimension = sample.mean(axis=0, dtype=np.float64), sample.shape[1]
     covariance = sum((chunk - mean).T @ (chunk - mean) for chunk in _chunks(sample, num_words)) / len(sample)
     spread = np.linalg.cholesky(covariance + 1e-9 * np.eye(dimension))
@@ -121,12 +124,12 @@ def _mixture_centers(sample: np.ndarray, num_words: int, rng: np.random.Generato
     return centers
 
 
-def _chunks(sample: np.ndarray, num_words: int) -> Iterator[np.ndarray]:
+def _chunks(sample: Float[np.ndarray, "samples dimensions"], num_words: int) -> Iterator[np.ndarray]:
     rows = max(1, _CHUNK // max(num_words, sample.shape[1]))
     return (sample[start : start + rows].astype(np.float64) for start in range(0, len(sample), rows))
 
 
-def _unit_length(vectors: np.ndarray) -> np.ndarray:
+def _unit_length(vectors: Float[np.ndarray, "vectors dimensions"]) -> Float[np.ndarray, "vectors dimensions"]:
     """Scale to unit length along the last axis; zero stays zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.where(length > 0, length, 1)

@@ -12,6 +12,7 @@ from typing import Literal, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int
 
 from mfvpr.features.extractor import Extractor
 from mfvpr.types import Array
@@ -48,22 +49,24 @@ class Windows:
 
     @property
     def count(self) -> int:
-        """Number V of windows of a map."""
+        """Number of windows of a map."""
         return self.grid[0] * self.grid[1]
 
     @property
     def dimension(self) -> int:
-        """Length D of a window as a vector, (row, column, channel)."""
+        """Length of a window as a vector, (row, column, channel)."""
         return self.size**2 * self.shape[2]
 
     @property
-    def corners(self) -> np.ndarray:
-        """`[V, 2]` (row, column) of each window's first position."""
+    def corners(self) -> Int[np.ndarray, "windows 2"]:
+        """(row, column) of each window's first position."""
         return self.stride * np.stack(np.divmod(np.arange(self.count), self.grid[1]), axis=1)
 
-    def take(self, maps: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-        """The windows `numbers` `[n]` of one map, `[n, D]`."""
-        parts = [maps[row : row + self.size, column : column + self.size] for row, column in self.corners[numbers]]
+    def take(
+        self, image_map: Float[np.ndarray, "rows columns channels"], numbers: Int[np.ndarray, " windows"]
+    ) -> Float[np.ndarray, "windows dimensions"]:
+        """The windows `numbers` of one map."""
+        parts = [image_map[row : row + self.size, column : column + self.size] for row, column in self.corners[numbers]]
         return np.reshape(parts, (len(numbers), self.dimension))
 
 
@@ -92,8 +95,13 @@ class WindowFitting:
         rows = np.random.default_rng([self.seed, 0]).permutation(num_images)
         return sorted(rows[: self.max_images].tolist())
 
-    def fit(self, maps: Iterable[Mapping[int, np.ndarray]], windows: Windows, rows: list[int]) -> Whitening:
-        """Learn the whitening from maps `[rows, columns, channels]`, which come by row in batches.
+    def fit(
+        self,
+        maps: Iterable[Mapping[int, Float[np.ndarray, "rows columns channels"]]],
+        windows: Windows,
+        rows: list[int],
+    ) -> Whitening:
+        """Learn the whitening from maps, which come by row in batches.
 
         Args:
             maps: of the images in `rows`; unreadable images may be missing.
@@ -170,15 +178,23 @@ def origin(extractor: WindowExtractor) -> str:
     return ""
 
 
-def kernels(whitening: Whitening, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
-    """The whitening as a convolution: the kernel `[size, size, channels, D']` and an offset `[D']`, float32."""
+def kernels(
+    whitening: Whitening, windows: Windows
+) -> tuple[Float[np.ndarray, "size size channels dimensions"], Float[np.ndarray, " dimensions"]]:
+    """The whitening as a convolution: a kernel and an offset, float32."""
     components = whitening.components.reshape(-1, windows.size, windows.size, windows.shape[2])
     offset = whitening.components.astype(np.float64) @ whitening.mean
     return np.moveaxis(components, 0, -1).astype(np.float32), offset.astype(np.float32)
 
 
-def whiten_windows(maps: Array, kernel: Array, offset: Array, *, stride: int) -> Array:
-    """Descriptors `[B, V, D']` of all windows of maps `[B, rows, columns, channels]`."""
+def whiten_windows(
+    maps: Float[Array, "images rows columns channels"],
+    kernel: Float[Array, "size size channels dimensions"],
+    offset: Float[Array, " dimensions"],
+    *,
+    stride: int,
+) -> Float[Array, "images windows dimensions"]:
+    """Descriptors of all windows of maps."""
     descriptors = jax.lax.conv_general_dilated(
         maps, kernel, (stride, stride), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC"),
         precision=jax.lax.Precision.HIGHEST,
@@ -186,7 +202,7 @@ def whiten_windows(maps: Array, kernel: Array, offset: Array, *, stride: int) ->
     return descriptors.reshape(len(maps), -1, descriptors.shape[-1]) - offset[None, None]
 
 
-def normalize_maps(maps: Array) -> Array:
-    """Scale maps `[..., channels]` to unit length at every position; zero stays zero."""
+def normalize_maps(maps: Float[Array, "*batch channels"]) -> Float[Array, "*batch channels"]:
+    """Scale maps to unit length at every position; zero stays zero."""
     length = jnp.sqrt(jnp.sum(maps * maps, axis=-1, keepdims=True))
     return maps / jnp.where(length > 0, length, 1.0)
