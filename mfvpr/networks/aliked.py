@@ -11,11 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jax import Array
+from jaxtyping import Float
 
 from mfvpr.networks.aliked_description import DescriptorHead, field
 from mfvpr.networks.aliked_detection import Detections, detect
+from mfvpr.networks.imagenet import Images
 from mfvpr.networks.sampling import sample, upsample
+from mfvpr.types import Array
 from mfvpr.utils.errors import InputError
 
 STRIDE = 32  # px, of the coarsest map
@@ -48,8 +50,8 @@ class DeformableConv(nnx.Module):
         self.offset = nnx.Conv(inputs, 18, (3, 3), padding=1, precision=precision, rngs=rngs)
         self.precision = precision
 
-    def __call__(self, x: Array) -> Array:
-        """`[B, h, w, inputs]` -> `[B, h, w, outputs]`. Taps move by a quarter of the longer side at most.
+    def __call__(self, x: Float[Array, "batch height width inputs"]) -> Float[Array, "batch height width outputs"]:
+        """Convolve a map; taps move by a quarter of the longer side at most.
 
         Adds one tap after the other: concatenating the samples of all taps takes several times longer.
         """
@@ -84,8 +86,7 @@ class Block(nnx.Module):
         self.bn1, self.bn2 = (nnx.BatchNorm(outputs, use_running_average=True, rngs=rngs) for _ in range(2))
         self.shortcut = nnx.Conv(inputs, outputs, (1, 1), precision=precision, rngs=rngs) if shortcut else None
 
-    def __call__(self, x: Array) -> Array:
-        """`[B, h, w, inputs]` -> `[B, h, w, outputs]`."""
+    def __call__(self, x: Float[Array, "batch height width inputs"]) -> Float[Array, "batch height width outputs"]:
         out = self.bn2(self.conv2(nnx.selu(self.bn1(self.conv1(x)))))
         return nnx.selu(out if self.shortcut is None else out + self.shortcut(x))
 
@@ -116,20 +117,21 @@ class Aliked(nnx.Module):
         self.score_head = nnx.List([_conv(*step, **options) for step in steps])
         self.desc_head = DescriptorHead(self.dimension, positions, precision=precision, rngs=rngs)
 
-    def __call__(self, images: Array) -> tuple[Array, Array]:
-        """Features `[B, H, W, dimension]` of unit length and scores `[B, H, W]` in (0, 1) of all pixels.
+    def __call__(
+        self, images: Images
+    ) -> tuple[Float[Array, "batch height width dimensions"], Float[Array, "batch height width"]]:
+        """Features of unit length and scores in (0, 1) of all pixels.
 
         Args:
-            images: `[B, H, W, 3]` float32 RGB, 0 .. 1. Border pixels are repeated to make the sides multiples of 32.
+            images: RGB, 0 .. 1. Border pixels are repeated to make the sides multiples of 32.
         """
         levels, scores = self.levels(images)
         return jax.vmap(lambda levels: field(levels, *_inside(images)).dense())(levels), scores
 
-    def levels(self, images: Array) -> tuple[list[Array], Array]:
-        """Parts of the features at each resolution of the padded images, and scores `[B, H, W]`.
-
-        Each part is `[B, h, w, dimension / 4]`.
-        """
+    def levels(
+        self, images: Images
+    ) -> tuple[list[Float[Array, "batch _ _ channels"]], Float[Array, "batch height width"]]:
+        """Parts of the features at each resolution of the padded images, and scores."""
         (top, bottom), (left, right) = (_margins(size) for size in images.shape[1:3])
         x = jnp.pad(images, ((0, 0), (top, bottom), (left, right), (0, 0)), mode="edge")
         levels = []
@@ -138,8 +140,10 @@ class Aliked(nnx.Module):
             levels.append(nnx.selu(getattr(self, f"conv{place}")(x)))
         return levels, self._scores(levels)[:, *_inside(images)]
 
-    def extract(self, images: Array, threshold: Array | float, capacity: int) -> tuple[Detections, Array]:
-        """Keypoints of images `[B, H, W, 3]`, and their descriptors `[B, N, dimension]` of unit length."""
+    def extract(
+        self, images: Images, threshold: Array | float, capacity: int
+    ) -> tuple[Detections, Float[Array, "batch slots dimensions"]]:
+        """Keypoints of images, and their descriptors of unit length."""
         levels, scores = self.levels(images)
 
         def extract_one(levels: list[Array], scores: Array) -> tuple[Detections, Array]:
@@ -148,8 +152,8 @@ class Aliked(nnx.Module):
 
         return jax.vmap(extract_one)(levels, scores)
 
-    def _scores(self, levels: list[Array]) -> Array:
-        """Scores `[B, H, W]` of the padded images.
+    def _scores(self, levels: list[Array]) -> Float[Array, "batch height width"]:
+        """Scores of the padded images.
 
         The first convolution (1 x 1) and the enlargement are linear, so the convolution runs first: 8 channels are
         enlarged instead of all.
@@ -193,7 +197,7 @@ def _narrow(conv: nnx.Conv, x: Array) -> Array:
 
 
 def _inside(images: Array) -> tuple[slice, slice]:
-    """Rows and columns of images `[B, H, W, 3]` within the padded images."""
+    """Rows and columns of images within the padded images."""
     (top, _), (left, _) = (_margins(size) for size in images.shape[1:3])
     return slice(top, top + images.shape[1]), slice(left, left + images.shape[2])
 

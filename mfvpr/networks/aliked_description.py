@@ -6,10 +6,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from flax import nnx
-from jax import Array
+from jaxtyping import Float, Int
 
 from mfvpr.networks.lengths import EPSILON, of_unit_length
 from mfvpr.networks.sampling import Neighbors, around, between, neighbors
+from mfvpr.types import Array
 
 _CHUNK = 256  # keypoints per step
 
@@ -17,34 +18,36 @@ _CHUNK = 256  # keypoints per step
 class Level(NamedTuple):
     """One map of a field, already enlarged in height; `columns` enlarge it in width."""
 
-    rows: Array  # [H, w, C]
-    columns: Neighbors | None  # [W]; None if w = W
+    rows: Float[Array, "height _ channels"]
+    columns: Neighbors | None  # None if the rows have full width
 
 
 class Field(NamedTuple):
-    """Features `[H, W, D]` of unit length, computed only at requested pixels.
+    """Features of all pixels, of unit length, computed only at requested pixels.
 
     Descriptors need about half of the pixels, and the features of 320 x 320 px take 52 MB.
     """
 
     levels: tuple[Level, ...]
-    inverse_norm: Array  # [H, W]
+    inverse_norm: Float[Array, "height width"]
 
-    def at(self, y: Array, x: Array) -> Array:
-        """Features `[N, D]` of pixels `[N]`; 0 outside."""
+    def at(self, y: Int[Array, " pixels"], x: Int[Array, " pixels"]) -> Float[Array, "pixels dimensions"]:
+        """Features of pixels; 0 outside."""
         height, width = self.inverse_norm.shape
         inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
         weight = jnp.where(inside, jnp.ones((), self.inverse_norm.dtype), 0)
         y, x = jnp.clip(y, 0, height - 1), jnp.clip(x, 0, width - 1)
         return jnp.concatenate(self._weighted_parts(y, x, weight), axis=-1)
 
-    def sample(self, points: Array) -> Array:
-        """Features `[N, D]` at positions `[N, 2]` (x, y) px, bilinear; 0 outside."""
+    def sample(self, points: Float[Array, "points 2"]) -> Float[Array, "points dimensions"]:
+        """Features at positions (x, y) px, bilinear; 0 outside."""
         corners = [self._weighted_parts(*corner) for corner in around(points, *self.inverse_norm.shape)]
         return jnp.concatenate([sum(parts[1:], start=parts[0]) for parts in zip(*corners, strict=True)], axis=-1)
 
-    def _weighted_parts(self, y: Array, x: Array, weight: Array) -> list[Array]:
-        """Parts `[N, C]` of each level for the features of pixels `[N]` inside the image, times `weight` `[N]`.
+    def _weighted_parts(
+        self, y: Int[Array, " pixels"], x: Int[Array, " pixels"], weight: Float[Array, " pixels"]
+    ) -> list[Float[Array, "pixels _"]]:
+        """Parts of each level for the features of pixels inside the image, times `weight`.
 
         Sums of separate parts are several times faster than sums of concatenated features.
         """
@@ -60,13 +63,13 @@ class Field(NamedTuple):
                 parts.append((weight * (1 - part))[:, None] * before + (weight * part)[:, None] * after)
         return parts
 
-    def dense(self) -> Array:
+    def dense(self) -> Float[Array, "height width dimensions"]:
         """All features."""
         return jnp.concatenate(_enlarge(self.levels), axis=-1) * self.inverse_norm[..., None]
 
 
-def field(levels: Sequence[Array], rows: slice, columns: slice) -> Field:
-    """Field of levels `[h, w, C]`, the first of full size, cropped to `rows` and `columns`."""
+def field(levels: Sequence[Float[Array, "_ _ channels"]], rows: slice, columns: slice) -> Field:
+    """Field of levels, the first of full size, cropped to `rows` and `columns`."""
     height, width = levels[0].shape[:2]
     parts = [Level(levels[0][rows, columns], None)]
     for level in levels[1:]:
@@ -92,8 +95,10 @@ class DescriptorHead(nnx.Module):
         self.agg_weights = nnx.Param(init(rngs.params(), (positions, dimension, dimension)))
         self.precision = precision
 
-    def __call__(self, features: Field, keypoints: Array, count: Array | int) -> Array:
-        """Descriptors `[N, D]` of unit length of keypoints `[N, 2]` (x, y) px; only the first `count` are valid.
+    def __call__(
+        self, features: Field, keypoints: Float[Array, "slots 2"], count: int | Int[Array, ""]
+    ) -> Float[Array, "slots dimensions"]:
+        """Descriptors of unit length of keypoints (x, y) px; only the first `count` are valid.
 
         Runs chunk by chunk, so that unused slots cost nothing.
         """
@@ -109,8 +114,8 @@ class DescriptorHead(nnx.Module):
         start = jnp.zeros((len(keypoints), dimension), keypoints.dtype)
         return jax.lax.fori_loop(0, chunks, describe, start)[:slots]
 
-    def _describe(self, features: Field, keypoints: Array) -> Array:
-        """Descriptors of all keypoints `[N, 2]`.
+    def _describe(self, features: Field, keypoints: Float[Array, "slots 2"]) -> Float[Array, "slots dimensions"]:
+        """Descriptors of all keypoints.
 
         Adds one place after the other, so that intermediate values stay in the CPU's caches.
         """
@@ -124,8 +129,8 @@ class DescriptorHead(nnx.Module):
         descriptors, _ = jax.lax.scan(add, start, (self._moves(features, keypoints), self.agg_weights[...]))
         return of_unit_length(descriptors)
 
-    def _moves(self, features: Field, keypoints: Array) -> Array:
-        """Offsets `[positions, N, 2]` (x, y) px of the places, a quarter of the longer side at most.
+    def _moves(self, features: Field, keypoints: Float[Array, "slots 2"]) -> Float[Array, "positions slots 2"]:
+        """Offsets (x, y) px of the places, a quarter of the longer side at most.
 
         Neighborhoods beyond the border are zero, as in the original's compiled operator. (The original's fallback in
         Python moves them inside instead.)

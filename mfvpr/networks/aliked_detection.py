@@ -4,25 +4,26 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import Array
+from jaxtyping import Bool, Float, Int
 
 from mfvpr.networks.sampling import sample
+from mfvpr.types import Array
 
 RADIUS = 2  # px, of the suppression, the refinement and the border without keypoints
 _TEMPERATURE = 0.1
 
 
 class Detections(NamedTuple):
-    """Keypoints of one image in N slots, ordered by row, or by score if there are more than N."""
+    """Keypoints of one image, ordered by row, or by score if there are more than slots."""
 
-    keypoints: Array  # [N, 2] (x, y) px
-    scores: Array  # [N]
-    mask: Array  # [N] bool, True on the first ones
-    count: Array  # [] number of peaks; if above N, those with the lowest scores are missing
+    keypoints: Float[Array, "slots 2"]  # (x, y) px
+    scores: Float[Array, " slots"]
+    mask: Bool[Array, " slots"]  # True on the first ones
+    count: Int[Array, ""]  # number of peaks; if above the slots, those with the lowest scores are missing
 
 
-def detect(score_map: Array, threshold: Array | float, capacity: int) -> Detections:
-    """Peaks of a map `[H, W]` above `threshold`, in min(capacity, H W) slots.
+def detect(score_map: Float[Array, "height width"], threshold: Array | float, capacity: int) -> Detections:
+    """Peaks of a map above `threshold`, in min(capacity, height * width) slots.
 
     If no peak is above it, or `threshold` is 0, the map's mean is the threshold. (The original takes the mean if the
     whole batch has no peak.)
@@ -39,8 +40,8 @@ def detect(score_map: Array, threshold: Array | float, capacity: int) -> Detecti
     return Detections(keypoints, sample(score_map[..., None], keypoints)[..., 0], key > -jnp.inf, count)
 
 
-def _peaks(scores: Array) -> Array:
-    """`[H, W]` bool: local maxima, and in two more rounds those outside the neighborhoods of maxima; no border."""
+def _peaks(scores: Float[Array, "height width"]) -> Bool[Array, "height width"]:
+    """Local maxima, and in two more rounds those outside the neighborhoods of maxima; no border."""
     is_peak = scores == _local_maximum(scores)
     for _ in range(2):
         suppressed = _local_maximum(is_peak)
@@ -62,8 +63,10 @@ def _local_maximum(values: Array) -> Array:
     return values
 
 
-def _refine(score_map: Array, row: Array, column: Array) -> Array:
-    """Mean position `[N, 2]` (x, y) px around each peak, weighted by a softmax of the scores."""
+def _refine(
+    score_map: Float[Array, "height width"], row: Int[Array, " slots"], column: Int[Array, " slots"]
+) -> Float[Array, "slots 2"]:
+    """Mean position (x, y) px around each peak, weighted by a softmax of the scores."""
     height, width = score_map.shape
     reach = jnp.arange(2 * RADIUS + 1)
     padded = jnp.pad(score_map, RADIUS)

@@ -11,7 +11,10 @@ from functools import partial
 
 import jax.numpy as jnp
 from flax import nnx
-from jax import Array, lax
+from jax import lax
+from jaxtyping import Bool, Float
+
+from mfvpr.types import Array
 
 _WIDE = 128  # least input channels for which fewer products outweigh more memory traffic
 # The convolution is a product of polynomials: their values at 0, 1, -1, 2, -2 and infinity, and the inverse.
@@ -56,12 +59,14 @@ class Conv3x3(nnx.Module):
         self.dilation = dilation
         self.precision = precision
 
-    def __call__(self, x: Array, uniform: Array | bool = False) -> Array:
-        """`[B, H, W, C]` -> `[B, H, W, D]`.
+    def __call__(
+        self, x: Float[Array, "batch height width inputs"], uniform: bool | Bool[Array, ""] = False
+    ) -> Float[Array, "batch height width outputs"]:
+        """Convolve a map.
 
         Args:
             x: the input.
-            uniform: `[]` bool, whether equal neighborhoods must give equal bits, which takes 1.5 times as long.
+            uniform: whether equal neighborhoods must give equal bits, which takes 1.5 times as long.
         """
 
         def direct(x: Array, kernel: Array) -> Array:
@@ -78,8 +83,13 @@ class Conv3x3(nnx.Module):
         return product + self.bias[...][None, None, None]
 
 
-def winograd(x: Array, kernel: Array, dilation: int, precision: str) -> Array:
-    """Convolve `[B, H, W, C]` with `[3, 3, C, D]` -> `[B, H, W, D]`, zeros outside."""
+def winograd(
+    x: Float[Array, "batch height width inputs"],
+    kernel: Float[Array, "3 3 inputs outputs"],
+    dilation: int,
+    precision: str,
+) -> Float[Array, "batch height width outputs"]:
+    """Convolve a map, zeros outside."""
     batch, height, width, channels = x.shape
     tiles = -(-height // (4 * dilation))
     below = dilation * (4 * tiles + 3) - height

@@ -13,12 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jax import Array, lax
+from jax import lax
+from jaxtyping import Bool, Float, Int
 
-from mfvpr.networks.imagenet import Preprocessing, preprocess
+from mfvpr.networks.imagenet import Images, Pixels, Preprocessing, preprocess
 from mfvpr.networks.lengths import of_unit_length
 from mfvpr.networks.sampling import between, neighbors
 from mfvpr.networks.vgg import Vgg16
+from mfvpr.types import Array
 
 STRIDE = 4  # px between positions of the map
 SCALES = (0.5, 1.0, 2.0)  # of the multi-scale detection, in this order
@@ -39,16 +41,16 @@ class D2Net(nnx.Module):
         self.vgg = Vgg16("conv4_3", pools=pools, dilations=(1, 1, 1, 2), precision=precision, rngs=rngs)
         self.relu = relu
 
-    def __call__(self, images: Array) -> Array:
-        """Dense maps `[B, h, w, 512]` of preprocessed images `[B, H, W, 3]`; h = H // 4 - 1, w = W // 4 - 1."""
+    def __call__(self, images: Images) -> Float[Array, "batch height//4-1 width//4-1 512"]:
+        """Dense maps of preprocessed images."""
         dense = self.vgg(images, uniform=_repeats(images))
         return nnx.relu(dense) if self.relu else dense
 
 
-def _repeats(images: Array) -> Array:
-    """Whether two neighbors in a map have equal receptive fields, as in a white sky; `[]` bool for all images.
+def _repeats(images: Images) -> Bool[Array, ""]:
+    """Whether two neighbors in a map of any image have equal receptive fields, as in a white sky.
 
-    The map is constant there, but rounding can create peaks. Pixels outside the images `[B, H, W, 3]` count as equal.
+    The map is constant there, but rounding can create peaks. Pixels outside the images count as equal.
     """
     batch, height, width, _ = images.shape
     rows, columns = -(-height // STRIDE), -(-width // STRIDE)
@@ -68,22 +70,22 @@ def _repeats(images: Array) -> Array:
 
 
 class Detections(NamedTuple):
-    """Keypoints of one map in N slots, ordered by channel, then row, then column; padding is last."""
+    """Keypoints of one map, ordered by channel, then row, then column; padding is last."""
 
-    keypoints: Array  # [N, 2] (x, y), px of the map's image
-    descriptors: Array  # [N, C], unit Euclidean length
-    scores: Array  # [N] the map's value at the integer position
-    mask: Array  # [N] bool
-    count: Array  # [] number of keypoints; if above N, those with the lowest scores are missing
+    keypoints: Float[Array, "slots 2"]  # (x, y), px of the map's image
+    descriptors: Float[Array, "slots channels"]  # unit Euclidean length
+    scores: Float[Array, " slots"]  # the map's value at the integer position
+    mask: Bool[Array, " slots"]
+    count: Int[Array, ""]  # number of keypoints; if above the slots, those with the lowest scores are missing
 
 
 class Survey(NamedTuple):
     """Properties of each position of a map, in its strongest channel."""
 
-    channel: Array  # [h, w] int32
-    score: Array  # [h, w]
-    detected: Array  # [h, w] bool
-    step: Array  # [h, w, 2] (row, column), from the position to the maximum of its parabola
+    channel: Int[Array, "height width"]
+    score: Float[Array, "height width"]
+    detected: Bool[Array, "height width"]
+    step: Float[Array, "height width 2"]  # (row, column), from the position to the maximum of its parabola
 
 
 def map_size(pixels: int) -> int:
@@ -93,13 +95,13 @@ def map_size(pixels: int) -> int:
 
 def extract(
     model: D2Net,
-    images: Array,
+    images: Pixels,
     *,
     preprocessing: Preprocessing = "caffe",
     scales: Sequence[float] = (1.0,),
     share: float = 1.0,
 ) -> tuple[Detections, ...]:
-    """Keypoints of images `[B, H, W, 3]`: one Detections per scale, each with a leading axis B.
+    """Keypoints of images: one Detections per scale, each with a leading axis `batch`.
 
     Args:
         model: the network.
@@ -117,9 +119,11 @@ def extract(
 
 
 def detect(
-    maps: Sequence[Array], ratios: Sequence[tuple[float, float]] = ((1.0, 1.0),), share: float = 1.0
+    maps: Sequence[Float[Array, "_ _ channels"]],
+    ratios: Sequence[tuple[float, float]] = ((1.0, 1.0),),
+    share: float = 1.0,
 ) -> tuple[Detections, ...]:
-    """Keypoints of one image from its dense maps `[h, w, C]`, one for each scale, the smallest first.
+    """Keypoints of one image from its dense maps, one for each scale, the smallest first.
 
     A map with keypoints is added to the next map. Positions that one map detects are not detected in later maps. Scores
     of the n-th map are divided by n.
@@ -147,8 +151,8 @@ def detect(
     return tuple(detections)
 
 
-def survey(dense: Array) -> Survey:
-    """Find the strongest channel and the local maxima of one dense map `[h, w, C]`.
+def survey(dense: Float[Array, "height width channels"]) -> Survey:
+    """Find the strongest channel and the local maxima of one dense map.
 
     If several channels share a position's maximum exactly, only the first counts. (The original reports the position
     once for each of them that is a maximum.) Positions with zeros in all channels are not detected.
@@ -170,8 +174,10 @@ def survey(dense: Array) -> Survey:
     return Survey(channel, score, is_peak & passes, step)
 
 
-def _parabola(around: dict[tuple[int, int], Array]) -> tuple[Array, Array]:
-    """Whether a position is no edge `[h, w]`, and the step to the maximum `[h, w, 2]`.
+def _parabola(
+    around: dict[tuple[int, int], Float[Array, "height width"]],
+) -> tuple[Bool[Array, "height width"], Float[Array, "height width 2"]]:
+    """Whether a position is no edge, and the step to the maximum.
 
     `around` holds the values at (down, right) of the position.
     """
@@ -188,14 +194,14 @@ def _parabola(around: dict[tuple[int, int], Array]) -> tuple[Array, Array]:
     return is_blob, step
 
 
-def select(dense: Array, seen: Survey, capacity: int) -> Detections:
-    """Keypoints among the detected positions of a map `[h, w, C]`, in min(capacity, h w) slots.
+def select(dense: Float[Array, "height width channels"], seen: Survey, capacity: int) -> Detections:
+    """Keypoints among the detected positions of a map, in min(capacity, height * width) slots.
 
     Keypoints lie on the map after the refinement, less than half a position from the detected one.
     """
     height, width, _ = dense.shape
     grid = jnp.stack(jnp.meshgrid(jnp.arange(height), jnp.arange(width), indexing="ij"), axis=-1)
-    position = grid.astype(seen.step.dtype) + seen.step  # [h, w, 2]
+    position = grid.astype(seen.step.dtype) + seen.step
     last = jnp.array([height - 1, width - 1], position.dtype)[None, None]
     inside = (jnp.floor(position) >= 0) & (jnp.ceil(position) <= last)
     valid = (seen.detected & jnp.all(inside & (jnp.abs(seen.step) < 0.5), axis=-1)).reshape(-1)
@@ -213,8 +219,10 @@ def select(dense: Array, seen: Survey, capacity: int) -> Detections:
     )
 
 
-def _interpolate(dense: Array, position: Array) -> Array:
-    """Vectors `[N, C]` of unit length of a map `[h, w, C]` at positions `[N, 2]`, bilinear."""
+def _interpolate(
+    dense: Float[Array, "height width channels"], position: Float[Array, "slots 2"]
+) -> Float[Array, "slots channels"]:
+    """Vectors of unit length of a map at positions, bilinear."""
     low, high = jnp.floor(position), jnp.ceil(position)
     after = position - low
     before = 1 - after
@@ -234,7 +242,7 @@ def _stretch(values: Array, size: int, *, axis: int) -> Array:
     return values if size == length else between(values, neighbors(length, size), axis)
 
 
-def _nearest(length: int, size: int) -> np.ndarray:
-    """`[size]` indices below `length`, evenly spread and rounded down."""
+def _nearest(length: int, size: int) -> Int[np.ndarray, " {size}"]:
+    """Indices below `length`, evenly spread and rounded down."""
     position = np.arange(size, dtype=np.float32) * (np.float32(length) / np.float32(size))
     return np.minimum(np.floor(position).astype(int), length - 1)

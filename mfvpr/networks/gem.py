@@ -4,12 +4,13 @@ from typing import Literal
 
 import jax.numpy as jnp
 from flax import nnx
-from jax import Array
+from jaxtyping import Float
 
-from mfvpr.networks.imagenet import preprocess
+from mfvpr.networks.imagenet import Images, Pixels, preprocess
 from mfvpr.networks.lengths import of_unit_length
 from mfvpr.networks.resnet import ResNet50
 from mfvpr.networks.vgg import Vgg16, require_position
+from mfvpr.types import Array
 
 Backbone = Literal["vgg16", "resnet50"]
 
@@ -23,8 +24,7 @@ class GeneralizedMean(nnx.Module):
     def __init__(self, power: float = 3.0) -> None:
         self.power = nnx.Param(jnp.full(1, power, jnp.float32))
 
-    def __call__(self, maps: Array) -> Array:
-        """`[B, h, w, C]` -> `[B, C]`."""
+    def __call__(self, maps: Float[Array, "batch height width channels"]) -> Float[Array, "batch channels"]:
         power, values = self.power[...][0], jnp.maximum(maps, _MIN_VALUE)
         largest = jnp.max(values, axis=(1, 2), keepdims=True)  # a divisor, so that powers of small values do not vanish
         means = jnp.mean((values / largest) ** power, axis=(1, 2))
@@ -53,10 +53,10 @@ class Gem(nnx.Module):
     require = staticmethod(require_position)
 
     @staticmethod
-    def preprocess(images: Array) -> Array:
-        """Images `[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32 -> inputs of the network, float32."""
+    def preprocess(images: Pixels) -> Images:
+        """RGB images, 0 .. 255, uint8 or float32 -> inputs of the network, float32."""
         return preprocess(images, "torch")
 
-    def __call__(self, images: Array) -> Array:
-        """Descriptors `[B, dimension]` of unit length of preprocessed images `[B, H, W, 3]`."""
+    def __call__(self, images: Images) -> Float[Array, "batch dimensions"]:
+        """Descriptors of unit length of preprocessed images."""
         return of_unit_length(self.projection(self.pool(of_unit_length(self.backbone(images)))))

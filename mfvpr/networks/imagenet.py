@@ -4,16 +4,20 @@ from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jaxtyping import Float, Num
+
+from mfvpr.types import Array
 
 Preprocessing = Literal["caffe", "torch"]
 
 MEAN = (0.485, 0.456, 0.406)  # of the training images, RGB in 0 .. 1
 DEVIATION = (0.229, 0.224, 0.225)
+Pixels = Num[Array, "batch height width 3"]  # RGB, 0 .. 255, uint8 or float32
+Images = Float[Array, "batch height width 3"]  # inputs of networks
 
 
-def preprocess(images: Array, preprocessing: Preprocessing) -> Array:
-    """RGB images `[B, H, W, 3]` from 0 to 255 -> inputs of the network, float32.
+def preprocess(images: Pixels, preprocessing: Preprocessing) -> Images:
+    """RGB images from 0 to 255 -> inputs of the network, float32.
 
     "caffe" is BGR minus the mean. "torch" is RGB in [0, 1], minus the mean, divided by the standard deviation. Results
     for bytes are rounded once.
@@ -33,8 +37,8 @@ _STATISTICS = {
 }
 
 
-def _table(scale: float, mean: np.ndarray, deviation: np.ndarray) -> np.ndarray:
-    """Results `[3, 256]` for all bytes, computed in float64 as in D2-Net's code; a device has no float64."""
+def _table(scale: float, mean: Float[np.ndarray, "3"], deviation: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 256"]:
+    """Results for all bytes, computed in float64 as in D2-Net's code; a device has no float64."""
     byte = np.arange(256, dtype=np.float32) / np.float32(scale)
     return ((byte[None] - mean[:, None]) / deviation[:, None]).astype(np.float32)
 

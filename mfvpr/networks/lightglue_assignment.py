@@ -5,10 +5,10 @@ from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jax import Array
+from jaxtyping import Bool, Float
 
 from mfvpr.networks.lightglue_attention import Affine, Block, Rotation, across, product, within
-from mfvpr.types import Features
+from mfvpr.types import Array, Features
 from mfvpr.utils.numerics import masked
 
 Tree = TypeVar("Tree")
@@ -27,14 +27,14 @@ class Packed(NamedTuple):
     """All weights; those of layers have a leading axis L. The last entry of `confidences` is unused padding."""
 
     input: Affine
-    frequencies: Array  # [2, d / 2]; a head has d numbers
+    frequencies: Float[Array, "2 angles"]  # half as many angles as numbers of a head
     layers: PackedLayer
     confidences: Affine
 
 
 def assignment(
     weights: Packed, features0: Features, features1: Features, *, depth_confidence: Array | float | None = None
-) -> Array:
+) -> Float[Array, "keypoints0 keypoints1"]:
     """Logarithm of the confidence that two keypoints match, for all pairs of keypoints of two images.
 
     Args:
@@ -45,7 +45,7 @@ def assignment(
             (published: 0.95). None = never.
 
     Returns:
-        `[N0, N1]`, at most 0; -inf if either keypoint is padding, or its descriptor or position is not finite.
+        At most 0; -inf if either keypoint is padding, or its descriptor or position is not finite.
     """
     sides = _finite(features0), _finite(features1)
     masks = [side.mask for side in sides]
@@ -93,7 +93,13 @@ def _confident_share(confidence: Affine, states: Sequence[Array], masks: Sequenc
     return 1 - sum(unsure[1:], start=unsure[0]) / jnp.maximum(jnp.sum(masks[0]) + jnp.sum(masks[1]), 1)
 
 
-def _assignment(layer: PackedLayer, states0: Array, states1: Array, mask0: Array, mask1: Array) -> Array:
+def _assignment(
+    layer: PackedLayer,
+    states0: Float[Array, "keypoints0 width"],
+    states1: Float[Array, "keypoints1 width"],
+    mask0: Bool[Array, " keypoints0"],
+    mask1: Bool[Array, " keypoints1"],
+) -> Float[Array, "keypoints0 keypoints1"]:
     """Assignment after a layer."""
     similarity = product(layer.projection(states0), layer.projection(states1).T)
     real = mask0[:, None] & mask1[None]
@@ -112,7 +118,7 @@ def _finite(features: Features) -> Features:
     )
 
 
-def _normalize(features: Features) -> Array:
+def _normalize(features: Features) -> Float[Array, "keypoints 2"]:
     """Keypoints in units of half of the image's longer side, from its center."""
     size = features.image_size
     return (features.keypoints - size[None] / 2) / (jnp.max(size) / 2)

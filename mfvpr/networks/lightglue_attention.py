@@ -1,29 +1,31 @@
 """LightGlue's two kinds of attention, on the states of the keypoints of one pair of images.
 
-States are `[N, D]`, of H heads with d = D / H numbers each. Masked keypoints do not affect other keypoints, and their
-own states are meaningless.
+Masked keypoints do not affect other keypoints, and their own states are meaningless.
 """
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import Array
+from jaxtyping import Bool, Float
+
+from mfvpr.types import Array
 
 _PRECISION = jax.lax.Precision.HIGHEST  # also on hardware with less than float32
 _EPSILON = 1e-5  # of the normalization
 
 Sides = tuple[Array, Array]  # of the two images
+States = Float[Array, "keypoints width"]
+Heads = Float[Array, "heads keypoints numbers"]  # equally many numbers of a state for each head
 
 
 class Affine(NamedTuple):
-    """A kernel `[inputs, outputs]` and a bias `[outputs]`."""
+    """Weights of a linear layer."""
 
-    kernel: Array
-    bias: Array
+    kernel: Float[Array, "inputs outputs"]
+    bias: Float[Array, " outputs"]
 
-    def __call__(self, values: Array) -> Array:
-        """`[N, inputs]` -> `[N, outputs]`."""
+    def __call__(self, values: Float[Array, "keypoints inputs"]) -> Float[Array, "keypoints outputs"]:
         return product(values, self.kernel) + self.bias[None]
 
 
@@ -32,20 +34,20 @@ class Block(NamedTuple):
 
     Attributes:
         inputs: states -> queries, keys and values (or keys and values), each head by head.
-        hidden: state and context, concatenated -> hidden values of the update, `[2 D, 2 D]`.
-        scale: `[2 D]` of their normalization.
-        shift: `[2 D]` of their normalization.
+        hidden: state and context, concatenated -> hidden values of the update, twice as many.
+        scale: of their normalization.
+        shift: of their normalization.
         update: hidden values -> change of the state.
     """
 
     inputs: Affine
     hidden: Affine
-    scale: Array
-    shift: Array
+    scale: Float[Array, " 2*width"]
+    shift: Float[Array, " 2*width"]
     update: Affine
 
-    def update_states(self, states: Array, context: Array) -> Array:
-        """States `[N, D]` after an update by a context `[H, N, d]`."""
+    def update_states(self, states: States, context: Heads) -> States:
+        """States after an update by a context."""
         together = jnp.concatenate([states, jnp.moveaxis(context, 0, 1).reshape(states.shape)], axis=1)
         hidden = self.hidden(together)
         centered = hidden - jnp.mean(hidden, axis=1, keepdims=True)
@@ -55,26 +57,26 @@ class Block(NamedTuple):
 
 
 class Rotation(NamedTuple):
-    """Rotary position encoding: cosines and sines `[N, d / 2]` of angles that turn pairs of numbers of a head."""
+    """Rotary position encoding: cosines and sines of angles that turn pairs of numbers of a head."""
 
-    cosine: Array
-    sine: Array
+    cosine: Float[Array, "keypoints angles"]
+    sine: Float[Array, "keypoints angles"]
 
     @classmethod
-    def of(cls, positions: Array, frequencies: Array) -> "Rotation":
-        """Rotation for positions `[N, 2]` and frequencies `[2, d / 2]`."""
+    def of(cls, positions: Float[Array, "keypoints 2"], frequencies: Float[Array, "2 angles"]) -> "Rotation":
+        """Rotation for positions and frequencies."""
         angles = product(positions, frequencies)
         return cls(jnp.cos(angles), jnp.sin(angles))
 
-    def __call__(self, values: Array) -> Array:
-        """Turn `[H, N, d]`; the first half of each head is paired with the second."""
+    def __call__(self, values: Heads) -> Heads:
+        """Turn values; the first half of each head is paired with the second."""
         first, second = jnp.split(values, 2, axis=-1)
         cosine, sine = self.cosine[None], self.sine[None]
         return jnp.concatenate([first * cosine - second * sine, second * cosine + first * sine], axis=-1)
 
 
-def within(block: Block, states: Array, mask: Array, rotation: Rotation) -> Array:
-    """States `[N, D]` after self-attention of the keypoints of one image, masked by `mask` `[N]`."""
+def within(block: Block, states: States, mask: Bool[Array, " keypoints"], rotation: Rotation) -> States:
+    """States after self-attention of the keypoints of one image, masked by `mask`."""
     queries, keys, values = _heads(block.inputs(states), 3, 2 * rotation.cosine.shape[1])
     weights, total = _weights(product(rotation(queries), rotation(keys).swapaxes(1, 2)), mask, 2)
     return block.update_states(states, product(weights, values) / total)
@@ -99,13 +101,17 @@ def product(left: Array, right: Array) -> Array:
     return jnp.matmul(left, right, precision=_PRECISION)
 
 
-def _heads(values: Array, parts: int, head: int) -> Array:
-    """`[N, parts * H * d]` -> `[parts, H, N, d]`."""
+def _heads(
+    values: Float[Array, "keypoints _"], parts: int, head: int
+) -> Float[Array, "{parts} heads keypoints {head}"]:
+    """Split the numbers of each keypoint into parts and heads."""
     return jnp.moveaxis(values.reshape(len(values), parts, -1, head), 0, 2)
 
 
-def _weights(logits: Array, mask: Array, axis: int) -> tuple[Array, Array]:
-    """Numerators and denominators of a masked softmax of `[H, N, M]` along an axis, which keeps length 1."""
+def _weights(
+    logits: Float[Array, "heads rows columns"], mask: Bool[Array, " keypoints"], axis: int
+) -> tuple[Float[Array, "heads rows columns"], Float[Array, "heads _ _"]]:
+    """Numerators and denominators of a masked softmax along an axis, which keeps length 1."""
     real = jnp.expand_dims(mask, (0, 3 - axis))
     logits = jnp.where(real, logits, jnp.finfo(logits.dtype).min)  # -inf gives NaN if none is real
     weights = jnp.exp(logits - jnp.max(logits, axis=axis, keepdims=True))

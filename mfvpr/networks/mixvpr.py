@@ -6,11 +6,12 @@ which all maps share. Two projections then reduce the number of maps and the num
 
 import jax.numpy as jnp
 from flax import nnx
-from jax import Array
+from jaxtyping import Float
 
-from mfvpr.networks.imagenet import DEVIATION, MEAN
+from mfvpr.networks.imagenet import DEVIATION, MEAN, Images, Pixels
 from mfvpr.networks.lengths import of_unit_length
 from mfvpr.networks.resnet import ResNet50
+from mfvpr.types import Array
 
 IMAGE_SIZE = (320, 320)  # px, width and height; the mixers' weights depend on it
 _CHANNELS, _POSITIONS = 1024, 20 * 20  # of the backbone's maps
@@ -25,8 +26,7 @@ class FeatureMixer(nnx.Module):
         self.linear1 = nnx.Linear(size, size, precision=precision, rngs=rngs)
         self.linear2 = nnx.Linear(size, size, precision=precision, rngs=rngs)
 
-    def __call__(self, maps: Array) -> Array:
-        """`[B, C, positions]` -> the same shape."""
+    def __call__(self, maps: Float[Array, "batch channels positions"]) -> Float[Array, "batch channels positions"]:
         return maps + self.linear2(nnx.relu(self.linear1(self.norm(maps))))
 
 
@@ -49,8 +49,8 @@ class MixVPR(nnx.Module):
         self.channel_proj = nnx.Linear(_CHANNELS, out_channels, precision=precision, rngs=rngs)
         self.row_proj = nnx.Linear(_POSITIONS, out_rows, precision=precision, rngs=rngs)
 
-    def __call__(self, images: Array) -> Array:
-        """Descriptors `[B, D]` of unit length, D = channels x rows, from preprocessed images `[B, 320, 320, 3]`.
+    def __call__(self, images: Images) -> Float[Array, "batch dimensions"]:
+        """Descriptors of unit length, channels times rows, from preprocessed images of 320 x 320 px.
 
         Raises:
             ValueError: images of another size.
@@ -60,16 +60,16 @@ class MixVPR(nnx.Module):
             raise ValueError(f"MixVPR takes images of 320 x 320 px only, got {width} x {height}")
         return self.aggregate(self.backbone(images))
 
-    def aggregate(self, maps: Array) -> Array:
-        """Descriptors `[B, D]` of unit length from the backbone's maps `[B, 20, 20, 1024]`."""
+    def aggregate(self, maps: Float[Array, "batch 20 20 1024"]) -> Float[Array, "batch dimensions"]:
+        """Descriptors of unit length from the backbone's maps."""
         maps = maps.reshape(len(maps), _POSITIONS, _CHANNELS).swapaxes(1, 2)
         for mixer in self.mix:
             maps = mixer(maps)
         descriptors = self._project(maps).reshape(len(maps), self.dimension)
         return of_unit_length(descriptors)
 
-    def _project(self, maps: Array) -> Array:
-        """Channel projection, then row projection: `[B, 1024, positions]` -> `[B, channels, rows]`.
+    def _project(self, maps: Float[Array, "batch 1024 positions"]) -> Float[Array, "batch channels rows"]:
+        """Channel projection, then row projection.
 
         Both are linear and act on different axes, so the rows, of which few remain, can be projected first. This saves
         1/6 of the mixers' and projections' time. The channels' bias is then summed over the rows' kernel.
@@ -77,12 +77,12 @@ class MixVPR(nnx.Module):
         channels, rows = self.channel_proj, self.row_proj
         kernel = rows.kernel[...]
         bias = jnp.outer(kernel.sum(0), channels.bias[...]) + rows.bias[...][:, None]  # pyright: ignore  (never None)
-        narrow = jnp.matmul(maps, kernel, precision=self.precision).swapaxes(1, 2)  # [B, rows, 1024]
+        narrow = jnp.matmul(maps, kernel, precision=self.precision).swapaxes(1, 2)
         projected = jnp.matmul(narrow, channels.kernel[...], precision=self.precision) + bias[None]
         return projected.swapaxes(1, 2)
 
 
-def preprocess(images: Array) -> Array:
-    """Images `[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32 -> inputs of the network, float32."""
+def preprocess(images: Pixels) -> Images:
+    """RGB images, 0 .. 255, uint8 or float32 -> inputs of the network, float32."""
     mean, deviation = (jnp.array(values, jnp.float32)[None, None, None] for values in (MEAN, DEVIATION))
     return (images.astype(jnp.float32) / 255 - mean) / deviation

@@ -8,12 +8,13 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jax import Array
+from jaxtyping import Float
 
-from mfvpr.networks.imagenet import preprocess
+from mfvpr.networks.imagenet import Images, Pixels, preprocess
 from mfvpr.networks.lengths import of_unit_length
 from mfvpr.networks.resnet import PointwiseConv
 from mfvpr.networks.vgg import Vgg16, require_position
+from mfvpr.types import Array
 
 CHANNELS = 512  # of VGG16's conv5_3
 Order = Literal["clusters", "channels"]  # the outer axis of a descriptor
@@ -40,18 +41,17 @@ class NetVlad(nnx.Module):
         self.order = order
         self.precision = precision
 
-    def __call__(self, maps: Array) -> Array:
-        """`[B, h, w, D]` -> `[B, K D]` of unit length."""
+    def __call__(self, maps: Float[Array, "batch rows columns channels"]) -> Float[Array, "batch dimensions"]:
+        """Descriptors of unit length."""
         x = of_unit_length(maps.reshape(len(maps), -1, CHANNELS))
         share = self._shares(x)
         sums = jnp.einsum("bpk,bpd->bkd", share, x, precision=self.precision)
         return self._descriptors(sums - jnp.sum(share, axis=1)[..., None] * self.centers[...][None])
 
-    def patches(self, maps: Array, size: int) -> Array:
-        """Descriptors of all squares of `size` positions, by rows.
-
-        `[B, h, w, D]` -> `[B, (h - size + 1) (w - size + 1), K D]`.
-        """
+    def patches(
+        self, maps: Float[Array, "batch rows columns channels"], size: int
+    ) -> Float[Array, "batch (rows-{size}+1)*(columns-{size}+1) dimensions"]:
+        """Descriptors of all squares of `size` positions, by rows."""
         x = of_unit_length(maps)
         residuals = self._shares(x)[..., None] * (x[..., None, :] - self.centers[...][None, None, None])
         sums = residuals
@@ -61,12 +61,11 @@ class NetVlad(nnx.Module):
             sums = jnp.moveaxis(jnp.tensordot(band, sums, axes=(0, axis), precision=self.precision), 0, axis)
         return self._descriptors(sums.reshape(len(maps), -1, *sums.shape[3:]))
 
-    def _shares(self, x: Array) -> Array:
-        """Shares `[..., K]` of the clusters for vectors of unit length."""
+    def _shares(self, x: Float[Array, "*batch channels"]) -> Float[Array, "*batch clusters"]:
+        """Shares of the clusters for vectors of unit length."""
         return nnx.softmax(jnp.matmul(x, self.assignment.kernel[0, 0], precision=self.precision), axis=-1)
 
-    def _descriptors(self, sums: Array) -> Array:
-        """`[..., K, D]` -> `[..., K D]`."""
+    def _descriptors(self, sums: Float[Array, "*batch clusters channels"]) -> Float[Array, "*batch dimensions"]:
         sums = of_unit_length(sums)
         ordered = sums if self.order == "clusters" else sums.swapaxes(-1, -2)
         return of_unit_length(ordered.reshape(*sums.shape[:-2], -1))
@@ -99,22 +98,23 @@ class VggNetVlad(nnx.Module):
 
     require = staticmethod(require_position)
 
-    def preprocess(self, images: Array) -> Array:
-        """Images `[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32 -> inputs of the network, float32."""
+    def preprocess(self, images: Pixels) -> Images:
+        """RGB images, 0 .. 255, uint8 or float32 -> inputs of the network, float32."""
         if self.original:
             return images.astype(jnp.float32) - self.average[...][None, None, None]
         return preprocess(images, "torch")
 
-    def __call__(self, images: Array) -> Array:
-        """Descriptors `[B, dimension]` of unit length of preprocessed images `[B, H, W, 3]`."""
+    def __call__(self, images: Images) -> Float[Array, "batch dimensions"]:
+        """Descriptors of unit length of preprocessed images."""
         return self._project(self.pool(self.vgg(images)))
 
-    def with_patches(self, images: Array, sizes: tuple[int, ...]) -> tuple[Array, tuple[Array, ...]]:
-        """Descriptors of images, and for each size those `[B, P, dimension]` of all patches, by rows."""
+    def with_patches(
+        self, images: Images, sizes: tuple[int, ...]
+    ) -> tuple[Float[Array, "batch dimensions"], tuple[Float[Array, "batch patches dimensions"], ...]]:
+        """Descriptors of images, and for each size those of all patches, by rows."""
         maps = self.vgg(images)
         patches = (self.pool.patches(maps, size) for size in sizes)
         return self._project(self.pool(maps)), tuple(map(self._project, patches))
 
-    def _project(self, descriptors: Array) -> Array:
-        """`[..., K D]` -> `[..., dimension]` of unit length."""
+    def _project(self, descriptors: Float[Array, "*batch _"]) -> Float[Array, "*batch dimensions"]:
         return of_unit_length(self.projection(descriptors)) if self.has_components else descriptors

@@ -5,7 +5,11 @@ Batch normalization uses its running statistics, since the network only extracts
 
 import jax.numpy as jnp
 from flax import nnx
-from jax import Array, lax
+from jax import lax
+from jaxtyping import Float
+
+from mfvpr.networks.imagenet import Images
+from mfvpr.types import Array
 
 _EXPANSION = 4  # channels of a block's output per channel inside
 _LAYERS = {"layer1": (3, 64), "layer2": (4, 128), "layer3": (6, 256), "layer4": (3, 512)}  # blocks, channels inside
@@ -23,8 +27,7 @@ class PointwiseConv(nnx.Module):
         self.stride = stride
         self.precision = precision
 
-    def __call__(self, x: Array) -> Array:
-        """`[B, H, W, C]` -> `[B, ceil(H / stride), ceil(W / stride), D]`."""
+    def __call__(self, x: Float[Array, "batch rows columns inputs"]) -> Float[Array, "batch _ _ outputs"]:
         return jnp.matmul(x[:, :: self.stride, :: self.stride], self.kernel[0, 0], precision=self.precision)
 
 
@@ -44,8 +47,7 @@ class Bottleneck(nnx.Module):
             self.shortcut = PointwiseConv(inputs, outputs, stride=stride, precision=precision, rngs=rngs)
             self.shortcut_bn = _norm(outputs, rngs=rngs)
 
-    def __call__(self, x: Array) -> Array:
-        """`[B, H, W, inputs]` -> `[B, H / stride, W / stride, 4 width]`."""
+    def __call__(self, x: Float[Array, "batch rows columns inputs"]) -> Float[Array, "batch _ _ outputs"]:
         shortcut = self.shortcut_bn(self.shortcut(x)) if self.has_projection else x
         x = nnx.relu(self.bn1(self.conv1(x)))
         x = nnx.relu(self.bn2(self.conv2(x)))
@@ -75,8 +77,7 @@ class ResNet50(nnx.Module):
                 inputs = _EXPANSION * width
             setattr(self, name, layer)
 
-    def __call__(self, images: Array) -> Array:
-        """`[B, H, W, 3]` float32 -> `[B, h, w, C]`."""
+    def __call__(self, images: Images) -> Float[Array, "batch rows columns channels"]:
         x = nnx.relu(self.bn1(self.conv1(images)))
         around = ((1, 1), (1, 1))  # one pixel of minus infinity; Flax's annotation allows names only
         x = nnx.max_pool(x, (3, 3), strides=(2, 2), padding=around)  # pyright: ignore[reportArgumentType]

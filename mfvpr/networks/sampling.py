@@ -5,19 +5,23 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jaxtyping import Float, Int
+
+from mfvpr.types import Array
 
 
 class Neighbors(NamedTuple):
-    """Pixels before and after each of n positions on a line, and the position between them."""
+    """Pixels before and after each position on a line, and the position between them."""
 
-    lower: np.ndarray  # [n] int
-    upper: np.ndarray  # [n] int
-    part: np.ndarray  # [n] in [0, 1], from lower to upper
+    lower: Int[np.ndarray, " positions"]
+    upper: Int[np.ndarray, " positions"]
+    part: Float[np.ndarray, " positions"]  # in [0, 1], from lower to upper
 
 
-def sample(dense: Array, points: Array) -> Array:
-    """Sample a map `[H, W, C]` at positions `[..., 2]` (x, y) px -> `[..., C]`.
+def sample(
+    dense: Float[Array, "height width channels"], points: Float[Array, "*points 2"]
+) -> Float[Array, "*points channels"]:
+    """Sample a map at positions (x, y) px.
 
     Pixels outside the map are zero, so values fade out within one pixel of the border, as in `grid_sample` with aligned
     corners and in deformable convolutions.
@@ -30,8 +34,10 @@ def sample(dense: Array, points: Array) -> Array:
     return total
 
 
-def around(points: Array, height: int, width: int) -> Iterator[tuple[Array, Array, Array]]:
-    """Yield y, x and weight of the four pixels around positions `[..., 2]` (x, y) px.
+def around(
+    points: Float[Array, "*points 2"], height: int, width: int
+) -> Iterator[tuple[Int[Array, "*points"], Int[Array, "*points"], Float[Array, "*points"]]]:
+    """Yield y, x and weight of the four pixels around positions (x, y) px.
 
     Pixels outside are moved inside, with weight 0.
     """
@@ -46,8 +52,10 @@ def around(points: Array, height: int, width: int) -> Iterator[tuple[Array, Arra
             yield jnp.clip(y, 0, height - 1), jnp.clip(x, 0, width - 1), jnp.where(inside, across * along, 0)
 
 
-def upsample(dense: Array, factor: int) -> Array:
-    """Enlarge maps `[..., h, w, C]` -> `[..., factor * h, factor * w, C]`, with aligned corner pixels."""
+def upsample(
+    dense: Float[Array, "*batch height width channels"], factor: int
+) -> Float[Array, "*batch {factor}*height {factor}*width channels"]:
+    """Enlarge maps, with aligned corner pixels."""
     if factor == 1:
         return dense
     for axis in (-3, -2):
@@ -63,7 +71,7 @@ def neighbors(size: int, count: int, window: slice = slice(None)) -> Neighbors:
     return Neighbors(lower, np.minimum(lower + 1, size - 1), position - lower.astype(np.float32))
 
 
-def between(dense: Array, places: Neighbors, axis: int) -> Array:
+def between(dense: Float[Array, "..."], places: Neighbors, axis: int) -> Float[Array, "..."]:
     """Interpolate `dense` at these places along one axis.
 
     Reading two neighbors is several times faster than a product with the sparse matrix of the interpolation.

@@ -2,11 +2,13 @@
 
 import jax.numpy as jnp
 from flax import nnx
-from jax import Array
+from jaxtyping import Float
 
 from mfvpr.networks.gem import GeneralizedMean
+from mfvpr.networks.imagenet import Images
 from mfvpr.networks.lengths import of_unit_length
 from mfvpr.networks.vit import Block, VisionTransformer
+from mfvpr.types import Array
 
 _PARALLEL = 0.2  # weight of the parallel adapter
 _BOTTLENECK = 2  # width of a token over hidden values of an adapter
@@ -20,8 +22,7 @@ class Adapter(nnx.Module):
         self.down = nnx.Linear(width, width // _BOTTLENECK, precision=precision, rngs=rngs)
         self.up = nnx.Linear(width // _BOTTLENECK, width, precision=precision, rngs=rngs)
 
-    def __call__(self, x: Array) -> Array:
-        """`[B, N, D]` -> `[B, N, D]`."""
+    def __call__(self, x: Float[Array, "batch tokens width"]) -> Float[Array, "batch tokens width"]:
         return self.up(nnx.relu(self.down(x)))
 
 
@@ -32,18 +33,18 @@ class AdaptedBlock(Block):
         super().__init__(width, heads, precision=precision, rngs=rngs)
         self.serial, self.parallel = (Adapter(width, precision=precision, rngs=rngs) for _ in range(2))
 
-    def attention_update(self, x: Array) -> Array:
+    def attention_update(self, x: Float[Array, "batch tokens width"]) -> Float[Array, "batch tokens width"]:
         """z + adapter(z), with the attention's output z."""
         output = super().attention_update(x)
         return output + self.serial(output)
 
-    def perceptron_update(self, x: Array) -> Array:
+    def perceptron_update(self, x: Float[Array, "batch tokens width"]) -> Float[Array, "batch tokens width"]:
         """perceptron(x) + 0.2 adapter(x)."""
         return super().perceptron_update(x) + _PARALLEL * self.parallel(x)
 
 
 class Upsampling(nnx.Module):
-    """Transposed 3 x 3 convolution, stride 2, padding 1: `[B, h, w, C]` -> `[B, 2 h - 1, 2 w - 1, D]`.
+    """Transposed 3 x 3 convolution, stride 2, padding 1.
 
     `kernel` `[3, 3, C, D]` adds position (i, j) of the input to (2 i + row - 1, 2 j + column - 1); `bias` is `[D]`.
     """
@@ -54,7 +55,9 @@ class Upsampling(nnx.Module):
         self.bias = nnx.Param(jnp.zeros(outputs, jnp.float32))
         self.precision = precision
 
-    def __call__(self, x: Array) -> Array:
+    def __call__(
+        self, x: Float[Array, "batch rows columns inputs"]
+    ) -> Float[Array, "batch 2*rows-1 2*columns-1 outputs"]:
         """Multiply by the whole kernel at once, then add neighbors, which avoids products with zeros."""
         parts = jnp.tensordot(x, self.kernel[...], axes=(3, 2), precision=self.precision)  # [B, h, w, 3, 3, D]
         rows = _interleave(parts, axis=1, kernel_axis=3)
@@ -100,12 +103,10 @@ class SelaVpr(nnx.Module):
 
     preprocess = staticmethod(VisionTransformer.preprocess)
 
-    def __call__(self, images: Array) -> tuple[Array, Array]:
-        """Global descriptors `[B, D]` and local descriptors `[B, 4 h - 3, 4 w - 3, 128]` of unit length.
-
-        Args:
-            images: preprocessed, `[B, 14 h, 14 w, 3]`.
-        """
+    def __call__(
+        self, images: Images
+    ) -> tuple[Float[Array, "batch dimensions"], Float[Array, "batch 4*(height//14)-3 4*(width//14)-3 128"]]:
+        """Global descriptors and local descriptors of unit length of preprocessed images."""
         maps = self.backbone(images).maps
         local = self.upsampling2(nnx.relu(self.upsampling1(maps)))
         return of_unit_length(self.pool(of_unit_length(maps))), of_unit_length(local)

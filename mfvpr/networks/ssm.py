@@ -5,10 +5,11 @@ before their ReLU. Pooling rounds sizes up, so a map has ceil(H / stride) x ceil
 """
 
 from flax import nnx
-from jax import Array
+from jaxtyping import Float
 
-from mfvpr.networks.imagenet import Preprocessing, preprocess
+from mfvpr.networks.imagenet import Images, Pixels, Preprocessing, preprocess
 from mfvpr.networks.vgg import Vgg16
+from mfvpr.types import Array
 
 STAGE1_LAYER, STAGE2_LAYER = "conv5_2", "conv4_2"
 STAGE1_STRIDE, STAGE2_STRIDE = 16, 8  # px between positions of the maps
@@ -24,23 +25,23 @@ class SsmVgg(nnx.Module):
     def __init__(self, *, precision: str = "highest", rngs: nnx.Rngs) -> None:
         self.vgg = Vgg16(STAGE1_LAYER, pools=("max_ceil",) * 4, precision=precision, rngs=rngs)
 
-    def __call__(self, images: Array) -> tuple[Array, Array]:
+    def __call__(self, images: Images) -> tuple[Float[Array, "batch _ _ 512"], Float[Array, "batch _ _ 512"]]:
         """`stage1` and `stage2` of the same images, in one pass."""
         first, second = self.vgg.maps(images, (STAGE1_LAYER, STAGE2_LAYER))
         return first, second
 
-    def stage1(self, images: Array) -> Array:
-        """Preprocessed images `[B, H, W, 3]` -> `[B, h, w, 512]`, before the ReLU; h = ceil(H / 16)."""
+    def stage1(self, images: Images) -> Float[Array, "batch rows columns 512"]:
+        """The first map of preprocessed images."""
         return self.vgg(images)
 
-    def stage2(self, images: Array) -> Array:
-        """Preprocessed images `[B, H, W, 3]` -> `[B, h, w, 512]`, before the ReLU; h = ceil(H / 8)."""
+    def stage2(self, images: Images) -> Float[Array, "batch rows columns 512"]:
+        """The second map of preprocessed images."""
         (second,) = self.vgg.maps(images, (STAGE2_LAYER,))
         return second
 
     @staticmethod
-    def preprocess(images: Array, preprocessing: Preprocessing = "torch") -> Array:
-        """RGB images `[B, H, W, 3]` from 0 to 255 -> inputs of the stages, float32; see `mfvpr.networks.imagenet`.
+    def preprocess(images: Pixels, preprocessing: Preprocessing = "torch") -> Images:
+        """RGB images from 0 to 255 -> inputs of the stages, float32; see `mfvpr.networks.imagenet`.
 
         The published code uses "torch", although its weights were trained with "caffe".
         """

@@ -3,11 +3,13 @@
 from collections.abc import Sequence
 from typing import Literal
 
-import jax
 import jax.numpy as jnp
 from flax import nnx
+from jaxtyping import Bool, Float
 
 from mfvpr.networks.convolution import Conv3x3
+from mfvpr.networks.imagenet import Images
+from mfvpr.types import Array
 from mfvpr.utils.errors import InputError
 
 STRIDE = 16  # px between positions of the last block's map
@@ -51,15 +53,20 @@ class Vgg16(nnx.Module):
             setattr(self, name, Conv3x3(inputs, LAYERS[name], dilation=dilation, precision=precision, rngs=rngs))
             inputs = LAYERS[name]
 
-    def __call__(self, images: jax.Array, uniform: jax.Array | bool = False) -> jax.Array:
-        """`[B, H, W, 3]` float32 -> `[B, h, w, D]`, before the last layer's ReLU; `uniform` as in `Conv3x3`."""
+    def __call__(
+        self, images: Images, uniform: bool | Bool[Array, ""] = False
+    ) -> Float[Array, "batch rows columns channels"]:
+        """Map before the last layer's ReLU; `uniform` as in `Conv3x3`."""
         (last,) = self.maps(images, self.layers[-1:], uniform)
         return last
 
     def maps(
-        self, images: jax.Array, layers: Sequence[str], uniform: jax.Array | bool = False
-    ) -> tuple[jax.Array, ...]:
-        """Outputs `[B, h, w, D]` of these layers before their ReLU; later layers do not run."""
+        self,
+        images: Images,
+        layers: Sequence[str],
+        uniform: bool | Bool[Array, ""] = False,
+    ) -> tuple[Float[Array, "batch _ _ _"], ...]:
+        """Outputs of these layers before their ReLU; later layers do not run."""
         outputs = {}
         x = images
         for name in self.layers:
@@ -84,7 +91,7 @@ def _block(name: str) -> int:
     return int(name[len("conv")])
 
 
-def _max_pool(x: jax.Array) -> jax.Array:
+def _max_pool(x: Array) -> Array:
     """Maximum, then ReLU, which equals the other order with a quarter of the work.
 
     Slices are used because a window reduction does not fuse with its neighbors on a CPU.
@@ -95,13 +102,13 @@ def _max_pool(x: jax.Array) -> jax.Array:
     return nnx.relu(jnp.maximum(rows[:, :, 0::2], rows[:, :, 1::2]))
 
 
-def _max_pool_ceil(x: jax.Array) -> jax.Array:
+def _max_pool_ceil(x: Array) -> Array:
     """As `_max_pool`, but keep an odd last row or column."""
     odd = ((0, 0), (0, x.shape[1] % 2), (0, x.shape[2] % 2), (0, 0))
     return _max_pool(jnp.pad(x, odd, mode="edge"))
 
 
-def _average_pool(x: jax.Array) -> jax.Array:
+def _average_pool(x: Array) -> Array:
     x = nnx.relu(x)
     return (x[:, :-1, :-1] + x[:, :-1, 1:] + x[:, 1:, :-1] + x[:, 1:, 1:]) / 4
 

@@ -6,11 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jax import Array
+from jaxtyping import Float
 
 from mfvpr.networks.gem import GeneralizedMean
-from mfvpr.networks.imagenet import preprocess
+from mfvpr.networks.imagenet import Images, Pixels, preprocess
 from mfvpr.networks.lengths import of_unit_length
+from mfvpr.types import Array
 from mfvpr.utils.errors import InputError
 
 Pooling = Literal["cls", "gem"]
@@ -26,8 +27,8 @@ _CUBIC = -0.75  # torch's parameter of bicubic interpolation
 class Tokens(NamedTuple):
     """Output of a transformer."""
 
-    class_token: Array  # [B, D]
-    maps: Array  # [B, h, w, D], tokens of the patches
+    class_token: Float[Array, "batch width"]
+    maps: Float[Array, "batch rows columns width"]  # tokens of the patches
 
 
 class Patches(nnx.Module):
@@ -39,8 +40,7 @@ class Patches(nnx.Module):
         self.bias = nnx.Param(jnp.zeros(width, jnp.float32))
         self.precision = precision
 
-    def __call__(self, images: Array) -> Array:
-        """`[B, 14 h, 14 w, 3]` -> `[B, h w, D]`."""
+    def __call__(self, images: Images) -> Float[Array, "batch (height//14)*(width//14) dimensions"]:
         batch, rows, columns = len(images), images.shape[1] // PATCH, images.shape[2] // PATCH
         pixels = images.reshape(batch, rows, PATCH, columns, PATCH, 3).swapaxes(2, 3)
         kernel = self.kernel[...].reshape(-1, self.kernel.shape[-1])
@@ -57,8 +57,7 @@ class Attention(nnx.Module):
         self.heads = heads
         self.precision = precision
 
-    def __call__(self, x: Array) -> Array:
-        """`[B, N, D]` -> `[B, N, D]`."""
+    def __call__(self, x: Float[Array, "batch tokens width"]) -> Float[Array, "batch tokens width"]:
         batch, tokens, width = x.shape
         queries, keys, values = jnp.moveaxis(self.qkv(x).reshape(batch, tokens, 3, self.heads, -1), (2, 3), (0, 2))
         queries = queries * (width // self.heads) ** -0.5
@@ -75,8 +74,7 @@ class Perceptron(nnx.Module):
         self.hidden = nnx.Linear(width, _EXPANSION * width, precision=precision, rngs=rngs)
         self.output = nnx.Linear(_EXPANSION * width, width, precision=precision, rngs=rngs)
 
-    def __call__(self, x: Array) -> Array:
-        """`[B, N, D]` -> `[B, N, D]`."""
+    def __call__(self, x: Float[Array, "batch tokens width"]) -> Float[Array, "batch tokens width"]:
         return self.output(jax.nn.gelu(self.hidden(x), approximate=False))
 
 
@@ -89,16 +87,15 @@ class Block(nnx.Module):
         self.perceptron = Perceptron(width, precision=precision, rngs=rngs)
         self.scale1, self.scale2 = (nnx.Param(jnp.ones(width, jnp.float32)) for _ in range(2))
 
-    def __call__(self, x: Array) -> Array:
-        """`[B, N, D]` -> `[B, N, D]`."""
+    def __call__(self, x: Float[Array, "batch tokens width"]) -> Float[Array, "batch tokens width"]:
         x = x + self.scale1[...][None, None] * self.attention_update(self.norm1(x))
         return x + self.scale2[...][None, None] * self.perceptron_update(self.norm2(x))
 
-    def attention_update(self, x: Array) -> Array:
+    def attention_update(self, x: Float[Array, "batch tokens width"]) -> Float[Array, "batch tokens width"]:
         """Attention of normalized tokens, before the scale."""
         return self.attention(x)
 
-    def perceptron_update(self, x: Array) -> Array:
+    def perceptron_update(self, x: Float[Array, "batch tokens width"]) -> Float[Array, "batch tokens width"]:
         """Perceptron of normalized tokens, before the scale."""
         return self.perceptron(x)
 
@@ -134,12 +131,12 @@ class VisionTransformer(nnx.Module):
         self.precision = precision
 
     @staticmethod
-    def preprocess(images: Array) -> Array:
-        """Images `[B, H, W, 3]` RGB, 0 .. 255, uint8 or float32 -> inputs of the network, float32."""
+    def preprocess(images: Pixels) -> Images:
+        """RGB images, 0 .. 255, uint8 or float32 -> inputs of the network, float32."""
         return preprocess(images, "torch")
 
-    def __call__(self, images: Array) -> Tokens:
-        """Normalized tokens of preprocessed images `[B, 14 h, 14 w, 3]`."""
+    def __call__(self, images: Images) -> Tokens:
+        """Normalized tokens of preprocessed images."""
         batch, rows, columns = len(images), images.shape[1] // PATCH, images.shape[2] // PATCH
         maps = self.patches(images) + self._positions(rows, columns)[None]
         first = (self.first[...] + self.positions[...][0])[None]
@@ -150,8 +147,8 @@ class VisionTransformer(nnx.Module):
         x = self.norm(x)
         return Tokens(x[:, 0], x[:, len(extra) :].reshape(batch, rows, columns, self.width))
 
-    def _positions(self, rows: int, columns: int) -> Array:
-        """Position encodings `[h w, D]` of the patches: the learned ones, resized without antialiasing."""
+    def _positions(self, rows: int, columns: int) -> Float[Array, "{rows}*{columns} width"]:
+        """Position encodings of the patches: the learned ones, resized without antialiasing."""
         learned = self.positions[...][1:]
         if rows == columns == _TRAINED:
             return learned
@@ -185,8 +182,8 @@ class TokenDescriptor(nnx.Module):
         """Raise an InputError unless width and height (px) are multiples of a patch's side."""
         require_patches(size)
 
-    def __call__(self, images: Array) -> Array:
-        """Descriptors `[B, D]` of unit length of preprocessed images `[B, 14 h, 14 w, 3]`."""
+    def __call__(self, images: Images) -> Float[Array, "batch dimensions"]:
+        """Descriptors of unit length of preprocessed images."""
         class_token, maps = self.network(images)
         return of_unit_length(class_token if self.pooling == "cls" else self.pool(of_unit_length(maps)))
 
@@ -201,8 +198,8 @@ def _norm(width: int, rngs: nnx.Rngs) -> nnx.LayerNorm:
     return nnx.LayerNorm(width, epsilon=_EPSILON, use_fast_variance=False, rngs=rngs)
 
 
-def _bicubic(size: int, count: int) -> Array:
-    """Matrix `[count, size]` of the interpolation at `count` places, `size / (count + 0.1)` apart; edges repeat."""
+def _bicubic(size: int, count: int) -> Float[Array, "{count} {size}"]:
+    """Matrix of the interpolation at `count` places, `size / (count + 0.1)` apart; edges repeat."""
     places = (np.arange(count) + 0.5) * size / (count + _OFFSET) - 0.5
     before, matrix = np.floor(places).astype(int), np.zeros((count, size))
     for step in (-1, 0, 1, 2):
